@@ -1,0 +1,242 @@
+"""OpenCL programs from the package's sources, and kernels whose arguments are bound by name.
+
+Sources are joined here, with `#line`, and never `#include` one another: so every cache sees the whole text,
+and errors name the file. Signatures are read from that text; style: `kernel void name(` with parameters
+`global [const] T *restrict name`, `local T *name`, and scalars of the types in `_SCALARS`.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import math
+import os
+import re
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Literal
+
+import numpy as np
+
+from .device import BROKEN_POCL, LESS_MEMORY, Device, first_line, is_out_of_memory
+from .errors import DeviceError
+
+Real = Literal["float", "double"]
+Define = int | float | str
+
+OPTIONS = ("-cl-std=CL1.2", "-cl-mad-enable")  # never fast-relaxed-math: infinities and NaN have meaning
+OPTIONS_VARIABLE = "CLSPLAT_BUILD_OPTIONS"  # more, from outside: -Werror in tests, -g for Oclgrind
+
+_SCALARS = {"int": np.int32, "uint": np.uint32, "ulong": np.uint64, "float": np.float32, "double": np.float64}
+_ATTRIBUTE = r"__attribute__\s*\(\(.*?\)\)\)?\s*"  # the third brace closes reqd_work_group_size(...)
+_KERNEL = re.compile(rf"\b(?:__)?kernel\s+(?:{_ATTRIBUTE})*void\s+(\w+)\s*\(([^)]*)\)", re.S)
+_COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.S)
+
+
+def source(*names: str) -> str:
+    """Text of kernel source files ("raster.cl", "shape/gaussian.clh") joined in order, each after its `#line`."""
+    return "".join(f'#line 1 "{name}"\n{_read(name)}\n' for name in names)
+
+
+def build(
+    device: Device,
+    files: tuple[str, ...],
+    defines: Mapping[str, Define] | None = None,
+    real: Real = "float",
+) -> Program:
+    """Program from source files, built once per device, files, defines and `real`.
+
+    Parameters
+    ----------
+    files : names as for `source`, lower ones first.
+    defines : become `#define` lines before the text; floats become literals of type `real`.
+    real : arithmetic; REAL_DOUBLE is defined as 0 or 1.
+
+    Raises
+    ------
+    DeviceError : the device has no doubles, or the build failed (device, first error line, defines).
+    """
+    defines = dict(defines or {})
+    key = (files, tuple(sorted(defines.items())), real, os.environ.get(OPTIONS_VARIABLE, ""))
+    if key not in device.programs:
+        device.programs[key] = build_text(device, source(*files), defines, real)
+    program: Program = device.programs[key]
+    return program
+
+
+def build_text(
+    device: Device, text: str, defines: Mapping[str, Define] | None = None, real: Real = "float"
+) -> Program:
+    """Program from OpenCL C text, not cached; otherwise as `build`."""
+    import pyopencl as cl
+
+    if real == "double" and not device.has_fp64:
+        raise DeviceError(f"device {device.info} has no double precision: use float32 or another --device")
+    lines = [f"#define REAL_DOUBLE {int(real == 'double')}"]
+    lines += [f"#define {name} {_literal(name, value, real)}" for name, value in (defines or {}).items()]
+    options = [*OPTIONS, *os.environ.get(OPTIONS_VARIABLE, "").split()]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", cl.CompilerWarning)  # some compilers report every success
+            built = cl.Program(device.context, "\n".join([*lines, text])).build(options)
+    except cl.Error as error:
+        raise _build_error(device, error, defines or {}, real) from None
+    return Program(device, built, parse_signatures(text, real))
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One kernel parameter: `kind` is "buffer", "local" or "scalar" (then with its NumPy dtype)."""
+
+    name: str
+    kind: Literal["buffer", "local", "scalar"]
+    dtype: np.dtype[Any] | None = None
+
+
+def parse_signatures(text: str, real: Real) -> dict[str, tuple[Parameter, ...]]:
+    """Parameters of every kernel in OpenCL C text, by kernel name; DeviceError names what it cannot read."""
+    signatures: dict[str, tuple[Parameter, ...]] = {}
+    for name, inside in _KERNEL.findall(_COMMENT.sub(" ", text)):
+        parts = [part for part in inside.split(",") if part.strip() not in ("", "void")]
+        parameters = tuple(_parse_parameter(name, part, real) for part in parts)
+        if signatures.setdefault(name, parameters) != parameters:
+            raise DeviceError(f"kernel {name}: two definitions with different parameters in one program")
+    return signatures
+
+
+class Program:
+    """A built program; `program["name"]` or `program.name` is a Kernel, made once."""
+
+    def __init__(self, device: Device, built: Any, signatures: dict[str, tuple[Parameter, ...]]) -> None:
+        self.device = device
+        self.signatures = signatures
+        self._built = built
+        self._kernels: dict[str, Kernel] = {}
+
+    def __getitem__(self, name: str) -> Kernel:
+        if name not in self._kernels:
+            if name not in self.signatures:
+                raise KeyError(f"no kernel {name!r}; this program has {', '.join(sorted(self.signatures))}")
+            self._kernels[name] = Kernel(self.device, self._built, name, self.signatures[name])
+        return self._kernels[name]
+
+    def __getattr__(self, name: str) -> Kernel:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        try:
+            return self[name]
+        except KeyError as error:
+            raise AttributeError(error.args[0]) from None
+
+
+class Kernel:
+    """One kernel, called as `kernel(global_size, local_size, name=value, ...)`; returns the pyopencl event.
+
+    Values: a pyopencl buffer for `global` pointers, a number for scalars, bytes for `local` pointers.
+    Not thread-safe, as OpenCL's kernel objects are not.
+    """
+
+    def __init__(self, device: Device, built: Any, name: str, parameters: tuple[Parameter, ...]) -> None:
+        import pyopencl as cl
+
+        self.name = name
+        self.parameters = parameters
+        self._device = device
+        self._queue = device.queue
+        self._kernel = cl.Kernel(built, name)
+        if self._kernel.num_args != len(parameters):
+            raise DeviceError(
+                f"kernel {name}: built with {self._kernel.num_args} parameters, but its text shows {len(parameters)}"
+            )
+        self._names = tuple(p.name for p in parameters)
+        self._local = tuple(i for i, p in enumerate(parameters) if p.kind == "local")
+        self._kernel.set_scalar_arg_dtypes([p.dtype for p in parameters])
+        self._local_memory: Callable[[int], Any] = cl.LocalMemory
+        self._enqueue = cl.enqueue_nd_range_kernel
+        self._marker = cl.enqueue_marker
+        self._cl_error: type[Exception] = cl.Error
+
+    def __call__(
+        self, global_size: tuple[int, ...], local_size: tuple[int, ...] | None, /, **args: Any
+    ) -> Any:
+        """Enqueue on the device's queue. An empty global size runs nothing (OpenCL 1.2 would refuse it).
+
+        Raises
+        ------
+        TypeError : an argument is missing, unknown, or of the wrong kind.
+        DeviceError : the device refused the launch.
+        """
+        try:
+            values = [args[name] for name in self._names]
+        except KeyError:
+            values = []
+        if len(values) != len(self._names) or len(args) != len(values):
+            raise TypeError(self._mismatch(set(args)))
+        for i in self._local:
+            values[i] = self._local_memory(values[i])
+        if 0 in global_size:
+            return self._marker(self._queue)
+        try:
+            self._kernel.set_args(*values)
+            return self._enqueue(self._queue, self._kernel, global_size, local_size)
+        except self._cl_error as error:
+            mend = f": {LESS_MEMORY}" if is_out_of_memory(error) else f", sizes {global_size} {local_size}"
+            raise DeviceError(
+                f"kernel {self.name} on {self._device.info}: {first_line(error)}{mend}"
+            ) from error
+
+    def _mismatch(self, given: set[str]) -> str:
+        missing = [name for name in self._names if name not in given]
+        unknown = sorted(given - set(self._names))
+        return f"kernel {self.name}: missing arguments {missing}, unknown arguments {unknown}"
+
+
+@cache
+def _read(name: str) -> str:
+    try:
+        return importlib.resources.files("clsplat_cl").joinpath(*name.split("/")).read_text(encoding="utf-8")
+    except (OSError, ModuleNotFoundError):
+        raise DeviceError(
+            f"kernel source {name!r} is not in the installed package: reinstall clsplat"
+        ) from None
+
+
+def _literal(name: str, value: Define, real: Real) -> str:
+    """A define's value as OpenCL C text."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (int, np.integer)):
+        return f"({int(value)})" if value < 0 else str(int(value))
+    if not math.isfinite(value):
+        raise ValueError(f"define {name}={value}: must be finite")
+    text = repr(float(value)) if real == "double" else f"{np.float32(value)!s}f"
+    return f"({text})" if value < 0 else text
+
+
+def _parse_parameter(kernel: str, text: str, real: Real) -> Parameter:
+    words = re.sub(r"\*", " * ", text).replace("__", "").split()
+    name, kinds = words[-1], words[:-1]
+    if "*" in kinds:
+        if "local" in kinds:
+            return Parameter(name, "local")
+        if "global" in kinds or "constant" in kinds:
+            return Parameter(name, "buffer")
+    types = [word for word in kinds if word not in ("const", "private")]
+    if len(types) == 1:
+        dtype = _SCALARS.get(real if types[0] == "real" else types[0])
+        if dtype is not None:
+            return Parameter(name, "scalar", np.dtype(dtype))
+    raise DeviceError(
+        f"kernel {kernel}: parameter {' '.join(text.split())!r} is of no type that can be bound"
+    )
+
+
+def _build_error(device: Device, error: Exception, defines: Mapping[str, Define], real: Real) -> DeviceError:
+    log = str(error)
+    if "unknown target CPU" in log:
+        return DeviceError(f"device {device.info}: {BROKEN_POCL}")
+    lines = [line.strip() for line in log.splitlines()]
+    reason = next((line for line in lines if re.search(r"\berror\b\s*:", line, re.I)), first_line(error))
+    given = " ".join(f"{name}={value}" for name, value in defines.items())
+    return DeviceError(f"kernels do not build on {device.info}: {reason} (real={real} {given})")
