@@ -1,0 +1,38 @@
+"""Writing files whole: a reader sees the old file or the new one, never half of one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from .errors import OutputError
+
+
+@contextmanager
+def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """A binary stream that becomes `path` when the block ends well, and leaves nothing when it does not.
+
+    Missing parent folders are made.
+
+    Raises
+    ------
+    OutputError : the folder or the file cannot be written.
+    """
+    target = Path(path)
+    # Beside the target, because os.replace is atomic within one file system only. Not tempfile: its files are
+    # private to the user (mode 0600), and the mode would stay.
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("wb") as stream:
+                yield stream
+            os.replace(temporary, target)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OutputError(f"{target}: cannot be written ({reason}); choose another place") from error
