@@ -11,6 +11,7 @@ import importlib.resources
 import math
 import os
 import re
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ Define = int | float | str
 OPTIONS = ("-cl-std=CL1.2", "-cl-mad-enable")  # never fast-relaxed-math: infinities and NaN have meaning
 OPTIONS_VARIABLE = "CLSPLAT_BUILD_OPTIONS"  # more, from outside: -Werror in tests, -g for Oclgrind
 
+SMOKE_TOLERANCE = 1e-5  # relative: OpenCL allows exp 3 ulp and erfc 16 ulp of float32 (6e-8 each)
+
 _SCALARS = {"int": np.int32, "uint": np.uint32, "ulong": np.uint64, "float": np.float32, "double": np.float64}
 _ATTRIBUTE = r"__attribute__\s*\(\(.*?\)\)\)?\s*"  # the third brace closes reqd_work_group_size(...)
 _KERNEL = re.compile(rf"\b(?:__)?kernel\s+(?:{_ATTRIBUTE})*void\s+(\w+)\s*\(([^)]*)\)", re.S)
@@ -35,7 +38,7 @@ _COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.S)
 
 
 def source(*names: str) -> str:
-    """Text of kernel source files ("raster.cl", "shape/gaussian.clh") joined in order, each after its `#line`."""
+    """Text of source files ("raster.cl", "shape/gaussian.clh") joined in order, each after its `#line`."""
     return "".join(f'#line 1 "{name}"\n{_read(name)}\n' for name in names)
 
 
@@ -147,7 +150,7 @@ class Kernel:
         self._kernel = cl.Kernel(built, name)
         if self._kernel.num_args != len(parameters):
             raise DeviceError(
-                f"kernel {name}: built with {self._kernel.num_args} parameters, but its text shows {len(parameters)}"
+                f"kernel {name}: {self._kernel.num_args} parameters built, {len(parameters)} in its text"
             )
         self._names = tuple(p.name for p in parameters)
         self._local = tuple(i for i, p in enumerate(parameters) if p.kind == "local")
@@ -179,6 +182,9 @@ class Kernel:
             return self._marker(self._queue)
         try:
             self._kernel.set_args(*values)
+        except Exception as error:  # pyopencl's and struct's own kinds, some of them bare RuntimeErrors
+            raise TypeError(f"kernel {self.name}: {first_line(error)}, parameters {self._names}") from error
+        try:
             return self._enqueue(self._queue, self._kernel, global_size, local_size)
         except self._cl_error as error:
             mend = f": {LESS_MEMORY}" if is_out_of_memory(error) else f", sizes {global_size} {local_size}"
@@ -190,6 +196,43 @@ class Kernel:
         missing = [name for name in self._names if name not in given]
         unknown = sorted(given - set(self._names))
         return f"kernel {self.name}: missing arguments {missing}, unknown arguments {unknown}"
+
+
+def smoke_test(device: Device) -> tuple[float, float]:
+    """Build and run a tiny kernel and check its numbers.
+
+    Returns
+    -------
+    build_ms, run_ms : wall time of the build (drivers may have it cached), device time of the kernel.
+
+    Raises
+    ------
+    DeviceError : it does not build or run, or the numbers are wrong.
+    """
+    import pyopencl as cl
+
+    start = time.perf_counter()
+    kernel = build(device, ("smoke.cl",))["smoke"]
+    build_ms = 1e3 * (time.perf_counter() - start)
+    x = np.linspace(-3, 3, 1000, dtype=np.float32)
+    given, result = device.alloc(x.nbytes), device.alloc(x.nbytes)
+    computed = np.empty_like(x)
+    try:
+        cl.enqueue_copy(device.queue, given, x)
+        event = kernel((1024,), None, x=given, y=result, n=x.size)
+        cl.enqueue_copy(device.queue, computed, result)
+        run_ms = 1e-6 * (event.profile.end - event.profile.start)
+    except cl.Error as error:
+        raise DeviceError(
+            f"device {device.info} runs no kernel: {first_line(error)}: update its driver"
+        ) from None
+    expected = np.array([math.exp(-v * v) + math.erfc(v) for v in x.tolist()])
+    worst = float(np.max(np.abs(computed - expected) / expected))
+    if not worst < SMOKE_TOLERANCE:
+        raise DeviceError(
+            f"device {device.info} computes wrong numbers (off by {worst:.1e}): update its driver"
+        )
+    return build_ms, run_ms
 
 
 @cache

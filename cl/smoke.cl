@@ -1,0 +1,10 @@
+// Does a device compute at all? y = exp(-x^2) + erfc(x), one work-item per value.
+
+kernel void smoke(
+    global const float *restrict x,  // [n]
+    global float *restrict y,        // [n], overwritten
+    int n)
+{
+    int i = get_global_id(0);
+    if (i < n) y[i] = exp(-x[i] * x[i]) + erfc(x[i]);
+}

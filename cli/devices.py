@@ -1,0 +1,104 @@
+"""`clsplat devices`: what OpenCL offers here, whether it works, and what to do where it does not."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from clsplat.errors import DeviceError
+
+if TYPE_CHECKING:
+    from clsplat.device import DeviceInfo
+
+
+@click.command()
+@click.pass_context
+def devices(ctx: click.Context) -> None:
+    """List the OpenCL devices, try each with a small kernel, and name the mend for known ailments.
+
+    The device that the other commands take by default is marked; --device takes an index such as 0:1, "cpu",
+    "gpu", or a part of a platform's or device's name. Exit code 1 when no device works.
+    """
+    from clsplat.device import NO_PLATFORM, list_devices, open_device
+
+    try:
+        found = list_devices()
+        chosen = open_device().info.index if found else None
+    except DeviceError as error:
+        click.echo(f"error: {error}", err=True)
+        chosen = None
+    if not found:
+        click.echo(f"error: {NO_PLATFORM}", err=True)
+    working = 0
+    for info in found:
+        mark = "  (default)" if info.index == chosen else ""
+        click.echo(f"{info.index}  {info.name}{mark}")
+        rows = {
+            "platform": f"{info.platform}, {info.platform_version}",
+            "driver": f"{info.driver} ({info.version})",
+            "type": f"{info.type}, {info.compute_units} compute units",
+            "memory": f"{_mb(info.global_mem_bytes)}, {_mb(info.max_alloc_bytes)} in one buffer, "
+            f"{info.local_mem_bytes >> 10} KB local",
+            "precision": "float32 and float64" if info.has_fp64 else "float32",
+        }
+        try:
+            rows |= _try(info)
+            working += 1
+        except DeviceError as error:
+            rows["FAILED"] = str(error)
+        for name, text in rows.items():
+            click.echo(f"     {name:<11}{text}")
+    for hint in hints({info.platform for info in found}, any(info.type == "GPU" for info in found)):
+        click.echo(f"hint: {hint}", err=True)
+    if not working:
+        ctx.exit(1)
+
+
+def hints(platforms: set[str], has_gpu: bool, root: Path = Path("/")) -> list[str]:
+    """Mends for hardware that is there but that OpenCL does not show (Linux).
+
+    Parameters
+    ----------
+    platforms : names of the OpenCL platforms found.
+    has_gpu : whether any of their devices is a GPU.
+    root : where `dev` lies.
+    """
+    if any("NVIDIA" in name for name in platforms):
+        return []
+    if (root / "dev/nvidia0").exists():
+        return [
+            "an NVIDIA GPU is here, but its OpenCL is not registered: install the driver's OpenCL library "
+            "and write its name, libnvidia-opencl.so.1, into /etc/OpenCL/vendors/nvidia.icd "
+            "(in a container also set NVIDIA_DRIVER_CAPABILITIES=compute,utility)"
+        ]
+    nodes = sorted((root / "dev/dri").glob("renderD*"))
+    if has_gpu or not nodes:
+        return []
+    if not any(os.access(node, os.R_OK | os.W_OK) for node in nodes):
+        return [f"a GPU is here, but this user may not use {nodes[0]}: add the user to the group `render`"]
+    return [
+        "a GPU is here, but no OpenCL driver for it: install intel-opencl-icd (Intel) "
+        "or ROCm's OpenCL runtime (AMD)"
+    ]
+
+
+def _try(info: DeviceInfo) -> dict[str, str]:
+    """Schedule and smoke test of one device; DeviceError where it does not work."""
+    from clsplat.device import SCHEDULES, default_schedule, open_device
+    from clsplat.program import smoke_test
+
+    device = open_device(info.index)
+    build_ms, run_ms = smoke_test(device)
+    schedule = default_schedule(device.cl_device)
+    name = next(name for name, known in SCHEDULES.items() if known == schedule)
+    return {
+        "schedule": f"{name} ({schedule}) unless tuned",
+        "smoke test": f"ok (built in {build_ms:.0f} ms, ran in {run_ms:.3f} ms)",
+    }
+
+
+def _mb(nbytes: int) -> str:
+    return f"{nbytes >> 20} MB"
