@@ -1,0 +1,33 @@
+"""Hypothesis strategies for splat models, shared by the tests of files and of `Splats`."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import strategies as st
+
+from clsplat.schema import public_shape
+from clsplat.shapes import SHAPES, SKEW_LIMIT
+
+Arrays = dict[str, np.ndarray]
+
+
+def random_arrays(shape: str, n: int, degree: int, seed: int, dtype: type = np.float32) -> Arrays:
+    """A usable model of any size, wide in range."""
+    rng = np.random.default_rng(seed)
+    arrays = {
+        field.name: (rng.normal(size=public_shape(field, n)) * 10.0 ** rng.integers(-6, 6)).astype(dtype)
+        for field in SHAPES[shape].schema(degree)
+    }
+    if "skew" in arrays:
+        norms = np.linalg.norm(arrays["skew"], axis=1, keepdims=True)
+        arrays["skew"] = (arrays["skew"] / norms * SKEW_LIMIT * rng.random((n, 1))).astype(dtype)
+    return arrays
+
+
+@st.composite
+def models(draw: st.DrawFn) -> tuple[str, str, Arrays]:
+    """(shape, normalisation, arrays); 0 to 6 splats, any SH degree."""
+    shape = draw(st.sampled_from(sorted(SHAPES)))
+    normalisation = draw(st.sampled_from(["peak", "pdf", "none"]))
+    n, degree, seed = draw(st.integers(0, 6)), draw(st.integers(0, 3)), draw(st.integers(0, 2**32 - 1))
+    return shape, normalisation, random_arrays(shape, n, degree, seed)
