@@ -1,0 +1,126 @@
+"""The splats that training starts from: structure-from-motion points, random points, or an earlier model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+from .schema import Array, sh_coefficients
+from .shapes import DEFAULT_SHAPE
+from .splats import Splats
+
+if TYPE_CHECKING:
+    from .scene import Scene
+
+# 3DGS-MCMC's start: small and half opaque (3DGS: opacity 0.1, scale factor 1).
+OPACITY = 0.5
+SCALE_FACTOR = 0.1
+RANDOM_POINTS = 100_000  # 3DGS
+RANDOM_EXTENT = 3.0  # half side of the cube of random points, in scene extents (3DGS-MCMC)
+FEWEST_POINTS = 4  # a point and its three neighbours give the first scale
+
+# |m| that a model without any skew starts from, in random directions: m = 0 is a stationary point. The effect
+# on the kernel is cubic: at 0.1 the skewness index is 4e-4, far below one step of an 8-bit image.
+SKEW_SEED = 0.1
+
+
+def initial_splats(
+    scene: Scene,
+    shape: str = DEFAULT_SHAPE,
+    cap: int = 1_000_000,
+    sh_degree: int = 3,
+    init: str = "sfm",
+    seed: int = 0,
+    *,
+    normalisation: str = "peak",
+    opacity: float = OPACITY,
+    scale_factor: float = SCALE_FACTOR,
+) -> tuple[Splats, str]:
+    """Splats to start from and one sentence on where they come from.
+
+    Parameters
+    ----------
+    scene : its points and training cameras are used.
+    shape, sh_degree, normalisation : of the result.
+    cap : most splats; of more points those with the longest tracks are kept, of a model the most opaque.
+    init : "sfm", "random", or the path of a .ply model. "sfm" without points becomes "random" and says so.
+    seed : of random points and of the first skew.
+    opacity, scale_factor : of splats made from points; scale = factor * distance to the three nearest.
+
+    Raises
+    ------
+    InputError : cap below 1, unknown `init`, an unreadable model, or one with skew of another normalisation.
+    """
+    if cap < 1:
+        raise InputError(f"cap {cap}: at least 1 splat is needed")
+    rng = np.random.default_rng(seed)
+    if init.lower().endswith(".ply"):
+        splats, message = _from_model(init, shape, cap, sh_degree, normalisation)
+    elif init in ("sfm", "random"):
+        xyz, rgb, message = _points(scene, init, cap, rng)
+        splats = Splats.from_points(xyz, rgb, shape=shape, sh_degree=sh_degree, normalisation=normalisation,
+                                    opacity=opacity, scale_factor=scale_factor)
+    else:
+        raise InputError(f"init {init!r}: choose sfm, random, or the path of a .ply model")
+    return _with_some_skew(splats, rng), message
+
+
+def _points(
+    scene: Scene, init: str, cap: int, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.uint8], str]:
+    """Positions, colours and the message."""
+    points = scene.points
+    found = len(points.xyz)
+    if init == "sfm" and found >= FEWEST_POINTS:
+        if found <= cap:
+            return points.xyz, points.rgb, f"{found} splats from the scene's points"
+        # A stable sort: equal tracks in the order of their indices.
+        keep = np.sort(np.argsort(-points.track_length.astype(np.int64), kind="stable")[:cap])
+        message = f"{cap} splats from the scene's points: the longest tracks of {found}"
+        return points.xyz[keep], points.rgb[keep], message
+    count = min(cap, RANDOM_POINTS)
+    centres = np.array([view.camera.position for view in scene.train])
+    # One camera, or several in one place, tell nothing of the size.
+    half_side = RANDOM_EXTENT * (scene.extent if scene.extent > 0 else 1.0)
+    xyz = centres.mean(axis=0) + rng.uniform(-half_side, half_side, (count, 3))
+    rgb = rng.integers(0, 256, (count, 3), dtype=np.uint8)
+    why = "" if init == "random" else f" (the scene has {found} points)"
+    return xyz, rgb, f"{count} splats at random around the cameras{why}"
+
+
+def _from_model(path: str, shape: str, cap: int, sh_degree: int, normalisation: str) -> tuple[Splats, str]:
+    """A model from a file, in the wanted shape, SH degree and count."""
+    loaded = Splats.load(path)
+    if loaded.skew.any() and loaded.normalisation != normalisation:
+        raise InputError(f"{path}: its normalisation is {loaded.normalisation}, not {normalisation}: "
+                         f"choose normalisation {loaded.normalisation}")
+    message = f"{len(loaded)} splats from {path}"
+    if len(loaded) > cap:
+        keep = np.sort(np.argsort(-loaded.opacity_logit, kind="stable")[:cap])
+        message = f"{cap} splats from {path}: the most opaque of {len(loaded)}"
+        loaded = loaded.select(keep)
+    arrays = loaded.as_shape(shape).to_numpy()
+    arrays["sh"] = _fit_bands(arrays["sh"], sh_coefficients(sh_degree))
+    return Splats(shape, arrays, normalisation=normalisation), message
+
+
+def _fit_bands(sh: Array, coefficients: int) -> Array:
+    """Colour (N, K, 3) with `coefficients` in place of K: higher bands cut, or zero."""
+    fitted = np.zeros((len(sh), coefficients, 3), sh.dtype)
+    shared = min(coefficients, sh.shape[1])
+    fitted[:, :shared] = sh[:, :shared]
+    return fitted
+
+
+def _with_some_skew(splats: Splats, rng: np.random.Generator) -> Splats:
+    """A small skew in random directions where the shape has one and the model none at all."""
+    if "skew" not in splats.schema or splats.skew.any():
+        return splats
+    direction = rng.standard_normal((len(splats), 3))
+    arrays = splats.to_numpy()
+    unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    arrays["skew"] = (SKEW_SEED * unit).astype(arrays["mean"].dtype)
+    return Splats(splats.shape, arrays, normalisation=splats.normalisation)

@@ -1,0 +1,146 @@
+"""initialise.py: where the first splats come from, under a cap, and that they can learn skew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.initialise import RANDOM_EXTENT, RANDOM_POINTS, SKEW_SEED, initial_splats
+from clsplat.splats import Splats
+
+
+def scene(n_points: int, extent: float = 2.0) -> Any:
+    """What `initial_splats` reads of a Scene: points, training cameras around (5, 0, 0), extent."""
+    rng = np.random.default_rng(0)
+    views = []
+    for x in (4.0, 6.0):
+        pose = np.eye(4)
+        pose[0, 3] = -x
+        views.append(SimpleNamespace(camera=Camera(20, 10, 20, 20, 10, 5, pose)))
+    points = SimpleNamespace(
+        xyz=rng.standard_normal((n_points, 3)),
+        rgb=rng.integers(0, 256, (n_points, 3), dtype=np.uint8),
+        track_length=np.arange(n_points) % 7,
+    )
+    return SimpleNamespace(points=points, train=views, extent=extent)
+
+
+def test_points_become_splats_in_order() -> None:
+    source = scene(50)
+    splats, message = initial_splats(source, cap=50, sh_degree=2)
+    np.testing.assert_allclose(splats.mean, source.points.xyz, rtol=1e-6)
+    assert splats.sh.shape == (50, 9, 3)
+    assert splats.shape == "skew-normal"
+    np.testing.assert_allclose(1 / (1 + np.exp(-splats.opacity_logit)), 0.5)
+    assert message == "50 splats from the scene's points"
+
+
+def test_scale_factor_and_opacity_are_passed_on() -> None:
+    small, _ = initial_splats(scene(30), scale_factor=0.1)
+    large, _ = initial_splats(scene(30), scale_factor=1.0, opacity=0.1)
+    np.testing.assert_allclose(large.log_scale - small.log_scale, np.log(10), rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-large.opacity_logit)), 0.1, rtol=1e-5)
+
+
+def test_a_cap_keeps_the_longest_tracks_first_index_first() -> None:
+    source = scene(70)
+    splats, message = initial_splats(source, cap=15)
+    order = sorted(range(70), key=lambda i: (-source.points.track_length[i], i))
+    np.testing.assert_allclose(splats.mean, source.points.xyz[sorted(order[:15])], rtol=1e-6)
+    assert "15 splats" in message
+    assert "of 70" in message
+
+
+@pytest.mark.parametrize(("init", "n_points"), [("random", 50), ("sfm", 0), ("sfm", 3)])
+def test_random_points_fill_the_cube_around_the_cameras(init: str, n_points: int) -> None:
+    splats, message = initial_splats(scene(n_points), cap=3000, init=init)
+    assert len(splats) == 3000
+    offset = (splats.mean - np.array([5.0, 0, 0])) / (RANDOM_EXTENT * 2.0)
+    assert np.abs(offset).max() <= 1 + 1e-6
+    assert np.abs(offset.mean(axis=0)).max() < 0.06
+    assert offset.std() == pytest.approx(3**-0.5, rel=0.05)
+    assert "at random" in message
+    assert (f"the scene has {n_points} points" in message) == (init == "sfm")
+
+
+def test_random_points_have_their_own_limit_and_need_no_extent() -> None:
+    splats, _ = initial_splats(scene(0, extent=0.0), shape="gaussian", sh_degree=0, init="random")
+    assert len(splats) == RANDOM_POINTS
+    assert np.ptp(splats.mean[:, 0]) > RANDOM_EXTENT
+
+
+def test_the_same_seed_gives_the_same_splats() -> None:
+    runs = [initial_splats(scene(9), init=init, cap=20, seed=seed)[0]
+            for init in ("random", "sfm") for seed in (1, 1, 2)]
+    for a, b, c in (runs[:3], runs[3:]):
+        np.testing.assert_array_equal(a.mean, b.mean)
+        np.testing.assert_array_equal(a.skew, b.skew)
+        assert not np.array_equal(a.skew, c.skew)
+
+
+def test_skew_starts_small_in_all_directions_and_only_where_the_shape_has_it() -> None:
+    splats, _ = initial_splats(scene(400))
+    np.testing.assert_allclose(np.linalg.norm(splats.skew, axis=1), SKEW_SEED, rtol=1e-5)
+    assert np.linalg.norm(splats.skew.mean(axis=0)) < 0.2 * SKEW_SEED
+    gaussian, _ = initial_splats(scene(40), shape="gaussian")
+    assert gaussian.shape == "gaussian"
+    assert not gaussian.skew.any()
+
+
+def saved(path: Path, shape: str, skew: np.ndarray | None = None, normalisation: str = "peak") -> Splats:
+    rng = np.random.default_rng(1)
+    arrays = {
+        "mean": rng.standard_normal((12, 3)), "quat": rng.standard_normal((12, 4)),
+        "log_scale": rng.standard_normal((12, 3)), "opacity_logit": rng.permutation(np.arange(12.0)),
+        "sh": rng.standard_normal((12, 4, 3)),
+    }
+    if skew is not None:
+        arrays["skew"] = skew
+    splats = Splats(shape, {name: array.astype(np.float32) for name, array in arrays.items()}, normalisation)
+    splats.save(path)
+    return splats
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_a_gaussian_model_becomes_another_shape_and_degree(tmp_path: Path, degree: int) -> None:
+    before = saved(tmp_path / "model.ply", "gaussian")
+    splats, message = initial_splats(scene(0), sh_degree=degree, init=str(tmp_path / "model.ply"))
+    np.testing.assert_array_equal(splats.mean, before.mean)
+    shared = min(4, (degree + 1) ** 2)
+    np.testing.assert_array_equal(splats.sh[:, :shared], before.sh[:, :shared])
+    assert splats.sh.shape == (12, (degree + 1) ** 2, 3)
+    assert not splats.sh[:, shared:].any()
+    assert splats.skew.any(axis=1).all()
+    assert "model.ply" in message
+
+
+def test_a_larger_model_keeps_its_most_opaque_and_its_skew(tmp_path: Path) -> None:
+    skew = np.zeros((12, 3))
+    skew[:, 1] = np.where(np.arange(12) % 2, 0.5, 0.0)
+    before = saved(tmp_path / "model.ply", "skew-normal", skew)
+    splats, message = initial_splats(scene(0), cap=5, init=str(tmp_path / "model.ply"))
+    keep = np.flatnonzero(before.opacity_logit >= 7)
+    np.testing.assert_array_equal(splats.mean, before.mean[keep])
+    np.testing.assert_array_equal(splats.skew, before.skew[keep])
+    assert "most opaque of 12" in message
+
+
+def test_a_skewed_model_of_another_normalisation_is_refused(tmp_path: Path) -> None:
+    saved(tmp_path / "model.ply", "skew-normal", np.full((12, 3), 0.2), normalisation="pdf")
+    with pytest.raises(InputError, match="normalisation is pdf"):
+        initial_splats(scene(0), init=str(tmp_path / "model.ply"))
+    splats, _ = initial_splats(scene(0), init=str(tmp_path / "model.ply"), normalisation="pdf")
+    assert splats.normalisation == "pdf"
+
+
+@pytest.mark.parametrize(("options", "words"), [({"init": "grid"}, "sfm, random"), ({"cap": 0}, "cap 0"),
+                                                ({"init": "missing.ply"}, "missing.ply")])
+def test_what_cannot_be_used(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        initial_splats(scene(10), **options)
