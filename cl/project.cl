@@ -1,0 +1,212 @@
+// project.cl: splats to screen records, and the gradient back to the raw parameters. LANES splats a work-item.
+//
+// geom, sh: component-major parameter buffers [rows, capacity] (clsplat/schema.py); rows by build constants.
+// Screen record of splat i: RECORD reals at records[i * RECORD]:
+//   mean_px x, y [px]; colour r, g, b; depth (camera z); first and last pixel row it can reach; shape's p.
+
+#define RECORD (8 + SHAPE_N)
+#define CULLED_KEY 0xFFFFFFFFu
+
+// What projection and its gradient both need.
+typedef struct {
+    vec3 mean, c;          // world, camera
+    unit_quat quat;
+    mat3 rotation;         // of the splat
+    vec3 scale;
+    projection to_px;
+    vec3 a0, a1;           // rows of A = J W [px per world unit]
+    vec3 ar0, ar1;         // rows of A R
+    vec3 b0, b1;           // rows of B = A R S
+    sym2 cov2d;            // B B' + low-pass [px^2]
+    vreal opacity;
+    vec3 m;                // skew, zero for shapes without
+    vmask in_front;
+} splat_terms;
+
+inline splat_terms splat_project(global const real *geom, const ulong capacity, constant real *cam) {
+    splat_terms s;
+    s.mean = vec3_load(geom + ROW_MEAN * capacity, capacity);
+    s.c = camera_from_world(cam, s.mean);
+    s.in_front = s.c.z >= (vreal)CAMERA_NEAR(cam);
+    s.c.z = lanes_if(s.in_front, s.c.z, (vreal)1);
+    s.quat = quat_load(geom + ROW_QUAT * capacity, capacity);
+    s.rotation = quat_rotation(s.quat);
+    const vec3 log_scale = vec3_load(geom + ROW_LOG_SCALE * capacity, capacity);
+    s.scale = (vec3){exp(log_scale.x), exp(log_scale.y), exp(log_scale.z)};
+    s.to_px = camera_project(cam, s.c);
+    const mat3 w = camera_rotation(cam);
+    s.a0 = add3(scale3(w.r0, s.to_px.j00), scale3(w.r2, s.to_px.j02));
+    s.a1 = add3(scale3(w.r1, s.to_px.j11), scale3(w.r2, s.to_px.j12));
+    s.ar0 = mat3_apply_transposed(s.rotation, s.a0);
+    s.ar1 = mat3_apply_transposed(s.rotation, s.a1);
+    s.b0 = mul3(s.ar0, s.scale);
+    s.b1 = mul3(s.ar1, s.scale);
+    s.cov2d = (sym2){dot3(s.b0, s.b0) + (vreal)LOW_PASS, dot3(s.b0, s.b1), dot3(s.b1, s.b1) + (vreal)LOW_PASS};
+    s.opacity = (vreal)1 / ((vreal)1 + exp(-lanes_load(geom + ROW_OPACITY_LOGIT * capacity)));
+#ifdef ROW_SKEW
+    s.m = vec3_load(geom + ROW_SKEW * capacity, capacity);
+#else
+    s.m = (vec3){(vreal)0, (vreal)0, (vreal)0};
+#endif
+    return s;
+}
+
+inline vec3 unit_direction(constant real *cam, vec3 mean, vreal *inv_norm) {
+    const vec3 from = add3(mean, scale3(CAMERA_CENTRE(cam), (vreal)-1));
+    *inv_norm = (vreal)1 / sqrt(max(dot3(from, from), (vreal)R(1e-30)));
+    return scale3(from, *inv_norm);
+}
+
+// records [n, RECORD], depth_key [n] (monotonic in depth; CULLED_KEY when unseen), tile_rect [n] (first and
+// past-the-end tile, x then y). Overwrites. Global size: splats / LANES.
+kernel void project_splats(
+    global const real *restrict geom,
+    global const real *restrict sh,
+    constant real *restrict cam,
+    global real *restrict records,
+    global uint *restrict depth_key,
+    global int4 *restrict tile_rect,
+    ulong capacity,
+    uint n_splats,
+    int sh_degree,
+    int width,
+    int height,
+    int tiles_x,
+    int tiles_y)
+{
+    const uint first = get_global_id(0) * LANES;
+    if (first >= n_splats) return;
+    const splat_terms s = splat_project(geom + first, capacity, cam);
+
+    vreal out[RECORD];
+    extents box;
+    shape_project(s.opacity, s.m, s.b0, s.b1, s.cov2d, out + 8, &box);
+    out[0] = s.to_px.x;
+    out[1] = s.to_px.y;
+    out[5] = s.c.z;
+
+    vreal basis[SH_COUNT], inv_norm;
+    sh_basis(unit_direction(cam, s.mean, &inv_norm), sh_degree, basis);
+    const int used = (sh_degree + 1) * (sh_degree + 1);
+    vreal rgb[3] = {(vreal)R(0.5), (vreal)R(0.5), (vreal)R(0.5)};
+    for (int k = 0; k < used; ++k)
+        for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * lanes_load(sh + first + (ulong)(3 * k + c) * capacity);
+    for (int c = 0; c < 3; ++c) out[2 + c] = max(rgb[c], (vreal)0);
+
+    // Pixels whose centres lie in the box; a NaN anywhere fails the comparison and culls the splat.
+    const vreal far = (vreal)R(1e6), half_px = (vreal)R(0.5);
+    const vreal x_lo = ceil(lanes_clamp(out[0] - box.left - half_px, -far, far));
+    const vreal x_hi = floor(lanes_clamp(out[0] + box.right - half_px, -far, far));
+    const vreal y_lo = ceil(lanes_clamp(out[1] - box.up - half_px, -far, far));
+    const vreal y_hi = floor(lanes_clamp(out[1] + box.down - half_px, -far, far));
+    out[6] = y_lo;
+    out[7] = y_hi;
+    const vmask seen = s.in_front & (box.left + box.right > (vreal)0) & (x_lo <= x_hi) & (y_lo <= y_hi)
+                     & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height)
+                     & (sym2_det(s.cov2d) > (vreal)0);
+    const vreal seen_real = lanes_if(seen, (vreal)1, (vreal)0);
+
+    real lane[LANES][RECORD], edge[5][LANES];
+    real column[LANES];
+    for (int j = 0; j < RECORD; ++j) {
+        lanes_store(out[j], column);
+        for (int l = 0; l < LANES; ++l) lane[l][j] = column[l];
+    }
+    lanes_store(x_lo, edge[0]);
+    lanes_store(x_hi, edge[1]);
+    lanes_store(y_lo, edge[2]);
+    lanes_store(y_hi, edge[3]);
+    lanes_store(seen_real, edge[4]);
+    for (int l = 0; l < LANES && first + l < n_splats; ++l) {
+        const uint i = first + l;
+        const bool keep = edge[4][l] > 0;
+        for (int j = 0; j < RECORD; ++j) records[(ulong)i * RECORD + j] = lane[l][j];
+        depth_key[i] = keep ? as_uint((float)lane[l][5]) : CULLED_KEY;
+        const int4 rect = {max((int)edge[0][l], 0) / TILE, max((int)edge[2][l], 0) / TILE,
+                           min((int)edge[1][l] / TILE + 1, tiles_x), min((int)edge[3][l] / TILE + 1, tiles_y)};
+        tile_rect[i] = keep ? rect : (int4)(0, 0, 0, 0);
+    }
+}
+
+// moments [rows SHAPE_V + 3, capacity]: summed over pixels; the last three are the gradient of the colour.
+// grad_geom, grad_sh: as geom, sh; overwritten (zero for unseen splats), sh only for the bands in use.
+kernel void project_splats_vjp(
+    global const real *restrict geom,
+    global const real *restrict sh,
+    constant real *restrict cam,
+    global const real *restrict moments,
+    global const real *restrict records,
+    global const uint *restrict depth_key,
+    global real *restrict grad_geom,
+    global real *restrict grad_sh,
+    ulong capacity,
+    uint n_splats,
+    int sh_degree)
+{
+    const uint first = get_global_id(0) * LANES;
+    if (first >= n_splats) return;
+    const splat_terms s = splat_project(geom + first, capacity, cam);
+    const vreal zero = (vreal)0;
+
+    real flag[LANES], seen_rgb[3][LANES];
+    for (int l = 0; l < LANES; ++l) {
+        const uint i = min(first + l, n_splats - 1);
+        flag[l] = first + l < n_splats && depth_key[i] != CULLED_KEY ? 1 : 0;
+        for (int c = 0; c < 3; ++c) seen_rgb[c][l] = records[(ulong)i * RECORD + 2 + c] > 0 ? flag[l] : 0;
+    }
+    const vmask seen = lanes_load(flag) > zero;
+
+    vreal v[SHAPE_V + 3];
+    for (int j = 0; j < SHAPE_V + 3; ++j)
+        v[j] = lanes_if(seen, lanes_load(moments + first + j * capacity), zero);
+
+    shape_grads g;
+    shape_project_vjp(s.opacity, s.m, s.b0, s.b1, s.cov2d, v, &g);
+
+    // cov2d = B B' + low-pass
+    const vec3 v_b0 = add3(g.b0, add3(scale3(s.b0, (real)2 * g.cov2d.xx), scale3(s.b1, g.cov2d.xy)));
+    const vec3 v_b1 = add3(g.b1, add3(scale3(s.b1, (real)2 * g.cov2d.yy), scale3(s.b0, g.cov2d.xy)));
+    // B = A R S
+    const vec3 v_scale = add3(mul3(v_b0, s.ar0), mul3(v_b1, s.ar1));
+    const vec3 v_ar0 = mul3(v_b0, s.scale), v_ar1 = mul3(v_b1, s.scale);
+    const vec3 v_a0 = mat3_apply(s.rotation, v_ar0), v_a1 = mat3_apply(s.rotation, v_ar1);
+    const mat3 v_rotation = {add3(scale3(v_ar0, s.a0.x), scale3(v_ar1, s.a1.x)),
+                             add3(scale3(v_ar0, s.a0.y), scale3(v_ar1, s.a1.y)),
+                             add3(scale3(v_ar0, s.a0.z), scale3(v_ar1, s.a1.z))};
+    // A = J W
+    const mat3 w = camera_rotation(cam);
+    const projection v_px = {g.mean_x, g.mean_y, dot3(v_a0, w.r0), dot3(v_a0, w.r2), dot3(v_a1, w.r1),
+                             dot3(v_a1, w.r2)};
+    vec3 v_mean = mat3_apply_transposed(w, camera_project_vjp(cam, s.c, v_px));
+
+    vreal v_rgb[3], inv_norm, basis[SH_COUNT], v_basis[SH_COUNT];
+    for (int c = 0; c < 3; ++c) v_rgb[c] = lanes_if(lanes_load(seen_rgb[c]) > zero, v[SHAPE_V + c], zero);
+    const vec3 direction = unit_direction(cam, s.mean, &inv_norm);
+    sh_basis(direction, sh_degree, basis);
+    const int used = (sh_degree + 1) * (sh_degree + 1);
+    for (int k = 0; k < used; ++k) {
+        v_basis[k] = zero;
+        for (int c = 0; c < 3; ++c) {
+            const ulong at = first + (ulong)(3 * k + c) * capacity;
+            lanes_store(basis[k] * v_rgb[c], grad_sh + at);
+            v_basis[k] += v_rgb[c] * lanes_load(sh + at);
+        }
+    }
+    vec3 v_direction = sh_basis_vjp(direction, sh_degree, v_basis);
+    v_direction = add3(v_direction, scale3(direction, -dot3(direction, v_direction)));
+    v_mean = add3(v_mean, scale3(v_direction, inv_norm));
+
+    global real *out = grad_geom + first;
+    const vec3 v_log_scale = mul3(v_scale, s.scale);
+    vec3_store((vec3){lanes_if(seen, v_mean.x, zero), lanes_if(seen, v_mean.y, zero),
+                      lanes_if(seen, v_mean.z, zero)}, out + ROW_MEAN * capacity, capacity);
+    vec3_store((vec3){lanes_if(seen, v_log_scale.x, zero), lanes_if(seen, v_log_scale.y, zero),
+                      lanes_if(seen, v_log_scale.z, zero)}, out + ROW_LOG_SCALE * capacity, capacity);
+    quat_rotation_vjp(s.quat, v_rotation, seen, out + ROW_QUAT * capacity, capacity);
+    lanes_store(lanes_if(seen, g.opacity * s.opacity * ((vreal)1 - s.opacity), zero),
+                out + ROW_OPACITY_LOGIT * capacity);
+#ifdef ROW_SKEW
+    vec3_store((vec3){lanes_if(seen, g.m.x, zero), lanes_if(seen, g.m.y, zero), lanes_if(seen, g.m.z, zero)},
+               out + ROW_SKEW * capacity, capacity);
+#endif
+}

@@ -1,0 +1,143 @@
+// sort.cl: stable least-significant-digit radix sort of (key, value) pairs, and the exclusive scan it needs.
+//
+// SORT_GROUP work-items share a block of the input; each owns a contiguous run of it, so order within a digit is
+// kept. RADIX = 1 << RADIX_BITS. On a CPU SORT_GROUP is 1 and a digit 8 bits; on a GPU 256 and 4.
+
+#define RADIX (1 << RADIX_BITS)
+#define SORT_ATTRIBUTE __attribute__((reqd_work_group_size(SORT_GROUP, 1, 1)))
+#if SORT_GROUP == 1
+#define sort_barrier()
+#else
+#define sort_barrier() barrier(CLK_LOCAL_MEM_FENCE)
+#endif
+
+// Histograms of this group's runs: hist[digit * SORT_GROUP + item].
+inline void count_digits(global const uint *keys, uint n, uint run, uint shift, local uint *hist) {
+    const uint lid = get_local_id(0);
+    for (uint d = 0; d < RADIX; ++d) hist[d * SORT_GROUP + lid] = 0;
+    const ulong start = (ulong)get_global_id(0) * run;
+    for (ulong k = start; k < start + run && k < n; ++k)
+        ++hist[((keys[k] >> shift) & (RADIX - 1)) * SORT_GROUP + lid];
+    sort_barrier();
+}
+
+// counts [RADIX, n_blocks], digit-major: its exclusive scan is where each block's digit starts.
+SORT_ATTRIBUTE
+kernel void radix_histogram(
+    global const uint *restrict keys,
+    global uint *restrict counts,
+    uint n,
+    uint run,
+    uint shift)
+{
+    local uint hist[RADIX * SORT_GROUP];
+    count_digits(keys, n, run, shift, hist);
+    for (uint d = get_local_id(0); d < RADIX; d += SORT_GROUP) {
+        uint sum = 0;
+        for (uint item = 0; item < SORT_GROUP; ++item) sum += hist[d * SORT_GROUP + item];
+        counts[d * get_num_groups(0) + get_group_id(0)] = sum;
+    }
+}
+
+// starts: the scanned counts.
+SORT_ATTRIBUTE
+kernel void radix_scatter(
+    global const uint *restrict keys,
+    global const uint *restrict values,
+    global const uint *restrict starts,
+    global uint *restrict keys_out,
+    global uint *restrict values_out,
+    uint n,
+    uint run,
+    uint shift)
+{
+    local uint hist[RADIX * SORT_GROUP];
+    count_digits(keys, n, run, shift, hist);
+    for (uint d = get_local_id(0); d < RADIX; d += SORT_GROUP) {
+        uint at = starts[d * get_num_groups(0) + get_group_id(0)];
+        for (uint item = 0; item < SORT_GROUP; ++item) {
+            const uint count = hist[d * SORT_GROUP + item];
+            hist[d * SORT_GROUP + item] = at;
+            at += count;
+        }
+    }
+    sort_barrier();
+    const uint lid = get_local_id(0);
+    const ulong start = (ulong)get_global_id(0) * run;
+    for (ulong k = start; k < start + run && k < n; ++k) {
+        const uint key = keys[k];
+        const uint to = hist[((key >> shift) & (RADIX - 1)) * SORT_GROUP + lid]++;
+        keys_out[to] = key;
+        values_out[to] = values[k];
+    }
+}
+
+kernel void fill_iota(
+    global uint *restrict values,
+    uint n)
+{
+    const uint i = get_global_id(0);
+    if (i < n) values[i] = i;
+}
+
+// Exclusive scan in three steps: sums of runs, scan of the sums by one group, scan within the runs.
+kernel void scan_sums(
+    global const uint *restrict values,
+    global uint *restrict sums,
+    uint n,
+    uint run)
+{
+    const ulong start = (ulong)get_global_id(0) * run;
+    uint sum = 0;
+    for (ulong k = start; k < start + run && k < n; ++k) sum += values[k];
+    sums[get_global_id(0)] = sum;
+}
+
+// One group: sums becomes its own exclusive scan; total[0] the grand total.
+SORT_ATTRIBUTE
+kernel void scan_spine(
+    global uint *restrict sums,
+    global uint *restrict total,
+    uint n)
+{
+    local uint part[SORT_GROUP];
+    const uint lid = get_local_id(0);
+    const uint run = (n + SORT_GROUP - 1) / SORT_GROUP;
+    const uint start = min(lid * run, n), end = min(start + run, n);
+    uint sum = 0;
+    for (uint k = start; k < end; ++k) sum += sums[k];
+    part[lid] = sum;
+    sort_barrier();
+    if (lid == 0) {
+        uint at = 0;
+        for (uint item = 0; item < SORT_GROUP; ++item) {
+            const uint count = part[item];
+            part[item] = at;
+            at += count;
+        }
+        total[0] = at;
+    }
+    sort_barrier();
+    uint at = part[lid];
+    for (uint k = start; k < end; ++k) {
+        const uint count = sums[k];
+        sums[k] = at;
+        at += count;
+    }
+}
+
+// scanned must be another buffer than values.
+kernel void scan_apply(
+    global const uint *restrict values,
+    global const uint *restrict sums,
+    global uint *restrict scanned,
+    uint n,
+    uint run)
+{
+    const ulong start = (ulong)get_global_id(0) * run;
+    uint at = sums[get_global_id(0)];
+    for (ulong k = start; k < start + run && k < n; ++k) {
+        scanned[k] = at;
+        at += values[k];
+    }
+}

@@ -1,0 +1,36 @@
+"""clsplat: Gaussian and skew-normal splatting on any OpenCL device.
+
+The public names load on first use, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .camera import Camera
+    from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
+    from .render import Rendered, Renderer
+    from .scene import Scene, load_scene
+    from .splats import Splats
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Camera": "camera", "ClsplatError": "errors", "DeviceError": "errors", "InputError": "errors",
+    "OutputError": "errors", "TrainingError": "errors", "Rendered": "render", "Renderer": "render",
+    "Scene": "scene", "load_scene": "scene", "Splats": "splats", "TrainConfig": "config", "train": "train",
+    "Model": "train",
+}
+
+__all__ = [
+    "Camera", "ClsplatError", "DeviceError", "InputError", "OutputError", "Rendered", "Renderer", "Scene", "Splats",
+    "TrainingError", "load_scene",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'clsplat' has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)

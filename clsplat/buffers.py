@@ -1,0 +1,139 @@
+"""Device memory: a pool of named buffers that only grow, and the splats as component-major buffers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .device import Device
+from .schema import Array, Group, Schema, public_shape
+from .splats import Splats
+
+CAPACITY_STEP = 64  # columns are padded so that every vector load stays inside and aligned
+
+
+class Pool:
+    """Buffers by name. A request larger than the buffer replaces it, half as large again; contents are then lost."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self._buffers: dict[str, Any] = {}
+        self._bytes: dict[str, int] = {}
+
+    def get(self, name: str, nbytes: int) -> Any:
+        """Buffer of at least `nbytes`; raises DeviceError when the device has no room for it."""
+        if self._bytes.get(name, -1) < nbytes:
+            first = name not in self._bytes
+            self._buffers.pop(name, None)
+            size = int(nbytes) if first else min(int(1.5 * nbytes), max(self.device.info.max_alloc_bytes, int(nbytes)))
+            self._bytes[name] = 0
+            self._buffers[name] = self.device.alloc(size)
+            self._bytes[name] = size
+        return self._buffers[name]
+
+    def zeroed(self, name: str, nbytes: int) -> Any:
+        """As `get`, set to zero up to `nbytes`."""
+        buffer = self.get(name, nbytes)
+        fill_zero(self.device, buffer, nbytes)
+        return buffer
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return sum(self._bytes.values())
+
+
+def fill_zero(device: Device, buffer: Any, nbytes: int) -> None:
+    """Zero the first `nbytes` (a multiple of 4) of a buffer."""
+    import pyopencl as cl
+
+    if nbytes:
+        cl.enqueue_fill_buffer(device.queue, buffer, np.zeros(1, np.uint32), 0, nbytes)
+
+
+def to_device(device: Device, buffer: Any, array: NDArray[Any], offset: int = 0) -> None:
+    """Copy an array into a buffer, at `offset` bytes; returns when it is there."""
+    import pyopencl as cl
+
+    if array.size:
+        cl.enqueue_copy(device.queue, buffer, np.ascontiguousarray(array), dst_offset=offset)
+
+
+def to_host(device: Device, buffer: Any, array: NDArray[Any], offset: int = 0) -> NDArray[Any]:
+    """Fill `array` from a buffer, from `offset` bytes on; returns it."""
+    import pyopencl as cl
+
+    if array.size:
+        cl.enqueue_copy(device.queue, array, buffer, src_offset=offset)
+    return array
+
+
+def capacity_for(n: int) -> int:
+    """Columns to allocate for n splats."""
+    return max(CAPACITY_STEP, -(-n // CAPACITY_STEP) * CAPACITY_STEP)
+
+
+class ParameterBuffers:
+    """One value per parameter of every splat: `geom` and `sh`, each [rows, capacity]. Starts at zero."""
+
+    def __init__(self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating]) -> None:
+        self.device, self.schema, self.capacity, self.dtype = device, schema, capacity_for(capacity), dtype
+        self.buffers = {group: device.alloc(self.group_bytes(group)) for group in Group}
+        for group, buffer in self.buffers.items():
+            fill_zero(device, buffer, self.group_bytes(group))
+
+    def group_bytes(self, group: Group) -> int:
+        """Size of one of the two buffers."""
+        return self.schema.rows(group) * self.capacity * self.dtype.itemsize
+
+    @property
+    def geom(self) -> Any:
+        return self.buffers[Group.GEOM]
+
+    @property
+    def sh(self) -> Any:
+        return self.buffers[Group.SH]
+
+    def upload(self, arrays: dict[str, Array]) -> None:
+        """Public arrays (see schema.public_shape) of n <= capacity splats into the first n columns."""
+        for field in self.schema:
+            array = np.asarray(arrays[field.name], self.dtype)
+            rows = array.reshape(len(array), field.width).T
+            padded = np.zeros((field.width, self.capacity), self.dtype)
+            padded[:, : rows.shape[1]] = rows
+            to_device(self.device, self.buffers[field.group], padded, self._offset_bytes(field.name))
+
+    def download(self, n: int, names: tuple[str, ...] | None = None) -> dict[str, Array]:
+        """Public arrays of the first n splats."""
+        arrays: dict[str, Array] = {}
+        for name in names or self.schema.names:
+            field = self.schema[name]
+            rows: Array = np.empty((field.width, self.capacity), self.dtype)
+            to_host(self.device, self.buffers[field.group], rows, self._offset_bytes(name))
+            arrays[name] = np.ascontiguousarray(rows[:, :n].T).reshape(public_shape(field, n))
+        return arrays
+
+    def _offset_bytes(self, name: str) -> int:
+        return self.schema.offset(name) * self.capacity * self.dtype.itemsize
+
+
+class SplatBuffers(ParameterBuffers):
+    """Splats on the device; `n` of `capacity` columns are in use."""
+
+    def __init__(self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating]) -> None:
+        super().__init__(device, schema, capacity, dtype)
+        self.n = 0
+
+    @classmethod
+    def of(cls, device: Device, splats: Splats, dtype: np.dtype[np.floating], capacity: int = 0) -> SplatBuffers:
+        """Upload of host splats, with room for `capacity`."""
+        self = cls(device, splats.schema, max(capacity, len(splats)), dtype)
+        self.set(splats.to_numpy())
+        return self
+
+    def set(self, arrays: dict[str, Array]) -> None:
+        """Replace all splats."""
+        self.upload(arrays)
+        self.n = len(arrays["mean"])

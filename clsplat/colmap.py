@@ -1,0 +1,234 @@
+"""COLMAP models through pycolmap: poses, cameras (undistorted where need be) and points."""
+
+from __future__ import annotations
+
+import copy
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Before pycolmap on purpose (see images.py), hence also pycolmap only inside functions.
+from . import images as _images
+from .camera import Camera
+from .colmap_files import check_binary_model, registered_images
+from .errors import InputError
+
+_PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+# Perspective models that are a plain pinhole when every distortion coefficient is 0.
+_DISTORTED_PINHOLES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_FILES = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """A structure-from-motion point cloud.
+
+    Parameters
+    ----------
+    xyz : (P, 3) float64, world positions.
+    rgb : (P, 3) uint8.
+    track_length : (P,) int64, number of images that observe each point.
+    """
+
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    track_length: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A registered image: its file name inside the images folder, its pose and its lens.
+
+    Parameters
+    ----------
+    name : as COLMAP stores it, with `/` between folders.
+    cam_from_world : (4, 4) world-to-camera pose.
+    """
+
+    name: str
+    cam_from_world: NDArray[np.float64]
+    _lens: Any
+
+    def fit(self, image: _images.ImageU8) -> tuple[_images.ImageU8, Camera]:
+        """The photo as a pinhole image, and its camera.
+
+        The lens is scaled to the image (folders images_2, images_4, ... hold reduced photos). A distorted
+        photo is undistorted as COLMAP's image_undistorter does it by default: focal lengths kept, the border
+        cropped or widened so that no pixel stays blank.
+
+        Parameters
+        ----------
+        image : (H, W, 3) uint8, as stored.
+
+        Raises
+        ------
+        InputError : the image has another aspect than the camera, or the lens has no pinhole image.
+        """
+        height, width = image.shape[:2]
+        lens = _scaled(self._lens, width, height, self.name)
+        if not _is_pinhole(lens):
+            image, lens = _undistorted(image, lens, self.name)
+            height, width = image.shape[:2]
+        try:
+            return image, Camera(width, height, lens.focal_length_x, lens.focal_length_y,
+                                 lens.principal_point_x, lens.principal_point_y, self.cam_from_world)
+        except InputError as error:
+            raise InputError(f"image {self.name!r}: {error}; rebuild the model") from None
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A sparse model: registered photos sorted by name, and points."""
+
+    photos: list[Photo]
+    points: Points
+
+
+def find_model(scene: Path) -> Path:
+    """The model folder of a scene: `sparse` itself if it holds one, else the largest of `sparse/*`.
+
+    Raises
+    ------
+    InputError : the scene has no COLMAP model.
+    """
+    if not scene.is_dir():
+        raise InputError(f"{scene}: no such folder; give a scene folder with images/ and sparse/")
+    sparse = scene / "sparse"
+    if not sparse.is_dir():
+        raise InputError(f"{scene}: no folder 'sparse'; a scene needs a COLMAP model in sparse/0 "
+                         "(run COLMAP's mapper on the photos)")
+    candidates = [sparse, *sorted(folder for folder in sparse.iterdir() if folder.is_dir())]
+    models = [folder for folder in candidates if _suffix(folder)]
+    if not models:
+        raise InputError(f"{sparse}: no COLMAP model (cameras and images, .bin or .txt) in it or below; "
+                         "run COLMAP's mapper, or copy the missing files")
+    return max(models, key=registered_images)          # the first of equals
+
+
+def read_model(folder: Path) -> Model:
+    """Read a binary or text model; missing points give an empty cloud.
+
+    Raises
+    ------
+    InputError : missing, truncated or damaged files, or no registered image.
+    """
+    suffix = _suffix(folder)
+    if not suffix:
+        raise InputError(f"{folder}: cameras or images file is missing (.bin or .txt)")
+    if suffix == ".bin":
+        check_binary_model(folder)
+    pycolmap = _library()
+    try:
+        with _complete(folder, suffix) as whole:
+            reconstruction = pycolmap.Reconstruction(str(whole))
+        photos, points = _photos(reconstruction), _points(reconstruction)
+    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
+        raise InputError(f"{folder}: COLMAP's reader refuses the model ({_reason(error)}); the files are "
+                         "damaged or do not belong together: copy or rebuild them") from None
+    if not photos:
+        raise InputError(f"{folder}: the model registers no image; rebuild it with COLMAP's mapper")
+    bad = int((~np.isfinite(points.xyz)).any(axis=1).sum())
+    if bad:
+        raise InputError(f"{folder}: {bad} points have a position that is not finite; the points3D file is "
+                         "damaged: rebuild it")
+    return Model(photos, points)
+
+
+def _suffix(folder: Path) -> str:
+    """".bin" or ".txt" as pycolmap will choose, "" where the folder holds no model."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{stem}{suffix}").is_file() for stem in _FILES[:2]):
+            return suffix
+    return ""
+
+
+def _library() -> ModuleType:
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)   # errors reach the user as exceptions
+    library: ModuleType = pycolmap
+    return library
+
+
+@contextmanager
+def _complete(folder: Path, suffix: str) -> Iterator[Path]:
+    """The folder itself, or, as the library insists on a points file, a copy with an empty one."""
+    if (folder / f"points3D{suffix}").is_file():
+        yield folder
+        return
+    with tempfile.TemporaryDirectory() as temporary:
+        whole = Path(temporary)
+        for file in folder.glob(f"*{suffix}"):
+            (whole / file.name).write_bytes(file.read_bytes())
+        (whole / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
+        yield whole
+
+
+def _photos(reconstruction: Any) -> list[Photo]:
+    photos = []
+    for image_id in reconstruction.reg_image_ids():
+        image = reconstruction.images[image_id]
+        pose = image.cam_from_world
+        pose = pose() if callable(pose) else pose         # an attribute before pycolmap 3.12
+        photos.append(Photo(image.name, np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]]),
+                            reconstruction.cameras[image.camera_id]))
+    return sorted(photos, key=lambda photo: photo.name)
+
+
+def _points(reconstruction: Any) -> Points:
+    found = reconstruction.points3D
+    xyz, rgb = np.empty((len(found), 3)), np.empty((len(found), 3), np.uint8)
+    track_length = np.empty(len(found), np.int64)
+    for row, (_, point) in enumerate(sorted(found.items(), key=lambda item: item[0])):
+        xyz[row], rgb[row], track_length[row] = point.xyz, point.color, point.track.length()
+    return Points(xyz, rgb, track_length)
+
+
+def _scaled(lens: Any, width: int, height: int, name: str) -> Any:
+    """The lens for an image of another size; the aspect may differ by rounding each side to whole pixels."""
+    if not np.isfinite(lens.params).all():
+        raise InputError(f"image {name!r}: its camera has a parameter that is not finite; rebuild the model")
+    if abs(width * lens.height - height * lens.width) >= lens.width + lens.height:
+        raise InputError(f"image {name!r} is {width}x{height} px but its camera {lens.width}x{lens.height}; "
+                         "use the photos that the model was made from, whole and unrotated")
+    scaled = copy.copy(lens)
+    if (width, height) != (lens.width, lens.height):
+        scaled.rescale(width, height)
+    return scaled
+
+
+def _is_pinhole(lens: Any) -> bool:
+    kind = lens.model.name
+    if kind in _PINHOLES:
+        return True
+    return kind in _DISTORTED_PINHOLES and not np.any(np.asarray(lens.params)[list(lens.extra_params_idxs())])
+
+
+def _undistorted(image: _images.ImageU8, lens: Any, name: str) -> tuple[_images.ImageU8, Any]:
+    pycolmap = _library()
+    try:
+        bitmap, pinhole = pycolmap.undistort_image(
+            pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.ascontiguousarray(image)), lens)
+    except (ValueError, RuntimeError, MemoryError) as error:
+        raise InputError(f"image {name!r}: its {lens.model.name} camera cannot be undistorted "
+                         f"({_reason(error)}); undistort the photos first") from None
+    # Panoramas, and fisheye lenses with all coefficients 0, come back as they were. Asking a panorama's camera
+    # for a focal length ends the process, so look at the model only.
+    if pinhole.model.name != "PINHOLE":
+        raise InputError(f"image {name!r}: a photo of a {lens.model.name} camera has no pinhole image; "
+                         "make perspective views of it first")
+    return np.ascontiguousarray(bitmap.to_array()), pinhole
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,0 +1,108 @@
+"""What a kernel build depends on, and the three programs made from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from . import optim_reference as adam
+from .device import Device, Schedule
+from .program import Define, Program, Real, build
+from .schema import Group, Schema
+from .shapes import NORMALISATIONS, SKEW_MAX, shape_named
+from .skew_map import SKEW_MAPS
+
+TILE = 16
+MARGIN_X, MARGIN_Y = 16, 8  # zero margin of every image plane: the SSIM window reaches 5 pixels out
+BATCH = 64
+
+ALPHA_MIN, ALPHA_MAX, T_MIN = 1.0 / 255.0, 0.99, 1e-4  # of gsplat and 3DGS
+LOW_PASS = 0.3  # px^2
+NEAR = 0.01  # world units
+
+_LOWER = ("lanes.clh", "group.clh", "algebra.clh", "harmonics.clh", "camera/pinhole.clh", "blend.clh",
+          "shape/contract.clh")
+
+
+@dataclass(frozen=True)
+class KernelBuild:
+    """One combination of shape, precision, schedule and thresholds.
+
+    `with_depth` adds the depth image, `with_v_alpha` a gradient coming in through alpha; training needs neither.
+    """
+
+    shape: str
+    sh_degree: int
+    schedule: Schedule
+    normalisation: str = "peak"
+    real: Real = "float"
+    skew_map: str = "cube-root"
+    with_depth: bool = False
+    with_v_alpha: bool = False
+    alpha_min: float = ALPHA_MIN
+    alpha_max: float = ALPHA_MAX
+    t_min: float = T_MIN
+
+    @cached_property
+    def schema(self) -> Schema:
+        """Fields of the shape at this build's SH degree."""
+        return shape_named(self.shape).schema(self.sh_degree)
+
+    @property
+    def dtype(self) -> np.dtype[np.floating]:
+        return np.dtype(np.float32 if self.real == "float" else np.float64)
+
+    @property
+    def record(self) -> int:
+        """Reals of a screen record."""
+        return 8 + shape_named(self.shape).record
+
+    @property
+    def v_record(self) -> int:
+        """Reals of an isect's gradient record: the shape's moments and three of colour."""
+        return shape_named(self.shape).moments + 3
+
+    @property
+    def lanes(self) -> int:
+        return self.schedule.lanes
+
+    def raster_program(self, device: Device) -> Program:
+        """Projection, binning, rasterisation, and their gradients."""
+        files = (*_LOWER, shape_named(self.shape).source, "project.cl", "bin.cl", "raster.cl")
+        return build(device, files, self._defines(), self.real)
+
+    def loss_program(self, device: Device) -> Program:
+        """Image loss. Depends on lanes and precision only."""
+        window = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+        window /= window.sum()
+        defines: dict[str, Define] = {f"WINDOW_{i}": float(window[i]) for i in range(6)}
+        defines |= {"LANES": self.lanes, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y}
+        return build(device, ("lanes.clh", "loss.cl"), defines, self.real)
+
+    def optim_program(self, device: Device) -> Program:
+        """Adam, skew map, regularisers, noise and gathers."""
+        defines = {k: v for k, v in self._defines().items() if k.startswith(("ROW_", "LANES", "SKEW_"))}
+        defines |= {"ADAM_BETA1": adam.BETA1, "ADAM_BETA2": adam.BETA2, "ADAM_EPS": adam.EPS,
+                    "SKEW_MAP": SKEW_MAPS.index(self.skew_map)}
+        return build(device, ("lanes.clh", "algebra.clh", "optim.cl"), defines, self.real)
+
+    def for_rendering(self) -> KernelBuild:
+        """The same with depth and an alpha gradient."""
+        return replace(self, with_depth=True, with_v_alpha=True)
+
+    def _defines(self) -> dict[str, Define]:
+        schema = self.schema
+        rows: dict[str, Define] = {
+            f"ROW_{field.name.upper()}": schema.offset(field.name) for field in schema.group(Group.GEOM)
+        }
+        return rows | {
+            "TILE": TILE, "BATCH": BATCH, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y,
+            "GROUP": self.schedule.group, "VECS": self.schedule.vecs, "LANES": self.lanes,
+            "SH_DEGREE": self.sh_degree, "WITH_DEPTH": int(self.with_depth), "WITH_V_ALPHA": int(self.with_v_alpha),
+            "NORMALISATION": NORMALISATIONS.index(self.normalisation),
+            "PEAK_STEPS": 3 if self.real == "float" else 4,
+            "SKEW_MAX": SKEW_MAX, "LOW_PASS": LOW_PASS,
+            "ALPHA_MIN": self.alpha_min, "ALPHA_MAX": self.alpha_max, "T_MIN": self.t_min,
+        }
