@@ -222,10 +222,9 @@ def _undistorted(image: _images.ImageU8, lens: Any, name: str) -> tuple[_images.
     except (ValueError, RuntimeError, MemoryError) as error:
         raise InputError(f"image {name!r}: its {lens.model.name} camera cannot be undistorted "
                          f"({_reason(error)}); undistort the photos first") from None
-    # Panoramas, and fisheye lenses with all coefficients 0, come back as they were. Asking a panorama's camera
-    # for a focal length ends the process, so look at the model only.
+    # A panorama comes back as it was, and asking its camera for a focal length would end the process.
     if pinhole.model.name != "PINHOLE":
-        raise InputError(f"image {name!r}: a photo of a {lens.model.name} camera has no pinhole image; "
+        raise InputError(f"image {name!r}: the camera model {lens.model.name} has no pinhole image; "
                          "make perspective views of it first")
     return np.ascontiguousarray(bitmap.to_array()), pinhole
 
