@@ -81,16 +81,6 @@ kernel void adam_step_skew(
     vec3_store(s, skew_s + i, capacity);
     vec3_store(skew_map(s), geom + at, capacity);
 }
-
-// m from s for every splat.
-kernel void map_skew(
-    global const real *restrict skew_s,
-    global real *restrict geom,
-    ulong capacity)
-{
-    const ulong i = get_global_id(0) * LANES;
-    vec3_store(skew_map(vec3_load(skew_s + i, capacity)), geom + i + ROW_SKEW * capacity, capacity);
-}
 #endif
 
 // Adds the gradients of opacity_scale * sum(opacity) + scale_scale * sum(scale) (3DGS-MCMC's regularisers).
@@ -111,18 +101,32 @@ kernel void regularise(
     }
 }
 
-// Philox4x32-10 (Salmon et al. 2011): counter-based, so noise depends on (seed, iteration, splat) alone.
-inline uint4 philox(uint4 counter, uint2 key) {
+// Philox4x32-10 (Salmon et al. 2011): counter-based, so noise depends on (seed, iteration, splat) alone. One counter
+// a lane; key the same for all.
+#if LANES == 1
+typedef uint vuint;
+#define lanes_uint_to_real(u) ((real)(u))
+#else
+typedef CAT(uint, LANES) vuint;
+#define lanes_uint_to_real(u) CAT(CAT(convert_, REAL_NAME), LANES)(CAT(convert_int, LANES)(u))
+#endif
+
+inline void philox(vuint *c, uint2 key) {
     for (int round = 0; round < 10; ++round) {
-        const uint hi0 = mul_hi(0xD2511F53u, counter.x), lo0 = 0xD2511F53u * counter.x;
-        const uint hi1 = mul_hi(0xCD9E8D57u, counter.z), lo1 = 0xCD9E8D57u * counter.z;
-        counter = (uint4)(hi1 ^ counter.y ^ key.x, lo1, hi0 ^ counter.w ^ key.y, lo0);
+        const vuint hi0 = mul_hi((vuint)0xD2511F53u, c[0]), lo0 = (vuint)0xD2511F53u * c[0];
+        const vuint hi1 = mul_hi((vuint)0xCD9E8D57u, c[2]), lo1 = (vuint)0xCD9E8D57u * c[2];
+        c[0] = hi1 ^ c[1] ^ (vuint)key.x;
+        c[1] = lo1;
+        c[2] = hi0 ^ c[3] ^ (vuint)key.y;
+        c[3] = lo0;
         key += (uint2)(0x9E3779B9u, 0xBB67AE85u);
     }
-    return counter;
 }
 
-inline real uniform_of(uint word) { return ((real)(word >> 9) + R(0.5)) * (real)(1.0 / 8388608.0); }
+// The top 23 bits at the centre of their interval, in (0, 1).
+inline vreal uniform_of(vuint word) {
+    return (lanes_uint_to_real(word >> 9) + (vreal)R(0.5)) * (vreal)(real)(1.0 / 8388608.0);
+}
 
 // mean += Sigma (xi gate amount), Sigma = R S S R', gate = sigmoid(0.5 - 100 opacity) (3DGS-MCMC, Kheradmand 2024).
 kernel void mcmc_noise(
@@ -139,16 +143,14 @@ kernel void mcmc_noise(
     global real *at = geom + first;
     const vreal o = (vreal)1 / ((vreal)1 + exp(-lanes_load(at + ROW_OPACITY_LOGIT * capacity)));
     const vreal gate = (vreal)amount / ((vreal)1 + exp((real)100 * o - (vreal)R(0.5)));
-    real xi[3][LANES];
-    for (int l = 0; l < LANES; ++l) {
-        const uint4 word = philox((uint4)(first + l, iteration, 0, 0), (uint2)(seed_lo, seed_hi));
-        const real radius01 = sqrt(R(-2.0) * log(uniform_of(word.x)));
-        const real angle01 = R(6.28318530717958647692) * uniform_of(word.y);
-        xi[0][l] = radius01 * cos(angle01);
-        xi[1][l] = radius01 * sin(angle01);
-        xi[2][l] = sqrt(R(-2.0) * log(uniform_of(word.z))) * cos(R(6.28318530717958647692) * uniform_of(word.w));
-    }
-    const vec3 step = {lanes_load(xi[0]) * gate, lanes_load(xi[1]) * gate, lanes_load(xi[2]) * gate};
+    uint index[LANES];
+    for (int l = 0; l < LANES; ++l) index[l] = first + l;
+    vuint words[4] = {lanes_load(index), (vuint)iteration, (vuint)0, (vuint)0};
+    philox(words, (uint2)(seed_lo, seed_hi));
+    const vreal two_pi = (vreal)R(6.28318530717958647692);
+    const vreal radius01 = sqrt(R(-2.0) * log(uniform_of(words[0]))), angle01 = two_pi * uniform_of(words[1]);
+    const vreal radius2 = sqrt(R(-2.0) * log(uniform_of(words[2]))), angle2 = two_pi * uniform_of(words[3]);
+    const vec3 step = scale3((vec3){radius01 * cos(angle01), radius01 * sin(angle01), radius2 * cos(angle2)}, gate);
     const mat3 rotation = quat_rotation(quat_load(at + ROW_QUAT * capacity, capacity));
     const vec3 ls = vec3_load(at + ROW_LOG_SCALE * capacity, capacity);
     const vec3 variance = {exp((real)2 * ls.x), exp((real)2 * ls.y), exp((real)2 * ls.z)};
@@ -156,23 +158,25 @@ kernel void mcmc_noise(
     vec3_store(add3(vec3_load(at + ROW_MEAN * capacity, capacity), moved), at + ROW_MEAN * capacity, capacity);
 }
 
-// out[row, i] = from[row, source[i]]. Global size: (n_out, rows).
+// moved[row, i] = values[row, source[i]]. Global size: (at least n, rows).
 kernel void gather_columns(
-    global const real *restrict from,
+    global const real *restrict values,
     global const int *restrict source,
-    global real *restrict out,
-    ulong capacity)
+    global real *restrict moved,
+    ulong capacity,
+    uint n)
 {
     const ulong i = get_global_id(0), row = get_global_id(1) * capacity;
-    out[row + i] = from[row + source[i]];
+    if (i < n) moved[row + i] = values[row + source[i]];
 }
 
-// values[row, i] = 0 where fresh[i]. Global size: (n, rows).
+// values[row, i] = 0 where fresh[i]. Global size: (at least n, rows).
 kernel void zero_columns(
     global real *restrict values,
     global const uchar *restrict fresh,
-    ulong capacity)
+    ulong capacity,
+    uint n)
 {
     const ulong i = get_global_id(0);
-    if (fresh[i]) values[get_global_id(1) * capacity + i] = 0;
+    if (i < n && fresh[i]) values[get_global_id(1) * capacity + i] = 0;
 }

@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from .camera import Camera
     from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
     from .render import Rendered, Renderer
+    from .config import TrainConfig
     from .scene import Scene, load_scene
     from .splats import Splats
+    from .train import Model, train
 
 __version__ = "0.1.0"
 
@@ -26,7 +28,7 @@ _HOME = {
 
 __all__ = [
     "Camera", "ClsplatError", "DeviceError", "InputError", "OutputError", "Rendered", "Renderer", "Scene", "Splats",
-    "TrainingError", "load_scene",
+    "TrainConfig", "TrainingError", "load_scene", "train", "Model",
 ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from .device import Device
 from .schema import Array, Group, Schema, public_shape
 from .splats import Splats
 
-CAPACITY_STEP = 64  # columns are padded so that every vector load stays inside and aligned
+CAPACITY_STEP = 1024  # columns are padded: whole groups of 64 items of 16 lanes stay inside
 
 
 class Pool:
@@ -96,10 +97,11 @@ class ParameterBuffers:
     def sh(self) -> Any:
         return self.buffers[Group.SH]
 
-    def upload(self, arrays: dict[str, Array]) -> None:
-        """Public arrays (see schema.public_shape) of n <= capacity splats into the first n columns."""
-        for field in self.schema:
-            array = np.asarray(arrays[field.name], self.dtype)
+    def upload(self, arrays: Mapping[str, Array]) -> None:
+        """Public arrays (see schema.public_shape) of n <= capacity splats, fields by name, into the first n columns."""
+        for name in arrays:
+            field = self.schema[name]
+            array = np.asarray(arrays[name], self.dtype)
             rows = array.reshape(len(array), field.width).T
             padded = np.zeros((field.width, self.capacity), self.dtype)
             padded[:, : rows.shape[1]] = rows
@@ -133,7 +135,7 @@ class SplatBuffers(ParameterBuffers):
         self.set(splats.to_numpy())
         return self
 
-    def set(self, arrays: dict[str, Array]) -> None:
+    def set(self, arrays: Mapping[str, Array]) -> None:
         """Replace all splats."""
         self.upload(arrays)
         self.n = len(arrays["mean"])

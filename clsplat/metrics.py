@@ -52,7 +52,7 @@ class Protocol:
 
 
 PROTOCOLS = {p.name: p for p in (Protocol("clsplat", True, "valid"), Protocol("3dgs", True, "zero"))}
-DEFAULT_PROTOCOL = "clsplat"
+DEFAULT_PROTOCOL = PROTOCOLS["clsplat"]
 
 
 def protocol_named(name: str) -> Protocol:

@@ -18,6 +18,7 @@ from .camera import Camera
 from .device import Device
 from .errors import DeviceError
 from .kernels import MARGIN_X, MARGIN_Y, NEAR, TILE, KernelBuild
+from .program import GROUP_ITEMS
 from .sort import Sorter
 
 MAX_ISECTS = 2**31 - 1
@@ -100,6 +101,8 @@ class Pipeline:
         self._real = kernels.dtype.itemsize
         self._layouts: dict[str, tuple[ImageLayout, Any]] = {}
         self._lists: Any = None
+        # PoCL stacks up the private arrays of all work-items of a group: groups of one where lanes do the work.
+        self._group = 1 if device.info.type == "CPU" else GROUP_ITEMS
 
     def forward(self, splats: SplatBuffers, camera: Camera, background: tuple[float, float, float] = (0, 0, 0),
                 sh_degree: int | None = None) -> Frame:
@@ -123,7 +126,7 @@ class Pipeline:
         lists = pool.get("isect_id", 4 * n_isects)
         if n_isects:
             tiles, lists = self.sorter.sort("isect_tile", "isect_id", n_isects, max((n_tiles - 1).bit_length(), 1))
-            self.program.find_tile_ranges((n_isects,), None, sorted_tile=tiles, tile_ranges=ranges, n_isects=n_isects)
+            self.program.find_tile_ranges.over(n_isects, sorted_tile=tiles, tile_ranges=ranges, n_isects=n_isects)
         self._lists = lists
         group = self.kernels.schedule.group
         r, g, b = background
@@ -155,12 +158,12 @@ class Pipeline:
             v_alpha=v_color if v_alpha is None else v_alpha, isect_grads=isect_grads, width=layout.width,
             height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane,
         )
-        self.program.gather_isect_grads(
-            (splats.n,), None, splat_isects=pool.get("splat_isects", 0), isect_grads=isect_grads, moments=moments,
+        self.program.gather_isect_grads.over(
+            splats.n, self._group, splat_isects=pool.get("splat_isects", 0), isect_grads=isect_grads, moments=moments,
             capacity=splats.capacity, n_splats=splats.n,
         )
-        self.program.project_splats_vjp(
-            (-(-splats.n // self.kernels.lanes),), None, geom=splats.geom, sh=splats.sh, cam=pool.get("camera", 0),
+        self.program.project_splats_vjp.over(
+            -(-splats.n // self.kernels.lanes), self._group, geom=splats.geom, sh=splats.sh, cam=pool.get("camera", 0),
             moments=moments, records=pool.get("records", 0), depth_key=pool.get("depth_key_kept", 0),
             grad_geom=grads.geom, grad_sh=grads.sh, capacity=splats.capacity, n_splats=splats.n,
             sh_degree=frame.sh_degree,
@@ -186,8 +189,8 @@ class Pipeline:
         block = camera_block(camera).astype(self.kernels.dtype)
         cam = pool.get("camera", block.nbytes)
         to_device(self.device, cam, block)
-        self.program.project_splats(
-            (-(-n // self.kernels.lanes),), None, geom=splats.geom, sh=splats.sh, cam=cam, records=records,
+        self.program.project_splats.over(
+            -(-n // self.kernels.lanes), self._group, geom=splats.geom, sh=splats.sh, cam=cam, records=records,
             depth_key=pool.get("depth_key_kept", 4 * n), tile_rect=pool.get("tile_rect", 16 * n),
             capacity=splats.capacity, n_splats=n, sh_degree=degree, width=layout.width, height=layout.height,
             tiles_x=layout.tiles_x, tiles_y=layout.tiles_y,
@@ -204,13 +207,13 @@ class Pipeline:
         _, order = self.sorter.sort("depth_key", "depth_order", n, 32)
         counts, offsets = pool.get("isect_counts", 4 * n), pool.get("isect_offsets", 4 * n)
         rect, total = pool.get("tile_rect", 0), pool.get("n_isects", 4)
-        program.count_isects((n,), None, order=order, tile_rect=rect, counts=counts, n_splats=n)
+        program.count_isects.over(n, order=order, tile_rect=rect, counts=counts, n_splats=n)
         self.sorter.scan(counts, offsets, n, total)
         n_isects = int(to_host(self.device, total, np.empty(1, np.uint32))[0])
         if n_isects > MAX_ISECTS:
             raise DeviceError(f"{n_isects} splat-tile pairs in one image: use smaller images (-r 2, 4, 8)")
-        program.emit_isects(
-            (n,), None, order=order, tile_rect=rect, offsets=offsets, splat_isects=pool.get("splat_isects", 8 * n),
+        program.emit_isects.over(
+            n, order=order, tile_rect=rect, offsets=offsets, splat_isects=pool.get("splat_isects", 8 * n),
             isect_tile=pool.get("isect_tile", 4 * n_isects), isect_id=pool.get("isect_id", 4 * n_isects),
             isect_splat=pool.get("isect_splat", 4 * n_isects), n_splats=n, tiles_x=layout.tiles_x,
         )

@@ -31,6 +31,8 @@ OPTIONS_VARIABLE = "CLSPLAT_BUILD_OPTIONS"  # more, from outside: -Werror in tes
 
 SMOKE_TOLERANCE = 1e-5  # relative: OpenCL allows exp 3 ulp and erfc 16 ulp of float32 (6e-8 each)
 
+GROUP_ITEMS = 64
+
 _SCALARS = {"int": np.int32, "uint": np.uint32, "ulong": np.uint64, "float": np.float32, "double": np.float64}
 _ATTRIBUTE = r"__attribute__\s*\(\(.*?\)\)\)?\s*"  # the third brace closes reqd_work_group_size(...)
 _KERNEL = re.compile(rf"\b(?:__)?kernel\s+(?:{_ATTRIBUTE})*void\s+(\w+)\s*\(([^)]*)\)", re.S)
@@ -191,6 +193,13 @@ class Kernel:
             raise DeviceError(
                 f"kernel {self.name} on {self._device.info}: {first_line(error)}{mend}"
             ) from error
+
+    def over(self, n: int, group: int = GROUP_ITEMS, /, **args: Any) -> Any:
+        """Enqueue at least `n` work-items in groups of `group`; the kernel must ignore those from n on.
+
+        A fixed group size matters: PoCL compiles a kernel anew for each size that it picks itself.
+        """
+        return self(((n + group - 1) // group * group,), (group,), **args)
 
     def _mismatch(self, given: set[str]) -> str:
         missing = [name for name in self._names if name not in given]

@@ -25,9 +25,9 @@ class Sorter:
         run = max(-(-n // _CPU_CHUNKS), 1024) if self.is_cpu else 64
         n_runs = max(-(-n // run), 1)
         sums = self.pool.get("scan_sums", 4 * n_runs)
-        self.program.scan_sums((n_runs,), None, values=values, sums=sums, n=n, run=run)
+        self.program.scan_sums.over(n_runs, 1, values=values, sums=sums, n=n, run=run)
         self.program.scan_spine((self.group,), (self.group,), sums=sums, total=total, n=n_runs)
-        self.program.scan_apply((n_runs,), None, values=values, sums=sums, scanned=scanned, n=n, run=run)
+        self.program.scan_apply.over(n_runs, 1, values=values, sums=sums, scanned=scanned, n=n, run=run)
 
     def sort(self, keys: str, values: str, n: int, key_bits: int) -> tuple[Any, Any]:
         """Sort n pairs held in the pool's buffers `keys` and `values` by the low `key_bits` bits.
@@ -53,4 +53,4 @@ class Sorter:
 
     def iota(self, values: Any, n: int) -> None:
         """values[i] = i."""
-        self.program.fill_iota((n,), None, values=values, n=n)
+        self.program.fill_iota.over(n, values=values, n=n)

@@ -1,0 +1,127 @@
+"""Everything that decides a training run, apart from the scene. JSON in and out."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from .errors import InputError
+from .schema import MAX_SH_DEGREE
+from .shapes import DEFAULT_SHAPE, check_normalisation, shape_named
+from .skew_map import DEFAULT_SKEW_MAP, SKEW_MAPS
+
+STRATEGIES = ("mcmc",)
+OPTIMIZERS = ("fused", "numpy")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Training options; the names are the command line's. Constants are 3DGS's and 3DGS-MCMC's unless said.
+
+    Parameters
+    ----------
+    shape, normalisation, skew_map : the splat kernel and the map of its trainable skew.
+    iterations : optimizer steps, one image each.
+    cap_max : hard limit on splats.
+    strategy : "mcmc" (relocate dead splats, grow to the cap, noise on positions).
+    init : "sfm", "random" or a .ply path.
+    sh_degree, sh_interval : highest SH degree; one more every `sh_interval` iterations (0: a tenth of the run,
+        at most 1000).
+    lambda_dssim : weight of 1 - SSIM against L1.
+    background : behind the splats, R, G, B in 0..1.
+    seed : of everything random.
+    coarse_to_fine : train on images at 1/4, then 1/2, then full size.
+    position_lr_init, position_lr_final : of the mean, times the scene extent, log-linear over the run.
+    opacity_lr, scaling_lr, rotation_lr, feature_lr, skew_lr : Adam's rates.
+    opacity_reg, scale_reg : weights of the mean opacity and mean scale in the loss.
+    noise_lr : of the position noise.
+    init_opacity, init_scale : of splats made from points; scale in units of the distance to three neighbours.
+    densify_from, densify_until, densify_interval : when the strategy acts; from and until as fractions of the run.
+    growth : least growth of the splat count per action; more where the cap is far (see train.growth_factor).
+    checkpoint_interval : iterations between checkpoints; 0: only at the end.
+    save_iterations, test_iterations : when to write a PLY, and to measure the test views (logged only).
+    optimizer : "fused" (on the device) or "numpy" (the reference).
+    device : as `--device`.
+    """
+
+    shape: str = DEFAULT_SHAPE
+    normalisation: str = "peak"
+    skew_map: str = DEFAULT_SKEW_MAP
+    iterations: int = 7000
+    cap_max: int = 100_000
+    strategy: str = "mcmc"
+    init: str = "sfm"
+    sh_degree: int = 3
+    sh_interval: int = 0
+    lambda_dssim: float = 0.2
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    seed: int = 0
+    coarse_to_fine: bool = True
+    position_lr_init: float = 1.6e-4
+    position_lr_final: float = 1.6e-6
+    opacity_lr: float = 0.05
+    scaling_lr: float = 5e-3
+    rotation_lr: float = 1e-3
+    feature_lr: float = 2.5e-3
+    skew_lr: float = 2.5e-3
+    opacity_reg: float = 0.01
+    scale_reg: float = 0.01
+    noise_lr: float = 5e5
+    init_opacity: float = 0.5
+    init_scale: float = 0.5
+    densify_from: float = 0.05
+    densify_until: float = 0.8
+    densify_interval: int = 100
+    growth: float = 1.05
+    checkpoint_interval: int = 1000
+    save_iterations: tuple[int, ...] = ()
+    test_iterations: tuple[int, ...] = ()
+    optimizer: str = "fused"
+    device: str | None = None
+
+    def __post_init__(self) -> None:
+        shape_named(self.shape)
+        check_normalisation(self.normalisation)
+        _one_of("skew_map", self.skew_map, SKEW_MAPS)
+        _one_of("strategy", self.strategy, STRATEGIES)
+        _one_of("optimizer", self.optimizer, OPTIMIZERS)
+        for name in ("iterations", "cap_max", "densify_interval"):
+            _at_least(name, getattr(self, name), 1)
+        for name in ("seed", "sh_interval", "checkpoint_interval", "position_lr_init", "position_lr_final",
+                     "opacity_lr", "scaling_lr", "rotation_lr", "feature_lr", "skew_lr", "opacity_reg", "scale_reg",
+                     "noise_lr"):
+            _at_least(name, getattr(self, name), 0)
+        if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
+            raise InputError(f"sh_degree {self.sh_degree}: must be 0 to {MAX_SH_DEGREE}")
+        if not 0 <= self.lambda_dssim <= 1:
+            raise InputError(f"lambda_dssim {self.lambda_dssim}: must be 0 to 1")
+        if self.position_lr_init <= 0 or self.position_lr_final <= 0:
+            raise InputError("position_lr_init and position_lr_final must be above 0")
+        if not 0 < self.init_opacity < 1 or self.init_scale <= 0:
+            raise InputError("init_opacity must lie between 0 and 1, init_scale above 0")
+        if len(self.background) != 3 or not all(0 <= c <= 1 for c in self.background):
+            raise InputError(f"background {self.background}: expected R,G,B, each 0 to 1")
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for json.dump."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> TrainConfig:
+        """The config that `to_json` gave; InputError on an unknown key."""
+        known = {field.name: field for field in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - set(known))
+        if unknown:
+            raise InputError(f"config: unknown option {unknown[0]!r}")
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+
+
+def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise InputError(f"{name} {value!r}: choose one of {', '.join(allowed)}")
+
+
+def _at_least(name: str, value: float, least: float) -> None:
+    if not value >= least:
+        raise InputError(f"{name} {value}: must be at least {least}")

@@ -1,0 +1,59 @@
+"""How much device memory a run will take, before it starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .config import TrainConfig
+from .device import Device
+from .errors import DeviceError
+from .kernels import KernelBuild
+from .pipeline import ImageLayout
+from .schema import Group
+
+_ROLES = 5  # value, gradient, two moments, and the copy that relocation swaps with
+_IMAGE_PLANES = 3 + 1 + 3 + 15 + 9 + 9 + 3  # colour, T, truth, SSIM maps and their gradients, v_color
+_ISECTS_PER_SPLAT = 12  # measured 4 to 10 at the end of runs on 400-px photos; more for few, large splats
+_SORT_WORDS = 5  # tile, id and their pairs, splat
+_SCREEN_WORDS = 16  # keys, orders, rectangles, counts and offsets of a splat
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Bytes by purpose, and the largest single buffer."""
+
+    splats: int
+    isects: int
+    images: int
+    largest_buffer: int
+
+    @property
+    def total(self) -> int:
+        return self.splats + self.isects + self.images
+
+    def __str__(self) -> str:
+        return (f"{self.total / 1e6:.0f} MB of device memory (splats {self.splats / 1e6:.0f}, "
+                f"splat-tile pairs {self.isects / 1e6:.0f}, images {self.images / 1e6:.0f})")
+
+
+def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout) -> Estimate:
+    """Memory at the cap, for the largest image. Splat-tile pairs are a guess, the rest is exact."""
+    real, n = kernels.dtype.itemsize, config.cap_max
+    rows = {group: kernels.schema.rows(group) for group in Group}
+    screen = (kernels.record + kernels.v_record) * real + 4 * _SCREEN_WORDS
+    isect = kernels.v_record * real + 4 * _SORT_WORDS
+    n_isects = _ISECTS_PER_SPLAT * n
+    buffers = [rows[Group.SH] * n * real, n_isects * kernels.v_record * real, 15 * layout.plane * real]
+    return Estimate(n * (_ROLES * sum(rows.values()) * real + screen), n_isects * isect,
+                    _IMAGE_PLANES * layout.plane * real, max(buffers))
+
+
+def check(needed: Estimate, device: Device) -> None:
+    """Raises DeviceError when the estimate does not fit the device."""
+    info = device.info
+    mend = "lower --cap-max, use smaller images (-r 2, 4, 8), a lower --sh-degree, or another --device"
+    if needed.total > info.global_mem_bytes:
+        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, the run needs about {needed}: {mend}")
+    if needed.largest_buffer > info.max_alloc_bytes:
+        raise DeviceError(f"{info} allows {info.max_alloc_bytes / 1e6:.0f} MB in one buffer, the run needs about "
+                          f"{needed.largest_buffer / 1e6:.0f} MB: {mend}")
