@@ -20,6 +20,12 @@ inline void stage_batch(global const uint *lists, global const uint *isect_splat
     group_barrier();
 }
 
+// Transmittance before any splat; pixels outside the image count as finished.
+inline vreal fresh_T(int x, int y, int width, int height) {
+    const vmask inside = ((vreal)x + lanes_iota() < (vreal)width) & lanes_mask(y < height);
+    return lanes_if(inside, (vreal)1, (vreal)-1);
+}
+
 // Runs [first, last) of this item that the splat's pixel rows can touch.
 inline int first_run(const real *rec, int tile_y) {
     const int row = max((int)rec[6] - tile_y, 0);
@@ -59,16 +65,14 @@ kernel void rasterize(
 #if WITH_DEPTH
     vreal z[VECS];
 #endif
-    vmask live[VECS];
     for (int v = 0; v < VECS; ++v) {
         const int run = v * GROUP + LID;
         const int x = tile_x + run % RUNS_PER_ROW * LANES, y = tile_y + run / RUNS_PER_ROW;
-        T[v] = (vreal)1;
+        T[v] = fresh_T(x, y, width, height);
         red[v] = green[v] = blue[v] = (vreal)0;
 #if WITH_DEPTH
         z[v] = (vreal)0;
 #endif
-        live[v] = ((vreal)x + lanes_iota() < (vreal)width) & lanes_mask(y < height);
     }
 
     for (uint start = range.x; start < range.y; start += BATCH) {
@@ -84,20 +88,18 @@ kernel void rasterize(
                 const real dy = tile_y + run / RUNS_PER_ROW + R(0.5) - rec[1];
                 shape_pixel pixel;
                 vreal alpha = shape_alpha((vreal)x + lanes_iota(), dy, rec + 8, &pixel);
-                vreal behind;
-                const vmask hit = blend_accept(&alpha, T[v], &live[v], &behind);
-                const vreal weight = lanes_if(hit, alpha * T[v], (vreal)0);
-                red[v] = mad(weight, (vreal)rec[2], red[v]);
-                green[v] = mad(weight, (vreal)rec[3], green[v]);
-                blue[v] = mad(weight, (vreal)rec[4], blue[v]);
+                vmask hit;
+                const vreal weight = blend(&alpha, &T[v], &hit);
+                red[v] = lanes_mad(weight, (vreal)rec[2], red[v]);
+                green[v] = lanes_mad(weight, (vreal)rec[3], green[v]);
+                blue[v] = lanes_mad(weight, (vreal)rec[4], blue[v]);
 #if WITH_DEPTH
-                z[v] = mad(weight, (vreal)rec[5], z[v]);
+                z[v] = lanes_mad(weight, (vreal)rec[5], z[v]);
 #endif
-                T[v] = lanes_if(hit, behind, T[v]);
             }
         }
         int any_live = 0;
-        for (int v = 0; v < VECS && !any_live; ++v) any_live = lanes_any(live[v]);
+        for (int v = 0; v < VECS && !any_live; ++v) any_live = lanes_any(lanes_not(BLEND_DONE(T[v])));
         if (!group_any(any_live, scratch)) break;
     }
 
@@ -107,9 +109,10 @@ kernel void rasterize(
         const vmask inside = ((vreal)x + lanes_iota() < (vreal)width) & lanes_mask(y < height);
         const ulong at = (ulong)(y + MARGIN_Y) * stride + x + MARGIN_X;
         const vreal zero = (vreal)0;
-        lanes_store(lanes_if(inside, mad(T[v], (vreal)background_r, red[v]), zero), color + at);
-        lanes_store(lanes_if(inside, mad(T[v], (vreal)background_g, green[v]), zero), color + at + plane);
-        lanes_store(lanes_if(inside, mad(T[v], (vreal)background_b, blue[v]), zero), color + at + 2 * plane);
+        T[v] = fabs(T[v]);
+        lanes_store(lanes_if(inside, lanes_mad(T[v], (vreal)background_r, red[v]), zero), color + at);
+        lanes_store(lanes_if(inside, lanes_mad(T[v], (vreal)background_g, green[v]), zero), color + at + plane);
+        lanes_store(lanes_if(inside, lanes_mad(T[v], (vreal)background_b, blue[v]), zero), color + at + 2 * plane);
         lanes_store(lanes_if(inside, T[v], zero), transmittance + at);
 #if WITH_DEPTH
         lanes_store(lanes_if(inside, z[v], zero), depth + at);
@@ -145,13 +148,11 @@ kernel void rasterize_vjp(
     const uint2 range = tile_ranges[tile];
 
     vreal T[VECS], rest[VECS], v_red[VECS], v_green[VECS], v_blue[VECS];
-    vmask live[VECS];
     for (int v = 0; v < VECS; ++v) {
         const int run = v * GROUP + LID;
         const int x = tile_x + run % RUNS_PER_ROW * LANES, y = tile_y + run / RUNS_PER_ROW;
         const ulong at = (ulong)(y + MARGIN_Y) * stride + x + MARGIN_X;
-        live[v] = ((vreal)x + lanes_iota() < (vreal)width) & lanes_mask(y < height);
-        T[v] = (vreal)1;
+        T[v] = fresh_T(x, y, width, height);
         v_red[v] = lanes_load(v_color + at);
         v_green[v] = lanes_load(v_color + at + plane);
         v_blue[v] = lanes_load(v_color + at + 2 * plane);
@@ -183,26 +184,25 @@ kernel void rasterize_vjp(
                 const real dy = tile_y + run / RUNS_PER_ROW + R(0.5) - rec[1];
                 shape_pixel pixel;
                 const vreal raw_alpha = shape_alpha(dx, dy, rec + 8, &pixel);
-                vreal alpha = raw_alpha, behind;
-                const vmask hit = blend_accept(&alpha, T[v], &live[v], &behind);
-                if (!lanes_any(hit)) continue;
-                const vreal weight = lanes_if(hit, alpha * T[v], (vreal)0);
+                vreal alpha = raw_alpha;
+                const vreal T_before = T[v];
+                vmask hit;
+                const vreal weight = blend(&alpha, &T[v], &hit);
                 const vreal g = v_red[v] * rec[2] + v_green[v] * rec[3] + v_blue[v] * rec[4];
                 rest[v] -= weight * g;
-                const vreal v_a = T[v] * g - rest[v] / ((vreal)1 - alpha);
+                const vreal v_a = T_before * g - rest[v] / ((vreal)1 - alpha);
                 shape_alpha_vjp(dx, dy, rec + 8, pixel, lanes_if(hit, blend_clamp_vjp(raw_alpha, v_a), (vreal)0),
                                 sums);
                 sums[SHAPE_V] += weight * v_red[v];
                 sums[SHAPE_V + 1] += weight * v_green[v];
                 sums[SHAPE_V + 2] += weight * v_blue[v];
-                T[v] = lanes_if(hit, behind, T[v]);
             }
             real own[V_RECORD];
             for (int j = 0; j < V_RECORD; ++j) own[j] = lanes_sum(sums[j]);
             group_sum_store(own, V_RECORD, scratch, isect_grads + (ulong)lists[start + k] * V_RECORD);
         }
         int any_live = 0;
-        for (int v = 0; v < VECS && !any_live; ++v) any_live = lanes_any(live[v]);
+        for (int v = 0; v < VECS && !any_live; ++v) any_live = lanes_any(lanes_not(BLEND_DONE(T[v])));
         finished = !group_any(any_live, scratch);
     }
 }
