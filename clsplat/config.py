@@ -21,26 +21,38 @@ class TrainConfig:
 
     Parameters
     ----------
-    shape, normalisation, skew_map : the splat kernel and the map of its trainable skew.
+    shape : the splat kernel.
+    normalisation : of skewed kernels: what `opacity` means.
+    skew_map : from the trainable skew to the kernel's.
     iterations : optimizer steps, one image each.
     cap_max : hard limit on splats.
     strategy : "mcmc" (relocate dead splats, grow to the cap, noise on positions).
     init : "sfm", "random" or a .ply path.
-    sh_degree, sh_interval : highest SH degree; one more every `sh_interval` iterations (0: a tenth of the run,
-        at most 1000).
+    sh_degree : highest degree of spherical harmonics, 0 to 3.
+    sh_interval : iterations from one SH degree to the next; 0: a tenth of the run, at most 1000.
     lambda_dssim : weight of 1 - SSIM against L1.
     background : behind the splats, R, G, B in 0..1.
-    seed : of everything random.
+    seed : of everything random; the same seed gives the same bits on one device.
     coarse_to_fine : train on images at 1/4, then 1/2, then full size.
-    position_lr_init, position_lr_final : of the mean, times the scene extent, log-linear over the run.
-    opacity_lr, scaling_lr, rotation_lr, feature_lr, skew_lr : Adam's rates.
-    opacity_reg, scale_reg : weights of the mean opacity and mean scale in the loss.
-    noise_lr : of the position noise.
-    init_opacity, init_scale : of splats made from points; scale in units of the distance to three neighbours.
-    densify_from, densify_until, densify_interval : when the strategy acts; from and until as fractions of the run.
+    position_lr_init : Adam's rate of positions at the start, times the scene extent.
+    position_lr_final : the same at the end; log-linear between.
+    opacity_lr : Adam's rate of opacity logits.
+    scaling_lr : Adam's rate of log scales.
+    rotation_lr : Adam's rate of quaternions.
+    feature_lr : Adam's rate of colour; bands above the constant learn 20 times slower.
+    skew_lr : Adam's rate of the trainable skew.
+    opacity_reg : weight of the mean opacity in the loss.
+    scale_reg : weight of the mean scale in the loss.
+    noise_lr : size of the position noise, times the positions' rate.
+    init_opacity : of splats made from points.
+    init_scale : of splats made from points, in units of the distance to their three neighbours.
+    densify_from : when the strategy begins, as a fraction of the run.
+    densify_until : when it ends, as a fraction of the run.
+    densify_interval : iterations between its actions.
     growth : least growth of the splat count per action; more where the cap is far (see train.growth_factor).
     checkpoint_interval : iterations between checkpoints; 0: only at the end.
-    save_iterations, test_iterations : when to write a PLY, and to measure the test views (logged only).
+    save_iterations : when to write a PLY, beside the end.
+    test_iterations : when to measure the test views; for the log only.
     optimizer : "fused" (on the device) or "numpy" (the reference).
     device : as `--device`.
     """
@@ -89,8 +101,8 @@ class TrainConfig:
         for name in ("iterations", "cap_max", "densify_interval"):
             _at_least(name, getattr(self, name), 1)
         for name in ("seed", "sh_interval", "checkpoint_interval", "position_lr_init", "position_lr_final",
-                     "opacity_lr", "scaling_lr", "rotation_lr", "feature_lr", "skew_lr", "opacity_reg", "scale_reg",
-                     "noise_lr"):
+                     "opacity_lr", "scaling_lr", "rotation_lr", "feature_lr", "skew_lr", "opacity_reg",
+                     "scale_reg", "noise_lr"):
             _at_least(name, getattr(self, name), 0)
         if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise InputError(f"sh_degree {self.sh_degree}: must be 0 to {MAX_SH_DEGREE}")

@@ -83,6 +83,17 @@ def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU
         Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="PNG")
 
 
+def write_grey16(path: str | os.PathLike[str], array: NDArray[np.uint16]) -> None:
+    """Write (H, W) as 16-bit grey PNG, atomically.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
+    with atomic_writer(path) as stream:
+        Image.fromarray(np.ascontiguousarray(array, np.uint16)).save(stream, format="PNG")
+
+
 def resize_area(image: ImageU8, width: int, height: int) -> ImageU8:
     """The image at another size [px], (height, width, 3 or 4); alpha weighs the colours.
 

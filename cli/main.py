@@ -1,0 +1,112 @@
+"""The `clsplat` command: loads the subcommand that was named, and turns errors into one line each."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import warnings
+from typing import Any, TextIO
+
+import click
+
+from clsplat import __version__
+from clsplat.errors import ClsplatError
+
+# Name to (module:attribute, line in the list). Listed here so that --help imports none of them.
+COMMANDS = {
+    "devices": ("clsplat_cli.devices:devices", "List the OpenCL devices and try each."),
+    "demo": ("clsplat_cli.demo:demo", "Make a small scene, train on it, render and measure: a first trial."),
+    "train": ("clsplat_cli.train:train", "Learn a splat model of a scene."),
+    "render": ("clsplat_cli.render:render", "Render a model or any splat PLY."),
+    "eval": ("clsplat_cli.evaluate:evaluate_models", "Measure models on the views they were not trained on."),
+}
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+
+
+class Commands(click.Group):
+    """Subcommands that are imported when used, with one-line errors."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, attribute = COMMANDS[cmd_name][0].partition(":")
+        command: click.Command = getattr(importlib.import_module(module), attribute)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
+
+    def invoke(self, ctx: click.Context) -> Any:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            try:
+                return super().invoke(ctx)
+            except KeyboardInterrupt:
+                _fail(ctx, "interrupted", INTERRUPTED)
+            except ClsplatError as error:
+                _fail(ctx, str(error))
+            except Exception as error:
+                message = _known_failure(error)
+                if message is None:
+                    raise
+                _fail(ctx, message)
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        """As click's, but a wrong command line is one line too (exit code 2)."""
+        extra["standalone_mode"] = False
+        try:
+            code = super().main(*args, **extra)
+        except click.UsageError as error:
+            see = f" (see: {error.ctx.command_path} --help)" if error.ctx else ""
+            click.echo(f"error: {_one_line(error.format_message())}{see}", err=True)
+            code = error.exit_code
+        except click.ClickException as error:
+            click.echo(f"error: {_one_line(error.format_message())}", err=True)
+            code = error.exit_code
+        except click.Abort:
+            code = INTERRUPTED
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+@click.group(cls=Commands, context_settings={
+    "help_option_names": ["-h", "--help"],
+    "token_normalize_func": lambda token: token.replace("_", "-"),  # 3DGS writes --sh_degree
+    "max_content_width": 110,
+})
+@click.version_option(__version__, prog_name="clsplat", message="%(prog)s %(version)s")
+def main() -> None:
+    """Gaussian and skew-normal splatting on any OpenCL device."""
+
+
+def _fail(ctx: click.Context, message: str, code: int = 1) -> None:
+    click.echo(f"error: {_one_line(message)}", err=True)
+    ctx.exit(code)
+
+
+def _known_failure(error: Exception) -> str | None:
+    """What to tell the user of an error that clsplat did not raise itself; None for a bug of ours."""
+    if isinstance(error, MemoryError):
+        return "out of memory: lower --cap-max or use smaller images (-r 2, 4, 8)"
+    if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    cl = sys.modules.get("pyopencl")  # without it no error can be OpenCL's
+    if cl is None or not isinstance(error, cl.Error):
+        return None
+    from clsplat.device import first_line, is_out_of_memory
+
+    if is_out_of_memory(error):
+        return "device out of memory: lower --cap-max, use smaller images (-r 2, 4, 8), or another --device"
+    return f"the OpenCL device failed: {first_line(error)}: try `clsplat devices`, or another --device"
+
+
+def _show_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int,
+                  file: TextIO | None = None, line: str | None = None) -> None:
+    click.echo(f"warning: {_one_line(str(message))}", err=True)
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split("\n"))

@@ -1,0 +1,156 @@
+"""`clsplat train`: learn a splat model of a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import click
+
+from clsplat.config import TrainConfig
+from clsplat.errors import InputError, OutputError
+from clsplat.model_folder import ModelFolder
+
+from .options import (
+    PATH,
+    SpacedLists,
+    config_options,
+    config_values,
+    is_given,
+    overwrite_option,
+    quiet_option,
+    scene_options,
+)
+from .progress import TrainingDisplay, duration
+
+if TYPE_CHECKING:
+    from clsplat.evaluate import Evaluation
+    from clsplat.scene import Scene
+    from clsplat.train import Model
+
+SCENE_KEYS = ("images", "resolution", "test_every", "test_list", "eval")
+INTERRUPTED = 130
+
+
+@click.command(cls=SpacedLists)
+@click.argument("scene", required=False, type=PATH)
+@click.option("-m", "--model-path", "-o", "model_path", type=PATH,
+              help="Folder of the model.  [default: output/<name of the scene>]")
+@scene_options
+@click.option("--eval", is_flag=True, help="Hold test views out of training, and measure them at the end.")
+@click.option("--test-every", type=int, metavar="N",
+              help="Of the sorted views, every Nth is a test view; implies --eval.  [default: 8]")
+@click.option("--test-list", type=PATH, metavar="FILE",
+              help="Names of the test views, one a line; implies --eval.")
+@click.option("--resume", is_flag=True,
+              help="Go on from the model's checkpoint, with the options of its run.")
+@overwrite_option
+@quiet_option
+@config_options
+@click.pass_context
+def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, model_path: Path | None,
+          resume: bool, overwrite: bool, quiet: bool, **values: Any) -> None:
+    """Learn a splat model of SCENE, a folder with photos in images/ and a COLMAP model in sparse/.
+
+    Writes config.json, cameras.json, log.jsonl, checkpoint.npz and point_cloud/iteration_N/point_cloud.ply
+    into the model's folder. Ctrl-C saves a checkpoint; --resume goes on from it.
+    """
+    if resume and overwrite:
+        raise click.UsageError("give --resume or --overwrite, not both")
+    if scene and source_path and scene != source_path:
+        raise click.UsageError(f"two scenes: {scene} and {source_path}")
+    path = scene or source_path
+    options = config_values(ctx, values)
+    reading = {key: values[key] for key in SCENE_KEYS if is_given(ctx, key)}
+    if path is None and not (resume and model_path):
+        raise click.UsageError("give the scene's folder")
+    if model_path is None:
+        assert path is not None
+        model_path = Path("output") / path.resolve().name
+    folder = ModelFolder(model_path)
+    if resume:
+        stored_config, stored_scene = _stored_run(folder)
+        options, reading = stored_config | options, stored_scene | reading
+        path = path or Path(reading["path"])
+    elif folder.is_used and not overwrite:
+        # train() says so too, but only after the scene is read.
+        raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
+    assert path is not None
+    config = TrainConfig(**options)
+    loaded, record = read_scene(path, reading, config.background)
+    model = run_training(loaded, config, model_path, record, resume, overwrite, quiet)
+    if not model.finished:
+        say_stopped(ctx, model)
+    if not quiet:
+        report(model, test_metrics(model, loaded))
+
+
+def read_scene(path: Path, reading: dict[str, Any],
+               background: tuple[float, float, float]) -> tuple[Scene, dict[str, Any]]:
+    """The scene, and what config.json shall say of how it was read.
+
+    reading : any of SCENE_KEYS; the others take load_scene's defaults, without test views.
+    """
+    from clsplat.scene import load_scene
+
+    arguments = {key: reading[key] for key in SCENE_KEYS if reading.get(key) is not None}
+    arguments["eval"] = bool(arguments.get("eval") or "test_every" in arguments or "test_list" in arguments)
+    scene = load_scene(path, background=background, **arguments)
+    record: dict[str, Any] = {"path": str(path.resolve())} | {key: arguments.get(key) for key in SCENE_KEYS}
+    if record["test_list"] is not None:
+        record["test_list"] = str(Path(record["test_list"]).resolve())
+    record["test_names"] = sorted(scene.test_names)
+    return scene, record
+
+
+def run_training(scene: Scene, config: TrainConfig, model_path: Path, record: dict[str, Any],
+                 resume: bool = False, overwrite: bool = False, quiet: bool = False) -> Model:
+    """Train with a live display."""
+    from clsplat.train import train as train_model
+
+    with TrainingDisplay(quiet) as display:
+        return train_model(scene, config, display, output=model_path, resume=resume, overwrite=overwrite,
+                           extra=record)
+
+
+def test_metrics(model: Model, scene: Scene) -> Evaluation | None:
+    """Metrics of the finished model on the views held out; None where there are none."""
+    if not scene.test or model.iteration in model.evaluations:
+        return model.evaluations.get(model.iteration)
+    from clsplat.evaluate import evaluate
+    from clsplat.render import Renderer
+
+    return evaluate(Renderer(model.config.device), model.splats, scene.test, model.config.background)
+
+
+def say_stopped(ctx: click.Context, model: Model) -> NoReturn:
+    """After Ctrl-C: how to go on."""
+    click.echo(f"stopped at iteration {model.iteration}, checkpoint saved; to go on: "
+               f"clsplat train --resume -m {model.path}", err=True)
+    ctx.exit(INTERRUPTED)
+
+
+def report(model: Model, metrics: Evaluation | None) -> None:
+    """Say where the model is, what it took, and how good it is."""
+    assert model.path is not None
+    ply = ModelFolder(model.path).ply_path(model.iteration)
+    click.echo(f"{ply}: {len(model.splats)} splats, {ply.stat().st_size / 1e6:.2f} MB")
+    click.echo(f"trained {model.iteration} iterations in {duration(model.seconds)}, "
+               f"peak memory {model.peak_bytes / 1e6:.0f} MB")
+    if metrics is not None:
+        click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, "
+                   f"SSIM {metrics.ssim:.4f}")
+
+
+def _stored_run(folder: ModelFolder) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Options and scene of the run in the folder."""
+    if not folder.checkpoint_path.is_file():
+        raise InputError(f"{folder.path}: no checkpoint to resume from: start without --resume")
+    stored = folder.read_config()
+    try:
+        config = TrainConfig.from_json(stored["config"])
+        scene = dict(stored["scene"])
+        scene["path"] = str(scene["path"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{folder.config_path}: damaged ({error}): start again with --overwrite") from None
+    return {name: getattr(config, name) for name in stored["config"]}, scene
