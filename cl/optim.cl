@@ -103,14 +103,6 @@ kernel void regularise(
 
 // Philox4x32-10 (Salmon et al. 2011): counter-based, so noise depends on (seed, iteration, splat) alone. One counter
 // a lane; key the same for all.
-#if LANES == 1
-typedef uint vuint;
-#define lanes_uint_to_real(u) ((real)(u))
-#else
-typedef CAT(uint, LANES) vuint;
-#define lanes_uint_to_real(u) CAT(CAT(convert_, REAL_NAME), LANES)(CAT(convert_int, LANES)(u))
-#endif
-
 inline void philox(vuint *c, uint2 key) {
     for (int round = 0; round < 10; ++round) {
         const vuint hi0 = mul_hi((vuint)0xD2511F53u, c[0]), lo0 = (vuint)0xD2511F53u * c[0];

@@ -1,7 +1,7 @@
 // sort.cl: stable least-significant-digit radix sort of (key, value) pairs, and the exclusive scan it needs.
 //
 // SORT_GROUP work-items share a block of the input; each owns a contiguous run of it, so order within a digit is
-// kept. RADIX = 1 << RADIX_BITS. On a CPU SORT_GROUP is 1 and a digit 8 bits; on a GPU 256 and 4.
+// kept. RADIX = 1 << RADIX_BITS. On a CPU SORT_GROUP is 1 and a digit 11 bits; on a GPU 256 and 4.
 
 #define RADIX (1 << RADIX_BITS)
 #define SORT_ATTRIBUTE __attribute__((reqd_work_group_size(SORT_GROUP, 1, 1)))
