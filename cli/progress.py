@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 PLAIN_INTERVAL = 10.0  # seconds between lines where there is no terminal
-_BAR = 20  # characters
+_BAR = (4, 20)  # characters, least and most
 
 
 class TrainingDisplay:
@@ -50,7 +50,7 @@ class TrainingDisplay:
             self._write(f"{progress.message}\n")
         elif self.live:
             columns = shutil.get_terminal_size().columns - 1
-            self._write("\r" + progress_line(progress, bar=True)[:columns].ljust(columns))
+            self._write("\r" + progress_line(progress, columns)[:columns].ljust(columns))
             self._open = True
         elif self.clock() - self._shown >= PLAIN_INTERVAL or progress.iteration == progress.iterations:
             self._shown = self.clock()
@@ -61,13 +61,16 @@ class TrainingDisplay:
         self.stream.flush()
 
 
-def progress_line(progress: Progress, bar: bool = False) -> str:
-    """Iteration, loss, PSNR, splats, speed and time left."""
+def progress_line(progress: Progress, columns: int = 0) -> str:
+    """Iteration, loss, PSNR, splats, speed and time left; with a bar for the share where `columns` allow."""
     share = progress.iteration / progress.iterations
-    drawn = f" [{'#' * round(_BAR * share):-<{_BAR}}]" if bar else ""
-    return (f"{progress.iteration}/{progress.iterations}{drawn} {share:4.0%}  loss {progress.loss:.4f}  "
-            f"PSNR {progress.psnr:.2f}  {progress.n_splats} splats  {progress.per_second:.1f} it/s  "
+    count = f"{progress.iteration}/{progress.iterations}"
+    speed = f"{progress.per_second:.{0 if progress.per_second >= 10 else 1}f} it/s"
+    text = (f"  loss {progress.loss:.4f}  PSNR {progress.psnr:.2f}  {progress.n_splats} splats  {speed}  "
             f"{duration(progress.seconds_left)} left")
+    least, most = _BAR
+    bar = min(columns - len(count) - len(text) - 3, most)
+    return count + (f" [{'#' * round(bar * share):-<{bar}}]" if bar >= least else f" {share:4.0%}") + text
 
 
 def duration(seconds: float) -> str:

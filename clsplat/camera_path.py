@@ -15,6 +15,8 @@ Vector = NDArray[np.float64]
 
 # Least eigenvalue of the mean of I - d d' below which the optical axes d count as parallel (about 4 degrees).
 _PARALLEL = 5e-3
+# Variance of x axes about level, (6 degrees)^2, below which tilting up no further is worth it.
+_LEVELLING = 1e-2
 # Without cameras: 3DGS worlds come from cameras, whose y axis points down; 60 degrees across, 4:3.
 _UP = np.array([0.0, -1.0, 0.0])
 _SIZE = (800, 600)
@@ -26,7 +28,7 @@ _LIFT = 0.3  # of the distance
 def orbit(splats: Splats, cameras: Sequence[Camera] = (), frames: int = 60) -> list[Camera]:
     """A full turn around the middle of the scene, looking at it.
 
-    With cameras: their mean up, median distance and median height about the point nearest to all their
+    With cameras: their common up, median distance and median height about the point nearest to all their
     optical axes; the image of the first. Without: around the median splat, from where nearly all are seen.
 
     Parameters
@@ -44,7 +46,7 @@ def orbit(splats: Splats, cameras: Sequence[Camera] = (), frames: int = 60) -> l
     if cameras:
         pattern = cameras[0]
         centres = np.array([camera.position for camera in cameras])
-        up = _unit(-np.sum([camera.rotation[1] for camera in cameras], axis=0), _UP)
+        up = _upwards(cameras)
         middle = _looked_at(cameras, means)
         offsets = centres - middle
         heights = offsets @ up
@@ -75,6 +77,14 @@ def look_at(position: Vector, target: Vector, up: Vector) -> Vector:
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     pose[:3, 3] = -pose[:3, :3] @ position
     return pose
+
+
+def _upwards(cameras: Sequence[Camera]) -> Vector:
+    """The cameras' mean up, pulled square to their x axes: photographers keep horizons level, not cameras."""
+    mean = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    right = np.array([camera.rotation[0] for camera in cameras])
+    levelled: Vector = np.linalg.solve(right.T @ right / len(cameras) + _LEVELLING * np.eye(3), mean)
+    return _unit(levelled, _UP)
 
 
 def _looked_at(cameras: Sequence[Camera], means: Vector) -> Vector:

@@ -1,0 +1,330 @@
+"""Training: the same bits twice and across interruptions, fused steps against NumPy, the loss, the cap."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli_runner import small_capture
+from numpy.typing import NDArray
+from reference_loss import reference_loss, reference_loss_gradient
+from tolerances import ROUNDING, relative_error
+
+import clsplat
+from clsplat.buffers import ParameterBuffers, SplatBuffers, to_host
+from clsplat.config import TrainConfig
+from clsplat.densify import plan_relocation
+from clsplat.device import Device, open_device
+from clsplat.errors import InputError, OutputError, TrainingError
+from clsplat.evaluate import evaluate
+from clsplat.kernels import KernelBuild
+from clsplat.loss import ImageLoss, LossValue
+from clsplat.noise import add_noise
+from clsplat.optim import make_optimizer
+from clsplat.pipeline import Pipeline
+from clsplat.program import Real
+from clsplat.scene import Scene, load_scene
+from clsplat.schema import Group
+from clsplat.skew_map import SKEW_MAPS
+from clsplat.splats import Splats
+from clsplat.train import Progress, Trainer, train
+from clsplat.tuning import schedule_for
+
+# Every part of the strategy acts: growth from 2252 points to the cap, noise, all resolutions and SH degrees.
+CONFIG = TrainConfig(iterations=80, cap_max=2400, sh_degree=1, densify_interval=10, checkpoint_interval=30)
+CAMERA = clsplat.Camera(27, 19, 25.0, 26.0, 13.0, 9.0, np.eye(4))
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(small_capture(tmp_path_factory))
+
+
+@pytest.fixture(scope="session")
+def uninterrupted(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of CONFIG's model."""
+    folder = tmp_path_factory.mktemp("run")
+    train(scene, CONFIG, output=folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def default_device() -> Device:
+    return open_device()
+
+
+def ply(folder: Path) -> bytes:
+    return (folder / "point_cloud" / f"iteration_{CONFIG.iterations}" / "point_cloud.ply").read_bytes()
+
+
+def some_splats(n: int = 300, shape: str = "skew-normal", sh_degree: int = 2) -> Splats:
+    """Random splats before CAMERA; some nearly transparent, so that noise and relocation act."""
+    rng = np.random.default_rng(5)
+    arrays = {
+        "mean": rng.uniform((-1, -1, 2), (1, 1, 4), (n, 3)),
+        "quat": rng.standard_normal((n, 4)),
+        "log_scale": rng.uniform(-3.5, -1.5, (n, 3)),
+        "opacity_logit": rng.uniform(-7, 3, n),
+        "sh": 0.5 * rng.standard_normal((n, (sh_degree + 1) ** 2, 3)),
+    }
+    if shape == "skew-normal":
+        skew = rng.standard_normal((n, 3))
+        # Ten steps do not reach 0 from here, where the cube-root map is steep and rounding is no measure.
+        arrays["skew"] = skew / np.linalg.norm(skew, axis=1, keepdims=True) * rng.uniform(0.6, 1.25, (n, 1))
+    return Splats(shape, {name: array.astype(np.float32) for name, array in arrays.items()})
+
+
+# --- the same bits ---------------------------------------------------------------------------
+
+
+def test_one_seed_gives_one_model(scene: Scene, uninterrupted: Path, tmp_path: Path) -> None:
+    train(scene, CONFIG, output=tmp_path / "again")
+    assert ply(tmp_path / "again") == ply(uninterrupted)
+    train(scene, replace(CONFIG, seed=1), output=tmp_path / "other")
+    assert ply(tmp_path / "other") != ply(uninterrupted)
+
+
+def raise_at_50(progress: Progress) -> None:
+    if progress.iteration == 50:
+        raise KeyboardInterrupt
+
+
+def press_ctrl_c_at_50(progress: Progress) -> None:
+    if progress.iteration == 50:
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("optimizer", ["fused", "numpy"])
+def test_a_crashed_run_resumes_to_the_same_model(
+    scene: Scene, uninterrupted: Path, tmp_path: Path, optimizer: str
+) -> None:
+    """A crash at 50 leaves the checkpoint of 30; relocation and growth lie on both sides."""
+    config = replace(CONFIG, optimizer=optimizer)
+    whole = uninterrupted
+    if optimizer == "numpy":
+        whole = tmp_path / "whole"
+        train(scene, config, output=whole)
+    with pytest.raises(KeyboardInterrupt):
+        train(scene, config, raise_at_50, output=tmp_path / "m")
+    said: list[str] = []
+    resumed = train(
+        scene, config, lambda progress: said.append(progress.message), output=tmp_path / "m", resume=True
+    )
+    assert "iteration 30" in said[0]
+    assert resumed.finished
+    assert ply(tmp_path / "m") == ply(whole)
+    logged = [
+        json.loads(line)["iteration"] for line in (tmp_path / "m" / "log.jsonl").read_text().splitlines()
+    ]
+    assert logged == [50, 80]
+
+
+def test_ctrl_c_saves_and_resumes_to_the_same_model(
+    scene: Scene, uninterrupted: Path, tmp_path: Path
+) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    stopped = train(scene, CONFIG, press_ctrl_c_at_50, output=tmp_path / "m")
+    assert not stopped.finished
+    assert 50 <= stopped.iteration < CONFIG.iterations
+    assert signal.getsignal(signal.SIGINT) is before
+    assert train(scene, CONFIG, output=tmp_path / "m", resume=True).finished
+    assert ply(tmp_path / "m") == ply(uninterrupted)
+
+
+# --- what training does ----------------------------------------------------------------------
+
+
+def test_training_improves_the_training_views_and_never_exceeds_the_cap(
+    scene: Scene, uninterrupted: Path, default_device: Device
+) -> None:
+    log = [json.loads(line) for line in (uninterrupted / "log.jsonl").read_text().splitlines()]
+    assert len(scene.points.xyz) < log[-1]["splats"] <= CONFIG.cap_max
+    trainer = Trainer(scene, CONFIG, device=default_device)
+    before = trainer.evaluate(scene.train).psnr
+    trained = Splats.load(uninterrupted / "point_cloud" / "iteration_80" / "point_cloud.ply")
+    assert len(trained) == log[-1]["splats"]
+    assert evaluate(trainer.renderer, trained, scene.train).psnr > before + 2
+
+
+def test_a_cap_below_the_points_holds_from_the_start(scene: Scene) -> None:
+    counts: list[int] = []
+    said: list[str] = []
+
+    def watch(progress: Progress) -> None:
+        said.append(progress.message)
+        counts.append(progress.n_splats)
+
+    model = train(scene, replace(CONFIG, iterations=50, cap_max=100), watch)
+    assert len(model.splats) == 100
+    assert max(counts) == 100
+    assert f"of {len(scene.points.xyz)}" in said[0]
+    assert model.path is None
+
+
+def test_models_are_not_overwritten_and_resume_wants_the_same_config(
+    scene: Scene, uninterrupted: Path
+) -> None:
+    kept = ply(uninterrupted)
+    with pytest.raises(OutputError, match="--overwrite"):
+        train(scene, CONFIG, output=uninterrupted)
+    with pytest.raises(InputError, match="seed=3"):
+        train(scene, replace(CONFIG, seed=3), output=uninterrupted, resume=True)
+    assert ply(uninterrupted) == kept
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ImageLoss, "value", lambda self: LossValue(float("nan"), 0, 0, 0))
+    with pytest.raises(TrainingError, match=r"iteration 50: .* learning rates"):
+        train(scene, CONFIG, output=tmp_path / "m")
+    assert (tmp_path / "m" / "checkpoint.npz").is_file()
+
+
+# --- fused kernels against NumPy -------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shape", "skew_map"), [("gaussian", SKEW_MAPS[0]), *(("skew-normal", m) for m in SKEW_MAPS)]
+)
+def test_ten_fused_steps_equal_numpy(default_device: Device, shape: str, skew_map: str) -> None:
+    """The same gradients into both; growth and relocation between the steps."""
+    device, splats = default_device, some_splats(shape=shape)
+    config = TrainConfig(shape=shape, skew_map=skew_map)
+    kernels = KernelBuild(shape, 2, schedule_for(device), skew_map=skew_map)
+    capacity = 400
+    both = {}
+    for name in ("fused", "numpy"):
+        buffers = SplatBuffers.of(device, splats, kernels.dtype, capacity)
+        both[name] = (buffers, make_optimizer(device, kernels, buffers, replace(config, optimizer=name)))
+    rng = np.random.default_rng(8)
+    degrees = [0] * 3 + [1] * 3 + [2] * 4
+    for step, degree in enumerate(degrees):
+        n = both["numpy"][0].n
+        gradients = {
+            name: rng.standard_normal(array.shape).astype(np.float32)
+            for name, array in both["numpy"][0].download(n).items()
+        }
+        grads = ParameterBuffers(device, splats.schema, capacity, kernels.dtype)
+        grads.upload(gradients)
+        for _, optimizer in both.values():
+            optimizer.step(grads, 1e-3, degree)
+        if step == 5:
+            arrays = both["numpy"][0].download(n)
+            plan = plan_relocation(
+                arrays["opacity_logit"], arrays["log_scale"], rng, capacity, 1.2, skew=arrays.get("skew")
+            )
+            assert plan.relocated > 0
+            assert plan.added > 0
+            for _, optimizer in both.values():
+                optimizer.apply(plan)
+    fused, numpy = (buffers.download(buffers.n) for buffers, _ in both.values())
+    start = splats.to_numpy()
+    for name, expected in numpy.items():
+        assert np.abs(expected[: len(splats)] - start[name]).max() > 1e-3, name  # it moved
+        # Ten float32 steps: some ulp of the value, and of ten steps of at most the rate.
+        np.testing.assert_allclose(fused[name], expected, rtol=3e-6, atol=3e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])
+def test_noise_equals_numpy(scene: Scene, default_device: Device, tmp_path: Path, shape: str) -> None:
+    """One iteration whose rates are 0 (the mean's next to it) moves splats by the noise alone."""
+    splats = some_splats(shape=shape, sh_degree=1)
+    splats.save(tmp_path / "start.ply")
+    rate = 1e-9
+    config = replace(
+        CONFIG,
+        shape=shape,
+        init=str(tmp_path / "start.ply"),
+        seed=(7 << 32) + 3,
+        opacity_lr=0,
+        scaling_lr=0,
+        rotation_lr=0,
+        feature_lr=0,
+        skew_lr=0,
+        opacity_reg=0,
+        scale_reg=0,
+        position_lr_init=rate,
+        position_lr_final=rate,
+        noise_lr=5 / rate,
+        densify_interval=1000,
+    )
+    trainer = Trainer(scene, config, device=default_device)
+    trainer.step()
+    moved = trainer.snapshot()
+    amount = 5 * scene.extent
+    expected = add_noise(
+        splats.mean, splats.quat, splats.log_scale, splats.opacity_logit, config.seed, 1, amount
+    )
+    shift = np.abs(expected - splats.mean).max()
+    assert shift > 1e-2
+    np.testing.assert_allclose(
+        moved.mean, expected, rtol=0, atol=2e-5 * max(shift, 1) + 2 * rate * scene.extent
+    )
+    for name in ("quat", "log_scale", "opacity_logit"):
+        np.testing.assert_allclose(getattr(moved, name), getattr(splats, name), rtol=1e-6)
+
+
+def test_regularisers_pull_opacity_and_scale_down(scene: Scene, default_device: Device) -> None:
+    """Gradients of the mean opacity and the mean scale, added to those of the image."""
+    grads: list[dict[str, NDArray[Any]]] = []
+    for weight in (0.0, 10.0):
+        trainer = Trainer(
+            scene, replace(CONFIG, opacity_reg=weight, scale_reg=2 * weight), device=default_device
+        )
+        first = trainer.snapshot()
+        trainer.step()
+        grads.append(trainer.grads.download(len(first)))
+    opacity = 1 / (1 + np.exp(-first.opacity_logit.astype(float)))
+    added = grads[1]["opacity_logit"] - grads[0]["opacity_logit"]
+    np.testing.assert_allclose(added, 10 * opacity * (1 - opacity) / len(first), rtol=1e-3)
+    added = grads[1]["log_scale"] - grads[0]["log_scale"]
+    np.testing.assert_allclose(
+        added, 20 * np.exp(first.log_scale.astype(float)) / (3 * len(first)), rtol=1e-3, atol=1e-7
+    )
+
+
+# --- loss ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("real", "weight", "tolerance"),
+    [("double", 0.2, ROUNDING), ("double", 1.0, ROUNDING), ("float", 0.2, 1e-4)],
+)
+def test_loss_and_gradient_equal_the_reference(
+    default_device: Device, real: Real, weight: float, tolerance: float
+) -> None:
+    """An image that is no multiple of a tile; the truth is noise and blocks."""
+    if real == "double" and not default_device.has_fp64:
+        pytest.skip("no double precision")
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 256, (CAMERA.height, CAMERA.width, 3)).astype(np.uint8)
+    truth[:14, :12] = 128
+    kernels = KernelBuild("gaussian", 0, schedule_for(default_device), real=real)
+    pipeline = Pipeline(default_device, kernels)
+    buffers = SplatBuffers.of(default_device, some_splats(shape="gaussian", sh_degree=0), kernels.dtype)
+    loss = ImageLoss(pipeline, weight)
+    for _ in range(2):  # buffers are used again
+        layout = loss.set_truth(truth)
+        pipeline.forward(buffers, CAMERA, (0.1, 0.2, 0.3))
+        gradient = loss.gradient(layout)
+    color = pipeline.read_image("color", layout)
+    planes = np.empty((3, layout.rows, layout.stride), kernels.dtype)
+    got = layout.unpack(to_host(default_device, gradient, planes))
+    value = loss.value()
+    target = truth / 255
+    assert value.total == pytest.approx(reference_loss(color, target, weight), rel=max(tolerance, 1e-9))
+    assert value.psnr == pytest.approx(-10 * np.log10(np.mean((color - target) ** 2)), abs=1e-3)
+    assert relative_error(got, reference_loss_gradient(color, target, weight)) < tolerance
+
+
+def test_rows_of_the_schema_fit_both_buffers() -> None:
+    """The optimizer steps all of geom but the skew by table: the skew must come last."""
+    schema = some_splats().schema
+    assert schema.group(Group.GEOM)[-1].name == "skew"
