@@ -1,0 +1,76 @@
+"""Shared fixtures: every usable OpenCL device, every schedule, and renderers built once for the whole run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from clsplat.device import SCHEDULES, Device, Schedule, default_schedule, list_devices, open_device
+from clsplat.program import OPTIONS_VARIABLE
+from clsplat.render import Renderer
+
+MakeRenderer = Callable[..., Renderer]
+
+# A checker that claims to be a device is too slow for these tests and has one of its own (test_oclgrind.py).
+USABLE = [info for info in list_devices() if info.ailment is None and info.platform != "Oclgrind"]
+
+NAMES = [info.platform.split()[0] for info in USABLE]
+
+# All schedules on the first device; on others one of lanes and one of groups, as building them takes seconds.
+DEVICE_SCHEDULES = [
+    (place, name) for place in range(len(USABLE)) for name in SCHEDULES
+    if place == 0 or name in ("cpu16", "gpu256")
+]  # fmt: skip
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kernels_build_without_warnings() -> Iterator[None]:
+    """A warning of any compiler is an error in tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(OPTIONS_VARIABLE, "-Werror")
+        yield
+
+
+@pytest.fixture(scope="session")
+def devices() -> list[Device]:
+    """All usable devices, opened."""
+    return [open_device(info.index) for info in USABLE]
+
+
+@pytest.fixture(scope="session", params=range(len(USABLE)), ids=NAMES)
+def device(request: pytest.FixtureRequest, devices: list[Device]) -> Device:
+    """Each usable device in turn."""
+    return devices[request.param]
+
+
+@pytest.fixture(scope="session", params=DEVICE_SCHEDULES,
+                ids=[f"{NAMES[place]}-{name}" for place, name in DEVICE_SCHEDULES])
+def scheduled(request: pytest.FixtureRequest, devices: list[Device]) -> tuple[Device, Schedule]:
+    """Each device with each of the schedules that it is tested with."""
+    place, name = request.param
+    device, schedule = devices[place], SCHEDULES[name]
+    if schedule.group > device.info.max_group:
+        pytest.skip(f"{device.info} has groups of {device.info.max_group} at most")
+    return device, schedule
+
+
+@pytest.fixture(scope="session")
+def make_renderer() -> MakeRenderer:
+    """make_renderer(device, precision, schedule=None, **thresholds) -> Renderer; kept: builds take seconds.
+
+    No schedule means the device's default one, never one that is measured.
+    """
+    kept: dict[object, Renderer] = {}
+
+    def make(device: Device, precision: str = "float32", schedule: Schedule | None = None,
+             **thresholds: float) -> Renderer:
+        if precision == "float64" and not device.has_fp64:
+            pytest.skip(f"{device.info} has no double precision")
+        schedule = schedule or default_schedule(device.cl_device)
+        key = (device, precision, schedule, tuple(sorted(thresholds.items())))
+        if key not in kept:
+            kept[key] = Renderer(device, precision, schedule=schedule, **thresholds)
+        return kept[key]
+
+    return make

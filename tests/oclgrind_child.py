@@ -1,0 +1,141 @@
+"""Run under Oclgrind by test_oclgrind.py: `python oclgrind_child.py render|sort|faults uninitialized|races`.
+
+Oclgrind 21.10 follows what kernels write and what a whole-buffer write from the host brings, but loses track
+of host writes at an offset, of fills, and of buffers whose memory served another one before. So this process
+replaces the first two by kernels and frees no buffer. It also misreads the halves of a vector (`v.hi`), so
+lanes_sum adds lane by lane.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from reference_scenes import random_camera, random_splats
+
+from clsplat import buffers, pipeline, program, render, sort
+from clsplat.device import Device, Schedule, open_device
+from clsplat.shapes import SHAPES
+from clsplat.splats import Splats
+
+SCHEDULES = {
+    "races": ("1x16x16", "1x32x8", "1x256x1", "64x4x1", "256x1x1"),
+    "uninitialized": ("1x16x16", "1x256x1", "64x4x1"),
+}
+
+HELPERS = """
+kernel void put(global const uint *restrict from, global uint *restrict to, ulong at)
+{ to[at + get_global_id(0)] = from[get_global_id(0)]; }
+kernel void zero(global uint *restrict to) { to[get_global_id(0)] = 0; }
+"""
+
+PLAIN_SUM = """
+#undef lanes_sum
+#define lanes_sum lanes_sum_one_by_one
+inline real lanes_sum_one_by_one(vreal v) {
+    real part[LANES], sum = 0;
+    lanes_store(v, part);
+    for (int l = 0; l < LANES; ++l) sum += part[l];
+    return sum;
+}
+"""
+
+FAULTS = """
+kernel void beyond(global uint *restrict x) { x[16] = 1; }
+kernel void unwritten(global uint *restrict x) { if (x[3] == 7) x[4] = 1; }
+kernel void race(global uint *restrict x) {
+    local uint shared_value;
+    if (get_local_id(0) == 0) shared_value = x[15];
+    x[get_local_id(0) / 2] = shared_value;
+}
+"""
+
+
+def make_traceable(device: Device) -> None:
+    """Host writes that Oclgrind can follow; sums that it does not misread."""
+    kept: list[Any] = []
+    alloc, join = device.alloc, program.source
+
+    def keep(nbytes: int) -> Any:
+        kept.append(alloc(nbytes))
+        return kept[-1]
+
+    def source(*names: str) -> str:
+        parts = [join(name) + (PLAIN_SUM if name == "lanes.clh" else "") for name in names]
+        return "".join(parts)
+
+    device.alloc = keep  # type: ignore[method-assign]
+    program.source = source
+    helpers = program.build_text(device, HELPERS)
+
+    def fill_zero(device: Device, buffer: Any, nbytes: int) -> None:
+        helpers.zero((nbytes // 4,), None, to=buffer)
+
+    def to_device(device: Device, buffer: Any, array: Any, offset: int = 0) -> None:
+        words = np.ascontiguousarray(array).reshape(-1).view(np.uint32)
+        if words.size:
+            staged = device.alloc(words.nbytes)
+            cl.enqueue_copy(device.queue, staged, words)
+            helpers.put((words.size,), None, **{"from": staged, "to": buffer, "at": offset // 4})
+
+    for module in (buffers, pipeline, render):
+        for replaced in (fill_zero, to_device):
+            if hasattr(module, replaced.__name__):
+                setattr(module, replaced.__name__, replaced)
+
+
+def render_and_back(device: Device, mode: str) -> None:
+    """Both shapes on every kind of schedule: 5 splats, a 20 x 18 image in 4 tiles."""
+    camera = random_camera(1, 20, 18)
+    arrays = random_splats(3, 5, 1, np.float32)
+    rng = np.random.default_rng(0)
+    v_color, v_alpha = rng.normal(size=(18, 20, 3)), rng.normal(size=(18, 20))
+    for shape in SHAPES:
+        fields = {name: value for name, value in arrays.items() if name != "skew" or "skew" in shape}
+        splats = Splats(shape, fields)
+        for schedule in SCHEDULES[mode]:
+            renderer = render.Renderer(device, schedule=Schedule.parse(schedule))
+            image = renderer.render(splats, camera)
+            gradients = renderer.backward(v_color, v_alpha)
+            assert image.alpha.mean() > 0.05
+            assert all(np.abs(value).max() > 0 for value in gradients.values())
+
+
+def sort_and_scan(device: Device, mode: str) -> None:
+    """Both forms of the sorter, over a block boundary of each."""
+    rng = np.random.default_rng(0)
+    for kind, n in (("CPU", 1030), ("GPU", 300), ("GPU", 4100)):
+        device.info = replace(device.info, type=kind)
+        pool = buffers.Pool(device)
+        sorter = sort.Sorter(device, pool)
+        keys = rng.integers(0, 50, n, np.uint32)
+        buffers.to_device(device, pool.get("keys", 4 * n), keys)
+        sorter.iota(pool.get("values", 4 * n), n)
+        _, order = sorter.sort("keys", "values", n, 6)
+        got = buffers.to_host(device, order, np.empty(n, np.uint32))
+        assert np.array_equal(got, np.argsort(keys, kind="stable"))
+
+
+def faults(device: Device, mode: str) -> None:
+    """What must be found."""
+    built = program.build_text(device, FAULTS)
+    for kernel in (built.beyond, built.unwritten):
+        kernel((1,), None, x=device.alloc(64)).wait()
+    built.race((16,), (16,), x=device.alloc(64)).wait()
+
+
+def main() -> None:
+    what, mode = sys.argv[1:]
+    device = open_device("oclgrind")
+    if mode == "uninitialized":
+        make_traceable(device)
+    {"render": render_and_back, "sort": sort_and_scan, "faults": faults}[what](device, mode)
+    device.queue.finish()
+    print("finished")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""Every kernel builds without a warning, at every value of every option."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from importlib.resources import files
+
+import pytest
+from kernel_checks import KERNELS
+
+from clsplat.device import SCHEDULES, Device
+from clsplat.kernels import KernelBuild
+from clsplat.program import build
+from clsplat.shapes import SHAPES
+from clsplat.skew_map import SKEW_MAPS
+
+REALS = ("float", "double")
+
+
+def all_builds() -> Iterator[KernelBuild]:
+    """The product of all that changes a program."""
+    for (shape, normalisation), schedule, real in itertools.product(KERNELS, SCHEDULES.values(), REALS):
+        yield KernelBuild(shape, 3, schedule, normalisation, real).for_rendering()
+    for shape, degree, schedule in itertools.product(SHAPES, (0, 1, 2, 3), SCHEDULES.values()):
+        yield KernelBuild(shape, degree, schedule)  # as training builds it
+    for skew_map, schedule in itertools.product(SKEW_MAPS, SCHEDULES.values()):
+        yield KernelBuild("skew-normal", 3, schedule, skew_map=skew_map)
+
+
+def some_builds() -> Iterator[KernelBuild]:
+    """Shapes x schedules x precisions, and each other option at each of its values."""
+    cpu = SCHEDULES["cpu16"]
+    for shape, schedule, real in itertools.product(SHAPES, SCHEDULES.values(), REALS):
+        yield KernelBuild(shape, 3, schedule, real=real).for_rendering()
+    for shape, normalisation in KERNELS:
+        yield KernelBuild(shape, 3, cpu, normalisation).for_rendering()
+    for degree, skew_map in itertools.zip_longest((0, 1, 2, 3), SKEW_MAPS, fillvalue=SKEW_MAPS[0]):
+        yield KernelBuild("skew-normal", degree, cpu, skew_map=skew_map)
+
+
+@pytest.fixture(scope="module")
+def compiler(devices: list[Device]) -> Device:
+    """One device: PoCL, whose front end is the quickest, where it is there."""
+    if not devices:
+        pytest.skip("no OpenCL device")
+    return min(devices, key=lambda device: device.info.platform != "Portable Computing Language")
+
+
+def build_all(device: Device, kernels: KernelBuild) -> None:
+    if kernels.real == "double" and not device.has_fp64:
+        return
+    kernels.raster_program(device)
+    kernels.loss_program(device)
+    kernels.optim_program(device)
+
+
+def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
+    """And every file in cl/ is part of some program."""
+    for kernels in some_builds():
+        build_all(compiler, kernels)
+    build(compiler, ("smoke.cl",))
+    build(compiler, ("sort.cl",), {"SORT_GROUP": 1, "RADIX_BITS": 11})
+    root = files("clsplat_cl")
+    there = {f.name for f in root.iterdir()} | {
+        f"{folder}/{f.name}" for folder in ("camera", "shape") for f in root.joinpath(folder).iterdir()
+    }
+    used = {name for names, *_ in compiler.programs for name in names}
+    assert used == {name for name in there if name.endswith((".cl", ".clh"))}
+
+
+@pytest.mark.slow
+def test_every_kernel_builds_on_every_device(device: Device) -> None:
+    for kernels in all_builds():
+        build_all(device, kernels)
+
+
+@pytest.mark.parametrize("group", [1, 64, 256])
+def test_sort_builds(device: Device, group: int) -> None:
+    build(device, ("sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": 11 if group == 1 else 4})
