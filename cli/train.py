@@ -96,10 +96,9 @@ def read_scene(path: Path, reading: dict[str, Any],
     arguments = {key: reading[key] for key in SCENE_KEYS if reading.get(key) is not None}
     arguments["eval"] = bool(arguments.get("eval") or "test_every" in arguments or "test_list" in arguments)
     scene = load_scene(path, background=background, **arguments)
-    record: dict[str, Any] = {"path": str(path.resolve())} | {key: arguments.get(key) for key in SCENE_KEYS}
+    record = {key: arguments.get(key) for key in SCENE_KEYS}
     if record["test_list"] is not None:
         record["test_list"] = str(Path(record["test_list"]).resolve())
-    record["test_names"] = sorted(scene.test_names)
     return scene, record
 
 

@@ -110,7 +110,9 @@ class TrainConfig:
             raise InputError(f"lambda_dssim {self.lambda_dssim}: must be 0 to 1")
         if self.position_lr_init <= 0 or self.position_lr_final <= 0:
             raise InputError("position_lr_init and position_lr_final must be above 0")
-        if not 0 < self.init_opacity < 1 or self.init_scale <= 0:
+        if self.seed >= 2**64:
+            raise InputError(f"seed {self.seed}: must be below 2^64")
+        if not 0 < self.init_opacity < 1 or not self.init_scale > 0:
             raise InputError("init_opacity must lie between 0 and 1, init_scale above 0")
         if len(self.background) != 3 or not all(0 <= c <= 1 for c in self.background):
             raise InputError(f"background {self.background}: expected R,G,B, each 0 to 1")

@@ -98,7 +98,7 @@ def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[P
     resume : go on from the folder's checkpoint; the config must be the same but for `iterations`-independent
         options such as `device`.
     overwrite : allow replacing a model in `output`.
-    extra : more keys for config.json (how the scene was read).
+    extra : more keys for config.json's "scene" (how it was read), beside its path and test views.
 
     Raises
     ------
@@ -119,7 +119,8 @@ def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[P
     if folder is not None:
         if checkpoint is None:
             folder.clear()
-        folder.write_config({"config": config.to_json(), "scene": extra or {"path": str(scene.path)}})
+        record = {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names)}
+        folder.write_config({"config": config.to_json(), "scene": record | (extra or {})})
         views = [*scene.test, *scene.train]
         folder.write_cameras([NamedCamera(view.name, view.camera) for view in views])
     return trainer.run(folder)

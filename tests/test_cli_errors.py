@@ -116,6 +116,8 @@ def test_bad_splits(scene: Path, tmp_path: Path) -> None:
         (["--cap-max", "0"], "cap_max", 1),
         (["--sh-degree", "4"], "sh_degree", 1),
         (["--lambda-dssim", "2"], "lambda_dssim", 1),
+        (["--seed", "99999999999999999999"], "seed", 1),
+        (["--init-scale", "nan"], "init_scale", 1),
         (["--init", "nothing"], "sfm, random", 1),
         (["--init", "none.ply"], "none.ply", 1),
         (["--device", "abacus"], "abacus", 1),

@@ -175,6 +175,22 @@ def test_eval_of_several_models_protocols_and_iterations(model: Path, tmp_path: 
     assert [results[f"ours_{n}"]["protocol"]["name"] for n in (20, ITERATIONS)] == ["3dgs", "clsplat"]
 
 
+def test_eval_of_a_model_trained_from_python(scene: Path, tmp_path: Path) -> None:
+    """Its folder tells the scene and the split without the command line's help."""
+    import clsplat as package
+
+    names = tmp_path / "names.txt"
+    names.write_text("view_002.png")
+    package.train(
+        package.load_scene(scene, test_list=names),
+        package.TrainConfig(iterations=2, cap_max=50, sh_degree=0),
+        output=tmp_path / "m",
+    )
+    clsplat("eval", tmp_path / "m")
+    per_view = json.loads((tmp_path / "m" / "per_view.json").read_text())
+    assert list(per_view["ours_2"]["PSNR"]) == ["view_002.png"]
+
+
 def test_eval_of_a_moved_scene(model: Path, scene: Path, tmp_path: Path) -> None:
     moved, copy = tmp_path / "moved", tmp_path / "m"
     shutil.copytree(scene, moved)
