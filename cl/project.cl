@@ -130,6 +130,7 @@ kernel void project_splats(
 
 // moments [rows SHAPE_V + 3, capacity]: summed over pixels; the last three are the gradient of the colour.
 // grad_geom, grad_sh: as geom, sh; overwritten (zero for unseen splats), sh only for the bands in use.
+// pull [capacity]: the norm of the gradient of mean_px is added (3DGS's densification signal).
 kernel void project_splats_vjp(
     global const real *restrict geom,
     global const real *restrict sh,
@@ -139,6 +140,7 @@ kernel void project_splats_vjp(
     global const uint *restrict depth_key,
     global real *restrict grad_geom,
     global real *restrict grad_sh,
+    global real *restrict pull,
     ulong capacity,
     uint n_splats,
     int sh_degree)
@@ -162,6 +164,9 @@ kernel void project_splats_vjp(
 
     shape_grads g;
     shape_project_vjp(s.opacity, s.m, s.b0, s.b1, s.cov2d, v, &g);
+
+    const vreal pulled = sqrt(g.mean_x * g.mean_x + g.mean_y * g.mean_y);
+    lanes_store(lanes_load(pull + first) + lanes_if(seen, pulled, zero), pull + first);
 
     // cov2d = B B' + low-pass
     const vec3 v_b0 = add3(g.b0, add3(scale3(s.b0, (real)2 * g.cov2d.xx), scale3(s.b1, g.cov2d.xy)));

@@ -30,7 +30,7 @@ class Checkpoint:
     optimizer : its state by key.
     rng : state of the NumPy generator, as JSON.
     queue : training views still to come in this epoch.
-    seconds : training time so far.
+    seconds : training time so far. schedule : of the kernels, whose rounding depends on it.
     """
 
     iteration: int
@@ -40,11 +40,12 @@ class Checkpoint:
     rng: dict[str, Any]
     queue: list[int]
     seconds: float
+    schedule: str
 
     def save(self, path: Path) -> None:
         """Write; raises OutputError when the disk is full or the folder read-only (the old file then stays)."""
         meta = {"version": VERSION, "iteration": self.iteration, "config": self.config, "rng": self.rng,
-                "queue": self.queue, "seconds": self.seconds}
+                "queue": self.queue, "seconds": self.seconds, "schedule": self.schedule}
         arrays = {f"splats.{k}": v for k, v in self.splats.items()}
         arrays |= {f"optimizer.{k}": v for k, v in self.optimizer.items()}
         arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
@@ -69,4 +70,4 @@ class Checkpoint:
             return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
         return cls(meta["iteration"], meta["config"], part("splats."), part("optimizer."), meta["rng"],
-                   meta["queue"], meta["seconds"])
+                   meta["queue"], meta["seconds"], meta["schedule"])

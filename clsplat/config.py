@@ -13,6 +13,7 @@ from .skew_map import DEFAULT_SKEW_MAP, SKEW_MAPS
 
 STRATEGIES = ("mcmc",)
 OPTIMIZERS = ("fused", "numpy")
+SAMPLINGS = ("opacity", "pull")
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class TrainConfig:
     iterations : optimizer steps, one image each.
     cap_max : hard limit on splats.
     strategy : "mcmc" (relocate dead splats, grow to the cap, noise on positions).
+    sampling : what new and relocated splats are drawn by: "opacity" (3DGS-MCMC), or "pull", opacity times the
+        gradient of the screen position (3DGS's criterion), which sends them where the image is still wrong.
     init : "sfm", "random" or a .ply path.
     sh_degree : highest degree of spherical harmonics, 0 to 3.
     sh_interval : iterations from one SH degree to the next; 0: a tenth of the run, at most 1000.
@@ -63,6 +66,7 @@ class TrainConfig:
     iterations: int = 7000
     cap_max: int = 100_000
     strategy: str = "mcmc"
+    sampling: str = "opacity"
     init: str = "sfm"
     sh_degree: int = 3
     sh_interval: int = 0
@@ -97,6 +101,7 @@ class TrainConfig:
         check_normalisation(self.normalisation)
         _one_of("skew_map", self.skew_map, SKEW_MAPS)
         _one_of("strategy", self.strategy, STRATEGIES)
+        _one_of("sampling", self.sampling, SAMPLINGS)
         _one_of("optimizer", self.optimizer, OPTIMIZERS)
         for name in ("iterations", "cap_max", "densify_interval"):
             _at_least(name, getattr(self, name), 1)

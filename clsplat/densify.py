@@ -79,6 +79,7 @@ def plan_relocation(
     skew: Array | None = None,
     finite: NDArray[np.bool_] | None = None,
     rule: str = "length",
+    pull: Array | None = None,
 ) -> Plan:
     """Move dead splats onto live ones and grow towards the cap.
 
@@ -94,6 +95,8 @@ def plan_relocation(
     min_opacity : splats at or below are dead.
     finite : (N,), False where some other parameter is not finite; such splats are relocated, as are those
         whose opacity, scale or skew is not finite.
+    pull : (N,) at least 0, how much each splat is wanted elsewhere; copies are then drawn in proportion to
+        opacity * pull.
     rule : "length" (opacity and scale, above) or "opacity-only" (scale kept; Deformable Beta Splatting).
 
     Raises
@@ -120,7 +123,10 @@ def plan_relocation(
     if len(live) == 0:  # nothing to copy from
         dead, n_new = live, n
 
-    drawn = live[_draw(opacity[live], len(dead) + n_new - n, rng)]
+    weights = opacity[live]
+    if pull is not None and np.isfinite(pull[live]).all() and pull[live].any():
+        weights = weights * pull[live].astype(np.float64)
+    drawn = live[_draw(weights, len(dead) + n_new - n, rng)]
     source = np.arange(n_new, dtype=np.int64)
     source[dead] = drawn[: len(dead)]
     source[n:] = drawn[len(dead) :]

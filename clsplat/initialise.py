@@ -77,9 +77,8 @@ def _points(
     if init == "sfm" and found >= FEWEST_POINTS:
         if found <= cap:
             return points.xyz, points.rgb, f"{found} splats from the scene's points"
-        # A stable sort: equal tracks in the order of their indices.
-        keep = np.sort(np.argsort(-points.track_length.astype(np.int64), kind="stable")[:cap])
-        message = f"{cap} splats from the scene's points: the longest tracks of {found}"
+        keep = best_observed(points.xyz, points.track_length, cap, scene)
+        message = f"{cap} splats from the scene's points: the best observed of {found}"
         return points.xyz[keep], points.rgb[keep], message
     count = min(cap, RANDOM_POINTS)
     centres = np.array([view.camera.position for view in scene.train])
@@ -89,6 +88,32 @@ def _points(
     rgb = rng.integers(0, 256, (count, 3), dtype=np.uint8)
     why = "" if init == "random" else f" (the scene has {found} points)"
     return xyz, rgb, f"{count} splats at random around the cameras{why}"
+
+
+def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene: Scene) -> NDArray[np.int64]:
+    """Indices of `cap` points with long tracks that still cover the scene, rising.
+
+    Half of them are the best observed of each cell of a grid, the rest the longest tracks left: by tracks alone
+    a textured mat would take everything and leave the background empty. Space is contracted around the
+    cameras (Barron et al. 2022, Mip-NeRF 360, eq. 10), so that far points share larger cells.
+    """
+    centres = np.array([view.camera.position for view in scene.train])
+    from_centre = (xyz - centres.mean(axis=0)) / scene.extent
+    norm = np.maximum(np.linalg.norm(from_centre, axis=1, keepdims=True), 1e-12)
+    contracted = np.where(norm > 1, from_centre / norm * (2 - 1 / norm), from_centre)
+    # A stable sort: equal tracks in the order of their indices.
+    order = np.argsort(-track_length.astype(np.int64), kind="stable")
+    low, high = 1.0, 4096.0  # cells per unit of length
+    first = order[:0]
+    for _ in range(24):
+        cells = 0.5 * (low + high)
+        _, position = np.unique(np.floor(contracted[order] * cells).astype(np.int64), axis=0, return_index=True)
+        if len(position) > max(cap // 2, 1):
+            high = cells
+        else:
+            low, first = cells, order[np.sort(position)]
+    rest = order[~np.isin(order, first)]
+    return np.sort(np.concatenate([first, rest])[:cap])
 
 
 def _from_model(path: str, shape: str, cap: int, sh_degree: int, normalisation: str) -> tuple[Splats, str]:

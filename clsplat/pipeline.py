@@ -101,6 +101,9 @@ class Pipeline:
         self._real = kernels.dtype.itemsize
         self._layouts: dict[str, tuple[ImageLayout, Any]] = {}
         self._lists: Any = None
+        self._forward_event: Any = None
+        self._pull_capacity = 0
+        self._backward_event: Any = None
         # PoCL stacks up the private arrays of all work-items of a group: groups of one where lanes do the work.
         self._group = 1 if device.info.type == "CPU" else GROUP_ITEMS
 
@@ -130,7 +133,7 @@ class Pipeline:
         self._lists = lists
         group = self.kernels.schedule.group
         r, g, b = background
-        self.program.rasterize(
+        self._forward_event = self.program.rasterize(
             (n_tiles * group,), (group,), tile_ranges=ranges, lists=lists,
             isect_splat=pool.get("isect_splat", 4 * n_isects), records=records,
             color=self.image("color", layout, 3), transmittance=self.image("transmittance", layout),
@@ -151,7 +154,7 @@ class Pipeline:
         isect_grads = pool.get("isect_grads", frame.n_isects * width)
         moments = pool.get("moments", splats.capacity * width)
         group = self.kernels.schedule.group
-        self.program.rasterize_vjp(
+        self._backward_event = self.program.rasterize_vjp(
             (layout.tiles_x * layout.tiles_y * group,), (group,), tile_ranges=pool.get("tile_ranges", 0),
             lists=self._lists, isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0),
             color=pool.get("color", 0), transmittance=pool.get("transmittance", 0), v_color=v_color,
@@ -165,7 +168,7 @@ class Pipeline:
         self.program.project_splats_vjp.over(
             -(-splats.n // self.kernels.lanes), self._group, geom=splats.geom, sh=splats.sh, cam=pool.get("camera", 0),
             moments=moments, records=pool.get("records", 0), depth_key=pool.get("depth_key_kept", 0),
-            grad_geom=grads.geom, grad_sh=grads.sh, capacity=splats.capacity, n_splats=splats.n,
+            grad_geom=grads.geom, grad_sh=grads.sh, pull=self.pull(splats.capacity), capacity=splats.capacity, n_splats=splats.n,
             sh_degree=frame.sh_degree,
         )
 
@@ -174,6 +177,28 @@ class Pipeline:
         planes = 3 if name == "color" else 1
         host = np.empty((planes, layout.rows, layout.stride), self.kernels.dtype)
         return layout.unpack(to_host(self.device, self.pool.get(name, 0), host))
+
+    def pull(self, capacity: int) -> Any:
+        """Buffer [capacity]: each splat's |gradient of mean_px|, summed over the backwards since `reset_pull`."""
+        known = self._pull_capacity
+        buffer = self.pool.get("pull", capacity * self._real)
+        if known != capacity:
+            self._pull_capacity = capacity
+            self.reset_pull()
+        return buffer
+
+    def read_pull(self, n: int) -> NDArray[Any]:
+        """`pull` of the first n splats."""
+        return to_host(self.device, self.pool.get("pull", 0), np.empty(n, self.kernels.dtype))
+
+    def reset_pull(self) -> None:
+        """Start summing anew."""
+        fill_zero(self.device, self.pool.get("pull", 0), self._pull_capacity * self._real)
+
+    def raster_events(self) -> tuple[Any, Any]:
+        """Finished events of the last rasterize and rasterize_vjp, for timing."""
+        self.device.queue.finish()
+        return self._forward_event, self._backward_event
 
     def image(self, name: str, layout: ImageLayout, planes: int = 1) -> Any:
         """Buffer for an image, zeroed whenever its layout changes: its margin must stay zero."""

@@ -22,7 +22,7 @@ from .cameras_json import NamedCamera
 from .checkpoint import Checkpoint
 from .config import TrainConfig
 from .densify import plan_relocation
-from .device import Device, open_device
+from .device import Device, Schedule, open_device
 from .errors import InputError, OutputError, TrainingError
 from .evaluate import Evaluation, evaluate
 from .images import ImageU8, resize_area
@@ -135,7 +135,9 @@ class Trainer:
             raise InputError(f"{scene.path}: no training views: all are test views")
         self.scene, self.config, self.progress = scene, config, progress
         self.device = device or open_device(config.device)
-        self.kernels = KernelBuild(config.shape, config.sh_degree, schedule_for(self.device), config.normalisation,
+        # A resumed run keeps its schedule: another one would round otherwise.
+        schedule = Schedule.parse(checkpoint.schedule) if checkpoint else schedule_for(self.device)
+        self.kernels = KernelBuild(config.shape, config.sh_degree, schedule, config.normalisation,
                                    skew_map=config.skew_map)
         largest = max((view.camera for view in scene.train), key=lambda c: c.width * c.height)
         self.memory = estimate(config, self.kernels, ImageLayout(largest.width, largest.height))
@@ -234,10 +236,12 @@ class Trainer:
         finite = np.ones(self.splats.n, bool)
         for array in arrays.values():
             finite &= np.isfinite(array.reshape(len(array), -1)).all(axis=1)
+        pull = self.pipeline.read_pull(self.splats.n) if self.config.sampling == "pull" else None
         rule = "length" if self.config.normalisation == "peak" or "skew" not in arrays else "opacity-only"
         self.optimizer.apply(plan_relocation(arrays["opacity_logit"], arrays["log_scale"], self.rng,
                                              self.config.cap_max, self.growth, skew=arrays.get("skew"),
-                                             finite=finite, rule=rule))
+                                             finite=finite, rule=rule, pull=pull))
+        self.pipeline.reset_pull()
 
     def snapshot(self) -> Splats:
         """The splats as they are now, on the host."""
@@ -250,7 +254,7 @@ class Trainer:
         """Everything that the rest of the run depends on."""
         return Checkpoint(self.iteration, self.config.to_json(), self.splats.download(self.splats.n),
                           self.optimizer.state(), self.rng.bit_generator.state, self.queue,  # type: ignore[arg-type]
-                          self.seconds)
+                          self.seconds, str(self.kernels.schedule))
 
     def evaluate(self, views: list[View]) -> Evaluation:
         """Metrics of the present splats."""
