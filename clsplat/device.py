@@ -37,8 +37,10 @@ class Schedule:
     def __post_init__(self) -> None:
         if min(self.group, self.vecs, self.lanes) < 1 or self.group * self.vecs * self.lanes != TILE_PIXELS:
             raise DeviceError(f"schedule {self}: GROUPxVECSxLANES must multiply to {TILE_PIXELS}")
-        if self.lanes not in (1, 2, 4, 8, 16):
-            raise DeviceError(f"schedule {self}: LANES must be 1, 2, 4, 8 or 16, OpenCL's vector widths")
+        if self.lanes not in (1, 8, 16):
+            raise DeviceError(f"schedule {self}: LANES must be 1, 8 or 16 (cl/lanes.clh)")
+        if self.group > 1 and self.group % 32:  # sums go by parts of 16; PoCL 3.1 gets groups of 16 wrong
+            raise DeviceError(f"schedule {self}: GROUP must be 1 or a multiple of 32 (cl/group.clh)")
 
     def __str__(self) -> str:
         return f"{self.group}x{self.vecs}x{self.lanes}"
