@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .camera import Camera
+    from .config import TrainConfig
     from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
     from .render import Rendered, Renderer
-    from .config import TrainConfig
     from .scene import Scene, load_scene
     from .splats import Splats
     from .train import Model, train
@@ -29,8 +29,8 @@ _HOME = {
 }
 
 __all__ = [
-    "Camera", "ClsplatError", "DeviceError", "InputError", "OutputError", "Rendered", "Renderer", "Scene", "Splats",
-    "TrainConfig", "TrainingError", "load_scene", "train", "Model",
+    "Camera", "ClsplatError", "DeviceError", "InputError", "Model", "OutputError", "Rendered", "Renderer",
+    "Scene", "Splats", "TrainConfig", "TrainingError", "load_scene", "train",
 ]
 
 

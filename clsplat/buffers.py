@@ -16,7 +16,7 @@ CAPACITY_STEP = 1024  # columns are padded: whole groups of 64 items of 16 lanes
 
 
 class Pool:
-    """Buffers by name. A request larger than the buffer replaces it, half as large again; contents are then lost."""
+    """Buffers by name. A larger request replaces the buffer, half as large again; contents are then lost."""
 
     def __init__(self, device: Device) -> None:
         self.device = device
@@ -28,7 +28,8 @@ class Pool:
         if self._bytes.get(name, -1) < nbytes:
             first = name not in self._bytes
             self._buffers.pop(name, None)
-            size = int(nbytes) if first else min(int(1.5 * nbytes), max(self.device.info.max_alloc_bytes, int(nbytes)))
+            most = max(self.device.info.max_alloc_bytes, int(nbytes))
+            size = int(nbytes) if first else min(int(1.5 * nbytes), most)
             self._bytes[name] = 0
             self._buffers[name] = self.device.alloc(size)
             self._bytes[name] = size
@@ -98,7 +99,7 @@ class ParameterBuffers:
         return self.buffers[Group.SH]
 
     def upload(self, arrays: Mapping[str, Array]) -> None:
-        """Public arrays (see schema.public_shape) of n <= capacity splats, fields by name, into the first n columns."""
+        """Public arrays (schema.public_shape) of n <= capacity splats, by field, into the first n columns."""
         for name in arrays:
             field = self.schema[name]
             array = np.asarray(arrays[name], self.dtype)
@@ -129,7 +130,8 @@ class SplatBuffers(ParameterBuffers):
         self.n = 0
 
     @classmethod
-    def of(cls, device: Device, splats: Splats, dtype: np.dtype[np.floating], capacity: int = 0) -> SplatBuffers:
+    def of(cls, device: Device, splats: Splats, dtype: np.dtype[np.floating],
+           capacity: int = 0) -> SplatBuffers:
         """Upload of host splats, with room for `capacity`."""
         self = cls(device, splats.schema, max(capacity, len(splats)), dtype)
         self.set(splats.to_numpy())

@@ -40,7 +40,8 @@ class Camera:
             raise InputError(f"camera: width x height is {width}x{height}; both must be at least 1")
         intrinsics = np.array([fx, fy, cx, cy], dtype=np.float64)
         if not np.all(np.isfinite(intrinsics)) or fx <= 0 or fy <= 0:
-            raise InputError(f"camera: fx={fx} fy={fy} cx={cx} cy={cy}; focal lengths must be above 0, all finite")
+            raise InputError(f"camera: fx={fx} fy={fy} cx={cx} cy={cy}; "
+                             "focal lengths must be above 0, all finite")
         pose = np.array(cam_from_world, dtype=np.float64)
         if pose.shape == (3, 4):
             pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
@@ -75,7 +76,8 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image of another size (whole field of view kept)."""
         sx, sy = width / self.width, height / self.height
-        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.cam_from_world)
+        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy,
+                      self.cam_from_world)
 
     def posed(self, cam_from_world: ArrayLike) -> Camera:
         """The same intrinsics at another pose."""

@@ -43,7 +43,7 @@ class Checkpoint:
     schedule: str
 
     def save(self, path: Path) -> None:
-        """Write; raises OutputError when the disk is full or the folder read-only (the old file then stays)."""
+        """Write; raises OutputError when the disk is full or the folder read-only (the old file stays)."""
         meta = {"version": VERSION, "iteration": self.iteration, "config": self.config, "rng": self.rng,
                 "queue": self.queue, "seconds": self.seconds, "schedule": self.schedule}
         arrays = {f"splats.{k}": v for k, v in self.splats.items()}
@@ -62,9 +62,11 @@ class Checkpoint:
         except FileNotFoundError:
             raise InputError(f"{path}: no checkpoint to resume from: start without --resume") from None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: not a readable checkpoint ({error}): start again with --overwrite") from None
+            raise InputError(f"{path}: not a readable checkpoint ({error}): "
+                             "start again with --overwrite") from None
         if meta.get("version") != VERSION:
-            raise InputError(f"{path}: checkpoint version {meta.get('version')}, this clsplat reads {VERSION}")
+            found = meta.get("version")
+            raise InputError(f"{path}: checkpoint version {found}, this clsplat reads {VERSION}")
 
         def part(prefix: str) -> dict[str, Any]:
             return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}

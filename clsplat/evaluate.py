@@ -20,7 +20,7 @@ MAX_PSNR = 100.0  # stands in for the infinity of two equal images, which JSON c
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Metrics of a set of views: means, and per view by name; `render_ms` is the median wall time of a render."""
+    """Metrics of views: means, and per view by name; `render_ms` is the median wall time of a render."""
 
     psnr: float
     ssim: float
@@ -28,8 +28,8 @@ class Evaluation:
     per_view: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
-def evaluate(renderer: Renderer, splats: Splats, views: Sequence[View], background: Sequence[float] = (0, 0, 0),
-             protocol: Protocol = DEFAULT_PROTOCOL,
+def evaluate(renderer: Renderer, splats: Splats, views: Sequence[View],
+             background: Sequence[float] = (0, 0, 0), protocol: Protocol = DEFAULT_PROTOCOL,
              on_view: Callable[[View, Rendered], None] | None = None) -> Evaluation:
     """Render every view and compare it with its photograph.
 

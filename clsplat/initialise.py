@@ -93,8 +93,8 @@ def _points(
 def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene: Scene) -> NDArray[np.int64]:
     """Indices of `cap` points with long tracks that still cover the scene, rising.
 
-    Half of them are the best observed of each cell of a grid, the rest the longest tracks left: by tracks alone
-    a textured mat would take everything and leave the background empty. Space is contracted around the
+    Half of them are the best observed of each cell of a grid, the rest the longest tracks left: by tracks
+    alone a textured mat would take everything and leave the background empty. Space is contracted around the
     cameras (Barron et al. 2022, Mip-NeRF 360, eq. 10), so that far points share larger cells.
     """
     centres = np.array([view.camera.position for view in scene.train])
@@ -107,7 +107,8 @@ def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene
     first = order[:0]
     for _ in range(24):
         cells = 0.5 * (low + high)
-        _, position = np.unique(np.floor(contracted[order] * cells).astype(np.int64), axis=0, return_index=True)
+        cell = np.floor(contracted[order] * cells).astype(np.int64)
+        _, position = np.unique(cell, axis=0, return_index=True)
         if len(position) > max(cap // 2, 1):
             high = cells
         else:

@@ -30,7 +30,8 @@ _LOWER = ("lanes.clh", "group.clh", "algebra.clh", "harmonics.clh", "camera/pinh
 class KernelBuild:
     """One combination of shape, precision, schedule and thresholds.
 
-    `with_depth` adds the depth image, `with_v_alpha` a gradient coming in through alpha; training needs neither.
+    `with_depth` adds the depth image, `with_v_alpha` a gradient coming in through alpha; training needs
+    neither.
     """
 
     shape: str
@@ -100,7 +101,8 @@ class KernelBuild:
         return rows | {
             "TILE": TILE, "BATCH": BATCH, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y,
             "GROUP": self.schedule.group, "VECS": self.schedule.vecs, "LANES": self.lanes,
-            "SH_DEGREE": self.sh_degree, "WITH_DEPTH": int(self.with_depth), "WITH_V_ALPHA": int(self.with_v_alpha),
+            "SH_DEGREE": self.sh_degree,
+            "WITH_DEPTH": int(self.with_depth), "WITH_V_ALPHA": int(self.with_v_alpha),
             "NORMALISATION": NORMALISATIONS.index(self.normalisation),
             "PEAK_STEPS": 3 if self.real == "float" else 4,
             "SKEW_MAX": SKEW_MAX, "LOW_PASS": LOW_PASS,

@@ -51,8 +51,8 @@ class ImageLoss:
         buffer = self.pipeline.pool.get("truth_bytes", image.nbytes)
         to_device(self.device, buffer, image)
         self.program.unpack_image((width, height), self._row(width), bytes=buffer,
-                                  image=self.pipeline.image("truth", layout, 3), width=width, stride=layout.stride,
-                                  plane=layout.plane)
+                                  image=self.pipeline.image("truth", layout, 3), width=width,
+                                  stride=layout.stride, plane=layout.plane)
         return layout
 
     def gradient(self, layout: ImageLayout) -> Any:

@@ -53,7 +53,8 @@ def check(needed: Estimate, device: Device) -> None:
     info = device.info
     mend = "lower --cap-max, use smaller images (-r 2, 4, 8), a lower --sh-degree, or another --device"
     if needed.total > info.global_mem_bytes:
-        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, the run needs about {needed}: {mend}")
+        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, "
+                          f"the run needs about {needed}: {mend}")
     if needed.largest_buffer > info.max_alloc_bytes:
-        raise DeviceError(f"{info} allows {info.max_alloc_bytes / 1e6:.0f} MB in one buffer, the run needs about "
-                          f"{needed.largest_buffer / 1e6:.0f} MB: {mend}")
+        raise DeviceError(f"{info} allows {info.max_alloc_bytes / 1e6:.0f} MB in one buffer, "
+                          f"the run needs about {needed.largest_buffer / 1e6:.0f} MB: {mend}")

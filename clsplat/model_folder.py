@@ -1,4 +1,4 @@
-"""The folder of a trained model: config.json, cameras.json, log.jsonl, checkpoint.npz and point clouds (3DGS's layout)."""
+"""A trained model's folder: config, cameras, log, checkpoint and point clouds, in 3DGS's layout."""
 
 from __future__ import annotations
 
@@ -59,7 +59,8 @@ class ModelFolder:
         """Point cloud of `iteration`, or the last; raises InputError when there is none."""
         found = self.iterations()
         if not found:
-            raise InputError(f"{self.path}: no point_cloud/iteration_N/point_cloud.ply in it: train a model first")
+            raise InputError(f"{self.path}: no point_cloud/iteration_N/point_cloud.ply in it: "
+                             "train a model first")
         if iteration is not None and iteration not in found:
             raise InputError(f"{self.path}: no iteration {iteration}: it has {', '.join(map(str, found))}")
         chosen = found[-1] if iteration is None else iteration
@@ -73,8 +74,8 @@ class ModelFolder:
             probe.write_bytes(b"")
             probe.unlink()
         except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written ({error.strerror or error}): choose another folder"
-                              ) from None
+            reason = error.strerror or error
+            raise OutputError(f"{self.path}: cannot be written ({reason}): choose another folder") from None
 
     def clear(self) -> None:
         """Remove what a former run wrote, and nothing else."""

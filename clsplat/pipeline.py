@@ -57,7 +57,8 @@ class ImageLayout:
         """(H, W, C) or (H, W) to planes with a zero margin, (C, rows, stride)."""
         image = image.reshape(self.height, self.width, -1)
         planes = np.zeros((image.shape[2], self.rows, self.stride), dtype)
-        planes[:, MARGIN_Y : MARGIN_Y + self.height, MARGIN_X : MARGIN_X + self.width] = np.moveaxis(image, 2, 0)
+        rows, columns = slice(MARGIN_Y, MARGIN_Y + self.height), slice(MARGIN_X, MARGIN_X + self.width)
+        planes[:, rows, columns] = np.moveaxis(image, 2, 0)
         return planes
 
     def unpack(self, planes: NDArray[Any]) -> NDArray[Any]:
@@ -90,7 +91,8 @@ def camera_block(camera: Camera) -> NDArray[np.float64]:
 class Pipeline:
     """Forward and backward for one kernel build on one device.
 
-    Images are buffers of the pool in the layout of `ImageLayout`: "color" (3 planes), "transmittance", "depth".
+    Images are buffers of the pool in the layout of `ImageLayout`: "color" (3 planes), "transmittance",
+    "depth".
     """
 
     def __init__(self, device: Device, kernels: KernelBuild) -> None:
@@ -104,11 +106,12 @@ class Pipeline:
         self._forward_event: Any = None
         self._pull_capacity = 0
         self._backward_event: Any = None
-        # PoCL stacks up the private arrays of all work-items of a group: groups of one where lanes do the work.
+        # PoCL stacks up the private arrays of all work-items of a group: groups of one where lanes do the
+        # work.
         self._group = 1 if device.info.type == "CPU" else GROUP_ITEMS
 
-    def forward(self, splats: SplatBuffers, camera: Camera, background: tuple[float, float, float] = (0, 0, 0),
-                sh_degree: int | None = None) -> Frame:
+    def forward(self, splats: SplatBuffers, camera: Camera,
+                background: tuple[float, float, float] = (0, 0, 0), sh_degree: int | None = None) -> Frame:
         """Render into the pool's "color", "transmittance" and (with depth) "depth" buffers.
 
         Raises
@@ -128,8 +131,10 @@ class Pipeline:
             n_isects = self._bin(layout, n)
         lists = pool.get("isect_id", 4 * n_isects)
         if n_isects:
-            tiles, lists = self.sorter.sort("isect_tile", "isect_id", n_isects, max((n_tiles - 1).bit_length(), 1))
-            self.program.find_tile_ranges.over(n_isects, sorted_tile=tiles, tile_ranges=ranges, n_isects=n_isects)
+            bits = max((n_tiles - 1).bit_length(), 1)
+            tiles, lists = self.sorter.sort("isect_tile", "isect_id", n_isects, bits)
+            self.program.find_tile_ranges.over(n_isects, sorted_tile=tiles, tile_ranges=ranges,
+                                               n_isects=n_isects)
         self._lists = lists
         group = self.kernels.schedule.group
         r, g, b = background
@@ -137,12 +142,14 @@ class Pipeline:
             (n_tiles * group,), (group,), tile_ranges=ranges, lists=lists,
             isect_splat=pool.get("isect_splat", 4 * n_isects), records=records,
             color=self.image("color", layout, 3), transmittance=self.image("transmittance", layout),
-            depth=self.image("depth", layout), width=layout.width, height=layout.height, tiles_x=layout.tiles_x,
-            stride=layout.stride, plane=layout.plane, background_r=r, background_g=g, background_b=b,
+            depth=self.image("depth", layout), width=layout.width, height=layout.height,
+            tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane,
+            background_r=r, background_g=g, background_b=b,
         )
         return Frame(layout, n_isects, degree, splats)
 
-    def backward(self, frame: Frame, v_color: Any, grads: ParameterBuffers, v_alpha: Any | None = None) -> None:
+    def backward(self, frame: Frame, v_color: Any, grads: ParameterBuffers,
+                 v_alpha: Any | None = None) -> None:
         """Gradients of the raw parameters of the last frame's splats into `grads` (overwritten).
 
         v_color, v_alpha : buffers in the frame's layout. SH bands above the frame's degree are left alone.
@@ -162,13 +169,14 @@ class Pipeline:
             height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane,
         )
         self.program.gather_isect_grads.over(
-            splats.n, self._group, splat_isects=pool.get("splat_isects", 0), isect_grads=isect_grads, moments=moments,
-            capacity=splats.capacity, n_splats=splats.n,
+            splats.n, self._group, splat_isects=pool.get("splat_isects", 0), isect_grads=isect_grads,
+            moments=moments, capacity=splats.capacity, n_splats=splats.n,
         )
         self.program.project_splats_vjp.over(
-            -(-splats.n // self.kernels.lanes), self._group, geom=splats.geom, sh=splats.sh, cam=pool.get("camera", 0),
-            moments=moments, records=pool.get("records", 0), depth_key=pool.get("depth_key_kept", 0),
-            grad_geom=grads.geom, grad_sh=grads.sh, pull=self.pull(splats.capacity), capacity=splats.capacity, n_splats=splats.n,
+            -(-splats.n // self.kernels.lanes), self._group, geom=splats.geom, sh=splats.sh,
+            cam=pool.get("camera", 0), moments=moments, records=pool.get("records", 0),
+            depth_key=pool.get("depth_key_kept", 0), grad_geom=grads.geom, grad_sh=grads.sh,
+            pull=self.pull(splats.capacity), capacity=splats.capacity, n_splats=splats.n,
             sh_degree=frame.sh_degree,
         )
 
@@ -179,7 +187,7 @@ class Pipeline:
         return layout.unpack(to_host(self.device, self.pool.get(name, 0), host))
 
     def pull(self, capacity: int) -> Any:
-        """Buffer [capacity]: each splat's |gradient of mean_px|, summed over the backwards since `reset_pull`."""
+        """Buffer [capacity]: each splat's |gradient of mean_px|, summed since `reset_pull`."""
         known = self._pull_capacity
         buffer = self.pool.get("pull", capacity * self._real)
         if known != capacity:
@@ -209,14 +217,16 @@ class Pipeline:
             self._layouts[name] = (layout, buffer)
         return buffer
 
-    def _project(self, splats: SplatBuffers, camera: Camera, layout: ImageLayout, degree: int, records: Any) -> None:
+    def _project(self, splats: SplatBuffers, camera: Camera, layout: ImageLayout, degree: int,
+                 records: Any) -> None:
         pool, n = self.pool, splats.n
         block = camera_block(camera).astype(self.kernels.dtype)
         cam = pool.get("camera", block.nbytes)
         to_device(self.device, cam, block)
         self.program.project_splats.over(
-            -(-n // self.kernels.lanes), self._group, geom=splats.geom, sh=splats.sh, cam=cam, records=records,
-            depth_key=pool.get("depth_key_kept", 4 * n), tile_rect=pool.get("tile_rect", 16 * n),
+            -(-n // self.kernels.lanes), self._group, geom=splats.geom, sh=splats.sh, cam=cam,
+            records=records, depth_key=pool.get("depth_key_kept", 4 * n),
+            tile_rect=pool.get("tile_rect", 16 * n),
             capacity=splats.capacity, n_splats=n, sh_degree=degree, width=layout.width, height=layout.height,
             tiles_x=layout.tiles_x, tiles_y=layout.tiles_y,
         )

@@ -42,7 +42,8 @@ class Renderer:
 
     Parameters
     ----------
-    device : None (the best one), a `--device` string ("cpu", "gpu", "0:1", part of a name), or an opened Device.
+    device : None (the best one), a `--device` string ("cpu", "gpu", "0:1", part of a name), or an opened
+        Device.
     precision : "float32" or "float64".
     schedule : how a tile's pixels are shared out; None lets the device choose.
     alpha_min, alpha_max, t_min : blending thresholds; (0, 1, 0) makes the image smooth, for gradient checks.
@@ -60,7 +61,8 @@ class Renderer:
         self.device = device if isinstance(device, Device) else open_device(device)
         self.precision = precision
         if precision == "float64" and not self.device.has_fp64:
-            raise DeviceError(f"device {self.device.info} has no double precision: use float32 or another --device")
+            raise DeviceError(f"device {self.device.info} has no double precision: "
+                              "use float32 or another --device")
         self.schedule = schedule
         self._thresholds = (alpha_min, alpha_max, t_min)
         self._pipelines: dict[KernelBuild, Pipeline] = {}
@@ -83,7 +85,8 @@ class Renderer:
         self._last = (pipeline, frame)
         layout = frame.layout
         alpha = 1 - pipeline.read_image("transmittance", layout)[..., 0]
-        return Rendered(pipeline.read_image("color", layout), alpha, pipeline.read_image("depth", layout)[..., 0])
+        depth = pipeline.read_image("depth", layout)[..., 0]
+        return Rendered(pipeline.read_image("color", layout), alpha, depth)
 
     def backward(self, v_color: ArrayLike, v_alpha: ArrayLike | None = None) -> dict[str, Array]:
         """Gradients of the last render's loss with respect to the raw values.

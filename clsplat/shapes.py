@@ -43,7 +43,8 @@ class Shape:
         return make_schema(self.fields, sh_degree)
 
 
-# Adam's rate of the trainable skew vector s (m = s/|s| * SKEW_MAX * tanh(|s|)^(1/3)); measured, see benchmarks.
+# Adam's rate of the trainable skew vector s (m = s/|s| * SKEW_MAX * tanh(|s|)^(1/3)); measured, see
+# benchmarks.
 SKEW = Field("skew", 3, ("skew_0", "skew_1", "skew_2"), (0.0, 0.0, 0.0), 2.5e-3, limit=SKEW_LIMIT)
 
 GAUSSIAN = Shape("gaussian", "shape/gaussian.clh", (), record=4, moments=6, normalised=False)

@@ -12,7 +12,7 @@ _CPU_CHUNKS = 16  # runs that a CPU's work is cut into
 
 
 class Sorter:
-    """Sorts and scans uint32 buffers. CPU: one work-item per chunk, 11-bit digits; else groups of 256, 4 bits."""
+    """Sorts, scans uint32 buffers. CPU: a work-item per chunk, 11-bit digits; else groups of 256, 4 bits."""
 
     def __init__(self, device: Device, pool: Pool) -> None:
         self.is_cpu = device.info.type == "CPU"
@@ -46,8 +46,8 @@ class Sorter:
         for shift in range(0, key_bits, self.bits):
             self.program.radix_histogram(size, local, keys=here[0], counts=counts, n=n, run=run, shift=shift)
             self.scan(counts, starts, n_counts, total)
-            self.program.radix_scatter(size, local, keys=here[0], values=here[1], starts=starts, keys_out=there[0],
-                                       values_out=there[1], n=n, run=run, shift=shift)
+            self.program.radix_scatter(size, local, keys=here[0], values=here[1], starts=starts,
+                                       keys_out=there[0], values_out=there[1], n=n, run=run, shift=shift)
             here, there = there, here
         return here
 

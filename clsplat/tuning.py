@@ -56,7 +56,7 @@ def schedule_for(device: Device) -> Schedule:
 
 
 def measure(device: Device) -> dict[str, float]:
-    """Milliseconds of rasterize and rasterize_vjp together, by schedule; those that do not run are left out."""
+    """Milliseconds of rasterize and rasterize_vjp together, by schedule; without those that do not run."""
     kind = device.info.type if device.info.type in _CANDIDATES else "other"
     times: dict[str, float] = {}
     for name in _CANDIDATES[kind]:
@@ -79,7 +79,8 @@ def _measure_one(device: Device, schedule: Schedule) -> float:
     for _ in range(_REPEATS + 1):
         frame = pipeline.forward(splats, camera)
         pipeline.backward(frame, pipeline.image("color", frame.layout, 3), grads)
-        times.append(sum(1e-6 * (event.profile.end - event.profile.start) for event in pipeline.raster_events()))
+        events = pipeline.raster_events()
+        times.append(sum(1e-6 * float(event.profile.end - event.profile.start) for event in events))
     return statistics.median(times[1:])
 
 
