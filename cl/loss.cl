@@ -44,9 +44,9 @@ kernel void ssim_rows(
         const vreal wx = WINDOW[k] * x, wy = WINDOW[k] * y;
         sx += wx;
         sy += wy;
-        sxx += wx * x;
-        syy += wy * y;
-        sxy += wx * y;
+        sxx = lanes_mad(wx, x, sxx);
+        syy = lanes_mad(wy, y, syy);
+        sxy = lanes_mad(wx, y, sxy);
     }
     lanes_store(sx, maps + at);
     lanes_store(sy, maps + at + 3 * plane);
@@ -71,11 +71,11 @@ kernel void ssim_columns(
     vreal mx = (vreal)0, my = (vreal)0, mxx = (vreal)0, myy = (vreal)0, mxy = (vreal)0;
     for (int k = 0; k < 11; ++k) {
         global const real *from = maps + at + (k - 5) * (long)stride;
-        mx += WINDOW[k] * lanes_load(from);
-        my += WINDOW[k] * lanes_load(from + 3 * plane);
-        mxx += WINDOW[k] * lanes_load(from + 6 * plane);
-        myy += WINDOW[k] * lanes_load(from + 9 * plane);
-        mxy += WINDOW[k] * lanes_load(from + 12 * plane);
+        mx = lanes_mad(WINDOW[k], lanes_load(from), mx);
+        my = lanes_mad(WINDOW[k], lanes_load(from + 3 * plane), my);
+        mxx = lanes_mad(WINDOW[k], lanes_load(from + 6 * plane), mxx);
+        myy = lanes_mad(WINDOW[k], lanes_load(from + 9 * plane), myy);
+        mxy = lanes_mad(WINDOW[k], lanes_load(from + 12 * plane), mxy);
     }
     const vreal a1 = (real)2 * mx * my + SSIM_C1, a2 = (real)2 * (mxy - mx * my) + SSIM_C2;
     const vreal b1 = mx * mx + my * my + SSIM_C1, b2 = mxx - mx * mx + myy - my * my + SSIM_C2;
@@ -128,9 +128,9 @@ kernel void loss_vjp(
     vreal v_mx = (vreal)0, v_mxx = (vreal)0, v_mxy = (vreal)0;
     for (int k = 0; k < 11; ++k) {
         global const real *from = hmaps + at + (k - 5) * (long)stride;
-        v_mx += WINDOW[k] * lanes_load(from);
-        v_mxx += WINDOW[k] * lanes_load(from + 3 * plane);
-        v_mxy += WINDOW[k] * lanes_load(from + 6 * plane);
+        v_mx = lanes_mad(WINDOW[k], lanes_load(from), v_mx);
+        v_mxx = lanes_mad(WINDOW[k], lanes_load(from + 3 * plane), v_mxx);
+        v_mxy = lanes_mad(WINDOW[k], lanes_load(from + 6 * plane), v_mxy);
     }
     const vreal x = lanes_load(rendered + at), y = lanes_load(truth + at), zero = (vreal)0;
     const vreal v_ssim = v_mx + (real)2 * x * v_mxx + y * v_mxy;

@@ -102,8 +102,7 @@ kernel void project_splats(
     out[6] = y_lo;
     out[7] = y_hi;
     const vmask seen = s.in_front & (box.left + box.right > (vreal)0) & (x_lo <= x_hi) & (y_lo <= y_hi)
-                     & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height)
-                     & (sym2_det(s.cov2d) > (vreal)0);
+                     & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height);
     const vreal seen_real = lanes_if(seen, (vreal)1, (vreal)0);
 
     real lane[LANES][RECORD], edge[5][LANES];

@@ -188,14 +188,14 @@ kernel void rasterize_vjp(
                 const vreal T_before = T[v];
                 vmask hit;
                 const vreal weight = blend(&alpha, &T[v], &hit);
-                const vreal g = v_red[v] * rec[2] + v_green[v] * rec[3] + v_blue[v] * rec[4];
-                rest[v] -= weight * g;
-                const vreal v_a = T_before * g - rest[v] / ((vreal)1 - alpha);
+                const vreal g = lanes_mad(v_red[v], rec[2], lanes_mad(v_green[v], rec[3], v_blue[v] * rec[4]));
+                rest[v] = lanes_mad(-weight, g, rest[v]);
+                const vreal v_a = lanes_mad(T_before, g, -rest[v] / ((vreal)1 - alpha));
                 shape_alpha_vjp(dx, dy, rec + 8, pixel, lanes_if(hit, blend_clamp_vjp(raw_alpha, v_a), (vreal)0),
                                 sums);
-                sums[SHAPE_V] += weight * v_red[v];
-                sums[SHAPE_V + 1] += weight * v_green[v];
-                sums[SHAPE_V + 2] += weight * v_blue[v];
+                sums[SHAPE_V] = lanes_mad(weight, v_red[v], sums[SHAPE_V]);
+                sums[SHAPE_V + 1] = lanes_mad(weight, v_green[v], sums[SHAPE_V + 1]);
+                sums[SHAPE_V + 2] = lanes_mad(weight, v_blue[v], sums[SHAPE_V + 2]);
             }
             real own[V_RECORD];
             for (int j = 0; j < V_RECORD; ++j) own[j] = lanes_sum(sums[j]);

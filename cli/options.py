@@ -11,7 +11,7 @@ from typing import Any, TypeVar, get_type_hints
 
 import click
 
-from clsplat.config import OPTIMIZERS, STRATEGIES, TrainConfig
+from clsplat.config import OPTIMIZERS, SAMPLINGS, STRATEGIES, TrainConfig
 from clsplat.shapes import NORMALISATIONS, SHAPES
 from clsplat.skew_map import SKEW_MAPS
 
@@ -22,7 +22,7 @@ PATH = click.Path(path_type=Path)
 SETS = ("test", "train", "all")
 
 _CHOICES = {"shape": tuple(SHAPES), "normalisation": NORMALISATIONS, "skew_map": SKEW_MAPS,
-            "strategy": STRATEGIES, "optimizer": OPTIMIZERS}
+            "strategy": STRATEGIES, "optimizer": OPTIMIZERS, "sampling": SAMPLINGS}
 _ALIASES = {"iterations": ("--steps",)}
 _METAVARS = {"init": "sfm|random|FILE.ply"}
 # Shared with other commands, or with a form of their own.

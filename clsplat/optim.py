@@ -36,8 +36,9 @@ class Optimizer(Protocol):
 
 def field_rates(config: TrainConfig) -> dict[str, float]:
     """Adam's rate per field; the mean's changes with the iteration and is set at each step."""
-    return {"quat": config.rotation_lr, "log_scale": config.scaling_lr, "opacity_logit": config.opacity_lr,
-            "sh": config.feature_lr, "skew": config.skew_lr}
+    rates = {"quat": config.rotation_lr, "log_scale": config.scaling_lr, "opacity_logit": config.opacity_lr,
+             "sh": config.feature_lr, "skew": config.skew_lr}
+    return {name: rate * config.rate_factor(name) for name, rate in rates.items()}
 
 
 def make_optimizer(device: Device, kernels: KernelBuild, splats: SplatBuffers, config: TrainConfig) -> Optimizer:

@@ -68,7 +68,8 @@ class Model:
     ----------
     iteration : iterations done; below the config's when the run was interrupted.
     seconds : training time, without evaluations. peak_bytes : of host memory (on a CPU device it holds all).
-    evaluations : on test views, by iteration, where the config asked for them.
+    evaluations, evaluation_seconds : on test views, by iteration, where the config asked for them, and the
+        training time until then.
     path : the model's folder, or None.
     """
 
@@ -79,6 +80,7 @@ class Model:
     peak_bytes: int
     device_bytes: int
     evaluations: dict[int, Evaluation] = field(default_factory=dict)
+    evaluation_seconds: dict[int, float] = field(default_factory=dict)
     path: Path | None = None
 
     @property
@@ -167,6 +169,7 @@ class Trainer:
         self.optim_program = self.kernels.optim_program(self.device)
         self.renderer = Renderer(self.device)
         self.evaluations: dict[int, Evaluation] = {}
+        self.evaluation_seconds: dict[int, float] = {}
         self._plan_schedules(len(first) if checkpoint is None else None)
         self._level: tuple[int, dict[int, tuple[Camera, ImageU8]]] = (0, {})
 
@@ -189,6 +192,7 @@ class Trainer:
                     self.seconds += time.perf_counter() - start
                 if it in config.test_iterations and self.scene.test:
                     self.evaluations[it] = self.evaluate(self.scene.test)
+                    self.evaluation_seconds[it] = self.seconds
                     log.write({"iteration": it, "seconds": self.seconds, "test_psnr": self.evaluations[it].psnr,
                                "test_ssim": self.evaluations[it].ssim, "splats": self.splats.n})
                 if folder is not None and (it in config.save_iterations or ends):
@@ -202,7 +206,7 @@ class Trainer:
             self.checkpoint().save(folder.checkpoint_path)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         return Model(self.snapshot(), config, self.iteration, self.seconds, peak, self.pipeline.pool.nbytes,
-                     self.evaluations, None if folder is None else folder.path)
+                     self.evaluations, self.evaluation_seconds, None if folder is None else folder.path)
 
     def step(self) -> None:
         """One iteration: one image, one optimizer step, and what the strategy does after it."""
@@ -220,8 +224,8 @@ class Trainer:
                 -(-n // self.kernels.lanes), geom=self.splats.geom, grad_geom=self.grads.geom,
                 capacity=self.splats.capacity, opacity_scale=config.opacity_reg / n,
                 scale_scale=config.scale_reg / (3 * n))
-        mean_lr = self.scene.extent * self.mean_rate(it)
-        self.optimizer.step(self.grads, mean_lr, degree)
+        mean_lr = self.scene.extent * self.mean_rate(it)  # the noise keeps to the published amount
+        self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree)
         if self.densify_first <= it <= self.densify_last and it % config.densify_interval == 0:
             self.densify()
         if config.noise_lr:

@@ -1,0 +1,133 @@
+"""Train shapes x caps x iterations x seeds on the real scenes, hold out every 8th view, write one JSON line a run.
+
+    python benchmarks/train_scenes.py --scenes fox kitchen --shapes gaussian skew-normal --caps 5000 20000 \\
+        --iterations 2000 --seeds 0 1 2 [--out benchmarks/results/scenes.jsonl]
+    python benchmarks/train_scenes.py --table                 # print what is there, run nothing
+
+A run that is in the file already is skipped: kill and restart at will. Test views are measured along the run for the
+time-to-quality columns; nothing is selected on them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import common
+import numpy as np
+
+LEVELS_DB = (16, 18, 20, 22, 24)
+MARKS = 8  # evaluations along a run
+KEY = ("scene", "shape", "cap", "iterations", "seed", "label")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=["fox", "sceaux_castle", "kitchen"])
+    parser.add_argument("--shapes", nargs="+", default=["gaussian", "skew-normal"])
+    parser.add_argument("--caps", nargs="+", type=int, default=[5000, 20000])
+    parser.add_argument("--iterations", nargs="+", type=int, default=[2000])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--option", action="append", default=[], help="NAME=VALUE of TrainConfig, part of the label")
+    parser.add_argument("--out", type=Path, default=common.RESULTS / "scenes.jsonl")
+    parser.add_argument("--models", type=Path, help="keep the trained models here")
+    parser.add_argument("--table", action="store_true")
+    parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.table:
+        print_table(common.read(args.out))
+        return
+    label = " ".join(args.option)
+    for scene, cap, iterations, seed, shape in itertools.product(
+            args.scenes, args.caps, args.iterations, args.seeds, args.shapes):
+        key = dict(zip(KEY, (scene, shape, cap, iterations, seed, label), strict=True))
+        if any(all(row[k] == v for k, v in key.items()) for row in common.read(args.out)):
+            continue
+        if args.one:
+            run(key, args.option, args.out, args.models)
+        else:  # a process of its own: peak memory is then the run's
+            command = [sys.executable, __file__, "--one", "--scenes", scene, "--shapes", shape, "--caps", str(cap),
+                       "--iterations", str(iterations), "--seeds", str(seed), "--out", str(args.out)]
+            for option in args.option:
+                command += ["--option", option]
+            subprocess.run(command + (["--models", str(args.models)] if args.models else []), check=True)
+    if not args.one:
+        print_table(common.read(args.out))
+
+
+def run(key: dict[str, Any], options: list[str], out: Path, models: Path | None) -> None:
+    """One training; appends its line."""
+    import clsplat
+    from clsplat.config import TrainConfig
+    from clsplat.device import open_device
+    from clsplat.tuning import schedule_for
+
+    n = key["iterations"]
+    marks = tuple(sorted({max(n * i // MARKS, 1) for i in range(1, MARKS + 1)}))
+    defaults = {"shape": key["shape"], "cap_max": key["cap"], "iterations": n, "seed": key["seed"],
+                "test_iterations": marks}
+    config = TrainConfig(**(defaults | {k: _value(v) for k, v in (o.split("=", 1) for o in options)}))
+    scene = clsplat.load_scene(common.data_folder() / key["scene"])
+    device = open_device(config.device)
+    schedule = schedule_for(device)  # measured before the clock starts
+    folder = models and models / "-".join(str(key[k]) for k in KEY if key[k] != "")
+    model = clsplat.train(scene, config, output=folder, overwrite=True)
+    last = model.evaluations[n]
+    skew = np.linalg.norm(model.splats.skew, axis=1)
+    row = key | {
+        "psnr": last.psnr, "ssim": last.ssim, "per_view": last.per_view, "seconds": model.seconds,
+        "splats": len(model.splats), "peak_mb": model.peak_bytes / 1e6, "render_ms": last.render_ms,
+        "along": [[it, round(model.evaluation_seconds[it], 2), round(e.psnr, 3)]
+                  for it, e in sorted(model.evaluations.items())],
+        "skew_quantiles": [round(float(q), 3) for q in np.quantile(skew, (0.1, 0.25, 0.5, 0.75, 0.9))],
+        "skewed_share": float(np.mean(skew > 0.5)),
+    }
+    common.append(out, row | common.environment(device, schedule))
+    print(f"{key} {last.psnr:.3f} dB SSIM {last.ssim:.4f} {model.seconds:.0f} s", flush=True)
+
+
+def print_table(rows: list[dict[str, Any]]) -> None:
+    """Mean over seeds of each configuration, and its spread (max - min)."""
+    print("| scene | shape | cap | iterations | options | seeds | PSNR [dB] | spread | SSIM | seconds | peak MB | "
+          "render ms | skewed | " + " | ".join(f"s to {db} dB" for db in LEVELS_DB) + " |")
+    print("|" + "---|" * (13 + len(LEVELS_DB)))
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[k] for k in KEY if k != "seed"), []).append(row)
+    for (scene, shape, cap, iterations, label), runs in sorted(groups.items()):
+        psnr = [r["psnr"] for r in runs]
+        cells = [scene, shape, cap, iterations, label, len(runs), f"{statistics.fmean(psnr):.2f}",
+                 f"{max(psnr) - min(psnr):.2f}", f"{_mean(runs, 'ssim'):.4f}", f"{_mean(runs, 'seconds'):.0f}",
+                 f"{_mean(runs, 'peak_mb'):.0f}", f"{_mean(runs, 'render_ms'):.0f}",
+                 f"{100 * _mean(runs, 'skewed_share'):.0f} %" if shape != "gaussian" else ""]
+        cells += [_seconds_to(runs, db) for db in LEVELS_DB]
+        print("| " + " | ".join(str(c) for c in cells) + " |")
+
+
+def _seconds_to(runs: list[dict[str, Any]], level: float) -> str:
+    """Median time until the mean test PSNR first reached `level`."""
+    times = [next((s for _, s, p in r["along"] if p >= level), None) for r in runs]
+    found = [t for t in times if t is not None]
+    return f"{statistics.median(found):.0f}" if len(found) == len(times) else ""
+
+
+def _mean(runs: list[dict[str, Any]], field: str) -> float:
+    return statistics.fmean(r[field] for r in runs)
+
+
+def _value(text: str) -> Any:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return {"true": True, "false": False}.get(text.lower(), text)
+
+
+if __name__ == "__main__":
+    main()
