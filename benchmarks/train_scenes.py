@@ -5,16 +5,19 @@
     python benchmarks/train_scenes.py --table                 # print what is there, run nothing
 
 A run that is in the file already is skipped: kill and restart at will. Test views are measured along the run for the
-time-to-quality columns; nothing is selected on them.
+time-to-quality columns; nothing is selected on them. `seconds` is wall time of training alone, on a machine that others
+may share (`load`: its five-minute load at the end); `CPU s` counts both cores, evaluations and start-up included.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import os
 import statistics
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -76,11 +79,13 @@ def run(key: dict[str, Any], options: list[str], out: Path, models: Path | None)
     device = open_device(config.device)
     schedule = schedule_for(device)  # measured before the clock starts
     folder = models and models / "-".join(str(key[k]) for k in KEY if key[k] != "")
+    cpu = time.process_time()
     model = clsplat.train(scene, config, output=folder, overwrite=True)
+    cpu = time.process_time() - cpu
     last = model.evaluations[n]
     skew = np.linalg.norm(model.splats.skew, axis=1)
     row = key | {
-        "psnr": last.psnr, "ssim": last.ssim, "per_view": last.per_view, "seconds": model.seconds,
+        "psnr": last.psnr, "ssim": last.ssim, "per_view": last.per_view, "seconds": model.seconds, "cpu_seconds": cpu, "load": os.getloadavg()[1],
         "splats": len(model.splats), "peak_mb": model.peak_bytes / 1e6, "render_ms": last.render_ms,
         "along": [[it, round(model.evaluation_seconds[it], 2), round(e.psnr, 3)]
                   for it, e in sorted(model.evaluations.items())],
@@ -93,9 +98,9 @@ def run(key: dict[str, Any], options: list[str], out: Path, models: Path | None)
 
 def print_table(rows: list[dict[str, Any]]) -> None:
     """Mean over seeds of each configuration, and its spread (max - min)."""
-    print("| scene | shape | cap | iterations | options | seeds | PSNR [dB] | spread | SSIM | seconds | peak MB | "
+    print("| scene | shape | cap | iterations | options | seeds | PSNR [dB] | spread | SSIM | seconds | CPU s | peak MB | "
           "render ms | skewed | " + " | ".join(f"s to {db} dB" for db in LEVELS_DB) + " |")
-    print("|" + "---|" * (13 + len(LEVELS_DB)))
+    print("|" + "---|" * (14 + len(LEVELS_DB)))
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault(tuple(row[k] for k in KEY if k != "seed"), []).append(row)
@@ -103,7 +108,7 @@ def print_table(rows: list[dict[str, Any]]) -> None:
         psnr = [r["psnr"] for r in runs]
         cells = [scene, shape, cap, iterations, label, len(runs), f"{statistics.fmean(psnr):.2f}",
                  f"{max(psnr) - min(psnr):.2f}", f"{_mean(runs, 'ssim'):.4f}", f"{_mean(runs, 'seconds'):.0f}",
-                 f"{_mean(runs, 'peak_mb'):.0f}", f"{_mean(runs, 'render_ms'):.0f}",
+                 f"{_mean(runs, 'cpu_seconds'):.0f}", f"{_mean(runs, 'peak_mb'):.0f}", f"{_mean(runs, 'render_ms'):.0f}",
                  f"{100 * _mean(runs, 'skewed_share'):.0f} %" if shape != "gaussian" else ""]
         cells += [_seconds_to(runs, db) for db in LEVELS_DB]
         print("| " + " | ".join(str(c) for c in cells) + " |")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 
 from .config import TrainConfig
@@ -34,6 +35,16 @@ class Estimate:
     def __str__(self) -> str:
         return (f"{self.total / 1e6:.0f} MB of device memory (splats {self.splats / 1e6:.0f}, "
                 f"splat-tile pairs {self.isects / 1e6:.0f}, images {self.images / 1e6:.0f})")
+
+
+def peak_bytes() -> int:
+    """Most host memory this process has held; 0 where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # bytes there, KiB elsewhere
 
 
 def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout) -> Estimate:

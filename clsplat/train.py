@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import resource
 import signal
 import threading
 import time
@@ -29,7 +28,7 @@ from .images import ImageU8, resize_area
 from .initialise import initial_splats
 from .kernels import KernelBuild
 from .loss import ImageLoss, LossValue
-from .memory import check, estimate
+from .memory import check, estimate, peak_bytes
 from .model_folder import ModelFolder
 from .optim import make_optimizer
 from .pipeline import ImageLayout, Pipeline
@@ -204,8 +203,7 @@ class Trainer:
         if folder is not None and self.iteration < config.iterations:
             log.flush()
             self.checkpoint().save(folder.checkpoint_path)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        return Model(self.snapshot(), config, self.iteration, self.seconds, peak, self.pipeline.pool.nbytes,
+        return Model(self.snapshot(), config, self.iteration, self.seconds, peak_bytes(), self.pipeline.pool.nbytes,
                      self.evaluations, self.evaluation_seconds, None if folder is None else folder.path)
 
     def step(self) -> None:
