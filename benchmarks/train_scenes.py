@@ -85,7 +85,8 @@ def run(key: dict[str, Any], options: list[str], out: Path, models: Path | None)
     last = model.evaluations[n]
     skew = np.linalg.norm(model.splats.skew, axis=1)
     row = key | {
-        "psnr": last.psnr, "ssim": last.ssim, "per_view": last.per_view, "seconds": model.seconds, "cpu_seconds": cpu, "load": os.getloadavg()[1],
+        "psnr": last.psnr, "ssim": last.ssim, "per_view": last.per_view, "seconds": model.seconds,
+        "cpu_seconds": cpu, "load": os.getloadavg()[1],
         "splats": len(model.splats), "peak_mb": model.peak_bytes / 1e6, "render_ms": last.render_ms,
         "along": [[it, round(model.evaluation_seconds[it], 2), round(e.psnr, 3)]
                   for it, e in sorted(model.evaluations.items())],
@@ -98,9 +99,9 @@ def run(key: dict[str, Any], options: list[str], out: Path, models: Path | None)
 
 def print_table(rows: list[dict[str, Any]]) -> None:
     """Mean over seeds of each configuration, and its spread (max - min)."""
-    print("| scene | shape | cap | iterations | options | seeds | PSNR [dB] | spread | SSIM | seconds | CPU s | peak MB | "
-          "render ms | skewed | " + " | ".join(f"s to {db} dB" for db in LEVELS_DB) + " |")
-    print("|" + "---|" * (14 + len(LEVELS_DB)))
+    titles = ["scene", "shape", "cap", "iterations", "options", "seeds", "PSNR [dB]", "spread", "SSIM", "seconds",
+              "CPU s", "peak MB", "render ms", "skewed", *(f"s to {db} dB" for db in LEVELS_DB)]
+    print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault(tuple(row[k] for k in KEY if k != "seed"), []).append(row)
@@ -108,7 +109,8 @@ def print_table(rows: list[dict[str, Any]]) -> None:
         psnr = [r["psnr"] for r in runs]
         cells = [scene, shape, cap, iterations, label, len(runs), f"{statistics.fmean(psnr):.2f}",
                  f"{max(psnr) - min(psnr):.2f}", f"{_mean(runs, 'ssim'):.4f}", f"{_mean(runs, 'seconds'):.0f}",
-                 f"{_mean(runs, 'cpu_seconds'):.0f}", f"{_mean(runs, 'peak_mb'):.0f}", f"{_mean(runs, 'render_ms'):.0f}",
+                 f"{_mean(runs, 'cpu_seconds'):.0f}", f"{_mean(runs, 'peak_mb'):.0f}",
+                 f"{_mean(runs, 'render_ms'):.0f}",
                  f"{100 * _mean(runs, 'skewed_share'):.0f} %" if shape != "gaussian" else ""]
         cells += [_seconds_to(runs, db) for db in LEVELS_DB]
         print("| " + " | ".join(str(c) for c in cells) + " |")

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, TextIO, TypeVar
 
 if TYPE_CHECKING:
-    from clsplat.train import Progress
+    from clsplat.run_log import Progress
 
 T = TypeVar("T")
 

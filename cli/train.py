@@ -26,7 +26,7 @@ from .progress import TrainingDisplay, duration
 if TYPE_CHECKING:
     from clsplat.evaluate import Evaluation
     from clsplat.scene import Scene
-    from clsplat.train import Model
+    from clsplat.training import Model
 
 SCENE_KEYS = ("images", "resolution", "test_every", "test_list", "eval")
 INTERRUPTED = 130
@@ -105,7 +105,7 @@ def read_scene(path: Path, reading: dict[str, Any],
 def run_training(scene: Scene, config: TrainConfig, model_path: Path, record: dict[str, Any],
                  resume: bool = False, overwrite: bool = False, quiet: bool = False) -> Model:
     """Train with a live display."""
-    from clsplat.train import train as train_model
+    from clsplat.training import train as train_model
 
     with TrainingDisplay(quiet) as display:
         return train_model(scene, config, display, output=model_path, resume=resume, overwrite=overwrite,

@@ -31,6 +31,7 @@ class Checkpoint:
     rng : state of the NumPy generator, as JSON.
     queue : training views still to come in this epoch.
     seconds : training time so far. schedule : of the kernels, whose rounding depends on it.
+    n_first : splats at the start, which the growth depends on.
     """
 
     iteration: int
@@ -41,11 +42,13 @@ class Checkpoint:
     queue: list[int]
     seconds: float
     schedule: str
+    n_first: int
 
     def save(self, path: Path) -> None:
         """Write; raises OutputError when the disk is full or the folder read-only (the old file stays)."""
         meta = {"version": VERSION, "iteration": self.iteration, "config": self.config, "rng": self.rng,
-                "queue": self.queue, "seconds": self.seconds, "schedule": self.schedule}
+                "queue": self.queue, "seconds": self.seconds, "schedule": self.schedule,
+                "n_first": self.n_first}
         arrays = {f"splats.{k}": v for k, v in self.splats.items()}
         arrays |= {f"optimizer.{k}": v for k, v in self.optimizer.items()}
         arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
@@ -72,4 +75,5 @@ class Checkpoint:
             return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
         return cls(meta["iteration"], meta["config"], part("splats."), part("optimizer."), meta["rng"],
-                   meta["queue"], meta["seconds"], meta["schedule"])
+                   meta["queue"], meta["seconds"], meta["schedule"],
+                   meta["n_first"])

@@ -130,7 +130,7 @@ class TrainConfig:
         scale, 0 otherwise; measured on validation views at 1500 iterations (ARCHITECTURE.md, "Training").
         """
         power = {"mean": 0.75, "quat": 0.5, "skew": 0.5, "log_scale": 0.25}.get(field, 0.0)
-        return max(1.0, PUBLISHED_ITERATIONS / self.iterations) ** power
+        return float(max(1.0, PUBLISHED_ITERATIONS / self.iterations) ** power)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for json.dump."""
@@ -143,7 +143,8 @@ class TrainConfig:
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise InputError(f"config: unknown option {unknown[0]!r}")
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**given)
 
 
 def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -108,7 +108,7 @@ class Pipeline:
         self._backward_event: Any = None
         # PoCL stacks up the private arrays of all work-items of a group: groups of one where lanes do the
         # work.
-        self._group = 1 if device.info.type == "CPU" else GROUP_ITEMS
+        self.group = 1 if device.info.type == "CPU" else GROUP_ITEMS
 
     def forward(self, splats: SplatBuffers, camera: Camera,
                 background: tuple[float, float, float] = (0, 0, 0), sh_degree: int | None = None) -> Frame:
@@ -169,11 +169,11 @@ class Pipeline:
             height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane,
         )
         self.program.gather_isect_grads.over(
-            splats.n, self._group, splat_isects=pool.get("splat_isects", 0), isect_grads=isect_grads,
+            splats.n, self.group, splat_isects=pool.get("splat_isects", 0), isect_grads=isect_grads,
             moments=moments, capacity=splats.capacity, n_splats=splats.n,
         )
         self.program.project_splats_vjp.over(
-            -(-splats.n // self.kernels.lanes), self._group, geom=splats.geom, sh=splats.sh,
+            -(-splats.n // self.kernels.lanes), self.group, geom=splats.geom, sh=splats.sh,
             cam=pool.get("camera", 0), moments=moments, records=pool.get("records", 0),
             depth_key=pool.get("depth_key_kept", 0), grad_geom=grads.geom, grad_sh=grads.sh,
             pull=self.pull(splats.capacity), capacity=splats.capacity, n_splats=splats.n,
@@ -224,7 +224,7 @@ class Pipeline:
         cam = pool.get("camera", block.nbytes)
         to_device(self.device, cam, block)
         self.program.project_splats.over(
-            -(-n // self.kernels.lanes), self._group, geom=splats.geom, sh=splats.sh, cam=cam,
+            -(-n // self.kernels.lanes), self.group, geom=splats.geom, sh=splats.sh, cam=cam,
             records=records, depth_key=pool.get("depth_key_kept", 4 * n),
             tile_rect=pool.get("tile_rect", 16 * n),
             capacity=splats.capacity, n_splats=n, sh_degree=degree, width=layout.width, height=layout.height,

@@ -16,17 +16,18 @@ ROOT = Path(__file__).resolve().parent.parent
 # A module imports modules of lower floors only.
 FLOORS = """
     errors
-    atomic runtime schema capture_world
+    atomic interrupt run_log runtime schema capture_world
     camera device images metrics noise optim_reference ply_header schedules shapes validity colmap_files
     cameras_json capture checkpoint colmap densify ply program skew_map
     config kernels scene splats
-    buffers camera_path initialise model_folder
+    buffers camera_path initialise model_folder view_sampler
     optim sort
     pipeline
     loss memory tuning
     render
     evaluate
-    train
+    trainer
+    training
 """
 FLOOR = {name: level for level, line in enumerate(FLOORS.split("\n")) for name in line.split()}
 

@@ -29,11 +29,13 @@ from clsplat.noise import add_noise
 from clsplat.optim import make_optimizer
 from clsplat.pipeline import Pipeline
 from clsplat.program import Real
+from clsplat.run_log import Progress
 from clsplat.scene import Scene, load_scene
 from clsplat.schema import Group
 from clsplat.skew_map import SKEW_MAPS
 from clsplat.splats import Splats
-from clsplat.train import Progress, Trainer, train
+from clsplat.trainer import Trainer
+from clsplat.training import train
 from clsplat.tuning import schedule_for
 
 # Every part of the strategy acts: growth from 2252 points to the cap, noise, all resolutions and SH degrees.
