@@ -8,7 +8,6 @@ import math
 import click
 import numpy as np
 import pytest
-from clsplat.train import Progress
 from clsplat_cli.options import Color, Iterations
 from clsplat_cli.outputs import output_stems
 from clsplat_cli.progress import TrainingDisplay, duration, table
@@ -16,6 +15,7 @@ from clsplat_cli.progress import TrainingDisplay, duration, table
 from clsplat.camera import Camera
 from clsplat.camera_path import look_at, orbit
 from clsplat.errors import InputError
+from clsplat.run_log import Progress
 from clsplat.splats import Splats
 
 
