@@ -11,7 +11,7 @@
 constant real WINDOW[11] = {WINDOW_0, WINDOW_1, WINDOW_2, WINDOW_3, WINDOW_4, WINDOW_5,
                             WINDOW_4, WINDOW_3, WINDOW_2, WINDOW_1, WINDOW_0};
 
-inline ulong pixel_at(int stride, ulong plane) {
+static inline ulong pixel_at(int stride, ulong plane) {
     return get_global_id(2) * plane + (get_global_id(1) + MARGIN_Y) * stride + get_global_id(0) * LANES + MARGIN_X;
 }
 

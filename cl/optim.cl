@@ -2,7 +2,7 @@
 // and the one kernel that moves splats about. The NumPy forms are in clsplat/optim_reference.py, skew_map.py and
 // noise.py; a test compares them step for step.
 
-inline vreal adam_direction(vreal grad, global real *m_at, global real *v_at, real correct1, real correct2) {
+static inline vreal adam_direction(vreal grad, global real *m_at, global real *v_at, real correct1, real correct2) {
     const vreal m = lanes_load(m_at) * ADAM_BETA1 + grad * ((real)1 - ADAM_BETA1);
     const vreal v = lanes_load(v_at) * ADAM_BETA2 + grad * grad * ((real)1 - ADAM_BETA2);
     lanes_store(m, m_at);
@@ -34,14 +34,14 @@ kernel void adam_step(
 // SKEW_MAP 0 ("cube-root"): f = SKEW_MAX tanh(|s|)^(1/3); 1 ("linear"): f = SKEW_MAX tanh(|s|).
 #define SKEW_FLOOR R(1e-6)
 
-inline vreal skew_radius(vreal s) {
+static inline vreal skew_radius(vreal s) {
 #if SKEW_MAP == 0
     return SKEW_MAX * cbrt(tanh(s));
 #else
     return SKEW_MAX * tanh(s);
 #endif
 }
-inline vreal skew_radius_derivative(vreal s, vreal f) {
+static inline vreal skew_radius_derivative(vreal s, vreal f) {
     const vreal th = tanh(s);
 #if SKEW_MAP == 0
     return f * ((vreal)1 - th * th) / ((real)3 * th);
@@ -50,7 +50,7 @@ inline vreal skew_radius_derivative(vreal s, vreal f) {
 #endif
 }
 
-inline vec3 skew_map(vec3 s) {
+static inline vec3 skew_map(vec3 s) {
     const vreal norm = max(sqrt(dot3(s, s)), (vreal)SKEW_FLOOR);
     return scale3(s, skew_radius(norm) / norm);
 }
@@ -103,7 +103,7 @@ kernel void regularise(
 
 // Philox4x32-10 (Salmon et al. 2011): counter-based, so noise depends on (seed, iteration, splat) alone. One counter
 // a lane; key the same for all.
-inline void philox(vuint *c, uint2 key) {
+static inline void philox(vuint *c, uint2 key) {
     for (int round = 0; round < 10; ++round) {
         const vuint hi0 = mul_hi((vuint)0xD2511F53u, c[0]), lo0 = (vuint)0xD2511F53u * c[0];
         const vuint hi1 = mul_hi((vuint)0xCD9E8D57u, c[2]), lo1 = (vuint)0xCD9E8D57u * c[2];
@@ -116,7 +116,7 @@ inline void philox(vuint *c, uint2 key) {
 }
 
 // The top 23 bits at the centre of their interval, in (0, 1).
-inline vreal uniform_of(vuint word) {
+static inline vreal uniform_of(vuint word) {
     return (lanes_uint_to_real(word >> 9) + (vreal)R(0.5)) * (vreal)(real)(1.0 / 8388608.0);
 }
 

@@ -23,7 +23,7 @@ typedef struct {
     vmask in_front;
 } splat_terms;
 
-inline splat_terms splat_project(global const real *geom, const ulong capacity, constant real *cam) {
+static inline splat_terms splat_project(global const real *geom, const ulong capacity, constant real *cam) {
     splat_terms s;
     s.mean = vec3_load(geom + ROW_MEAN * capacity, capacity);
     s.c = camera_from_world(cam, s.mean);
@@ -51,7 +51,7 @@ inline splat_terms splat_project(global const real *geom, const ulong capacity, 
     return s;
 }
 
-inline vec3 unit_direction(constant real *cam, vec3 mean, vreal *inv_norm) {
+static inline vec3 unit_direction(constant real *cam, vec3 mean, vreal *inv_norm) {
     const vec3 from = add3(mean, scale3(CAMERA_CENTRE(cam), (vreal)-1));
     *inv_norm = (vreal)1 / sqrt(max(dot3(from, from), (vreal)R(1e-30)));
     return scale3(from, *inv_norm);

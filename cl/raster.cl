@@ -11,7 +11,7 @@
 #define V_RECORD (SHAPE_V + 3)
 
 // Copies a batch of records; `lists` holds isect ids in depth order.
-inline void stage_batch(global const uint *lists, global const uint *isect_splat, global const real *records,
+static inline void stage_batch(global const uint *lists, global const uint *isect_splat, global const real *records,
                         uint start, int n, local real *batch) {
     for (int k = LID; k < n; k += GROUP) {
         global const real *from = records + (ulong)isect_splat[lists[start + k]] * RECORD;
@@ -21,17 +21,17 @@ inline void stage_batch(global const uint *lists, global const uint *isect_splat
 }
 
 // Transmittance before any splat; pixels outside the image count as finished.
-inline vreal fresh_T(int x, int y, int width, int height) {
+static inline vreal fresh_T(int x, int y, int width, int height) {
     const vmask inside = ((vreal)x + lanes_iota() < (vreal)width) & lanes_mask(y < height);
     return lanes_if(inside, (vreal)1, (vreal)-1);
 }
 
 // Runs [first, last) of this item that the splat's pixel rows can touch.
-inline int first_run(const real *rec, int tile_y) {
+static inline int first_run(const real *rec, int tile_y) {
     const int row = max((int)rec[6] - tile_y, 0);
     return row * RUNS_PER_ROW / GROUP;
 }
-inline int past_run(const real *rec, int tile_y) {
+static inline int past_run(const real *rec, int tile_y) {
     const int rows = min((int)rec[7] - tile_y + 1, TILE);
     return (rows * RUNS_PER_ROW + GROUP - 1) / GROUP;
 }

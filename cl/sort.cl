@@ -12,7 +12,7 @@
 #endif
 
 // Histograms of this group's runs: hist[digit * SORT_GROUP + item].
-inline void count_digits(global const uint *keys, uint n, uint run, uint shift, local uint *hist) {
+static inline void count_digits(global const uint *keys, uint n, uint run, uint shift, local uint *hist) {
     const uint lid = get_local_id(0);
     for (uint d = 0; d < RADIX; ++d) hist[d * SORT_GROUP + lid] = 0;
     const ulong start = (ulong)get_global_id(0) * run;
