@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 def devices(ctx: click.Context) -> None:
     """List the OpenCL devices, try each with a small kernel, and name the mend for known ailments.
 
+    The first time, a device's quickest schedule is measured, which takes some seconds.
+
     The device that the other commands take by default is marked; --device takes an index such as 0:1, "cpu",
     "gpu", or a part of a platform's or device's name. Exit code 1 when no device works.
     """
@@ -87,15 +89,16 @@ def hints(platforms: set[str], has_gpu: bool, root: Path = Path("/")) -> list[st
 
 def _try(info: DeviceInfo) -> dict[str, str]:
     """Schedule and smoke test of one device; DeviceError where it does not work."""
-    from clsplat.device import SCHEDULES, default_schedule, open_device
+    from clsplat.device import SCHEDULES, open_device
     from clsplat.program import smoke_test
+    from clsplat.tuning import schedule_for
 
     device = open_device(info.index)
     build_ms, run_ms = smoke_test(device)
-    schedule = default_schedule(device.cl_device)
-    name = next(name for name, known in SCHEDULES.items() if known == schedule)
+    schedule = schedule_for(device)
+    name = next((name for name, known in SCHEDULES.items() if known == schedule), "set by hand")
     return {
-        "schedule": f"{name} ({schedule}) unless tuned",
+        "schedule": f"{name} ({schedule})",
         "smoke test": f"ok (built in {build_ms:.0f} ms, ran in {run_ms:.3f} ms)",
     }
 

@@ -1,0 +1,32 @@
+"""The benchmarks run, on a capture of a few pixels: they cannot rot."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from cli_runner import small_capture
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+def test_train_scenes(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    out = tmp_path / "scenes.jsonl"
+    options = ["--scenes", scene.name, "--shapes", "skew-normal", "--caps", "100", "--iterations", "8",
+               "--out", str(out)]
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    command = [sys.executable, str(BENCHMARKS / "train_scenes.py")]
+    done = subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
+    (row,) = [json.loads(line) for line in out.read_text().splitlines()]
+    assert row["splats"] <= 100
+    assert row["along"][-1][0] == 8
+    assert {"device", "driver", "schedule", "commit"} <= set(row)
+    again = subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
+    assert len(out.read_text().splitlines()) == 1, "a run that is there is not run again"
+    assert f"{row['psnr']:.2f}" in again.stdout
+    assert f"{row['psnr']:.3f}" in done.stdout
