@@ -9,20 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from clsplat.atomic import atomic_writer
+from clsplat.cameras_json import bare_name
 from clsplat.errors import InputError
 
 if TYPE_CHECKING:
     from clsplat.render import Rendered
 
-_IMAGE_SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
 _FULL_SCALE = 65535
 
 
-def output_stems(names: Sequence[str], extras: Sequence[str] = ()) -> list[str]:
+def output_stems(names: Sequence[str], extras: Sequence[str] = (), keep_suffix: bool = False) -> list[str]:
     """File names without suffix, one for each view: its name less an image's extension, folders kept.
 
     Parameters
     ----------
+    keep_suffix : keep the extension: an array's file is called exactly `<img_name>.npy`.
     extras : "alpha" and "depth" where those are written beside.
 
     Raises
@@ -32,7 +33,7 @@ def output_stems(names: Sequence[str], extras: Sequence[str] = ()) -> list[str]:
     stems: list[str] = []
     taken: dict[str, str] = {}
     for name in names:
-        stem = _stem(name)
+        stem = _safe(name) if keep_suffix else bare_name(_safe(name))
         for file in (stem, *(f"{stem}_{extra}" for extra in extras)):
             if file in taken:
                 raise InputError(f"views {taken[file]!r} and {name!r} would both be written to {file}: "
@@ -42,13 +43,13 @@ def output_stems(names: Sequence[str], extras: Sequence[str] = ()) -> list[str]:
     return stems
 
 
-def _stem(name: str) -> str:
+def _safe(name: str) -> str:
+    """The name as a relative path with forward slashes."""
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".")]
     absolute = name.startswith(("/", "\\")) or (bool(parts) and ":" in parts[0])
     if not parts or absolute or ".." in parts or "\0" in name:
         raise InputError(f"view {name!r}: its image would lie outside the output folder: rename it")
-    path = PurePosixPath(*parts)
-    return str(path.with_suffix("") if path.suffix.lower() in _IMAGE_SUFFIXES else path)
+    return str(PurePosixPath(*parts))
 
 
 class ImageWriter:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from clsplat.cameras_json import NamedCamera, read_cameras, write_cameras
+from clsplat.cameras_json import NamedCamera, bare_name, img_names, read_cameras, write_cameras
 from clsplat.errors import InputError
 
 from .models import LoadedModel, load_model, scene_of
@@ -76,7 +76,8 @@ def render(model: Path | None, model_path: Path | None, output: Path, cameras: P
         views, source, view_set = read_cameras(cameras), cameras, view_set or "all"
     elif from_scene:
         scene = scene_of(loaded, source_path, images, resolution)
-        views = [NamedCamera(view.name, view.camera) for view in scene.views]
+        names = img_names([view.name for view in scene.views])
+        views = [NamedCamera(name, view.camera) for name, view in zip(names, scene.views, strict=True)]
         test_names, source = scene.test_names, scene.path
     else:
         views = _recorded_cameras(loaded)
@@ -106,7 +107,7 @@ def render_views(model: LoadedModel, views: Sequence[NamedCamera], output: Path,
     from clsplat.render import Renderer
 
     extras = [name for name, wanted in (("alpha", alpha), ("depth", depth)) if wanted]
-    stems = output_stems([view.name for view in views], extras)
+    stems = output_stems([view.name for view in views], extras, keep_suffix=format == "npy")
     writer = ImageWriter(output, format, extras)
     renderer = Renderer(device)
     times = []
@@ -133,7 +134,8 @@ def _chosen(views: list[NamedCamera], test_names: frozenset[str] | None, view_se
     if not views:
         raise InputError(f"{source}: no cameras to render: give --cameras cameras.json, a scene with -s, "
                          "or --path orbit")
-    names = test_names or frozenset()
+    held_out = test_names or frozenset()
+    names = held_out | {bare_name(name) for name in held_out}  # cameras.json has them without the extension
     test = [view for view in views if view.name in names]
     if view_set in (None, "all"):
         return test if test and view_set is None else views

@@ -31,6 +31,21 @@ class NamedCamera:
     camera: Camera
 
 
+_IMAGE_SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
+
+
+def bare_name(name: str) -> str:
+    """An image's name without its extension; other names, dots included, stay."""
+    stem, dot, suffix = name.rpartition(".")
+    return stem if stem and dot + suffix.lower() in _IMAGE_SUFFIXES else name
+
+
+def img_names(names: Sequence[str]) -> list[str]:
+    """`img_name` of each image file: without its extension, as 3DGS writes it, unless two would be the same."""
+    bare = [bare_name(name) for name in names]
+    return bare if len(set(bare)) == len(bare) else list(names)
+
+
 def read_cameras(path: str | os.PathLike[str]) -> list[NamedCamera]:
     """Cameras in file order; keys that clsplat does not know are ignored, `id` too.
 

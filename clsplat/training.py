@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from .cameras_json import NamedCamera
+from .cameras_json import NamedCamera, img_names
 from .checkpoint import Checkpoint
 from .config import TrainConfig
 from .errors import InputError, OutputError
@@ -57,7 +57,8 @@ def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[P
         record = {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names)}
         folder.write_config({"config": config.to_json(), "scene": record | (extra or {})})
         views = [*scene.test, *scene.train]
-        folder.write_cameras([NamedCamera(view.name, view.camera) for view in views])
+        names = img_names([view.name for view in views])
+        folder.write_cameras([NamedCamera(n, view.camera) for n, view in zip(names, views, strict=True)])
     return trainer.run(folder)
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
-from clsplat.cameras_json import NamedCamera, read_cameras, write_cameras
+from clsplat.cameras_json import NamedCamera, img_names, read_cameras, write_cameras
 from clsplat.errors import InputError, OutputError
 
 IN_FOLDER = settings(
@@ -163,3 +163,8 @@ def test_fuzz_succeeds_or_says_why(file: Path, key: str, value: Any) -> None:
         message = str(error)
     assert message.startswith(str(file))
     assert "\n" not in message
+
+
+def test_image_names_lose_their_extension_unless_that_confuses_them() -> None:
+    assert img_names(["a.jpg", "b.c.PNG", "d", ".png"]) == ["a", "b.c", "d", ".png"]
+    assert img_names(["a.jpg", "a.png"]) == ["a.jpg", "a.png"]

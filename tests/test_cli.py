@@ -123,7 +123,7 @@ def test_cameras_json_has_3dgs_keys_and_all_views_test_first(model: Path, scene:
     keys = {"id", "img_name", "width", "height", "position", "rotation", "fx", "fy"}
     assert all(keys <= set(entry) for entry in entries)
     loaded = load_scene(scene)
-    assert [entry["img_name"] for entry in entries] == [view.name for view in (*loaded.test, *loaded.train)]
+    assert [entry["img_name"] for entry in entries] == [Path(view.name).stem for view in (*loaded.test, *loaded.train)]
     camera = loaded.test[0].camera
     np.testing.assert_allclose(entries[0]["position"], camera.position, atol=1e-12)
     np.testing.assert_allclose(entries[0]["rotation"], camera.rotation.T, atol=1e-12)

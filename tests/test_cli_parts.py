@@ -77,6 +77,7 @@ def test_stems() -> None:
     names = ["a.JPG", "dir/b.png", "./c.0001", "d.e.webp", "dir//f"]
     assert output_stems(names) == ["a", "dir/b", "c.0001", "d.e", "dir/f"]
     assert output_stems(["a", "a_alpha"]) == ["a", "a_alpha"]
+    assert output_stems(["a.jpg", "./b//c.png"], keep_suffix=True) == ["a.jpg", "b/c.png"]
     for bad in (["x/../y"], ["/x"], [""], ["."], ["a\0"], ["a", "a.png"]):
         with pytest.raises(InputError):
             output_stems(bad)
