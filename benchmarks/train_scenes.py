@@ -3,6 +3,7 @@
     python benchmarks/train_scenes.py --scenes fox kitchen --shapes gaussian skew-normal --caps 5000 20000 \\
         --iterations 2000 --seeds 0 1 2 [--out benchmarks/results/scenes.jsonl]
     python benchmarks/train_scenes.py --table                 # print what is there, run nothing
+    python benchmarks/train_scenes.py --pairs                 # likewise, gaussian beside skew-normal
 
 A run that is in the file already is skipped: kill and restart at will. Test views are measured along the run for the
 time-to-quality columns; nothing is selected on them. `seconds` is wall time of training alone, on a machine that others
@@ -40,10 +41,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=common.RESULTS / "scenes.jsonl")
     parser.add_argument("--models", type=Path, help="keep the trained models here")
     parser.add_argument("--table", action="store_true")
+    parser.add_argument("--pairs", action="store_true")
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.table:
-        print_table(common.read(args.out))
+    if args.table or args.pairs:
+        (print_pairs if args.pairs else print_table)(common.read(args.out))
         return
     label = " ".join(args.option)
     for scene, cap, iterations, seed, shape in itertools.product(
@@ -113,6 +115,29 @@ def print_table(rows: list[dict[str, Any]]) -> None:
                  f"{_mean(runs, 'render_ms'):.0f}",
                  f"{100 * _mean(runs, 'skewed_share'):.0f} %" if shape != "gaussian" else ""]
         cells += [_seconds_to(runs, db) for db in LEVELS_DB]
+        print("| " + " | ".join(str(c) for c in cells) + " |")
+
+
+def print_pairs(rows: list[dict[str, Any]]) -> None:
+    """Gaussian beside skew-normal at equal splats, iterations and seeds; difference: mean of the paired runs."""
+    titles = ["scene", "splats", "iterations", "seeds", "gaussian PSNR / SSIM", "skew-normal PSNR / SSIM",
+              "difference [dB]", "CPU s", "render ms"]
+    print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
+    by_key = {tuple(row[k] for k in KEY): row for row in rows}
+    groups: dict[tuple[Any, ...], list[tuple[dict[str, Any], dict[str, Any]]]] = {}
+    for row in rows:
+        other = by_key.get(tuple("skew-normal" if k == "shape" else row[k] for k in KEY))
+        if row["shape"] == "gaussian" and other is not None:
+            groups.setdefault((row["scene"], row["cap"], row["iterations"], row["label"]), []).append((row, other))
+    for (scene, cap, iterations, label), pairs in sorted(groups.items()):
+        sides = [[pair[side] for pair in pairs] for side in (0, 1)]
+        gain = [b["psnr"] - a["psnr"] for a, b in pairs]
+        spread = f" ({min(gain):+.2f} to {max(gain):+.2f})" if len(gain) > 1 else ""
+        cells = [scene, cap, f"{iterations} {label}".strip(), len(pairs),
+                 *(f"{_mean(runs, 'psnr'):.2f} / {_mean(runs, 'ssim'):.4f}" for runs in sides),
+                 f"{statistics.fmean(gain):+.2f}{spread}",
+                 " / ".join(f"{_mean(runs, 'cpu_seconds'):.0f}" for runs in sides),
+                 " / ".join(f"{_mean(runs, 'render_ms'):.0f}" for runs in sides)]
         print("| " + " | ".join(str(c) for c in cells) + " |")
 
 
