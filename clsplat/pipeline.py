@@ -199,6 +199,10 @@ class Pipeline:
         """`pull` of the first n splats."""
         return to_host(self.device, self.pool.get("pull", 0), np.empty(n, self.kernels.dtype))
 
+    def write_pull(self, pull: NDArray[Any], capacity: int) -> None:
+        """Go on summing from `pull`."""
+        to_device(self.device, self.pull(capacity), pull.astype(self.kernels.dtype))
+
     def reset_pull(self) -> None:
         """Start summing anew."""
         fill_zero(self.device, self.pool.get("pull", 0), self._pull_capacity * self._real)

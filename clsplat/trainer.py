@@ -100,6 +100,7 @@ class Trainer:
         self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config)
         if checkpoint is not None:
             self.optimizer.load_state(checkpoint.optimizer)
+            self.pipeline.write_pull(checkpoint.pull, self.splats.capacity)
         self.loss = ImageLoss(self.pipeline, config.lambda_dssim)
         self.optim_program = self.kernels.optim_program(self.device)
         self.renderer = Renderer(self.device)
@@ -194,7 +195,8 @@ class Trainer:
         """Everything that the rest of the run depends on."""
         return Checkpoint(self.iteration, self.config.to_json(), self.splats.download(self.splats.n),
                           self.optimizer.state(), dict(self.rng.bit_generator.state), self.views.queue,
-                          self.seconds, str(self.kernels.schedule), self.n_first)
+                          self.seconds, str(self.kernels.schedule), self.n_first,
+                          self.pipeline.read_pull(self.splats.n))
 
     def evaluate(self, views: list[View]) -> Evaluation:
         """Metrics of the present splats."""

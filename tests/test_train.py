@@ -102,14 +102,16 @@ def press_ctrl_c_at_50(progress: Progress) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
 
-@pytest.mark.parametrize("optimizer", ["fused", "numpy"])
+@pytest.mark.parametrize(
+    ("optimizer", "sampling", "interval"), [("fused", "opacity", 30), ("numpy", "opacity", 30), ("fused", "pull", 37)]
+)
 def test_a_crashed_run_resumes_to_the_same_model(
-    scene: Scene, uninterrupted: Path, tmp_path: Path, optimizer: str
+    scene: Scene, uninterrupted: Path, tmp_path: Path, optimizer: str, sampling: str, interval: int
 ) -> None:
-    """A crash at 50 leaves the checkpoint of 30; relocation and growth lie on both sides."""
-    config = replace(CONFIG, optimizer=optimizer)
+    """A crash at 50 leaves an earlier checkpoint; relocation and growth lie on both sides, and sums lie open at 37."""
+    config = replace(CONFIG, optimizer=optimizer, sampling=sampling, checkpoint_interval=interval)
     whole = uninterrupted
-    if optimizer == "numpy":
+    if (optimizer, sampling) != ("fused", "opacity"):
         whole = tmp_path / "whole"
         train(scene, config, output=whole)
     with pytest.raises(KeyboardInterrupt):
@@ -118,7 +120,7 @@ def test_a_crashed_run_resumes_to_the_same_model(
     resumed = train(
         scene, config, lambda progress: said.append(progress.message), output=tmp_path / "m", resume=True
     )
-    assert "iteration 30" in said[0]
+    assert f"iteration {interval}" in said[0]
     assert resumed.finished
     assert ply(tmp_path / "m") == ply(whole)
     logged = [
