@@ -6,6 +6,7 @@
 
 #define RECORD (8 + SHAPE_N)
 #define CULLED_KEY 0xFFFFFFFFu
+#define COV2D_MAX R(1e12)  // px^2: a wider splat would overflow float32 on the way, and is no longer a splat
 
 // What projection and its gradient both need.
 typedef struct {
@@ -102,7 +103,8 @@ kernel void project_splats(
     out[6] = y_lo;
     out[7] = y_hi;
     const vmask seen = s.in_front & (box.left + box.right > (vreal)0) & (x_lo <= x_hi) & (y_lo <= y_hi)
-                     & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height);
+                     & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height)
+                     & (s.cov2d.xx < (vreal)COV2D_MAX) & (s.cov2d.yy < (vreal)COV2D_MAX);
     const vreal seen_real = lanes_if(seen, (vreal)1, (vreal)0);
 
     real lane[LANES][RECORD], edge[5][LANES];

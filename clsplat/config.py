@@ -53,7 +53,7 @@ class TrainConfig:
     densify_from : when the strategy begins, as a fraction of the run.
     densify_until : when it ends, as a fraction of the run.
     densify_interval : iterations between its actions.
-    growth : least growth of the splat count per action; more where the cap is far (see train.growth_factor).
+    growth : least growth of the splat count per action; more where the cap is far (see trainer.growth_factor).
     checkpoint_interval : iterations between checkpoints; 0: only at the end.
     save_iterations : when to write a PLY, beside the end.
     test_iterations : when to measure the test views; for the log only.

@@ -28,7 +28,6 @@ class Shape:
     source : its file in cl/shape/.
     fields : learnable fields beside the core ones and colour.
     record : reals of its screen record (SHAPE_N); moments : its gradient accumulators (SHAPE_V).
-    normalised : whether `normalisation` (peak, pdf, none) means anything to it.
     """
 
     name: str
@@ -36,7 +35,6 @@ class Shape:
     fields: tuple[Field, ...]
     record: int
     moments: int
-    normalised: bool
 
     def schema(self, sh_degree: int) -> Schema:
         """Fields of this shape at one SH degree."""
@@ -47,8 +45,8 @@ class Shape:
 # benchmarks.
 SKEW = Field("skew", 3, ("skew_0", "skew_1", "skew_2"), (0.0, 0.0, 0.0), 2.5e-3, limit=SKEW_LIMIT)
 
-GAUSSIAN = Shape("gaussian", "shape/gaussian.clh", (), record=4, moments=6, normalised=False)
-SKEW_NORMAL = Shape("skew-normal", "shape/skew_normal.clh", (SKEW,), record=9, moments=9, normalised=True)
+GAUSSIAN = Shape("gaussian", "shape/gaussian.clh", (), record=4, moments=6)
+SKEW_NORMAL = Shape("skew-normal", "shape/skew_normal.clh", (SKEW,), record=9, moments=9)
 
 SHAPES = {shape.name: shape for shape in (GAUSSIAN, SKEW_NORMAL)}
 DEFAULT_SHAPE = SKEW_NORMAL.name

@@ -24,6 +24,7 @@ from clsplat.device import (
     open_device,
 )
 from clsplat.errors import DeviceError
+from clsplat.tuning import schedule_for
 
 INFO = DeviceInfo(
     index="0:0",
@@ -40,6 +41,7 @@ INFO = DeviceInfo(
     has_fp64=False,
     compute_units=8,
 )
+
 POCL, INTEL = "Portable Computing Language", "Intel(R) OpenCL"
 
 
@@ -250,7 +252,7 @@ def test_command_lists_and_tries_every_device():
     for info in list_devices():
         assert f"{info.index}  {info.name}" in result.output
     assert "ok (built in" in result.output
-    assert str(default_schedule(open_device().cl_device)) in result.output
+    assert str(schedule_for(open_device())) in result.output
     assert result.output.count("(default)") == 1
 
 
