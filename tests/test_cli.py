@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -53,11 +52,8 @@ def ply(model: Path, iteration: int = ITERATIONS) -> Path:
 # --- the program -------------------------------------------------------------------------------
 
 
-def test_help_lists_all_commands_and_is_quick() -> None:
-    start = time.perf_counter()
+def test_help_lists_all_commands_and_loads_nothing_heavy() -> None:
     text = subprocess.run([*PROGRAM, "--help"], check=True, capture_output=True, text=True).stdout
-    # 0.1 s on an idle machine; a heavy import (NumPy, pyopencl, pycolmap, scipy) would be seen by name.
-    assert time.perf_counter() - start < 2
     for name in ("devices", "demo", "train", "render", "eval"):
         assert f"\n  {name} " in text
     loaded = subprocess.run(
@@ -267,7 +263,7 @@ def test_interrupt_then_resume(scene: Path, tmp_path: Path) -> None:
         if "/100000" in line:
             break
     process.send_signal(2)
-    rest = process.communicate(timeout=60)[1]
+    rest = process.communicate(timeout=300)[1]
     assert process.returncode == 130
     assert f"clsplat train --resume -m {model}" in rest.splitlines()[-1]
     assert "Traceback" not in rest
