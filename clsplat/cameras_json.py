@@ -31,13 +31,13 @@ class NamedCamera:
     camera: Camera
 
 
-_IMAGE_SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
+IMAGE_SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
 
 
 def bare_name(name: str) -> str:
     """An image's name without its extension; other names, dots included, stay."""
     stem, dot, suffix = name.rpartition(".")
-    return stem if stem and dot + suffix.lower() in _IMAGE_SUFFIXES else name
+    return stem if stem and dot + suffix.lower() in IMAGE_SUFFIXES else name
 
 
 def img_names(names: Sequence[str]) -> list[str]:

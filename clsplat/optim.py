@@ -13,7 +13,7 @@ from .densify import Plan
 from .device import Device
 from .kernels import KernelBuild
 from .optim_reference import BETA1, BETA2, SH_REST_FACTOR, NumpyAdam
-from .program import GROUP_ITEMS
+from .program import GROUP_ITEMS, lane_group
 from .schema import Array, Group
 from .skew_map import SkewMap
 
@@ -52,7 +52,7 @@ class FusedAdam:
     def __init__(self, device: Device, kernels: KernelBuild, splats: SplatBuffers, config: TrainConfig) -> None:
         self.device, self.splats, self.kernels = device, splats, kernels
         self.program = kernels.optim_program(device)
-        self._group = 1 if device.info.type == "CPU" else GROUP_ITEMS
+        self._group = lane_group(device)
         self.rates = field_rates(config)
         self.steps = 0
         schema, capacity, dtype = splats.schema, splats.capacity, splats.dtype

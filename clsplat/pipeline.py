@@ -18,7 +18,7 @@ from .camera import Camera
 from .device import Device
 from .errors import DeviceError
 from .kernels import MARGIN_X, MARGIN_Y, NEAR, TILE, KernelBuild
-from .program import GROUP_ITEMS
+from .program import lane_group
 from .sort import Sorter
 
 MAX_ISECTS = 2**31 - 1
@@ -106,9 +106,7 @@ class Pipeline:
         self._forward_event: Any = None
         self._pull_capacity = 0
         self._backward_event: Any = None
-        # PoCL stacks up the private arrays of all work-items of a group: groups of one where lanes do the
-        # work.
-        self.group = 1 if device.info.type == "CPU" else GROUP_ITEMS
+        self.group = lane_group(device)
 
     def forward(self, splats: SplatBuffers, camera: Camera,
                 background: tuple[float, float, float] = (0, 0, 0), sh_degree: int | None = None) -> Frame:

@@ -110,6 +110,14 @@ def parse_signatures(text: str, real: Real) -> dict[str, tuple[Parameter, ...]]:
     return signatures
 
 
+def lane_group(device: Device) -> int:
+    """Group size for kernels whose work-items are vectors of splats.
+
+    PoCL stacks up the private arrays of all work-items of a group: groups of one where lanes do the work.
+    """
+    return 1 if device.info.type == "CPU" else GROUP_ITEMS
+
+
 class Program:
     """A built program; `program["name"]` or `program.name` is a Kernel, made once."""
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from .camera import Camera
+from .cameras_json import IMAGE_SUFFIXES
 from .colmap import Photo, Points, find_model, read_model
 from .errors import InputError
 from .images import ImageU8, read_image, resize_area
@@ -19,7 +20,6 @@ from .images import ImageU8, read_image, resize_area
 MAX_WIDTH = 1600                # 3DGS: with resolution -1, wider images are reduced to this [px]
 _EXTENT_MARGIN = 1.1            # 3DGS: extent over the farthest camera's distance from their mean
 _FEW_REGISTERED = 0.8
-_IMAGE_SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
 
 __all__ = ["MAX_WIDTH", "Points", "Scene", "View", "load_scene"]
 
@@ -157,7 +157,7 @@ def _photo_files(folder: Path, names: list[str]) -> dict[str, Path]:
 
 
 def _warn_of_unregistered(folder: Path, registered: int) -> None:
-    photos = sum(1 for file in folder.rglob("*") if file.suffix.lower() in _IMAGE_SUFFIXES)
+    photos = sum(1 for file in folder.rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
     if registered < _FEW_REGISTERED * photos:
         warnings.warn(f"{folder}: the model registers only {registered} of {photos} photos; parts of the "
                       "scene may be missing. More overlap between photos helps.", stacklevel=3)
