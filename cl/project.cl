@@ -10,7 +10,8 @@
 
 // What projection and its gradient both need.
 typedef struct {
-    vec3 mean, c;          // world, camera
+    vec3 mean, c;          // the point that is projected: world, camera
+    vec3 centre;           // that point in the splat's own unit frame, from (x, y, z)
     unit_quat quat;
     mat3 rotation;         // of the splat
     vec3 scale;
@@ -19,21 +20,62 @@ typedef struct {
     vec3 ar0, ar1;         // rows of A R
     vec3 b0, b1;           // rows of B = A R S
     sym2 cov2d;            // B B' + low-pass [px^2]
-    vreal opacity;
-    vec3 m;                // skew, zero for shapes without
+    splat_params s;
     vmask in_front;
 } splat_terms;
 
+static inline vreal opacity_of(vreal raw) {
+#if OPACITY_SIGNED
+    return tanh(raw);
+#else
+    return (vreal)1 / ((vreal)1 + exp(-raw));
+#endif
+}
+// Derivative of the opacity with respect to its raw value, given the opacity.
+static inline vreal opacity_slope(vreal opacity) {
+#if OPACITY_SIGNED
+    return (vreal)1 - opacity * opacity;
+#else
+    return opacity * ((vreal)1 - opacity);
+#endif
+}
+
+static inline splat_params load_params(global const real *geom, const ulong capacity) {
+    splat_params s = no_grads().s;
+    s.opacity = opacity_of(lanes_load(geom + ROW_OPACITY_LOGIT * capacity));
+#ifdef ROW_OPACITY_MINUS_LOGIT
+    s.opacity_minus = opacity_of(lanes_load(geom + ROW_OPACITY_MINUS_LOGIT * capacity));
+#endif
+#ifdef ROW_SKEW
+    s.skew = vec3_load(geom + ROW_SKEW * capacity, capacity);
+#endif
+#ifdef ROW_NORMAL
+    s.skew = vec3_load(geom + ROW_NORMAL * capacity, capacity);
+#endif
+#ifdef ROW_BETA
+    s.beta = lanes_load(geom + ROW_BETA * capacity);
+#endif
+#ifdef ROW_NU
+    s.nu = lanes_load(geom + ROW_NU * capacity);
+#endif
+    return s;
+}
+
 static inline splat_terms splat_project(global const real *geom, const ulong capacity, constant real *cam) {
     splat_terms s;
-    s.mean = vec3_load(geom + ROW_MEAN * capacity, capacity);
-    s.c = camera_from_world(cam, s.mean);
-    s.in_front = s.c.z >= (vreal)CAMERA_NEAR(cam);
-    s.c.z = lanes_if(s.in_front, s.c.z, (vreal)1);
+    s.s = load_params(geom, capacity);
     s.quat = quat_load(geom + ROW_QUAT * capacity, capacity);
     s.rotation = quat_rotation(s.quat);
     const vec3 log_scale = vec3_load(geom + ROW_LOG_SCALE * capacity, capacity);
     s.scale = (vec3){exp(log_scale.x), exp(log_scale.y), exp(log_scale.z)};
+    s.mean = vec3_load(geom + ROW_MEAN * capacity, capacity);
+#ifdef SHAPE_CENTRE
+    s.centre = shape_centre(s.s);
+    s.mean = add3(s.mean, mat3_apply(s.rotation, mul3(s.scale, s.centre)));
+#endif
+    s.c = camera_from_world(cam, s.mean);
+    s.in_front = s.c.z >= (vreal)CAMERA_NEAR(cam);
+    s.c.z = lanes_if(s.in_front, s.c.z, (vreal)1);
     s.to_px = camera_project(cam, s.c);
     const mat3 w = camera_rotation(cam);
     s.a0 = add3(scale3(w.r0, s.to_px.j00), scale3(w.r2, s.to_px.j02));
@@ -43,12 +85,6 @@ static inline splat_terms splat_project(global const real *geom, const ulong cap
     s.b0 = mul3(s.ar0, s.scale);
     s.b1 = mul3(s.ar1, s.scale);
     s.cov2d = (sym2){dot3(s.b0, s.b0) + (vreal)LOW_PASS, dot3(s.b0, s.b1), dot3(s.b1, s.b1) + (vreal)LOW_PASS};
-    s.opacity = (vreal)1 / ((vreal)1 + exp(-lanes_load(geom + ROW_OPACITY_LOGIT * capacity)));
-#ifdef ROW_SKEW
-    s.m = vec3_load(geom + ROW_SKEW * capacity, capacity);
-#else
-    s.m = (vec3){(vreal)0, (vreal)0, (vreal)0};
-#endif
     return s;
 }
 
@@ -81,7 +117,7 @@ kernel void project_splats(
 
     vreal out[RECORD];
     extents box;
-    shape_project(s.opacity, s.m, s.b0, s.b1, s.cov2d, out + 8, &box);
+    shape_project(s.s, s.b0, s.b1, s.cov2d, out + 8, &box);
     out[0] = s.to_px.x;
     out[1] = s.to_px.y;
     out[5] = s.c.z;
@@ -131,7 +167,9 @@ kernel void project_splats(
 
 // moments [rows SHAPE_V + 3, capacity]: summed over pixels; the last three are the gradient of the colour.
 // grad_geom, grad_sh: as geom, sh; overwritten (zero for unseen splats), sh only for the bands in use.
-// pull [capacity]: the norm of the gradient of mean_px is added (3DGS's densification signal).
+// signals [4, capacity], for strategies, of the splats seen: added to, the norm of the gradient of mean_px in units of
+// half the image (3DGS's normalised device coordinates), the absolute gradient along the viewing ray [1/world unit]
+// (3DSGS's depth gradient) and 1; and the largest 3 sigma radius on the screen [px].
 kernel void project_splats_vjp(
     global const real *restrict geom,
     global const real *restrict sh,
@@ -141,10 +179,12 @@ kernel void project_splats_vjp(
     global const uint *restrict depth_key,
     global real *restrict grad_geom,
     global real *restrict grad_sh,
-    global real *restrict pull,
+    global real *restrict signals,
     ulong capacity,
     uint n_splats,
-    int sh_degree)
+    int sh_degree,
+    int width,
+    int height)
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n_splats) return;
@@ -164,26 +204,37 @@ kernel void project_splats_vjp(
         v[j] = lanes_if(seen, lanes_load(moments + first + j * capacity), zero);
 
     shape_grads g;
-    shape_project_vjp(s.opacity, s.m, s.b0, s.b1, s.cov2d, v, &g);
-
-    const vreal pulled = sqrt(g.mean_x * g.mean_x + g.mean_y * g.mean_y);
-    lanes_store(lanes_load(pull + first) + lanes_if(seen, pulled, zero), pull + first);
+    shape_project_vjp(s.s, s.b0, s.b1, s.cov2d, v, &g);
 
     // cov2d = B B' + low-pass
     const vec3 v_b0 = add3(g.b0, add3(scale3(s.b0, (real)2 * g.cov2d.xx), scale3(s.b1, g.cov2d.xy)));
     const vec3 v_b1 = add3(g.b1, add3(scale3(s.b1, (real)2 * g.cov2d.yy), scale3(s.b0, g.cov2d.xy)));
     // B = A R S
-    const vec3 v_scale = add3(mul3(v_b0, s.ar0), mul3(v_b1, s.ar1));
+    vec3 v_scale = add3(mul3(v_b0, s.ar0), mul3(v_b1, s.ar1));
     const vec3 v_ar0 = mul3(v_b0, s.scale), v_ar1 = mul3(v_b1, s.scale);
     const vec3 v_a0 = mat3_apply(s.rotation, v_ar0), v_a1 = mat3_apply(s.rotation, v_ar1);
-    const mat3 v_rotation = {add3(scale3(v_ar0, s.a0.x), scale3(v_ar1, s.a1.x)),
+    mat3 v_rotation = {add3(scale3(v_ar0, s.a0.x), scale3(v_ar1, s.a1.x)),
                              add3(scale3(v_ar0, s.a0.y), scale3(v_ar1, s.a1.y)),
                              add3(scale3(v_ar0, s.a0.z), scale3(v_ar1, s.a1.z))};
     // A = J W
     const mat3 w = camera_rotation(cam);
     const projection v_px = {g.mean_x, g.mean_y, dot3(v_a0, w.r0), dot3(v_a0, w.r2), dot3(v_a1, w.r1),
                              dot3(v_a1, w.r2)};
-    vec3 v_mean = mat3_apply_transposed(w, camera_project_vjp(cam, s.c, v_px));
+    const vec3 v_c = camera_project_vjp(cam, s.c, v_px);
+    vec3 v_mean = mat3_apply_transposed(w, v_c);
+
+    const vreal half_x = g.mean_x * (vreal)(real)(0.5 * width), half_y = g.mean_y * (vreal)(real)(0.5 * height);
+    const vreal along_ray = fabs(dot3(v_c, s.c)) / sqrt(dot3(s.c, s.c));
+    const vreal middle = (real)0.5 * (s.cov2d.xx + s.cov2d.yy), half_gap = (real)0.5 * (s.cov2d.xx - s.cov2d.yy);
+    const vreal radius = (real)3 * sqrt(middle + sqrt(half_gap * half_gap + s.cov2d.xy * s.cov2d.xy));
+    global real *signal = signals + first;
+    lanes_store(lanes_load(signal) + lanes_if(seen, sqrt(half_x * half_x + half_y * half_y), zero), signal);
+    signal += capacity;
+    lanes_store(lanes_load(signal) + lanes_if(seen, along_ray, zero), signal);
+    signal += capacity;
+    lanes_store(lanes_load(signal) + lanes_if(seen, (vreal)1, zero), signal);
+    signal += capacity;
+    lanes_store(max(lanes_load(signal), lanes_if(seen, radius, zero)), signal);
 
     vreal v_rgb[3], inv_norm, basis[SH_COUNT], v_basis[SH_COUNT];
     for (int c = 0; c < 3; ++c) v_rgb[c] = lanes_if(lanes_load(seen_rgb[c]) > zero, v[SHAPE_V + c], zero);
@@ -202,6 +253,15 @@ kernel void project_splats_vjp(
     v_direction = add3(v_direction, scale3(direction, -dot3(direction, v_direction)));
     v_mean = add3(v_mean, scale3(v_direction, inv_norm));
 
+#ifdef SHAPE_CENTRE  // projected point = (x, y, z) + R S centre
+    const vec3 stretched = mul3(s.scale, s.centre), v_stretched = mat3_apply_transposed(s.rotation, v_mean);
+    v_scale = add3(v_scale, mul3(v_stretched, s.centre));
+    v_rotation.r0 = add3(v_rotation.r0, scale3(stretched, v_mean.x));
+    v_rotation.r1 = add3(v_rotation.r1, scale3(stretched, v_mean.y));
+    v_rotation.r2 = add3(v_rotation.r2, scale3(stretched, v_mean.z));
+    g.s.skew = add3(g.s.skew, shape_centre_vjp(s.s, mul3(v_stretched, s.scale)));
+#endif
+
     global real *out = grad_geom + first;
     const vec3 v_log_scale = mul3(v_scale, s.scale);
     vec3_store((vec3){lanes_if(seen, v_mean.x, zero), lanes_if(seen, v_mean.y, zero),
@@ -209,10 +269,23 @@ kernel void project_splats_vjp(
     vec3_store((vec3){lanes_if(seen, v_log_scale.x, zero), lanes_if(seen, v_log_scale.y, zero),
                       lanes_if(seen, v_log_scale.z, zero)}, out + ROW_LOG_SCALE * capacity, capacity);
     quat_rotation_vjp(s.quat, v_rotation, seen, out + ROW_QUAT * capacity, capacity);
-    lanes_store(lanes_if(seen, g.opacity * s.opacity * ((vreal)1 - s.opacity), zero),
-                out + ROW_OPACITY_LOGIT * capacity);
+    lanes_store(lanes_if(seen, g.s.opacity * opacity_slope(s.s.opacity), zero), out + ROW_OPACITY_LOGIT * capacity);
+#ifdef ROW_OPACITY_MINUS_LOGIT
+    lanes_store(lanes_if(seen, g.s.opacity_minus * opacity_slope(s.s.opacity_minus), zero),
+                out + ROW_OPACITY_MINUS_LOGIT * capacity);
+#endif
+#ifdef ROW_BETA
+    lanes_store(lanes_if(seen, g.s.beta, zero), out + ROW_BETA * capacity);
+#endif
+#ifdef ROW_NU
+    lanes_store(lanes_if(seen, g.s.nu, zero), out + ROW_NU * capacity);
+#endif
+    const vec3 v_skew = {lanes_if(seen, g.s.skew.x, zero), lanes_if(seen, g.s.skew.y, zero),
+                         lanes_if(seen, g.s.skew.z, zero)};
 #ifdef ROW_SKEW
-    vec3_store((vec3){lanes_if(seen, g.m.x, zero), lanes_if(seen, g.m.y, zero), lanes_if(seen, g.m.z, zero)},
-               out + ROW_SKEW * capacity, capacity);
+    vec3_store(v_skew, out + ROW_SKEW * capacity, capacity);
+#endif
+#ifdef ROW_NORMAL
+    vec3_store(v_skew, out + ROW_NORMAL * capacity, capacity);
 #endif
 }

@@ -21,7 +21,7 @@ RGB = tuple[float, float, float]
 PATH = click.Path(path_type=Path)
 SETS = ("test", "train", "all")
 
-_CHOICES = {"shape": tuple(SHAPES), "normalisation": NORMALISATIONS, "skew_map": SKEW_MAPS,
+_CHOICES = {"shape": tuple(SHAPES), "normalisation": NORMALISATIONS, "skew_map": ("auto", *SKEW_MAPS),
             "strategy": STRATEGIES, "optimizer": OPTIMIZERS, "sampling": SAMPLINGS}
 _ALIASES = {"iterations": ("--steps",)}
 _METAVARS = {"init": "sfm|random|FILE.ply"}

@@ -15,7 +15,7 @@ from .atomic import atomic_writer
 from .errors import InputError
 from .schema import Array
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Checkpoint:
     queue : training views still to come in this epoch.
     seconds : training time so far. schedule : of the kernels, whose rounding depends on it.
     n_first : splats at the start, which the growth depends on.
-    pull : (N,), see Pipeline.pull.
+    signals : (4, N), see Pipeline.signals.
     """
 
     iteration: int
@@ -44,7 +44,7 @@ class Checkpoint:
     seconds: float
     schedule: str
     n_first: int
-    pull: Array
+    signals: Array
 
     def save(self, path: Path) -> None:
         """Write; raises OutputError when the disk is full or the folder read-only (the old file stays)."""
@@ -53,7 +53,7 @@ class Checkpoint:
                 "n_first": self.n_first}
         arrays = {f"splats.{k}": v for k, v in self.splats.items()}
         arrays |= {f"optimizer.{k}": v for k, v in self.optimizer.items()}
-        arrays["pull"] = self.pull
+        arrays["signals"] = self.signals
         arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         with atomic_writer(path) as stream:
             np.savez(stream, **arrays)  # type: ignore[arg-type]
@@ -65,7 +65,7 @@ class Checkpoint:
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
             meta = json.loads(arrays.pop("meta").tobytes())
-            pull = arrays.pop("pull")
+            signals = arrays.pop("signals")
         except FileNotFoundError:
             raise InputError(f"{path}: no checkpoint to resume from: start without --resume") from None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
@@ -80,4 +80,4 @@ class Checkpoint:
 
         return cls(meta["iteration"], meta["config"], part("splats."), part("optimizer."), meta["rng"],
                    meta["queue"], meta["seconds"], meta["schedule"],
-                   meta["n_first"], pull)
+                   meta["n_first"], signals)

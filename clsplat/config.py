@@ -9,10 +9,13 @@ from typing import Any
 from .errors import InputError
 from .schema import MAX_SH_DEGREE
 from .shapes import DEFAULT_SHAPE, check_normalisation, shape_named
-from .skew_map import DEFAULT_SKEW_MAP, SKEW_MAPS
+from .skew_map import check_map, map_named
 
-STRATEGIES = ("mcmc",)
+STRATEGIES = ("mcmc", "adc")
 OPTIMIZERS = ("fused", "numpy")
+POSITION_OPTIMIZERS = ("adam", "sghmc", "sghmc-sss")
+ALTERNATIONS = ("off", "cyclic")
+RELOCATIONS = ("length", "length-squared", "opacity-only")
 SAMPLINGS = ("opacity", "pull")
 PUBLISHED_ITERATIONS = 30_000  # that 3DGS's rates are meant for
 
@@ -25,10 +28,14 @@ class TrainConfig:
     ----------
     shape : the splat kernel.
     normalisation : of skewed kernels: what `opacity` means.
-    skew_map : from the trainable skew to the kernel's.
+    skew_map : from the trainable skew to the kernel's; "auto": cube-root for the centred form, polar for the direct.
     iterations : optimizer steps, one image each.
     cap_max : hard limit on splats.
-    strategy : "mcmc" (relocate dead splats, grow to the cap, noise on positions).
+    strategy : "mcmc" (relocate dead splats, grow to the cap, noise on positions) or "adc" (3DGS: clone, split,
+        prune, opacity reset).
+    relocation : what a relocated splat's copies change: "length" (opacity and scale, such that what they absorb along
+        a line stays), "length-squared" (SSS as released: the square of that factor), "opacity-only".
+    relocation_limit : most splats relocated per action, as a fraction of all (SSS: 0.05); 1: no limit.
     sampling : what new and relocated splats are drawn by: "opacity" (3DGS-MCMC), or "pull", opacity times the
         gradient of the screen position (3DGS's criterion), which sends them where the image is still wrong.
     init : "sfm", "random" or a .ply path.
@@ -47,13 +54,31 @@ class TrainConfig:
     skew_lr : Adam's rate of the trainable skew.
     opacity_reg : weight of the mean opacity in the loss.
     scale_reg : weight of the mean scale in the loss.
+    bisect_reg : weight of the mean squared difference of a splat's two opacities in the loss (3DSGS).
+    normal_lr : Adam's rate of the plane's normal (half-gaussian).
+    beta_lr : Adam's rate of log beta (generalised-exponential).
+    nu_lr : Adam's rate of log nu (student-t).
     noise_lr : size of the position noise, times the positions' rate.
+    position_optimizer : "adam", "sghmc" (friction and noise in scene units, always stable) or "sghmc-sss" (as SSS
+        writes it).
+    sghmc_friction : SSS's C, after the burn-in.
+    sghmc_burn_in : fraction of the run before momentum sets in.
+    sghmc_burn_in_friction : SSS's C during the burn-in; there it only sets the noise.
+    alternation : "off", or "cyclic": after a joint warm-up, cycles that train first everything but the skew, then
+        the skew alone (SNS).
+    alternation_warmup : fraction of the run before the first cycle.
+    alternation_cycle : iterations of a cycle.
+    alternation_split : fraction of a cycle given to everything but the skew.
     init_opacity : of splats made from points.
     init_scale : of splats made from points, in units of the distance to their three neighbours.
     densify_from : when the strategy begins, as a fraction of the run.
     densify_until : when it ends, as a fraction of the run.
     densify_interval : iterations between its actions.
     growth : least growth of the splat count per action; more where the cap is far (see trainer.growth_factor).
+    grad_threshold : "adc" clones or splits splats whose mean gradient of the screen position is above it (3DGS).
+    depth_threshold : the same for the gradient along the viewing ray (3DSGS); 0: not looked at.
+    opacity_reset : "adc" resets opacities that often per run; 0: never.
+    dense_size : "adc" splits splats larger than this fraction of the scene extent and clones others.
     checkpoint_interval : iterations between checkpoints; 0: only at the end.
     save_iterations : when to write a PLY, beside the end.
     test_iterations : when to measure the test views; for the log only.
@@ -63,10 +88,12 @@ class TrainConfig:
 
     shape: str = DEFAULT_SHAPE
     normalisation: str = "peak"
-    skew_map: str = DEFAULT_SKEW_MAP
+    skew_map: str = "auto"
     iterations: int = 7000
     cap_max: int = 100_000
     strategy: str = "mcmc"
+    relocation: str = "length"
+    relocation_limit: float = 1.0
     sampling: str = "opacity"
     init: str = "sfm"
     sh_degree: int = 3
@@ -84,13 +111,29 @@ class TrainConfig:
     skew_lr: float = 2.5e-3
     opacity_reg: float = 0.001
     scale_reg: float = 0.001
+    bisect_reg: float = 0.0
+    normal_lr: float = 3e-3
+    beta_lr: float = 1e-3
+    nu_lr: float = 1e-2
     noise_lr: float = 5e5
+    position_optimizer: str = "adam"
+    sghmc_friction: float = 120.0
+    sghmc_burn_in: float = 7 / 30
+    sghmc_burn_in_friction: float = 5e5
+    alternation: str = "off"
+    alternation_warmup: float = 0.1
+    alternation_cycle: int = 100
+    alternation_split: float = 0.5
     init_opacity: float = 0.5
     init_scale: float = 0.5
     densify_from: float = 0.05
     densify_until: float = 0.8
     densify_interval: int = 100
     growth: float = 1.05
+    grad_threshold: float = 2e-4
+    depth_threshold: float = 0.0
+    opacity_reset: int = 10
+    dense_size: float = 0.01
     checkpoint_interval: int = 1000
     save_iterations: tuple[int, ...] = ()
     test_iterations: tuple[int, ...] = ()
@@ -100,20 +143,25 @@ class TrainConfig:
     def __post_init__(self) -> None:
         shape_named(self.shape)
         check_normalisation(self.normalisation)
-        _one_of("skew_map", self.skew_map, SKEW_MAPS)
+        check_map(self.skew_map, shape_named(self.shape).skew_form)
         _one_of("strategy", self.strategy, STRATEGIES)
         _one_of("sampling", self.sampling, SAMPLINGS)
         _one_of("optimizer", self.optimizer, OPTIMIZERS)
-        for name in ("iterations", "cap_max", "densify_interval"):
+        _one_of("relocation", self.relocation, RELOCATIONS)
+        _one_of("position_optimizer", self.position_optimizer, POSITION_OPTIMIZERS)
+        _one_of("alternation", self.alternation, ALTERNATIONS)
+        for name in ("iterations", "cap_max", "densify_interval", "alternation_cycle"):
             _at_least(name, getattr(self, name), 1)
         for name in ("seed", "sh_interval", "checkpoint_interval", "position_lr_init", "position_lr_final",
                      "opacity_lr", "scaling_lr", "rotation_lr", "feature_lr", "skew_lr", "opacity_reg",
-                     "scale_reg", "noise_lr"):
+                     "scale_reg", "bisect_reg", "normal_lr", "beta_lr", "nu_lr", "noise_lr", "sghmc_friction",
+                     "sghmc_burn_in_friction", "grad_threshold", "depth_threshold", "opacity_reset", "dense_size"):
             _at_least(name, getattr(self, name), 0)
         if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise InputError(f"sh_degree {self.sh_degree}: must be 0 to {MAX_SH_DEGREE}")
-        if not 0 <= self.lambda_dssim <= 1:
-            raise InputError(f"lambda_dssim {self.lambda_dssim}: must be 0 to 1")
+        for name in ("lambda_dssim", "relocation_limit", "sghmc_burn_in", "alternation_warmup", "alternation_split"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"{name} {getattr(self, name)}: must be 0 to 1")
         if self.position_lr_init <= 0 or self.position_lr_final <= 0:
             raise InputError("position_lr_init and position_lr_final must be above 0")
         if self.seed >= 2**64:
@@ -126,11 +174,17 @@ class TrainConfig:
     def rate_factor(self, field: str) -> float:
         """How much larger a field's rate is in a short run: (30 000 / iterations)^p, at least 1.
 
-        3DGS's rates belong to 30 000 iterations. p is 3/4 for positions, 1/2 for rotation and skew, 1/4 for
+        3DGS's rates belong to 30 000 iterations. p is 3/4 for positions, 1/2 for rotation and the shape's own, 1/4 for
         scale, 0 otherwise; measured on validation views at 1500 iterations (ARCHITECTURE.md, "Training").
         """
-        power = {"mean": 0.75, "quat": 0.5, "skew": 0.5, "log_scale": 0.25}.get(field, 0.0)
+        power = {"mean": 0.75, "quat": 0.5, "skew": 0.5, "normal": 0.5, "beta": 0.5, "nu": 0.5,
+                 "log_scale": 0.25}.get(field, 0.0)
         return float(max(1.0, PUBLISHED_ITERATIONS / self.iterations) ** power)
+
+    @property
+    def map(self) -> str:
+        """The skew map in use, "auto" resolved; "" for shapes without a skew."""
+        return map_named(self.skew_map, shape_named(self.shape).skew_form)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for json.dump."""

@@ -15,14 +15,13 @@ peak-normalised kernel seen from the side, as a function of |m|, integrated nume
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+from .plan import Plan
 from .schema import Array
 from .shapes import SKEW_MAX
 
@@ -36,37 +35,6 @@ RULES = ("length", "opacity-only")
 _SKEW_NODES = 257  # of the r_j table; linear interpolation between them errs by less than 2e-4
 
 Reals = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What becomes of each splat; rows 0..N-1 are the old ones in place, rows N.. are added.
-
-    Attributes
-    ----------
-    source : (N_new,) int64, the old row that the new row copies its parameters from (itself if unmoved). A
-        row that is copied from is never itself replaced (`source[source] == source`).
-    opacity_logit : (N_new,) float32, the new value, for every row.
-    log_scale_offset : (N_new,) float32, to add to all three log scales *after* the copy.
-    fresh : (N_new,) bool, rows whose Adam moments become zero. Moments are never copied: a relocated row
-        keeps its own, which explore; the live row it was put on starts afresh, which holds it
-        (ubc-vision/3dgs-mcmc#21). Added rows and rows that were not finite start afresh too.
-    relocated, added : counts, for the log.
-    """
-
-    source: NDArray[np.int64]
-    opacity_logit: NDArray[np.float32]
-    log_scale_offset: NDArray[np.float32]
-    fresh: NDArray[np.bool_]
-    relocated: int
-    added: int
-
-    def apply(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
-        """The parameters after the plan (copies); the device's gather must do the same."""
-        moved = {name: array[self.source] for name, array in arrays.items()}
-        moved["opacity_logit"] = self.opacity_logit.astype(arrays["opacity_logit"].dtype)
-        moved["log_scale"] = moved["log_scale"] + self.log_scale_offset[:, None]
-        return moved
 
 
 def plan_relocation(
@@ -144,7 +112,9 @@ def plan_relocation(
     fresh = np.zeros(n_new, np.bool_)
     fresh[:n] = (copies > 0) | ~sound
     fresh[n:] = True
-    return Plan(source, new_logit[source], offset[source], fresh, relocated=len(dead), added=n_new - n)
+    values = {"opacity_logit": new_logit[source],
+              "log_scale": log_scale[source] + offset[source, None].astype(log_scale.dtype)}
+    return Plan(source, values, fresh, relocated=len(dead), added=n_new - n)
 
 
 def relocation(

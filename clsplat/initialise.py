@@ -22,11 +22,6 @@ RANDOM_POINTS = 100_000  # 3DGS
 RANDOM_EXTENT = 3.0  # half side of the cube of random points, in scene extents (3DGS-MCMC)
 FEWEST_POINTS = 4  # a point and its three neighbours give the first scale
 
-# |m| that a model without any skew starts from, in random directions: m = 0 is a stationary point. The effect
-# on the kernel is cubic: at 0.1 the skewness index is 4e-4, far below one step of an 8-bit image.
-SKEW_SEED = 0.1
-
-
 def initial_splats(
     scene: Scene,
     shape: str = DEFAULT_SHAPE,
@@ -65,7 +60,7 @@ def initial_splats(
                                     opacity=opacity, scale_factor=scale_factor)
     else:
         raise InputError(f"init {init!r}: choose sfm, random, or the path of a .ply model")
-    return _with_some_skew(splats, rng), message
+    return _started(splats, rng), message
 
 
 def _points(
@@ -141,12 +136,16 @@ def _fit_bands(sh: Array, coefficients: int) -> Array:
     return fitted
 
 
-def _with_some_skew(splats: Splats, rng: np.random.Generator) -> Splats:
-    """A small skew in random directions where the shape has one and the model none at all."""
-    if "skew" not in splats.schema or splats.skew.any():
-        return splats
-    direction = rng.standard_normal((len(splats), 3))
+def _started(splats: Splats, rng: np.random.Generator) -> Splats:
+    """With the fields that must not start at their neutral value moved off it, where all splats are there."""
     arrays = splats.to_numpy()
-    unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    arrays["skew"] = (SKEW_SEED * unit).astype(arrays["mean"].dtype)
+    for field in splats.schema:
+        values = arrays[field.name]
+        if field.start is None or (values.reshape(len(values), -1) != np.asarray(field.neutral, values.dtype)).any():
+            continue
+        if field.width == 1:
+            values[:] = field.start
+        else:
+            direction = rng.standard_normal(values.shape)
+            values[:] = field.start * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     return Splats(splats.shape, arrays, normalisation=splats.normalisation)

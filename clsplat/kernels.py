@@ -11,7 +11,7 @@ from . import optim_reference as adam
 from .device import Device, Schedule
 from .program import Define, Program, Real, build
 from .schema import Group, Schema
-from .shapes import NORMALISATIONS, SKEW_MAX, shape_named
+from .shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, shape_named
 from .skew_map import SKEW_MAPS
 
 TILE = 16
@@ -84,7 +84,7 @@ class KernelBuild:
 
     def optim_program(self, device: Device) -> Program:
         """Adam, skew map, regularisers, noise and gathers."""
-        defines = {k: v for k, v in self._defines().items() if k.startswith(("ROW_", "LANES", "SKEW_"))}
+        defines = {k: v for k, v in self._defines().items() if k.startswith(("ROW_", "LANES", "SKEW_", "SLANT_", "OPACITY_"))}
         defines |= {"ADAM_BETA1": adam.BETA1, "ADAM_BETA2": adam.BETA2, "ADAM_EPS": adam.EPS,
                     "SKEW_MAP": SKEW_MAPS.index(self.skew_map)}
         return build(device, ("lanes.clh", "algebra.clh", "optim.cl"), defines, self.real)
@@ -105,6 +105,7 @@ class KernelBuild:
             "WITH_DEPTH": int(self.with_depth), "WITH_V_ALPHA": int(self.with_v_alpha),
             "NORMALISATION": NORMALISATIONS.index(self.normalisation),
             "PEAK_STEPS": 3 if self.real == "float" else 4,
-            "SKEW_MAX": SKEW_MAX, "LOW_PASS": LOW_PASS,
+            "SKEW_MAX": SKEW_MAX, "SLANT_MAX": SLANT_MAX, "OPACITY_SIGNED": int(shape_named(self.shape).signed),
+            **dict(shape_named(self.shape).defines), "LOW_PASS": LOW_PASS,
             "ALPHA_MIN": self.alpha_min, "ALPHA_MAX": self.alpha_max, "T_MIN": self.t_min,
         }

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from .buffers import ParameterBuffers, SplatBuffers, to_device, to_host
 from .config import TrainConfig
-from .densify import Plan
 from .device import Device
 from .kernels import KernelBuild
 from .optim_reference import BETA1, BETA2, SH_REST_FACTOR, NumpyAdam
+from .plan import Plan
 from .program import GROUP_ITEMS, lane_group
 from .schema import Array, Group
 from .skew_map import SkewMap
@@ -60,7 +60,7 @@ class FusedAdam:
         self.second = ParameterBuffers(device, schema, capacity, dtype)
         self.spare = {group: device.alloc(splats.group_bytes(group)) for group in Group}
         self.skewed = "skew" in schema
-        self.map = SkewMap(config.skew_map)
+        self.map = SkewMap(config.map or "cube-root")
         if self.skewed:
             self._skew_bytes = 3 * splats.capacity * dtype.itemsize
             self.skew_s, self.skew_spare = device.alloc(self._skew_bytes), device.alloc(self._skew_bytes)
@@ -113,7 +113,7 @@ class FusedAdam:
             self._gather(self.skew_s, source, self.skew_spare, n_new, 3)
             self.skew_s, self.skew_spare = self.skew_spare, self.skew_s
         splats.n = n_new
-        set_planned(splats, plan)
+        splats.upload(plan.values)
 
     def state(self) -> dict[str, NDArray[Any]]:
         n = self.splats.n
@@ -151,7 +151,7 @@ class HostAdam:
 
     def __init__(self, device: Device, kernels: KernelBuild, splats: SplatBuffers, config: TrainConfig) -> None:
         self.splats, self.adam, self.rates = splats, NumpyAdam(), field_rates(config)
-        self.map = SkewMap(config.skew_map)
+        self.map = SkewMap(config.map or "cube-root")
         self.skewed = "skew" in splats.schema
         self.skew_s: Array = np.empty(0)
         if self.skewed:
@@ -181,7 +181,7 @@ class HostAdam:
         self.adam.relocate(plan.fresh)
         if self.skewed:
             self.skew_s = self.skew_s[plan.source]
-        set_planned(self.splats, plan)
+        self.splats.upload(plan.values)
 
     def state(self) -> dict[str, NDArray[Any]]:
         state: dict[str, NDArray[Any]] = dict(self.adam.state_dict())
@@ -191,10 +191,3 @@ class HostAdam:
         self.adam.load_state_dict({k: v for k, v in state.items() if k != "skew_s"})
         if self.skewed:
             self.skew_s = state["skew_s"]
-
-
-def set_planned(splats: SplatBuffers, plan: Plan) -> None:
-    """Opacity and scale of a plan, after its gather."""
-    scales = splats.download(splats.n, ("log_scale",))["log_scale"]
-    splats.upload({"log_scale": scales + plan.log_scale_offset[:, None].astype(scales.dtype),
-                   "opacity_logit": plan.opacity_logit})

@@ -22,6 +22,7 @@ from .program import lane_group
 from .sort import Sorter
 
 MAX_ISECTS = 2**31 - 1
+SIGNALS = 4  # screen gradient, depth gradient, times seen, screen radius
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class Pipeline:
         self._layouts: dict[str, tuple[ImageLayout, Any]] = {}
         self._lists: Any = None
         self._forward_event: Any = None
-        self._pull_capacity = 0
+        self._signal_capacity = 0
         self._backward_event: Any = None
         self.group = lane_group(device)
 
@@ -174,8 +175,8 @@ class Pipeline:
             -(-splats.n // self.kernels.lanes), self.group, geom=splats.geom, sh=splats.sh,
             cam=pool.get("camera", 0), moments=moments, records=pool.get("records", 0),
             depth_key=pool.get("depth_key_kept", 0), grad_geom=grads.geom, grad_sh=grads.sh,
-            pull=self.pull(splats.capacity), capacity=splats.capacity, n_splats=splats.n,
-            sh_degree=frame.sh_degree,
+            signals=self.signals(splats.capacity), capacity=splats.capacity, n_splats=splats.n,
+            sh_degree=frame.sh_degree, width=layout.width, height=layout.height,
         )
 
     def read_image(self, name: str, layout: ImageLayout) -> NDArray[Any]:
@@ -184,26 +185,29 @@ class Pipeline:
         host = np.empty((planes, layout.rows, layout.stride), self.kernels.dtype)
         return layout.unpack(to_host(self.device, self.pool.get(name, 0), host))
 
-    def pull(self, capacity: int) -> Any:
-        """Buffer [capacity]: each splat's |gradient of mean_px|, summed since `reset_pull`."""
-        known = self._pull_capacity
-        buffer = self.pool.get("pull", capacity * self._real)
+    def signals(self, capacity: int) -> Any:
+        """Buffer [4, capacity] for strategies, collected since `reset_signals` (rows: cl/project.cl)."""
+        known = self._signal_capacity
+        buffer = self.pool.get("signals", SIGNALS * capacity * self._real)
         if known != capacity:
-            self._pull_capacity = capacity
-            self.reset_pull()
+            self._signal_capacity = capacity
+            self.reset_signals()
         return buffer
 
-    def read_pull(self, n: int) -> NDArray[Any]:
-        """`pull` of the first n splats."""
-        return to_host(self.device, self.pool.get("pull", 0), np.empty(n, self.kernels.dtype))
+    def read_signals(self, n: int) -> NDArray[Any]:
+        """`signals` of the first n splats, (4, n)."""
+        rows = np.empty((SIGNALS, self._signal_capacity), self.kernels.dtype)
+        return np.ascontiguousarray(to_host(self.device, self.pool.get("signals", 0), rows)[:, :n])
 
-    def write_pull(self, pull: NDArray[Any], capacity: int) -> None:
-        """Go on summing from `pull`."""
-        to_device(self.device, self.pull(capacity), pull.astype(self.kernels.dtype))
+    def write_signals(self, signals: NDArray[Any], capacity: int) -> None:
+        """Go on collecting from `signals` (4, n)."""
+        rows = np.zeros((SIGNALS, capacity), self.kernels.dtype)
+        rows[:, : signals.shape[1]] = signals
+        to_device(self.device, self.signals(capacity), rows)
 
-    def reset_pull(self) -> None:
-        """Start summing anew."""
-        fill_zero(self.device, self.pool.get("pull", 0), self._pull_capacity * self._real)
+    def reset_signals(self) -> None:
+        """Start collecting anew."""
+        fill_zero(self.device, self.pool.get("signals", 0), SIGNALS * self._signal_capacity * self._real)
 
     def raster_events(self) -> tuple[Any, Any]:
         """Finished events of the last rasterize and rasterize_vjp, for timing."""

@@ -37,6 +37,12 @@ class Field:
     neutral : value at which a shape *is* the Gaussian; used where a file lacks the field.
     lr : Adam's learning rate (3DGS's constants unless a comment says otherwise).
     limit : largest allowed Euclidean norm of the stored vector, or None.
+    bounds : lowest and highest allowed value of each component, or None. Bounded fields are positive, and the
+        optimizer steps their logarithm.
+    neutral_from : another field of the same width whose value is the neutral one, instead of `neutral`.
+    nonzero : whether the vector's length carries no meaning and must not be 0 (quaternions, directions).
+    start : what training starts from where all is neutral: the length of a vector in a random direction, or a
+        number; None: the neutral value itself.
     """
 
     name: str
@@ -46,6 +52,10 @@ class Field:
     lr: float
     group: Group = Group.GEOM
     limit: float | None = None
+    bounds: tuple[float, float] | None = None
+    neutral_from: str | None = None
+    nonzero: bool = False
+    start: float | None = None
 
 
 def sh_coefficients(degree: int) -> int:
@@ -63,7 +73,7 @@ def sh_degree_of(n_coefficients: int) -> int:
 
 # 3DGS's learning rates; the mean's is multiplied by the scene extent and decays (see train).
 MEAN = Field("mean", 3, ("x", "y", "z"), (0.0, 0.0, 0.0), 1.6e-4)
-QUAT = Field("quat", 4, ("rot_0", "rot_1", "rot_2", "rot_3"), (1.0, 0.0, 0.0, 0.0), 1e-3)
+QUAT = Field("quat", 4, ("rot_0", "rot_1", "rot_2", "rot_3"), (1.0, 0.0, 0.0, 0.0), 1e-3, nonzero=True)
 LOG_SCALE = Field("log_scale", 3, ("scale_0", "scale_1", "scale_2"), (0.0, 0.0, 0.0), 5e-3)
 OPACITY_LOGIT = Field("opacity_logit", 1, ("opacity",), (0.0,), 5e-2)
 

@@ -21,13 +21,29 @@ from numpy.typing import NDArray
 from .errors import InputError
 from .shapes import SKEW_MAX
 
-SKEW_MAPS = ("cube-root", "linear")
-DEFAULT_SKEW_MAP = SKEW_MAPS[0]
+# By the form of the skew (shapes.Shape.skew_form); the first is its default.
+MAPS = {"centred": ("cube-root", "linear"), "direct": ("polar", "radial", "coupled")}
+SKEW_MAPS = tuple(name for names in MAPS.values() for name in names)
 R_FLOOR = 1e-6  # a kernel that repeats this map in float32 needs the same constants
 R_CEILING = 20.0  # cosh(r)^2 stays in float32's range; tanh is 1 long before
 TANH_CEILING = 1.0 - 1e-4  # inverse: keeps s where the map still has a slope
 
 _F = TypeVar("_F", np.float32, np.float64)
+
+
+def map_named(name: str, form: str | None) -> str:
+    """`name`, or for "auto" the default map of a form of skew; "" where there is no skew."""
+    if form is None:
+        return ""
+    return MAPS[form][0] if name == "auto" else name
+
+
+def check_map(name: str, form: str | None) -> None:
+    """Raises InputError unless `name` is "auto" or a map of the form (any map where there is no skew)."""
+    known = SKEW_MAPS if form is None else MAPS[form]
+    if name != "auto" and name not in known:
+        kind = "" if form is None else f" for the {form} form of skew"
+        raise InputError(f"skew_map {name!r}{kind}: choose auto or one of {', '.join(known)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +59,7 @@ class SkewMap:
     InputError : unknown name.
     """
 
-    name: str = DEFAULT_SKEW_MAP
+    name: str = "cube-root"
 
     def __post_init__(self) -> None:
         if self.name not in SKEW_MAPS:

@@ -52,7 +52,9 @@ class Splats:
         schema = descriptor.schema(sh_degree_for(own))
         n = len(own["mean"]) if "mean" in own and own["mean"].ndim else 0
         for field in descriptor.fields:
-            if field.name not in own:
+            if field.name not in own and field.neutral_from in own:
+                own[field.name] = own[field.neutral_from].copy()
+            elif field.name not in own:
                 own[field.name] = np.tile(np.asarray(field.neutral, dtype=dtype), (n, 1)).reshape(
                     public_shape(field, n)
                 )

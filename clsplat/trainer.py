@@ -29,6 +29,7 @@ from .render import Renderer
 from .run_log import Progress, RunLog
 from .scene import Scene, View
 from .schedules import exponential_decay, sh_degree_at
+from .skew_map import SKEW_MAPS
 from .splats import Splats
 from .tuning import schedule_for
 from .view_sampler import ViewSampler
@@ -76,7 +77,7 @@ class Trainer:
         # A resumed run keeps its schedule: another one would round otherwise.
         schedule = Schedule.parse(checkpoint.schedule) if checkpoint else schedule_for(self.device)
         self.kernels = KernelBuild(config.shape, config.sh_degree, schedule, config.normalisation,
-                                   skew_map=config.skew_map)
+                                   skew_map=config.map or SKEW_MAPS[0])
         largest = max((view.camera for view in scene.train), key=lambda c: c.width * c.height)
         self.memory = estimate(config, self.kernels, ImageLayout(largest.width, largest.height))
         check(self.memory, self.device)
@@ -100,7 +101,7 @@ class Trainer:
         self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config)
         if checkpoint is not None:
             self.optimizer.load_state(checkpoint.optimizer)
-            self.pipeline.write_pull(checkpoint.pull, self.splats.capacity)
+            self.pipeline.write_signals(checkpoint.signals, self.splats.capacity)
         self.loss = ImageLoss(self.pipeline, config.lambda_dssim)
         self.optim_program = self.kernels.optim_program(self.device)
         self.renderer = Renderer(self.device)
@@ -177,12 +178,12 @@ class Trainer:
         finite = np.ones(self.splats.n, bool)
         for array in arrays.values():
             finite &= np.isfinite(array.reshape(len(array), -1)).all(axis=1)
-        pull = self.pipeline.read_pull(self.splats.n) if self.config.sampling == "pull" else None
+        pull = self.pipeline.read_signals(self.splats.n)[0] if self.config.sampling == "pull" else None
         rule = "length" if self.config.normalisation == "peak" or "skew" not in arrays else "opacity-only"
         self.optimizer.apply(plan_relocation(arrays["opacity_logit"], arrays["log_scale"], self.rng,
                                              self.config.cap_max, self.growth, skew=arrays.get("skew"),
                                              finite=finite, rule=rule, pull=pull))
-        self.pipeline.reset_pull()
+        self.pipeline.reset_signals()
 
     def snapshot(self) -> Splats:
         """The splats as they are now, on the host."""
@@ -196,7 +197,7 @@ class Trainer:
         return Checkpoint(self.iteration, self.config.to_json(), self.splats.download(self.splats.n),
                           self.optimizer.state(), dict(self.rng.bit_generator.state), self.views.queue,
                           self.seconds, str(self.kernels.schedule), self.n_first,
-                          self.pipeline.read_pull(self.splats.n))
+                          self.pipeline.read_signals(self.splats.n))
 
     def evaluate(self, views: list[View]) -> Evaluation:
         """Metrics of the present splats."""

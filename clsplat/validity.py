@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from .errors import InputError
-from .schema import MAX_SH_DEGREE, QUAT, Array, Field, Schema, public_shape, sh_coefficients
+from .schema import MAX_SH_DEGREE, Array, Field, Schema, public_shape, sh_coefficients
 
-# A quaternion's squared norm must neither vanish nor overflow in float32 (1.2e-38 to 3.4e38).
+# A quaternion's (or direction's) squared norm must neither vanish nor overflow in float32 (1.2e-38 to 3.4e38).
 QUAT_NORM_MIN, QUAT_NORM_MAX = 1e-15, 1e15
 # A vector stored at its limit may round up in float32.
 LIMIT_SLACK = 1e-5
@@ -44,10 +44,17 @@ def first_fault(field: Field, values: Array) -> Fault | None:
         index, *component = (int(i) for i in np.argwhere(~finite)[0])
         value = float(values[(index, *component)])
         return Fault(index, tuple(component), f"value is {value}, must be finite")
-    if field != QUAT and field.limit is None:
+    if field.bounds is not None:
+        low, high = field.bounds
+        bad = np.flatnonzero((values < low * (1 - LIMIT_SLACK)) | (values > high * (1 + LIMIT_SLACK)))
+        if bad.size == 0:
+            return None
+        index = int(bad[0])
+        return Fault(index, (), f"value is {float(values[index]):.6g}, must be {low:g} to {high:g}")
+    if not field.nonzero and field.limit is None:
         return None
     norms = np.linalg.norm(values.astype(np.float64), axis=1)
-    if field == QUAT:
+    if field.nonzero:
         bad = np.flatnonzero((norms < QUAT_NORM_MIN) | (norms > QUAT_NORM_MAX))
         rule = "above 0" if bad.size and norms[bad[0]] < 1 else f"at most {QUAT_NORM_MAX:g}"
     else:

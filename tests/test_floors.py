@@ -17,8 +17,9 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = """
     errors
     atomic interrupt run_log runtime schema capture_world
-    camera device images metrics noise optim_reference ply_header schedules shapes validity colmap_files
-    cameras_json capture checkpoint colmap densify ply program skew_map
+    camera device images metrics noise optim_reference plan ply_header profiles schedules validity colmap_files
+    cameras_json capture checkpoint colmap program shapes
+    densify ply skew_map
     config kernels scene splats
     buffers camera_path initialise model_folder view_sampler
     optim sort
