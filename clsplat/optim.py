@@ -21,8 +21,16 @@ from .skew_map import SkewMap
 class Optimizer(Protocol):
     """Steps the splats; owns the moments and the trainable skew s, of which the splats hold m."""
 
-    def step(self, grads: ParameterBuffers, mean_lr: float, sh_degree: int) -> None:
-        """One step on all splats; `mean_lr` [world units]; SH bands above `sh_degree` stay."""
+    def step(self, grads: ParameterBuffers, mean_lr: float, sh_degree: int, iteration: int) -> None:
+        """One step on all splats.
+
+        Parameters
+        ----------
+        grads : of the stored parameters; the optimizer may change them.
+        mean_lr : Adam's rate of the means at this iteration, scene extent and rate factor included [world units].
+        sh_degree : SH bands above it stay.
+        iteration : from 1; decides which blocks learn, and the noise.
+        """
 
     def apply(self, plan: Plan) -> None:
         """Move, add and reset splats as planned."""
@@ -41,8 +49,9 @@ def field_rates(config: TrainConfig) -> dict[str, float]:
     return {name: rate * config.rate_factor(name) for name, rate in rates.items()}
 
 
-def make_optimizer(device: Device, kernels: KernelBuild, splats: SplatBuffers, config: TrainConfig) -> Optimizer:
-    """The optimizer that the config names."""
+def make_optimizer(device: Device, kernels: KernelBuild, splats: SplatBuffers, config: TrainConfig,
+                   extent: float) -> Optimizer:
+    """The optimizer that the config names; `extent` of the scene [world units]."""
     return (FusedAdam if config.optimizer == "fused" else HostAdam)(device, kernels, splats, config)
 
 
@@ -76,7 +85,7 @@ class FusedAdam:
                               Group.SH: device.alloc(sh_rates.nbytes)}
         to_device(device, self._rate_buffers[Group.SH], sh_rates)
 
-    def step(self, grads: ParameterBuffers, mean_lr: float, sh_degree: int) -> None:
+    def step(self, grads: ParameterBuffers, mean_lr: float, sh_degree: int, iteration: int) -> None:
         self.steps += 1
         correct = {"correct1": 1 / (1 - BETA1**self.steps), "correct2": 1 / (1 - BETA2**self.steps)}
         self._geom_rates[:3] = mean_lr
@@ -157,7 +166,7 @@ class HostAdam:
         if self.skewed:
             self.skew_s = self.map.inverse(splats.download(splats.n, ("skew",))["skew"])
 
-    def step(self, grads: ParameterBuffers, mean_lr: float, sh_degree: int) -> None:
+    def step(self, grads: ParameterBuffers, mean_lr: float, sh_degree: int, iteration: int) -> None:
         n = self.splats.n
         params, gradients = self.splats.download(n), grads.download(n)
         rates: dict[str, Any] = self.rates | {"mean": mean_lr}

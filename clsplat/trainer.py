@@ -98,7 +98,7 @@ class Trainer:
         self.pipeline = Pipeline(self.device, self.kernels)
         self.splats = SplatBuffers.of(self.device, first, dtype, capacity)
         self.grads = ParameterBuffers(self.device, self.splats.schema, capacity, dtype)
-        self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config)
+        self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config, scene.extent)
         if checkpoint is not None:
             self.optimizer.load_state(checkpoint.optimizer)
             self.pipeline.write_signals(checkpoint.signals, self.splats.capacity)
@@ -163,7 +163,7 @@ class Trainer:
                 capacity=self.splats.capacity, opacity_scale=config.opacity_reg / n,
                 scale_scale=config.scale_reg / (3 * n))
         mean_lr = self.scene.extent * self.mean_rate(it)
-        self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree)
+        self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it)
         if self.densify_first <= it <= self.densify_last and it % config.densify_interval == 0:
             self.densify()
         if config.noise_lr:

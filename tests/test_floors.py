@@ -21,7 +21,7 @@ FLOORS = """
     cameras_json capture checkpoint colmap program shapes
     densify ply skew_map
     config kernels scene splats
-    buffers camera_path initialise model_folder view_sampler
+    blocks buffers camera_path initialise model_folder view_sampler
     optim sort
     pipeline
     loss memory tuning
