@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from reference import (
-    FIELDS,
     Rendered,
     alpha_maps,
     prepared,
@@ -18,6 +17,7 @@ from reference import (
     render_reference,
     visible_order,
 )
+from reference_scenes import for_shape
 from tolerances import relative_error
 
 from clsplat import render
@@ -35,7 +35,8 @@ SMOOTH = {"alpha_min": 0.0, "alpha_max": 1.0, "t_min": 0.0}
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One scene, one view, one loss, and what the reference says of them.
+    """One scene, one view, one loss, and what the reference says of them. `arrays` may lack the shape's own fields
+    (see `reference_scenes.for_shape`).
 
     The values are rounded to `dtype` first, so that both sides see the same ones. A pixel is *decided* if no
     alpha and no transmittance in it lies so close to a threshold that float32 may fall on the other side;
@@ -53,7 +54,7 @@ class Case:
 
     @cached_property
     def values(self) -> Arrays:
-        return {name: np.asarray(self.arrays[name], self.dtype) for name in FIELDS[self.shape]}
+        return {name: value.astype(self.dtype) for name, value in for_shape(self.arrays, self.shape).items()}
 
     @cached_property
     def splats(self) -> Splats:
@@ -74,14 +75,15 @@ class Case:
         """(H, W)."""
         shape = (self.camera.height, self.camera.width)
         values = prepared(self.values, self.shape)
-        order = visible_order(values, self.camera)
+        order = visible_order(values, self.camera, self.shape)
         if self.thresholds or not len(order):
             return np.ones(shape, bool)
         ordered = {name: value[order] for name, value in values.items()}
         screen = project(ordered, self.camera, self.shape, self.normalisation)
         raw = alpha_maps(screen, self.camera, 0.0, np.inf)
         behind = np.cumprod(1.0 - alpha_maps(screen, self.camera), axis=0)
-        close = (np.abs(raw / ALPHA_MIN - 1.0) < 3e-4) | (np.abs(raw - ALPHA_MAX) < 1e-5)
+        size = np.abs(raw)
+        close = (np.abs(size / ALPHA_MIN - 1.0) < 3e-4) | (np.abs(size - ALPHA_MAX) < 1e-5)
         close |= np.abs(behind / T_MIN - 1.0) < 2e-3
         return ~close.any(axis=0).reshape(shape)
 

@@ -1,8 +1,8 @@
 """An independent float64 renderer, slow and obvious, that the OpenCL kernels are held against.
 
-It goes another way than the kernels wherever there is one: skewed splats are converted to the direct
-(location, scale matrix, slope) form in 3D and projected there, every pixel meets every splat, the peak
-is found by bisection, and gradients come by complex step instead of hand-written adjoints.
+It goes another way than the kernels wherever there is one: skewed splats are in the direct (location, scale matrix,
+slope) form, every pixel meets every splat, the peak is found by bisection, and gradients come by complex step instead
+of hand-written adjoints. The shapes' own parts are in reference_skewed.py and reference_radial.py.
 
 All of it accepts complex arrays; see reference_formulas.py for the closed forms and the complex step.
 """
@@ -11,31 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from reference_formulas import (
-    bounded,
-    direct_form,
-    inverse_2x2,
-    jacobian,
-    normal_cdf,
-    peak,
-    rotation,
-    sh_basis,
-    slope_of,
-)
+from reference_formulas import inverse_2x2, jacobian, normal_cdf, rotation, sh_basis
+from reference_radial import RADIAL
+from reference_shape import Array, Geometry, Kernel
+from reference_skewed import SKEWED
 
 from clsplat.camera import Camera
 
-Array = NDArray[Any]
-
-LOW_PASS = 0.3  # added to the screen covariance [px²]
 NEAR_PLANE = 0.01  # splats with a camera z below this are skipped
+REFERENCES = SKEWED | RADIAL
 FIELDS = {
-    "gaussian": ("mean", "quat", "log_scale", "opacity_logit", "sh"),
-    "skew-normal": ("mean", "quat", "log_scale", "opacity_logit", "sh", "skew"),
+    name: ("mean", "quat", "log_scale", "opacity_logit", *own.fields, "sh") for name, own in REFERENCES.items()
 }
 STEP = 1e-20  # of the complex step; its square must vanish beside 1
 
@@ -50,71 +40,68 @@ class Rendered(NamedTuple):
 
 @dataclass(frozen=True)
 class Screen:
-    """B projected splats: alpha = amplitude exp(-d' inverse(scale2d) d / 2) Phi(slope' d), d from location.
-
-    Parameters
-    ----------
-    mean_px : (B, 2), where the mean falls [px]; location : (B, 2), where the kernel is centred [px].
-    scale2d : (B, 2, 2), scale matrix, low-pass included [px²]; the covariance where the slope is 0.
-    slope : (B, 2) [1/px], or None for shapes without skew (no Phi then).
-    amplitude : (B,), factor before the exponential: opacity and normalisation.
-    color : (B, 3), >= 0; depth : (B,), camera z.
+    """B projected splats: their kernels, where the projected point falls (B, 2) [px], color (B, 3) >= 0 and
+    depth (B,), its camera z.
     """
 
+    kernel: Kernel
     mean_px: Array
-    location: Array
-    scale2d: Array
-    slope: Array | None
-    amplitude: Array
     color: Array
     depth: Array
+
+
+def projected_point(arrays: Mapping[str, Array], shape: str) -> Array:
+    """(B, 3) world positions of the points that are projected."""
+    centre = REFERENCES[shape].centre
+    if centre is None:
+        return arrays["mean"]
+    return arrays["mean"] + np.einsum("bij,bj->bi", axes_of(arrays), centre(arrays))
+
+
+def axes_of(arrays: Mapping[str, Array]) -> Array:
+    """R S (B, 3, 3), world from splat frame."""
+    return rotation(arrays["quat"]) * np.exp(arrays["log_scale"])[:, None, :]
 
 
 def project(arrays: Mapping[str, Array], camera: Camera, shape: str = "gaussian", normalisation: str = "peak",
             sh_degree: int | None = None) -> Screen:
     """Raw splats (fields as stored, real or complex) to the screen; `sh_degree` None means all stored."""
-    point = arrays["mean"] @ camera.rotation.T + camera.translation
+    world = projected_point(arrays, shape)
+    point = world @ camera.rotation.T + camera.translation
     z = point[:, 2]
-    tangent = point[:, :2] / z[:, None]
-    mean_px = tangent * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    axes = rotation(arrays["quat"]) * np.exp(arrays["log_scale"])[:, None, :]  # R S, world from splat frame
-    affine = jacobian(point, camera) @ camera.rotation
-    opacity = 1.0 / (1.0 + np.exp(-arrays["opacity_logit"]))
-
-    scale3d = axes @ np.swapaxes(axes, 1, 2)
-    location, slope, amplitude = mean_px, None, opacity
-    if shape == "skew-normal":
-        scale3d, delta3d = direct_form(scale3d, np.einsum("bij,bj->bi", axes, bounded(arrays["skew"])))
-        delta = np.einsum("bij,bj->bi", affine, delta3d)
-        location = mean_px - np.sqrt(2.0 / np.pi) * delta
-    elif shape != "gaussian":
-        raise ValueError(f"unknown shape {shape!r}")
-    scale2d = affine @ scale3d @ np.swapaxes(affine, 1, 2) + LOW_PASS * np.eye(2)
-    if shape == "skew-normal":
-        slope, c = slope_of(scale2d, delta)
-        amplitude = opacity * {"peak": 1.0 / peak(c), "pdf": 2.0, "none": 1.0}[normalisation]
+    mean_px = point[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    geometry = Geometry(mean_px, jacobian(point, camera) @ camera.rotation, axes_of(arrays))
+    kernel = REFERENCES[shape].kernel(arrays, geometry, normalisation)
 
     stored = int(np.sqrt(arrays["sh"].shape[1])) - 1
     degree = stored if sh_degree is None else sh_degree
-    ray = arrays["mean"] - camera.position
+    ray = world - camera.position
     basis = sh_basis(ray / np.sqrt((ray * ray).sum(-1, keepdims=True)), degree)
     color = np.einsum("bk,bkc->bc", basis, arrays["sh"][:, : (degree + 1) ** 2]) + 0.5
     color = np.where(color.real > 0.0, color, 0.0)
-    return Screen(mean_px, location, scale2d, slope, amplitude, color, z)
+    return Screen(kernel, mean_px, color, z)
+
+
+def kernel_values(kernel: Kernel, pixels: Array) -> Array:
+    """(B, P) alphas before clamp and cutoff at the points `pixels` (2, P) or (B, 2, P) [px]."""
+    d = pixels - kernel.location[:, :, None]
+    conic = inverse_2x2(kernel.scale2d)
+    q = conic[:, 0, 0, None] * d[:, 0] ** 2 + conic[:, 1, 1, None] * d[:, 1] ** 2
+    q = q + 2.0 * conic[:, 0, 1, None] * d[:, 0] * d[:, 1]
+    opacity = kernel.amplitude[:, None]
+    if kernel.slope is not None:
+        above = normal_cdf((kernel.slope[:, :, None] * d).sum(1))
+        minus = 0.0 if kernel.amplitude_minus is None else kernel.amplitude_minus[:, None]
+        opacity = minus + (opacity - minus) * above
+    return kernel.falloff(q) * opacity
 
 
 def alpha_maps(screen: Screen, camera: Camera, alpha_min: float = 1 / 255, alpha_max: float = 0.99) -> Array:
-    """(B, H W) alphas at the pixel centres, clamped to alpha_max and 0 below alpha_min."""
+    """(B, H W) alphas at the pixel centres, |alpha| clamped to alpha_max and 0 where it is below alpha_min."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    d = np.stack([x.ravel(), y.ravel()]) - screen.location[:, :, None]
-    conic = inverse_2x2(screen.scale2d)
-    q = conic[:, 0, 0, None] * d[:, 0] ** 2 + conic[:, 1, 1, None] * d[:, 1] ** 2
-    q = q + 2.0 * conic[:, 0, 1, None] * d[:, 0] * d[:, 1]
-    alpha = screen.amplitude[:, None] * np.exp(-0.5 * q)
-    if screen.slope is not None:
-        alpha = alpha * normal_cdf((screen.slope[:, :, None] * d).sum(1))
-    alpha = np.where(alpha.real > alpha_max, alpha_max, alpha)
-    return np.where(alpha.real < alpha_min, 0.0, alpha)
+    alpha = kernel_values(screen.kernel, np.stack([x.ravel(), y.ravel()]))
+    alpha = np.where(np.abs(alpha.real) > alpha_max, np.copysign(alpha_max, alpha.real), alpha)
+    return np.where(np.abs(alpha.real) < alpha_min, 0.0, alpha)
 
 
 def blend(alphas: Sequence[Array], colors: Sequence[Array], depths: Sequence[Array], background: ArrayLike,
@@ -141,15 +128,13 @@ def blend(alphas: Sequence[Array], colors: Sequence[Array], depths: Sequence[Arr
 
 
 def prepared(arrays: Mapping[str, ArrayLike], shape: str) -> dict[str, Array]:
-    """The shape's fields as float64 arrays; a missing skew is zero."""
-    given = dict(arrays)
-    given.setdefault("skew", np.zeros((len(np.asarray(given["mean"])), 3)))
-    return {name: np.asarray(given[name], dtype=np.float64) for name in FIELDS[shape]}
+    """The shape's fields as float64 arrays."""
+    return {name: np.asarray(arrays[name], dtype=np.float64) for name in FIELDS[shape]}
 
 
-def visible_order(values: Mapping[str, Array], camera: Camera) -> NDArray[np.intp]:
+def visible_order(values: Mapping[str, Array], camera: Camera, shape: str) -> NDArray[np.intp]:
     """Indices of the splats not in front of the near plane, nearest first; equal depths keep their order."""
-    z = values["mean"] @ camera.rotation[2] + camera.translation[2]
+    z = projected_point(values, shape) @ camera.rotation[2] + camera.translation[2]
     order = np.argsort(z, kind="stable")
     return order[z[order] >= NEAR_PLANE]
 
@@ -159,10 +144,10 @@ def render_reference(arrays: Mapping[str, ArrayLike], camera: Camera, shape: str
                      alpha_min: float = 1 / 255, alpha_max: float = 0.99, t_min: float = 1e-4,
                      sh_degree: int | None = None) -> Rendered:
     """Render raw splats: `arrays` holds mean (N, 3), quat (N, 4), log_scale (N, 3), opacity_logit (N,),
-    sh (N, K, 3) and, for skewed shapes, skew (N, 3).
+    sh (N, K, 3) and the shape's own.
     """
     values = prepared(arrays, shape)
-    order = visible_order(values, camera)
+    order = visible_order(values, camera, shape)
     size = (camera.height, camera.width)
     if len(order) == 0:
         color = np.broadcast_to(np.asarray(background, dtype=np.float64), (*size, 3)).copy()
@@ -188,7 +173,7 @@ def reference_gradients(arrays: Mapping[str, ArrayLike], camera: Camera, v_color
     values = prepared(arrays, shape)
     names = FIELDS[shape] if fields is None else tuple(fields)
     gradients = {name: np.zeros_like(values[name]) for name in names}
-    order = visible_order(values, camera)
+    order = visible_order(values, camera, shape)
     if len(order) == 0:
         return gradients
     weights = np.asarray(v_color, dtype=np.float64).reshape(-1, 3)

@@ -18,6 +18,7 @@ Array = NDArray[Any]
 
 CLAMP_MARGIN = 0.3  # of tan(half the field of view), beyond the image border, in the Jacobian only
 SKEW_MAX = 0.985 * np.sqrt(2.0 / (np.pi - 2.0))
+SLANT_MAX = 10.0
 
 
 def normal_cdf(x: Array) -> Array:
@@ -90,11 +91,11 @@ def jacobian(point: Array, camera: Camera) -> Array:
     return np.stack(rows, -2)
 
 
-def bounded(skew: Array) -> Array:
-    """(B, 3) skew vectors, those longer than SKEW_MAX scaled down to that length."""
+def bounded(skew: Array, largest: float = SKEW_MAX) -> Array:
+    """(B, 3) skew vectors, those longer than `largest` scaled down to that length."""
     squared = (skew * skew).sum(-1, keepdims=True)
-    long = squared.real > SKEW_MAX**2
-    return np.where(long, skew * (SKEW_MAX / np.sqrt(np.where(long, squared, 1.0))), skew)
+    long = squared.real > largest**2
+    return np.where(long, skew * (largest / np.sqrt(np.where(long, squared, 1.0))), skew)
 
 
 def direct_form(covariance: Array, shift: Array) -> tuple[Array, Array]:
@@ -113,8 +114,13 @@ def slope_of(scale2d: Array, delta: Array) -> tuple[Array, Array]:
     return weighted / np.sqrt(1.0 - k)[..., None], k / (1.0 - k)
 
 
+def determinant(matrix: Array) -> Array:
+    """Determinants (B,) of (B, 2, 2) symmetric matrices."""
+    return matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] ** 2
+
+
 def inverse_2x2(matrix: Array) -> Array:
     """Inverse of (B, 2, 2) symmetric matrices."""
     a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
     rows = [np.stack([c, -b], -1), np.stack([-b, a], -1)]
-    return np.stack(rows, -2) / (a * c - b * b)[..., None, None]
+    return np.stack(rows, -2) / determinant(matrix)[..., None, None]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
-from reference_formulas import SKEW_MAX
+from reference import FIELDS, REFERENCES
+from reference_formulas import SKEW_MAX, SLANT_MAX
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
@@ -37,3 +40,31 @@ def random_splats(seed: int = 0, n: int = 6, sh_degree: int = 2, dtype: type = n
         "skew": direction * rng.uniform(0.0, 0.99 * SKEW_MAX, (n, 1)),
     }
     return {name: array.astype(dtype) for name, array in arrays.items()}
+
+
+def for_shape(arrays: Mapping[str, NDArray[np.floating]], shape: str) -> Arrays:
+    """`arrays` as the fields of `shape`: its own that are missing are random, skew and opacity take its form.
+
+    The other side's opacities are those of the splats in reverse, so what is dim in all stays so. `skew` is m and
+    becomes the slant of the same skewness; every third opacity becomes negative where the sign is free.
+    """
+    own, rng, n = REFERENCES[shape], np.random.default_rng(11), len(arrays["mean"])
+    normal, nu, beta = rng.normal(size=(n, 3)), 10.0 ** rng.uniform(0.0, 4.0, n), 0.5 * 16.0 ** rng.uniform(0.0, 1.0, n)
+    fields = {"opacity_minus_logit": arrays["opacity_logit"][::-1], "normal": normal, "nu": nu, "beta": beta, **arrays}
+    if own.direct:
+        fields["skew"] = slant_of(arrays["skew"])
+    if own.signed:
+        positive = 0.5 * (1.0 + np.tanh(0.5 * arrays["opacity_logit"].astype(np.float64)))
+        sign = np.where(np.arange(n) % 3, 1.0, -1.0)
+        fields["opacity_logit"] = sign * np.arctanh(np.minimum(positive, 1.0 - 1e-12))
+    return {name: np.asarray(fields[name]) for name in FIELDS[shape]}
+
+
+def slant_of(shift: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Slants eta (N, 3) of the shifts m (N, 3): |eta|² = k / (1 - k), k = (pi/2) t / (1 + t), t = |m|²; a little
+    below SLANT_MAX at most, where a finite difference has room.
+    """
+    t = (shift.astype(np.float64) ** 2).sum(1, keepdims=True)
+    most = (0.99 * SLANT_MAX) ** 2
+    k = np.minimum(0.5 * np.pi * t / (1.0 + t), most / (1.0 + most))
+    return shift * np.sqrt(k / (1.0 - k) / np.maximum(t, 1e-30))

@@ -12,9 +12,10 @@ import pytest
 from conftest import MakeRenderer
 from kernel_checks import Arrays, Case
 from numpy.typing import NDArray
-from reference import Screen, prepared, project
+from reference import prepared, project
 from reference_formulas import SKEW_MAX
 from reference_scenes import random_camera, random_splats
+from reference_shape import Kernel
 from scipy.special import ndtr
 from tolerances import IMAGE_FLOAT32, ROUNDING
 
@@ -72,7 +73,7 @@ def test_no_pixel_is_lost_in_other_normalisations(make_renderer: MakeRenderer, d
         case.check_image(case.render(renderer), IMAGE_FLOAT32)
 
 
-def true_boxes(screen: Screen) -> NDArray[np.float64]:
+def true_boxes(screen: Kernel) -> NDArray[np.float64]:
     """(N, 4) lowest x, y and highest x, y [px] where alpha >= ALPHA_MIN; NaN where it is nowhere.
 
     With scale2d = L L' and d = L y, alpha is amplitude exp(-y'y/2) Phi(b'y): log-concave, highest on the ray
@@ -136,7 +137,7 @@ def test_boxes_hold_their_splats_and_little_else(device: Device, shape: str, tur
     if turned:
         pose[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
     camera = Camera(size, size, 1.0 * size, 1.1 * size, 0.52 * size, 0.49 * size, pose)
-    screen = project(prepared(arrays, shape), camera, shape)
+    screen = project(prepared(arrays, shape), camera, shape).kernel
     truth = true_boxes(screen)
     seen = np.isfinite(truth[:, 0])
     assert seen.sum() > 0.9 * n

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import LOW_PASS, alpha_maps, project
+from reference import alpha_maps, project
 from reference_formulas import (
     CLAMP_MARGIN,
     SKEW_MAX,
@@ -21,6 +21,7 @@ from reference_formulas import (
     slope_of,
 )
 from reference_scenes import random_camera, random_splats
+from reference_shape import LOW_PASS
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.special import erfc, factorial, lpmv, ndtr
@@ -116,11 +117,11 @@ def test_screen_kernel_has_the_gaussian_s_moments(seed):
     arrays = random_splats(seed, 1, 0)
     screen = project(arrays, random_camera(seed), "skew-normal", "pdf")
     gaussian = project(arrays, random_camera(seed), "gaussian")
-    root = np.linalg.cholesky(gaussian.scale2d[0])
+    root = np.linalg.cholesky(gaussian.kernel.scale2d[0])
     line = np.arange(-13.0, 13.0, 0.05)
     y = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
     x = y @ root.T + gaussian.mean_px[0]
-    weight = direct_density(x - screen.location[0], screen.scale2d[0], screen.slope[0])
+    weight = direct_density(x - screen.kernel.location[0], screen.kernel.scale2d[0], screen.kernel.slope[0])
     weight *= np.linalg.det(root) * 0.05**2
     assert weight.sum() == pytest.approx(1.0, abs=1e-8)
     assert np.abs(weight @ y).max() < 1e-8
@@ -138,7 +139,7 @@ def test_centred_pixel_formula_is_the_direct_form(seed, normalisation):
     point = arrays["mean"] @ camera.rotation.T + camera.translation
     affine = jacobian(point, camera) @ camera.rotation
     v = np.einsum("bij,bjk,bk->bi", affine, axes, arrays["skew"])
-    conic = np.linalg.inv(gaussian.scale2d)
+    conic = np.linalg.inv(gaussian.kernel.scale2d)
     u = np.einsum("bij,bj->bi", conic, v)
     t = (u * v).sum(1)[:, None]
     h = np.sqrt(np.pi / 2.0 / ((1.0 + t) * (1.0 - (np.pi / 2.0 - 1.0) * t)))
@@ -148,7 +149,7 @@ def test_centred_pixel_formula_is_the_direct_form(seed, normalisation):
     q = np.einsum("bpi,bij,bpj->bp", d, conic, d) + (2.0 * a + t - a * a) / (1.0 + t)
     k = np.pi / 2.0 * t / (1.0 + t)
     factor = {"peak": 1.0 / peak(k / (1.0 - k)), "pdf": 2.0, "none": 1.0}[normalisation]
-    alpha = factor * gaussian.amplitude[:, None] * np.exp(-0.5 * q) * ndtr(h * (a + t))
+    alpha = factor * gaussian.kernel.amplitude[:, None] * np.exp(-0.5 * q) * ndtr(h * (a + t))
     assert relative_error(alpha_maps(screen, camera, 0.0, np.inf), alpha) < ROUNDING
 
 
@@ -166,18 +167,18 @@ def test_zero_skew_is_the_gaussian(seed):
 def test_peak_normalised_splat_reaches_its_opacity(seed):
     """The highest alpha over the plane is the opacity: on the line through the mode, and on a grid."""
     screen = project(random_splats(seed, 1, 0), random_camera(seed), "skew-normal")
-    opacity = project(random_splats(seed, 1, 0), random_camera(seed), "gaussian").amplitude[0]
-    conic, slope = inverse_2x2(screen.scale2d)[0], screen.slope[0]
+    opacity = project(random_splats(seed, 1, 0), random_camera(seed), "gaussian").kernel.amplitude[0]
+    conic, slope = inverse_2x2(screen.kernel.scale2d)[0], screen.kernel.slope[0]
 
     def alpha(d):
-        return screen.amplitude[0] * np.exp(-0.5 * np.einsum("...i,ij,...j", d, conic, d)) * ndtr(d @ slope)
+        return screen.kernel.amplitude[0] * np.exp(-0.5 * np.einsum("...i,ij,...j", d, conic, d)) * ndtr(d @ slope)
 
-    along = screen.scale2d[0] @ slope
+    along = screen.kernel.scale2d[0] @ slope
     along /= np.sqrt(along @ conic @ along)
     best = minimize_scalar(lambda x: -alpha(x * along), bounds=(-1.0, 2.0), method="bounded")
     assert -best.fun == pytest.approx(opacity, rel=1e-9)
     line = np.arange(-4.0, 4.0, 0.02)
-    plane = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2) @ np.linalg.cholesky(screen.scale2d[0]).T
+    plane = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2) @ np.linalg.cholesky(screen.kernel.scale2d[0]).T
     assert opacity * (1.0 - 2e-3) < alpha(plane).max() <= opacity * (1.0 + 1e-12)
 
 

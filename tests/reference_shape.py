@@ -1,0 +1,88 @@
+"""What a shape's own part of the reference renderer is: one `ShapeReference` in a table by the shape's name.
+
+Every function accepts complex arrays (see reference_formulas.py: the complex step).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+LOW_PASS = 0.3  # added to the screen covariance [px²]
+
+
+def logistic(raw: Array) -> Array:
+    """Opacity of a shape whose opacities lie in (0, 1)."""
+    return 1.0 / (1.0 + np.exp(-raw))
+
+
+def gaussian_falloff(q: Array) -> Array:
+    return np.exp(-0.5 * q)
+
+
+class Kernel(NamedTuple):
+    """B screen kernels: alpha(d) = falloff(q) (amplitude_minus + (amplitude - amplitude_minus) Phi(slope' d)).
+
+    Parameters
+    ----------
+    location : (B, 2), where it is centred [px]; d = pixel - location.
+    scale2d : (B, 2, 2), low-pass included [px²]; q = d' inverse(scale2d) d.
+    amplitude : (B,), factor before the falloff: opacity and normalisation.
+    slope : (B, 2) [1/px], or None for shapes without sides (no Phi then).
+    amplitude_minus : (B,), or None for 0: the factor where slope' d is far below 0.
+    falloff : rho of the q's (B, P), with the splats' own parameters bound in it.
+    """
+
+    location: Array
+    scale2d: Array
+    amplitude: Array
+    slope: Array | None = None
+    amplitude_minus: Array | None = None
+    falloff: Callable[[Array], Array] = gaussian_falloff
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """The projection that all shapes share: point_px (B, 2) of the point that is projected, the affine map about it
+    (B, 2, 3) [px per world unit] and the splats' axes R S (B, 3, 3), world from unit frame.
+    """
+
+    point_px: Array
+    affine: Array
+    axes: Array
+
+    def matrix2d(self, inner: Array | None = None) -> Array:
+        """Screen matrix A R S inner S R' A' + low-pass of the (B, 3, 3) `inner`, the identity by default."""
+        b = self.affine @ self.axes
+        half = b if inner is None else b @ inner
+        return half @ np.swapaxes(b, 1, 2) + LOW_PASS * np.eye(2)
+
+    def vector2d(self, inner: Array) -> Array:
+        """A R S inner (B, 2) of the (B, 3) `inner`."""
+        return np.einsum("bij,bjk,bk->bi", self.affine, self.axes, inner)
+
+
+@dataclass(frozen=True)
+class ShapeReference:
+    """One shape.
+
+    Parameters
+    ----------
+    fields : its own fields, beside mean, quat, log_scale, opacity_logit and sh.
+    kernel : (arrays, geometry, normalisation) -> Kernel.
+    centre : the point that is projected, in the unit frame from (x, y, z): arrays -> (B, 3); None for (x, y, z).
+    direct : whether the field `skew` is the slant eta, and not the centred m.
+    signed : whether opacities are tanh of the raw values, and not the logistic function.
+    """
+
+    fields: tuple[str, ...]
+    kernel: Callable[[Mapping[str, Array], Geometry, str], Kernel]
+    centre: Callable[[Mapping[str, Array]], Array] | None = None
+    direct: bool = False
+    signed: bool = False
