@@ -71,7 +71,8 @@ class KernelBuild:
 
     def raster_program(self, device: Device) -> Program:
         """Projection, binning, rasterisation, and their gradients."""
-        files = (*_LOWER, shape_named(self.shape).source, "project.cl", "bin.cl", "raster.cl")
+        shape = shape_named(self.shape)
+        files = (*_LOWER, *shape.lower, shape.source, "project.cl", "bin.cl", "raster.cl")
         return build(device, files, self._defines(), self.real)
 
     def loss_program(self, device: Device) -> Program:
@@ -84,10 +85,12 @@ class KernelBuild:
 
     def optim_program(self, device: Device) -> Program:
         """Adam, skew map, regularisers, noise and gathers."""
-        defines = {k: v for k, v in self._defines().items() if k.startswith(("ROW_", "LANES", "SKEW_", "SLANT_", "OPACITY_"))}
+        wanted = ("ROW_", "LANES", "SKEW_", "SLANT_", "OPACITY_")
+        defines = {k: v for k, v in self._defines().items() if k.startswith(wanted)}
         defines |= {"ADAM_BETA1": adam.BETA1, "ADAM_BETA2": adam.BETA2, "ADAM_EPS": adam.EPS,
                     "SKEW_MAP": SKEW_MAPS.index(self.skew_map)}
-        return build(device, ("lanes.clh", "algebra.clh", "optim.cl"), defines, self.real)
+        files = ("lanes.clh", "algebra.clh", "skew_map.clh", "noise.clh", "optim.cl")
+        return build(device, files, defines, self.real)
 
     def for_rendering(self) -> KernelBuild:
         """The same with depth and an alpha gradient."""

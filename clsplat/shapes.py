@@ -33,7 +33,7 @@ class Shape:
     Parameters
     ----------
     name : as in files and on the command line.
-    source : its file in cl/shape/.
+    source : its file in cl/shape/; lower : files in cl/shape/ that it builds upon.
     fields : learnable fields beside the core ones and colour.
     record : reals of its screen record (SHAPE_N); moments : its gradient accumulators (SHAPE_V).
     profile : alpha along the axis on which copies are stacked (see profiles.py).
@@ -53,6 +53,7 @@ class Shape:
     normalised: bool = False
     signed: bool = False
     defines: tuple[tuple[str, int], ...] = ()
+    lower: tuple[str, ...] = ()
 
     def schema(self, sh_degree: int) -> Schema:
         """Fields of this shape at one SH degree."""
@@ -92,11 +93,12 @@ NU = Field("nu", 1, ("nu",), (NU_BOUNDS[1],), 1e-2, bounds=NU_BOUNDS, start=100.
 
 GAUSSIAN = Shape("gaussian", "shape/gaussian.clh", (), record=4, moments=6, profile=profiles.gaussian)
 SKEW_NORMAL = Shape("skew-normal", "shape/skew_normal.clh", (SKEW,), record=9, moments=9,
-                    profile=profiles.skew_normal, skew_form="centred", normalised=True)
+                    profile=profiles.skew_normal, skew_form="centred", normalised=True, lower=("shape/skew_pixel.clh",))
 
 # As skew-normal splatting was published: (x, y, z) is the location, R S S R' the scale matrix.
 SKEW_NORMAL_DIRECT = Shape("skew-normal-direct", "shape/skew_normal_direct.clh", (SLANT,), record=9, moments=9,
-                           profile=profiles.skew_normal_direct, skew_form="direct", normalised=True)
+                           profile=profiles.skew_normal_direct, skew_form="direct", normalised=True,
+                           lower=("shape/skew_pixel.clh", "shape/displacement.clh"))
 # A plane through the location, one opacity a side, projected exactly.
 HALF_GAUSSIAN = Shape("half-gaussian", "shape/half_gaussian.clh", (OPACITY_MINUS, NORMAL), record=7, moments=10,
                       profile=profiles.half_gaussian)
@@ -113,7 +115,7 @@ STUDENT_T = Shape("student-t", "shape/student_t.clh", (NU,), record=5, moments=7
                   signed=True)
 
 # In the order in which a file without clsplat's comment is matched by its columns.
-SHAPES = {shape.name: shape for shape in (GAUSSIAN, SKEW_NORMAL)}
+SHAPES = {shape.name: shape for shape in (GAUSSIAN, SKEW_NORMAL, SKEW_NORMAL_DIRECT)}
 DEFAULT_SHAPE = SKEW_NORMAL.name
 
 
