@@ -101,11 +101,12 @@ SKEW_NORMAL_DIRECT = Shape("skew-normal-direct", "shape/skew_normal_direct.clh",
                            lower=("shape/skew_pixel.clh", "shape/displacement.clh"))
 # A plane through the location, one opacity a side, projected exactly.
 HALF_GAUSSIAN = Shape("half-gaussian", "shape/half_gaussian.clh", (OPACITY_MINUS, NORMAL), record=7, moments=10,
-                      profile=profiles.half_gaussian)
+                      profile=profiles.half_gaussian, lower=("shape/displacement.clh", "shape/two_sided.clh"))
 # The same divided by a finite skew: gaussian (equal opacities), skew-normal-direct (one of them 0), half-gaussian
 # (infinite skew) are its limits.
 BISECTED_SKEW = Shape("bisected-skew", "shape/bisected_skew.clh", (OPACITY_MINUS, SLANT), record=7, moments=10,
-                      profile=profiles.bisected_skew, skew_form="direct")
+                      profile=profiles.bisected_skew, skew_form="direct",
+                      lower=("shape/displacement.clh", "shape/two_sided.clh"))
 GENERALISED_EXPONENTIAL = Shape("generalised-exponential", "shape/generalised_exponential.clh", (BETA,), record=5,
                                 moments=7, profile=profiles.generalised_exponential)
 # GES as released: beta only scales the Gaussian, by 2 / (1 + exp(-0.1 (beta - 2))).
@@ -115,7 +116,7 @@ STUDENT_T = Shape("student-t", "shape/student_t.clh", (NU,), record=5, moments=7
                   signed=True)
 
 # In the order in which a file without clsplat's comment is matched by its columns.
-SHAPES = {shape.name: shape for shape in (GAUSSIAN, SKEW_NORMAL, SKEW_NORMAL_DIRECT)}
+SHAPES = {shape.name: shape for shape in (GAUSSIAN, SKEW_NORMAL, SKEW_NORMAL_DIRECT, HALF_GAUSSIAN, BISECTED_SKEW)}
 DEFAULT_SHAPE = SKEW_NORMAL.name
 
 
