@@ -13,7 +13,6 @@ import numpy as np
 from .buffers import ParameterBuffers, SplatBuffers
 from .checkpoint import Checkpoint
 from .config import TrainConfig
-from .densify import plan_relocation
 from .device import Device, Schedule, open_device
 from .errors import InputError, TrainingError
 from .evaluate import Evaluation, evaluate
@@ -31,6 +30,7 @@ from .scene import Scene, View
 from .schedules import exponential_decay, sh_degree_at
 from .skew_map import SKEW_MAPS
 from .splats import Splats
+from .strategy import Moment, plan
 from .tuning import schedule_for
 from .view_sampler import ViewSampler
 
@@ -165,24 +165,18 @@ class Trainer:
         mean_lr = self.scene.extent * self.mean_rate(it)
         self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it)
         if self.densify_first <= it <= self.densify_last and it % config.densify_interval == 0:
-            self.densify()
+            self.densify(camera.width)
         if config.noise_lr:
             self.optim_program.mcmc_noise.over(
                 -(-self.splats.n // self.kernels.lanes), self.pipeline.group, geom=self.splats.geom,
                 capacity=self.splats.capacity, n_splats=self.splats.n, seed_lo=config.seed & 0xFFFFFFFF,
                 seed_hi=config.seed >> 32, iteration=it, amount=config.noise_lr * mean_lr)
 
-    def densify(self) -> None:
-        """Relocate dead and non-finite splats, grow towards the cap."""
-        arrays = self.splats.download(self.splats.n)
-        finite = np.ones(self.splats.n, bool)
-        for array in arrays.values():
-            finite &= np.isfinite(array.reshape(len(array), -1)).all(axis=1)
-        pull = self.pipeline.read_signals(self.splats.n)[0] if self.config.sampling == "pull" else None
-        rule = "length" if self.config.normalisation == "peak" or "skew" not in arrays else "opacity-only"
-        self.optimizer.apply(plan_relocation(arrays["opacity_logit"], arrays["log_scale"], self.rng,
-                                             self.config.cap_max, self.growth, skew=arrays.get("skew"),
-                                             finite=finite, rule=rule, pull=pull))
+    def densify(self, image_width: int) -> None:
+        """One action of the strategy, on images of that width."""
+        moment = Moment(self.iteration, self.densify_last, self.growth, self.scene.extent, image_width)
+        arrays, signals = self.splats.download(self.splats.n), self.pipeline.read_signals(self.splats.n)
+        self.optimizer.apply(plan(self.config, arrays, signals, self.rng, moment))
         self.pipeline.reset_signals()
 
     def snapshot(self) -> Splats:

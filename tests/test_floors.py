@@ -16,19 +16,19 @@ ROOT = Path(__file__).resolve().parent.parent
 # A module imports modules of lower floors only.
 FLOORS = """
     errors
-    atomic interrupt run_log runtime schema capture_world
+    atomic compare_table interrupt presets run_log runtime schema capture_world
     camera device images metrics noise optim_reference plan ply_header profiles schedules validity colmap_files
     cameras_json capture checkpoint colmap program shapes
-    densify ply skew_map
-    config kernels scene splats
-    blocks buffers camera_path initialise model_folder view_sampler
+    opacities ply skew_map
+    adc config densify kernels scene splats
+    blocks buffers camera_path initialise model_folder strategy systems view_sampler
     optim sort
     pipeline
     loss memory tuning
     render
     evaluate
     trainer
-    training
+    compare training
 """
 FLOOR = {name: level for level, line in enumerate(FLOORS.split("\n")) for name in line.split()}
 
@@ -42,6 +42,7 @@ OWNERS = {
 
 # Files beside shapes.py and cl/shape/ that may name a shape, and why.
 SHAPE_NAMES_IN = {
+    "presets.py": "a published system has its kernel",
     "tuning.py": "the cheapest kernel is the one that schedules are measured on",
 }
 

@@ -1,0 +1,113 @@
+"""strategy.py: which plan the options ask for, and when."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from model_arrays import Arrays, random_model
+
+from clsplat import shapes, strategy
+from clsplat.config import TrainConfig
+from clsplat.densify import relocation
+from clsplat.plan import Plan
+from clsplat.strategy import Moment
+
+N = 100
+
+
+def action(config: TrainConfig, iteration: int = 100, seed: int = 0, arrays: Arrays | None = None,
+           signals: np.ndarray | None = None, width: int = 2000) -> tuple[Arrays, Plan]:
+    shape = shapes.shape_named(config.shape)
+    arrays = random_model(shape, N, 1) if arrays is None else arrays
+    signals = np.zeros((4, N)) if signals is None else signals
+    moment = Moment(iteration, int(config.densify_until * config.iterations), 1.5, 1.0, width)
+    return arrays, strategy.plan(config, arrays, signals, np.random.default_rng(seed), moment)
+
+
+def test_mcmc_relocates_and_grows_by_the_options() -> None:
+    config = TrainConfig(shape="gaussian", cap_max=130, iterations=3000)
+    arrays, plan = action(config)
+    assert len(plan.source) == 130
+    dead = np.sum(shapes.GAUSSIAN.strength(arrays) <= 0.005)
+    assert plan.relocated == dead > 10
+    _, few = action(TrainConfig(shape="gaussian", cap_max=130, relocation_limit=0.05))
+    assert few.relocated == 5
+    _, flat = action(TrainConfig(shape="gaussian", cap_max=130, relocation="opacity-only"))
+    assert "log_scale" not in flat.values
+
+
+def test_length_squared_is_twice_the_log_factor() -> None:
+    shifts = []
+    for rule in ("length", "length-squared"):
+        arrays, plan = action(TrainConfig(shape="gaussian", cap_max=130, relocation=rule))
+        shifts.append(plan.values["log_scale"] - arrays["log_scale"][plan.source])
+    assert shifts[0].min() < -0.01
+    np.testing.assert_allclose(shifts[1], 2 * shifts[0], atol=1e-5)
+    size = np.bincount(plan.source, minlength=N)
+    row = int(size.argmax())
+    _, factor = relocation(shapes.GAUSSIAN, {k: a[row : row + 1] for k, a in arrays.items()}, size[row : row + 1])
+    np.testing.assert_allclose(shifts[0][row], np.log(factor[0]), atol=1e-5)
+
+
+@pytest.mark.parametrize(("normalisation", "scaled"), [("peak", True), ("pdf", False), ("none", False)])
+def test_a_kernel_without_peak_one_keeps_its_scale(normalisation: str, scaled: bool) -> None:
+    _, plan = action(TrainConfig(shape="skew-normal", normalisation=normalisation, cap_max=130))
+    assert ("log_scale" in plan.values) == scaled
+
+
+def test_pull_is_read_only_when_asked_for() -> None:
+    signals = np.zeros((4, N))
+    arrays, _ = action(TrainConfig())
+    wanted = int(np.flatnonzero(shapes.SKEW_NORMAL.strength(arrays) > 0.005)[7])
+    signals[0, wanted] = 1.0
+    _, plan = action(TrainConfig(sampling="pull"), signals=signals)
+    assert (plan.source[N:] == wanted).all()
+    _, plan = action(TrainConfig(sampling="opacity"), signals=signals)
+    assert not (plan.source[N:] == wanted).all()
+
+
+def adc(**options: object) -> TrainConfig:
+    return TrainConfig(**({"shape": "gaussian", "strategy": "adc", "iterations": 30_000, "densify_until": 0.5,
+                           "cap_max": 1000} | options))  # type: ignore[arg-type]
+
+
+def test_adc_resets_when_3dgs_does() -> None:
+    config = adc()
+    at = [it for it in range(100, 15_001, 100) if action(config, it)[1].reset_fields]
+    assert at == [3000, 6000, 9000, 12_000]
+    assert not any(action(adc(opacity_reset=0), it)[1].reset_fields for it in at)
+    # A multiple that no action falls on is made up for at the next action, once.
+    odd = adc(iterations=7000, opacity_reset=7, densify_interval=300, densify_until=0.8)
+    assert [it for it in range(300, 5601, 300) if action(odd, it)[1].reset_fields] == [1200, 2100, 3000, 4200, 5100]
+
+
+def test_adc_looks_at_sizes_after_the_first_reset_and_scales_the_pixels_with_the_image() -> None:
+    arrays = random_model(shapes.GAUSSIAN, N, 1, dead=0)
+    arrays["log_scale"][:] = -5
+    arrays["log_scale"][0] = 0  # as large as the scene
+    signals = np.zeros((4, N))
+    signals[3, 1:4] = (4.5, 5.5, 20.5)
+
+    def left(iteration: int, width: int, config: TrainConfig | None = None) -> set[int]:
+        _, plan = action(config or adc(), iteration, arrays=arrays, signals=signals, width=width)
+        return set(range(4)) - set(plan.source.tolist())
+
+    assert left(3000, 250) == set()
+    assert left(3100, 250) == {0, 2, 3}
+    assert left(3100, 1000) == left(3100, 1600) == {0, 3}
+    assert left(9000, 250, adc(opacity_reset=0)) == set()
+
+
+def test_adc_hands_on_its_options() -> None:
+    arrays = random_model(shapes.GAUSSIAN, N, 1, dead=0)
+    signals = np.zeros((4, N))
+    signals[:3, 5] = (0.1, 1.0, 1.0)
+    assert len(action(adc(), arrays=arrays, signals=signals)[1].source) == N + 1
+    assert len(action(adc(grad_threshold=0.2), arrays=arrays, signals=signals)[1].source) == N
+    deep = adc(grad_threshold=0.2, depth_threshold=0.5)
+    assert len(action(deep, arrays=arrays, signals=signals)[1].source) == N + 1
+    assert len(action(adc(cap_max=N), arrays=arrays, signals=signals)[1].source) == N
+    size = float(np.exp(arrays["log_scale"][5].max()))
+    assert "log_scale" in action(adc(dense_size=size / 2), arrays=arrays, signals=signals)[1].values
+    cloned = action(adc(dense_size=size * 2), arrays=arrays, signals=signals)[1]
+    assert np.array_equal(cloned.apply(arrays)["log_scale"], arrays["log_scale"][cloned.source])
