@@ -19,6 +19,8 @@ COMMANDS = {
     "train": ("clsplat_cli.train:train", "Learn a splat model of a scene."),
     "render": ("clsplat_cli.render:render", "Render a model or any splat PLY."),
     "eval": ("clsplat_cli.evaluate:evaluate_models", "Measure models on the views they were not trained on."),
+    "compare": ("clsplat_cli.compare:compare_systems", "Train published systems side by side and tabulate them."),
+    "convert": ("clsplat_cli.convert:convert_model", "Write a model as another shape, with the same images."),
 }
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 

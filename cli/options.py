@@ -11,7 +11,15 @@ from typing import Any, TypeVar, get_type_hints
 
 import click
 
-from clsplat.config import OPTIMIZERS, SAMPLINGS, STRATEGIES, TrainConfig
+from clsplat.config import (
+    ALTERNATIONS,
+    OPTIMIZERS,
+    POSITION_OPTIMIZERS,
+    RELOCATIONS,
+    SAMPLINGS,
+    STRATEGIES,
+    TrainConfig,
+)
 from clsplat.shapes import NORMALISATIONS, SHAPES
 from clsplat.skew_map import SKEW_MAPS
 
@@ -22,7 +30,8 @@ PATH = click.Path(path_type=Path)
 SETS = ("test", "train", "all")
 
 _CHOICES = {"shape": tuple(SHAPES), "normalisation": NORMALISATIONS, "skew_map": ("auto", *SKEW_MAPS),
-            "strategy": STRATEGIES, "optimizer": OPTIMIZERS, "sampling": SAMPLINGS}
+            "strategy": STRATEGIES, "optimizer": OPTIMIZERS, "sampling": SAMPLINGS, "relocation": RELOCATIONS,
+            "position_optimizer": POSITION_OPTIMIZERS, "alternation": ALTERNATIONS}
 _ALIASES = {"iterations": ("--steps",)}
 _METAVARS = {"init": "sfm|random|FILE.ply"}
 # Shared with other commands, or with a form of their own.
@@ -46,18 +55,26 @@ class Color(click.ParamType):  # type: ignore[type-arg]  # not generic before cl
         return rgb
 
 
-class Iterations(click.ParamType):  # type: ignore[type-arg]
-    """Whole numbers with commas or spaces between them."""
+class Numbers(click.ParamType):  # type: ignore[type-arg]
+    """Whole numbers with commas or spaces between them.
+
+    Parameters
+    ----------
+    what : they are, for messages. least : smallest allowed.
+    """
 
     name = "N,N,..."
+
+    def __init__(self, what: str = "iterations", least: int = 1) -> None:
+        self.what, self.least = what, least
 
     def convert(self, value: Any, param: click.Parameter | None,
                 ctx: click.Context | None) -> tuple[int, ...]:
         if isinstance(value, tuple):
             return value
         parts = [part for part in re.split(r"[,\s]+", value) if part]
-        if not parts or not all(part.isdecimal() and int(part) > 0 for part in parts):
-            self.fail(f"{value!r} is no list of iterations: give for example 1000,2000", param, ctx)
+        if not parts or not all(part.isdecimal() and int(part) >= self.least for part in parts):
+            self.fail(f"{value!r} is no list of {self.what}: give for example 1000,2000", param, ctx)
         return tuple(int(part) for part in parts)
 
 
@@ -65,7 +82,7 @@ class SpacedLists(click.Command):
     """A command that also takes 3DGS's form of a list, `--save_iterations 1000 2000`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        lists = {name for param in self.params if isinstance(param.type, Iterations) for name in param.opts}
+        lists = {name for param in self.params if isinstance(param.type, Numbers) for name in param.opts}
         joined: list[str] = []
         in_list = False  # whether the last argument belongs to a list that may go on
         for arg in args:
@@ -102,36 +119,53 @@ def background_of(background: RGB | None, white: bool) -> RGB | None:
     return (1.0, 1.0, 1.0) if white else background
 
 
-def scene_options(function: F) -> F:
-    """`-s`, `-i` and `-r`: where the photos are, and how large."""
+def photo_options(function: F) -> F:
+    """`-i` and `-r`: which photos of the scene, and how large."""
     function = click.option(
         "-r", "--resolution", type=int, metavar="N",
         help="1, 2, 4, 8: divide the size of the photos; another number: their width in pixels; "
              "-1: as they are, but at most 1600 wide.")(function)
-    function = click.option("-i", "--images", metavar="NAME",
-                            help="Folder of photos inside the scene, such as images_4.")(function)
+    return click.option("-i", "--images", metavar="NAME",
+                        help="Folder of photos inside the scene, such as images_4.")(function)
+
+
+def scene_options(function: F) -> F:
+    """`-s`, `-i` and `-r`: where the photos are, and how large."""
     return click.option("-s", "--source-path", type=PATH,
-                        help="Scene: a folder with photos and a COLMAP model.")(function)
+                        help="Scene: a folder with photos and a COLMAP model.")(photo_options(function))
 
 
-def config_options(function: F) -> F:
-    """One option for each field of TrainConfig; `config_values` reads them."""
+def split_options(function: F) -> F:
+    """`--test-every` and `--test-list`: which views are held out."""
+    function = click.option("--test-list", type=PATH, metavar="FILE",
+                            help="Names of the test views, one a line; implies --eval.")(function)
+    return click.option("--test-every", type=int, metavar="N",
+                        help="Of the sorted views, every Nth is a test view; implies --eval.  [default: 8]")(function)
+
+
+def config_options(*without: str) -> Callable[[F], F]:
+    """One option for each field of TrainConfig but those in `without`; `config_values` reads them."""
     help_of, types = _field_help(), get_type_hints(TrainConfig)
-    for name in ("test_iterations", "save_iterations"):
-        function = click.option(_flag(name), name, type=Iterations(), multiple=True,
-                                help=help_of.get(name))(function)
-    function = background_options(device_option(function))
-    for field in reversed(dataclasses.fields(TrainConfig)):
-        if field.name not in _OWN:
-            function = _field_option(field, types[field.name], help_of.get(field.name))(function)
-    return function
+
+    def decorate(function: F) -> F:
+        for name in ("test_iterations", "save_iterations"):
+            if name not in without:
+                function = click.option(_flag(name), name, type=Numbers(), multiple=True,
+                                        help=help_of.get(name))(function)
+        function = background_options(device_option(function))
+        for field in reversed(dataclasses.fields(TrainConfig)):
+            if field.name not in (*_OWN, *without):
+                function = _field_option(field, types[field.name], help_of.get(field.name))(function)
+        return function
+
+    return decorate
 
 
 def config_values(ctx: click.Context, values: dict[str, Any]) -> dict[str, Any]:
     """TrainConfig's arguments that the user gave on the command line; takes them out of `values`."""
     background = background_of(values.pop("background"), values.pop("white_background"))
     device = values.pop("device")
-    lists = {name: sorted({n for group in values.pop(name) for n in group})
+    lists = {name: sorted({n for group in values.pop(name, ()) for n in group})
              for name in ("save_iterations", "test_iterations")}
     given = {field.name: values.pop(field.name) for field in dataclasses.fields(TrainConfig)
              if field.name in values and is_given(ctx, field.name)}

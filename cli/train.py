@@ -10,6 +10,7 @@ import click
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError, OutputError
 from clsplat.model_folder import ModelFolder
+from clsplat.presets import PRESETS, with_preset
 
 from .options import (
     PATH,
@@ -20,6 +21,7 @@ from .options import (
     overwrite_option,
     quiet_option,
     scene_options,
+    split_options,
 )
 from .progress import TrainingDisplay, duration
 
@@ -38,18 +40,17 @@ INTERRUPTED = 130
               help="Folder of the model.  [default: output/<name of the scene>]")
 @scene_options
 @click.option("--eval", is_flag=True, help="Hold test views out of training, and measure them at the end.")
-@click.option("--test-every", type=int, metavar="N",
-              help="Of the sorted views, every Nth is a test view; implies --eval.  [default: 8]")
-@click.option("--test-list", type=PATH, metavar="FILE",
-              help="Names of the test views, one a line; implies --eval.")
+@split_options
 @click.option("--resume", is_flag=True,
               help="Go on from the model's checkpoint, with the options of its run.")
 @overwrite_option
 @quiet_option
-@config_options
+@click.option("--preset", type=click.Choice(list(PRESETS)),
+              help="A published system: kernel, optimizer, strategy and constants; other options replace constants.")
+@config_options()
 @click.pass_context
 def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, model_path: Path | None,
-          resume: bool, overwrite: bool, quiet: bool, **values: Any) -> None:
+          resume: bool, overwrite: bool, quiet: bool, preset: str | None, **values: Any) -> None:
     """Learn a splat model of SCENE, a folder with photos in images/ and a COLMAP model in sparse/.
 
     Writes config.json, cameras.json, log.jsonl, checkpoint.npz and point_cloud/iteration_N/point_cloud.ply
@@ -61,6 +62,8 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
         raise click.UsageError(f"two scenes: {scene} and {source_path}")
     path = scene or source_path
     options = config_values(ctx, values)
+    if preset is not None:
+        options = with_preset(preset, options)
     reading = {key: values[key] for key in SCENE_KEYS if is_given(ctx, key)}
     if path is None and not (resume and model_path):
         raise click.UsageError("give the scene's folder")

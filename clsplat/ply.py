@@ -48,7 +48,8 @@ class PlyModel:
 def read_ply(path: str | os.PathLike[str]) -> PlyModel:
     """Read a splat model: binary of either byte order, or ascii; properties in any order, found by name.
 
-    A file without clsplat's comment is the shape whose columns it has, else Gaussian. Normals are ignored.
+    A file without clsplat's comment is the first shape that has just its columns, else Gaussian. A file with it must
+    have all columns of its shape. Normals are ignored.
 
     Raises
     ------
@@ -143,14 +144,11 @@ def _channel_major(sh: Array) -> Array:
 
 
 def _gather(field: Field, columns: Mapping[str, Array], n: int) -> Array:
-    """The field's public array; neutral where the file lacks the field."""
+    """The field's public array."""
     double = all(values.dtype == np.float64 for values in columns.values())
     dtype = np.dtype(np.float64 if double else np.float32)
-    if field.ply[0] not in columns:
-        flat = np.tile(np.asarray(field.neutral, dtype=dtype), (n, 1))
-    else:
-        with np.errstate(over="ignore"):  # what overflows is found and named by the check
-            flat = np.stack([columns[name].astype(dtype) for name in field.ply], axis=1)
+    with np.errstate(over="ignore"):  # what overflows is found and named by the check
+        flat = np.stack([columns[name].astype(dtype) for name in field.ply], axis=1)
     if field.group is Group.SH:
         rest = flat[:, 3:].reshape(n, 3, field.width // 3 - 1).transpose(0, 2, 1)
         return np.concatenate([flat[:, None, :3], rest], axis=1)
@@ -176,11 +174,13 @@ def _kernel(path: Path, header: Header) -> tuple[Shape, str]:
             return shape, check_normalisation(values.get("normalisation", NORMALISATIONS[0]))
         except InputError as error:
             raise InputError(f"{path}: comment {comment[:80]!r}: {error}") from None
-    present = set(header.names)
-    for shape in SHAPES.values():
-        if any(present.intersection(field.ply) for field in shape.fields):
-            return shape, NORMALISATIONS[0]
-    return GAUSSIAN, NORMALISATIONS[0]
+    columns = {shape.name: {name for field in shape.fields for name in field.ply} for shape in SHAPES.values()}
+    own = set(header.names) & set().union(*columns.values())  # of any shape
+    if not own:
+        return GAUSSIAN, NORMALISATIONS[0]
+    # Where none has just these, the one that lacks least: what it lacks is then named.
+    some = [shape for shape in SHAPES.values() if columns[shape.name] & own]
+    return min(some, key=lambda shape: len(columns[shape.name] ^ own)), NORMALISATIONS[0]
 
 
 def _schema(path: Path, header: Header, shape: Shape) -> Schema:
@@ -192,12 +192,12 @@ def _schema(path: Path, header: Header, shape: Shape) -> Schema:
         raise InputError(f"{path}: has {rest} properties f_rest_*; SH degree 0 to 3 has one of {counts}")
     schema = shape.schema(_REST_COUNTS.index(rest))
     needed = set(_file_order(schema)) - set(_NORMALS)
-    for field in shape.fields:
-        if names.isdisjoint(field.ply):
-            needed -= set(field.ply)  # wholly absent: neutral
     missing = [name for name in _file_order(schema) if name in needed - names]
     if missing:
-        raise InputError(f"{path}: property {missing[0]!r} is missing; export all of 3DGS's properties")
+        own = any(missing[0] in field.ply for field in shape.fields)
+        mend = (f"shape {shape.name} has it; export the shape's columns, or name the shape that the file holds" if own
+                else "export all of 3DGS's properties")
+        raise InputError(f"{path}: property {missing[0]!r} is missing; {mend}")
     for kind, name in header.properties:
         if name not in needed and name not in _NORMALS:
             raise InputError(f"{path}: property {name!r} is unknown for shape {shape.name}; remove it")

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from clsplat.schema import public_shape
-from clsplat.shapes import SHAPES, SKEW_LIMIT
+from clsplat.shapes import SHAPES
 
 Arrays = dict[str, np.ndarray]
 
@@ -14,13 +14,14 @@ Arrays = dict[str, np.ndarray]
 def random_arrays(shape: str, n: int, degree: int, seed: int, dtype: type = np.float32) -> Arrays:
     """A usable model of any size, wide in range."""
     rng = np.random.default_rng(seed)
-    arrays = {
-        field.name: (rng.normal(size=public_shape(field, n)) * 10.0 ** rng.integers(-6, 6)).astype(dtype)
-        for field in SHAPES[shape].schema(degree)
-    }
-    if "skew" in arrays:
-        norms = np.linalg.norm(arrays["skew"], axis=1, keepdims=True)
-        arrays["skew"] = (arrays["skew"] / norms * SKEW_LIMIT * rng.random((n, 1))).astype(dtype)
+    arrays = {}
+    for field in SHAPES[shape].schema(degree):
+        values = rng.normal(size=public_shape(field, n)) * 10.0 ** rng.integers(-6, 6)
+        if field.limit is not None:
+            values *= field.limit * rng.random((n, 1)) / np.linalg.norm(values, axis=1, keepdims=True)
+        if field.bounds is not None:
+            values = rng.uniform(*field.bounds, values.shape)
+        arrays[field.name] = values.astype(dtype)
     return arrays
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from scenes_data import scene_folder
 
 from clsplat.errors import InputError
 from clsplat.ply import read_ply, write_ply
+from clsplat.schema import Field
+from clsplat.shapes import SHAPES
 
 IN_FOLDER = settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -132,9 +135,58 @@ def test_kernel_from_comment_or_columns(file: Path) -> None:
     assert (read.shape, read.normalisation) == ("skew-normal", "peak")
     np.testing.assert_array_equal(read.arrays["skew"], np.tile(np.float32([0, 0.1, 0.2]), (2, 1)))
     comment = ("clsplat shape=skew-normal normalisation=none",)
-    read = read_ply(save(file, plain(), comments=comment))  # columns wholly absent: neutral
+    read = read_ply(save(file, plain(skew=True), comments=comment))
     assert (read.shape, read.normalisation) == ("skew-normal", "none")
-    assert read.arrays["skew"].tolist() == [[0, 0, 0]] * 2
+
+
+def own_columns(shape: str) -> dict[str, list[float]]:
+    """Columns of a usable file of any shape."""
+    columns = plain()
+    for field in SHAPES[shape].fields:
+        columns |= dict(zip(field.ply, ([value] * 2 for value in field.neutral), strict=True))
+    return columns
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_every_shape_is_known_by_its_columns(file: Path, shape: str) -> None:
+    columns = own_columns(shape)
+    first = next(name for name in SHAPES if own_columns(name).keys() == columns.keys())
+    assert read_ply(save(file, columns)).shape == first
+    assert read_ply(save(file, columns, comments=(f"clsplat shape={shape}",))).shape == shape
+
+
+@pytest.mark.parametrize(
+    ("shape", "column"), [(shape.name, name) for shape in SHAPES.values() for f in shape.fields for name in f.ply]
+)
+def test_a_shape_named_without_its_columns_is_an_error(file: Path, shape: str, column: str) -> None:
+    columns = own_columns(shape)
+    del columns[column]
+    with pytest.raises(InputError, match=f"property '{column}' is missing; shape {shape} has it") as caught:
+        read_ply(save(file, columns, comments=(f"clsplat shape={shape}",)))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "field"), [(shape.name, f) for shape in SHAPES.values() for f in shape.fields if f.bounds], ids=str
+)
+def test_values_out_of_bounds_are_named(file: Path, shape: str, field: Field) -> None:
+    assert field.bounds is not None
+    low, high = field.bounds
+    for value in (low, high):
+        read_ply(save(file, own_columns(shape) | {field.name: [value, value]}))
+    for value in (0.0, -low, 0.99 * low, 1.01 * high):
+        said = f"property {field.name}, vertex 1: value is {value:.6g}, must be {low:g} to {high:g}"
+        with pytest.raises(InputError, match=re.escape(said)):
+            read_ply(save(file, own_columns(shape) | {field.name: [low, value]}))
+
+
+@pytest.mark.parametrize(
+    ("shape", "field"), [(shape.name, f) for shape in SHAPES.values() for f in shape.fields if f.nonzero], ids=str
+)
+def test_directions_of_no_length_are_named(file: Path, shape: str, field: Field) -> None:
+    columns = own_columns(shape) | {name: [0.5, 0.0] for name in field.ply}
+    with pytest.raises(InputError, match=r"vertex 1: norm is 0, must be above 0"):
+        read_ply(save(file, columns))
 
 
 def test_float64_is_rounded_on_writing(file: Path) -> None:
@@ -168,7 +220,7 @@ ZERO_QUAT = plain(3) | {f"rot_{i}": [1.0, 1.0, 0.0] for i in range(4)}
         (without("skew_1"), "'skew_1' is missing"),
         (without("f_rest_4"), "has 8 properties f_rest"),
         (without("f_rest_4") | {"f_rest_9": [0.0, 0.0]}, "'f_rest_4' is missing"),
-        (plain() | {"beta": [0.0, 0.0]}, "'beta' is unknown for shape gaussian"),
+        (plain() | {"gamma": [0.0, 0.0]}, "'gamma' is unknown for shape gaussian"),
         (with_value("opacity", np.nan), "property opacity, vertex 1: value is nan"),
         (with_value("x", np.inf), "property x, vertex 1: value is inf"),
         (with_value("f_rest_5", -np.inf), "property f_rest_5, vertex 1: value is -inf"),

@@ -1,0 +1,95 @@
+"""`clsplat compare`: systems trained side by side, and the table of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from clsplat.errors import InputError
+from clsplat.presets import PRESETS
+from clsplat.systems import DEFAULT, parse_systems
+
+from .options import (
+    PATH,
+    Numbers,
+    SpacedLists,
+    config_options,
+    config_values,
+    is_given,
+    photo_options,
+    quiet_option,
+    split_options,
+)
+from .progress import TrainingDisplay, duration, table
+from .train import SCENE_KEYS, read_scene
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from clsplat.compare import Run
+    from clsplat.compare_table import Record
+    from clsplat.scene import Scene
+
+
+@click.command("compare", cls=SpacedLists)
+@click.argument("scenes", nargs=-1, required=True, type=PATH)
+@click.option("-o", "--output", required=True, type=PATH, metavar="DIR", help="Folder of the runs and the table.")
+@click.option("--systems", default=",".join((DEFAULT, *PRESETS)), show_default=True, metavar="NAME,NAME,...",
+              help='Presets, shapes, or "default"; any with changes: sns:alternation=off,skew_map=coupled.')
+@click.option("--cap-max", "caps", type=Numbers("caps"), multiple=True, help="Most splats.  [default: 5000]")
+@click.option("--seeds", type=Numbers("seeds", 0), multiple=True, help="A run for each.  [default: 0]")
+@photo_options
+@split_options
+@click.option("--save-models", is_flag=True, help="Keep the splats of each run, in DIR/models.")
+@quiet_option
+@config_options("shape", "cap_max", "seed", "save_iterations", "test_iterations", "checkpoint_interval")
+@click.pass_context
+def compare_systems(ctx: click.Context, /, scenes: tuple[Path, ...], output: Path, systems: str,
+                    caps: tuple[tuple[int, ...], ...], seeds: tuple[tuple[int, ...], ...], save_models: bool,
+                    quiet: bool, **values: Any) -> None:
+    """Train each of the systems on SCENES with equal caps, iterations and seeds, and measure the test views.
+
+    Options of training hold for all systems; a system's own changes replace them. Writes a line a run into
+    DIR/runs.jsonl, and table.md and results.json of all runs there. After Ctrl-C, the same command goes on.
+    """
+    from clsplat.compare import compare
+    from clsplat.compare_table import HEAD, cells, notes, summarise
+
+    common = config_values(ctx, values)
+    reading = {key: values[key] for key in SCENE_KEYS if key in values and is_given(ctx, key)} | {"eval": True}
+    names = [path.resolve().name for path in scenes]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two scenes are called {name}: rename one of the folders")
+    background = common.get("background", (0.0, 0.0, 0.0))
+
+    def loaded() -> Iterator[Scene]:
+        for path in scenes:
+            yield read_scene(path, reading, background)[0]
+
+    with TrainingDisplay(quiet) as display:
+        records = compare(loaded(), parse_systems(systems), output, _flat(caps) or [5000], _flat(seeds) or [0], common,
+                          save_models=save_models, progress=display, on_run=None if quiet else _say)
+    if not quiet:
+        rows = summarise(records)
+        click.echo(table(HEAD, map(cells, rows)))
+        for note in notes(records, rows):
+            click.echo(note)
+
+
+def _flat(groups: tuple[tuple[int, ...], ...]) -> list[int]:
+    """All numbers once, in the order given."""
+    return list(dict.fromkeys(number for group in groups for number in group))
+
+
+def _say(run: Run, record: Record | None) -> None:
+    """Name a run before it starts, and its result after it."""
+    if record is None:
+        click.echo(str(run), err=True)
+    elif record["failed"]:
+        click.echo(f"{run}: failed: {record['failed']}", err=True)
+    else:
+        click.echo(f"{run}: PSNR {record['psnr']:.2f} dB, SSIM {record['ssim']:.4f}, {record['splats']} splats, "
+                   f"{duration(record['seconds'])}", err=True)

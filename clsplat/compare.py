@@ -1,0 +1,223 @@
+"""Systems trained side by side: same scenes, caps, iterations and seeds, one line of JSON a run, resumable."""
+
+from __future__ import annotations
+
+import json
+import re
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import __version__
+from .atomic import atomic_writer
+from .compare_table import MEASURED, Record, markdown, notes, summarise
+from .config import TrainConfig
+from .device import Device, open_device
+from .errors import InputError, OutputError, TrainingError
+from .evaluate import evaluate
+from .metrics import DEFAULT_PROTOCOL
+from .model_folder import write_json
+from .run_log import Progress
+from .scene import Scene
+from .systems import System
+from .trainer import Trainer
+
+RUNS, TABLE, RESULTS, MODELS = "runs.jsonl", "table.md", "results.json", "models"
+WARM_UP = 3  # iterations
+# Options that change nothing in the result: runs that differ in these alone are the same run.
+_FREE = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run that is wanted: the `number`th of `total` on its scene."""
+
+    scene: str
+    system: str
+    config: TrainConfig
+    number: int
+    total: int
+
+    def __str__(self) -> str:
+        config = self.config
+        return f"[{self.number}/{self.total}] {self.scene} {self.system} cap {config.cap_max} seed {config.seed}"
+
+    @property
+    def stem(self) -> str:
+        """For file names: system, cap and seed."""
+        return re.sub(r"[^\w.=,-]", "_", f"{self.system}-cap{self.config.cap_max}-seed{self.config.seed}")
+
+
+class RunFile:
+    """runs.jsonl: the runs that are done, appended one by one."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / RUNS
+        self.records: list[Record] = []
+        text = ""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if self.path.exists():
+                text = self.path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise OutputError(f"{self.path}: cannot be used ({error}): choose another folder") from None
+        for line in text.splitlines():
+            try:
+                record = json.loads(line)
+            except ValueError:
+                continue  # cut short by a crash: that run is done again
+            if isinstance(record, dict) and record.keys() >= _KEYS:
+                self.records.append(record)
+        self._separator = "" if not text or text.endswith("\n") else "\n"
+
+    def find(self, scene: Mapping[str, Any], system: str, config: TrainConfig) -> Record | None:
+        """The record of a run, if it is done."""
+        wanted = (scene, system, _identity(config.to_json()))
+        for record in self.records:
+            if (record["scene"], record["system"], _identity(record["config"])) == wanted:
+                return record
+        return None
+
+    def add(self, record: Record) -> None:
+        """Append a record; OutputError where it cannot be written."""
+        try:
+            with self.path.open("a", encoding="utf-8") as stream:
+                stream.write(self._separator + json.dumps(record) + "\n")
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written ({error.strerror or error}): free some space") from None
+        self._separator = ""
+        self.records.append(json.loads(json.dumps(record)))
+
+
+def compare(scenes: Iterable[Scene], systems: Sequence[System], output: str | Path, caps: Sequence[int],
+            seeds: Sequence[int], common: Mapping[str, Any] | None = None, *, save_models: bool = False,
+            progress: Callable[[Progress], None] | None = None,
+            on_run: Callable[[Run, Record | None], None] | None = None) -> list[Record]:
+    """Train every system at every cap with every seed on every scene, and measure it on the test views.
+
+    Runs that `output` has already are not done again. The table is of all runs there, these and earlier ones.
+
+    Parameters
+    ----------
+    scenes : with test views; one after the other, so that they may be loaded as they are needed.
+    output : folder of runs.jsonl, table.md and results.json; after Ctrl-C too.
+    common : options of all systems, by TrainConfig's names.
+    save_models : keep the splats of each run in `output`/models.
+    progress : as `train`'s. on_run : called with each run and None before it, and with its record after it.
+
+    Returns
+    -------
+    All runs in `output`, in the order they were made; `compare_table.summarise` makes the table's rows of them.
+
+    Raises
+    ------
+    InputError : a scene without test views, or options that do not fit a system. OutputError : cannot be written.
+    DeviceError : no device, or not enough memory. A run whose training fails is a record of its own ("failed").
+    """
+    folder = Path(output)
+    # Systems innermost: an interrupted comparison has as many runs of each.
+    configs = [(system.label, system.config(cap, seed, common)) for cap in caps for seed in seeds for system in systems]
+    runs = RunFile(folder)
+    device: Device | None = None
+    warm: set[str] = set()
+    try:
+        for scene in scenes:
+            if not scene.test:
+                raise InputError(f"{scene.path}: no test views to measure on: load it with eval")
+            identity = scene_identity(scene)
+            for number, (label, config) in enumerate(configs, 1):
+                if runs.find(identity, label, config) is not None:
+                    continue
+                run = Run(scene.name, label, config, number, len(configs))
+                if on_run is not None:
+                    on_run(run, None)
+                device = device or open_device(config.device)
+                if label not in warm:
+                    warm_up(scene, config, device)
+                    warm.add(label)
+                ply = folder / MODELS / f"{scene.name}-{run.stem}.ply" if save_models else None
+                record = {"scene": identity, "system": label, "config": config.to_json(),
+                          **train_and_measure(scene, config, device, progress, ply)}
+                runs.add(record)
+                if on_run is not None:
+                    on_run(run, record)
+    finally:
+        write_table(folder, runs.records)
+    return runs.records
+
+
+def warm_up(scene: Scene, config: TrainConfig, device: Device) -> None:
+    """Let the driver compile, which it does at a kernel's first launch, so that no run's seconds hold it."""
+    trainer = Trainer(scene, config, device=device)
+    for _ in range(min(WARM_UP, config.iterations)):
+        trainer.step()
+
+
+def train_and_measure(scene: Scene, config: TrainConfig, device: Device,
+                      progress: Callable[[Progress], None] | None = None, ply: Path | None = None) -> Record:
+    """One run: what compare_table.MEASURED names, and on what it was measured.
+
+    `seconds` is of training, `cpu_seconds` that of all threads of this process, with preparation; `peak_bytes` is the
+    most that the whole process has held so far and never falls, `device_bytes` is of this run's working buffers.
+
+    Parameters
+    ----------
+    ply : where to write the splats; None: written only to be weighed.
+    """
+    started = time.process_time()
+    record: Record = dict.fromkeys((*MEASURED, "peak_bytes")) | {
+        "failed": None, "finite": False, "cap_held": True, "device": str(device.info),
+        "driver": f"{device.info.driver} ({device.info.version})", "version": __version__,
+        "protocol": DEFAULT_PROTOCOL.describe()}
+    trainer = Trainer(scene, config, progress=progress, device=device)
+    record["schedule"] = str(trainer.kernels.schedule)
+    try:
+        model = trainer.run()
+    except TrainingError as error:
+        return record | {"failed": str(error)}
+    cpu_seconds = time.process_time() - started
+    measured = evaluate(trainer.renderer, model.splats, scene.test, config.background)
+    arrays = model.splats.arrays
+    with tempfile.TemporaryDirectory() as folder:
+        file = ply or Path(folder) / "splats.ply"
+        model.splats.save(file)
+        nbytes = file.stat().st_size
+    return record | {
+        "psnr": measured.psnr, "ssim": measured.ssim, "render_ms": measured.render_ms, "seconds": model.seconds,
+        "cpu_seconds": cpu_seconds, "splats": len(model.splats), "bytes": nbytes,
+        "parameters": sum(array.size for array in arrays.values()), "device_bytes": model.device_bytes,
+        "peak_bytes": model.peak_bytes, "finite": all(bool(np.isfinite(array).all()) for array in arrays.values()),
+        "cap_held": len(model.splats) <= config.cap_max,
+    }
+
+
+def scene_identity(scene: Scene) -> dict[str, Any]:
+    """What tells one scene, read in one way, from another: name, size of the first view, views of either set."""
+    camera = scene.views[0].camera
+    return {"name": scene.name, "width": camera.width, "height": camera.height, "train": len(scene.train),
+            "test": len(scene.test)}
+
+
+def write_table(folder: Path, records: Sequence[Record]) -> None:
+    """Write table.md and results.json, if there is anything to tell."""
+    if records:
+        rows = summarise(records)
+        with atomic_writer(folder / TABLE) as stream:
+            stream.write(markdown(records).encode())
+        write_json(folder / RESULTS, {"rows": rows, "notes": notes(records, rows)})
+
+
+# What a line of runs.jsonl must have.
+_KEYS = {"scene", "system", "config", "failed", "finite", "cap_held", "device", "driver", "schedule", "version",
+         "protocol", *MEASURED}
+
+
+def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A config's values as JSON has them, without those that change nothing."""
+    values: dict[str, Any] = json.loads(json.dumps({key: config[key] for key in config if key not in _FREE}))
+    return values

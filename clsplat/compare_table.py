@@ -1,0 +1,111 @@
+"""The table of a comparison: runs that differ in nothing but the seed make a row, with mean and spread."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Callable, Sequence
+from typing import Any
+
+Record = dict[str, Any]  # a line of runs.jsonl
+
+HEAD = ("scene", "cap", "iterations", "system", "seeds", "PSNR", "SSIM", "seconds", "splats", "parameters", "MB")
+MEASURED = ("psnr", "ssim", "seconds", "cpu_seconds", "render_ms", "splats", "parameters", "bytes", "device_bytes")
+_FROM_MEASURED = {"PSNR": ("psnr", 1.0, 2), "SSIM": ("ssim", 1.0, 4), "seconds": ("seconds", 1.0, 1),
+                  "splats": ("splats", 1.0, 0), "parameters": ("parameters", 1.0, 0), "MB": ("bytes", 1e-6, 2)}
+
+
+def summarise(records: Sequence[Record]) -> list[Record]:
+    """One row for each scene, cap and system, in the order of their first runs within scene and cap.
+
+    Returns
+    -------
+    Rows with "scene", "cap", "iterations", "system", "config" (all options but the seed), "seeds", "failed" (messages
+    by seed), "finite", "cap_held" (over all its runs), and for each of MEASURED {"mean", "half_spread"}, the latter
+    being half of maximum less minimum; None where every run failed. Systems of the same name but other options are
+    told apart in "system" by the options in which they differ.
+    """
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        groups.setdefault(_group_key(record), []).append(record)
+    rows = [_row(group) for group in groups.values()]
+    for row, said in zip(rows, [_differing(row, rows) for row in rows], strict=True):
+        row["system"] += said
+    places = {scene: place for place, scene in enumerate(dict.fromkeys(row["scene"] for row in rows))}
+    rows.sort(key=lambda row: (places[row["scene"]], row["cap"]))
+    return rows
+
+
+def cells(row: Record) -> tuple[str, ...]:
+    """A row as text, under HEAD."""
+    texts = {"scene": row["scene"], "cap": str(row["cap"]), "iterations": str(row["iterations"]),
+             "system": row["system"], "seeds": str(len(row["seeds"]))}
+    for title, (key, unit, digits) in _FROM_MEASURED.items():
+        values = row[key]
+        texts[title] = "failed"
+        if values is not None:
+            texts[title] = f"{unit * values['mean']:.{digits}f}"
+            if len(row["seeds"]) - len(row["failed"]) > 1 and title in ("PSNR", "SSIM", "seconds"):
+                texts[title] += f" ± {unit * values['half_spread']:.{digits}f}"
+    return tuple(texts[title] for title in HEAD)
+
+
+def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
+    """What a reader of the table must know, one sentence each."""
+    said = ["mean ± half the spread (maximum less minimum) over the seeds"]
+    said += [f"failed: {row['system']} on {row['scene']} at cap {row['cap']}, seed {seed}: {message}"
+             for row in rows for seed, message in row["failed"].items()]
+    said += [f"{row['system']} on {row['scene']} at cap {row['cap']}: {fault}" for row in rows
+             for key, fault in (("cap_held", "more splats than the cap"), ("finite", "parameters that are not finite"))
+             if row["seeds"] and not row[key] and not row["failed"]]
+    by_key: tuple[tuple[str, Callable[[Record], Any]], ...] = (
+        ("device", lambda record: f"{record['device']} ({record['driver']})"),
+        ("schedule", lambda record: record["schedule"]), ("version", lambda record: f"clsplat {record['version']}"),
+        ("protocol", lambda record: f"PSNR {record['protocol']['PSNR']}; SSIM {record['protocol']['SSIM']}"))
+    for name, of in by_key:
+        values = list(dict.fromkeys(of(record) for record in records))
+        mixed = " (mixed: seconds and rounding are not those of one machine)" if len(values) > 1 else ""
+        said.append(f"{name}: {', '.join(values)}{mixed}")
+    return said
+
+
+def markdown(records: Sequence[Record]) -> str:
+    """The whole table, with its notes."""
+    rows = summarise(records)
+    lines = [" | ".join(HEAD), " | ".join("---" if title in ("scene", "system") else "---:" for title in HEAD)]
+    lines += [" | ".join(cells(row)) for row in rows]
+    return "".join(f"| {line} |\n" for line in lines) + "\n" + "".join(f"- {note}\n" for note in notes(records, rows))
+
+
+def _group_key(record: Record) -> str:
+    config = {key: value for key, value in record["config"].items() if key != "seed"}
+    return json.dumps([record["scene"], record["system"], config], sort_keys=True)
+
+
+def _row(group: Sequence[Record]) -> Record:
+    first = group[0]
+    size = first["scene"]
+    row: Record = {
+        "scene": f"{size['name']} {size['width']}x{size['height']}", "cap": first["config"]["cap_max"],
+        "iterations": first["config"]["iterations"], "system": first["system"],
+        "config": {key: value for key, value in first["config"].items() if key != "seed"},
+        "seeds": [record["config"]["seed"] for record in group],
+        "failed": {str(record["config"]["seed"]): record["failed"] for record in group if record["failed"]},
+        "finite": all(record["finite"] for record in group),
+        "cap_held": all(record["cap_held"] for record in group),
+    }
+    done = [record for record in group if not record["failed"]]
+    for key in MEASURED:
+        values = [record[key] for record in done]
+        row[key] = {"mean": statistics.fmean(values), "half_spread": (max(values) - min(values)) / 2} if done else None
+    return row
+
+
+def _differing(row: Record, rows: Sequence[Record]) -> str:
+    """The options that tell a row from others of the same scene, cap and system, as " [key=value, ...]"."""
+    keys = ("scene", "cap", "system")
+    others = [other for other in rows if all(other[key] == row[key] for key in keys)]
+    differing = [key for key, value in row["config"].items() if any(o["config"].get(key) != value for o in others)]
+    differing = [key for key in differing if key != "iterations"]  # has a column of its own
+    said = ", ".join(f"{key}={row['config'][key]}" for key in differing)
+    return f" [{said}]" if said else ""
