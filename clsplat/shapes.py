@@ -91,7 +91,8 @@ NORMAL = Field("normal", 3, ("normal_0", "normal_1", "normal_2"), (0.0, 0.0, 1.0
 BETA = Field("beta", 1, ("beta",), (2.0,), 1e-3, bounds=BETA_BOUNDS)  # GES: rate 1e-3
 NU = Field("nu", 1, ("nu",), (NU_BOUNDS[1],), 1e-2, bounds=NU_BOUNDS, start=100.0)  # SSS starts at 100
 
-GAUSSIAN = Shape("gaussian", "shape/gaussian.clh", (), record=4, moments=6, profile=profiles.gaussian)
+GAUSSIAN = Shape("gaussian", "shape/gaussian.clh", (), record=4, moments=6, profile=profiles.gaussian,
+                 lower=("shape/gaussian_pixel.clh",))
 SKEW_NORMAL = Shape("skew-normal", "shape/skew_normal.clh", (SKEW,), record=9, moments=9,
                     profile=profiles.skew_normal, skew_form="centred", normalised=True, lower=("shape/skew_pixel.clh",))
 
@@ -111,12 +112,15 @@ GENERALISED_EXPONENTIAL = Shape("generalised-exponential", "shape/generalised_ex
                                 moments=7, profile=profiles.generalised_exponential)
 # GES as released: beta only scales the Gaussian, by 2 / (1 + exp(-0.1 (beta - 2))).
 GES_MODULATION = Shape("ges-modulation", "shape/ges_modulation.clh", (BETA,), record=4, moments=6,
-                       profile=profiles.gaussian)
+                       profile=profiles.gaussian, lower=("shape/gaussian_pixel.clh",))
 STUDENT_T = Shape("student-t", "shape/student_t.clh", (NU,), record=5, moments=7, profile=profiles.student_t,
                   signed=True)
 
 # In the order in which a file without clsplat's comment is matched by its columns.
-SHAPES = {shape.name: shape for shape in (GAUSSIAN, SKEW_NORMAL, SKEW_NORMAL_DIRECT, HALF_GAUSSIAN, BISECTED_SKEW)}
+SHAPES = {
+    shape.name: shape for shape in (GAUSSIAN, SKEW_NORMAL, SKEW_NORMAL_DIRECT, HALF_GAUSSIAN, BISECTED_SKEW,
+                                    GENERALISED_EXPONENTIAL, GES_MODULATION, STUDENT_T)
+}  # fmt: skip
 DEFAULT_SHAPE = SKEW_NORMAL.name
 
 
