@@ -8,7 +8,7 @@ import math
 import click
 import numpy as np
 import pytest
-from clsplat_cli.options import Color, Iterations
+from clsplat_cli.options import Color, Numbers
 from clsplat_cli.outputs import output_stems
 from clsplat_cli.progress import TrainingDisplay, duration, table
 
@@ -85,8 +85,8 @@ def test_stems() -> None:
 
 def test_option_types() -> None:
     assert Color().convert("0, .5,1", None, None) == (0, 0.5, 1)
-    assert Iterations().convert("1000, 7000 30000", None, None) == (1000, 7000, 30000)
-    for kind, bad in ((Color(), "1,1,1,1"), (Color(), "-1,0,0"), (Iterations(), "0"), (Iterations(), "")):
+    assert Numbers().convert("1000, 7000 30000", None, None) == (1000, 7000, 30000)
+    for kind, bad in ((Color(), "1,1,1,1"), (Color(), "-1,0,0"), (Numbers(), "0"), (Numbers(), "")):
         with pytest.raises(click.BadParameter):
             kind.convert(bad, None, None)
 
