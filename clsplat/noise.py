@@ -1,4 +1,4 @@
-"""The exploration noise of 3DGS-MCMC, with random numbers that a kernel can repeat.
+"""The exploration noise of 3DGS-MCMC, with random numbers that a kernel can repeat (cl/noise.clh).
 
 Random integers come from Philox4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): a
 pure function of (seed, iteration, splat), so order, device and thread count do not matter. The uniforms made
@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .rotations import rotations
 from .schema import Array
 
 Words = NDArray[np.uint32]
@@ -47,20 +48,21 @@ def philox4x32(counter: FourWords, key: tuple[int, int]) -> FourWords:
     return c0, c1, c2, c3
 
 
-def normal3(seed: int, iteration: int, n: int) -> NDArray[np.float32]:
+def normal3(seed: int, iteration: int, n: int, stream: int = 0) -> NDArray[np.float32]:
     """Three independent standard normals for each of `n` splats, (n, 3).
 
-    Key (seed low, seed high), counter (index, iteration, 0, 0); words 0, 1 give components 0, 1 and words
+    Key (seed low, seed high), counter (index, iteration, stream, 0); words 0, 1 give components 0, 1 and words
     2, 3 component 2 (the second of that pair is not used), by Box-Muller:
     radius sqrt(-2 ln uniform(word a)), angle 2 pi uniform(word b). |normal| < 5.8.
 
     Parameters
     ----------
     seed : 0 <= seed < 2^64. iteration : 0 <= iteration < 2^32.
+    stream : users of noise in one iteration have one each: 0 this module's, 1 sghmc.py's.
     """
     index = np.arange(n, dtype=np.uint32)
-    zero = np.zeros((), np.uint32)
-    words = philox4x32((index, np.asarray(iteration, np.uint32), zero, zero), (seed & _MASK, seed >> 32))
+    rest = [np.asarray(word, np.uint32) for word in (iteration, stream, 0)]
+    words = philox4x32((index, rest[0], rest[1], rest[2]), (seed & _MASK, seed >> 32))
     u0, u1, u2, u3 = (_uniform(word) for word in words)
     radius01, angle01 = np.sqrt(-2.0 * np.log(u0)), 2.0 * np.pi * u1
     radius2, angle2 = np.sqrt(-2.0 * np.log(u2)), 2.0 * np.pi * u3
@@ -68,20 +70,28 @@ def normal3(seed: int, iteration: int, n: int) -> NDArray[np.float32]:
     return np.stack(normals, axis=1).astype(np.float32)
 
 
-def noise_gate(opacity_logit: Array) -> NDArray[np.float64]:
-    """How much of the noise a splat takes, (N,): .62 at opacity 0, .5 at .005, .01 at .05."""
-    opacity = 1.0 / (1.0 + np.exp(-np.clip(opacity_logit.astype(np.float64), -80.0, 80.0)))
-    gate: NDArray[np.float64] = 1.0 / (1.0 + np.exp(GATE_SHARPNESS * opacity - GATE_OFFSET))
+def noise_gate(strength: Array) -> NDArray[np.float64]:
+    """How much of the noise a splat takes, (N,), by its largest |opacity|: .62 at 0, .5 at .005, .01 at .05."""
+    gate: NDArray[np.float64] = 1.0 / (1.0 + np.exp(GATE_SHARPNESS * strength.astype(np.float64) - GATE_OFFSET))
     return gate
 
 
-def add_noise(mean: Array, quat: Array, log_scale: Array, opacity_logit: Array, seed: int, iteration: int,
+def covariance_times(quat: Array, log_scale: Array, vector: Array) -> NDArray[np.float64]:
+    """Sigma v of (N, 3) vectors, Sigma = R S S R'."""
+    rotation = rotations(quat.astype(np.float64))
+    in_frame = np.einsum("nji,nj->ni", rotation, vector) * np.exp(2.0 * log_scale.astype(np.float64))
+    product: NDArray[np.float64] = np.einsum("nij,nj->ni", rotation, in_frame)
+    return product
+
+
+def add_noise(mean: Array, quat: Array, log_scale: Array, strength: Array, seed: int, iteration: int,
               amount: float) -> Array:
-    """Means after the noise step: mean + Sigma (xi gate amount), Sigma = R S S R'.
+    """Means after the noise step: mean + Sigma (xi gate amount).
 
     Parameters
     ----------
-    mean (N, 3), quat (N, 4) wxyz of any norm above 0, log_scale (N, 3), opacity_logit (N,) : raw values.
+    mean (N, 3), quat (N, 4) wxyz of any norm above 0, log_scale (N, 3) : raw values.
+    strength : (N,) the largest |opacity| of each splat (Shape.strength).
     amount : noise learning rate (NOISE_LR) times the mean's learning rate of this iteration.
 
     Returns
@@ -89,11 +99,8 @@ def add_noise(mean: Array, quat: Array, log_scale: Array, opacity_logit: Array, 
     (N, 3) of the mean's dtype.
     """
     xi = normal3(seed, iteration, len(mean)).astype(np.float64)
-    rotation = _rotations(quat.astype(np.float64))
-    variance = np.exp(2.0 * log_scale.astype(np.float64))
-    step = xi * (noise_gate(opacity_logit) * amount)[:, None]
-    in_frame = np.einsum("nji,nj->ni", rotation, step) * variance
-    moved: Array = (mean + np.einsum("nij,nj->ni", rotation, in_frame)).astype(mean.dtype)
+    step = xi * (noise_gate(strength) * amount)[:, None]
+    moved: Array = (mean + covariance_times(quat, log_scale, step)).astype(mean.dtype)
     return moved
 
 
@@ -105,15 +112,3 @@ def _halves(product: NDArray[np.uint64]) -> tuple[Words, Words]:
 def _uniform(words: Words) -> NDArray[np.float64]:
     """The top 23 bits at the centre of their interval: in (0, 1), exact in float32."""
     return ((words >> np.uint32(9)).astype(np.float64) + 0.5) * 2.0**-23
-
-
-def _rotations(quat: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4) wxyz."""
-    w, x, y, z = (quat / np.linalg.norm(quat, axis=1, keepdims=True)).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    matrices: NDArray[np.float64] = np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
-    return matrices

@@ -10,49 +10,55 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .errors import InputError
-from .schema import Array, Schema
+from .schema import Array
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15  # 3DGS
-SH_REST_FACTOR = 1.0 / 20.0  # 3DGS: bands above the constant learn 20 times slower
-
-
-def learning_rates(schema: Schema, mean: float) -> dict[str, ArrayLike]:
-    """Adam's rate per field, shaped to broadcast over the public arrays.
-
-    Parameters
-    ----------
-    schema : fields with their rates.
-    mean : the mean's rate of this iteration (scene extent and decay included) [world units].
-
-    Returns
-    -------
-    Field name to float, but for `sh` to a (1, K, 1) array.
-    """
-    rates: dict[str, ArrayLike] = {field.name: field.lr for field in schema}
-    rates["mean"] = mean
-    sh = np.full((1, schema["sh"].width // 3, 1), schema["sh"].lr)
-    sh[:, 1:] *= SH_REST_FACTOR
-    rates["sh"] = sh
-    return rates
 
 
 class NumpyAdam:
     """Adam over named arrays whose first axis is the splat.
 
+    Parameters
+    ----------
+    params : the arrays to come, for the shapes and dtypes of their moments.
+
     Attributes
     ----------
     step_count : steps taken.
-    first, second : name to first and second moments, of the parameters' shapes and dtypes.
+    first, second : name to first and second moments.
     """
 
-    def __init__(self, beta1: float = BETA1, beta2: float = BETA2, eps: float = EPS) -> None:
+    def __init__(self, params: Mapping[str, Array], beta1: float = BETA1, beta2: float = BETA2,
+                 eps: float = EPS) -> None:
         self.beta1, self.beta2, self.eps = beta1, beta2, eps
         self.step_count = 0
-        self.first: dict[str, Array] = {}
-        self.second: dict[str, Array] = {}
+        self.first = {name: np.zeros_like(param) for name, param in params.items()}
+        self.second = {name: np.zeros_like(param) for name, param in params.items()}
+
+    def advance(self) -> None:
+        """Begin a step: the bias corrections follow the count."""
+        self.step_count += 1
+
+    def direction(self, name: str, grad: Array) -> Array:
+        """Take a gradient into the moments of `name`; the bias-corrected direction, to be scaled by a rate.
+
+        Raises
+        ------
+        KeyError : no such name. ValueError : the gradient has another shape than the parameter.
+        """
+        m, v = self.first[name], self.second[name]
+        if grad.shape != m.shape:
+            raise ValueError(f"{name}: gradient {grad.shape}, parameter {m.shape}")
+        m *= self.beta1
+        m += (1.0 - self.beta1) * grad
+        v *= self.beta2
+        v += (1.0 - self.beta2) * (grad * grad)
+        correction1 = 1.0 - self.beta1**self.step_count
+        correction2 = math.sqrt(1.0 - self.beta2**self.step_count)
+        ascent: Array = (m / correction1) / (np.sqrt(v) / correction2 + self.eps)
+        return ascent
 
     def step(
         self, params: Mapping[str, Array], grads: Mapping[str, Array], lrs: Mapping[str, ArrayLike]
@@ -63,55 +69,8 @@ class NumpyAdam:
         ----------
         params, grads : name to array; every parameter needs a gradient of its shape.
         lrs : name to rate, a number or anything that broadcasts over the parameter.
-
-        Raises
-        ------
-        KeyError : a parameter without gradient or rate. ValueError : shapes differ.
         """
-        self.step_count += 1
-        correction1 = 1.0 - self.beta1**self.step_count
-        correction2 = math.sqrt(1.0 - self.beta2**self.step_count)
+        self.advance()
         for name, param in params.items():
-            grad = grads[name]
-            if grad.shape != param.shape:
-                raise ValueError(f"{name}: gradient {grad.shape}, parameter {param.shape}")
-            m = self.first.setdefault(name, np.zeros_like(param))
-            v = self.second.setdefault(name, np.zeros_like(param))
-            m *= self.beta1
-            m += (1.0 - self.beta1) * grad
-            v *= self.beta2
-            v += (1.0 - self.beta2) * (grad * grad)
             rate = np.asarray(lrs[name], dtype=param.dtype)
-            param -= rate * (m / correction1) / (np.sqrt(v) / correction2 + self.eps)
-
-    def reset(self, rows: ArrayLike) -> None:
-        """Zero the moments of `rows` (indices, or a boolean mask)."""
-        for moment in (*self.first.values(), *self.second.values()):
-            moment[np.asarray(rows)] = 0
-
-    def relocate(self, fresh: NDArray[np.bool_]) -> None:
-        """Follow a densify.Plan: append zero moments up to len(fresh) rows and zero the fresh ones."""
-        for moments in (self.first, self.second):
-            for name, moment in moments.items():
-                grown = np.zeros((len(fresh), *moment.shape[1:]), moment.dtype)
-                grown[: len(moment)] = moment
-                grown[fresh] = 0
-                moments[name] = grown
-
-    def state_dict(self) -> dict[str, NDArray[np.generic]]:
-        """Copies of everything needed to go on: `step`, `<name>.first`, `<name>.second`."""
-        state: dict[str, NDArray[np.generic]] = {"step": np.array(self.step_count, np.int64)}
-        for name in self.first:
-            state[f"{name}.first"] = self.first[name].copy()
-            state[f"{name}.second"] = self.second[name].copy()
-        return state
-
-    def load_state_dict(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        """Take over a `state_dict`; raises InputError naming a missing or unpaired entry."""
-        names = {key.rpartition(".")[0] for key in state if key != "step"}
-        wanted = {"step"} | {f"{name}.{part}" for name in names for part in ("first", "second")}
-        if odd := sorted(wanted ^ set(state)):
-            raise InputError(f"optimizer state: missing or unknown entry {odd[0]!r}")
-        self.step_count = int(state["step"])
-        self.first = {name: np.array(state[f"{name}.first"]) for name in sorted(names)}
-        self.second = {name: np.array(state[f"{name}.second"]) for name in sorted(names)}
+            param -= rate * self.direction(name, grads[name])

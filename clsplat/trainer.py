@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .blocks import active_blocks
 from .buffers import ParameterBuffers, SplatBuffers
 from .checkpoint import Checkpoint
 from .config import TrainConfig
@@ -156,17 +157,17 @@ class Trainer:
         layout = self.loss.set_truth(image)
         frame = self.pipeline.forward(self.splats, camera, config.background, degree)
         self.pipeline.backward(frame, self.loss.gradient(layout), self.grads)
-        if config.opacity_reg or config.scale_reg:
+        if config.opacity_reg or config.scale_reg or config.bisect_reg:
             n = self.splats.n
             self.optim_program.regularise.over(
                 -(-n // self.kernels.lanes), geom=self.splats.geom, grad_geom=self.grads.geom,
                 capacity=self.splats.capacity, opacity_scale=config.opacity_reg / n,
-                scale_scale=config.scale_reg / (3 * n))
+                scale_scale=config.scale_reg / (3 * n), bisect_scale=config.bisect_reg / n)
         mean_lr = self.scene.extent * self.mean_rate(it)
         self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it)
         if self.densify_first <= it <= self.densify_last and it % config.densify_interval == 0:
             self.densify(camera.width)
-        if config.noise_lr:
+        if config.noise_lr and active_blocks(it, config).base:
             self.optim_program.mcmc_noise.over(
                 -(-self.splats.n // self.kernels.lanes), self.pipeline.group, geom=self.splats.geom,
                 capacity=self.splats.capacity, n_splats=self.splats.n, seed_lo=config.seed & 0xFFFFFFFF,

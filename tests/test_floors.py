@@ -17,14 +17,14 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = """
     errors
     atomic compare_table interrupt presets run_log runtime schema capture_world
-    camera device images metrics noise optim_reference plan ply_header profiles schedules validity colmap_files
-    cameras_json capture checkpoint colmap program shapes
-    opacities ply skew_map
+    camera device images metrics optim_reference plan ply_header profiles rotations schedules validity colmap_files
+    cameras_json capture checkpoint colmap noise program shapes
+    opacities ply sghmc skew_map
     adc config densify kernels scene splats
     blocks buffers camera_path initialise model_folder strategy systems view_sampler
-    optim sort
-    pipeline
-    loss memory tuning
+    optim_rules sort
+    optim_fused optim_host pipeline
+    loss memory optim tuning
     render
     evaluate
     trainer

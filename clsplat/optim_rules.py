@@ -1,0 +1,82 @@
+"""What both optimizers go by: rates, the skew map, how positions move, and which blocks learn when."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .blocks import Blocks, active_blocks
+from .config import TrainConfig
+from .errors import InputError
+from .schema import Array, Field, Schema
+from .sghmc import Coefficients, Sghmc
+from .shapes import Shape, shape_named
+from .skew_map import SkewMap
+
+SH_REST_FACTOR = 1.0 / 20.0  # 3DGS: bands above the constant learn 20 times slower
+
+
+@dataclass(frozen=True)
+class Rules:
+    """The config as the optimizers read it; `extent` of the scene [world units]."""
+
+    config: TrainConfig
+    extent: float
+
+    @property
+    def shape(self) -> Shape:
+        return shape_named(self.config.shape)
+
+    @cached_property
+    def rates(self) -> dict[str, float]:
+        """Adam's rate per field; the mean's changes with the iteration and is given at each step."""
+        config = self.config
+        rates = {"quat": config.rotation_lr, "log_scale": config.scaling_lr, "opacity_logit": config.opacity_lr,
+                 "opacity_minus_logit": config.opacity_lr, "sh": config.feature_lr, "skew": config.skew_lr,
+                 "normal": config.normal_lr, "beta": config.beta_lr, "nu": config.nu_lr}
+        return {name: rate * config.rate_factor(name) for name, rate in rates.items()}
+
+    def sh_rates(self, rows: int, dtype: np.dtype[np.floating]) -> Array:
+        """Rate per row of colour, of which the first three are the constant band."""
+        rates = np.full(rows, self.rates["sh"], dtype)
+        rates[3:] *= SH_REST_FACTOR
+        return rates
+
+    @cached_property
+    def map(self) -> SkewMap | None:
+        """The map of the trainable skew, where the shape has one."""
+        return SkewMap(self.config.map) if self.config.map else None
+
+    @cached_property
+    def sghmc(self) -> Sghmc | None:
+        """How positions move, unless by Adam."""
+        config = self.config
+        if config.position_optimizer == "adam":
+            return None
+        return Sghmc(config.position_optimizer == "sghmc-sss", self.extent, config.sghmc_friction,
+                     config.sghmc_burn_in_friction, int(config.sghmc_burn_in * config.iterations))
+
+    def coefficients(self, sghmc: Sghmc, iteration: int, mean_lr: float) -> Coefficients:
+        """Of SGHMC's step, from the rate that Adam would take."""
+        factor = self.config.rate_factor("mean")
+        return sghmc.coefficients(iteration, mean_lr / factor, factor)
+
+    def blocks(self, iteration: int) -> Blocks:
+        """The blocks that learn at `iteration`."""
+        return active_blocks(iteration, self.config)
+
+    def base_fields(self, schema: Schema) -> tuple[Field, ...]:
+        """All fields but the skew: the base block."""
+        return tuple(field for field in schema if field.name != "skew")
+
+    def check_state(self, state: Mapping[str, NDArray[Any]], schema: Schema) -> None:
+        """Raises InputError naming an entry that an optimizer's state lacks, or has and should not."""
+        wanted = {"steps"} | {f"{role}.{name}" for role in ("first", "second") for name in schema.names}
+        wanted |= ({"skew_s"} if self.map else set()) | ({"momentum"} if self.sghmc else set())
+        if odd := sorted(wanted ^ set(state)):
+            raise InputError(f"optimizer state: missing or unknown entry {odd[0]!r}: start without --resume")
