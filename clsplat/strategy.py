@@ -64,7 +64,7 @@ def plan(config: TrainConfig, arrays: Mapping[str, Array], signals: Array, rng: 
         largest_px = min(LARGEST_PX, LARGEST_WIDTH * moment.image_width)
     grown = plan_adc(
         arrays, shape, signals, rng, config.cap_max, extent=moment.extent, grad_threshold=config.grad_threshold,
-        depth_threshold=config.depth_threshold, dense_size=config.dense_size, largest_px=largest_px)
+        depth_threshold=config.depth_threshold / moment.extent, dense_size=config.dense_size, largest_px=largest_px)
     return with_reset(grown, arrays, shape) if resets(config, moment) else grown
 
 
