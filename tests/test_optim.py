@@ -10,11 +10,13 @@ import pytest
 from clsplat.buffers import ParameterBuffers, SplatBuffers
 from clsplat.config import TrainConfig
 from clsplat.device import Device, default_schedule
+from clsplat.errors import InputError
 from clsplat.kernels import KernelBuild
+from clsplat.noise import add_noise
 from clsplat.optim import Optimizer, make_optimizer
 from clsplat.plan import Plan
 from clsplat.schema import Group
-from clsplat.shapes import shape_named
+from clsplat.shapes import SHAPES, shape_named
 from clsplat.skew_map import MAPS, SKEW_MAPS
 from clsplat.splats import Splats
 
@@ -152,3 +154,147 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
     assert set(states[0]) == set(states[1])
     for name, expected in states[1].items():
         np.testing.assert_allclose(states[0][name], expected, 1e-6, 1e-6 * np.abs(expected).max(), err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["fused", "numpy"])
+def test_a_plan_moves_parameters_and_states(devices: list[Device], name: str) -> None:
+    """Parameters as Plan.apply, states as Plan.apply_state, and s found anew only where the skew is another."""
+    config = config_of(shape="bisected-skew", skew_map="polar", optimizer=name, **SGHMC)
+    buffers, optimizer = started(devices[0], config, some_splats(config.shape))
+    rng = np.random.default_rng(3)
+    for iteration, make_plan in enumerate((shrinking, growing), start=1):
+        step(buffers, optimizer, gradients(buffers, rng), iteration)
+        old, state = buffers.download(buffers.n), optimizer.state()
+        plan = make_plan(old, rng)
+        optimizer.apply(plan)
+        moved, after = buffers.download(buffers.n), optimizer.state()
+        for field, expected in plan.apply(old).items():
+            np.testing.assert_array_equal(moved[field], expected, err_msg=field)
+        for key in state:
+            role, _, field = key.partition(".")
+            if role in ("first", "second", "momentum"):
+                expected = plan.apply_state(state[key], field or "mean")
+                np.testing.assert_array_equal(after[key], expected, err_msg=key)
+        changed = (moved["skew"] != old["skew"][plan.source]).any(axis=1)
+        assert changed.sum() == (4 if make_plan is shrinking else 0)
+        np.testing.assert_array_equal(after["skew_s"][~changed], state["skew_s"][plan.source][~changed])
+        np.testing.assert_allclose(np.linalg.norm(after["skew_s"][changed, 1:], axis=1), 1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["fused", "numpy"])
+def test_a_frozen_block_keeps_values_moments_and_count(devices: list[Device], name: str) -> None:
+    config = config_of(shape="skew-normal-direct", optimizer=name, alternation="cyclic", alternation_warmup=0,
+                       alternation_cycle=4)  # two iterations each
+    buffers, optimizer = started(devices[0], config, some_splats(config.shape))
+    rng = np.random.default_rng(3)
+    for iteration in range(1, 7):
+        before = optimizer.state() | buffers.download(buffers.n)
+        step(buffers, optimizer, gradients(buffers, rng), iteration)
+        after = optimizer.state() | buffers.download(buffers.n)
+        base = (iteration - 1) % 4 < 2
+        for key in set(before) - {"steps"}:
+            assert np.array_equal(before[key], after[key]) == (("skew" in key) == base), key
+        np.testing.assert_array_equal(after["steps"] - before["steps"], [base, not base])
+
+
+@pytest.mark.parametrize("name", ["fused", "numpy"])
+@pytest.mark.parametrize(("shape", "field"), [("generalised-exponential", "beta"), ("student-t", "nu")])
+def test_bounded_fields_move_by_factors_and_stay_within(
+    devices: list[Device], name: str, shape: str, field: str
+) -> None:
+    config = config_of(shape=shape, optimizer=name, **{f"{field}_lr": 0.05})
+    splats = some_splats(shape)
+    low, high = splats.schema[field].bounds or (0, 0)
+    arrays = splats.to_numpy()
+    arrays[field][:3] = low, high, 2.0
+    buffers, optimizer = started(devices[0], config, Splats(shape, arrays))
+    grads = {key: np.ones_like(value) for key, value in arrays.items()}
+    grads[field][1] = -1
+    step(buffers, optimizer, grads, 1)
+    got = buffers.download(buffers.n)[field]
+    np.testing.assert_allclose(got[:3], [low, high, 2 * np.exp(-0.05)], rtol=1e-6)  # Adam's first step is the rate
+    for iteration in range(2, 30):
+        step(buffers, optimizer, grads, iteration)
+    got = buffers.download(buffers.n)[field]
+    assert got.min() == np.float32(low)
+    assert got.max() == np.float32(high)
+
+
+def test_a_state_continues_to_the_same_bits_and_goes_from_one_optimizer_to_the_other(devices: list[Device]) -> None:
+    config = config_of(**CASES[-1])
+    buffers, optimizer = started(devices[0], config, some_splats(config.shape))
+    rng = np.random.default_rng(3)
+    for iteration in range(1, 7):
+        step(buffers, optimizer, gradients(buffers, rng), iteration)
+    state, splats = optimizer.state(), Splats(config.shape, buffers.download(buffers.n))
+    grads = gradients(buffers, rng)
+    step(buffers, optimizer, grads, 7)
+    for name, tolerance in (("fused", 0.0), ("numpy", TOLERANCE)):
+        others, other = started(devices[0], replace(config, optimizer=name), splats)
+        other.load_state(state)
+        step(others, other, grads, 7)
+        for key, expected in buffers.download(buffers.n).items():
+            np.testing.assert_allclose(others.download(others.n)[key], expected, tolerance, 10 * tolerance)
+        for key in ("momentum", "skew_s", "first.nu"):
+            odd = {k: v for k, v in state.items() if k != key} if key in state else state | {key: state["steps"]}
+            with pytest.raises(InputError, match=key):
+                other.load_state(odd)
+
+
+def test_every_field_has_a_rate(devices: list[Device]) -> None:
+    """All fields of all shapes move, the second opacity at the rate of the first."""
+    for shape in SHAPES:
+        config = config_of(shape=shape, opacity_lr=0.03)
+        splats = some_splats(shape, 20, 0)
+        buffers, optimizer = started(devices[0], config, splats)
+        step(buffers, optimizer, {key: np.ones_like(value) for key, value in splats.to_numpy().items()}, 1, 0)
+        for key, moved in buffers.download(buffers.n).items():
+            change = np.abs(moved - splats.to_numpy()[key])
+            assert np.all(change.reshape(len(change), -1).max(axis=1) > 0), (shape, key)
+            if "opacity" in key:
+                np.testing.assert_allclose(change, 0.03, rtol=1e-4)
+
+
+# --- kernels beside the step -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", ["gaussian", "bisected-skew", "student-t"])
+def test_regularisers_are_the_gradients_of_their_penalties(devices: list[Device], shape: str) -> None:
+    """Mean |opacity| of a splat's sides, scale, and the squared difference of two sides."""
+    device, splats, kind = devices[0], some_splats(shape), shape_named(shape)
+    kernels = kernels_of(device, config_of(shape=shape))
+    buffers = SplatBuffers.of(device, splats, kernels.dtype)
+    grads = ParameterBuffers(device, splats.schema, buffers.capacity, buffers.dtype)
+    kernels.optim_program(device).regularise.over(
+        -(-buffers.n // kernels.lanes), geom=buffers.geom, grad_geom=grads.geom, capacity=buffers.capacity,
+        opacity_scale=0.3, scale_scale=0.2, bisect_scale=0.7)
+
+    def penalty(arrays: dict[str, np.ndarray]) -> np.ndarray:
+        sides = [kind.opacity(arrays[key]) for key in arrays if "opacity" in key]
+        gap = sides[0] - sides[-1]
+        return 0.3 * np.abs(sides).mean(axis=0) + 0.2 * np.exp(arrays["log_scale"]).sum(axis=1) + 0.7 * gap**2
+
+    arrays = {key: array.astype(np.float64) for key, array in splats.to_numpy().items()}
+    for key, got in grads.download(buffers.n).items():
+        columns = got.reshape(len(got), -1).T
+        for column, values in enumerate(columns):
+            up, down = ({k: a.copy() for k, a in arrays.items()} for _ in range(2))
+            up[key].reshape(len(got), -1)[:, column] += 1e-6
+            down[key].reshape(len(got), -1)[:, column] -= 1e-6
+            np.testing.assert_allclose(values, (penalty(up) - penalty(down)) / 2e-6, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", ["bisected-skew", "student-t"])
+def test_mcmc_noise_follows_the_stronger_opacity_of_either_sign(devices: list[Device], shape: str) -> None:
+    device, splats, kind = devices[0], some_splats(shape), shape_named(shape)
+    kernels = kernels_of(device, config_of(shape=shape))
+    buffers = SplatBuffers.of(device, splats, kernels.dtype)
+    kernels.optim_program(device).mcmc_noise.over(
+        -(-buffers.n // kernels.lanes), geom=buffers.geom, capacity=buffers.capacity, n_splats=buffers.n, seed_lo=3,
+        seed_hi=7, iteration=9, amount=50.0)
+    arrays = splats.to_numpy()
+    strength = kind.strength(arrays)
+    assert np.sum(strength < 0.05) > 5
+    expected = add_noise(splats.mean, splats.quat, splats.log_scale, strength, (7 << 32) + 3, 9, 50.0)
+    assert np.abs(expected - splats.mean).max() > 0.1
+    np.testing.assert_allclose(buffers.download(buffers.n)["mean"], expected, rtol=1e-6, atol=2e-5)
