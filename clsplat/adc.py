@@ -1,11 +1,14 @@
 """Adaptive density control of 3DGS (Kerbl et al. 2023), and 3DSGS's depth criterion, planned on the host.
 
 Splats whose mean screen gradient is high are cloned (small ones: a copy in the same place) or split in two (large
-ones: both halves are drawn from the Gaussian, and smaller by 1.6); faint ones, and later large ones, are pruned. With
-a depth threshold (3DSGS, arXiv 2605.18334) a splat is split when either gradient is high, always along its longest
-axis; that paper leaves the two halves open, so here they keep what the parent had:
+ones: both halves are drawn from the Gaussian, and smaller by 1.6); faint ones, and later large ones, are pruned. Large
+is meant in the world: 3DGS's limit on the screen (20 px) has no effect in its released code, nor had it in its
+published numbers (graphdeco-inria/gaussian-splatting#123, #643), and where splats are few it removes most of them.
 
-    place    mean -+ s/2 along the axis, s the parent's deviation there
+With a depth threshold (3DSGS, arXiv 2605.18334) a splat is split when either gradient is high, always along its
+longest axis; that paper leaves the two halves open, so here they keep what the parent had:
+
+    place    mean +- s/2 along the axis, s the parent's deviation there
     scale    s sqrt(3)/2 along the axis: the variance of the pair is the parent's
     skew     its part across the axis stays; the part along it is halved: a piece of a skewed density is less skewed
              than the whole, and how the pieces differ is now their own opacities' and colours' business
@@ -52,7 +55,7 @@ def plan_adc(
     grad_threshold: float,
     depth_threshold: float = 0.0,
     dense_size: float = 0.01,
-    largest_px: float | None = None,
+    prune_large: bool = False,
 ) -> Plan:
     """Clone, split and prune.
 
@@ -63,14 +66,14 @@ def plan_adc(
     Parameters
     ----------
     arrays : all public arrays of the model.
-    signals : (4, N), see cl/project.cl: sums of the screen and the depth gradient, times seen, largest 3 sigma
-        radius [px].
+    signals : (at least 3, N), see cl/project.cl: sums of the screen and the depth gradient, times seen.
     rng : advanced by three normals for each half that is drawn.
     cap : most splats after growth; more than that are kept, not removed.
     extent : of the scene [world units].
-    grad_threshold : of the mean screen gradient. depth_threshold : of the mean depth gradient; 0: not looked at.
+    grad_threshold : of the mean screen gradient. depth_threshold : of the mean depth gradient
+        times the extent; 0: not looked at.
     dense_size : splats larger than this fraction of the extent are split, others cloned.
-    largest_px : splats larger on the screen are pruned, and those larger than WORLD_SIZE; None: neither.
+    prune_large : whether splats larger than WORLD_SIZE are pruned.
 
     Raises
     ------
@@ -83,13 +86,13 @@ def plan_adc(
         size = np.exp(arrays["log_scale"].astype(np.float64).max(axis=1))
     bright = sound & (shape.strength(arrays) >= MIN_OPACITY)
     by_axis = depth_threshold > 0
-    limit = math.inf if largest_px is None else WORLD_SIZE * extent
-    keep = bright & (size <= limit) & (signals[3] <= (math.inf if largest_px is None else largest_px))
+    limit = WORLD_SIZE * extent if prune_large else math.inf
+    keep = bright & (size <= limit)
     splittable = bright & (size / (1.0 if by_axis else SPLIT_SHRINK) <= limit)
     if not keep.any():
         keep = sound
 
-    score = _score(signals, grad_threshold, depth_threshold)
+    score = _score(signals, grad_threshold, depth_threshold, extent)
     splits = (score > 1.0) & splittable & (by_axis | (size > dense_size * extent))
     clones = (score > 1.0) & keep & bright & ~splits
     split, clone = _best(score, splits, clones, keep, cap)
@@ -117,13 +120,13 @@ def with_reset(plan: Plan, arrays: Mapping[str, Array], shape: Shape) -> Plan:
     return replace(plan, values=plan.values | low, reset_fields=plan.reset_fields + names)
 
 
-def _score(signals: Array, grad_threshold: float, depth_threshold: float) -> Reals:
+def _score(signals: Array, grad_threshold: float, depth_threshold: float, extent: float) -> Reals:
     """(N,) mean gradient over its threshold, the higher of the two; 0 where it is not finite."""
     seen = np.maximum(signals[2].astype(np.float64), 1.0)
     tiny = np.finfo(np.float64).tiny
     score: Reals = signals[0] / seen / max(grad_threshold, tiny)
     if depth_threshold > 0:
-        score = np.fmax(score, signals[1] / seen / depth_threshold)
+        score = np.fmax(score, signals[1] * extent / seen / depth_threshold)
     return np.where(np.isfinite(score), score, 0.0)
 
 

@@ -14,10 +14,6 @@ from .plan import Plan
 from .schema import Array
 from .shapes import shape_named
 
-# 3DGS prunes splats of more than 20 px on the screen, with images of 1000 to 1600 px: 0.02 of the width.
-LARGEST_PX = 20.0
-LARGEST_WIDTH = 0.02
-
 
 @dataclass(frozen=True, slots=True)
 class Moment:
@@ -27,14 +23,12 @@ class Moment:
     ----------
     iteration : from 1. last : the last one at which the strategy may act.
     growth : new count over old count of "mcmc". extent : of the scene [world units].
-    image_width : of the images that the signals were collected on [px].
     """
 
     iteration: int
     last: int
     growth: float
     extent: float
-    image_width: int
 
 
 def plan(config: TrainConfig, arrays: Mapping[str, Array], signals: Array, rng: np.random.Generator,
@@ -59,12 +53,10 @@ def plan(config: TrainConfig, arrays: Mapping[str, Array], signals: Array, rng: 
             rule=config.relocation if scaled else "opacity-only",
             pull=signals[0] if config.sampling == "pull" else None)
     every = reset_interval(config)
-    largest_px = None
-    if every and moment.iteration > every:
-        largest_px = min(LARGEST_PX, LARGEST_WIDTH * moment.image_width)
     grown = plan_adc(
         arrays, shape, signals, rng, config.cap_max, extent=moment.extent, grad_threshold=config.grad_threshold,
-        depth_threshold=config.depth_threshold / moment.extent, dense_size=config.dense_size, largest_px=largest_px)
+        depth_threshold=config.depth_threshold, dense_size=config.dense_size,
+        prune_large=0 < every < moment.iteration)
     return with_reset(grown, arrays, shape) if resets(config, moment) else grown
 
 

@@ -166,16 +166,16 @@ class Trainer:
         mean_lr = self.scene.extent * self.mean_rate(it)
         self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it)
         if self.densify_first <= it <= self.densify_last and it % config.densify_interval == 0:
-            self.densify(camera.width)
+            self.densify()
         if config.noise_lr and active_blocks(it, config).base:
             self.optim_program.mcmc_noise.over(
                 -(-self.splats.n // self.kernels.lanes), self.pipeline.group, geom=self.splats.geom,
                 capacity=self.splats.capacity, n_splats=self.splats.n, seed_lo=config.seed & 0xFFFFFFFF,
                 seed_hi=config.seed >> 32, iteration=it, amount=config.noise_lr * mean_lr)
 
-    def densify(self, image_width: int) -> None:
-        """One action of the strategy, on images of that width."""
-        moment = Moment(self.iteration, self.densify_last, self.growth, self.scene.extent, image_width)
+    def densify(self) -> None:
+        """One action of the strategy."""
+        moment = Moment(self.iteration, self.densify_last, self.growth, self.scene.extent)
         arrays, signals = self.splats.download(self.splats.n), self.pipeline.read_signals(self.splats.n)
         self.optimizer.apply(plan(self.config, arrays, signals, self.rng, moment))
         self.pipeline.reset_signals()

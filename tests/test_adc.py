@@ -22,12 +22,10 @@ EXTENT = 2.0
 THRESHOLD = 2e-4
 
 
-def signals_of(gradient: np.ndarray, depth: np.ndarray | None = None, radius: np.ndarray | None = None,
-               seen: int = 4) -> np.ndarray:
+def signals_of(gradient: np.ndarray, depth: np.ndarray | None = None, seen: int = 4) -> np.ndarray:
     """Signals with these means."""
     n = len(gradient)
-    rows = [gradient * seen, (np.zeros(n) if depth is None else depth) * seen, np.full(n, seen),
-            np.zeros(n) if radius is None else radius]
+    rows = [gradient * seen, (np.zeros(n) if depth is None else depth) * seen, np.full(n, seen), np.zeros(n)]
     return np.array(rows, np.float32)
 
 
@@ -54,9 +52,9 @@ def test_laws_of_a_plan(
 ) -> None:
     arrays = random_model(shape, n, seed, dead)
     rng = np.random.default_rng(seed)
-    signals = signals_of(*(rng.exponential(scale, n) for scale in (THRESHOLD, 0.1, 10.0)))
+    signals = signals_of(*(rng.exponential(scale, n) for scale in (THRESHOLD, 0.1)))
     cap = max(1, n + spare)
-    options = {"depth_threshold": 0.1 if by_axis else 0.0, "dense_size": 0.02, "largest_px": 20.0 if large else None}
+    options = {"depth_threshold": 0.1 if by_axis else 0.0, "dense_size": 0.02, "prune_large": large}
     plan = planned(arrays, shape, signals, cap, seed, **options)
     again = planned(arrays, shape, signals, cap, seed, **options)
     moved = plan.apply(arrays)
@@ -68,7 +66,7 @@ def test_laws_of_a_plan(
     assert all(np.array_equal(a, again.apply(arrays)[name]) for name, a in moved.items())
     kept = shape.strength(arrays) >= MIN_OPACITY
     if large:
-        kept &= (np.exp(arrays["log_scale"].max(axis=1)) <= WORLD_SIZE * EXTENT) & (signals[3] <= 20)
+        kept &= np.exp(arrays["log_scale"].max(axis=1)) <= WORLD_SIZE * EXTENT
     if kept.any() and not by_axis:  # an opacity beyond a plane may be faint: it goes the next time
         assert (shape.strength(moved) >= MIN_OPACITY * (1 - 1e-6)).all()
     # Survivors first, in order, as they were and with their optimizer state; then new rows, with none.
@@ -127,14 +125,14 @@ def test_pruning_by_opacity_and_after_a_reset_by_size() -> None:
     arrays["opacity_logit"][0] = logit(0.9 * MIN_OPACITY)
     arrays["opacity_logit"][1] = logit(1.1 * MIN_OPACITY)
     arrays["log_scale"][2, 1] = math.log(1.1 * WORLD_SIZE * EXTENT)
-    quiet = signals_of(np.zeros(4), radius=np.array([0, 0, 0, 21.0]))
+    quiet = signals_of(np.zeros(4))
     assert planned(arrays, shapes.GAUSSIAN, quiet).source.tolist() == [1, 2, 3]
-    assert planned(arrays, shapes.GAUSSIAN, quiet, largest_px=20.0).source.tolist() == [1]
+    assert planned(arrays, shapes.GAUSSIAN, quiet, prune_large=True).source.tolist() == [1, 3]
     # A too large one whose halves are small enough is split instead, a splat too faint never.
-    loud = signals_of(np.full(4, 1.0), radius=np.array([0, 0, 0, 21.0]))
-    assert planned(arrays, shapes.GAUSSIAN, loud, largest_px=20.0).source.tolist() == [1, 1, 2, 2]
+    loud = signals_of(np.array([1.0, 0.0, 1.0, 0.0]))
+    assert planned(arrays, shapes.GAUSSIAN, loud, prune_large=True).source.tolist() == [1, 3, 2, 2]
     arrays["log_scale"][2, 1] += math.log(SPLIT_SHRINK)
-    assert planned(arrays, shapes.GAUSSIAN, loud, largest_px=20.0).source.tolist() == [1, 1]
+    assert planned(arrays, shapes.GAUSSIAN, loud, prune_large=True).source.tolist() == [1, 3]
 
 
 def test_two_sided_splats_live_by_their_stronger_side_and_signed_ones_by_the_absolute() -> None:
@@ -229,6 +227,13 @@ def test_the_centroid_of_the_direct_form_stays(depth_threshold: float) -> None:
     scale = float(np.exp(arrays["log_scale"].max()))
     shift = np.linalg.norm((centroid(halves).mean(axis=0) - centroid(arrays)[0]) / scale)
     assert shift < (1e-6 if depth_threshold else 5 * 2 / 200)
+
+
+def test_the_depth_threshold_does_not_depend_on_the_scenes_units() -> None:
+    for extent, count in ((0.9, 1), (1.1, 2)):
+        signals = signals_of(np.zeros(1), np.full(1, 0.1))
+        plan = planned(plain(1, 1e-3), shapes.GAUSSIAN, signals, depth_threshold=0.1, extent=extent)
+        assert len(plan.source) == count
 
 
 def opacities(shape: Shape, arrays: Arrays) -> np.ndarray:
