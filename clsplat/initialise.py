@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .schema import Array, sh_coefficients
-from .shapes import DEFAULT_SHAPE
+from .shapes import DEFAULT_SHAPE, shape_named
 from .splats import Splats
 
 if TYPE_CHECKING:
@@ -120,7 +120,8 @@ def _from_model(path: str, shape: str, cap: int, sh_degree: int, normalisation: 
                          f"choose normalisation {loaded.normalisation}")
     message = f"{len(loaded)} splats from {path}"
     if len(loaded) > cap:
-        keep = np.sort(np.argsort(-loaded.opacity_logit, kind="stable")[:cap])
+        strength = shape_named(loaded.shape).strength(loaded.arrays)
+        keep = np.sort(np.argsort(-strength, kind="stable")[:cap])
         message = f"{cap} splats from {path}: the most opaque of {len(loaded)}"
         loaded = loaded.select(keep)
     arrays = loaded.as_shape(shape).to_numpy()

@@ -18,6 +18,7 @@ from .validity import check_arrays, sh_degree_for
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 _MIN_SQUARED_DISTANCE = 1e-7  # 3DGS's floor, for points that coincide
+_OPACITIES = (1e-12, 1.0 - 1e-7)  # whose raw values are finite
 
 
 class Splats:
@@ -127,7 +128,7 @@ class Splats:
             "mean": points,
             "quat": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
             "log_scale": np.repeat(np.log(np.sqrt(squared) * scale_factor)[:, None], 3, axis=1),
-            "opacity_logit": np.full(n, np.log(opacity / (1.0 - opacity))),
+            "opacity_logit": shape_named(shape).raw_opacity(np.full(n, opacity)),
             "sh": sh,
         }
         return cls(shape, {name: values.astype(np.float32) for name, values in arrays.items()}, normalisation)
@@ -222,11 +223,20 @@ class Splats:
 
         Raises
         ------
-        InputError : an unknown shape.
+        InputError : an unknown shape, or negative opacities for a shape that has none.
         """
-        target = shape_named(name).schema(self.sh_degree)
-        shared = [field.name for field in target if field in self._schema.fields]
-        return Splats(name, {field: self._arrays[field] for field in shared}, self._normalisation)
+        source, target = shape_named(self._shape), shape_named(name)
+        shared = [field.name for field in target.schema(self.sh_degree) if field in self._schema.fields]
+        arrays = {field: self._arrays[field] for field in shared}
+        if source.signed != target.signed:
+            raw = arrays["opacity_logit"]
+            opacity = source.opacity(raw.astype(np.float64))
+            negative = int(np.sum(opacity < 0))
+            if negative:
+                raise InputError(f"splats: {negative} of {len(self)} have a negative opacity, which shape {name} has "
+                                 "not: remove them or choose another shape")
+            arrays["opacity_logit"] = target.raw_opacity(np.clip(opacity, *_OPACITIES)).astype(raw.dtype)
+        return Splats(name, arrays, self._normalisation)
 
 
 def _real(name: str, values: ArrayLike, dtype: np.dtype[Any]) -> Array:

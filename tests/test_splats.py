@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from model_strategies import Arrays, models, random_arrays
 
 from clsplat.errors import InputError, OutputError
+from clsplat.shapes import SHAPES
 from clsplat.splats import Splats
 
 IN_FOLDER = settings(
@@ -56,11 +57,29 @@ def test_select_takes_rows(model: tuple[str, str, Arrays], data: st.DataObject) 
 def test_as_shape(model: tuple[str, str, Arrays]) -> None:
     splats = Splats(*[model[i] for i in (0, 2, 1)])
     same(splats.as_shape(splats.shape), splats)
+    if SHAPES[splats.shape].signed and (splats.opacity_logit < 0).any():
+        with pytest.raises(InputError, match=r"of \d+ have a negative opacity, which shape gaussian has not"):
+            splats.as_shape("gaussian")
+        return
     gaussian = splats.as_shape("gaussian")
     assert "skew" not in gaussian.arrays
     back = gaussian.as_shape("skew-normal")
     assert not back.skew.any()
     same(back.as_shape("gaussian"), gaussian)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_opacities_keep_their_meaning(shape: str) -> None:
+    opacity = np.array([0.003, 0.3, 0.7, 0.999])
+    splats = Splats.from_points(np.eye(4)[:, :3], np.zeros((4, 3)), shape="gaussian")
+    splats = Splats("gaussian", splats.to_numpy() | {"opacity_logit": SHAPES["gaussian"].raw_opacity(opacity)})
+    other = splats.as_shape(shape)
+    for name in ("opacity_logit", "opacity_minus_logit"):
+        if name in other.arrays:
+            np.testing.assert_allclose(SHAPES[shape].opacity(other.arrays[name]), opacity, rtol=1e-5)
+    np.testing.assert_allclose(other.as_shape("gaussian").opacity_logit, splats.opacity_logit, rtol=1e-4)
+    started = Splats.from_points(np.eye(3), np.zeros((3, 3)), shape=shape, opacity=0.25)
+    np.testing.assert_allclose(SHAPES[shape].strength(started.arrays), 0.25, rtol=1e-6)
 
 
 def test_immutable_and_copied() -> None:
