@@ -54,7 +54,7 @@ def ply(model: Path, iteration: int = ITERATIONS) -> Path:
 
 def test_help_lists_all_commands_and_loads_nothing_heavy() -> None:
     text = subprocess.run([*PROGRAM, "--help"], check=True, capture_output=True, text=True).stdout
-    for name in ("devices", "demo", "train", "render", "eval"):
+    for name in ("devices", "demo", "train", "render", "eval", "compare", "convert"):
         assert f"\n  {name} " in text
     loaded = subprocess.run(
         [
@@ -71,7 +71,7 @@ def test_help_lists_all_commands_and_loads_nothing_heavy() -> None:
     assert not [name for name in ("numpy", "pyopencl", "pycolmap", "scipy", "PIL") if f"'{name}'" in loaded]
 
 
-@pytest.mark.parametrize("command", ["devices", "demo", "train", "render", "eval"])
+@pytest.mark.parametrize("command", ["devices", "demo", "train", "render", "eval", "compare", "convert"])
 def test_each_command_has_help(command: str) -> None:
     assert f"Usage: clsplat {command}" in clsplat(command, "--help")
 
