@@ -33,4 +33,4 @@ def convert_model(model: Path, output: Path, shape: str, iteration: int | None, 
     converted = convert(splats, shape)
     converted.save(output)
     if not quiet:
-        click.echo(f"{output}: {len(converted)} splats, {splats.shape} to {shape}; images are equal to float32")
+        click.echo(f"{output}: {len(converted)} splats, {splats.shape} to {shape}, with the same images")
