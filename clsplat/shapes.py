@@ -61,9 +61,8 @@ class Shape:
 
     def opacity(self, raw: Array) -> Array:
         """Opacity of the raw values of `opacity_logit` (or `opacity_minus_logit`)."""
-        if self.signed:
-            return np.tanh(raw)
-        return 0.5 * (1.0 + np.tanh(0.5 * raw))
+        opacity: Array = np.tanh(raw) if self.signed else 0.5 * (1.0 + np.tanh(0.5 * raw))
+        return opacity
 
     def raw_opacity(self, opacity: Array) -> Array:
         """The raw value that gives `opacity`."""

@@ -21,7 +21,7 @@ FLOORS = """
     cameras_json capture checkpoint colmap noise program shapes
     opacities ply sghmc skew_map
     adc config densify kernels scene splats
-    blocks buffers camera_path initialise model_folder strategy systems view_sampler
+    blocks buffers camera_path convert initialise model_folder strategy systems view_sampler
     optim_rules sort
     optim_fused optim_host pipeline
     loss memory optim tuning
@@ -42,6 +42,7 @@ OWNERS = {
 
 # Files beside shapes.py and cl/shape/ that may name a shape, and why.
 SHAPE_NAMES_IN = {
+    "convert.py": "which shape's splats are Gaussians of other scales",
     "presets.py": "a published system has its kernel",
     "tuning.py": "the cheapest kernel is the one that schedules are measured on",
 }
