@@ -23,12 +23,16 @@ from tolerances import relative_error
 from clsplat import render
 from clsplat.camera import Camera
 from clsplat.kernels import ALPHA_MAX, ALPHA_MIN, T_MIN
+from clsplat.shapes import NORMALISATIONS, SHAPES
 from clsplat.splats import Splats
 
 Arrays = dict[str, NDArray[np.floating]]
 
 # (shape, normalisation) of every kernel there is.
-KERNELS = [("gaussian", "peak"), ("skew-normal", "peak"), ("skew-normal", "pdf"), ("skew-normal", "none")]
+KERNELS = [
+    (shape.name, normalisation) for shape in SHAPES.values()
+    for normalisation in (NORMALISATIONS if shape.normalised else NORMALISATIONS[:1])
+]  # fmt: skip
 BACKGROUND = (0.2, 0.5, 0.9)
 SMOOTH = {"alpha_min": 0.0, "alpha_max": 1.0, "t_min": 0.0}
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from reference_scenes import random_camera, random_splats
+from reference_scenes import for_shape, random_camera, random_splats
 
 from clsplat import buffers, pipeline, program, render, sort
 from clsplat.device import Device, Schedule, open_device
@@ -88,13 +88,13 @@ def make_traceable(device: Device) -> None:
 
 
 def render_and_back(device: Device, mode: str) -> None:
-    """Both shapes on every kind of schedule: 5 splats, a 20 x 18 image in 4 tiles."""
+    """All shapes on every kind of schedule: 5 splats, a 20 x 18 image in 4 tiles."""
     camera = random_camera(1, 20, 18)
     arrays = random_splats(3, 5, 1, np.float32)
     rng = np.random.default_rng(0)
     v_color, v_alpha = rng.normal(size=(18, 20, 3)), rng.normal(size=(18, 20))
     for shape in SHAPES:
-        fields = {name: value for name, value in arrays.items() if name != "skew" or "skew" in shape}
+        fields = {name: value.astype(np.float32) for name, value in for_shape(arrays, shape).items()}
         splats = Splats(shape, fields)
         for schedule in SCHEDULES[mode]:
             renderer = render.Renderer(device, schedule=Schedule.parse(schedule))
