@@ -167,9 +167,9 @@ kernel void project_splats(
 
 // moments [rows SHAPE_V + 3, capacity]: summed over pixels; the last three are the gradient of the colour.
 // grad_geom, grad_sh: as geom, sh; overwritten (zero for unseen splats), sh only for the bands in use.
-// signals [4, capacity], for strategies, of the splats seen: added to, the norm of the gradient of mean_px in units of
+// signals [3, capacity], for strategies, of the splats seen: added to, the norm of the gradient of mean_px in units of
 // half the image (3DGS's normalised device coordinates), the absolute gradient along the viewing ray [1/world unit]
-// (3DSGS's depth gradient) and 1; and the largest 3 sigma radius on the screen [px].
+// (3DSGS's depth gradient) and 1.
 kernel void project_splats_vjp(
     global const real *restrict geom,
     global const real *restrict sh,
@@ -225,16 +225,12 @@ kernel void project_splats_vjp(
 
     const vreal half_x = g.mean_x * (vreal)(real)(0.5 * width), half_y = g.mean_y * (vreal)(real)(0.5 * height);
     const vreal along_ray = fabs(dot3(v_c, s.c)) / sqrt(dot3(s.c, s.c));
-    const vreal middle = (real)0.5 * (s.cov2d.xx + s.cov2d.yy), half_gap = (real)0.5 * (s.cov2d.xx - s.cov2d.yy);
-    const vreal radius = (real)3 * sqrt(middle + sqrt(half_gap * half_gap + s.cov2d.xy * s.cov2d.xy));
     global real *signal = signals + first;
     lanes_store(lanes_load(signal) + lanes_if(seen, sqrt(half_x * half_x + half_y * half_y), zero), signal);
     signal += capacity;
     lanes_store(lanes_load(signal) + lanes_if(seen, along_ray, zero), signal);
     signal += capacity;
     lanes_store(lanes_load(signal) + lanes_if(seen, (vreal)1, zero), signal);
-    signal += capacity;
-    lanes_store(max(lanes_load(signal), lanes_if(seen, radius, zero)), signal);
 
     vreal v_rgb[3], inv_norm, basis[SH_COUNT], v_basis[SH_COUNT];
     for (int c = 0; c < 3; ++c) v_rgb[c] = lanes_if(lanes_load(seen_rgb[c]) > zero, v[SHAPE_V + c], zero);

@@ -7,7 +7,7 @@ import inspect
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import click
 
@@ -181,12 +181,13 @@ def is_given(ctx: click.Context, name: str) -> bool:
 
 def _field_option(field: dataclasses.Field[Any], kind: Any, text: str | None) -> Callable[[F], F]:
     flag, default = _flag(field.name), field.default
+    kind = next((part for part in get_args(kind) if part is not type(None)), kind)  # X | None is X
     if kind is bool:
         return click.option(f"{flag}/--no-{flag[2:]}", field.name, default=default, show_default=True,
                             help=text)
     type_: Any = click.Choice(_CHOICES[field.name]) if field.name in _CHOICES else kind
     return click.option(flag, *_ALIASES.get(field.name, ()), field.name, type=type_, default=default,
-                        show_default=True, metavar=_METAVARS.get(field.name), help=text)
+                        show_default=default is not None, metavar=_METAVARS.get(field.name), help=text)
 
 
 def _flag(name: str) -> str:

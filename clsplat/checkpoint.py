@@ -32,7 +32,7 @@ class Checkpoint:
     queue : training views still to come in this epoch.
     seconds : training time so far. schedule : of the kernels, whose rounding depends on it.
     n_first : splats at the start, which the growth depends on.
-    signals : (4, N), see Pipeline.signals.
+    signals : (3, N), see Pipeline.signals.
     """
 
     iteration: int

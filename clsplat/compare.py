@@ -96,6 +96,7 @@ class RunFile:
 
 def compare(scenes: Iterable[Scene], systems: Sequence[System], output: str | Path, caps: Sequence[int],
             seeds: Sequence[int], common: Mapping[str, Any] | None = None, *, save_models: bool = False,
+            extra: Mapping[str, Any] | None = None,
             progress: Callable[[Progress], None] | None = None,
             on_run: Callable[[Run, Record | None], None] | None = None) -> list[Record]:
     """Train every system at every cap with every seed on every scene, and measure it on the test views.
@@ -108,6 +109,7 @@ def compare(scenes: Iterable[Scene], systems: Sequence[System], output: str | Pa
     output : folder of runs.jsonl, table.md and results.json; after Ctrl-C too.
     common : options of all systems, by TrainConfig's names.
     save_models : keep the splats of each run in `output`/models.
+    extra : more keys of each record.
     progress : as `train`'s. on_run : called with each run and None before it, and with its record after it.
 
     Returns
@@ -142,7 +144,7 @@ def compare(scenes: Iterable[Scene], systems: Sequence[System], output: str | Pa
                     warm.add(label)
                 ply = folder / MODELS / f"{scene.name}-{run.stem}.ply" if save_models else None
                 record = {"scene": identity, "system": label, "config": config.to_json(),
-                          **train_and_measure(scene, config, device, progress, ply)}
+                          **train_and_measure(scene, config, device, progress, ply), **(extra or {})}
                 runs.add(record)
                 if on_run is not None:
                     on_run(run, record)

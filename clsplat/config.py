@@ -51,7 +51,7 @@ class TrainConfig:
     scaling_lr : Adam's rate of log scales.
     rotation_lr : Adam's rate of quaternions.
     feature_lr : Adam's rate of colour; bands above the constant learn 20 times slower.
-    skew_lr : Adam's rate of the trainable skew.
+    skew_lr : Adam's rate of the trainable skew; not given: the shape's own (2.5e-3 centred, 1.25e-2 direct).
     opacity_reg : weight of the mean opacity in the loss.
     scale_reg : weight of the mean scale in the loss.
     bisect_reg : weight of the mean squared difference of a splat's two opacities in the loss (3DSGS).
@@ -77,7 +77,7 @@ class TrainConfig:
     growth : least growth of the splat count per action; more where the cap is far (see trainer.growth_factor).
     grad_threshold : "adc" clones or splits splats whose mean gradient of the screen position is above it (3DGS).
     depth_threshold : the same for the gradient along the viewing ray times the scene extent (3DSGS); 0: not looked at.
-    opacity_reset : "adc" resets opacities that often per run; 0: never.
+    opacity_reset : "adc" resets opacities that often per run, but not within 500 iterations; 0: never.
     dense_size : "adc" splits splats larger than this fraction of the scene extent and clones others.
     checkpoint_interval : iterations between checkpoints; 0: only at the end.
     save_iterations : when to write a PLY, beside the end.
@@ -108,7 +108,7 @@ class TrainConfig:
     scaling_lr: float = 5e-3
     rotation_lr: float = 1e-3
     feature_lr: float = 2.5e-3
-    skew_lr: float = 2.5e-3
+    skew_lr: float | None = None
     opacity_reg: float = 0.001
     scale_reg: float = 0.001
     bisect_reg: float = 0.0
@@ -153,10 +153,12 @@ class TrainConfig:
         for name in ("iterations", "cap_max", "densify_interval", "alternation_cycle"):
             _at_least(name, getattr(self, name), 1)
         for name in ("seed", "sh_interval", "checkpoint_interval", "position_lr_init", "position_lr_final",
-                     "opacity_lr", "scaling_lr", "rotation_lr", "feature_lr", "skew_lr", "opacity_reg",
+                     "opacity_lr", "scaling_lr", "rotation_lr", "feature_lr", "opacity_reg",
                      "scale_reg", "bisect_reg", "normal_lr", "beta_lr", "nu_lr", "noise_lr", "sghmc_friction",
                      "sghmc_burn_in_friction", "grad_threshold", "depth_threshold", "opacity_reset", "dense_size"):
             _at_least(name, getattr(self, name), 0)
+        if self.skew_lr is not None:
+            _at_least("skew_lr", self.skew_lr, 0)
         if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise InputError(f"sh_degree {self.sh_degree}: must be 0 to {MAX_SH_DEGREE}")
         for name in ("lambda_dssim", "relocation_limit", "sghmc_burn_in", "alternation_warmup", "alternation_split"):

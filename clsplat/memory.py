@@ -11,6 +11,7 @@ from .errors import DeviceError
 from .kernels import KernelBuild
 from .pipeline import ImageLayout
 from .schema import Group
+from .skew_map import SkewMap
 
 _ROLES = 5  # value, gradient, two moments, and the copy that relocation swaps with
 _IMAGE_PLANES = 3 + 1 + 3 + 15 + 9 + 9 + 3  # colour, T, truth, SSIM maps and their gradients, v_color
@@ -56,8 +57,10 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout) -> 
     screen = (kernels.record + kernels.v_record) * real + 4 * _SCREEN_WORDS
     isect = kernels.v_record * real + 4 * _SORT_WORDS
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
+    extra = 8 * SkewMap(config.map).width if config.map else 0  # s, gradient, moments, and a spare of each
+    extra += 0 if config.position_optimizer == "adam" else 6  # momentum
     buffers = [rows[Group.SH] * n * real, n_isects * kernels.v_record * real, 15 * layout.plane * real]
-    return Estimate(n * (_ROLES * sum(rows.values()) * real + screen), n_isects * isect,
+    return Estimate(n * ((_ROLES * sum(rows.values()) + extra) * real + screen), n_isects * isect,
                     _IMAGE_PLANES * layout.plane * real, max(buffers))
 
 

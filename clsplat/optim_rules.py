@@ -37,8 +37,11 @@ class Rules:
         """Adam's rate per field; the mean's changes with the iteration and is given at each step."""
         config = self.config
         rates = {"quat": config.rotation_lr, "log_scale": config.scaling_lr, "opacity_logit": config.opacity_lr,
-                 "opacity_minus_logit": config.opacity_lr, "sh": config.feature_lr, "skew": config.skew_lr,
+                 "opacity_minus_logit": config.opacity_lr, "sh": config.feature_lr,
                  "normal": config.normal_lr, "beta": config.beta_lr, "nu": config.nu_lr}
+        for field in self.shape.fields:
+            if field.name == "skew":
+                rates["skew"] = field.lr if config.skew_lr is None else config.skew_lr
         return {name: rate * config.rate_factor(name) for name, rate in rates.items()}
 
     def sh_rates(self, rows: int, dtype: np.dtype[np.floating]) -> Array:

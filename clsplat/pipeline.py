@@ -22,7 +22,7 @@ from .program import lane_group
 from .sort import Sorter
 
 MAX_ISECTS = 2**31 - 1
-SIGNALS = 4  # screen gradient, depth gradient, times seen, screen radius
+SIGNALS = 3  # screen gradient, depth gradient, times seen
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class Pipeline:
         return layout.unpack(to_host(self.device, self.pool.get(name, 0), host))
 
     def signals(self, capacity: int) -> Any:
-        """Buffer [4, capacity] for strategies, collected since `reset_signals` (rows: cl/project.cl)."""
+        """Buffer [3, capacity] for strategies, collected since `reset_signals` (rows: cl/project.cl)."""
         known = self._signal_capacity
         buffer = self.pool.get("signals", SIGNALS * capacity * self._real)
         if known != capacity:
@@ -195,12 +195,12 @@ class Pipeline:
         return buffer
 
     def read_signals(self, n: int) -> NDArray[Any]:
-        """`signals` of the first n splats, (4, n)."""
+        """`signals` of the first n splats, (3, n)."""
         rows = np.empty((SIGNALS, self._signal_capacity), self.kernels.dtype)
         return np.ascontiguousarray(to_host(self.device, self.pool.get("signals", 0), rows)[:, :n])
 
     def write_signals(self, signals: NDArray[Any], capacity: int) -> None:
-        """Go on collecting from `signals` (4, n)."""
+        """Go on collecting from `signals` (3, n)."""
         rows = np.zeros((SIGNALS, capacity), self.kernels.dtype)
         rows[:, : signals.shape[1]] = signals
         to_device(self.device, self.signals(capacity), rows)

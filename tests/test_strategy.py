@@ -19,7 +19,7 @@ def action(config: TrainConfig, iteration: int = 100, seed: int = 0, arrays: Arr
            signals: np.ndarray | None = None) -> tuple[Arrays, Plan]:
     shape = shapes.shape_named(config.shape)
     arrays = random_model(shape, N, 1) if arrays is None else arrays
-    signals = np.zeros((4, N)) if signals is None else signals
+    signals = np.zeros((3, N)) if signals is None else signals
     moment = Moment(iteration, int(config.densify_until * config.iterations), 1.5, 1.0)
     return arrays, strategy.plan(config, arrays, signals, np.random.default_rng(seed), moment)
 
@@ -56,7 +56,7 @@ def test_a_kernel_without_peak_one_keeps_its_scale(normalisation: str, scaled: b
 
 
 def test_pull_is_read_only_when_asked_for() -> None:
-    signals = np.zeros((4, N))
+    signals = np.zeros((3, N))
     arrays, _ = action(TrainConfig())
     wanted = int(np.flatnonzero(shapes.SKEW_NORMAL.strength(arrays) > 0.005)[7])
     signals[0, wanted] = 1.0
@@ -91,7 +91,7 @@ def test_adc_looks_at_sizes_after_the_first_reset() -> None:
 
 def test_adc_hands_on_its_options() -> None:
     arrays = random_model(shapes.GAUSSIAN, N, 1, dead=0)
-    signals = np.zeros((4, N))
+    signals = np.zeros((3, N))
     signals[:3, 5] = (0.1, 1.0, 1.0)
     assert len(action(adc(), arrays=arrays, signals=signals)[1].source) == N + 1
     assert len(action(adc(grad_threshold=0.2), arrays=arrays, signals=signals)[1].source) == N
@@ -102,3 +102,8 @@ def test_adc_hands_on_its_options() -> None:
     assert "log_scale" in action(adc(dense_size=size / 2), arrays=arrays, signals=signals)[1].values
     cloned = action(adc(dense_size=size * 2), arrays=arrays, signals=signals)[1]
     assert np.array_equal(cloned.apply(arrays)["log_scale"], arrays["log_scale"][cloned.source])
+
+
+def test_short_runs_leave_opacities_the_time_to_recover() -> None:
+    config = adc(iterations=2000, densify_until=0.9)
+    assert [it for it in range(100, 1801, 100) if action(config, it)[1].reset_fields] == [500, 1000, 1500]

@@ -1,0 +1,87 @@
+"""Systems, shapes and parameterisations against each other in one engine: the tables behind docs/SYSTEMS.md.
+
+    python benchmarks/systems.py fox kitchen --groups presets forms [--caps 5000] [--seeds 0 1 2] [--device 0:0]
+    python benchmarks/systems.py --table                  # print what is there, run nothing
+
+One folder a scene under benchmarks/results/systems (runs.jsonl, table.md, results.json; see `clsplat compare`). A
+run that is there already is not done again: kill and restart at will, add seeds, caps or groups later. Two scenes may
+run in two processes. Fox is read at half size: what the seconds allow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import common
+
+from clsplat.compare import RUNS, Run, compare
+from clsplat.compare_table import Record, markdown
+from clsplat.scene import load_scene
+from clsplat.systems import parse_systems
+
+OUT = common.RESULTS / "systems"
+RESOLUTION = {"fox": 2}  # of load_scene; others as they are
+ITERATIONS = 1000
+
+
+class Group(NamedTuple):
+    """Systems that answer one question, and the caps to ask it at."""
+
+    systems: tuple[str, ...]
+    caps: tuple[int, ...]
+
+
+GROUPS = {
+    # every published system as published, and clsplat's default
+    "presets": Group(("default", "3dgs", "3dgs-mcmc", "ges", "3d-hgs", "sss", "sns", "3dsgs"), (5000, 20000)),
+    # one optimizer; the skew's form and its training: SNS's four ablation rows (vanilla, decomposition, alternation,
+    # both) and the centred form with and without alternation
+    "forms": Group(("default", "default:alternation=cyclic", "skew-normal-direct:skew_map=coupled",
+                    "skew-normal-direct:skew_map=polar", "skew-normal-direct:skew_map=coupled,alternation=cyclic",
+                    "skew-normal-direct:skew_map=polar,alternation=cyclic", "gaussian"), (1000, 5000, 20000)),
+    # one optimizer, every kernel
+    "shapes": Group(("gaussian", "default", "skew-normal-direct:skew_map=polar", "half-gaussian", "bisected-skew",
+                     "generalised-exponential", "ges-modulation", "student-t:opacity_lr=0.005"), (5000,)),
+    # one kernel, other options
+    "factors": Group(("gaussian", "gaussian:noise_lr=0", "gaussian:position_optimizer=sghmc,noise_lr=0",
+                      "gaussian:position_optimizer=sghmc-sss,noise_lr=0", "gaussian:strategy=adc,noise_lr=0",
+                      "default", "default:strategy=adc,noise_lr=0", "default:position_optimizer=sghmc,noise_lr=0",
+                      "default:normalisation=pdf", "default:normalisation=none", "default:skew_map=linear",
+                      "skew-normal-direct:skew_map=radial"), (5000,)),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*")
+    parser.add_argument("--groups", nargs="+", choices=tuple(GROUPS), default=list(GROUPS))
+    parser.add_argument("--caps", nargs="+", type=int, help="only these of the groups' caps; others where none is one")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--iterations", type=int, default=ITERATIONS)
+    parser.add_argument("--device")
+    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--table", action="store_true")
+    args = parser.parse_args()
+    for name in args.scenes if not args.table else ():
+        scene = load_scene(common.data_folder() / name, resolution=RESOLUTION.get(name, -1), eval=True)
+        for group in (GROUPS[group] for group in args.groups):
+            caps = [cap for cap in group.caps if args.caps is None or cap in args.caps] or args.caps or []
+            compare([scene], parse_systems(",".join(group.systems)), args.out / name, caps, args.seeds,
+                    {"iterations": args.iterations, "device": args.device}, extra={"commit": common.commit()},
+                    on_run=say)
+    for path in sorted(args.out.glob(f"*/{RUNS}")):
+        print(markdown(common.read(path)))
+
+
+def say(run: Run, record: Record | None) -> None:
+    """Progress, a line a run."""
+    if record is not None:
+        result = record["failed"] or f"{record['psnr']:.3f} dB, {record['cpu_seconds']:.0f} CPU s"
+        print(f"{run}: {result}", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    main()
