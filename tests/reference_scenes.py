@@ -45,12 +45,13 @@ def random_splats(seed: int = 0, n: int = 6, sh_degree: int = 2, dtype: type = n
 def for_shape(arrays: Mapping[str, NDArray[np.floating]], shape: str) -> Arrays:
     """`arrays` as the fields of `shape`: its own that are missing are random, skew and opacity take its form.
 
-    The other side's opacities are those of the splats in reverse, so what is dim in all stays so. `skew` is m and
+    The other side's opacities are those of the splats before, so what is dim in all stays so. `skew` is m and
     becomes the slant of the same skewness; every third opacity becomes negative where the sign is free.
     """
     own, rng, n = REFERENCES[shape], np.random.default_rng(11), len(arrays["mean"])
     normal, nu, beta = rng.normal(size=(n, 3)), 10.0 ** rng.uniform(0.0, 4.0, n), 0.5 * 16.0 ** rng.uniform(0.0, 1.0, n)
-    fields = {"opacity_minus_logit": arrays["opacity_logit"][::-1], "normal": normal, "nu": nu, "beta": beta, **arrays}
+    minus = np.roll(arrays["opacity_logit"], 1)
+    fields = {"opacity_minus_logit": minus, "normal": normal, "nu": nu, "beta": beta, **arrays}
     if own.direct:
         fields["skew"] = slant_of(arrays["skew"])
     if own.signed:

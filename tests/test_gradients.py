@@ -22,6 +22,7 @@ from tolerances import DIFFERENCES, relative_error
 from clsplat.camera import Camera
 from clsplat.device import SCHEDULES, Device
 from clsplat.render import Renderer
+from clsplat.shapes import SHAPES
 from clsplat.splats import Splats
 
 STEP = 1e-3  # with the five-point rule: truncation STEP^4 f'''''/30, rounding 1e-16 |f| / STEP
@@ -84,7 +85,7 @@ def test_gradients_are_those_of_the_image(make_renderer: MakeRenderer, devices: 
             assert not np.allclose(want[2], 0.0), "the bounded splat's skew still turns"
 
 
-@pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])
+@pytest.mark.parametrize("shape", SHAPES)
 def test_gradients_through_the_default_thresholds(make_renderer: MakeRenderer, device: Device,
                                                   shape: str) -> None:
     """One direction, with a step so small that no pixel crosses a threshold."""
