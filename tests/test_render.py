@@ -193,7 +193,8 @@ def stack(shape: str) -> Case:
     arrays = random_splats(7, 3 * BATCH, 3)
     arrays["mean"] *= 0.5
     arrays["log_scale"] = np.minimum(arrays["log_scale"] + 3.0, 0.8)
-    arrays["opacity_logit"][:] = np.where(np.arange(3 * BATCH) % 21 == 1, 7.0, -3.0)  # never one of a sign that may flip
+    opaque = np.arange(3 * BATCH) % 21 == 1  # never one of a sign that may flip
+    arrays["opacity_logit"][:] = np.where(opaque, 7.0, -3.0)
     fields = ("mean", "skew") if shape == SKEWED else ("mean",)
     return Case(arrays, random_camera(7, 18, 8), shape, fields=fields)
 
