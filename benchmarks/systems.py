@@ -1,4 +1,4 @@
-"""Systems, shapes and parameterisations against each other in one engine: the tables behind docs/SYSTEMS.md.
+"""Systems, shapes and parameterisations against each other in one engine: the tables behind SYSTEMS.md.
 
     python benchmarks/systems.py fox kitchen --groups presets forms [--caps 5000] [--seeds 0 1 2] [--device 0:0]
     python benchmarks/systems.py --table                  # print what is there, run nothing
