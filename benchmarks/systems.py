@@ -2,6 +2,7 @@
 
     python benchmarks/systems.py fox kitchen --groups presets forms [--caps 5000] [--seeds 0 1 2] [--device 0:0]
     python benchmarks/systems.py --table                  # print what is there, run nothing
+    python benchmarks/systems.py --page                   # likewise, the tables of SYSTEMS.md: by question
 
 One folder a scene under benchmarks/results/systems (runs.jsonl, table.md, results.json; see `clsplat compare`). A
 run that is there already is not done again: kill and restart at will, add seeds, caps or groups later. Two scenes may
@@ -11,6 +12,7 @@ run in two processes. Fox is read at half size: what the seconds allow.
 from __future__ import annotations
 
 import argparse
+import statistics
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -64,7 +66,11 @@ def main() -> None:
     parser.add_argument("--device")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--table", action="store_true")
+    parser.add_argument("--page", action="store_true")
     args = parser.parse_args()
+    if args.page:
+        print(page(args.out))
+        return
     for name in args.scenes if not args.table else ():
         scene = load_scene(common.data_folder() / name, resolution=RESOLUTION.get(name, -1), eval=True)
         for group in (GROUPS[group] for group in args.groups):
@@ -74,6 +80,44 @@ def main() -> None:
                     on_run=say)
     for path in sorted(args.out.glob(f"*/{RUNS}")):
         print(markdown(common.read(path)))
+
+
+def page(folder: Path) -> str:
+    """The tables by question: for each group and cap the scenes side by side, and the difference to the first system.
+
+    A system's mean ± half the spread is over the seeds it has; the difference over those that both have, seed by seed.
+    """
+    scenes = {path.parent.name: common.read(path) for path in sorted(folder.glob(f"*/{RUNS}"))}
+    lines = []
+    for name, group in GROUPS.items():
+        for cap in group.caps:
+            by = {(scene, system): {record["config"]["seed"]: record for record in records
+                                    if record["system"] == system and record["config"]["cap_max"] == cap}
+                  for scene, records in scenes.items() for system in group.systems}
+            if not any(len(seeds) for (_, system), seeds in by.items() if system != group.systems[0]):
+                continue
+            lines += [f"**{name}, {cap} splats**", "", "| system | " + " | ".join(
+                f"{scene}: PSNR | to {group.systems[0]} | SSIM | CPU s | seeds" for scene in scenes) + " |",
+                "|---|" + "---:|" * 5 * len(scenes)]
+            for system in group.systems:
+                cells = [cell for scene in scenes for cell in row(by[scene, system], by[scene, group.systems[0]])]
+                lines.append(f"| {system} | " + " | ".join(cells) + " |")
+            lines.append("")
+    return "\n".join(lines)
+
+
+def row(own: dict[int, Record], base: dict[int, Record]) -> list[str]:
+    """Cells of one system on one scene."""
+    done = [record for record in own.values() if not record["failed"]]
+    if not done:
+        return ["failed" if own else "", "", "", "", str(len(own) or "")]
+    psnr = [record["psnr"] for record in done]
+    pairs = [own[seed]["psnr"] - base[seed]["psnr"] for seed in own
+             if seed in base and own is not base and not own[seed]["failed"] and not base[seed]["failed"]]
+    to_base = f"{min(pairs):+.2f} to {max(pairs):+.2f}" if len(pairs) > 1 else "".join(f"{d:+.2f}" for d in pairs)
+    return [f"{statistics.fmean(psnr):.2f} ± {(max(psnr) - min(psnr)) / 2:.2f}" if len(psnr) > 1 else f"{psnr[0]:.2f}",
+            to_base, f"{statistics.fmean(record['ssim'] for record in done):.4f}",
+            f"{statistics.fmean(record['cpu_seconds'] for record in done):.0f}", str(len(done))]
 
 
 def say(run: Run, record: Record | None) -> None:

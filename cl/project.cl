@@ -40,30 +40,29 @@ static inline vreal opacity_slope(vreal opacity) {
 #endif
 }
 
-static inline splat_params load_params(global const real *geom, const ulong capacity) {
-    splat_params s = no_grads().s;
-    s.opacity = opacity_of(lanes_load(geom + ROW_OPACITY_LOGIT * capacity));
+static inline void load_params(global const real *geom, const ulong capacity, splat_params *s) {
+    no_params(s);
+    s->opacity = opacity_of(lanes_load(geom + ROW_OPACITY_LOGIT * capacity));
 #ifdef ROW_OPACITY_MINUS_LOGIT
-    s.opacity_minus = opacity_of(lanes_load(geom + ROW_OPACITY_MINUS_LOGIT * capacity));
+    s->opacity_minus = opacity_of(lanes_load(geom + ROW_OPACITY_MINUS_LOGIT * capacity));
 #endif
 #ifdef ROW_SKEW
-    s.skew = vec3_load(geom + ROW_SKEW * capacity, capacity);
+    s->skew = vec3_load(geom + ROW_SKEW * capacity, capacity);
 #endif
 #ifdef ROW_NORMAL
-    s.skew = vec3_load(geom + ROW_NORMAL * capacity, capacity);
+    s->skew = vec3_load(geom + ROW_NORMAL * capacity, capacity);
 #endif
 #ifdef ROW_BETA
-    s.beta = lanes_load(geom + ROW_BETA * capacity);
+    s->beta = lanes_load(geom + ROW_BETA * capacity);
 #endif
 #ifdef ROW_NU
-    s.nu = lanes_load(geom + ROW_NU * capacity);
+    s->nu = lanes_load(geom + ROW_NU * capacity);
 #endif
-    return s;
 }
 
 static inline splat_terms splat_project(global const real *geom, const ulong capacity, constant real *cam) {
     splat_terms s;
-    s.s = load_params(geom, capacity);
+    load_params(geom, capacity, &s.s);
     s.quat = quat_load(geom + ROW_QUAT * capacity, capacity);
     s.rotation = quat_rotation(s.quat);
     const vec3 log_scale = vec3_load(geom + ROW_LOG_SCALE * capacity, capacity);

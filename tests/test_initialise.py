@@ -11,7 +11,8 @@ import pytest
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.initialise import RANDOM_EXTENT, RANDOM_POINTS, SKEW_SEED, initial_splats
+from clsplat.initialise import RANDOM_EXTENT, RANDOM_POINTS, initial_splats
+from clsplat.shapes import SHAPES
 from clsplat.splats import Splats
 
 
@@ -99,13 +100,20 @@ def test_the_same_seed_gives_the_same_splats() -> None:
         assert not np.array_equal(a.skew, c.skew)
 
 
-def test_skew_starts_small_in_all_directions_and_only_where_the_shape_has_it() -> None:
-    splats, _ = initial_splats(scene(400))
-    np.testing.assert_allclose(np.linalg.norm(splats.skew, axis=1), SKEW_SEED, rtol=1e-5)
-    assert np.linalg.norm(splats.skew.mean(axis=0)) < 0.2 * SKEW_SEED
-    gaussian, _ = initial_splats(scene(40), shape="gaussian")
-    assert gaussian.shape == "gaussian"
-    assert not gaussian.skew.any()
+def test_fields_start_off_their_stationary_point_in_all_directions() -> None:
+    starts = {"skew": 0.1, "normal": 1.0}
+    for name, shape in SHAPES.items():
+        splats, _ = initial_splats(scene(400), shape=name)
+        for field in shape.fields:
+            values = splats.arrays[field.name]
+            if field.name in starts:
+                np.testing.assert_allclose(np.linalg.norm(values, axis=1), starts[field.name], rtol=1e-5)
+                assert np.linalg.norm(values.mean(axis=0)) < 0.2 * starts[field.name]
+        if "nu" in splats.arrays:
+            assert (splats.arrays["nu"] == 100).all(), "SSS starts there"
+        if "opacity_minus_logit" in splats.arrays:
+            np.testing.assert_array_equal(splats.arrays["opacity_minus_logit"], splats.opacity_logit)
+        assert ("skew" in splats.arrays) == splats.skew.any()
 
 
 def saved(path: Path, shape: str, skew: np.ndarray | None = None, normalisation: str = "peak") -> Splats:
