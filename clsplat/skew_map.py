@@ -138,7 +138,8 @@ class SkewMap:
             direction = np.where(length > tiny, skew / np.maximum(length, tiny), pole)
             return np.concatenate([r, direction], axis=-1)
         floor = np.full_like(r, R_FLOOR)
-        s: NDArray[_F] = skew * np.where(r > floor, r / np.maximum(length, tiny), floor / self._length(floor))
+        with np.errstate(invalid="ignore"):  # what is not finite stays so
+            s: NDArray[_F] = skew * np.where(r > floor, r / np.maximum(length, tiny), floor / self._length(floor))
         return s
 
     def follow(self, s: NDArray[_F], before: Mapping[str, Array], after: Mapping[str, Array]) -> NDArray[_F]:

@@ -23,6 +23,7 @@ from .kernels import KernelBuild
 from .loss import ImageLoss, LossValue
 from .memory import check, estimate, peak_bytes
 from .model_folder import ModelFolder
+from .opacities import finite_rows
 from .optim import make_optimizer
 from .pipeline import ImageLayout, Pipeline
 from .render import Renderer
@@ -85,19 +86,22 @@ class Trainer:
         self.rng = np.random.default_rng(config.seed)
         self.iteration, self.seconds = 0, 0.0
         if checkpoint is None:
-            first, message = initial_splats(
+            start, message = initial_splats(
                 scene, config.shape, config.cap_max, config.sh_degree, config.init, config.seed,
                 normalisation=config.normalisation, opacity=config.init_opacity, scale_factor=config.init_scale)
+            first = start.to_numpy()
         else:
-            first = Splats(config.shape, checkpoint.splats, config.normalisation)
+            first = checkpoint.splats  # not as Splats: it may hold splats that the strategy is yet to mend
             message = f"resumed at iteration {checkpoint.iteration}"
             self.iteration, self.seconds = checkpoint.iteration, checkpoint.seconds
             self.rng.bit_generator.state = checkpoint.rng
         self._say(f"{message}; about {self.memory}")
-        capacity = max(config.cap_max, len(first))
+        n_first = len(first["mean"])
+        capacity = max(config.cap_max, n_first)
         dtype = self.kernels.dtype
         self.pipeline = Pipeline(self.device, self.kernels)
-        self.splats = SplatBuffers.of(self.device, first, dtype, capacity)
+        self.splats = SplatBuffers(self.device, self.kernels.schema, capacity, dtype)
+        self.splats.set(first)
         self.grads = ParameterBuffers(self.device, self.splats.schema, capacity, dtype)
         self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config, scene.extent)
         if checkpoint is not None:
@@ -108,7 +112,7 @@ class Trainer:
         self.renderer = Renderer(self.device)
         self.evaluations: dict[int, Evaluation] = {}
         self.evaluation_seconds: dict[int, float] = {}
-        self.n_first = checkpoint.n_first if checkpoint else len(first)
+        self.n_first = checkpoint.n_first if checkpoint else n_first
         self.views = ViewSampler(scene.train, config.iterations, config.coarse_to_fine, self.rng,
                                  checkpoint.queue if checkpoint else [])
         self._plan_schedules()
@@ -181,9 +185,14 @@ class Trainer:
         self.pipeline.reset_signals()
 
     def snapshot(self) -> Splats:
-        """The splats as they are now, on the host."""
+        """The splats as they are now, on the host, without those that are not finite."""
+        arrays = self.splats.download(self.splats.n)
+        sound = finite_rows(arrays)
+        if len(sound) and not sound.any():
+            raise TrainingError(f"iteration {self.iteration}: no splat is finite any more: lower the learning rates")
         try:
-            return Splats(self.config.shape, self.splats.download(self.splats.n), self.config.normalisation)
+            return Splats(self.config.shape, {name: array[sound] for name, array in arrays.items()},
+                          self.config.normalisation)
         except InputError as error:
             raise TrainingError(f"iteration {self.iteration}: {error}: lower the learning rates") from None
 

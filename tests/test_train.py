@@ -18,6 +18,7 @@ from tolerances import ROUNDING, relative_error
 
 import clsplat
 from clsplat.buffers import SplatBuffers, to_host
+from clsplat.checkpoint import Checkpoint
 from clsplat.config import TrainConfig
 from clsplat.device import Device, open_device
 from clsplat.errors import InputError, OutputError, TrainingError
@@ -287,3 +288,29 @@ def test_rows_of_the_schema_fit_both_buffers() -> None:
     """The optimizer steps all of geom but the skew by table: the skew must come last."""
     schema = some_splats().schema
     assert schema.group(Group.GEOM)[-1].name == "skew"
+
+
+def test_splats_that_are_not_finite_are_mended_or_left_out(scene: Scene, tmp_path: Path,
+                                                           default_device: Device) -> None:
+    """Broken between two actions of the strategy: saved without them, resumed with them, then relocated."""
+    config = replace(CONFIG, iterations=40)
+    trainer = Trainer(scene, config, device=default_device)
+    for _ in range(12):
+        trainer.step()
+    n = trainer.splats.n
+    arrays = trainer.splats.download(n)
+    arrays["mean"][3], arrays["skew"][7, 1] = np.nan, np.inf
+    trainer.splats.upload(arrays)
+    assert len(trainer.snapshot()) == n - 2
+    trainer.checkpoint().save(tmp_path / "broken.npz")
+    resumed = Trainer(scene, config, Checkpoint.load(tmp_path / "broken.npz"), device=default_device)
+    for run in (trainer, resumed):
+        while run.iteration < 20:  # acts at 20
+            run.step()
+        assert len(run.snapshot()) == run.splats.n
+    for name, array in trainer.snapshot().arrays.items():
+        np.testing.assert_array_equal(array, resumed.snapshot().arrays[name])
+    trainer.splats.upload({name: np.full_like(array, np.nan)
+                           for name, array in trainer.splats.download(trainer.splats.n).items()})
+    with pytest.raises(TrainingError, match="no splat is finite"):
+        trainer.snapshot()
