@@ -26,7 +26,6 @@ from clsplat.systems import parse_systems
 
 OUT = common.RESULTS / "systems"
 RESOLUTION = {"fox": 2}  # of load_scene; others as they are
-ITERATIONS = 1000
 
 
 class Group(NamedTuple):
@@ -34,6 +33,7 @@ class Group(NamedTuple):
 
     systems: tuple[str, ...]
     caps: tuple[int, ...]
+    iterations: int = 1000
 
 
 GROUPS = {
@@ -53,6 +53,11 @@ GROUPS = {
                       "default", "default:strategy=adc,noise_lr=0", "default:position_optimizer=sghmc,noise_lr=0",
                       "default:normalisation=pdf", "default:normalisation=none", "default:skew_map=linear",
                       "skew-normal-direct:skew_map=radial"), (5000,)),
+    # whether three times the iterations say the same
+    "long": Group(("default", "default:alternation=cyclic", "default:alternation=cyclic,alternation_split=0.8",
+                   "skew-normal-direct:skew_map=polar", "skew-normal-direct:skew_map=coupled",
+                   "skew-normal-direct:skew_map=polar,alternation=cyclic", "gaussian", "generalised-exponential",
+                   "3dgs", "3dgs-mcmc", "sss", "sns", "3dsgs"), (5000,), 3000),
 }
 
 
@@ -62,7 +67,7 @@ def main() -> None:
     parser.add_argument("--groups", nargs="+", choices=tuple(GROUPS), default=list(GROUPS))
     parser.add_argument("--caps", nargs="+", type=int, help="only these of the groups' caps; others where none is one")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--iterations", type=int, default=ITERATIONS)
+    parser.add_argument("--iterations", type=int, help="instead of the groups' own")
     parser.add_argument("--device")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--table", action="store_true")
@@ -75,9 +80,9 @@ def main() -> None:
         scene = load_scene(common.data_folder() / name, resolution=RESOLUTION.get(name, -1), eval=True)
         for group in (GROUPS[group] for group in args.groups):
             caps = [cap for cap in group.caps if args.caps is None or cap in args.caps] or args.caps or []
+            common_options = {"iterations": args.iterations or group.iterations, "device": args.device}
             compare([scene], parse_systems(",".join(group.systems)), args.out / name, caps, args.seeds,
-                    {"iterations": args.iterations, "device": args.device}, extra={"commit": common.commit()},
-                    on_run=say)
+                    common_options, extra={"commit": common.commit()}, on_run=say)
     for path in sorted(args.out.glob(f"*/{RUNS}")):
         print(markdown(common.read(path)))
 
@@ -92,11 +97,12 @@ def page(folder: Path) -> str:
     for name, group in GROUPS.items():
         for cap in group.caps:
             by = {(scene, system): {record["config"]["seed"]: record for record in records
-                                    if record["system"] == system and record["config"]["cap_max"] == cap}
+                                    if (record["system"], record["config"]["cap_max"], record["config"]["iterations"])
+                                    == (system, cap, group.iterations)}
                   for scene, records in scenes.items() for system in group.systems}
             if not any(len(seeds) for (_, system), seeds in by.items() if system != group.systems[0]):
                 continue
-            lines += [f"**{name}, {cap} splats**", "", "| system | " + " | ".join(
+            lines += [f"**{name}, {cap} splats, {group.iterations} iterations**", "", "| system | " + " | ".join(
                 f"{scene}: PSNR | to {group.systems[0]} | SSIM | CPU s | seeds" for scene in scenes) + " |",
                 "|---|" + "---:|" * 5 * len(scenes)]
             for system in group.systems:

@@ -30,3 +30,23 @@ def test_train_scenes(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) 
     assert len(out.read_text().splitlines()) == 1, "a run that is there is not run again"
     assert f"{row['psnr']:.2f}" in again.stdout
     assert f"{row['psnr']:.3f}" in done.stdout
+
+
+def test_systems(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    command = [sys.executable, str(BENCHMARKS / "systems.py"), "--out", str(tmp_path)]
+    options = [scene.name, "--groups", "factors", "--caps", "60", "--seeds", "0", "--iterations", "4"]
+    for _ in range(2):
+        subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
+    file = tmp_path / scene.name / "runs.jsonl"
+    runs = [json.loads(line) for line in file.read_text().splitlines()]
+    assert len(runs) == len({run["system"] for run in runs}) == 12, "each once, also when it is called again"
+    assert all(run["commit"] and run["finite"] and run["cap_held"] for run in runs)
+    for run in runs:  # as if they were the real ones
+        run["config"] |= {"cap_max": 5000, "iterations": 1000}
+    file.write_text("".join(json.dumps(run) + "\n" for run in runs))
+    page = subprocess.run([*command, "--page"], env=environment, capture_output=True, text=True, check=True).stdout
+    first, second = (next(run for run in runs if run["system"] == name) for name in ("gaussian", "default"))
+    expected = f"| {second['psnr']:.2f} | {second['psnr'] - first['psnr']:+.2f} | {second['ssim']:.4f} |"
+    assert any(expected in line for line in page.splitlines() if line.startswith("| default | ")), page
