@@ -1,6 +1,7 @@
 """Systems, shapes and parameterisations against each other in one engine: the tables behind SYSTEMS.md.
 
     python benchmarks/systems.py fox kitchen --groups presets forms [--caps 5000] [--seeds 0 1 2] [--device 0:0]
+    python benchmarks/systems.py fox kitchen --groups strategies --validate  # for choices: no test view is looked at
     python benchmarks/systems.py --table                  # print what is there, run nothing
     python benchmarks/systems.py --page                   # likewise, the tables of SYSTEMS.md: by question
 
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +23,7 @@ import common
 
 from clsplat.compare import RUNS, Run, compare
 from clsplat.compare_table import Record, markdown
-from clsplat.scene import load_scene
+from clsplat.scene import Scene, load_scene
 from clsplat.systems import parse_systems
 
 OUT = common.RESULTS / "systems"
@@ -53,6 +55,11 @@ GROUPS = {
                       "default", "default:strategy=adc,noise_lr=0", "default:position_optimizer=sghmc,noise_lr=0",
                       "default:normalisation=pdf", "default:normalisation=none", "default:skew_map=linear",
                       "skew-normal-direct:skew_map=radial"), (5000,)),
+    # which start and which strategy; ask it on validation views, as defaults hang on it
+    "strategies": Group(("default", "default:init_opacity=0.1,init_scale=1",
+                         "default:init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0", "3dgs:shape=skew-normal",
+                         "3dgs", "3dgs:shape=generalised-exponential", "generalised-exponential", "gaussian"),
+                        (5000, 20000)),
     # whether three times the iterations say the same
     "long": Group(("default", "default:alternation=cyclic", "default:alternation=cyclic,alternation_split=0.8",
                    "skew-normal-direct:skew_map=polar", "skew-normal-direct:skew_map=coupled",
@@ -70,14 +77,19 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, help="instead of the groups' own")
     parser.add_argument("--device")
     parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--validate", action="store_true", help="hold out training views; test views are not looked at")
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--page", action="store_true")
     args = parser.parse_args()
+    if args.validate:
+        args.out = args.out.with_name(args.out.name + "-validation")
     if args.page:
         print(page(args.out))
         return
     for name in args.scenes if not args.table else ():
         scene = load_scene(common.data_folder() / name, resolution=RESOLUTION.get(name, -1), eval=True)
+        if args.validate:
+            scene = validation(scene)
         for group in (GROUPS[group] for group in args.groups):
             caps = [cap for cap in group.caps if args.caps is None or cap in args.caps] or args.caps or []
             common_options = {"iterations": args.iterations or group.iterations, "device": args.device}
@@ -85,6 +97,11 @@ def main() -> None:
                     common_options, extra={"commit": common.commit()}, on_run=say)
     for path in sorted(args.out.glob(f"*/{RUNS}")):
         print(markdown(common.read(path)))
+
+
+def validation(scene: Scene) -> Scene:
+    """The scene without its test views, and every 7th training view held out instead."""
+    return replace(scene, views=scene.train, test_names=frozenset(view.name for view in scene.train[3::7]))
 
 
 def page(folder: Path) -> str:
