@@ -105,5 +105,5 @@ def test_adc_hands_on_its_options() -> None:
 
 
 def test_short_runs_leave_opacities_the_time_to_recover() -> None:
-    config = adc(iterations=2000, densify_until=0.9)
-    assert [it for it in range(100, 1801, 100) if action(config, it)[1].reset_fields] == [500, 1000, 1500]
+    config = adc(iterations=4000, densify_until=0.9)
+    assert [it for it in range(100, 3601, 100) if action(config, it)[1].reset_fields] == [1000, 2000, 3000]
