@@ -60,9 +60,13 @@ GROUPS = {
                          "default:init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0", "3dgs:shape=skew-normal",
                          "3dgs", "3dgs:shape=generalised-exponential", "generalised-exponential", "gaussian"),
                         (5000, 20000)),
-    # what makes the difference between the two strategies where the cap leaves room to grow; on validation views
-    "growth": Group(("default", "default:densify_until=0.5", "default:noise_lr=0", "default:sampling=pull",
-                     "default:strategy=adc,noise_lr=0,densify_until=0.5", "3dgs:shape=skew-normal"), (20000,)),
+    # what makes the difference between the two strategies, with and without room to grow; on validation views
+    "growth": Group(("default", "default:sampling=pull", "default:sampling=pull,opacity_reg=0,scale_reg=0",
+                     "default:sampling=pull,init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0",
+                     "default:strategy=adc,noise_lr=0,densify_until=0.5",
+                     "default:strategy=adc,noise_lr=0,densify_until=0.5,opacity_reg=0,scale_reg=0",
+                     "3dgs:shape=skew-normal", "generalised-exponential:sampling=pull",
+                     "default:densify_until=0.5", "default:noise_lr=0"), (5000, 20000)),
     # whether three times the iterations say the same
     "long": Group(("default", "default:alternation=cyclic", "default:alternation=cyclic,alternation_split=0.8",
                    "skew-normal-direct:skew_map=polar", "skew-normal-direct:skew_map=coupled",

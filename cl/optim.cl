@@ -123,15 +123,6 @@ kernel void skew_map(global const real *restrict skew_s, global real *restrict g
 }
 #endif
 
-// d opacity / d raw.
-static inline vreal opacity_slope(vreal o) {
-#if OPACITY_SIGNED
-    return (vreal)1 - o * o;
-#else
-    return o * ((vreal)1 - o);
-#endif
-}
-
 // Adds the gradients of opacity_scale * sum(|opacity|) + scale_scale * sum(scale) (3DGS-MCMC's regularisers) and, where
 // a splat has two opacities, whose mean counts then, of bisect_scale * sum((one - other)^2) (3DSGS).
 kernel void regularise(

@@ -24,22 +24,6 @@ typedef struct {
     vmask in_front;
 } splat_terms;
 
-static inline vreal opacity_of(vreal raw) {
-#if OPACITY_SIGNED
-    return tanh(raw);
-#else
-    return (vreal)1 / ((vreal)1 + exp(-raw));
-#endif
-}
-// Derivative of the opacity with respect to its raw value, given the opacity.
-static inline vreal opacity_slope(vreal opacity) {
-#if OPACITY_SIGNED
-    return (vreal)1 - opacity * opacity;
-#else
-    return opacity * ((vreal)1 - opacity);
-#endif
-}
-
 static inline void load_params(global const real *geom, const ulong capacity, splat_params *s) {
     no_params(s);
     s->opacity = opacity_of(lanes_load(geom + ROW_OPACITY_LOGIT * capacity));
@@ -83,7 +67,7 @@ static inline splat_terms splat_project(global const real *geom, const ulong cap
     s.ar1 = mat3_apply_transposed(s.rotation, s.a1);
     s.b0 = mul3(s.ar0, s.scale);
     s.b1 = mul3(s.ar1, s.scale);
-    s.cov2d = (sym2){dot3(s.b0, s.b0) + (vreal)LOW_PASS, dot3(s.b0, s.b1), dot3(s.b1, s.b1) + (vreal)LOW_PASS};
+    s.cov2d = cov2d_of(s.b0, s.b1);
     return s;
 }
 

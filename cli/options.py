@@ -7,7 +7,7 @@ import inspect
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar
 
 import click
 
@@ -145,7 +145,7 @@ def split_options(function: F) -> F:
 
 def config_options(*without: str) -> Callable[[F], F]:
     """One option for each field of TrainConfig but those in `without`; `config_values` reads them."""
-    help_of, types = _field_help(), get_type_hints(TrainConfig)
+    help_of, types = _field_help(), TrainConfig.option_types()
 
     def decorate(function: F) -> F:
         for name in ("test_iterations", "save_iterations"):
@@ -181,7 +181,6 @@ def is_given(ctx: click.Context, name: str) -> bool:
 
 def _field_option(field: dataclasses.Field[Any], kind: Any, text: str | None) -> Callable[[F], F]:
     flag, default = _flag(field.name), field.default
-    kind = next((part for part in get_args(kind) if part is not type(None)), kind)  # X | None is X
     if kind is bool:
         return click.option(f"{flag}/--no-{flag[2:]}", field.name, default=default, show_default=True,
                             help=text)

@@ -16,7 +16,7 @@ import numpy as np
 from . import __version__
 from .atomic import atomic_writer
 from .compare_table import MEASURED, Record, markdown, notes, summarise
-from .config import TrainConfig
+from .config import FREE_OPTIONS, TrainConfig
 from .device import Device, open_device
 from .errors import InputError, OutputError, TrainingError
 from .evaluate import evaluate
@@ -29,8 +29,6 @@ from .trainer import Trainer
 
 RUNS, TABLE, RESULTS, MODELS = "runs.jsonl", "table.md", "results.json", "models"
 WARM_UP = 3  # iterations
-# Options that change nothing in the result: runs that differ in these alone are the same run.
-_FREE = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
 
 
 @dataclass(frozen=True)
@@ -221,5 +219,5 @@ _KEYS = {"scene", "system", "config", "failed", "finite", "cap_held", "device", 
 
 def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
     """A config's values as JSON has them, without those that change nothing."""
-    values: dict[str, Any] = json.loads(json.dumps({key: config[key] for key in config if key not in _FREE}))
+    values: dict[str, Any] = json.loads(json.dumps({key: config[key] for key in config if key not in FREE_OPTIONS}))
     return values

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, get_args, get_type_hints
 
 from .errors import InputError
 from .schema import MAX_SH_DEGREE
@@ -17,6 +18,8 @@ POSITION_OPTIMIZERS = ("adam", "sghmc", "sghmc-sss")
 ALTERNATIONS = ("off", "cyclic")
 RELOCATIONS = ("length", "length-squared", "opacity-only")
 SAMPLINGS = ("opacity", "pull")
+# Options that change nothing in the result: runs that differ in these alone are the same run.
+FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
 PUBLISHED_ITERATIONS = 30_000  # that 3DGS's rates are meant for
 
 
@@ -187,6 +190,14 @@ class TrainConfig:
     def map(self) -> str:
         """The skew map in use, "auto" resolved; "" for shapes without a skew."""
         return map_named(self.skew_map, shape_named(self.shape).skew_form)
+
+    @classmethod
+    def option_types(cls) -> dict[str, Any]:
+        """The type of each option's values; X of those that are X or not given."""
+        hints = get_type_hints(cls)
+        optional = {key: [part for part in get_args(hint) if part is not NoneType]
+                    for key, hint in hints.items() if isinstance(hint, UnionType)}
+        return hints | {key: parts[0] for key, parts in optional.items()}
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for json.dump."""

@@ -22,6 +22,7 @@ RANDOM_POINTS = 100_000  # 3DGS
 RANDOM_EXTENT = 3.0  # half side of the cube of random points, in scene extents (3DGS-MCMC)
 FEWEST_POINTS = 4  # a point and its three neighbours give the first scale
 
+
 def initial_splats(
     scene: Scene,
     shape: str = DEFAULT_SHAPE,

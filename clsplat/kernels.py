@@ -22,8 +22,8 @@ ALPHA_MIN, ALPHA_MAX, T_MIN = 1.0 / 255.0, 0.99, 1e-4  # of gsplat and 3DGS
 LOW_PASS = 0.3  # px^2
 NEAR = 0.01  # world units
 
-_LOWER = ("lanes.clh", "group.clh", "algebra.clh", "harmonics.clh", "camera/pinhole.clh", "blend.clh",
-          "shape/contract.clh")
+_LOWER = ("lanes.clh", "group.clh", "algebra.clh", "opacity.clh", "harmonics.clh", "camera/pinhole.clh",
+          "blend.clh", "shape/contract.clh")
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class KernelBuild:
         defines |= {"ADAM_BETA1": adam.BETA1, "ADAM_BETA2": adam.BETA2, "ADAM_EPS": adam.EPS,
                     "ADAM_REST1": 1.0 - adam.BETA1, "ADAM_REST2": 1.0 - adam.BETA2,
                     "SKEW_MAP": SKEW_MAPS.index(self.skew_map)}
-        files = ("lanes.clh", "algebra.clh", "skew_map.clh", "noise.clh", "optim.cl")
+        files = ("lanes.clh", "algebra.clh", "opacity.clh", "skew_map.clh", "noise.clh", "optim.cl")
         return build(device, files, defines, self.real)
 
     def for_rendering(self) -> KernelBuild:
@@ -111,6 +111,5 @@ class KernelBuild:
             "NORMALISATION": NORMALISATIONS.index(self.normalisation),
             "PEAK_STEPS": 3 if self.real == "float" else 4,
             "SKEW_MAX": SKEW_MAX, "SLANT_MAX": SLANT_MAX, "OPACITY_SIGNED": int(shape_named(self.shape).signed),
-            **dict(shape_named(self.shape).defines), "LOW_PASS": LOW_PASS,
-            "ALPHA_MIN": self.alpha_min, "ALPHA_MAX": self.alpha_max, "T_MIN": self.t_min,
+            "LOW_PASS": LOW_PASS, "ALPHA_MIN": self.alpha_min, "ALPHA_MAX": self.alpha_max, "T_MIN": self.t_min,
         }

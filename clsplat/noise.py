@@ -25,7 +25,6 @@ _MASK = 0xFFFFFFFF
 # are nearly transparent are moved.
 GATE_SHARPNESS = 100.0
 GATE_OFFSET = 0.5
-NOISE_LR = 5e5
 
 
 def philox4x32(counter: FourWords, key: tuple[int, int]) -> FourWords:
@@ -92,7 +91,7 @@ def add_noise(mean: Array, quat: Array, log_scale: Array, strength: Array, seed:
     ----------
     mean (N, 3), quat (N, 4) wxyz of any norm above 0, log_scale (N, 3) : raw values.
     strength : (N,) the largest |opacity| of each splat (Shape.strength).
-    amount : noise learning rate (NOISE_LR) times the mean's learning rate of this iteration.
+    amount : noise learning rate (5e5 in 3DGS-MCMC) times the mean's learning rate of this iteration.
 
     Returns
     -------

@@ -40,7 +40,6 @@ class Shape:
     skew_form : "centred" (skew is m), "direct" (skew is eta) or None (no field `skew`).
     normalised : whether `normalisation` means anything to it.
     signed : whether the opacity is tanh of its raw value, in (-1, 1), instead of the logistic function.
-    defines : further build constants of its source.
     """
 
     name: str
@@ -52,7 +51,6 @@ class Shape:
     skew_form: str | None = None
     normalised: bool = False
     signed: bool = False
-    defines: tuple[tuple[str, int], ...] = ()
     lower: tuple[str, ...] = ()
 
     def schema(self, sh_degree: int) -> Schema:

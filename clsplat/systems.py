@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 from .config import TrainConfig
 from .errors import InputError
@@ -109,8 +109,7 @@ def _change(name: str, change: str) -> tuple[str, Any]:
         raise InputError(f"system {name}: {key} is the same for all systems of a comparison: give it as a flag")
     if key not in {field.name for field in dataclasses.fields(TrainConfig)}:
         raise InputError(f"system {name}: unknown option {key!r}: the options of `clsplat train` can be changed")
-    kind = get_type_hints(TrainConfig)[key]
-    kind = next((part for part in get_args(kind) if part is not type(None)), kind)  # X | None is X
+    kind = TrainConfig.option_types()[key]
     try:  # all kinds but str, bool, int and float are of SHARED
         return key, _WORDS[text.lower()] if kind is bool else kind(text)
     except (KeyError, ValueError):

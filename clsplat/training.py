@@ -8,7 +8,7 @@ from typing import Any
 
 from .cameras_json import NamedCamera, img_names
 from .checkpoint import Checkpoint
-from .config import TrainConfig
+from .config import FREE_OPTIONS, TrainConfig
 from .errors import InputError, OutputError
 from .model_folder import ModelFolder
 from .run_log import Progress
@@ -16,9 +16,6 @@ from .scene import Scene
 from .trainer import Model, Trainer
 
 __all__ = ["Model", "Progress", "train"]
-
-# What may differ between a run and its continuation: none of it changes the result.
-_FREE = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
 
 
 def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[Progress], None] | None = None, *,
@@ -67,7 +64,7 @@ def _fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:
     checkpoint = Checkpoint.load(folder.checkpoint_path)
     stored = TrainConfig.from_json(checkpoint.config).to_json()
     for key, value in config.to_json().items():
-        if key not in _FREE and stored[key] != value:
+        if key not in FREE_OPTIONS and stored[key] != value:
             raise InputError(f"{folder.path}: --resume with {key}={value}, but the run was started with "
                              f"{key}={stored[key]}: use the same options, or --overwrite to start again")
     return checkpoint
