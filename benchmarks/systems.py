@@ -23,11 +23,21 @@ import common
 
 from clsplat.compare import RUNS, Run, compare
 from clsplat.compare_table import Record, markdown
+from clsplat.config import TrainConfig
 from clsplat.scene import Scene, load_scene
-from clsplat.systems import parse_systems
+from clsplat.shapes import SHAPES
+from clsplat.systems import System, parse_systems
 
 OUT = common.RESULTS / "systems"
 RESOLUTION = {"fox": 2}  # of load_scene; others as they are
+
+
+# What shapes are trained with: the defaults of the day on which these tables were begun, written out so that they stay
+# one experiment when defaults change. Presets bring their own.
+BASE = {"strategy": "mcmc", "sampling": "opacity", "relocation": "length", "growth": 1.05, "noise_lr": 5e5,
+        "init_opacity": 0.5, "init_scale": 0.5, "opacity_reg": 0.001, "scale_reg": 0.001,
+        "densify_from": 0.05, "densify_until": 0.8, "densify_interval": 100, "grad_threshold": 2e-4,
+        "opacity_reset": 10}
 
 
 class Group(NamedTuple):
@@ -37,41 +47,56 @@ class Group(NamedTuple):
     caps: tuple[int, ...]
     iterations: int = 1000
 
+    def contestants(self) -> list[System]:
+        """The systems, shapes with the options of BASE."""
+        return [replace(system, changes=BASE | dict(system.changes)) if system.base in SHAPES else system
+                for system in parse_systems(",".join(self.systems))]
+
+
+# 3DGS's growth by gradient with our start and rates
+ADC = "skew-normal:strategy=adc,noise_lr=0,densify_until=0.5,opacity_reg=0,scale_reg=0"
 
 GROUPS = {
     # every published system as published, and clsplat's default
     "presets": Group(("default", "3dgs", "3dgs-mcmc", "ges", "3d-hgs", "sss", "sns", "3dsgs"), (5000, 20000)),
     # one optimizer; the skew's form and its training: SNS's four ablation rows (vanilla, decomposition, alternation,
     # both) and the centred form with and without alternation
-    "forms": Group(("default", "default:alternation=cyclic", "skew-normal-direct:skew_map=coupled",
+    "forms": Group(("skew-normal", "skew-normal:alternation=cyclic", "skew-normal-direct:skew_map=coupled",
                     "skew-normal-direct:skew_map=polar", "skew-normal-direct:skew_map=coupled,alternation=cyclic",
                     "skew-normal-direct:skew_map=polar,alternation=cyclic", "gaussian"), (1000, 5000, 20000)),
     # one optimizer, every kernel
-    "shapes": Group(("gaussian", "default", "skew-normal-direct:skew_map=polar", "half-gaussian", "bisected-skew",
+    "shapes": Group(("gaussian", "skew-normal", "skew-normal-direct:skew_map=polar", "half-gaussian", "bisected-skew",
                      "generalised-exponential", "ges-modulation", "student-t:opacity_lr=0.005"), (5000,)),
     # one kernel, other options
     "factors": Group(("gaussian", "gaussian:noise_lr=0", "gaussian:position_optimizer=sghmc,noise_lr=0",
                       "gaussian:position_optimizer=sghmc-sss,noise_lr=0", "gaussian:strategy=adc,noise_lr=0",
-                      "default", "default:strategy=adc,noise_lr=0", "default:position_optimizer=sghmc,noise_lr=0",
-                      "default:normalisation=pdf", "default:normalisation=none", "default:skew_map=linear",
+                      "skew-normal", "skew-normal:strategy=adc,noise_lr=0",
+                      "skew-normal:position_optimizer=sghmc,noise_lr=0", "skew-normal:normalisation=pdf",
+                      "skew-normal:normalisation=none", "skew-normal:skew_map=linear",
                       "skew-normal-direct:skew_map=radial"), (5000,)),
     # which start and which strategy; ask it on validation views, as defaults hang on it
-    "strategies": Group(("default", "default:init_opacity=0.1,init_scale=1",
-                         "default:init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0", "3dgs:shape=skew-normal",
-                         "3dgs", "3dgs:shape=generalised-exponential", "generalised-exponential", "gaussian"),
-                        (5000, 20000)),
+    "strategies": Group(("skew-normal", "skew-normal:init_opacity=0.1,init_scale=1",
+                         "skew-normal:init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0",
+                         "3dgs:shape=skew-normal", "3dgs", "3dgs:shape=generalised-exponential",
+                         "generalised-exponential", "gaussian"), (5000, 20000)),
     # what makes the difference between the two strategies, with and without room to grow; on validation views
-    "growth": Group(("default", "default:sampling=pull", "default:sampling=pull,opacity_reg=0,scale_reg=0",
-                     "default:sampling=pull,init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0",
-                     "default:strategy=adc,noise_lr=0,densify_until=0.5",
-                     "default:strategy=adc,noise_lr=0,densify_until=0.5,opacity_reg=0,scale_reg=0",
-                     "3dgs:shape=skew-normal", "generalised-exponential:sampling=pull",
-                     "default:densify_until=0.5", "default:noise_lr=0"), (5000, 20000)),
+    "growth": Group(("skew-normal", "skew-normal:sampling=pull", "skew-normal:sampling=pull,opacity_reg=0,scale_reg=0",
+                     "skew-normal:sampling=pull,init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0",
+                     "skew-normal:strategy=adc,noise_lr=0,densify_until=0.5", ADC, "3dgs:shape=skew-normal",
+                     "generalised-exponential:sampling=pull", "skew-normal:densify_until=0.5",
+                     "skew-normal:noise_lr=0"), (5000, 20000)),
+    # which start goes with which strategy; on validation views
+    "starts": Group((ADC, f"{ADC},init_opacity=0.1,init_scale=0.5", f"{ADC},init_opacity=0.5,init_scale=1",
+                     f"{ADC},init_opacity=0.2,init_scale=0.7", f"{ADC},init_opacity=0.1,init_scale=1",
+                     "skew-normal:sampling=pull,opacity_reg=0,scale_reg=0,init_opacity=0.2,init_scale=0.7",
+                     "skew-normal:sampling=pull,opacity_reg=0,scale_reg=0,init_opacity=0.1,init_scale=0.5"),
+                    (5000, 20000)),
     # whether three times the iterations say the same
-    "long": Group(("default", "default:alternation=cyclic", "default:alternation=cyclic,alternation_split=0.8",
-                   "skew-normal-direct:skew_map=polar", "skew-normal-direct:skew_map=coupled",
-                   "skew-normal-direct:skew_map=polar,alternation=cyclic", "gaussian", "generalised-exponential",
-                   "3dgs", "3dgs-mcmc", "sss", "sns", "3dsgs"), (5000,), 3000),
+    "long": Group(("skew-normal", "skew-normal:alternation=cyclic",
+                   "skew-normal:alternation=cyclic,alternation_split=0.8", "skew-normal-direct:skew_map=polar",
+                   "skew-normal-direct:skew_map=coupled", "skew-normal-direct:skew_map=polar,alternation=cyclic",
+                   "gaussian", "generalised-exponential", "default", "3dgs", "3dgs-mcmc", "sss", "sns", "3dsgs"),
+                  (5000,), 3000),
 }
 
 
@@ -100,7 +125,7 @@ def main() -> None:
         for group in (GROUPS[group] for group in args.groups):
             caps = [cap for cap in group.caps if args.caps is None or cap in args.caps] or args.caps or []
             common_options = {"iterations": args.iterations or group.iterations, "device": args.device}
-            compare([scene], parse_systems(",".join(group.systems)), args.out / name, caps, args.seeds,
+            compare([scene], group.contestants(), args.out / name, caps, args.seeds,
                     common_options, extra={"commit": common.commit()}, on_run=say)
     for path in sorted(args.out.glob(f"*/{RUNS}")):
         print(markdown(common.read(path)))
@@ -120,10 +145,8 @@ def page(folder: Path) -> str:
     lines = []
     for name, group in GROUPS.items():
         for cap in group.caps:
-            by = {(scene, system): {record["config"]["seed"]: record for record in records
-                                    if (record["system"], record["config"]["cap_max"], record["config"]["iterations"])
-                                    == (system, cap, group.iterations)}
-                  for scene, records in scenes.items() for system in group.systems}
+            by = {(scene, system.label): own_runs(records, system, cap, group.iterations)
+                  for scene, records in scenes.items() for system in group.contestants()}
             if not any(len(seeds) for (_, system), seeds in by.items() if system != group.systems[0]):
                 continue
             lines += [f"**{name}, {cap} splats, {group.iterations} iterations**", "", "| system | " + " | ".join(
@@ -134,6 +157,16 @@ def page(folder: Path) -> str:
                 lines.append(f"| {system} | " + " | ".join(cells) + " |")
             lines.append("")
     return "\n".join(lines)
+
+
+def own_runs(records: list[Record], system: System, cap: int, iterations: int) -> dict[int, Record]:
+    """A system's runs by seed: those made with the options it has now."""
+    def same(record: Record) -> bool:
+        options = replace(TrainConfig.from_json(record["config"]), device=None)
+        return options == system.config(cap, options.seed, {"iterations": iterations})
+
+    return {record["config"]["seed"]: record for record in records if record["system"] == system.label
+            and record["config"]["cap_max"] == cap and same(record)}
 
 
 def row(own: dict[int, Record], base: dict[int, Record]) -> list[str]:
