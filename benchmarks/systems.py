@@ -55,6 +55,7 @@ class Group(NamedTuple):
 
 # 3DGS's growth by gradient with our start and rates
 ADC = "skew-normal:strategy=adc,noise_lr=0,densify_until=0.5,opacity_reg=0,scale_reg=0"
+START = "init_opacity=0.2,init_scale=0.7"
 
 GROUPS = {
     # every published system as published, and clsplat's default
@@ -91,6 +92,18 @@ GROUPS = {
                      "skew-normal:sampling=pull,opacity_reg=0,scale_reg=0,init_opacity=0.2,init_scale=0.7",
                      "skew-normal:sampling=pull,opacity_reg=0,scale_reg=0,init_opacity=0.1,init_scale=0.5"),
                     (5000, 20000)),
+    # the candidates for a default, then the kernel with the best of them; on validation views
+    "candidates": Group(("skew-normal", f"{ADC},{START}",
+                         f"skew-normal:sampling=pull,opacity_reg=0,scale_reg=0,{START}",
+                         f"{ADC},init_opacity=0.1,init_scale=0.5",
+                         f"skew-normal:strategy=adc,noise_lr=0,densify_until=0.5,{START}",
+                         f"{ADC},{START}".replace("skew-normal", "generalised-exponential")), (5000, 20000)),
+    "kernels": Group(("skew-normal", *(f"{ADC},{START}".replace("skew-normal", shape)
+                                       for shape in ("gaussian", "skew-normal", "generalised-exponential"))),
+                     (5000, 20000)),
+    "kernels-long": Group(("skew-normal", *(f"{ADC},{START}".replace("skew-normal", shape)
+                                            for shape in ("gaussian", "skew-normal", "generalised-exponential"))),
+                          (5000, 20000), 3000),
     # whether three times the iterations say the same
     "long": Group(("skew-normal", "skew-normal:alternation=cyclic",
                    "skew-normal:alternation=cyclic,alternation_split=0.8", "skew-normal-direct:skew_map=polar",

@@ -1,4 +1,4 @@
-"""Run under Oclgrind by test_oclgrind.py: `python oclgrind_child.py render|sort|faults uninitialized|races`.
+"""Run under Oclgrind by test_oclgrind.py: `python oclgrind_child.py render|render-all|sort|faults uninitialized|races`.
 
 Oclgrind 21.10 follows what kernels write and what a whole-buffer write from the host brings, but loses track
 of host writes at an offset, of fills, and of buffers whose memory served another one before. So this process
@@ -18,7 +18,7 @@ from reference_scenes import for_shape, random_camera, random_splats
 
 from clsplat import buffers, pipeline, program, render, sort
 from clsplat.device import Device, Schedule, open_device
-from clsplat.shapes import SHAPES
+from clsplat.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.splats import Splats
 
 SCHEDULES = {
@@ -87,16 +87,26 @@ def make_traceable(device: Device) -> None:
                 setattr(module, replaced.__name__, replaced)
 
 
-def render_and_back(device: Device, mode: str) -> None:
-    """All shapes on every kind of schedule: 5 splats, a 20 x 18 image in 4 tiles."""
+def render_some(device: Device, mode: str) -> None:
+    """A skewed and a two-sided shape on a schedule of lanes and one of groups."""
+    render_and_back(device, (DEFAULT_SHAPE, "bisected-skew"), ("1x16x16", "64x4x1"))
+
+
+def render_all(device: Device, mode: str) -> None:
+    """All shapes on every kind of schedule."""
+    render_and_back(device, tuple(SHAPES), SCHEDULES[mode])
+
+
+def render_and_back(device: Device, shapes: tuple[str, ...], schedules: tuple[str, ...]) -> None:
+    """5 splats, a 20 x 18 image in 4 tiles."""
     camera = random_camera(1, 20, 18)
     arrays = random_splats(3, 5, 1, np.float32)
     rng = np.random.default_rng(0)
     v_color, v_alpha = rng.normal(size=(18, 20, 3)), rng.normal(size=(18, 20))
-    for shape in SHAPES:
+    for shape in shapes:
         fields = {name: value.astype(np.float32) for name, value in for_shape(arrays, shape).items()}
         splats = Splats(shape, fields)
-        for schedule in SCHEDULES[mode]:
+        for schedule in schedules:
             renderer = render.Renderer(device, schedule=Schedule.parse(schedule))
             image = renderer.render(splats, camera)
             gradients = renderer.backward(v_color, v_alpha)
@@ -132,7 +142,7 @@ def main() -> None:
     device = open_device("oclgrind")
     if mode == "uninitialized":
         make_traceable(device)
-    {"render": render_and_back, "sort": sort_and_scan, "faults": faults}[what](device, mode)
+    {"render": render_some, "render-all": render_all, "sort": sort_and_scan, "faults": faults}[what](device, mode)
     device.queue.finish()
     print("finished")
 

@@ -32,6 +32,28 @@ def test_train_scenes(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) 
     assert f"{row['psnr']:.3f}" in done.stdout
 
 
+def test_stages(tmp_path: Path) -> None:
+    out = tmp_path / "stages.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "stages.py"), "--out", str(out)]
+    for _ in range(2):
+        done = subprocess.run([*command, "--smoke"], capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["shape"] for row in rows] == ["gaussian", "skew-normal"], "each once, also when it is called again"
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit", "load", "peak_mb"} <= set(row)
+        assert min(row["copy_bytes_per_s"], row["fma_flops_per_s"]) > 0
+        assert [report["task"] for report in row["reports"]] == ["training step", "render"]
+        assert f"| {row['shape']} |" in done.stdout
+    slower = tmp_path / "other.jsonl"
+    for report in (report for row in rows for report in row["reports"]):
+        report["wall_ms"] *= 2
+    slower.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    printed = subprocess.run([*command, "--against", str(slower)], capture_output=True, text=True, check=True).stdout
+    lines = printed.splitlines()[2:]
+    assert len(lines) == 4
+    assert all("| 0.50 | 1.00 |" in line for line in lines), printed
+
+
 def test_systems(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scene = small_capture(tmp_path_factory)
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
@@ -47,6 +69,6 @@ def test_systems(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> No
         run["config"] |= {"cap_max": 5000, "iterations": 1000}
     file.write_text("".join(json.dumps(run) + "\n" for run in runs))
     page = subprocess.run([*command, "--page"], env=environment, capture_output=True, text=True, check=True).stdout
-    first, second = (next(run for run in runs if run["system"] == name) for name in ("gaussian", "default"))
+    first, second = (next(run for run in runs if run["system"] == name) for name in ("gaussian", "skew-normal"))
     expected = f"| {second['psnr']:.2f} | {second['psnr'] - first['psnr']:+.2f} | {second['ssim']:.4f} |"
-    assert any(expected in line for line in page.splitlines() if line.startswith("| default | ")), page
+    assert any(expected in line for line in page.splitlines() if line.startswith("| skew-normal | ")), page

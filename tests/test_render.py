@@ -47,7 +47,7 @@ def test_every_schedule_agrees_with_the_reference(make_renderer: MakeRenderer,
         case.check_image(case.render(renderer), IMAGE_FLOAT32)
 
 
-@EVERY
+@BOTH
 def test_one_lane_agrees_with_the_reference(make_renderer: MakeRenderer, devices: list[Device], shape: str) -> None:
     """The other form of every formula; the default schedules of CPUs have lanes."""
     if not devices:
