@@ -52,7 +52,8 @@ def fill_zero(device: Device, buffer: Any, nbytes: int) -> None:
     import pyopencl as cl
 
     if nbytes:
-        cl.enqueue_fill_buffer(device.queue, buffer, np.zeros(1, np.uint32), 0, nbytes)
+        event = cl.enqueue_fill_buffer(device.queue, buffer, np.zeros(1, np.uint32), 0, nbytes)
+        device.observe("fill", (nbytes,), event)
 
 
 def to_device(device: Device, buffer: Any, array: NDArray[Any], offset: int = 0) -> None:
@@ -60,7 +61,8 @@ def to_device(device: Device, buffer: Any, array: NDArray[Any], offset: int = 0)
     import pyopencl as cl
 
     if array.size:
-        cl.enqueue_copy(device.queue, buffer, np.ascontiguousarray(array), dst_offset=offset)
+        event = cl.enqueue_copy(device.queue, buffer, np.ascontiguousarray(array), dst_offset=offset)
+        device.observe("upload", (array.nbytes,), event)
 
 
 def to_host(device: Device, buffer: Any, array: NDArray[Any], offset: int = 0) -> NDArray[Any]:
@@ -68,7 +70,8 @@ def to_host(device: Device, buffer: Any, array: NDArray[Any], offset: int = 0) -
     import pyopencl as cl
 
     if array.size:
-        cl.enqueue_copy(device.queue, array, buffer, src_offset=offset)
+        event = cl.enqueue_copy(device.queue, array, buffer, src_offset=offset)
+        device.observe("download", (array.nbytes,), event)
     return array
 
 

@@ -19,9 +19,9 @@ from .colmap_files import ModelView, write_binary_model
 from .errors import InputError, OutputError
 from .images import write_png
 
-_RADIUS = 3.6                              # of the ring of cameras, world units
+RING_RADIUS = 3.6                              # of the ring of cameras, world units
 _HEIGHTS = (0.75, 1.9)                     # first half of the views low, second half high
-_TARGET = np.array([0.0, 0.0, 0.5])
+RING_TARGET = np.array([0.0, 0.0, 0.5])
 _FOCAL = 0.9                               # of the image width: 58 degrees across
 _SUBPIXELS = (0.25, 0.75)                  # 2x2 supersampling
 
@@ -81,8 +81,8 @@ def ring_cameras(width: int, height: int, n_views: int) -> list[Camera]:
     for index in range(n_views):
         ring, place, count = (0, index, low) if index < low else (1, index - low + 0.5, n_views - low)
         angle = 2 * np.pi * place / count
-        position = np.array([_RADIUS * np.cos(angle), _RADIUS * np.sin(angle), _HEIGHTS[ring]])
-        forward = (_TARGET - position) / np.linalg.norm(_TARGET - position)
+        position = np.array([RING_RADIUS * np.cos(angle), RING_RADIUS * np.sin(angle), _HEIGHTS[ring]])
+        forward = (RING_TARGET - position) / np.linalg.norm(RING_TARGET - position)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         pose = np.eye(4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,6 +100,7 @@ class DeviceInfo:
 
 
 Found = tuple[Any, DeviceInfo]  # a pyopencl device and its description
+Observer = Callable[[str, tuple[int, ...], Any], None]
 
 
 class Device:
@@ -109,6 +111,7 @@ class Device:
     info : DeviceInfo.
     context, queue : pyopencl objects.
     programs : programs built for this device, kept by `program.build`.
+    observer : told of every command that is enqueued, or None (see launches.py).
     """
 
     def __init__(self, cl_device: Any, info: DeviceInfo) -> None:
@@ -124,10 +127,16 @@ class Device:
         except cl.Error as error:
             raise DeviceError(f"device {info} cannot be opened: {first_line(error)}") from None
         self.programs: dict[Any, Any] = {}
+        self.observer: Observer | None = None
 
     @property
     def has_fp64(self) -> bool:
         return self.info.has_fp64
+
+    def observe(self, name: str, size: tuple[int, ...], event: Any) -> None:
+        """Tell the observer, if there is one: a kernel and its global size, or a transfer and its bytes."""
+        if self.observer is not None:
+            self.observer(name, size, event)
 
     def alloc(self, nbytes: int) -> Any:
         """Read-write buffer of `nbytes` bytes (at least 4, as OpenCL has no empty ones), not initialised.

@@ -75,6 +75,11 @@ class KernelBuild:
         files = (*_LOWER, *shape.lower, shape.source, "project.cl", "bin.cl", "raster.cl")
         return build(device, files, self._defines(), self.real)
 
+    def count_program(self, device: Device) -> Program:
+        """Useful pairs of a frame (pairs.py)."""
+        shape = shape_named(self.shape)
+        return build(device, (*_LOWER, *shape.lower, shape.source, "count.cl"), self._defines(), self.real)
+
     def loss_program(self, device: Device) -> Program:
         """Image loss. Depends on lanes and precision only."""
         window = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)

@@ -70,12 +70,16 @@ class ImageLayout:
 
 @dataclass(frozen=True)
 class Frame:
-    """A rendered frame on the device; valid until the pipeline's next forward."""
+    """A rendered frame on the device; valid until the pipeline's next forward.
+
+    lists : isect ids [n_isects] by tile, front to back.
+    """
 
     layout: ImageLayout
     n_isects: int
     sh_degree: int
     splats: SplatBuffers
+    lists: Any
 
 
 def camera_block(camera: Camera) -> NDArray[np.float64]:
@@ -103,7 +107,7 @@ class Pipeline:
         self.program = kernels.raster_program(device)
         self._real = kernels.dtype.itemsize
         self._layouts: dict[str, tuple[ImageLayout, Any]] = {}
-        self._lists: Any = None
+        self.frame: Frame | None = None  # the last one
         self._forward_event: Any = None
         self._signal_capacity = 0
         self._backward_event: Any = None
@@ -134,7 +138,6 @@ class Pipeline:
             tiles, lists = self.sorter.sort("isect_tile", "isect_id", n_isects, bits)
             self.program.find_tile_ranges.over(n_isects, sorted_tile=tiles, tile_ranges=ranges,
                                                n_isects=n_isects)
-        self._lists = lists
         group = self.kernels.schedule.group
         r, g, b = background
         self._forward_event = self.program.rasterize(
@@ -145,7 +148,8 @@ class Pipeline:
             tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane,
             background_r=r, background_g=g, background_b=b,
         )
-        return Frame(layout, n_isects, degree, splats)
+        self.frame = Frame(layout, n_isects, degree, splats, lists)
+        return self.frame
 
     def backward(self, frame: Frame, v_color: Any, grads: ParameterBuffers,
                  v_alpha: Any | None = None) -> None:
@@ -162,7 +166,7 @@ class Pipeline:
         group = self.kernels.schedule.group
         self._backward_event = self.program.rasterize_vjp(
             (layout.tiles_x * layout.tiles_y * group,), (group,), tile_ranges=pool.get("tile_ranges", 0),
-            lists=self._lists, isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0),
+            lists=frame.lists, isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0),
             color=pool.get("color", 0), transmittance=pool.get("transmittance", 0), v_color=v_color,
             v_alpha=v_color if v_alpha is None else v_alpha, isect_grads=isect_grads, width=layout.width,
             height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane,
@@ -243,7 +247,8 @@ class Pipeline:
 
         pool, program = self.pool, self.program
         keys, values = pool.get("depth_key", 4 * n), pool.get("depth_order", 4 * n)
-        cl.enqueue_copy(self.device.queue, keys, pool.get("depth_key_kept", 0), byte_count=4 * n)
+        event = cl.enqueue_copy(self.device.queue, keys, pool.get("depth_key_kept", 0), byte_count=4 * n)
+        self.device.observe("copy", (4 * n,), event)
         self.sorter.iota(values, n)
         _, order = self.sorter.sort("depth_key", "depth_order", n, 32)
         counts, offsets = pool.get("isect_counts", 4 * n), pool.get("isect_offsets", 4 * n)

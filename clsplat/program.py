@@ -195,12 +195,14 @@ class Kernel:
         except Exception as error:  # pyopencl's and struct's own kinds, some of them bare RuntimeErrors
             raise TypeError(f"kernel {self.name}: {first_line(error)}, parameters {self._names}") from error
         try:
-            return self._enqueue(self._queue, self._kernel, global_size, local_size)
+            event = self._enqueue(self._queue, self._kernel, global_size, local_size)
         except self._cl_error as error:
             mend = f": {LESS_MEMORY}" if is_out_of_memory(error) else f", sizes {global_size} {local_size}"
             raise DeviceError(
                 f"kernel {self.name} on {self._device.info}: {first_line(error)}{mend}"
             ) from error
+        self._device.observe(self.name, global_size, event)
+        return event
 
     def over(self, n: int, group: int = GROUP_ITEMS, /, **args: Any) -> Any:
         """Enqueue at least `n` work-items in groups of `group`; the kernel must ignore those from n on.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from . import profiles
 from .errors import InputError
+from .flops import DENSITY, EXP, LOG, LOG1P, MOMENTS, PHI, QUADRATIC
 from .schema import Array, Field, Schema, make_schema
 
 SKEW_LIMIT = math.sqrt(2.0 / (math.pi - 2.0))  # 1.3236: |m| of an infinitely skewed normal
@@ -37,6 +38,7 @@ class Shape:
     fields : learnable fields beside the core ones and colour.
     record : reals of its screen record (SHAPE_N); moments : its gradient accumulators (SHAPE_V).
     profile : alpha along the axis on which copies are stacked (see profiles.py).
+    flops : of one pixel's `shape_alpha` and, beyond it, `shape_alpha_vjp`, counted as flops.py says.
     skew_form : "centred" (skew is m), "direct" (skew is eta) or None (no field `skew`).
     normalised : whether `normalisation` means anything to it.
     signed : whether the opacity is tanh of its raw value, in (-1, 1), instead of the logistic function.
@@ -48,6 +50,7 @@ class Shape:
     record: int
     moments: int
     profile: Callable[..., Array]
+    flops: tuple[int, int]
     skew_form: str | None = None
     normalised: bool = False
     signed: bool = False
@@ -88,30 +91,42 @@ NORMAL = Field("normal", 3, ("normal_0", "normal_1", "normal_2"), (0.0, 0.0, 1.0
 BETA = Field("beta", 1, ("beta",), (2.0,), 1e-3, bounds=BETA_BOUNDS)  # GES: rate 1e-3
 NU = Field("nu", 1, ("nu",), (NU_BOUNDS[1],), 1e-2, bounds=NU_BOUNDS, start=100.0)  # SSS starts at 100
 
+# Flops, term by term as the pixel formulas of cl/shape/ have them.
+_GAUSSIAN_FLOPS = (QUADRATIC + EXP + 1, 1 + 1 + MOMENTS)  # times opacity; w, its sum
+# Argument of Phi 2; w and z 2, the sums of w and z 2, moments of z 4.
+_SKEW_FLOPS = (QUADRATIC + EXP + 1 + 2 + PHI + 1, DENSITY + 1 + 2 + 2 + MOMENTS + 4)
+# above 1, alpha 3; below 1, density 2, w and z 2, both opacities 4, sum and moments of z 5.
+_TWO_SIDED_FLOPS = (QUADRATIC + EXP + 2 + PHI + 1 + 3, 1 + DENSITY + 2 + 2 + 4 + MOMENTS + 5)
+
 GAUSSIAN = Shape("gaussian", "shape/gaussian.clh", (), record=4, moments=6, profile=profiles.gaussian,
-                 lower=("shape/gaussian_pixel.clh",))
+                 flops=_GAUSSIAN_FLOPS, lower=("shape/gaussian_pixel.clh",))
 SKEW_NORMAL = Shape("skew-normal", "shape/skew_normal.clh", (SKEW,), record=9, moments=9,
-                    profile=profiles.skew_normal, skew_form="centred", normalised=True, lower=("shape/skew_pixel.clh",))
+                    profile=profiles.skew_normal, flops=_SKEW_FLOPS, skew_form="centred", normalised=True,
+                    lower=("shape/skew_pixel.clh",))
 
 # As skew-normal splatting was published: (x, y, z) is the location, R S S R' the scale matrix.
 SKEW_NORMAL_DIRECT = Shape("skew-normal-direct", "shape/skew_normal_direct.clh", (SLANT,), record=9, moments=9,
-                           profile=profiles.skew_normal_direct, skew_form="direct", normalised=True,
+                           profile=profiles.skew_normal_direct, flops=_SKEW_FLOPS, skew_form="direct", normalised=True,
                            lower=("shape/skew_pixel.clh", "shape/displacement.clh"))
 # A plane through the location, one opacity a side, projected exactly.
 HALF_GAUSSIAN = Shape("half-gaussian", "shape/half_gaussian.clh", (OPACITY_MINUS, NORMAL), record=7, moments=10,
-                      profile=profiles.half_gaussian, lower=("shape/displacement.clh", "shape/two_sided.clh"))
+                      profile=profiles.half_gaussian, flops=_TWO_SIDED_FLOPS,
+                      lower=("shape/displacement.clh", "shape/two_sided.clh"))
 # The same divided by a finite skew: gaussian (equal opacities), skew-normal-direct (one of them 0), half-gaussian
 # (infinite skew) are its limits.
 BISECTED_SKEW = Shape("bisected-skew", "shape/bisected_skew.clh", (OPACITY_MINUS, SLANT), record=7, moments=10,
-                      profile=profiles.bisected_skew, skew_form="direct",
+                      profile=profiles.bisected_skew, flops=_TWO_SIDED_FLOPS, skew_form="direct",
                       lower=("shape/displacement.clh", "shape/two_sided.clh"))
 GENERALISED_EXPONENTIAL = Shape("generalised-exponential", "shape/generalised_exponential.clh", (BETA,), record=5,
-                                moments=7, profile=profiles.generalised_exponential)
+                                moments=7, profile=profiles.generalised_exponential,
+                                # times beta, times opacity; w, its power, quotient 3, sums
+                                flops=(QUADRATIC + LOG + 1 + EXP + EXP + 1, 3 + 1 + MOMENTS + 2))
 # GES as released: beta only scales the Gaussian, by 2 / (1 + exp(-0.1 (beta - 2))).
 GES_MODULATION = Shape("ges-modulation", "shape/ges_modulation.clh", (BETA,), record=4, moments=6,
-                       profile=profiles.gaussian, lower=("shape/gaussian_pixel.clh",))
+                       profile=profiles.gaussian, flops=_GAUSSIAN_FLOPS, lower=("shape/gaussian_pixel.clh",))
 STUDENT_T = Shape("student-t", "shape/student_t.clh", (NU,), record=5, moments=7, profile=profiles.student_t,
-                  signed=True)
+                  # times nu, times opacity; inverse, share, e, g 5, gap 9, sums
+                  flops=(QUADRATIC + LOG1P + 1 + EXP + 1, 5 + 9 + 1 + MOMENTS + 4), signed=True)
 
 # In the order in which a file without clsplat's comment is matched by its columns.
 SHAPES = {

@@ -11,13 +11,23 @@ from .program import build
 _CPU_CHUNKS = 16  # runs that a CPU's work is cut into
 
 
+def digit_bits(is_cpu: bool) -> int:
+    """Bits that one pass of the sort looks at."""
+    return 11 if is_cpu else 4
+
+
+def radix_passes(is_cpu: bool, key_bits: int) -> int:
+    """Passes over all pairs that a sort by `key_bits` bits takes."""
+    return -(-key_bits // digit_bits(is_cpu))
+
+
 class Sorter:
     """Sorts, scans uint32 buffers. CPU: a work-item per chunk, 11-bit digits; else groups of 256, 4 bits."""
 
     def __init__(self, device: Device, pool: Pool) -> None:
         self.is_cpu = device.info.type == "CPU"
         group = 1 if self.is_cpu else min(256, device.info.max_group)
-        self.group, self.bits, self.pool = group, 11 if self.is_cpu else 4, pool
+        self.group, self.bits, self.pool = group, digit_bits(self.is_cpu), pool
         self.program = build(device, ("sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": self.bits})
 
     def scan(self, values: Any, scanned: Any, n: int, total: Any) -> None:

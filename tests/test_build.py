@@ -11,6 +11,7 @@ from kernel_checks import KERNELS
 
 from clsplat.device import SCHEDULES, Device
 from clsplat.kernels import KernelBuild
+from clsplat.limits import CHAINS, limits_program
 from clsplat.program import build
 from clsplat.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.skew_map import SKEW_MAPS
@@ -59,6 +60,8 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
     """And every file in cl/ is part of some program."""
     for kernels in some_builds():
         build_all(compiler, kernels)
+    KernelBuild(DEFAULT_SHAPE, 3, SCHEDULES["cpu16"]).count_program(compiler)
+    limits_program(compiler, CHAINS[0])
     build(compiler, ("smoke.cl",))
     build(compiler, ("sort.cl",), {"SORT_GROUP": 1, "RADIX_BITS": 11})
     root = files("clsplat_cl")

@@ -15,20 +15,20 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # A module imports modules of lower floors only.
 FLOORS = """
-    errors
+    errors flops
     atomic compare_table interrupt presets run_log runtime schema capture_world
     camera device images metrics optim_reference plan ply_header profiles rotations schedules validity colmap_files
-    cameras_json capture checkpoint colmap noise program shapes
+    cameras_json capture checkpoint colmap launches noise program shapes
     opacities ply sghmc skew_map
     adc config densify kernels scene splats
-    blocks buffers camera_path convert initialise model_folder strategy systems view_sampler
-    optim_rules sort
-    optim_fused optim_host pipeline
-    loss memory optim tuning
+    blocks buffers camera_path convert initialise model_folder strategy synthetic systems view_sampler
+    limits optim_rules sort
+    optim_fused optim_host pipeline stages
+    loss memory optim pairs tuning
     render
     evaluate
     trainer
-    compare training
+    bench compare training
 """
 FLOOR = {name: level for level, line in enumerate(FLOORS.split("\n")) for name in line.split()}
 

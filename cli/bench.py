@@ -1,0 +1,153 @@
+"""`clsplat bench`: where the time goes on the user's own device, and what limits it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from clsplat.errors import InputError
+from clsplat.shapes import DEFAULT_SHAPE, SHAPES
+
+from .options import PATH, device_option, is_given, scene_options
+from .progress import table
+
+if TYPE_CHECKING:
+    from clsplat.bench import Report, StageTime
+    from clsplat.device import Device
+    from clsplat.scene import Scene
+    from clsplat.splats import Splats
+
+SPLATS, WIDTH, HEIGHT = 30_000, 640, 480
+HEAD = ("stage", "ms", "share", "MB", "of copy limit", "Mflop", "of FMA limit")
+_DOMINANT = 0.1  # of an iteration: stages that get a sentence
+_NEAR = 0.5  # of a limit: closer than that it is what limits
+
+
+@click.command()
+@scene_options
+@click.option("-m", "--model-path", "model_path", type=PATH, metavar="MODEL_OR_PLY",
+              help="With -s: the splats of a trained model.  [default: the scene's points]")
+@click.option("--splats", type=click.IntRange(min=1), metavar="N",
+              help=f"How many made-up splats, or with -s how many of the scene's points at most.  [default: {SPLATS}; "
+                   "with -s all]")
+@click.option("--width", type=click.IntRange(min=16), default=WIDTH, show_default=True, help="Without -s [px].")
+@click.option("--height", type=click.IntRange(min=16), default=HEIGHT, show_default=True, help="Without -s [px].")
+@click.option("--shape", type=click.Choice(tuple(SHAPES)),
+              help=f"The splat kernel.  [default: {DEFAULT_SHAPE}, or the model's]")
+@click.option("--sh-degree", type=click.IntRange(0, 3), default=3, show_default=True,
+              help="Degree of spherical harmonics.")
+@click.option("--iterations", "--steps", type=click.IntRange(1, 1000), default=10, show_default=True,
+              help="How many are timed, after a few that are not.")
+@click.option("--json", "json_path", type=PATH, metavar="FILE", help="Write all numbers there, too.")
+@device_option
+@click.pass_context
+def bench(ctx: click.Context, source_path: Path | None, images: str | None, resolution: int | None,
+          model_path: Path | None, splats: int | None, width: int, height: int, shape: str | None, sh_degree: int,
+          iterations: int, json_path: Path | None, device: str | None) -> None:
+    """Time each stage of a training step and of an image, and compare with what the device can do at best.
+
+    The limits are measured on the same device: bytes a second of a copy, operations a second of fused multiply-adds.
+    Bytes and operations are those that the work needs at least; only pairs of splat and pixel that show are counted.
+    Other work on the machine makes all of it slower.
+    """
+    from clsplat.atomic import atomic_writer
+    from clsplat.bench import bench_trainer, measure_render, measure_training
+    from clsplat.device import open_device
+    from clsplat.limits import measure_limits
+
+    if source_path is None and (images or resolution is not None or model_path):
+        raise click.UsageError("-i, -r and -m belong to a scene: give it with -s")
+    if source_path is not None and (is_given(ctx, "width") or is_given(ctx, "height")):
+        raise click.UsageError("--width and --height are for made-up scenes: with -s use -r")
+    if model_path is not None and splats is not None:
+        raise click.UsageError("give -m or --splats, not both")
+    opened = open_device(device)
+    if source_path is not None:
+        scene, start = _read(source_path, images, resolution, model_path, splats)
+    else:
+        from clsplat.synthetic import synthetic_scene
+
+        scene, start = synthetic_scene(splats or SPLATS, width, height, shape or DEFAULT_SHAPE, sh_degree)
+    kernel = shape or (DEFAULT_SHAPE if isinstance(start, int) else start.shape)
+    trainer = bench_trainer(scene, opened, kernel, start, sh_degree)
+    limits = measure_limits(opened)
+    schedule = str(trainer.kernels.schedule)
+    click.echo(f"device: {opened.info}, schedule {schedule}\nlimits measured on it: {limits}")
+    reports = []
+    for measure in (measure_training, measure_render):
+        reports.append(measure(trainer, limits, iterations))
+        click.echo("\n" + "\n".join(describe(reports[-1], scene.name)))
+    if json_path is not None:
+        values = device_record(opened, schedule) | {
+            "scene": scene.name, "copy_bytes_per_s": limits.copy, "fma_flops_per_s": limits.fma,
+            "reports": [report.to_json() for report in reports]}
+        with atomic_writer(json_path) as stream:
+            stream.write(json.dumps(values, indent=1).encode())
+
+
+def device_record(device: Device, schedule: str) -> dict[str, str]:
+    """What was measured on."""
+    info = device.info
+    return {"device": info.name, "platform": info.platform, "driver": info.driver, "schedule": schedule}
+
+
+def describe(report: Report, scene: str) -> list[str]:
+    """Lines: what was measured, the table, and a sentence on each stage that takes much of the time."""
+    sizes = report.sizes
+    lines = [
+        f"{report.task}: {report.wall_ms:.1f} ms ({1e3 / report.wall_ms:.3g} a second), median of {report.iterations}",
+        f"  {scene}, up to {report.width}x{report.height} px: {sizes.splats} {report.shape} splats, {sizes.isects} "
+        f"splat-tile pairs, {1e-6 * sizes.pairs:.2f} M useful splat-pixel pairs"
+        f" ({100 * report.useful:.0f} % of those in the tiles)",
+        table(HEAD, map(cells, report.stages)),
+    ]
+    dominant = sorted((stage for stage in report.stages if stage.share >= _DOMINANT), key=lambda stage: -stage.share)
+    return [*lines, *(sentence(stage) for stage in dominant)]
+
+
+def cells(stage: StageTime) -> tuple[str, ...]:
+    """One row of the table; nothing where nothing is counted."""
+    return (stage.stage, f"{stage.ms:.3f}", _percent(stage.share),
+            f"{1e-6 * stage.bytes:.1f}" if stage.bytes else "", _percent(stage.of_copy),
+            f"{1e-6 * stage.flops:.0f}" if stage.flops else "", _percent(stage.of_fma))
+
+
+def sentence(stage: StageTime) -> str:
+    """What limits a stage, as far as the two fractions tell."""
+    start = f"{stage.stage} takes {_percent(stage.share)} of the time"
+    fractions = [f"{_percent(fraction)} of the {name} limit"
+                 for name, fraction in (("FMA", stage.of_fma), ("copy", stage.of_copy)) if fraction is not None]
+    if stage.stage == "host":
+        return f"{start}: the device waits for Python and its driver; more splats or pixels would hide it."
+    if not fractions:
+        return f"{start}: it is not compared with a limit."
+    start += ", at " + " and ".join(fractions)
+    fma, copy = stage.of_fma or 0.0, stage.of_copy or 0.0
+    if max(fma, copy) < _NEAR:
+        return f"{start}: neither limits it: latency, or work beyond what is counted, does."
+    if fma >= copy:
+        return f"{start}: arithmetic limits it."
+    return f"{start}: " + ("memory limits it." if copy <= 1 else "the caches help it; memory limits it.")
+
+
+def _percent(fraction: float | None) -> str:
+    return "" if fraction is None else f"{100 * fraction:.0f} %"
+
+
+def _read(path: Path, images: str | None, resolution: int | None, model: Path | None,
+          splats: int | None) -> tuple[Scene, Splats | int]:
+    """The scene, all of its views, and what to start from."""
+    from clsplat.scene import load_scene
+
+    scene = load_scene(path, images, -1 if resolution is None else resolution, eval=False)
+    if model is None:
+        return scene, splats or len(scene.points) or SPLATS
+    from .models import load_model
+
+    loaded = load_model(model).splats
+    if not len(loaded):
+        raise InputError(f"{model}: holds no splats")
+    return scene, loaded
