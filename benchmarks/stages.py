@@ -7,9 +7,9 @@
     python benchmarks/stages.py --smoke --out FILE            # a few seconds, for tests
 
 Real scenes are at full size (at most 1600 px wide) and start from their points; synthetic ones have about the same
-useful pairs a pixel at every count (clsplat/synthetic.py). A case that is in the file for this commit and device is skipped:
-kill and restart at will. Times are medians, of the device's own clock but for `wall`, `host` and `strategy`. `load` is
-the machine's one-minute load at the start of a case: where others were at work the numbers are worth little.
+useful pairs a pixel at every count (clsplat/synthetic.py). A case that is in the file for this commit and device is
+skipped: kill and restart at will. Times are medians, of the device's own clock but for `wall`, `host` and `strategy`.
+`load` is the machine's one-minute load at the start of a case: where others were at work the numbers are worth little.
 """
 
 from __future__ import annotations

@@ -27,9 +27,10 @@ def synthetic_scene(n: int, width: int = 640, height: int = 480, shape: str = DE
                     n_views: int = 6, seed: int = 0) -> tuple[Scene, Splats]:
     """A ball of `n` random splats in a ring of cameras, and smooth images to compare with.
 
-    Sizes fall as 1/sqrt(n), so that the splats over a pixel, and with them the useful pairs of an image, stay nearly the
-    same: some 40 a pixel, and up to 60 where there are three splats a pixel and the low-pass widens them. Opacities are of every height, most of them low or high as in trained models; skew and the like are as different.
-    Equal arguments give equal bits.
+    Sizes fall as 1/sqrt(n), so that the splats over a pixel, and with them the useful pairs of an image, stay nearly
+    the same: some 40 a pixel, and up to 60 where there are three splats a pixel and the low-pass widens them. Opacities
+    are of every height, most of them low or high as in trained models; skew and the like are as different. Equal
+    arguments give equal bits.
 
     Parameters
     ----------
