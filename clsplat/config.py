@@ -20,12 +20,21 @@ RELOCATIONS = ("length", "length-squared", "opacity-only")
 SAMPLINGS = ("opacity", "pull")
 # Options that change nothing in the result: runs that differ in these alone are the same run.
 FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
+# What an option is where it is not given: what was best with that strategy on validation views (benchmarks/SYSTEMS.md).
+BY_STRATEGY: dict[str, dict[str, float]] = {
+    "mcmc": {"opacity_reg": 0.001, "scale_reg": 0.001, "noise_lr": 5e5, "densify_until": 0.8,
+             "init_opacity": 0.5, "init_scale": 0.5},
+    "adc": {"opacity_reg": 0.0, "scale_reg": 0.0, "noise_lr": 0.0, "densify_until": 0.5,
+            "init_opacity": 0.2, "init_scale": 0.7},
+}  # fmt: skip
 PUBLISHED_ITERATIONS = 30_000  # that 3DGS's rates are meant for
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """Training options; the names are the command line's. Constants are 3DGS's and 3DGS-MCMC's unless said.
+
+    Those of BY_STRATEGY that are not given (None) become their strategy's own.
 
     Parameters
     ----------
@@ -55,13 +64,13 @@ class TrainConfig:
     rotation_lr : Adam's rate of quaternions.
     feature_lr : Adam's rate of colour; bands above the constant learn 20 times slower.
     skew_lr : Adam's rate of the trainable skew; not given: the shape's own (2.5e-3 centred, 1.25e-2 direct).
-    opacity_reg : weight of the mean opacity in the loss.
-    scale_reg : weight of the mean scale in the loss.
+    opacity_reg : weight of the mean opacity in the loss; not given: 0.001 with "mcmc", 0 with "adc".
+    scale_reg : weight of the mean scale in the loss; not given: likewise.
     bisect_reg : weight of the mean squared difference of a splat's two opacities in the loss (3DSGS).
     normal_lr : Adam's rate of the plane's normal (half-gaussian).
     beta_lr : Adam's rate of log beta (generalised-exponential).
     nu_lr : Adam's rate of log nu (student-t).
-    noise_lr : size of the position noise, times the positions' rate.
+    noise_lr : size of the position noise, times the positions' rate; not given: 5e5 with "mcmc", 0 with "adc".
     position_optimizer : "adam", "sghmc" (friction and noise in scene units, always stable) or "sghmc-sss" (as SSS
         writes it).
     sghmc_friction : SSS's C, after the burn-in.
@@ -72,10 +81,11 @@ class TrainConfig:
     alternation_warmup : fraction of the run before the first cycle.
     alternation_cycle : iterations of a cycle.
     alternation_split : fraction of a cycle given to everything but the skew.
-    init_opacity : of splats made from points.
-    init_scale : of splats made from points, in units of the distance to their three neighbours.
+    init_opacity : of splats made from points; not given: 0.5 with "mcmc", 0.2 with "adc".
+    init_scale : of splats made from points, in units of the distance to their three neighbours; not given: 0.5 with
+        "mcmc", 0.7 with "adc".
     densify_from : when the strategy begins, as a fraction of the run.
-    densify_until : when it ends, as a fraction of the run.
+    densify_until : when it ends, as a fraction of the run; not given: 0.8 with "mcmc", 0.5 with "adc".
     densify_interval : iterations between its actions.
     growth : least growth of the splat count per action; more where the cap is far (see trainer.growth_factor).
     grad_threshold : "adc" clones or splits splats whose mean gradient of the screen position is above it (3DGS).
@@ -94,7 +104,7 @@ class TrainConfig:
     skew_map: str = "auto"
     iterations: int = 7000
     cap_max: int = 100_000
-    strategy: str = "mcmc"
+    strategy: str = "adc"
     relocation: str = "length"
     relocation_limit: float = 1.0
     sampling: str = "opacity"
@@ -112,13 +122,13 @@ class TrainConfig:
     rotation_lr: float = 1e-3
     feature_lr: float = 2.5e-3
     skew_lr: float | None = None
-    opacity_reg: float = 0.001
-    scale_reg: float = 0.001
+    opacity_reg: float = None  # type: ignore[assignment]  # see BY_STRATEGY: never None after __post_init__
+    scale_reg: float = None  # type: ignore[assignment]
     bisect_reg: float = 0.0
     normal_lr: float = 3e-3
     beta_lr: float = 1e-3
     nu_lr: float = 1e-2
-    noise_lr: float = 5e5
+    noise_lr: float = None  # type: ignore[assignment]
     position_optimizer: str = "adam"
     sghmc_friction: float = 120.0
     sghmc_burn_in: float = 7 / 30
@@ -127,10 +137,10 @@ class TrainConfig:
     alternation_warmup: float = 0.1
     alternation_cycle: int = 100
     alternation_split: float = 0.5
-    init_opacity: float = 0.5
-    init_scale: float = 0.5
+    init_opacity: float = None  # type: ignore[assignment]
+    init_scale: float = None  # type: ignore[assignment]
     densify_from: float = 0.05
-    densify_until: float = 0.8
+    densify_until: float = None  # type: ignore[assignment]
     densify_interval: int = 100
     growth: float = 1.05
     grad_threshold: float = 2e-4
@@ -148,6 +158,9 @@ class TrainConfig:
         check_normalisation(self.normalisation)
         check_map(self.skew_map, shape_named(self.shape).skew_form)
         _one_of("strategy", self.strategy, STRATEGIES)
+        for name, value in BY_STRATEGY[self.strategy].items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
         _one_of("sampling", self.sampling, SAMPLINGS)
         _one_of("optimizer", self.optimizer, OPTIMIZERS)
         _one_of("relocation", self.relocation, RELOCATIONS)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from model_arrays import Arrays, random_model
 
 from clsplat import shapes, strategy
-from clsplat.config import TrainConfig
+from clsplat.config import BY_STRATEGY, STRATEGIES, TrainConfig
 from clsplat.densify import relocation
+from clsplat.errors import InputError
 from clsplat.plan import Plan
 from clsplat.strategy import Moment
 
@@ -24,22 +27,26 @@ def action(config: TrainConfig, iteration: int = 100, seed: int = 0, arrays: Arr
     return arrays, strategy.plan(config, arrays, signals, np.random.default_rng(seed), moment)
 
 
+def mcmc(**options: Any) -> TrainConfig:
+    return TrainConfig(strategy="mcmc", **options)
+
+
 def test_mcmc_relocates_and_grows_by_the_options() -> None:
-    config = TrainConfig(shape="gaussian", cap_max=130, iterations=3000)
+    config = mcmc(shape="gaussian", cap_max=130, iterations=3000)
     arrays, plan = action(config)
     assert len(plan.source) == 130
     dead = np.sum(shapes.GAUSSIAN.strength(arrays) <= 0.005)
     assert plan.relocated == dead > 10
-    _, few = action(TrainConfig(shape="gaussian", cap_max=130, relocation_limit=0.05))
+    _, few = action(mcmc(shape="gaussian", cap_max=130, relocation_limit=0.05))
     assert few.relocated == 5
-    _, flat = action(TrainConfig(shape="gaussian", cap_max=130, relocation="opacity-only"))
+    _, flat = action(mcmc(shape="gaussian", cap_max=130, relocation="opacity-only"))
     assert "log_scale" not in flat.values
 
 
 def test_length_squared_is_twice_the_log_factor() -> None:
     shifts = []
     for rule in ("length", "length-squared"):
-        arrays, plan = action(TrainConfig(shape="gaussian", cap_max=130, relocation=rule))
+        arrays, plan = action(mcmc(shape="gaussian", cap_max=130, relocation=rule))
         shifts.append(plan.values["log_scale"] - arrays["log_scale"][plan.source])
     assert shifts[0].min() < -0.01
     np.testing.assert_allclose(shifts[1], 2 * shifts[0], atol=1e-5)
@@ -51,18 +58,18 @@ def test_length_squared_is_twice_the_log_factor() -> None:
 
 @pytest.mark.parametrize(("normalisation", "scaled"), [("peak", True), ("pdf", False), ("none", False)])
 def test_a_kernel_without_peak_one_keeps_its_scale(normalisation: str, scaled: bool) -> None:
-    _, plan = action(TrainConfig(shape="skew-normal", normalisation=normalisation, cap_max=130))
+    _, plan = action(mcmc(shape="skew-normal", normalisation=normalisation, cap_max=130))
     assert ("log_scale" in plan.values) == scaled
 
 
 def test_pull_is_read_only_when_asked_for() -> None:
     signals = np.zeros((3, N))
-    arrays, _ = action(TrainConfig())
+    arrays, _ = action(mcmc())
     wanted = int(np.flatnonzero(shapes.SKEW_NORMAL.strength(arrays) > 0.005)[7])
     signals[0, wanted] = 1.0
-    _, plan = action(TrainConfig(sampling="pull"), signals=signals)
+    _, plan = action(mcmc(sampling="pull"), signals=signals)
     assert (plan.source[N:] == wanted).all()
-    _, plan = action(TrainConfig(sampling="opacity"), signals=signals)
+    _, plan = action(mcmc(sampling="opacity"), signals=signals)
     assert not (plan.source[N:] == wanted).all()
 
 
@@ -107,3 +114,14 @@ def test_adc_hands_on_its_options() -> None:
 def test_short_runs_leave_opacities_the_time_to_recover() -> None:
     config = adc(iterations=4000, densify_until=0.9)
     assert [it for it in range(100, 3601, 100) if action(config, it)[1].reset_fields] == [1000, 2000, 3000]
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_options_that_are_not_given_are_the_strategys_own(name: str) -> None:
+    config = TrainConfig(strategy=name, noise_lr=7.0)
+    assert config == TrainConfig.from_json(config.to_json())
+    own = BY_STRATEGY[name] | {"noise_lr": 7.0}
+    assert {key: getattr(config, key) for key in own} == own
+    assert TrainConfig() == TrainConfig(strategy=TrainConfig().strategy, **BY_STRATEGY[TrainConfig().strategy])
+    with pytest.raises(InputError, match="opacity_reg -1: must be at least 0"):
+        TrainConfig(strategy=name, opacity_reg=-1)

@@ -37,7 +37,8 @@ from clsplat.training import train
 from clsplat.tuning import schedule_for
 
 # Every part of the strategy acts: growth from 2252 points to the cap, noise, all resolutions and SH degrees.
-CONFIG = TrainConfig(iterations=80, cap_max=2400, sh_degree=1, densify_interval=10, checkpoint_interval=30)
+CONFIG = TrainConfig(iterations=80, cap_max=2400, sh_degree=1, densify_interval=10, checkpoint_interval=30,
+                     strategy="mcmc")
 CAMERA = clsplat.Camera(27, 19, 25.0, 26.0, 13.0, 9.0, np.eye(4))
 
 
@@ -101,15 +102,18 @@ def press_ctrl_c_at_50(progress: Progress) -> None:
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "sampling", "interval"), [("fused", "opacity", 30), ("numpy", "opacity", 30), ("fused", "pull", 37)]
+    ("optimizer", "changes", "interval"),
+    [("fused", {}, 30), ("numpy", {}, 30), ("fused", {"sampling": "pull"}, 37),
+     ("fused", {"strategy": "adc", "densify_until": 0.8, "opacity_reset": 2}, 37)],
+    ids=["fused", "numpy", "pull", "adc"],
 )
 def test_a_crashed_run_resumes_to_the_same_model(
-    scene: Scene, uninterrupted: Path, tmp_path: Path, optimizer: str, sampling: str, interval: int
+    scene: Scene, uninterrupted: Path, tmp_path: Path, optimizer: str, changes: dict[str, Any], interval: int
 ) -> None:
     """A crash at 50 leaves an earlier checkpoint; relocation and growth lie on both sides, and sums lie open at 37."""
-    config = replace(CONFIG, optimizer=optimizer, sampling=sampling, checkpoint_interval=interval)
+    config = replace(CONFIG, optimizer=optimizer, checkpoint_interval=interval, **changes)
     whole = uninterrupted
-    if (optimizer, sampling) != ("fused", "opacity"):
+    if optimizer != "fused" or changes:
         whole = tmp_path / "whole"
         train(scene, config, output=whole)
     with pytest.raises(KeyboardInterrupt):
