@@ -104,6 +104,10 @@ GROUPS = {
     "kernels-long": Group(("skew-normal", *(f"{ADC},{START}".replace("skew-normal", shape)
                                             for shape in ("gaussian", "skew-normal", "generalised-exponential"))),
                           (5000, 20000), 3000),
+    "resets": Group((f"{ADC},{START}", f"{ADC},{START},opacity_reset=0",
+                     f"{ADC},{START},opacity_reset=0".replace("skew-normal", "gaussian"),
+                     f"{ADC},{START},opacity_reset=0".replace("skew-normal", "generalised-exponential")),
+                    (5000, 20000), 3000),
     # whether three times the iterations say the same
     "long": Group(("skew-normal", "skew-normal:alternation=cyclic",
                    "skew-normal:alternation=cyclic,alternation_split=0.8", "skew-normal-direct:skew_map=polar",

@@ -101,9 +101,9 @@ def _skew_normal() -> Values:
     Adam, a joint warm-up and then cycles of one block after the other, and no regulariser.
 
     Not published; here: the rate of the skew, 1.25e-2 (5 times the centred form's, best in 2D trials); the bound of
-    the slant, 10; warm-up, cycle and split: clsplat's defaults; first opacity and scale: clsplat's
-    with "mcmc"; SGHMC's constants: SSS's, in the stable form; the strategy: SSS's relocation without its square (times and baselines suggest SSS's code); the rates
-    of all else: clsplat's defaults, which are 3DGS's.
+    the slant, 10; warm-up, cycle and split: clsplat's defaults; first opacity and scale: clsplat's with "mcmc";
+    SGHMC's constants: SSS's, in the stable form; the strategy: SSS's relocation without its square (times and
+    baselines suggest SSS's code); the rates of all else: clsplat's defaults, which are 3DGS's.
     """
     return {
         "shape": "skew-normal-direct", "normalisation": "none", "skew_map": "polar", "skew_lr": 1.25e-2,
