@@ -90,7 +90,7 @@ class TrainConfig:
     growth : least growth of the splat count per action; more where the cap is far (see trainer.growth_factor).
     grad_threshold : "adc" clones or splits splats whose mean gradient of the screen position is above it (3DGS).
     depth_threshold : the same for the gradient along the viewing ray times the scene extent (3DSGS); 0: not looked at.
-    opacity_reset : "adc" resets opacities that often per run, but not within 1000 iterations; 0: never.
+    opacity_reset : "adc" resets opacities that often per run (3DGS: 10), but not within 1000 iterations; 0: never.
     dense_size : "adc" splits splats larger than this fraction of the scene extent and clones others.
     checkpoint_interval : iterations between checkpoints; 0: only at the end.
     save_iterations : when to write a PLY, beside the end.
@@ -145,7 +145,7 @@ class TrainConfig:
     growth: float = 1.05
     grad_threshold: float = 2e-4
     depth_threshold: float = 0.0
-    opacity_reset: int = 10
+    opacity_reset: int = 0
     dense_size: float = 0.01
     checkpoint_interval: int = 1000
     save_iterations: tuple[int, ...] = ()

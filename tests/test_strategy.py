@@ -74,7 +74,7 @@ def test_pull_is_read_only_when_asked_for() -> None:
 
 
 def adc(**options: object) -> TrainConfig:
-    return TrainConfig(**({"shape": "gaussian", "strategy": "adc", "iterations": 30_000, "densify_until": 0.5,
+    return TrainConfig(**({"shape": "gaussian", "strategy": "adc", "iterations": 30_000, "opacity_reset": 10,
                            "cap_max": 1000} | options))  # type: ignore[arg-type]
 
 
