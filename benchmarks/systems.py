@@ -1,9 +1,9 @@
 """Systems, shapes and parameterisations against each other in one engine: the tables behind SYSTEMS.md.
 
     python benchmarks/systems.py fox kitchen --groups presets forms [--caps 5000] [--seeds 0 1 2] [--device 0:0]
-    python benchmarks/systems.py fox kitchen --groups strategies --validate  # for choices: no test view is looked at
+    python benchmarks/systems.py fox kitchen --validate      # groups for choices: no test view is looked at
     python benchmarks/systems.py --table                  # print what is there, run nothing
-    python benchmarks/systems.py --page                   # likewise, the tables of SYSTEMS.md: by question
+    python benchmarks/systems.py --page [--validate]      # likewise, the tables of SYSTEMS.md: by question
 
 One folder a scene under benchmarks/results/systems (runs.jsonl, table.md, results.json; see `clsplat compare`). A
 run that is there already is not done again: kill and restart at will, add seeds, caps or groups later. Two scenes may
@@ -41,11 +41,12 @@ BASE = {"strategy": "mcmc", "sampling": "opacity", "relocation": "length", "grow
 
 
 class Group(NamedTuple):
-    """Systems that answer one question, and the caps to ask it at."""
+    """Systems that answer one question, the caps to ask it at, and on which views: defaults hang on some answers."""
 
     systems: tuple[str, ...]
     caps: tuple[int, ...]
     iterations: int = 1000
+    validate: bool = False
 
     def contestants(self) -> list[System]:
         """The systems, shapes with the options of BASE."""
@@ -53,9 +54,19 @@ class Group(NamedTuple):
                 for system in parse_systems(",".join(self.systems))]
 
 
-# 3DGS's growth by gradient with our start and rates
-ADC = "skew-normal:strategy=adc,noise_lr=0,densify_until=0.5,opacity_reg=0,scale_reg=0"
+# Growth by gradient instead of BASE's by opacity.
+ADC = "strategy=adc,noise_lr=0,densify_until=0.5,opacity_reg=0,scale_reg=0"
 START = "init_opacity=0.2,init_scale=0.7"
+
+
+def adc(shape: str, *more: str) -> str:
+    """A shape with growth by gradient and more options."""
+    return ",".join((f"{shape}:{ADC}", *more))
+
+
+PULL = "skew-normal:sampling=pull,opacity_reg=0,scale_reg=0"  # growth by opacity times gradient
+SHORT = {ADC: "adc*", START: "start*", PULL: "skew-normal:pull*"}  # in the tables
+KERNELS = tuple(adc(shape, START) for shape in ("gaussian", "skew-normal", "generalised-exponential"))
 
 GROUPS = {
     # every published system as published, and clsplat's default
@@ -75,39 +86,29 @@ GROUPS = {
                       "skew-normal:position_optimizer=sghmc,noise_lr=0", "skew-normal:normalisation=pdf",
                       "skew-normal:normalisation=none", "skew-normal:skew_map=linear",
                       "skew-normal-direct:skew_map=radial"), (5000,)),
-    # which start and which strategy; ask it on validation views, as defaults hang on it
+    # which start and which strategy
     "strategies": Group(("skew-normal", "skew-normal:init_opacity=0.1,init_scale=1",
                          "skew-normal:init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0",
                          "3dgs:shape=skew-normal", "3dgs", "3dgs:shape=generalised-exponential",
-                         "generalised-exponential", "gaussian"), (5000, 20000)),
-    # what makes the difference between the two strategies, with and without room to grow; on validation views
-    "growth": Group(("skew-normal", "skew-normal:sampling=pull", "skew-normal:sampling=pull,opacity_reg=0,scale_reg=0",
-                     "skew-normal:sampling=pull,init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0",
-                     "skew-normal:strategy=adc,noise_lr=0,densify_until=0.5", ADC, "3dgs:shape=skew-normal",
-                     "generalised-exponential:sampling=pull", "skew-normal:densify_until=0.5",
-                     "skew-normal:noise_lr=0"), (5000, 20000)),
-    # which start goes with which strategy; on validation views
-    "starts": Group((ADC, f"{ADC},init_opacity=0.1,init_scale=0.5", f"{ADC},init_opacity=0.5,init_scale=1",
-                     f"{ADC},init_opacity=0.2,init_scale=0.7", f"{ADC},init_opacity=0.1,init_scale=1",
-                     "skew-normal:sampling=pull,opacity_reg=0,scale_reg=0,init_opacity=0.2,init_scale=0.7",
-                     "skew-normal:sampling=pull,opacity_reg=0,scale_reg=0,init_opacity=0.1,init_scale=0.5"),
-                    (5000, 20000)),
-    # the candidates for a default, then the kernel with the best of them; on validation views
-    "candidates": Group(("skew-normal", f"{ADC},{START}",
-                         f"skew-normal:sampling=pull,opacity_reg=0,scale_reg=0,{START}",
-                         f"{ADC},init_opacity=0.1,init_scale=0.5",
-                         f"skew-normal:strategy=adc,noise_lr=0,densify_until=0.5,{START}",
-                         f"{ADC},{START}".replace("skew-normal", "generalised-exponential")), (5000, 20000)),
-    "kernels": Group(("skew-normal", *(f"{ADC},{START}".replace("skew-normal", shape)
-                                       for shape in ("gaussian", "skew-normal", "generalised-exponential"))),
-                     (5000, 20000)),
-    "kernels-long": Group(("skew-normal", *(f"{ADC},{START}".replace("skew-normal", shape)
-                                            for shape in ("gaussian", "skew-normal", "generalised-exponential"))),
-                          (5000, 20000), 3000),
-    "resets": Group((f"{ADC},{START}", f"{ADC},{START},opacity_reset=0",
-                     f"{ADC},{START},opacity_reset=0".replace("skew-normal", "gaussian"),
-                     f"{ADC},{START},opacity_reset=0".replace("skew-normal", "generalised-exponential")),
-                    (5000, 20000), 3000),
+                         "generalised-exponential", "gaussian"), (5000, 20000), validate=True),
+    # what makes the difference between the two strategies, with and without room to grow
+    "growth": Group(("skew-normal", "skew-normal:sampling=pull", PULL, f"{PULL},init_opacity=0.1,init_scale=1",
+                     "skew-normal:strategy=adc,noise_lr=0,densify_until=0.5", adc("skew-normal"),
+                     "3dgs:shape=skew-normal", "generalised-exponential:sampling=pull",
+                     "skew-normal:densify_until=0.5", "skew-normal:noise_lr=0"), (5000, 20000), validate=True),
+    # which start goes with which strategy
+    "starts": Group((adc("skew-normal"), adc("skew-normal", "init_opacity=0.1,init_scale=0.5"),
+                     adc("skew-normal", "init_opacity=0.5,init_scale=1"), adc("skew-normal", START),
+                     adc("skew-normal", "init_opacity=0.1,init_scale=1"), f"{PULL},{START}",
+                     f"{PULL},init_opacity=0.1,init_scale=0.5"), (5000, 20000), validate=True),
+    # the candidates for a default, then the kernel with the best of them
+    "candidates": Group(("skew-normal", adc("skew-normal", START), f"{PULL},{START}",
+                         adc("skew-normal", "init_opacity=0.1,init_scale=0.5"),
+                         f"skew-normal:strategy=adc,noise_lr=0,densify_until=0.5,{START}"), (5000, 20000),
+                        validate=True),
+    "kernels": Group(("skew-normal", *KERNELS), (5000, 20000), validate=True),
+    "kernels-long": Group(("skew-normal", *KERNELS, *(f"{kernel},opacity_reset=0" for kernel in KERNELS)),
+                          (20000,), 3000, validate=True),
     # whether three times the iterations say the same
     "long": Group(("skew-normal", "skew-normal:alternation=cyclic",
                    "skew-normal:alternation=cyclic,alternation_split=0.8", "skew-normal-direct:skew_map=polar",
@@ -120,7 +121,7 @@ GROUPS = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--groups", nargs="+", choices=tuple(GROUPS), default=list(GROUPS))
+    parser.add_argument("--groups", nargs="+", choices=tuple(GROUPS), help="not given: all for these views")
     parser.add_argument("--caps", nargs="+", type=int, help="only these of the groups' caps; others where none is one")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--iterations", type=int, help="instead of the groups' own")
@@ -133,13 +134,14 @@ def main() -> None:
     if args.validate:
         args.out = args.out.with_name(args.out.name + "-validation")
     if args.page:
-        print(page(args.out))
+        print(page(args.out, args.validate))
         return
     for name in args.scenes if not args.table else ():
         scene = load_scene(common.data_folder() / name, resolution=RESOLUTION.get(name, -1), eval=True)
         if args.validate:
             scene = validation(scene)
-        for group in (GROUPS[group] for group in args.groups):
+        asked = args.groups or [group for group in GROUPS if GROUPS[group].validate == args.validate]
+        for group in (GROUPS[group] for group in asked):
             caps = [cap for cap in group.caps if args.caps is None or cap in args.caps] or args.caps or []
             common_options = {"iterations": args.iterations or group.iterations, "device": args.device}
             compare([scene], group.contestants(), args.out / name, caps, args.seeds,
@@ -153,7 +155,7 @@ def validation(scene: Scene) -> Scene:
     return replace(scene, views=scene.train, test_names=frozenset(view.name for view in scene.train[3::7]))
 
 
-def page(folder: Path) -> str:
+def page(folder: Path, validate: bool) -> str:
     """The tables by question: for each group and cap the scenes side by side, and the difference to the first system.
 
     A system's mean ± half the spread is over the seeds it has; the difference over those that both have, seed by seed.
@@ -161,19 +163,26 @@ def page(folder: Path) -> str:
     scenes = {path.parent.name: common.read(path) for path in sorted(folder.glob(f"*/{RUNS}"))}
     lines = []
     for name, group in GROUPS.items():
-        for cap in group.caps:
+        for cap in group.caps if group.validate == validate else ():
             by = {(scene, system.label): own_runs(records, system, cap, group.iterations)
                   for scene, records in scenes.items() for system in group.contestants()}
             if not any(len(seeds) for (_, system), seeds in by.items() if system != group.systems[0]):
                 continue
             lines += [f"**{name}, {cap} splats, {group.iterations} iterations**", "", "| system | " + " | ".join(
-                f"{scene}: PSNR | to {group.systems[0]} | SSIM | CPU s | seeds" for scene in scenes) + " |",
+                f"{scene}: PSNR | to {short(group.systems[0])} | SSIM | CPU s | seeds" for scene in scenes) + " |",
                 "|---|" + "---:|" * 5 * len(scenes)]
             for system in group.systems:
                 cells = [cell for scene in scenes for cell in row(by[scene, system], by[scene, group.systems[0]])]
-                lines.append(f"| {system} | " + " | ".join(cells) + " |")
+                lines.append(f"| {short(system)} | " + " | ".join(cells) + " |")
             lines.append("")
     return "\n".join(lines)
+
+
+def short(label: str) -> str:
+    """A system's label without the options that many have."""
+    for options, name in SHORT.items():
+        label = label.replace(options, name)
+    return label
 
 
 def own_runs(records: list[Record], system: System, cap: int, iterations: int) -> dict[int, Record]:
