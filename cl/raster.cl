@@ -36,7 +36,12 @@ static inline int past_run(const real *rec, int tile_y) {
     return (rows * RUNS_PER_ROW + GROUP - 1) / GROUP;
 }
 
+// What the forward tells the gradient about an isect: the runs in which it changed a pixel, a bit each. Where a work-item
+// has them all, and in vectors: of a group each item would know its own only.
+#define TELLS_RUNS (GROUP == 1 && LANES > 1)
+
 // color [3 planes], transmittance [plane] (final T), depth [plane] (sum of weight * z; only if WITH_DEPTH).
+// isect_runs [n_isects], by unsorted isect id: see TELLS_RUNS.
 GROUP_ATTRIBUTE
 kernel void rasterize(
     global const uint2 *restrict tile_ranges,
@@ -46,6 +51,7 @@ kernel void rasterize(
     global real *restrict color,
     global real *restrict transmittance,
     global real *restrict depth,
+    global uint *restrict isect_runs,
     int width,
     int height,
     int tiles_x,
@@ -82,14 +88,21 @@ kernel void rasterize(
             real rec[RECORD];
             for (int j = 0; j < RECORD; ++j) rec[j] = batch[k * RECORD + j];
             const int past = past_run(rec, tile_y);
+#if TELLS_RUNS
+            vmask changed = lanes_mask(0);
+#endif
             for (int v = first_run(rec, tile_y); v < past; ++v) {
                 const int run = v * GROUP + LID;
                 const real x = tile_x + run % RUNS_PER_ROW * LANES + R(0.5) - rec[0];
                 const real dy = tile_y + run / RUNS_PER_ROW + R(0.5) - rec[1];
                 shape_pixel pixel;
                 vreal alpha = shape_alpha((vreal)x + lanes_iota(), dy, rec + 8, &pixel);
+                const vreal T_before = T[v];
                 vmask hit;
                 const vreal weight = blend(&alpha, &T[v], &hit);
+#if TELLS_RUNS
+                changed |= (T[v] != T_before) & (mask_int)(1 << v);
+#endif
                 red[v] = lanes_mad(weight, (vreal)rec[2], red[v]);
                 green[v] = lanes_mad(weight, (vreal)rec[3], green[v]);
                 blue[v] = lanes_mad(weight, (vreal)rec[4], blue[v]);
@@ -97,6 +110,9 @@ kernel void rasterize(
                 z[v] = lanes_mad(weight, (vreal)rec[5], z[v]);
 #endif
             }
+#if TELLS_RUNS
+            isect_runs[lists[start + k]] = (uint)lanes_or(changed);
+#endif
         }
         int any_live = 0;
         for (int v = 0; v < VECS && !any_live; ++v) any_live = lanes_any(lanes_not(BLEND_DONE(T[v])));
@@ -134,6 +150,7 @@ kernel void rasterize_vjp(
     global const real *restrict transmittance,
     global const real *restrict v_color,
     global const real *restrict v_alpha,
+    global const uint *restrict isect_runs,
     global real *restrict isect_grads,
     int width,
     int height,
@@ -177,8 +194,13 @@ kernel void rasterize_vjp(
             for (int j = 0; j < RECORD; ++j) rec[j] = batch[k * RECORD + j];
             vreal sums[V_RECORD];
             for (int j = 0; j < V_RECORD; ++j) sums[j] = (vreal)0;
-            const int past = past_run(rec, tile_y);
-            for (int v = first_run(rec, tile_y); v < past; ++v) {
+#if TELLS_RUNS
+            const uint told = isect_runs[lists[start + k]];
+            const int first = popcount((told & -told) - 1u), past = 32 - clz(told);
+#else
+            const int first = first_run(rec, tile_y), past = past_run(rec, tile_y);
+#endif
+            for (int v = first; v < past; ++v) {
                 const int run = v * GROUP + LID;
                 const vreal dx = (vreal)(tile_x + run % RUNS_PER_ROW * LANES + R(0.5) - rec[0]) + lanes_iota();
                 const real dy = tile_y + run / RUNS_PER_ROW + R(0.5) - rec[1];

@@ -18,7 +18,7 @@ _IMAGE_PLANES = 3 + 1 + 3 + 15 + 9 + 9 + 3  # colour, T, truth, SSIM maps and th
 # Splat-tile pairs of an image: about 100 a tile, however few the splats, and 4 more a splat. At the end of runs on
 # three real scenes of 400-px photos with 5 000 and 20 000 splats there were 0.5 to 0.8 times as many.
 _ISECTS_PER_TILE, _ISECTS_PER_SPLAT = 100, 4
-_SORT_WORDS = 5  # tile, id and their pairs, splat
+_SORT_WORDS = 6  # tile, id and their pairs, splat, runs
 _SCREEN_WORDS = 16  # keys, orders, rectangles, counts and offsets of a splat
 
 

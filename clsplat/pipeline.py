@@ -144,8 +144,8 @@ class Pipeline:
             (n_tiles * group,), (group,), tile_ranges=ranges, lists=lists,
             isect_splat=pool.get("isect_splat", 4 * n_isects), records=records,
             color=self.image("color", layout, 3), transmittance=self.image("transmittance", layout),
-            depth=self.image("depth", layout), width=layout.width, height=layout.height,
-            tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane,
+            depth=self.image("depth", layout), isect_runs=pool.get("isect_runs", 4 * n_isects), width=layout.width,
+            height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane,
             background_r=r, background_g=g, background_b=b,
         )
         self.frame = Frame(layout, n_isects, degree, splats, lists)
@@ -168,8 +168,9 @@ class Pipeline:
             (layout.tiles_x * layout.tiles_y * group,), (group,), tile_ranges=pool.get("tile_ranges", 0),
             lists=frame.lists, isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0),
             color=pool.get("color", 0), transmittance=pool.get("transmittance", 0), v_color=v_color,
-            v_alpha=v_color if v_alpha is None else v_alpha, isect_grads=isect_grads, width=layout.width,
-            height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane,
+            v_alpha=v_color if v_alpha is None else v_alpha, isect_runs=pool.get("isect_runs", 0),
+            isect_grads=isect_grads, width=layout.width, height=layout.height, tiles_x=layout.tiles_x,
+            stride=layout.stride, plane=layout.plane,
         )
         self.program.gather_isect_grads.over(
             splats.n, self.group, splat_isects=pool.get("splat_isects", 0), isect_grads=isect_grads,

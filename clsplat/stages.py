@@ -86,10 +86,10 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
         "depth sort": Work(n * (4 + 20 * depth_passes)),  # numbers; keys twice, values, and both written
         "binning": Work(68 * n + 12 * isects),  # order and boxes twice, counts and their scan; three words out
         "tile sort": Work((4 + 20 * tile_passes) * isects + 8 * tiles),
-        "rasterize": Work((8 + record) * isects + 4 * real * pixels, pairs * (forward + BLEND)),
+        "rasterize": Work((12 + record) * isects + 4 * real * pixels, pairs * (forward + BLEND)),
         # bytes in, planes: truth 3; rows 6 and 15, columns 21 and 9, back 9 and 9, 15 and 3
         "loss": Work((3 + real * 90) * pixels, 3 * LOSS * pixels),
-        "rasterize_vjp": Work((8 + record + v_record) * isects + 6 * real * pixels,
+        "rasterize_vjp": Work((12 + record + v_record) * isects + 6 * real * pixels,
                               pairs * (forward + backward + BLEND_VJP)),
         "gather": Work((8 + v_record) * n + v_record * isects),
         "project_vjp": Work(n * (real * (2 * geometry + 2 * colour + 3 + 6) + v_record + 4)),
