@@ -36,7 +36,7 @@ static inline int past_run(const real *rec, int tile_y) {
     return (rows * RUNS_PER_ROW + GROUP - 1) / GROUP;
 }
 
-// What the forward tells the gradient about an isect: the runs in which it changed a pixel, a bit each. Where a work-item
+// What the forward tells the gradient about an isect: the runs in which it met a live pixel, a bit each. Where a work-item
 // has them all, and in vectors: of a group each item would know its own only.
 #define TELLS_RUNS (GROUP == 1 && LANES > 1)
 
@@ -101,7 +101,7 @@ kernel void rasterize(
                 vmask hit;
                 const vreal weight = blend(&alpha, &T[v], &hit);
 #if TELLS_RUNS
-                changed |= (T[v] != T_before) & (mask_int)(1 << v);
+                changed |= (hit | (T[v] != T_before)) & (mask_int)(1 << v);
 #endif
                 red[v] = lanes_mad(weight, (vreal)rec[2], red[v]);
                 green[v] = lanes_mad(weight, (vreal)rec[3], green[v]);
