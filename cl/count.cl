@@ -3,7 +3,6 @@
 // A pair of splat and pixel is useful if |alpha| reaches the cutoff and the pixel is not yet finished by a splat before
 // it; the one that finishes it counts, as it had to be evaluated. Screen records as in project.cl.
 
-#define RECORD (8 + SHAPE_N)
 #define RUNS_PER_TILE (TILE * TILE / LANES)
 
 // counts [tiles, RUNS_PER_TILE]: useful pairs of each run of LANES pixels. Overwrites. Global size: the counts.

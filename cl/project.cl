@@ -4,7 +4,6 @@
 // Screen record of splat i: RECORD reals at records[i * RECORD]:
 //   mean_px x, y [px]; colour r, g, b; depth (camera z); first and last pixel row it can reach; shape's p.
 
-#define RECORD (8 + SHAPE_N)
 #define CULLED_KEY 0xFFFFFFFFu
 #define COV2D_MAX R(1e12)  // px^2: a wider splat would overflow float32 on the way, and is no longer a splat
 

@@ -6,7 +6,6 @@
 // staged in local memory. Images are planar with a margin: plane c, pixel (x, y) at
 // c * plane + (y + MARGIN_Y) * stride + x + MARGIN_X; pixels beyond width or height are written as 0.
 
-#define RECORD (8 + SHAPE_N)
 #define RUNS_PER_ROW (TILE / LANES)
 #define V_RECORD (SHAPE_V + 3)
 

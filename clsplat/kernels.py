@@ -71,14 +71,11 @@ class KernelBuild:
 
     def raster_program(self, device: Device) -> Program:
         """Projection, binning, rasterisation, and their gradients."""
-        shape = shape_named(self.shape)
-        files = (*_LOWER, *shape.lower, shape.source, "project.cl", "bin.cl", "raster.cl")
-        return build(device, files, self._defines(), self.real)
+        return self._shape_program(device, "project.cl", "bin.cl", "raster.cl")
 
     def count_program(self, device: Device) -> Program:
         """Useful pairs of a frame (pairs.py)."""
-        shape = shape_named(self.shape)
-        return build(device, (*_LOWER, *shape.lower, shape.source, "count.cl"), self._defines(), self.real)
+        return self._shape_program(device, "count.cl")
 
     def loss_program(self, device: Device) -> Program:
         """Image loss. Depends on lanes and precision only."""
@@ -102,6 +99,11 @@ class KernelBuild:
     def for_rendering(self) -> KernelBuild:
         """The same with depth and an alpha gradient."""
         return replace(self, with_depth=True, with_v_alpha=True)
+
+    def _shape_program(self, device: Device, *files: str) -> Program:
+        """Files above the shape's own."""
+        shape = shape_named(self.shape)
+        return build(device, (*_LOWER, *shape.lower, shape.source, *files), self._defines(), self.real)
 
     def _defines(self) -> dict[str, Define]:
         schema = self.schema
