@@ -148,7 +148,8 @@ kernel void project_splats(
 }
 
 // moments [rows SHAPE_V + 3, capacity]: summed over pixels; the last three are the gradient of the colour.
-// grad_geom, grad_sh: as geom, sh; overwritten (zero for unseen splats), sh only for the bands in use.
+// grad_geom, grad_sh: as geom, sh; overwritten (zero for unseen splats), sh only for the bands in use. If `compact`, grad_sh
+// is [6, capacity]: the gradient of the colour, and the unit direction whose basis times it is that of sh.
 // signals [3, capacity], for strategies, of the splats seen: added to, the norm of the gradient of mean_px in units of
 // half the image (3DGS's normalised device coordinates), the absolute gradient along the viewing ray [1/world unit]
 // (3DSGS's depth gradient) and 1.
@@ -165,6 +166,7 @@ kernel void project_splats_vjp(
     ulong capacity,
     uint n_splats,
     int sh_degree,
+    uint compact,
     int width,
     int height)
 {
@@ -214,18 +216,23 @@ kernel void project_splats_vjp(
     signal += capacity;
     lanes_store(lanes_load(signal) + lanes_if(seen, (vreal)1, zero), signal);
 
-    vreal v_rgb[3], inv_norm, basis[SH_COUNT], v_basis[SH_COUNT];
+    vreal v_rgb[3], inv_norm, v_basis[SH_COUNT];
     for (int c = 0; c < 3; ++c) v_rgb[c] = lanes_if(lanes_load(seen_rgb[c]) > zero, v[SHAPE_V + c], zero);
     const vec3 direction = unit_direction(cam, s.mean, &inv_norm);
-    sh_basis(direction, sh_degree, basis);
     const int used = (sh_degree + 1) * (sh_degree + 1);
+    if (compact) {
+        vec3_store((vec3){v_rgb[0], v_rgb[1], v_rgb[2]}, grad_sh + first, capacity);
+        vec3_store(direction, grad_sh + first + 3 * capacity, capacity);
+    } else {
+        vreal basis[SH_COUNT];
+        sh_basis(direction, sh_degree, basis);
+        for (int k = 0; k < used; ++k)
+            for (int c = 0; c < 3; ++c) lanes_store(basis[k] * v_rgb[c], grad_sh + first + (ulong)(3 * k + c) * capacity);
+    }
     for (int k = 0; k < used; ++k) {
         v_basis[k] = zero;
-        for (int c = 0; c < 3; ++c) {
-            const ulong at = first + (ulong)(3 * k + c) * capacity;
-            lanes_store(basis[k] * v_rgb[c], grad_sh + at);
-            v_basis[k] += v_rgb[c] * lanes_load(sh + at);
-        }
+        for (int c = 0; c < 3; ++c)
+            v_basis[k] += v_rgb[c] * lanes_load(sh + first + (ulong)(3 * k + c) * capacity);
     }
     vec3 v_direction = sh_basis_vjp(direction, sh_degree, v_basis);
     v_direction = add3(v_direction, scale3(direction, -dot3(direction, v_direction)));

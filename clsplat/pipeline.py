@@ -17,6 +17,7 @@ from .buffers import ParameterBuffers, Pool, SplatBuffers, fill_zero, to_device,
 from .camera import Camera
 from .device import Device
 from .errors import DeviceError
+from .gradients import CompactGradients
 from .kernels import MARGIN_X, MARGIN_Y, NEAR, TILE, KernelBuild
 from .program import lane_group
 from .sort import Sorter
@@ -181,7 +182,8 @@ class Pipeline:
             cam=pool.get("camera", 0), moments=moments, records=pool.get("records", 0),
             depth_key=pool.get("depth_key_kept", 0), grad_geom=grads.geom, grad_sh=grads.sh,
             signals=self.signals(splats.capacity), capacity=splats.capacity, n_splats=splats.n,
-            sh_degree=frame.sh_degree, width=layout.width, height=layout.height,
+            sh_degree=frame.sh_degree, compact=int(isinstance(grads, CompactGradients)), width=layout.width,
+            height=layout.height,
         )
 
     def read_image(self, name: str, layout: ImageLayout) -> NDArray[Any]:
