@@ -1,8 +1,8 @@
 """OpenCL programs from the package's sources, and kernels whose arguments are bound by name.
 
 Sources are joined here, with `#line`, and never `#include` one another: so every cache sees the whole text,
-and errors name the file. Signatures are read from that text; style: `kernel void name(` with parameters
-`global [const] T *restrict name`, `local T *name`, and scalars of the types in `_SCALARS`.
+and errors name the file. Signatures are read from that text (signatures.py). Between processes a program is kept by its
+driver or by binaries.py, never by pyopencl's cache.
 """
 
 from __future__ import annotations
@@ -14,16 +14,18 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
 from functools import cache
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from .binaries import binary_path, load_binary, store_binary
 from .device import BROKEN_POCL, LESS_MEMORY, Device, first_line, is_out_of_memory
 from .errors import DeviceError
+from .signatures import Parameter, parse_signatures
+from .signatures import Real as Real  # of this module's interface
 
-Real = Literal["float", "double"]
 Define = int | float | str
 
 OPTIONS = ("-cl-std=CL1.2", "-cl-mad-enable")  # never fast-relaxed-math: infinities and NaN have meaning
@@ -32,11 +34,6 @@ OPTIONS_VARIABLE = "CLSPLAT_BUILD_OPTIONS"  # more, from outside: -Werror in tes
 SMOKE_TOLERANCE = 1e-5  # relative: OpenCL allows exp 3 ulp and erfc 16 ulp of float32 (6e-8 each)
 
 GROUP_ITEMS = 64
-
-_SCALARS = {"int": np.int32, "uint": np.uint32, "ulong": np.uint64, "float": np.float32, "double": np.float64}
-_ATTRIBUTE = r"__attribute__\s*\(\(.*?\)\)\)?\s*"  # the third brace closes reqd_work_group_size(...)
-_KERNEL = re.compile(rf"\b(?:__)?kernel\s+(?:{_ATTRIBUTE})*void\s+(\w+)\s*\(([^)]*)\)", re.S)
-_COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.S)
 
 
 def source(*names: str) -> str:
@@ -73,7 +70,7 @@ def build(
 def build_text(
     device: Device, text: str, defines: Mapping[str, Define] | None = None, real: Real = "float"
 ) -> Program:
-    """Program from OpenCL C text, not cached; otherwise as `build`."""
+    """Program from OpenCL C text, not kept in `device`; otherwise as `build`."""
     import pyopencl as cl
 
     if real == "double" and not device.has_fp64:
@@ -84,30 +81,10 @@ def build_text(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)  # some compilers report every success
-            built = cl.Program(device.context, "\n".join([*lines, text])).build(options)
+            built = _compiled(device, "\n".join([*lines, text]), options)
     except cl.Error as error:
         raise _build_error(device, error, defines or {}, real) from None
     return Program(device, built, parse_signatures(text, real))
-
-
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """One kernel parameter: `kind` is "buffer", "local" or "scalar" (then with its NumPy dtype)."""
-
-    name: str
-    kind: Literal["buffer", "local", "scalar"]
-    dtype: np.dtype[Any] | None = None
-
-
-def parse_signatures(text: str, real: Real) -> dict[str, tuple[Parameter, ...]]:
-    """Parameters of every kernel in OpenCL C text, by kernel name; DeviceError names what it cannot read."""
-    signatures: dict[str, tuple[Parameter, ...]] = {}
-    for name, inside in _KERNEL.findall(_COMMENT.sub(" ", text)):
-        parts = [part for part in inside.split(",") if part.strip() not in ("", "void")]
-        parameters = tuple(_parse_parameter(name, part, real) for part in parts)
-        if signatures.setdefault(name, parameters) != parameters:
-            raise DeviceError(f"kernel {name}: two definitions with different parameters in one program")
-    return signatures
 
 
 def lane_group(device: Device) -> int:
@@ -254,6 +231,22 @@ def smoke_test(device: Device) -> tuple[float, float]:
     return build_ms, run_ms
 
 
+def _compiled(device: Device, text: str, options: list[str]) -> Any:
+    """A built pyopencl program, from its kept binary where there is a good one; cl.Error when it does not build."""
+    import pyopencl as cl
+
+    path = binary_path(device.info, text, [*options, os.environ.get("PYOPENCL_BUILD_OPTIONS", "")])
+    binary = None if path is None else load_binary(path)
+    if binary is not None:
+        with suppress(cl.Error):  # a binary that the driver does not take after all
+            return cl.Program(device.context, [device.cl_device], [binary]).build(options)
+    # False, which its annotation lacks, turns pyopencl's cache off.
+    built = cl.Program(device.context, text).build(options, cache_dir=False)  # type: ignore[arg-type]
+    if path is not None:
+        store_binary(path, built.get_info(cl.program_info.BINARIES)[0])
+    return built
+
+
 @cache
 def _read(name: str) -> str:
     try:
@@ -274,24 +267,6 @@ def _literal(name: str, value: Define, real: Real) -> str:
         raise ValueError(f"define {name}={value}: must be finite")
     text = repr(float(value)) if real == "double" else f"{np.float32(value)!s}f"
     return f"({text})" if value < 0 else text
-
-
-def _parse_parameter(kernel: str, text: str, real: Real) -> Parameter:
-    words = re.sub(r"\*", " * ", text).replace("__", "").split()
-    name, kinds = words[-1], words[:-1]
-    if "*" in kinds:
-        if "local" in kinds:
-            return Parameter(name, "local")
-        if "global" in kinds or "constant" in kinds:
-            return Parameter(name, "buffer")
-    types = [word for word in kinds if word not in ("const", "private")]
-    if len(types) == 1:
-        dtype = _SCALARS.get(real if types[0] == "real" else types[0])
-        if dtype is not None:
-            return Parameter(name, "scalar", np.dtype(dtype))
-    raise DeviceError(
-        f"kernel {kernel}: parameter {' '.join(text.split())!r} is of no type that can be bound"
-    )
 
 
 def _build_error(device: Device, error: Exception, defines: Mapping[str, Define], real: Real) -> DeviceError:

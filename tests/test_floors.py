@@ -16,10 +16,10 @@ ROOT = Path(__file__).resolve().parent.parent
 # A module imports modules of lower floors only.
 FLOORS = """
     errors flops harmonics
-    atomic compare_table interrupt presets run_log runtime schema capture_world
+    atomic compare_table interrupt presets run_log runtime schema signatures capture_world
     camera device images metrics optim_reference plan ply_header profiles rotations schedules validity colmap_files
-    cameras_json capture checkpoint colmap launches noise program shapes
-    opacities ply sghmc skew_map
+    binaries cameras_json capture checkpoint colmap launches noise shapes
+    opacities ply program sghmc skew_map
     adc config densify kernels scene splats
     blocks buffers camera_path convert initialise model_folder strategy synthetic systems view_sampler
     gradients limits optim_rules sort
