@@ -1,6 +1,7 @@
-// optim.cl: fused Adam (Kingma & Ba 2015) over component-major buffers, SGHMC for positions, the skew map's chain rule,
-// regularisers, MCMC noise, and the kernels that move splats about. The NumPy forms are in clsplat/optim_host.py,
-// optim_reference.py, sghmc.py, skew_map.py and noise.py; a test compares them step for step.
+// optim.cl: one step of all parameters: fused Adam (Kingma & Ba 2015) over component-major buffers, with regularisers and the
+// skew map's chain rule; SGHMC for positions, MCMC noise, and the kernels that move splats about. The NumPy forms are in
+// clsplat/optim_host.py, optim_reference.py, regularisers.py, sghmc.py, skew_map.py and noise.py; a test compares them
+// step for step.
 
 static inline vreal adam_direction(vreal grad, global real *m_at, global real *v_at, real correct1, real correct2) {
     const vreal m = lanes_load(m_at) * ADAM_BETA1 + grad * ADAM_REST1;
@@ -10,43 +11,171 @@ static inline vreal adam_direction(vreal grad, global real *m_at, global real *v
     return m * correct1 / (sqrt(v * correct2) + (vreal)ADAM_EPS);
 }
 
-// value, m, v [rows, capacity] in place; lr [rows]. correct1, correct2 = 1 / (1 - beta^step).
-// Global size: (capacity / LANES, rows to update).
-kernel void adam_step(
-    global real *restrict value,
-    global const real *restrict grad,
-    global real *restrict adam_m,
-    global real *restrict adam_v,
-    constant real *restrict lr,
-    ulong capacity,
-    uint first_row,
-    real correct1,
-    real correct2)
-{
-    const ulong row = first_row + get_global_id(1);
-    const ulong at = row * capacity + get_global_id(0) * LANES;
-    const vreal step = adam_direction(lanes_load(grad + at), adam_m + at, adam_v + at, correct1, correct2);
-    lanes_store(lanes_load(value + at) - lr[row] * step, value + at);
+// The moments of a buffer [rows, capacity], from a splat's column on, and their corrections 1 / (1 - beta^step).
+typedef struct {
+    global real *m, *v;
+    real correct1, correct2;
+} adam_moments;
+
+static inline void adam_step(vreal grad, real lr, global real *value, adam_moments adam, const ulong at) {
+    const vreal old = lanes_load(value + at);
+    lanes_store(old - lr * adam_direction(grad, adam.m + at, adam.v + at, adam.correct1, adam.correct2), value + at);
 }
 
-// The same on the logarithm of one row of positive values, which stays within its bounds.
-kernel void adam_step_bounded(
-    global real *restrict value,
-    global const real *restrict grad,
-    global real *restrict adam_m,
-    global real *restrict adam_v,
-    ulong capacity,
-    uint row,
-    real lr,
-    real low,
-    real high,
-    real correct1,
-    real correct2)
+// The same on the logarithm of a positive value, which stays within its bounds.
+static inline void adam_step_bounded(
+    vreal grad, real lr, real low, real high, global real *value, adam_moments adam, const ulong at)
 {
-    const ulong at = row * capacity + get_global_id(0) * LANES;
     const vreal old = lanes_load(value + at);
-    const vreal step = adam_direction(lanes_load(grad + at) * old, adam_m + at, adam_v + at, correct1, correct2);
+    const vreal step = adam_direction(grad * old, adam.m + at, adam.v + at, adam.correct1, adam.correct2);
     lanes_store(lanes_clamp(old * exp(-lr * step), low, high), value + at);
+}
+
+// Coefficient k of the colour. grad_sh [6, capacity]: the gradient of the colour and the direction (cl/project.cl), whose
+// product with the basis is formed here.
+static inline void step_coefficient(
+    uint k, int degree, real lr, global real *sh, global const real *grad_sh, adam_moments adam, const ulong capacity)
+{
+    vreal basis[SH_COUNT];
+    sh_basis(vec3_load(grad_sh + 3 * capacity, capacity), degree, basis);
+    for (int c = 0; c < 3; ++c)
+        adam_step(basis[k] * lanes_load(grad_sh + c * capacity), lr, sh, adam, (3 * k + c) * capacity);
+}
+
+// Parts that a step of geometry is shared out in: each reads its own rows and writes them, so that few streams of memory
+// are open at a time. The skew goes with the rotation where its map depends on it.
+#define PART_MEAN 0
+#define PART_QUAT 1
+#define PART_SCALE 2
+#define PART_OWN 3  // opacities, and the shape's own but the skew
+#define PART_SKEW 4
+#define PARTS 5     // then one a coefficient of the colour
+
+// Rows of a part, skew left out.
+static inline uint2 part_rows(uint part) {
+    switch (part) {
+    case PART_MEAN: return (uint2)(ROW_MEAN, ROW_MEAN + 3);
+    case PART_QUAT: return (uint2)(ROW_QUAT, ROW_QUAT + 4);
+    case PART_SCALE: return (uint2)(ROW_LOG_SCALE, ROW_LOG_SCALE + 3);
+#ifdef ROW_SKEW
+    case PART_OWN: return (uint2)(ROW_OPACITY_LOGIT, ROW_SKEW);
+#else
+    case PART_OWN: return (uint2)(ROW_OPACITY_LOGIT, GEOM_ROWS);
+#endif
+    default: return (uint2)(0, 0);
+    }
+}
+#define PART_ROWS 4  // at most
+
+// Adds to g, the gradients of a part's rows, those of opacity_scale * sum(|opacity|) + scale_scale * sum(scale)
+// (3DGS-MCMC's regularisers) and, where a splat has two opacities, whose mean counts then, of
+// bisect_scale * sum((one - other)^2) (3DSGS).
+static inline void regularise(uint part, vreal *g, global const real *geom, const ulong capacity, real opacity_scale,
+                              real scale_scale, real bisect_scale)
+{
+    if (part == PART_SCALE)
+        for (int c = 0; c < 3; ++c) g[c] += scale_scale * exp(lanes_load(geom + (ROW_LOG_SCALE + c) * capacity));
+    if (part == PART_OWN) {
+        const vreal o = opacity_of(lanes_load(geom + ROW_OPACITY_LOGIT * capacity));
+        vreal v_o = opacity_scale * sign(o);
+#ifdef ROW_OPACITY_MINUS_LOGIT
+        const vreal o_minus = opacity_of(lanes_load(geom + ROW_OPACITY_MINUS_LOGIT * capacity));
+        const vreal gap = (real)2 * bisect_scale * (o - o_minus);
+        const vreal v_minus = (real)0.5 * opacity_scale * sign(o_minus) - gap;
+        v_o = (real)0.5 * v_o + gap;
+        g[ROW_OPACITY_MINUS_LOGIT - ROW_OPACITY_LOGIT] += v_minus * opacity_slope(o_minus);
+#endif
+        g[0] += v_o * opacity_slope(o);
+    }
+}
+
+// One step of all parameters but the means that SGHMC moves (then means_learn is 0): geom, sh and their moments in place.
+// grad_geom may change where the skew's map depends on the rotation. rates [3, GEOM_ROWS]: the rate (of the means
+// mean_lr instead), and the bounds of what is stepped in the logarithm (0, 0 without). The skew follows the trainable one,
+// skew_s with skew_m, skew_v [SKEW_WIDTH, capacity] (of any content in shapes without), which learns if skew_learns; all
+// else learns if base_learns. Global size: (capacity / LANES, PARTS + coefficients of the degree).
+kernel void step_splats(
+    global real *restrict geom,
+    global real *restrict grad_geom,
+    global real *restrict geom_m,
+    global real *restrict geom_v,
+    global real *restrict sh,
+    global const real *restrict grad_sh,
+    global real *restrict sh_m,
+    global real *restrict sh_v,
+    global real *restrict skew_s,
+    global real *restrict skew_m,
+    global real *restrict skew_v,
+    constant real *restrict rates,
+    ulong capacity,
+    int sh_degree,
+    uint base_learns,
+    uint means_learn,
+    uint skew_learns,
+    real mean_lr,
+    real sh_lr,
+    real sh_rest_lr,
+    real skew_lr,
+    real correct1,
+    real correct2,
+    real skew_correct1,
+    real skew_correct2,
+    real opacity_scale,
+    real scale_scale,
+    real bisect_scale)
+{
+    const ulong i = get_global_id(0) * LANES;
+    const uint part = get_global_id(1);
+    if (part >= PARTS) {
+        const adam_moments adam = {sh_m + i, sh_v + i, correct1, correct2};
+        const uint k = part - PARTS;
+        if (base_learns) step_coefficient(k, sh_degree, k == 0 ? sh_lr : sh_rest_lr, sh + i, grad_sh + i, adam, capacity);
+        return;
+    }
+    geom += i;
+    grad_geom += i;
+    const uint2 rows = part_rows(part);
+    vreal g[PART_ROWS];
+    for (uint row = rows.x; row < rows.y; ++row) g[row - rows.x] = lanes_load(grad_geom + row * capacity);
+    if (opacity_scale > 0 || scale_scale > 0 || bisect_scale > 0)
+        regularise(part, g, geom, capacity, opacity_scale, scale_scale, bisect_scale);
+#ifdef ROW_SKEW
+    const bool maps = part == (SKEW_ROTATES ? PART_QUAT : PART_SKEW) && (skew_learns || SKEW_ROTATES);
+    vreal v_s[SKEW_WIDTH];
+    if (maps) {
+        vec3 v = vec3_load(grad_geom + ROW_SKEW * capacity, capacity);
+#if SKEW_ROTATES
+        const unit_quat q = quat_load(geom + ROW_QUAT * capacity, capacity);
+        const vec3 a = skew_of(skew_s + i, capacity);
+        global real *v_quat = grad_geom + ROW_QUAT * capacity;
+        quat_rotation_vjp(q, (mat3){scale3(v, a.x), scale3(v, a.y), scale3(v, a.z)}, lanes_mask(1), v_quat, capacity);
+        for (int c = 0; c < 4; ++c) g[c] += lanes_load(v_quat + c * capacity);
+        v = mat3_apply(quat_rotation(q), v);
+#endif
+        skew_of_vjp(skew_s + i, v, v_s, capacity);
+    }
+#endif
+    const adam_moments adam = {geom_m + i, geom_v + i, correct1, correct2};
+    if (part == PART_MEAN ? means_learn : base_learns)
+        for (uint row = rows.x; row < rows.y; ++row) {
+            const real lr = part == PART_MEAN ? mean_lr : rates[row];
+            const real low = rates[GEOM_ROWS + row], high = rates[2 * GEOM_ROWS + row];
+            if (high > 0)
+                adam_step_bounded(g[row - rows.x], lr, low, high, geom, adam, row * capacity);
+            else
+                adam_step(g[row - rows.x], lr, geom, adam, row * capacity);
+        }
+#ifdef ROW_SKEW
+    if (!maps) return;
+    const adam_moments adam_s = {skew_m + i, skew_v + i, skew_correct1, skew_correct2};
+    if (skew_learns)
+        for (int row = 0; row < SKEW_WIDTH; ++row) adam_step(v_s[row], skew_lr, skew_s + i, adam_s, row * capacity);
+    vec3 skew = skew_of(skew_s + i, capacity);
+#if SKEW_ROTATES
+    skew = mat3_apply_transposed(quat_rotation(quat_load(geom + ROW_QUAT * capacity, capacity)), skew);
+#endif
+    vec3_store(skew, geom + ROW_SKEW * capacity, capacity);
+#endif
 }
 
 // One step of the means with momentum [3, capacity]: clsplat/sghmc.py has the formula and the coefficients.
@@ -83,71 +212,6 @@ kernel void sghmc_step(
         const vreal p = gate * (keep * lanes_load(momentum + own) + noise * random[c]) - drive * g;
         lanes_store(p, momentum + own);
         lanes_store(lanes_load(geom + row) + length * p, geom + row);
-    }
-}
-
-#ifdef ROW_SKEW
-// The gradient v_s of the trainable skew, from that of the kernel's; adds to the rotation's where the map depends on it.
-kernel void skew_map_vjp(
-    global const real *restrict skew_s,
-    global const real *restrict geom,
-    global real *restrict grad_geom,
-    global real *restrict v_s,
-    ulong capacity)
-{
-    const ulong i = get_global_id(0) * LANES;
-    vec3 v = vec3_load(grad_geom + i + ROW_SKEW * capacity, capacity);
-#if SKEW_ROTATES
-    const unit_quat q = quat_load(geom + i + ROW_QUAT * capacity, capacity);
-    const vec3 a = skew_of(skew_s + i, capacity);
-    global real *to = grad_geom + i + ROW_QUAT * capacity;
-    vreal others[4];
-    for (int c = 0; c < 4; ++c) others[c] = lanes_load(to + c * capacity);
-    quat_rotation_vjp(q, (mat3){scale3(v, a.x), scale3(v, a.y), scale3(v, a.z)}, lanes_mask(1), to, capacity);
-    for (int c = 0; c < 4; ++c) lanes_store(lanes_load(to + c * capacity) + others[c], to + c * capacity);
-    v = mat3_apply(quat_rotation(q), v);
-#endif
-    skew_of_vjp(skew_s + i, v, v_s + i, capacity);
-}
-
-// The kernel's skew anew.
-kernel void skew_map(global const real *restrict skew_s, global real *restrict geom, ulong capacity)
-{
-    const ulong i = get_global_id(0) * LANES;
-    vec3 skew = skew_of(skew_s + i, capacity);
-#if SKEW_ROTATES
-    const mat3 rotation = quat_rotation(quat_load(geom + i + ROW_QUAT * capacity, capacity));
-    skew = mat3_apply_transposed(rotation, skew);
-#endif
-    vec3_store(skew, geom + i + ROW_SKEW * capacity, capacity);
-}
-#endif
-
-// Adds the gradients of opacity_scale * sum(|opacity|) + scale_scale * sum(scale) (3DGS-MCMC's regularisers) and, where
-// a splat has two opacities, whose mean counts then, of bisect_scale * sum((one - other)^2) (3DSGS).
-kernel void regularise(
-    global const real *restrict geom,
-    global real *restrict grad_geom,
-    ulong capacity,
-    real opacity_scale,
-    real scale_scale,
-    real bisect_scale)
-{
-    const ulong i = get_global_id(0) * LANES;
-    const ulong at = i + ROW_OPACITY_LOGIT * capacity;
-    const vreal o = opacity_of(lanes_load(geom + at));
-    vreal v_o = opacity_scale * sign(o);
-#ifdef ROW_OPACITY_MINUS_LOGIT
-    const ulong at_minus = i + ROW_OPACITY_MINUS_LOGIT * capacity;
-    const vreal o_minus = opacity_of(lanes_load(geom + at_minus)), gap = (real)2 * bisect_scale * (o - o_minus);
-    const vreal v_minus = (real)0.5 * opacity_scale * sign(o_minus) - gap;
-    v_o = (real)0.5 * v_o + gap;
-    lanes_store(lanes_load(grad_geom + at_minus) + v_minus * opacity_slope(o_minus), grad_geom + at_minus);
-#endif
-    lanes_store(lanes_load(grad_geom + at) + v_o * opacity_slope(o), grad_geom + at);
-    for (int c = 0; c < 3; ++c) {
-        const ulong to = i + (ROW_LOG_SCALE + c) * capacity;
-        lanes_store(lanes_load(grad_geom + to) + scale_scale * exp(lanes_load(geom + to)), grad_geom + to);
     }
 }
 

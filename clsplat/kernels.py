@@ -86,14 +86,14 @@ class KernelBuild:
         return build(device, ("lanes.clh", "loss.cl"), defines, self.real)
 
     def optim_program(self, device: Device) -> Program:
-        """Adam, skew map, regularisers, noise and gathers."""
-        wanted = ("ROW_", "LANES", "SKEW_", "SLANT_", "OPACITY_")
+        """The step with its skew map and regularisers, noise and gathers."""
+        wanted = ("ROW_", "LANES", "SKEW_", "SLANT_", "OPACITY_", "SH_")
         defines = {k: v for k, v in self._defines().items() if k.startswith(wanted)}
         # 1 - beta is a constant of its own: as a difference of float32 it is off by 1e-5.
         defines |= {"ADAM_BETA1": adam.BETA1, "ADAM_BETA2": adam.BETA2, "ADAM_EPS": adam.EPS,
                     "ADAM_REST1": 1.0 - adam.BETA1, "ADAM_REST2": 1.0 - adam.BETA2,
-                    "SKEW_MAP": SKEW_MAPS.index(self.skew_map)}
-        files = ("lanes.clh", "algebra.clh", "opacity.clh", "skew_map.clh", "noise.clh", "optim.cl")
+                    "SKEW_MAP": SKEW_MAPS.index(self.skew_map), "GEOM_ROWS": self.schema.rows(Group.GEOM)}
+        files = ("lanes.clh", "algebra.clh", "opacity.clh", "harmonics.clh", "skew_map.clh", "noise.clh", "optim.cl")
         return build(device, files, defines, self.real)
 
     def for_rendering(self) -> KernelBuild:

@@ -6,9 +6,10 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from .buffers import ParameterBuffers, SplatBuffers
+from .buffers import SplatBuffers
 from .config import TrainConfig
 from .device import Device
+from .gradients import CompactGradients
 from .kernels import KernelBuild
 from .optim_fused import FusedOptimizer
 from .optim_host import HostOptimizer
@@ -23,8 +24,8 @@ class Optimizer(Protocol):
     (skew_map.py), all else by Adam. A block that does not learn (blocks.py) keeps values, moments and step count.
     """
 
-    def step(self, grads: ParameterBuffers, mean_lr: float, sh_degree: int, iteration: int) -> None:
-        """One step on all splats.
+    def step(self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int) -> None:
+        """One step on all splats, regularisers included.
 
         Parameters
         ----------

@@ -9,14 +9,18 @@ from numpy.typing import NDArray
 
 from .buffers import ParameterBuffers, SplatBuffers, fill_zero, to_device, to_host
 from .device import Device
+from .gradients import CompactGradients
 from .kernels import KernelBuild
 from .optim_reference import BETA1, BETA2
 from .optim_rules import Rules
 from .plan import Plan
 from .program import GROUP_ITEMS, lane_group
-from .schema import Array, Field, Group, Schema
+from .schema import Array, Group, Schema, sh_coefficients
 from .sghmc import STREAM, Sghmc
 from .skew_map import SkewMap
+
+_PARTS = 5  # of geometry in a step (cl/optim.cl)
+_CPU_GROUP = 8  # work-items of a step: fewer cost a call each, more spill their private arrays
 
 
 class Rows:
@@ -41,16 +45,13 @@ class Rows:
 
 
 class TrainableSkew:
-    """The trainable skew s, the gradient that the map's chain rule gives it, and Adam's moments of it."""
+    """The trainable skew s and Adam's moments of it."""
 
-    def __init__(self, splats: SplatBuffers, skew_map: SkewMap, rate: float) -> None:
+    def __init__(self, splats: SplatBuffers, skew_map: SkewMap) -> None:
         self.map, self.steps = skew_map, 0
-        self.s, self.grad, self.first, self.second = (Rows(splats, skew_map.width) for _ in range(4))
+        self.s, self.first, self.second = (Rows(splats, skew_map.width) for _ in range(3))
         values = splats.download(splats.n, ("skew", "quat"))
         self.s.set(skew_map.inverse(values["skew"], values["quat"]))
-        rates = np.full(skew_map.width, rate, splats.dtype)
-        self.rates = splats.device.alloc(rates.nbytes)
-        to_device(splats.device, self.rates, rates)
 
 
 class FusedOptimizer:
@@ -60,43 +61,43 @@ class FusedOptimizer:
         self.device, self.kernels, self.splats, self.rules = device, kernels, splats, rules
         self.program = kernels.optim_program(device)
         self._group = lane_group(device)
+        self._step_group = _CPU_GROUP if device.info.type == "CPU" else GROUP_ITEMS
         self.steps = 0
         schema, dtype = splats.schema, splats.dtype
         # Of the size of the splats' own buffers, so that one spare serves all; the skew's rows are not used.
         self.first = ParameterBuffers(device, schema, splats.capacity, dtype)
         self.second = ParameterBuffers(device, schema, splats.capacity, dtype)
         self.spare = {group: device.alloc(splats.group_bytes(group)) for group in Group}
-        self.skew = TrainableSkew(splats, rules.map, rules.rates["skew"]) if rules.map is not None else None
+        self.skew = TrainableSkew(splats, rules.map) if rules.map is not None else None
         self.momentum = Rows(splats, 3) if rules.sghmc is not None else None
         base = rules.base_fields(schema)
         self._base_names = tuple(field.name for field in base)
-        self._bounded = [field for field in base if field.bounds is not None]
-        plain = [field for field in base if field.group is Group.GEOM and field.bounds is None
-                 and not (field.name == "mean" and self.momentum is not None)]
-        self._runs = _runs(schema, plain)
-        rates = [rules.rates.get(field.name, 0.0) for field in schema.group(Group.GEOM) for _ in range(field.width)]
-        self._geom_rates = np.array(rates, dtype)
-        sh_rates = rules.sh_rates(schema.rows(Group.SH), dtype)
-        self._rate_buffers = {Group.GEOM: device.alloc(self._geom_rates.nbytes),
-                              Group.SH: device.alloc(sh_rates.nbytes)}
-        to_device(device, self._rate_buffers[Group.SH], sh_rates)
+        table = _rate_table(schema, rules, dtype)
+        self._rates = device.alloc(table.nbytes)
+        to_device(device, self._rates, table)
+        self._sh_rates = rules.sh_rates(schema.rows(Group.SH), dtype)
 
-    def step(self, grads: ParameterBuffers, mean_lr: float, sh_degree: int, iteration: int) -> None:
-        blocks, skew = self.rules.blocks(iteration), self.skew
-        capacity = self.splats.capacity
-        maps = skew is not None and (blocks.skew or skew.map.rotates)
-        if skew is not None and maps:
-            self.program.skew_map_vjp.over(self._columns, self._group, skew_s=skew.s.buffer, geom=self.splats.geom,
-                                           grad_geom=grads.geom, v_s=skew.grad.buffer, capacity=capacity)
-        if blocks.base:
-            self._step_base(grads, mean_lr, sh_degree, iteration)
-        if skew is not None and blocks.skew:
-            skew.steps += 1
-            self._adam(skew.s.buffer, skew.grad.buffer, skew.first.buffer, skew.second.buffer, skew.rates, 0,
-                       skew.map.width, skew.steps)
-        if skew is not None and maps:
-            self.program.skew_map.over(self._columns, self._group, skew_s=skew.s.buffer, geom=self.splats.geom,
-                                       capacity=capacity)
+    def step(self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int) -> None:
+        blocks, skew, sghmc = self.rules.blocks(iteration), self.skew, self.rules.sghmc
+        self.steps += blocks.base
+        if blocks.base and sghmc is not None and self.momentum is not None:  # first: it sees the old covariance
+            self._sghmc(sghmc, self.momentum, grads, mean_lr, iteration)
+        rows = {"skew_s": grads.geom, "skew_m": grads.geom, "skew_v": grads.geom}  # not looked at
+        of_skew = _corrections(0)
+        if skew is not None:
+            skew.steps += blocks.skew
+            rows = {"skew_s": skew.s.buffer, "skew_m": skew.first.buffer, "skew_v": skew.second.buffer}
+            of_skew = _corrections(skew.steps)
+        penalty = self.rules.penalty(self.splats.n)
+        self.program.step_splats(
+            (self._columns, _PARTS + sh_coefficients(sh_degree)), (self._step_group, 1), geom=self.splats.geom,
+            grad_geom=grads.geom, geom_m=self.first.geom, geom_v=self.second.geom, sh=self.splats.sh, grad_sh=grads.sh,
+            sh_m=self.first.sh, sh_v=self.second.sh, **rows, rates=self._rates, capacity=self.splats.capacity,
+            sh_degree=sh_degree, base_learns=int(blocks.base), means_learn=int(blocks.base and sghmc is None),
+            skew_learns=int(skew is not None and blocks.skew), mean_lr=mean_lr, sh_lr=self._sh_rates[0],
+            sh_rest_lr=self._sh_rates[-1], skew_lr=self.rules.rates.get("skew", 0.0), **_corrections(self.steps),
+            skew_correct1=of_skew["correct1"], skew_correct2=of_skew["correct2"], opacity_scale=penalty.opacity,
+            scale_scale=penalty.scale, bisect_scale=penalty.bisect)
 
     def apply(self, plan: Plan) -> None:
         splats, n_old, n_new = self.splats, self.splats.n, len(plan.source)
@@ -156,31 +157,7 @@ class FusedOptimizer:
         """Work-items of a kernel over all splats."""
         return -(-self.splats.n // (self.kernels.lanes * GROUP_ITEMS)) * GROUP_ITEMS
 
-    def _step_base(self, grads: ParameterBuffers, mean_lr: float, sh_degree: int, iteration: int) -> None:
-        self.steps += 1
-        if self.rules.sghmc is not None and self.momentum is not None:  # first: it sees the old covariance
-            self._sghmc(self.rules.sghmc, self.momentum, grads, mean_lr, iteration)
-        self._geom_rates[:3] = mean_lr
-        to_device(self.device, self._rate_buffers[Group.GEOM], self._geom_rates)
-        runs = [(Group.GEOM, *run) for run in self._runs] + [(Group.SH, 0, 3 * (sh_degree + 1) ** 2)]
-        for group, first_row, rows in runs:
-            self._adam(self.splats.buffers[group], grads.buffers[group], self.first.buffers[group],
-                       self.second.buffers[group], self._rate_buffers[group], first_row, rows, self.steps)
-        for field in self._bounded:
-            assert field.bounds is not None
-            self.program.adam_step_bounded.over(
-                self._columns, self._group, value=self.splats.geom, grad=grads.geom, adam_m=self.first.geom,
-                adam_v=self.second.geom, capacity=self.splats.capacity, row=self.splats.schema.offset(field.name),
-                lr=self.rules.rates[field.name], low=field.bounds[0], high=field.bounds[1],
-                **_corrections(self.steps))
-
-    def _adam(self, value: Any, grad: Any, first: Any, second: Any, rates: Any, first_row: int, rows: int,
-              steps: int) -> None:
-        self.program.adam_step(
-            (self._columns, rows), (GROUP_ITEMS, 1), value=value, grad=grad, adam_m=first, adam_v=second, lr=rates,
-            capacity=self.splats.capacity, first_row=first_row, **_corrections(steps))
-
-    def _sghmc(self, sghmc: Sghmc, momentum: Rows, grads: ParameterBuffers, mean_lr: float, iteration: int) -> None:
+    def _sghmc(self, sghmc: Sghmc, momentum: Rows, grads: CompactGradients, mean_lr: float, iteration: int) -> None:
         c, seed = self.rules.coefficients(sghmc, iteration, mean_lr), self.rules.config.seed
         self.program.sghmc_step.over(
             self._columns, self._group, geom=self.splats.geom, grad_geom=grads.geom, adam_m=self.first.geom,
@@ -238,17 +215,13 @@ class FusedOptimizer:
 
 
 def _corrections(steps: int) -> dict[str, float]:
-    """Adam's bias corrections after `steps`."""
-    return {"correct1": 1 / (1 - BETA1**steps), "correct2": 1 / (1 - BETA2**steps)}
+    """Adam's bias corrections after `steps`; 0 before the first."""
+    return {"correct1": 1 / (1 - BETA1**steps) if steps else 0.0, "correct2": 1 / (1 - BETA2**steps) if steps else 0.0}
 
 
-def _runs(schema: Schema, fields: list[Field]) -> list[tuple[int, int]]:
-    """(first row, rows) of each run of neighbouring fields of geom."""
-    runs: list[tuple[int, int]] = []
-    for field in fields:
-        start = schema.offset(field.name)
-        if runs and sum(runs[-1]) == start:
-            runs[-1] = (runs[-1][0], runs[-1][1] + field.width)
-        else:
-            runs.append((start, field.width))
-    return runs
+def _rate_table(schema: Schema, rules: Rules, dtype: np.dtype[np.floating]) -> Array:
+    """Per row of geom (3, G): its rate, and its bounds, 0 and 0 without."""
+    fields = schema.group(Group.GEOM)
+    columns = [(rules.rates.get(field.name, 0.0), *(field.bounds or (0.0, 0.0))) for field in fields
+               for _ in range(field.width)]
+    return np.array(columns, dtype).T.copy()

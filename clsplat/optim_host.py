@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .buffers import ParameterBuffers, SplatBuffers
+from .buffers import SplatBuffers
+from .gradients import CompactGradients
 from .noise import normal3
 from .optim_reference import NumpyAdam
 from .optim_rules import Rules
@@ -36,9 +37,11 @@ class HostOptimizer:
             self.skew_s = rules.map.inverse(params["skew"], params["quat"])
         self.skew = NumpyAdam({"skew": self.skew_s})
 
-    def step(self, grads: ParameterBuffers, mean_lr: float, sh_degree: int, iteration: int) -> None:
-        blocks, skew_map = self.rules.blocks(iteration), self.rules.map
-        params, gradients = self.splats.download(self.splats.n), grads.download(self.splats.n)
+    def step(self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int) -> None:
+        blocks, skew_map, n = self.rules.blocks(iteration), self.rules.map, self.splats.n
+        params, gradients = self.splats.download(n), grads.written_out(n)
+        for name, pull in self.rules.penalty(n).gradients(self.rules.shape, params).items():
+            gradients[name] += pull
         maps = skew_map is not None and (blocks.skew or skew_map.rotates)
         if skew_map is not None and maps:
             gradients["skew"], v_quat = skew_map.vjp(self.skew_s, params["quat"], gradients["skew"])

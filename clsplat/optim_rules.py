@@ -1,4 +1,4 @@
-"""What both optimizers go by: rates, the skew map, how positions move, and which blocks learn when."""
+"""What both optimizers go by: rates, regularisers, the skew map, how positions move, and which blocks learn when."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .blocks import Blocks, active_blocks
 from .config import TrainConfig
 from .errors import InputError
+from .regularisers import Penalty
 from .schema import Array, Field, Schema
 from .sghmc import Coefficients, Sghmc
 from .shapes import Shape, shape_named
@@ -49,6 +50,11 @@ class Rules:
         rates = np.full(rows, self.rates["sh"], dtype)
         rates[3:] *= SH_REST_FACTOR
         return rates
+
+    def penalty(self, n: int) -> Penalty:
+        """The regularisers of n splats: the config's weights are those of means over splats."""
+        config = self.config
+        return Penalty(config.opacity_reg / n, config.scale_reg / (3 * n), config.bisect_reg / n)
 
     @cached_property
     def map(self) -> SkewMap | None:

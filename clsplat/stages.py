@@ -22,7 +22,7 @@ STAGES = {
     "rasterize_vjp": ("rasterize_vjp",),
     "gather": ("gather_isect_grads",),
     "project_vjp": ("project_splats_vjp",),
-    "step": ("adam_step", "adam_step_bounded", "sghmc_step", "skew_map", "skew_map_vjp", "regularise", "mcmc_noise"),
+    "step": ("step_splats", "sghmc_step", "mcmc_noise"),
     "strategy": ("gather_columns", "zero_columns"),
     "transfers": TRANSFERS,
 }

@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from .blocks import active_blocks
-from .buffers import ParameterBuffers, SplatBuffers
+from .buffers import SplatBuffers
 from .checkpoint import Checkpoint
 from .config import TrainConfig
 from .device import Device, Schedule, open_device
 from .errors import InputError, TrainingError
 from .evaluate import Evaluation, evaluate
+from .gradients import CompactGradients
 from .initialise import initial_splats
 from .interrupt import stoppable
 from .kernels import KernelBuild
@@ -102,7 +103,7 @@ class Trainer:
         self.pipeline = Pipeline(self.device, self.kernels)
         self.splats = SplatBuffers(self.device, self.kernels.schema, capacity, dtype)
         self.splats.set(first)
-        self.grads = ParameterBuffers(self.device, self.splats.schema, capacity, dtype)
+        self.grads = CompactGradients(self.device, self.splats.schema, capacity, dtype)
         self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config, scene.extent)
         if checkpoint is not None:
             self.optimizer.load_state(checkpoint.optimizer)
@@ -161,12 +162,6 @@ class Trainer:
         layout = self.loss.set_truth(image)
         frame = self.pipeline.forward(self.splats, camera, config.background, degree)
         self.pipeline.backward(frame, self.loss.gradient(layout), self.grads)
-        if config.opacity_reg or config.scale_reg or config.bisect_reg:
-            n = self.splats.n
-            self.optim_program.regularise.over(
-                -(-n // self.kernels.lanes), geom=self.splats.geom, grad_geom=self.grads.geom,
-                capacity=self.splats.capacity, opacity_scale=config.opacity_reg / n,
-                scale_scale=config.scale_reg / (3 * n), bisect_scale=config.bisect_reg / n)
         mean_lr = self.scene.extent * self.mean_rate(it)
         self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it)
         if self.densify_first <= it <= self.densify_last and it % config.densify_interval == 0:

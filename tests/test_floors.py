@@ -20,7 +20,7 @@ FLOORS = """
     camera device images metrics optim_reference plan ply_header profiles rotations schedules validity colmap_files
     binaries cameras_json capture checkpoint colmap launches noise shapes
     opacities ply program sghmc skew_map
-    adc config densify kernels scene splats
+    adc config densify kernels regularisers scene splats
     blocks buffers camera_path convert initialise model_folder strategy synthetic systems view_sampler
     gradients limits optim_rules sort
     optim_fused optim_host pipeline stages

@@ -7,14 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.buffers import ParameterBuffers, SplatBuffers
+from clsplat.buffers import SplatBuffers
 from clsplat.config import TrainConfig
 from clsplat.device import Device, default_schedule
 from clsplat.errors import InputError
+from clsplat.gradients import CompactGradients
+from clsplat.harmonics import sh_basis
 from clsplat.kernels import KernelBuild
 from clsplat.noise import add_noise
 from clsplat.optim import Optimizer, make_optimizer
 from clsplat.plan import Plan
+from clsplat.regularisers import Penalty
 from clsplat.schema import Group
 from clsplat.shapes import SHAPES, shape_named
 from clsplat.skew_map import MAPS, SKEW_MAPS
@@ -29,14 +32,25 @@ TOLERANCE = 3e-6  # ten float32 steps: some ulp of the value or vector, and of t
 SGHMC = {"position_optimizer": "sghmc", "sghmc_burn_in": 4.5 / ITERATIONS}
 CASES = [
     {"shape": "gaussian"},
+    {"shape": "gaussian", "strategy": "adc", "opacity_reg": 3.0, "scale_reg": 2.0},
     *({"shape": "skew-normal", "skew_map": name} for name in MAPS["centred"]),
     *({"shape": "skew-normal-direct", "skew_map": name} for name in MAPS["direct"]),
-    {"shape": "half-gaussian", **SGHMC},
+    {"shape": "half-gaussian", **SGHMC, "bisect_reg": 3.0},
     {"shape": "generalised-exponential"},
     {"shape": "student-t", **SGHMC, "position_optimizer": "sghmc-sss"},
     {"shape": "bisected-skew", "skew_map": "coupled", **SGHMC, "alternation": "cyclic",
      "alternation_warmup": 2.5 / ITERATIONS, "alternation_cycle": 3},
 ]  # fmt: skip
+
+
+def some_directions() -> np.ndarray:
+    """Unit vectors in which no function of the basis is near 0: Adam divides its rounding by its size."""
+    found = np.random.default_rng(2).standard_normal((4000, 3))
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    return found[np.abs(sh_basis(found, 3)).min(axis=1) > 0.05]
+
+
+DIRECTIONS = some_directions()
 
 
 def some_splats(shape: str, n: int = 300, sh_degree: int = 2) -> Splats:
@@ -81,13 +95,23 @@ def started(device: Device, config: TrainConfig, splats: Splats) -> tuple[SplatB
 
 
 def gradients(buffers: SplatBuffers, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    return {name: rng.standard_normal(array.shape).astype(np.float32)
-            for name, array in buffers.download(buffers.n).items()}  # fmt: skip
+    grads = {name: rng.standard_normal(array.shape).astype(np.float32)
+             for name, array in buffers.download(buffers.n).items() if name != "sh"}  # fmt: skip
+    colour = rng.standard_normal((buffers.n, 2, 3)).astype(np.float32)  # its gradient, and the direction
+    colour[:, 1] = rng.choice(DIRECTIONS, buffers.n)
+    return grads | {"sh": colour}
+
+
+def ones(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Gradients of 1 everywhere; directions in which all coefficients have some."""
+    colour = np.ones((len(arrays["mean"]), 2, 3), np.float32)
+    colour[:, 1] = np.sqrt([0.15, 0.25, 0.6])
+    return {key: np.ones_like(value) for key, value in arrays.items()} | {"sh": colour}
 
 
 def step(buffers: SplatBuffers, optimizer: Optimizer, grads: dict[str, np.ndarray], iteration: int,
          sh_degree: int = 2) -> None:
-    on_device = ParameterBuffers(buffers.device, buffers.schema, CAPACITY, buffers.dtype)
+    on_device = CompactGradients(buffers.device, buffers.schema, CAPACITY, buffers.dtype)
     on_device.upload(grads)
     optimizer.step(on_device, MEAN_LR, sh_degree, iteration)
 
@@ -153,7 +177,8 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
     states = [optimizer.state() for _, optimizer in both.values()]
     assert set(states[0]) == set(states[1])
     for name, expected in states[1].items():
-        np.testing.assert_allclose(states[0][name], expected, 1e-6, 1e-6 * np.abs(expected).max(), err_msg=name)
+        near = 3e-5 if name == "momentum" else 1e-6  # its gate takes an opacity's rounding a hundred times
+        np.testing.assert_allclose(states[0][name], expected, near, 1e-6 * np.abs(expected).max(), err_msg=name)
 
 
 @pytest.mark.parametrize("name", ["fused", "numpy"])
@@ -208,7 +233,7 @@ def test_bounded_fields_move_by_factors_and_stay_within(
     arrays = splats.to_numpy()
     arrays[field][:3] = low, high, 2.0
     buffers, optimizer = started(devices[0], config, Splats(shape, arrays))
-    grads = {key: np.ones_like(value) for key, value in arrays.items()}
+    grads = ones(arrays)
     grads[field][1] = -1
     step(buffers, optimizer, grads, 1)
     got = buffers.download(buffers.n)[field]
@@ -247,7 +272,7 @@ def test_every_field_has_a_rate(devices: list[Device]) -> None:
         config = config_of(shape=shape, opacity_lr=0.03)
         splats = some_splats(shape, 20, 0)
         buffers, optimizer = started(devices[0], config, splats)
-        step(buffers, optimizer, {key: np.ones_like(value) for key, value in splats.to_numpy().items()}, 1, 0)
+        step(buffers, optimizer, ones(splats.to_numpy()), 1, 0)
         for key, moved in buffers.download(buffers.n).items():
             change = np.abs(moved - splats.to_numpy()[key])
             assert np.all(change.reshape(len(change), -1).max(axis=1) > 0), (shape, key)
@@ -255,33 +280,28 @@ def test_every_field_has_a_rate(devices: list[Device]) -> None:
                 np.testing.assert_allclose(change, 0.03, rtol=1e-4)
 
 
-# --- kernels beside the step -----------------------------------------------------------------
+# --- what goes into the step, and beside it --------------------------------------------------
 
 
 @pytest.mark.parametrize("shape", ["gaussian", "bisected-skew", "student-t"])
-def test_regularisers_are_the_gradients_of_their_penalties(devices: list[Device], shape: str) -> None:
+def test_regularisers_are_the_gradients_of_their_penalties(shape: str) -> None:
     """Mean |opacity| of a splat's sides, scale, and the squared difference of two sides."""
-    device, splats, kind = devices[0], some_splats(shape), shape_named(shape)
-    kernels = kernels_of(device, config_of(shape=shape))
-    buffers = SplatBuffers.of(device, splats, kernels.dtype)
-    grads = ParameterBuffers(device, splats.schema, buffers.capacity, buffers.dtype)
-    kernels.optim_program(device).regularise.over(
-        -(-buffers.n // kernels.lanes), geom=buffers.geom, grad_geom=grads.geom, capacity=buffers.capacity,
-        opacity_scale=0.3, scale_scale=0.2, bisect_scale=0.7)
+    kind = shape_named(shape)
 
     def penalty(arrays: dict[str, np.ndarray]) -> np.ndarray:
         sides = [kind.opacity(arrays[key]) for key in arrays if "opacity" in key]
         gap = sides[0] - sides[-1]
         return 0.3 * np.abs(sides).mean(axis=0) + 0.2 * np.exp(arrays["log_scale"]).sum(axis=1) + 0.7 * gap**2
 
-    arrays = {key: array.astype(np.float64) for key, array in splats.to_numpy().items()}
-    for key, got in grads.download(buffers.n).items():
-        columns = got.reshape(len(got), -1).T
-        for column, values in enumerate(columns):
+    arrays = {key: array.astype(np.float64) for key, array in some_splats(shape).to_numpy().items()}
+    grads = Penalty(0.3, 0.2, 0.7).gradients(kind, arrays)
+    assert set(grads) == {key for key in arrays if "opacity" in key or key == "log_scale"}
+    for key, got in grads.items():
+        for column, values in enumerate(got.reshape(len(got), -1).T):
             up, down = ({k: a.copy() for k, a in arrays.items()} for _ in range(2))
             up[key].reshape(len(got), -1)[:, column] += 1e-6
             down[key].reshape(len(got), -1)[:, column] -= 1e-6
-            np.testing.assert_allclose(values, (penalty(up) - penalty(down)) / 2e-6, rtol=1e-3, atol=1e-6)
+            np.testing.assert_allclose(values, (penalty(up) - penalty(down)) / 2e-6, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("shape", ["bisected-skew", "student-t"])
