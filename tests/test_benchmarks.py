@@ -72,3 +72,42 @@ def test_systems(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> No
     first, second = (next(run for run in runs if run["system"] == name) for name in ("gaussian", "skew-normal"))
     expected = f"| {second['psnr']:.2f} | {second['psnr'] - first['psnr']:+.2f} | {second['ssim']:.4f} |"
     assert any(expected in line for line in page.splitlines() if line.startswith("| skew-normal | ")), page
+
+
+def test_startup(tmp_path: Path) -> None:
+    out = tmp_path / "startup.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "startup.py"), "--smoke", "--out", str(out)]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [(row["task"], row["caches"]) for row in rows] == [("--help", ""), ("render", "warm")]
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit", "load"} <= set(row)
+        assert 0 < row["fastest"] <= row["seconds"] <= row["slowest"]
+        assert f"| {row['task']} |" in printed
+
+
+def test_scalar(tmp_path: Path) -> None:
+    out = tmp_path / "scalar.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "scalar.py"), "--smoke", "--out", str(out)]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    (row,) = [json.loads(line) for line in out.read_text().splitlines()]
+    assert set(row["ms"]) == {"1x16x16", "256x1x1"}
+    assert row["step_ratio"] == pytest.approx(row["ms"]["256x1x1"]["step"] / row["ms"]["1x16x16"]["step"])
+    assert f"| {row['raster_ratio']:.1f} |" in printed
+
+
+def test_time_to_quality(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    out = tmp_path / "times.jsonl"
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    command = [sys.executable, str(BENCHMARKS / "time_to_quality.py"), "--out", str(out)]
+    options = ["--smoke", "--scenes", scene.name, "--validate", "--options", "", "coarse_to_fine=off"]
+    for _ in range(2):
+        subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["options"] for row in rows] == ["", "coarse_to_fine=off"], "each once, also when it is called again"
+    assert all([point[0] for point in row["along"]] == [2, 4] for row in rows)
+    rows[0]["along"] = [[50, 10.0, 19.0, 100, 19.0], [100, 20.0, 38.0, 100, 23.0]]
+    out.write_text(json.dumps(rows[0]) + "\n")
+    printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
+    assert "| 12.5 | 17.5 |  |  | 100 | 20.0 | 38.0 | 100 | 23.00 |" in printed.splitlines()[-1]

@@ -1,0 +1,113 @@
+"""Vectors against scalars: training steps of one source in two schedules, one work-item a tile and one a pixel.
+
+    python benchmarks/scalar.py [--device 0:0] [--scenes kitchen] [--splats 20000] [--iterations 20]
+    python benchmarks/scalar.py --table                       # print what is there, run nothing
+    python benchmarks/scalar.py --smoke --out FILE            # some seconds, for tests
+
+`256x1x1` has a work-item for every pixel and nothing of a vector's width in its text: what a compiler makes of the
+plain form. Both runs take their steps in turn, over the same views, from a scene's points at full size; times are
+medians, of the device's own clock but for the whole step, which is wall time. A JSON line each, with the ratio of other
+to first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import common
+
+WARM_UP = 2
+RASTER = ("rasterize", "rasterize_vjp")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=["kitchen"], help="of the data folder, or `synthetic`")
+    parser.add_argument("--shapes", nargs="+", default=["gaussian", "skew-normal"])
+    parser.add_argument("--splats", type=int, default=20_000)
+    parser.add_argument("--schedules", nargs=2, default=["cpu16", "gpu256"])
+    parser.add_argument("--iterations", type=int, default=20)
+    parser.add_argument("--device")
+    parser.add_argument("--out", type=Path, default=common.RESULTS / "scalar.jsonl")
+    parser.add_argument("--table", action="store_true")
+    parser.add_argument("--smoke", action="store_true")
+    args = parser.parse_args()
+    if args.smoke:
+        args.scenes, args.shapes, args.splats, args.iterations = ["synthetic"], ["gaussian"], 100, 2
+    for scene in args.scenes if not args.table else ():
+        for shape in args.shapes:
+            common.append(args.out, run(scene, shape, args))
+    print_table(common.read(args.out))
+
+
+def run(name: str, shape: str, args: argparse.Namespace) -> dict[str, Any]:
+    """The line of a scene and shape."""
+    from clsplat.bench import bench_trainer
+    from clsplat.device import Schedule, open_device
+    from clsplat.scene import load_scene
+    from clsplat.synthetic import synthetic_scene
+    from clsplat.tuning import SCHEDULE_VARIABLE
+
+    device, load = open_device(args.device), os.getloadavg()[0]
+    schedules = [str(Schedule.parse(schedule)) for schedule in args.schedules]
+    if name == "synthetic":
+        scene, start = synthetic_scene(args.splats, 64, 48, shape)
+    else:
+        scene, start = load_scene(common.data_folder() / name, eval=False), args.splats
+    trainers = {}
+    for schedule in schedules:
+        os.environ[SCHEDULE_VARIABLE] = schedule
+        trainers[schedule] = bench_trainer(scene, device, shape, start)
+    done: dict[str, list[dict[str, float]]] = {schedule: [] for schedule in schedules}
+    for _ in range(WARM_UP + args.iterations):
+        for schedule, trainer in trainers.items():
+            done[schedule].append(timed_step(trainer))
+    times = {schedule: {stage: statistics.median(one[stage] for one in each[WARM_UP:]) for stage in (*RASTER, "step")}
+             for schedule, each in done.items()}
+    camera = scene.cameras[0]
+    return common.environment(device, schedules[0]) | {
+        "scene": name, "shape": shape, "splats": trainers[schedules[0]].splats.n, "width": camera.width,
+        "height": camera.height, "load": load, "other": schedules[1], "ms": times,
+        "raster_ratio": raster(times[schedules[1]]) / raster(times[schedules[0]]),
+        "step_ratio": times[schedules[1]]["step"] / times[schedules[0]]["step"]}
+
+
+def timed_step(trainer: Any) -> dict[str, float]:
+    """Milliseconds of one training step: of the rasteriser's two stages on the device, and of the whole step."""
+    from clsplat.launches import recorded
+
+    trainer.device.queue.finish()
+    with recorded(trainer.device) as launches:
+        start = time.perf_counter()
+        trainer.step()
+        trainer.device.queue.finish()
+        wall = 1e3 * (time.perf_counter() - start)
+    return {stage: sum(launch.ms for launch in launches if launch.name == stage) for stage in RASTER} | {"step": wall}
+
+
+def raster(times: dict[str, float]) -> float:
+    return sum(times[stage] for stage in RASTER)
+
+
+def print_table(rows: list[dict[str, Any]]) -> None:
+    """A line a case: both schedules' times, and how many times longer the other takes."""
+    titles = ["scene", "splats", "shape", "platform", "schedules", "load", "rasterize [ms]", "rasterize_vjp [ms]",
+              "both: ratio", "step [ms]", "step: ratio"]
+    print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
+    for row in rows:
+        pair = (row["schedule"], row["other"])
+        forward, backward, step = (" / ".join(f"{row['ms'][schedule][stage]:.1f}" for schedule in pair)
+                                   for stage in (*RASTER, "step"))
+        cells = [f"{row['scene']} {row['width']}x{row['height']}", row["splats"], row["shape"],
+                 row["platform"].split()[0], " / ".join(pair), f"{row['load']:.1f}", forward, backward,
+                 f"{row['raster_ratio']:.1f}", step, f"{row['step_ratio']:.1f}"]
+        print("| " + " | ".join(map(str, cells)) + " |")
+
+
+if __name__ == "__main__":
+    main()
