@@ -228,18 +228,19 @@ kernel void rasterize_vjp(
     }
 }
 
-// moments [V_RECORD, capacity]: each splat's isects summed in order. Overwrites.
+// moments [V_RECORD, capacity]: each splat's isects summed in order. Overwrites, or goes on with the sum that is there.
 kernel void gather_isect_grads(
     global const uint2 *restrict splat_isects,
     global const real *restrict isect_grads,
     global real *restrict moments,
     ulong capacity,
-    uint n_splats)
+    uint n_splats,
+    int go_on)
 {
     const uint i = get_global_id(0);
     if (i >= n_splats) return;
     real sums[V_RECORD];
-    for (int j = 0; j < V_RECORD; ++j) sums[j] = 0;
+    for (int j = 0; j < V_RECORD; ++j) sums[j] = go_on ? moments[i + j * capacity] : 0;
     const uint2 range = splat_isects[i];
     for (uint isect = range.x; isect < range.y; ++isect)
         for (int j = 0; j < V_RECORD; ++j) sums[j] += isect_grads[(ulong)isect * V_RECORD + j];

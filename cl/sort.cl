@@ -1,15 +1,10 @@
 // sort.cl: stable least-significant-digit radix sort of (key, value) pairs, and the exclusive scan it needs.
 //
 // SORT_GROUP work-items share a block of the input; each owns a contiguous run of it, so order within a digit is
-// kept. RADIX = 1 << RADIX_BITS. On a CPU SORT_GROUP is 1 and a digit 11 bits; on a GPU 256 and 4.
+// kept. RADIX = 1 << RADIX_BITS.
 
 #define RADIX (1 << RADIX_BITS)
 #define SORT_ATTRIBUTE __attribute__((reqd_work_group_size(SORT_GROUP, 1, 1)))
-#if SORT_GROUP == 1
-#define sort_barrier()
-#else
-#define sort_barrier() barrier(CLK_LOCAL_MEM_FENCE)
-#endif
 
 // Histograms of this group's runs: hist[digit * SORT_GROUP + item].
 static inline void count_digits(global const uint *keys, uint n, uint run, uint shift, local uint *hist) {
@@ -18,7 +13,7 @@ static inline void count_digits(global const uint *keys, uint n, uint run, uint 
     const ulong start = (ulong)get_global_id(0) * run;
     for (ulong k = start; k < start + run && k < n; ++k)
         ++hist[((keys[k] >> shift) & (RADIX - 1)) * SORT_GROUP + lid];
-    sort_barrier();
+    barrier(CLK_LOCAL_MEM_FENCE);
 }
 
 // counts [RADIX, n_blocks], digit-major: its exclusive scan is where each block's digit starts.
@@ -61,7 +56,7 @@ kernel void radix_scatter(
             at += count;
         }
     }
-    sort_barrier();
+    barrier(CLK_LOCAL_MEM_FENCE);
     const uint lid = get_local_id(0);
     const ulong start = (ulong)get_global_id(0) * run;
     for (ulong k = start; k < start + run && k < n; ++k) {
@@ -80,15 +75,15 @@ kernel void fill_iota(
     if (i < n) values[i] = i;
 }
 
-// Exclusive scan in three steps: sums of runs, scan of the sums by one group, scan within the runs.
+// Exclusive scan in three steps: sums of runs, one a work-item, scan of the sums by one group, scan within the runs.
 kernel void scan_sums(
     global const uint *restrict values,
-    global uint *restrict sums,
+    global ulong *restrict sums,
     uint n,
     uint run)
 {
     const ulong start = (ulong)get_global_id(0) * run;
-    uint sum = 0;
+    ulong sum = 0;
     for (ulong k = start; k < start + run && k < n; ++k) sum += values[k];
     sums[get_global_id(0)] = sum;
 }
@@ -96,46 +91,46 @@ kernel void scan_sums(
 // One group: sums becomes its own exclusive scan; total[0] the grand total.
 SORT_ATTRIBUTE
 kernel void scan_spine(
-    global uint *restrict sums,
-    global uint *restrict total,
+    global ulong *restrict sums,
+    global ulong *restrict total,
     uint n)
 {
-    local uint part[SORT_GROUP];
+    local ulong part[SORT_GROUP];
     const uint lid = get_local_id(0);
     const uint run = (n + SORT_GROUP - 1) / SORT_GROUP;
     const uint start = min(lid * run, n), end = min(start + run, n);
-    uint sum = 0;
+    ulong sum = 0;
     for (uint k = start; k < end; ++k) sum += sums[k];
     part[lid] = sum;
-    sort_barrier();
+    barrier(CLK_LOCAL_MEM_FENCE);
     if (lid == 0) {
-        uint at = 0;
+        ulong at = 0;
         for (uint item = 0; item < SORT_GROUP; ++item) {
-            const uint count = part[item];
+            const ulong count = part[item];
             part[item] = at;
             at += count;
         }
         total[0] = at;
     }
-    sort_barrier();
-    uint at = part[lid];
+    barrier(CLK_LOCAL_MEM_FENCE);
+    ulong at = part[lid];
     for (uint k = start; k < end; ++k) {
-        const uint count = sums[k];
+        const ulong count = sums[k];
         sums[k] = at;
         at += count;
     }
 }
 
-// scanned must be another buffer than values.
+// scanned (modulo 2^32) must be another buffer than values.
 kernel void scan_apply(
     global const uint *restrict values,
-    global const uint *restrict sums,
+    global const ulong *restrict sums,
     global uint *restrict scanned,
     uint n,
     uint run)
 {
     const ulong start = (ulong)get_global_id(0) * run;
-    uint at = sums[get_global_id(0)];
+    uint at = (uint)sums[get_global_id(0)];
     for (ulong k = start; k < start + run && k < n; ++k) {
         scanned[k] = at;
         at += values[k];

@@ -56,6 +56,23 @@ def fill_zero(device: Device, buffer: Any, nbytes: int) -> None:
         device.observe("fill", (nbytes,), event)
 
 
+def copy(device: Device, source: Any, target: Any, nbytes: int) -> None:
+    """Copy the first `nbytes` of a buffer to another."""
+    import pyopencl as cl
+
+    if nbytes:
+        device.observe("copy", (nbytes,), cl.enqueue_copy(device.queue, target, source, byte_count=nbytes))
+
+
+def send_to_device(device: Device, buffer: Any, array: NDArray[Any]) -> Any:
+    """Copy an array into a buffer without waiting. Keep what is returned until the copy is done: letting go waits."""
+    import pyopencl as cl
+
+    event = cl.enqueue_copy(device.queue, buffer, np.ascontiguousarray(array), is_blocking=False)
+    device.observe("upload", (array.nbytes,), event)
+    return event
+
+
 def to_device(device: Device, buffer: Any, array: NDArray[Any], offset: int = 0) -> None:
     """Copy an array into a buffer, at `offset` bytes; returns when it is there."""
     import pyopencl as cl

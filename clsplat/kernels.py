@@ -70,8 +70,8 @@ class KernelBuild:
         return self.schedule.lanes
 
     def raster_program(self, device: Device) -> Program:
-        """Projection, binning, rasterisation, and their gradients."""
-        return self._shape_program(device, "project.cl", "bin.cl", "raster.cl")
+        """Projection, rasterisation, and their gradients."""
+        return self._shape_program(device, "project.cl", "raster.cl")
 
     def count_program(self, device: Device) -> Program:
         """Useful pairs of a frame (pairs.py)."""

@@ -9,7 +9,7 @@ from .config import TrainConfig
 from .device import Device
 from .errors import DeviceError
 from .kernels import KernelBuild
-from .pipeline import ImageLayout
+from .pipeline import ImageLayout, isect_bytes
 from .schema import Group
 from .skew_map import SkewMap
 
@@ -18,17 +18,18 @@ _IMAGE_PLANES = 3 + 1 + 3 + 15 + 9 + 9 + 3  # colour, T, truth, SSIM maps and th
 # Splat-tile pairs of an image: about 100 a tile, however few the splats, and 4 more a splat. At the end of runs on
 # three real scenes of 400-px photos with 5 000 and 20 000 splats there were 0.5 to 0.8 times as many.
 _ISECTS_PER_TILE, _ISECTS_PER_SPLAT = 100, 4
-_SORT_WORDS = 6  # tile, id and their pairs, splat, runs
+_LEAST_ISECTS = 1 << 20  # that there must be room for: images with more are cut into bands
 _SCREEN_WORDS = 16  # keys, orders, rectangles, counts and offsets of a splat
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Bytes by purpose, and the largest single buffer."""
+    """Bytes by purpose, of an isect, and of the largest single buffer other than those of isects."""
 
     splats: int
     isects: int
     images: int
+    isect: int
     largest_buffer: int
 
     @property
@@ -55,20 +56,25 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout) -> 
     real, n = kernels.dtype.itemsize, config.cap_max
     rows = {group: kernels.schema.rows(group) for group in Group}
     screen = (kernels.record + kernels.v_record) * real + 4 * _SCREEN_WORDS
-    isect = kernels.v_record * real + 4 * _SORT_WORDS
+    isect = isect_bytes(kernels)
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
     extra = 8 * SkewMap(config.map).width if config.map else 0  # s, gradient, moments, and a spare of each
     extra += 0 if config.position_optimizer == "adam" else 6  # momentum
-    buffers = [rows[Group.SH] * n * real, n_isects * kernels.v_record * real, 15 * layout.plane * real]
+    buffers = [rows[Group.SH] * n * real, 15 * layout.plane * real]
     return Estimate(n * ((_ROLES * sum(rows.values()) + extra) * real + screen), n_isects * isect,
-                    _IMAGE_PLANES * layout.plane * real, max(buffers))
+                    _IMAGE_PLANES * layout.plane * real, isect, max(buffers))
+
+
+def room_for_isects(needed: Estimate, device: Device) -> int:
+    """Isects that fit beside splats and images; buffers that grow take half as much again."""
+    return max(device.info.global_mem_bytes - needed.splats - needed.images, 0) * 2 // (3 * needed.isect)
 
 
 def check(needed: Estimate, device: Device) -> None:
-    """Raises DeviceError when the estimate does not fit the device."""
+    """Raises DeviceError when splats and images do not fit the device, with some isects beside them."""
     info = device.info
     mend = "lower --cap-max, use smaller images (-r 2, 4, 8), a lower --sh-degree, or another --device"
-    if needed.total > info.global_mem_bytes:
+    if needed.total > info.global_mem_bytes and room_for_isects(needed, device) < _LEAST_ISECTS:
         raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, "
                           f"the run needs about {needed}: {mend}")
     if needed.largest_buffer > info.max_alloc_bytes:

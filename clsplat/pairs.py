@@ -14,9 +14,11 @@ def count_pairs(pipeline: Pipeline, frame: Frame) -> int:
     kernels, layout, pool = pipeline.kernels, frame.layout, pipeline.pool
     n_counts = layout.tiles_x * layout.tiles_y * TILE * TILE // kernels.lanes
     counts = pool.get("pair_counts", 4 * n_counts)
-    kernels.count_program(pipeline.device).count_pairs.over(
-        n_counts, pipeline.group, tile_ranges=pool.get("tile_ranges", 0), lists=frame.lists,
-        isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0), counts=counts, n_counts=n_counts,
-        width=layout.width, height=layout.height, tiles_x=layout.tiles_x)
-    host = to_host(pipeline.device, counts, np.empty(n_counts, np.uint32))
-    return int(host.sum(dtype=np.int64))
+    useful = 0
+    for _, lists in pipeline.bands(frame):
+        kernels.count_program(pipeline.device).count_pairs.over(
+            n_counts, pipeline.group, tile_ranges=pool.get("tile_ranges", 0), lists=lists,
+            isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0), counts=counts, n_counts=n_counts,
+            width=layout.width, height=layout.height, tiles_x=layout.tiles_x)
+        useful += int(to_host(pipeline.device, counts, np.empty(n_counts, np.uint32)).sum(dtype=np.int64))
+    return useful

@@ -1,28 +1,28 @@
 """Splats to an image and gradients back, as a list of kernel launches. Everything stays on the device.
 
-project -> depth sort -> count, scan -> emit -> tile sort -> ranges -> rasterize
+project -> depth order -> isects by tile -> rasterize
 rasterize_vjp -> gather -> project_vjp
-One number crosses to the host in each frame: the count of isects, which sizes the buffers.
+The counts of isects cross to the host once in each frame: they size the buffers. An image with more isects than one
+buffer holds is made in bands of tiles, each listed, rasterized, and listed again by the gradient.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .buffers import ParameterBuffers, Pool, SplatBuffers, fill_zero, to_device, to_host
+from .binning import MAX_ISECTS, Band, cut, make_binner
+from .buffers import ParameterBuffers, Pool, SplatBuffers, fill_zero, send_to_device, to_device, to_host
 from .camera import Camera
 from .device import Device
-from .errors import DeviceError
 from .gradients import CompactGradients
 from .kernels import MARGIN_X, MARGIN_Y, NEAR, TILE, KernelBuild
 from .program import lane_group
-from .sort import Sorter
 
-MAX_ISECTS = 2**31 - 1
 SIGNALS = 3  # screen gradient, depth gradient, times seen
 
 
@@ -73,14 +73,17 @@ class ImageLayout:
 class Frame:
     """A rendered frame on the device; valid until the pipeline's next forward.
 
-    lists : isect ids [n_isects] by tile, front to back.
+    bands : of tiles, in order; the isects of one at a time are on the device (`Pipeline.bands`).
     """
 
     layout: ImageLayout
-    n_isects: int
     sh_degree: int
     splats: SplatBuffers
-    lists: Any
+    bands: tuple[Band, ...]
+
+    @property
+    def n_isects(self) -> int:
+        return sum(band.n_isects for band in self.bands)
 
 
 def camera_block(camera: Camera) -> NDArray[np.float64]:
@@ -99,12 +102,17 @@ class Pipeline:
 
     Images are buffers of the pool in the layout of `ImageLayout`: "color" (3 planes), "transmittance",
     "depth".
+
+    Parameters
+    ----------
+    max_isects : most isects on the device at once; None for what the device allows.
     """
 
-    def __init__(self, device: Device, kernels: KernelBuild) -> None:
+    def __init__(self, device: Device, kernels: KernelBuild, max_isects: int | None = None) -> None:
         self.device, self.kernels = device, kernels
         self.pool = Pool(device)
-        self.sorter = Sorter(device, self.pool)
+        self.binner = make_binner(device, self.pool)
+        self.max_isects = most_isects(device, kernels) if max_isects is None else max_isects
         self.program = kernels.raster_program(device)
         self._real = kernels.dtype.itemsize
         self._layouts: dict[str, tuple[ImageLayout, Any]] = {}
@@ -112,6 +120,8 @@ class Pipeline:
         self._forward_event: Any = None
         self._signal_capacity = 0
         self._backward_event: Any = None
+        self._camera_event: Any = None
+        self._lists: Any = None  # of the band on the device
         self.group = lane_group(device)
 
     def forward(self, splats: SplatBuffers, camera: Camera,
@@ -120,37 +130,28 @@ class Pipeline:
 
         Raises
         ------
-        DeviceError : more isects than fit.
+        DeviceError : more splats over one tile than fit.
         """
         layout = ImageLayout(camera.width, camera.height)
         degree = self.kernels.sh_degree if sh_degree is None else min(sh_degree, self.kernels.sh_degree)
-        n_tiles, n = layout.tiles_x * layout.tiles_y, splats.n
-        pool, real = self.pool, self._real
-        ranges = pool.zeroed("tile_ranges", 8 * n_tiles)
-        records = pool.get("records", n * self.kernels.record * real)
-        pool.get("splat_isects", 8 * n)
-        n_isects = 0
-        if n:
-            self._project(splats, camera, layout, degree, records)
-            n_isects = self._bin(layout, n)
-        lists = pool.get("isect_id", 4 * n_isects)
-        if n_isects:
-            bits = max((n_tiles - 1).bit_length(), 1)
-            tiles, lists = self.sorter.sort("isect_tile", "isect_id", n_isects, bits)
-            self.program.find_tile_ranges.over(n_isects, sorted_tile=tiles, tile_ranges=ranges,
-                                               n_isects=n_isects)
-        group = self.kernels.schedule.group
-        r, g, b = background
-        self._forward_event = self.program.rasterize(
-            (n_tiles * group,), (group,), tile_ranges=ranges, lists=lists,
-            isect_splat=pool.get("isect_splat", 4 * n_isects), records=records,
-            color=self.image("color", layout, 3), transmittance=self.image("transmittance", layout),
-            depth=self.image("depth", layout), isect_runs=pool.get("isect_runs", 4 * n_isects), width=layout.width,
-            height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane,
-            background_r=r, background_g=g, background_b=b,
-        )
-        self.frame = Frame(layout, n_isects, degree, splats, lists)
+        bands = self._project(splats, camera, layout, degree)
+        self.frame = Frame(layout, degree, splats, bands)
+        # The last band first: each launch covers the tiles before its band, too, as tiles without isects.
+        for band in reversed(bands):
+            self._list(self.frame, band)
+            self._forward_event = self._rasterize(layout, band, "", background)
         return self.frame
+
+    def bands(self, frame: Frame) -> Iterator[tuple[Band, Any]]:
+        """The last frame's bands in order, each with its lists (isect ids by tile, front to back) while it is on the
+        device with "tile_ranges" (others': empty), "isect_splat" and "splat_isects".
+        """
+        if len(frame.bands) > 1:
+            self.binner.begin(frame.splats.n, frame.layout.tiles_x, frame.layout.tiles_y)
+        for band in frame.bands:
+            if len(frame.bands) > 1:
+                self._list(frame, band)
+            yield band, self._lists
 
     def backward(self, frame: Frame, v_color: Any, grads: ParameterBuffers,
                  v_alpha: Any | None = None) -> None:
@@ -162,21 +163,24 @@ class Pipeline:
         if not splats.n:
             return
         width = self.kernels.v_record * self._real
-        isect_grads = pool.get("isect_grads", frame.n_isects * width)
+        isect_grads = pool.get("isect_grads", max(band.n_isects for band in frame.bands) * width)
         moments = pool.get("moments", splats.capacity * width)
         group = self.kernels.schedule.group
-        self._backward_event = self.program.rasterize_vjp(
-            (layout.tiles_x * layout.tiles_y * group,), (group,), tile_ranges=pool.get("tile_ranges", 0),
-            lists=frame.lists, isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0),
-            color=pool.get("color", 0), transmittance=pool.get("transmittance", 0), v_color=v_color,
-            v_alpha=v_color if v_alpha is None else v_alpha, isect_runs=pool.get("isect_runs", 0),
-            isect_grads=isect_grads, width=layout.width, height=layout.height, tiles_x=layout.tiles_x,
-            stride=layout.stride, plane=layout.plane,
-        )
-        self.program.gather_isect_grads.over(
-            splats.n, self.group, splat_isects=pool.get("splat_isects", 0), isect_grads=isect_grads,
-            moments=moments, capacity=splats.capacity, n_splats=splats.n,
-        )
+        for band, lists in self.bands(frame):
+            if len(frame.bands) > 1:  # what the forward told of the band's isects is lost; the image must not be
+                self._rasterize(layout, band, "again_")
+            self._backward_event = self.program.rasterize_vjp(
+                (band.past * group,), (group,), tile_ranges=pool.get("tile_ranges", 0), lists=lists,
+                isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0), color=pool.get("color", 0),
+                transmittance=pool.get("transmittance", 0), v_color=v_color,
+                v_alpha=v_color if v_alpha is None else v_alpha, isect_runs=pool.get("isect_runs", 0),
+                isect_grads=isect_grads, width=layout.width, height=layout.height, tiles_x=layout.tiles_x,
+                stride=layout.stride, plane=layout.plane,
+            )
+            self.program.gather_isect_grads.over(
+                splats.n, self.group, splat_isects=pool.get("splat_isects", 0), isect_grads=isect_grads,
+                moments=moments, capacity=splats.capacity, n_splats=splats.n, go_on=int(band.first > 0),
+            )
         self.program.project_splats_vjp.over(
             -(-splats.n // self.kernels.lanes), self.group, geom=splats.geom, sh=splats.sh,
             cam=pool.get("camera", 0), moments=moments, records=pool.get("records", 0),
@@ -230,12 +234,15 @@ class Pipeline:
             self._layouts[name] = (layout, buffer)
         return buffer
 
-    def _project(self, splats: SplatBuffers, camera: Camera, layout: ImageLayout, degree: int,
-                 records: Any) -> None:
+    def _project(self, splats: SplatBuffers, camera: Camera, layout: ImageLayout, degree: int) -> tuple[Band, ...]:
+        """Screen records, depth order, and the bands that the image is cut into."""
         pool, n = self.pool, splats.n
+        records = pool.get("records", n * self.kernels.record * self._real)
+        if not n:
+            return (Band(0, layout.tiles_x * layout.tiles_y, 0),)
         block = camera_block(camera).astype(self.kernels.dtype)
         cam = pool.get("camera", block.nbytes)
-        to_device(self.device, cam, block)
+        self._camera_event = send_to_device(self.device, cam, block)
         self.program.project_splats.over(
             -(-n // self.kernels.lanes), self.group, geom=splats.geom, sh=splats.sh, cam=cam,
             records=records, depth_key=pool.get("depth_key_kept", 4 * n),
@@ -243,27 +250,43 @@ class Pipeline:
             capacity=splats.capacity, n_splats=n, sh_degree=degree, width=layout.width, height=layout.height,
             tiles_x=layout.tiles_x, tiles_y=layout.tiles_y,
         )
+        self.binner.order(n)
+        self.binner.begin(n, layout.tiles_x, layout.tiles_y)
+        return cut(self.binner.count, layout.tiles_x, layout.tiles_y, self.max_isects)
 
-    def _bin(self, layout: ImageLayout, n: int) -> int:
-        """Depth order, isects in depth order; returns their number."""
-        import pyopencl as cl
+    def _list(self, frame: Frame, band: Band) -> None:
+        """The band's isects onto the device."""
+        n_tiles = frame.layout.tiles_x * frame.layout.tiles_y
+        if not frame.splats.n:
+            self.pool.zeroed("tile_ranges", 8 * n_tiles)
+            self._lists = self.pool.get("isect_splat", 0)
+            return
+        if len(frame.bands) > 1:
+            self.pool.zeroed("tile_ranges", 8 * n_tiles)
+        self._lists = self.binner.list_isects(band)
 
-        pool, program = self.pool, self.program
-        keys, values = pool.get("depth_key", 4 * n), pool.get("depth_order", 4 * n)
-        event = cl.enqueue_copy(self.device.queue, keys, pool.get("depth_key_kept", 0), byte_count=4 * n)
-        self.device.observe("copy", (4 * n,), event)
-        self.sorter.iota(values, n)
-        _, order = self.sorter.sort("depth_key", "depth_order", n, 32)
-        counts, offsets = pool.get("isect_counts", 4 * n), pool.get("isect_offsets", 4 * n)
-        rect, total = pool.get("tile_rect", 0), pool.get("n_isects", 4)
-        program.count_isects.over(n, order=order, tile_rect=rect, counts=counts, n_splats=n)
-        self.sorter.scan(counts, offsets, n, total)
-        n_isects = int(to_host(self.device, total, np.empty(1, np.uint32))[0])
-        if n_isects > MAX_ISECTS:
-            raise DeviceError(f"{n_isects} splat-tile pairs in one image: use smaller images (-r 2, 4, 8)")
-        program.emit_isects.over(
-            n, order=order, tile_rect=rect, offsets=offsets, splat_isects=pool.get("splat_isects", 8 * n),
-            isect_tile=pool.get("isect_tile", 4 * n_isects), isect_id=pool.get("isect_id", 4 * n_isects),
-            isect_splat=pool.get("isect_splat", 4 * n_isects), n_splats=n, tiles_x=layout.tiles_x,
+    def _rasterize(self, layout: ImageLayout, band: Band, prefix: str,
+                   background: tuple[float, float, float] = (0, 0, 0)) -> Any:
+        """Images into the buffers of these names after `prefix`; returns the event."""
+        pool, group = self.pool, self.kernels.schedule.group
+        r, g, b = background
+        return self.program.rasterize(
+            (band.past * group,), (group,), tile_ranges=pool.get("tile_ranges", 0), lists=self._lists,
+            isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0),
+            color=self.image(prefix + "color", layout, 3), transmittance=self.image(prefix + "transmittance", layout),
+            depth=self.image(prefix + "depth", layout), isect_runs=pool.get("isect_runs", 4 * band.n_isects),
+            width=layout.width, height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride,
+            plane=layout.plane, background_r=r, background_g=g, background_b=b,
         )
-        return n_isects
+
+
+def most_isects(device: Device, kernels: KernelBuild) -> int:
+    """Isects that fit the device at once: their records in one buffer, all about them in a third of its memory."""
+    record = kernels.v_record * kernels.dtype.itemsize
+    info = device.info
+    return max(min(MAX_ISECTS, info.max_alloc_bytes // record, info.global_mem_bytes // (3 * isect_bytes(kernels))), 1)
+
+
+def isect_bytes(kernels: KernelBuild) -> int:
+    """Device memory for an isect: its gradient record; tile, id and their pairs (if sorted), splat, runs."""
+    return kernels.v_record * kernels.dtype.itemsize + 4 * 6

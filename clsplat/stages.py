@@ -14,8 +14,8 @@ from .sort import radix_passes
 
 STAGES = {
     "project": ("project_splats",),
-    "depth sort": ("fill_iota",),
-    "binning": ("count_isects", "emit_isects"),
+    "depth sort": ("depth_span", "depth_histogram", "depth_scatter", "depth_buckets", "fill_iota"),
+    "binning": ("count_tiles", "total_tiles", "list_isects", "count_isects", "emit_isects"),
     "tile sort": ("find_tile_ranges",),
     "rasterize": ("rasterize",),
     "loss": ("unpack_image", "ssim_rows", "ssim_columns", "ssim_rows_vjp", "loss_vjp", "sum_runs"),
@@ -79,13 +79,21 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
     geometry, colour = kernels.schema.rows(Group.GEOM), 3 * sh_coefficients(sizes.sh_degree)
     record, v_record = real * kernels.record, real * kernels.v_record
     tiles = -(-pixels // 256)
-    depth_passes, tile_passes = (radix_passes(is_cpu, bits) for bits in (32, max((tiles - 1).bit_length(), 1)))
+    depth_passes, tile_passes = (radix_passes(bits) for bits in (32, max((tiles - 1).bit_length(), 1)))
     forward, backward = shape.flops
-    return {
+    if is_cpu:
+        listing = {
+            "depth sort": Work(40 * n),  # keys three times; pairs and numbers written, pairs twice read
+            "binning": Work(52 * n + 8 * isects),  # orders and boxes, boxes in order; ids and splats
+        }
+    else:
+        listing = {
+            "depth sort": Work(n * (4 + 20 * depth_passes)),  # numbers; keys twice, values, and both written
+            "binning": Work(68 * n + 12 * isects),  # order and boxes twice, counts and their scan; three words out
+            "tile sort": Work((4 + 20 * tile_passes) * isects + 8 * tiles),
+        }
+    return listing | {
         "project": Work(n * (real * (geometry + colour) + record + 20)),
-        "depth sort": Work(n * (4 + 20 * depth_passes)),  # numbers; keys twice, values, and both written
-        "binning": Work(68 * n + 12 * isects),  # order and boxes twice, counts and their scan; three words out
-        "tile sort": Work((4 + 20 * tile_passes) * isects + 8 * tiles),
         "rasterize": Work((12 + record) * isects + 4 * real * pixels, pairs * (forward + BLEND)),
         # bytes in, planes: truth 3; rows 6 and 15, columns 21 and 9, back 9 and 9, 15 and 3
         "loss": Work((3 + real * 90) * pixels, 3 * LOSS * pixels),

@@ -22,11 +22,11 @@ from .initialise import initial_splats
 from .interrupt import stoppable
 from .kernels import KernelBuild
 from .loss import ImageLoss, LossValue
-from .memory import check, estimate, peak_bytes
+from .memory import check, estimate, peak_bytes, room_for_isects
 from .model_folder import ModelFolder
 from .opacities import finite_rows
 from .optim import make_optimizer
-from .pipeline import ImageLayout, Pipeline
+from .pipeline import ImageLayout, Pipeline, most_isects
 from .render import Renderer
 from .run_log import Progress, RunLog
 from .scene import Scene, View
@@ -100,7 +100,8 @@ class Trainer:
         n_first = len(first["mean"])
         capacity = max(config.cap_max, n_first)
         dtype = self.kernels.dtype
-        self.pipeline = Pipeline(self.device, self.kernels)
+        most = min(most_isects(self.device, self.kernels), room_for_isects(self.memory, self.device))
+        self.pipeline = Pipeline(self.device, self.kernels, most)
         self.splats = SplatBuffers(self.device, self.kernels.schema, capacity, dtype)
         self.splats.set(first)
         self.grads = CompactGradients(self.device, self.splats.schema, capacity, dtype)

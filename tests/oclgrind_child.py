@@ -9,14 +9,13 @@ lanes_sum and lanes_or go lane by lane.
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 from reference_scenes import for_shape, random_camera, random_splats
 
-from clsplat import buffers, pipeline, program, render, sort
+from clsplat import binning, buffers, pipeline, program, render, sort
 from clsplat.device import Device, Schedule, open_device
 from clsplat.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.splats import Splats
@@ -88,8 +87,11 @@ def make_traceable(device: Device) -> None:
             cl.enqueue_copy(device.queue, staged, words)
             helpers.put((words.size,), None, **{"from": staged, "to": buffer, "at": offset // 4})
 
+    def send_to_device(device: Device, buffer: Any, array: Any) -> None:
+        to_device(device, buffer, array)
+
     for module in (buffers, pipeline, render):
-        for replaced in (fill_zero, to_device):
+        for replaced in (fill_zero, to_device, send_to_device):
             if hasattr(module, replaced.__name__):
                 setattr(module, replaced.__name__, replaced)
 
@@ -122,10 +124,9 @@ def render_and_back(device: Device, shapes: tuple[str, ...], schedules: tuple[st
 
 
 def sort_and_scan(device: Device, mode: str) -> None:
-    """Both forms of the sorter, over a block boundary of each."""
+    """The sorter, over a block boundary; the order by depth of few work-items, over one of chunks and small buckets."""
     rng = np.random.default_rng(0)
-    for kind, n in (("CPU", 1030), ("GPU", 300), ("GPU", 4100)):
-        device.info = replace(device.info, type=kind)
+    for n in (300, 4100):
         pool = buffers.Pool(device)
         sorter = sort.Sorter(device, pool)
         keys = rng.integers(0, 50, n, np.uint32)
@@ -134,6 +135,13 @@ def sort_and_scan(device: Device, mode: str) -> None:
         _, order = sorter.sort("keys", "values", n, 6)
         got = buffers.to_host(device, order, np.empty(n, np.uint32))
         assert np.array_equal(got, np.argsort(keys, kind="stable"))
+    n = 4100
+    pool = buffers.Pool(device)
+    keys = rng.choice(rng.integers(0, 2**31, 60, np.uint32), n)
+    buffers.to_device(device, pool.get("depth_key_kept", 4 * n), keys)
+    binning.ChunkBinner(device, pool).order(n)
+    got = buffers.to_host(device, pool.get("depth_order", 0), np.empty(n, np.uint32))
+    assert np.array_equal(got, np.argsort(keys, kind="stable"))
 
 
 def faults(device: Device, mode: str) -> None:

@@ -9,12 +9,14 @@ from importlib.resources import files
 import pytest
 from kernel_checks import KERNELS
 
+from clsplat.binning import BUCKET_BITS
 from clsplat.device import SCHEDULES, Device
 from clsplat.kernels import KernelBuild
 from clsplat.limits import CHAINS, limits_program
 from clsplat.program import build
 from clsplat.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.skew_map import SKEW_MAPS
+from clsplat.sort import DIGIT_BITS
 
 REALS = ("float", "double")
 
@@ -63,7 +65,8 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
     KernelBuild(DEFAULT_SHAPE, 3, SCHEDULES["cpu16"]).count_program(compiler)
     limits_program(compiler, CHAINS[0])
     build(compiler, ("smoke.cl",))
-    build(compiler, ("sort.cl",), {"SORT_GROUP": 1, "RADIX_BITS": 11})
+    build(compiler, ("sort.cl",), {"SORT_GROUP": 64, "RADIX_BITS": DIGIT_BITS})
+    build(compiler, ("order.cl", "bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
     root = files("clsplat_cl")
     there = {f.name for f in root.iterdir()} | {
         f"{folder}/{f.name}" for folder in ("camera", "shape") for f in root.joinpath(folder).iterdir()
@@ -78,6 +81,8 @@ def test_every_kernel_builds_on_every_device(device: Device) -> None:
         build_all(device, kernels)
 
 
-@pytest.mark.parametrize("group", [1, 64, 256])
-def test_sort_builds(device: Device, group: int) -> None:
-    build(device, ("sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": 11 if group == 1 else 4})
+@pytest.mark.parametrize("group", [64, 256])
+def test_sort_and_binning_build(device: Device, group: int) -> None:
+    build(device, ("sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": DIGIT_BITS})
+    build(device, ("order.cl", "bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
+    build(device, ("bin.cl",))

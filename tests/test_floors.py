@@ -23,8 +23,9 @@ FLOORS = """
     adc config densify kernels regularisers scene splats
     blocks buffers camera_path convert initialise model_folder strategy synthetic systems view_sampler
     gradients limits optim_rules sort
-    optim_fused optim_host pipeline stages
-    loss memory optim pairs tuning
+    binning optim_fused optim_host stages
+    optim pipeline
+    loss memory pairs tuning
     render
     evaluate
     trainer
@@ -34,7 +35,7 @@ FLOOR = {name: level for level, line in enumerate(FLOORS.split("\n")) for name i
 
 # Libraries that only these modules import.
 OWNERS = {
-    "pyopencl": {"buffers", "device", "pipeline", "program"},
+    "pyopencl": {"buffers", "device", "program"},
     "pycolmap": {"colmap"},
     "PIL": {"images"},
     "click": set(),  # the command line's
