@@ -45,7 +45,8 @@ def test_drivers_that_keep_their_own_are_left_to_it() -> None:
 
 
 @given(binary=st.binary(max_size=200), cut=st.integers(0, 300), place=st.integers(0, 300))
-def test_a_damaged_file_is_a_miss(tmp_path_factory: pytest.TempPathFactory, binary: bytes, cut: int, place: int) -> None:
+def test_a_damaged_file_is_a_miss(tmp_path_factory: pytest.TempPathFactory, binary: bytes, cut: int,
+                                  place: int) -> None:
     path = tmp_path_factory.mktemp("bin") / "a.bin"
     assert load_binary(path) is None
     store_binary(path, binary)
