@@ -1,154 +1,236 @@
 // loss.cl: (1 - lambda) L1 + lambda (1 - SSIM), its value and gradient with respect to the rendered image.
 //
 // SSIM: 11 x 11 Gaussian window, sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, zero padding, mean over pixels and channels
-// (Wang et al. 2004, as 3DGS uses it). The window is separable: two passes there, two back. Images are planar with
-// a zero margin (see raster.cl), so no pass tests for a border. Global size: (runs in a row, rows, 3 channels);
-// a run is LANES pixels.
+// (Wang et al. 2004, as 3DGS uses it), written in sum s = x + y and difference d = x - y of rendered x and truth y.
+// With means m of the window and half variances h = (E[s^2] - m_s^2) / 2, likewise for d:
+//   2 m_x m_y = (m_s^2 - m_d^2) / 2    m_x^2 + m_y^2 = (m_s^2 + m_d^2) / 2
+//   2 cov = h_s - h_d                  var_x + var_y = h_s + h_d
+// Four maps to blur instead of five, and where x is close to y less cancels.
+//
+// A work-item goes down a strip of up to STRIP vectors (one, with one lane), `segment` rows of it: it blurs each row, keeps the last 11 in a
+// ring, and blurs the columns from there, so that no blurred map is ever stored. Global size: (at least the strips,
+// segments, 3 channels).
+// Images are planar with a zero margin (see raster.cl), the truth as bytes.
 
 #define SSIM_C1 R(0.0001)
 #define SSIM_C2 R(0.0009)
 
-constant real WINDOW[11] = {WINDOW_0, WINDOW_1, WINDOW_2, WINDOW_3, WINDOW_4, WINDOW_5,
-                            WINDOW_4, WINDOW_3, WINDOW_2, WINDOW_1, WINDOW_0};
+#define REACH 5
+#define TAPS 11
+#define SIDE ((REACH + LANES - 1) / LANES)  // vectors that the window reaches beyond a strip
 
-static inline ulong pixel_at(int stride, ulong plane) {
-    return get_global_id(2) * plane + (get_global_id(1) + MARGIN_Y) * stride + get_global_id(0) * LANES + MARGIN_X;
+// The ring [RING][STRIP][maps]. Each row is written twice, 11 slots apart: so the last 11 are contiguous wherever it
+// stands. With one lane it moves up by a row instead: no index is then variable, and it fits into registers.
+#define SHIFT (LANES == 1)
+#define RING (SHIFT ? TAPS : 2 * TAPS)
+#define SLOT (SHIFT ? TAPS - 1 : slot)
+#define PUT(map, value) (ring[SLOT][v][map] = ring[SHIFT ? SLOT : SLOT + TAPS][v][map] = (value))
+#define MOVE_UP(maps) \
+    if (SHIFT) \
+        for (int k = 0; k < TAPS - 1; ++k) \
+            for (int map = 0; map < maps; ++map) ring[k][0][map] = ring[k + 1][0][map];
+
+// A vector at any address: of vload16, PoCL makes eight loads and as many shuffles where several overlap.
+typedef vreal vreal_anywhere __attribute__((aligned(sizeof(real))));
+#define row_load(p) ((vreal)*(global const vreal_anywhere *)(p))
+#define row_store(v, p) (*(global vreal_anywhere *)(p) = (v))
+#define own_load(p) ((vreal)*(const vreal_anywhere *)(p))
+#define own_store(v, p) (*(vreal_anywhere *)(p) = (v))
+#define truth_load(p) (lanes_uchar_to_real(p) * (real)(1.0 / 255.0))
+
+// Written out, as not every compiler unrolls: `pair(weight, k)` for both pixels k from the centre.
+#define PAIRS_OF_WINDOW(pair) pair(WINDOW_4, 1) pair(WINDOW_3, 2) pair(WINDOW_2, 3) pair(WINDOW_1, 4) pair(WINDOW_0, 5)
+
+// Strip, rows and place of a work-item.
+typedef struct {
+    int first, n;    // vectors of the row
+    int top, end;    // rows
+    ulong at;        // of the strip in row 0
+} strip;
+
+static inline int strips_of(int stride) { return ((stride - 2 * MARGIN_X) / LANES + STRIP - 1) / STRIP; }
+
+// Strips as equal as can be.
+static inline strip own_strip(int height, int stride, ulong plane, int segment) {
+    const int vecs = (stride - 2 * MARGIN_X) / LANES, strips = strips_of(stride), i = get_global_id(0);
+    strip own;
+    own.first = i * vecs / strips;
+    own.n = STRIP == 1 ? 1 : (i + 1) * vecs / strips - own.first;
+    own.top = get_global_id(1) * segment;
+    own.end = min(own.top + segment, height);
+    own.at = get_global_id(2) * plane + (ulong)MARGIN_Y * stride + own.first * LANES + MARGIN_X;
+    return own;
 }
 
-// 8-bit interleaved RGB rows of `width` pixels into a planar image in [0, 1]. Overwrites width x height pixels.
+static inline vmask inside_image(int vec, int width) { return (vreal)(vec * LANES) + lanes_iota() < (vreal)width; }
+
+// 8-bit interleaved RGB rows into planes [3] of bytes with a zero margin. Overwrites; global size: (stride, rows).
 kernel void unpack_image(
     global const uchar *restrict bytes,
-    global real *restrict image,
+    global uchar *restrict truth,
     int width,
-    int stride,
+    int height,
     ulong plane)
 {
-    const size_t x = get_global_id(0), y = get_global_id(1);
-    for (int c = 0; c < 3; ++c)
-        image[c * plane + (y + MARGIN_Y) * stride + x + MARGIN_X] =
-            (real)bytes[3 * (y * width + x) + c] * (real)(1.0 / 255.0);
+    const int x = (int)get_global_id(0) - MARGIN_X, y = (int)get_global_id(1) - MARGIN_Y;
+    const bool inside = x >= 0 && x < width && y >= 0 && y < height;
+    const ulong at = get_global_id(1) * get_global_size(0) + get_global_id(0);
+    for (int c = 0; c < 3; ++c) truth[c * plane + at] = inside ? bytes[3 * ((ulong)y * width + x) + c] : (uchar)0;
 }
 
-// maps [5, 3 planes]: x, y, xx, yy, xy blurred along rows; x rendered, y truth.
-kernel void ssim_rows(
+// partial [3, channels, segments, strips]: sums of |x - y|, SSIM and (x - y)^2. v_maps [3, 3 planes]: gradient of SSIM
+// with respect to the window's mean of x, h_s and h_d (zero outside the image). Overwrites.
+kernel void image_loss(
     global const real *restrict rendered,
-    global const real *restrict truth,
-    global real *restrict maps,
-    int stride,
-    ulong plane)
-{
-    const ulong at = pixel_at(stride, plane);
-    vreal sx = (vreal)0, sy = (vreal)0, sxx = (vreal)0, syy = (vreal)0, sxy = (vreal)0;
-    for (int k = 0; k < 11; ++k) {
-        const vreal x = lanes_load(rendered + at + k - 5), y = lanes_load(truth + at + k - 5);
-        const vreal wx = WINDOW[k] * x, wy = WINDOW[k] * y;
-        sx += wx;
-        sy += wy;
-        sxx = lanes_mad(wx, x, sxx);
-        syy = lanes_mad(wy, y, syy);
-        sxy = lanes_mad(wx, y, sxy);
-    }
-    lanes_store(sx, maps + at);
-    lanes_store(sy, maps + at + 3 * plane);
-    lanes_store(sxx, maps + at + 6 * plane);
-    lanes_store(syy, maps + at + 9 * plane);
-    lanes_store(sxy, maps + at + 12 * plane);
-}
-
-// partial [3, n_runs]: sums of |x - y|, SSIM and (x - y)^2 over each run. v_maps [3, 3 planes]: gradient of SSIM with
-// respect to the blurred x, xx and xy (zero outside the image). Overwrites.
-kernel void ssim_columns(
-    global const real *restrict rendered,
-    global const real *restrict truth,
-    global const real *restrict maps,
+    global const uchar *restrict truth,
     global real *restrict v_maps,
     global real *restrict partial,
     int width,
-    int stride,
-    ulong plane)
-{
-    const ulong at = pixel_at(stride, plane);
-    vreal mx = (vreal)0, my = (vreal)0, mxx = (vreal)0, myy = (vreal)0, mxy = (vreal)0;
-    for (int k = 0; k < 11; ++k) {
-        global const real *from = maps + at + (k - 5) * (long)stride;
-        mx = lanes_mad(WINDOW[k], lanes_load(from), mx);
-        my = lanes_mad(WINDOW[k], lanes_load(from + 3 * plane), my);
-        mxx = lanes_mad(WINDOW[k], lanes_load(from + 6 * plane), mxx);
-        myy = lanes_mad(WINDOW[k], lanes_load(from + 9 * plane), myy);
-        mxy = lanes_mad(WINDOW[k], lanes_load(from + 12 * plane), mxy);
-    }
-    const vreal a1 = (real)2 * mx * my + SSIM_C1, a2 = (real)2 * (mxy - mx * my) + SSIM_C2;
-    const vreal b1 = mx * mx + my * my + SSIM_C1, b2 = mxx - mx * mx + myy - my * my + SSIM_C2;
-    const vreal inv = (vreal)1 / (b1 * b2);
-    const vreal ssim = a1 * a2 * inv;
-    const vreal v_mxy = (real)2 * a1 * inv, v_mxx = -ssim / b2;
-    const vreal v_mx = (real)2 * my * (a2 - a1) * inv - (real)2 * mx * ssim * ((vreal)1 / b1 - (vreal)1 / b2);
-
-    const vreal zero = (vreal)0;
-    const vmask inside = (vreal)(get_global_id(0) * LANES) + lanes_iota() < (vreal)width;
-    lanes_store(lanes_if(inside, v_mx, zero), v_maps + at);
-    lanes_store(lanes_if(inside, v_mxx, zero), v_maps + at + 3 * plane);
-    lanes_store(lanes_if(inside, v_mxy, zero), v_maps + at + 6 * plane);
-    const vreal error = lanes_load(rendered + at) - lanes_load(truth + at);
-    const ulong n_runs = get_global_size(0) * get_global_size(1) * get_global_size(2);
-    const ulong run = (get_global_id(2) * get_global_size(1) + get_global_id(1)) * get_global_size(0) + get_global_id(0);
-    partial[run] = lanes_sum(lanes_if(inside, fabs(error), zero));
-    partial[n_runs + run] = lanes_sum(lanes_if(inside, ssim, zero));
-    partial[2 * n_runs + run] = lanes_sum(lanes_if(inside, error * error, zero));
-}
-
-// hmaps [3, 3 planes]: v_maps blurred along rows (the window is symmetric: its own adjoint).
-kernel void ssim_rows_vjp(
-    global const real *restrict v_maps,
-    global real *restrict hmaps,
-    int stride,
-    ulong plane)
-{
-    const ulong at = pixel_at(stride, plane);
-    for (int map = 0; map < 3; ++map) {
-        vreal sum = (vreal)0;
-        for (int k = 0; k < 11; ++k) sum += WINDOW[k] * lanes_load(v_maps + at + 3 * map * plane + k - 5);
-        lanes_store(sum, hmaps + at + 3 * map * plane);
-    }
-}
-
-// v_color: gradient of the loss; l1_scale = (1 - lambda) / count, ssim_scale = lambda / count. Overwrites.
-kernel void loss_vjp(
-    global const real *restrict rendered,
-    global const real *restrict truth,
-    global const real *restrict hmaps,
-    global real *restrict v_color,
-    int width,
+    int height,
     int stride,
     ulong plane,
+    int segment)
+{
+    const int strips = strips_of(stride);
+    if (get_global_id(0) >= strips) return;
+    const strip own = own_strip(height, stride, plane, segment);
+    vreal ring[RING][STRIP][4];  // s, d, s^2, d^2
+    real s_row[(STRIP + 2 * SIDE) * LANES], d_row[(STRIP + 2 * SIDE) * LANES];
+    vreal l1 = (vreal)0, ssims = (vreal)0, squares = (vreal)0;
+    const vreal zero = (vreal)0;
+    int slot = 0;
+    for (int row = own.top - REACH; row < own.end + REACH; ++row) {
+        MOVE_UP(4)
+        if (row >= 0 && row < height) {
+            const ulong at = own.at + (long)row * stride - SIDE * LANES;
+            for (int v = 0; v < own.n + 2 * SIDE; ++v) {
+                const vreal x = row_load(rendered + at + v * LANES), y = truth_load(truth + at + v * LANES);
+                own_store(x + y, s_row + v * LANES);
+                own_store(x - y, d_row + v * LANES);
+            }
+            for (int v = 0; v < own.n; ++v) {
+                const real *s_at = s_row + (SIDE + v) * LANES, *d_at = d_row + (SIDE + v) * LANES;
+                const vreal s = own_load(s_at), d = own_load(d_at);
+                vreal s1 = WINDOW_5 * s, d1 = WINDOW_5 * d, s2 = s1 * s, d2 = d1 * d;
+#define ADD_PAIR(w, k) { \
+                const vreal sa = own_load(s_at - k), sb = own_load(s_at + k); \
+                const vreal da = own_load(d_at - k), db = own_load(d_at + k); \
+                s1 = lanes_mad(w, sa + sb, s1); \
+                d1 = lanes_mad(w, da + db, d1); \
+                s2 = lanes_mad(w, lanes_mad(sa, sa, sb * sb), s2); \
+                d2 = lanes_mad(w, lanes_mad(da, da, db * db), d2); }
+                PAIRS_OF_WINDOW(ADD_PAIR)
+#undef ADD_PAIR
+                PUT(0, s1);
+                PUT(1, d1);
+                PUT(2, s2);
+                PUT(3, d2);
+            }
+        } else {
+            for (int v = 0; v < own.n; ++v)
+                for (int map = 0; map < 4; ++map) PUT(map, zero);
+        }
+        slot = SHIFT || slot == TAPS - 1 ? 0 : slot + 1;
+        if (row < own.top + REACH) continue;
+        const ulong centre = own.at + (long)(row - REACH) * stride;
+        for (int v = 0; v < own.n; ++v) {
+            const vreal (*mid)[4] = &ring[slot + REACH][v];
+            vreal ms = WINDOW_5 * mid[0][0], md = WINDOW_5 * mid[0][1];
+            vreal ms2 = WINDOW_5 * mid[0][2], md2 = WINDOW_5 * mid[0][3];
+#define ADD_PAIR(w, k) \
+            ms = lanes_mad(w, mid[-k * STRIP][0] + mid[k * STRIP][0], ms); \
+            md = lanes_mad(w, mid[-k * STRIP][1] + mid[k * STRIP][1], md); \
+            ms2 = lanes_mad(w, mid[-k * STRIP][2] + mid[k * STRIP][2], ms2); \
+            md2 = lanes_mad(w, mid[-k * STRIP][3] + mid[k * STRIP][3], md2);
+            PAIRS_OF_WINDOW(ADD_PAIR)
+#undef ADD_PAIR
+            const vreal half_s = R(0.5) * ms * ms, half_d = R(0.5) * md * md;
+            const vreal hs = lanes_mad(R(0.5), ms2, -half_s), hd = lanes_mad(R(0.5), md2, -half_d);
+            const vreal a1 = half_s - half_d + SSIM_C1, b1 = half_s + half_d + SSIM_C1;
+            const vreal a2 = hs - hd + SSIM_C2, b2 = hs + hd + SSIM_C2;
+            const vreal inv = (vreal)1 / (b1 * b2), ssim = a1 * a2 * inv;
+            const vreal by_a1 = a2 * inv, by_a2 = a1 * inv, by_b1 = -ssim * inv * b2, by_b2 = -ssim * inv * b1;
+            const vreal v_hs = by_b2 + by_a2, v_hd = by_b2 - by_a2;
+            const vreal v_mean = lanes_mad(ms, by_b1 + by_a1 - v_hs, md * (by_b1 - by_a1 - v_hd));
+
+            const vmask inside = inside_image(own.first + v, width);
+            const ulong at = centre + v * LANES;
+            row_store(lanes_if(inside, v_mean, zero), v_maps + at);
+            row_store(lanes_if(inside, v_hs, zero), v_maps + at + 3 * plane);
+            row_store(lanes_if(inside, v_hd, zero), v_maps + at + 6 * plane);
+            const vreal error = row_load(rendered + at) - truth_load(truth + at);  // 0 outside
+            l1 += fabs(error);
+            ssims += lanes_if(inside, ssim, zero);
+            squares = lanes_mad(error, error, squares);
+        }
+    }
+    const ulong n_parts = strips * get_global_size(1) * get_global_size(2);
+    const ulong part = (get_global_id(2) * get_global_size(1) + get_global_id(1)) * strips + get_global_id(0);
+    partial[part] = lanes_sum(l1);
+    partial[n_parts + part] = lanes_sum(ssims);
+    partial[2 * n_parts + part] = lanes_sum(squares);
+}
+
+// v_color: gradient of the loss, from v_maps blurred (the window is symmetric: its own adjoint);
+// l1_scale = (1 - lambda) / count, ssim_scale = lambda / count. Overwrites.
+kernel void image_loss_vjp(
+    global const real *restrict rendered,
+    global const uchar *restrict truth,
+    global const real *restrict v_maps,
+    global real *restrict v_color,
+    int width,
+    int height,
+    int stride,
+    ulong plane,
+    int segment,
     real l1_scale,
     real ssim_scale)
 {
-    const ulong at = pixel_at(stride, plane);
-    vreal v_mx = (vreal)0, v_mxx = (vreal)0, v_mxy = (vreal)0;
-    for (int k = 0; k < 11; ++k) {
-        global const real *from = hmaps + at + (k - 5) * (long)stride;
-        v_mx = lanes_mad(WINDOW[k], lanes_load(from), v_mx);
-        v_mxx = lanes_mad(WINDOW[k], lanes_load(from + 3 * plane), v_mxx);
-        v_mxy = lanes_mad(WINDOW[k], lanes_load(from + 6 * plane), v_mxy);
+    if (get_global_id(0) >= strips_of(stride)) return;
+    const strip own = own_strip(height, stride, plane, segment);
+    vreal ring[RING][STRIP][3];
+    const vreal zero = (vreal)0;
+    int slot = 0;
+    for (int row = own.top - REACH; row < own.end + REACH; ++row) {
+        MOVE_UP(3)
+        if (row >= 0 && row < height) {
+            global const real *from = v_maps + own.at + (long)row * stride;
+            for (int v = 0; v < own.n; ++v, from += LANES) {
+                global const real *hs = from + 3 * plane, *hd = from + 6 * plane;
+                vreal v_mean = WINDOW_5 * row_load(from);
+                vreal v_hs = WINDOW_5 * row_load(hs), v_hd = WINDOW_5 * row_load(hd);
+#define ADD_PAIR(w, k) \
+                v_mean = lanes_mad(w, row_load(from - k) + row_load(from + k), v_mean); \
+                v_hs = lanes_mad(w, row_load(hs - k) + row_load(hs + k), v_hs); \
+                v_hd = lanes_mad(w, row_load(hd - k) + row_load(hd + k), v_hd);
+                PAIRS_OF_WINDOW(ADD_PAIR)
+#undef ADD_PAIR
+                PUT(0, v_mean);
+                PUT(1, v_hs);
+                PUT(2, v_hd);
+            }
+        } else {
+            for (int v = 0; v < own.n; ++v)
+                for (int map = 0; map < 3; ++map) PUT(map, zero);
+        }
+        slot = SHIFT || slot == TAPS - 1 ? 0 : slot + 1;
+        if (row < own.top + REACH) continue;
+        const ulong centre = own.at + (long)(row - REACH) * stride;
+        for (int v = 0; v < own.n; ++v) {
+            const vreal (*mid)[3] = &ring[slot + REACH][v];
+            vreal v_mean = WINDOW_5 * mid[0][0], v_hs = WINDOW_5 * mid[0][1], v_hd = WINDOW_5 * mid[0][2];
+#define ADD_PAIR(w, k) \
+            v_mean = lanes_mad(w, mid[-k * STRIP][0] + mid[k * STRIP][0], v_mean); \
+            v_hs = lanes_mad(w, mid[-k * STRIP][1] + mid[k * STRIP][1], v_hs); \
+            v_hd = lanes_mad(w, mid[-k * STRIP][2] + mid[k * STRIP][2], v_hd);
+            PAIRS_OF_WINDOW(ADD_PAIR)
+#undef ADD_PAIR
+            const ulong at = centre + v * LANES;
+            const vreal x = row_load(rendered + at), y = truth_load(truth + at);
+            const vreal v_ssim = lanes_mad(x + y, v_hs, lanes_mad(x - y, v_hd, v_mean));
+            const vreal sign_l1 = lanes_if(x > y, (vreal)1, lanes_if(x < y, (vreal)-1, zero));
+            row_store(lanes_if(inside_image(own.first + v, width), l1_scale * sign_l1 - ssim_scale * v_ssim, zero),
+                      v_color + at);
+        }
     }
-    const vreal x = lanes_load(rendered + at), y = lanes_load(truth + at), zero = (vreal)0;
-    const vreal v_ssim = v_mx + (real)2 * x * v_mxx + y * v_mxy;
-    const vreal sign_l1 = lanes_if(x > y, (vreal)1, lanes_if(x < y, (vreal)-1, zero));
-    const vmask inside = (vreal)(get_global_id(0) * LANES) + lanes_iota() < (vreal)width;
-    lanes_store(lanes_if(inside, l1_scale * sign_l1 - ssim_scale * v_ssim, zero), v_color + at);
-}
-
-// sums [3, n_parts]: runs of `run` values of partial [3, n], in order. Global size: (n_parts, 3).
-kernel void sum_runs(
-    global const real *restrict partial,
-    global real *restrict sums,
-    uint n,
-    uint run)
-{
-    const ulong row = get_global_id(1);
-    const ulong start = get_global_id(0) * run;
-    real sum = 0;
-    for (ulong k = start; k < start + run && k < n; ++k) sum += partial[row * n + k];
-    sums[row * get_global_size(0) + get_global_id(0)] = sum;
 }

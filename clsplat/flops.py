@@ -22,7 +22,7 @@ BLEND = 10
 # dx 1, T and weight 3, colour . v_color 5, the rest behind 2, v_alpha 3 (one division), gradients of the colour 6.
 BLEND_VJP = 20
 
-# Per pixel and channel. A tap of the eleven: five maps along rows 10, along columns 10, three maps back 6 and 6. SSIM,
-# its gradient and the sums 37, the end 8.
-LOSS = 11 * (10 + 10 + 6 + 6) + 37 + 8
+# Per pixel and channel. A pair of the window: four maps along rows 16, along columns 12, three maps back 9 and 9; its
+# centre 4, 4, 3 and 3. Sum and difference 3, SSIM, its gradient and the sums 41, the end 10.
+LOSS = 5 * (16 + 12 + 9 + 9) + 4 + 4 + 3 + 3 + 3 + 41 + 10
 ADAM = 14  # moments 7, corrections, root, epsilon and quotient 5, step 2

@@ -69,6 +69,11 @@ class KernelBuild:
     def lanes(self) -> int:
         return self.schedule.lanes
 
+    @property
+    def strip(self) -> int:
+        """Vectors of a row that a work-item of the loss blurs: rings of 22 rows and four maps, 28 kB in float32."""
+        return 1 if self.lanes == 1 else 80 // self.lanes
+
     def raster_program(self, device: Device) -> Program:
         """Projection, rasterisation, and their gradients."""
         return self._shape_program(device, "project.cl", "raster.cl")
@@ -82,7 +87,7 @@ class KernelBuild:
         window = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
         window /= window.sum()
         defines: dict[str, Define] = {f"WINDOW_{i}": float(window[i]) for i in range(6)}
-        defines |= {"LANES": self.lanes, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y}
+        defines |= {"LANES": self.lanes, "STRIP": self.strip, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y}
         return build(device, ("lanes.clh", "loss.cl"), defines, self.real)
 
     def optim_program(self, device: Device) -> Program:

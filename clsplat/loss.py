@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .buffers import to_device, to_host
+from .buffers import to_host
 from .pipeline import ImageLayout, Pipeline
+from .program import lane_group
 
-_SUM_RUN = 512  # partial sums added by one work-item
+_LEAST_ROWS = 32  # of a work-item, which blurs ten rows beyond them
+_ITEMS_PER_UNIT = {"CPU": 8, "GPU": 2048}  # so many that no compute unit of the device waits long for the last
 
 
 @dataclass(frozen=True)
@@ -42,52 +43,44 @@ class ImageLoss:
         self.pipeline, self.weight = pipeline, weight
         self.device, self.kernels = pipeline.device, pipeline.kernels
         self.program = self.kernels.loss_program(self.device)
+        # One lane, an item a pixel column: groups that read whole lines of memory.
+        self._group = lane_group(self.device) if self.kernels.lanes > 1 else 64
         self._sums: tuple[Any, int, int] | None = None
 
-    def set_truth(self, image: NDArray[np.uint8]) -> ImageLayout:
-        """Upload an (H, W, 3) image; returns its layout."""
-        height, width = image.shape[:2]
-        layout = ImageLayout(width, height)
-        buffer = self.pipeline.pool.get("truth_bytes", image.nbytes)
-        to_device(self.device, buffer, image)
-        self.program.unpack_image((width, height), self._row(width), bytes=buffer,
-                                  image=self.pipeline.image("truth", layout, 3), width=width,
-                                  stride=layout.stride, plane=layout.plane)
-        return layout
+    def gradient(self, layout: ImageLayout, truth: Any) -> Any:
+        """Gradient of the loss with respect to "color", as a buffer; the value waits for `value`.
 
-    def gradient(self, layout: ImageLayout) -> Any:
-        """Gradient of the loss with respect to "color", as a buffer; the value waits for `value`."""
-        image, pool, real = self.pipeline.image, self.pipeline.pool, self.kernels.dtype.itemsize
-        size = (layout.tiles_x * 16 // self.kernels.lanes, layout.height, 3)
-        n_runs = size[0] * size[1] * size[2]
-        row = self._row(size[0]) and (size[0], 1, 1)
-        common = {"stride": layout.stride, "plane": layout.plane}
-        pair = {"rendered": image("color", layout, 3), "truth": image("truth", layout, 3)}
-        maps, v_maps = image("ssim_maps", layout, 15), image("ssim_v_maps", layout, 9)
-        hmaps, v_color = image("ssim_v_rows", layout, 9), image("v_color", layout, 3)
-        partial = pool.get("loss_partial", 3 * n_runs * real)
-        count = 3 * layout.width * layout.height
-        program = self.program
-        program.ssim_rows(size, row, maps=maps, **pair, **common)
-        program.ssim_columns(size, row, maps=maps, v_maps=v_maps, partial=partial, width=layout.width, **pair,
-                             **common)
-        program.ssim_rows_vjp(size, row, v_maps=v_maps, hmaps=hmaps, **common)
-        program.loss_vjp(size, row, hmaps=hmaps, v_color=v_color, width=layout.width,
-                         l1_scale=(1 - self.weight) / count, ssim_scale=self.weight / count, **pair, **common)
-        n_parts = -(-n_runs // _SUM_RUN)
-        sums = pool.get("loss_sums", 3 * n_parts * real)
-        program.sum_runs((n_parts, 3), (1, 1), partial=partial, sums=sums, n=n_runs, run=_SUM_RUN)
-        self._sums = (sums, n_parts, count)
+        Parameters
+        ----------
+        truth : buffer of bytes [3, rows, stride] in the layout (truths.py).
+        """
+        image, kernels = self.pipeline.image, self.kernels
+        strips = -(-layout.tiles_x * 16 // (kernels.lanes * kernels.strip))
+        segment = self._rows(strips, layout.height)
+        segments = -(-layout.height // segment)
+        n_parts = 3 * segments * strips
+        partial = self.pipeline.pool.get("loss_partial", 3 * n_parts * kernels.dtype.itemsize)
+        group, count = self._group, 3 * layout.width * layout.height
+        size, v_color = (-(-strips // group) * group, segments, 3), image("v_color", layout, 3)
+        common = {"rendered": image("color", layout, 3), "truth": truth, "v_maps": image("loss_v_maps", layout, 9),
+                  "width": layout.width, "height": layout.height, "stride": layout.stride, "plane": layout.plane,
+                  "segment": segment}
+        self.program.image_loss(size, (group, 1, 1), partial=partial, **common)
+        self.program.image_loss_vjp(size, (group, 1, 1), v_color=v_color, l1_scale=(1 - self.weight) / count,
+                                    ssim_scale=self.weight / count, **common)
+        self._sums = (partial, n_parts, count)
         return v_color
-
-    def _row(self, items: int) -> tuple[int, int] | None:
-        """Groups of one row on CPUs (see Kernel.over), the driver's choice elsewhere."""
-        return (items, 1) if self.device.info.type == "CPU" and items <= self.device.info.max_group else None
 
     def value(self) -> LossValue:
         """The loss of the last `gradient` call (waits for the device)."""
         assert self._sums is not None
-        sums, n_parts, count = self._sums
-        parts = to_host(self.device, sums, np.empty((3, n_parts), self.kernels.dtype))
+        partial, n_parts, count = self._sums
+        parts = to_host(self.device, partial, np.empty((3, n_parts), self.kernels.dtype))
         l1, ssim, mse = (parts.astype(np.float64).sum(axis=1) / count).tolist()
         return LossValue((1 - self.weight) * l1 + self.weight * (1 - ssim), l1, ssim, mse)
+
+    def _rows(self, strips: int, height: int) -> int:
+        """Rows of a work-item: as many as still leave work for the whole device."""
+        info = self.device.info
+        wanted = info.compute_units * _ITEMS_PER_UNIT["CPU" if info.type == "CPU" else "GPU"]
+        return max(-(-height // -(-wanted // (3 * strips))), _LEAST_ROWS)

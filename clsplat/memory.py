@@ -14,7 +14,7 @@ from .schema import Group
 from .skew_map import SkewMap
 
 _ROLES = 5  # value, gradient, two moments, and the copy that relocation swaps with
-_IMAGE_PLANES = 3 + 1 + 3 + 15 + 9 + 9 + 3  # colour, T, truth, SSIM maps and their gradients, v_color
+_IMAGE_PLANES = 3 + 1 + 9 + 3  # colour, T, gradients of SSIM's maps, v_color
 # Splat-tile pairs of an image: about 100 a tile, however few the splats, and 4 more a splat. At the end of runs on
 # three real scenes of 400-px photos with 5 000 and 20 000 splats there were 0.5 to 0.8 times as many.
 _ISECTS_PER_TILE, _ISECTS_PER_SPLAT = 100, 4
@@ -51,8 +51,8 @@ def peak_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024  # bytes there, KiB elsewhere
 
 
-def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout) -> Estimate:
-    """Memory at the cap, for the largest image. Splat-tile pairs are a guess, the rest is exact."""
+def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, truth_bytes: int) -> Estimate:
+    """Memory at the cap, for the largest image, with `truth_bytes` of images to learn. Splat-tile pairs are a guess."""
     real, n = kernels.dtype.itemsize, config.cap_max
     rows = {group: kernels.schema.rows(group) for group in Group}
     screen = (kernels.record + kernels.v_record) * real + 4 * _SCREEN_WORDS
@@ -60,9 +60,9 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout) -> 
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
     extra = 8 * SkewMap(config.map).width if config.map else 0  # s, gradient, moments, and a spare of each
     extra += 0 if config.position_optimizer == "adam" else 6  # momentum
-    buffers = [rows[Group.SH] * n * real, 15 * layout.plane * real]
+    buffers = [rows[Group.SH] * n * real, 9 * layout.plane * real]
     return Estimate(n * ((_ROLES * sum(rows.values()) + extra) * real + screen), n_isects * isect,
-                    _IMAGE_PLANES * layout.plane * real, isect, max(buffers))
+                    _IMAGE_PLANES * layout.plane * real + truth_bytes, isect, max(buffers))
 
 
 def room_for_isects(needed: Estimate, device: Device) -> int:

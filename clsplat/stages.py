@@ -18,7 +18,7 @@ STAGES = {
     "binning": ("count_tiles", "total_tiles", "list_isects", "count_isects", "emit_isects"),
     "tile sort": ("find_tile_ranges",),
     "rasterize": ("rasterize",),
-    "loss": ("unpack_image", "ssim_rows", "ssim_columns", "ssim_rows_vjp", "loss_vjp", "sum_runs"),
+    "loss": ("unpack_image", "image_loss", "image_loss_vjp"),
     "rasterize_vjp": ("rasterize_vjp",),
     "gather": ("gather_isect_grads",),
     "project_vjp": ("project_splats_vjp",),
@@ -95,8 +95,8 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
     return listing | {
         "project": Work(n * (real * (geometry + colour) + record + 20)),
         "rasterize": Work((12 + record) * isects + 4 * real * pixels, pairs * (forward + BLEND)),
-        # bytes in, planes: truth 3; rows 6 and 15, columns 21 and 9, back 9 and 9, 15 and 3
-        "loss": Work((3 + real * 90) * pixels, 3 * LOSS * pixels),
+        # truth twice; planes: 3 and three maps of each out, 12 back, 3 out
+        "loss": Work((6 + real * 27) * pixels, 3 * LOSS * pixels),
         "rasterize_vjp": Work((12 + record + v_record) * isects + 6 * real * pixels,
                               pairs * (forward + backward + BLEND_VJP)),
         "gather": Work((8 + v_record) * n + v_record * isects),

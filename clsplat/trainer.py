@@ -34,6 +34,7 @@ from .schedules import exponential_decay, sh_degree_at
 from .skew_map import SKEW_MAPS
 from .splats import Splats
 from .strategy import Moment, plan
+from .truths import Truths, truth_budget, truth_bytes
 from .tuning import schedule_for
 from .view_sampler import ViewSampler
 
@@ -82,7 +83,9 @@ class Trainer:
         self.kernels = KernelBuild(config.shape, config.sh_degree, schedule, config.normalisation,
                                    skew_map=config.map or SKEW_MAPS[0])
         largest = max((view.camera for view in scene.train), key=lambda c: c.width * c.height)
-        self.memory = estimate(config, self.kernels, ImageLayout(largest.width, largest.height))
+        budget = truth_budget(self.device)
+        self.memory = estimate(config, self.kernels, ImageLayout(largest.width, largest.height),
+                               truth_bytes(scene.train, budget))
         check(self.memory, self.device)
         self.rng = np.random.default_rng(config.seed)
         self.iteration, self.seconds = 0, 0.0
@@ -110,6 +113,7 @@ class Trainer:
             self.optimizer.load_state(checkpoint.optimizer)
             self.pipeline.write_signals(checkpoint.signals, self.splats.capacity)
         self.loss = ImageLoss(self.pipeline, config.lambda_dssim)
+        self.truths = Truths(self.device, self.kernels, scene.train, budget)
         self.optim_program = self.kernels.optim_program(self.device)
         self.renderer = Renderer(self.device)
         self.evaluations: dict[int, Evaluation] = {}
@@ -150,19 +154,20 @@ class Trainer:
         if folder is not None and self.iteration < config.iterations:
             log.flush()
             self.checkpoint().save(folder.checkpoint_path)
-        return Model(self.snapshot(), config, self.iteration, self.seconds, peak_bytes(), self.pipeline.pool.nbytes,
-                     self.evaluations, self.evaluation_seconds, None if folder is None else folder.path)
+        return Model(self.snapshot(), config, self.iteration, self.seconds, peak_bytes(),
+                     self.pipeline.pool.nbytes + self.truths.nbytes, self.evaluations, self.evaluation_seconds,
+                     None if folder is None else folder.path)
 
     def step(self) -> None:
         """One iteration: one image, one optimizer step, and what the strategy does after it."""
         config = self.config
         self.iteration += 1
         it = self.iteration
-        camera, image = self.views.next(it)
+        truth = self.truths.get(*self.views.next(it))
         degree = sh_degree_at(it, self.sh_interval, config.sh_degree)
-        layout = self.loss.set_truth(image)
-        frame = self.pipeline.forward(self.splats, camera, config.background, degree)
-        self.pipeline.backward(frame, self.loss.gradient(layout), self.grads)
+        frame = self.pipeline.forward(self.splats, truth.camera, config.background, degree)
+        v_color = self.loss.gradient(truth.layout, self.truths.planes(truth))
+        self.pipeline.backward(frame, v_color, self.grads)
         mean_lr = self.scene.extent * self.mean_rate(it)
         self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it)
         if self.densify_first <= it <= self.densify_last and it % config.densify_interval == 0:

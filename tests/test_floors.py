@@ -25,7 +25,7 @@ FLOORS = """
     gradients limits optim_rules sort
     binning optim_fused optim_host stages
     optim pipeline
-    loss memory pairs tuning
+    loss memory pairs truths tuning
     render
     evaluate
     trainer
@@ -35,7 +35,7 @@ FLOOR = {name: level for level, line in enumerate(FLOORS.split("\n")) for name i
 
 # Libraries that only these modules import.
 OWNERS = {
-    "pyopencl": {"buffers", "device", "program"},
+    "pyopencl": {"buffers", "device", "program", "truths"},
     "pycolmap": {"colmap"},
     "PIL": {"images"},
     "click": set(),  # the command line's

@@ -13,28 +13,21 @@ import numpy as np
 import pytest
 from cli_runner import small_capture
 from numpy.typing import NDArray
-from reference_loss import reference_loss, reference_loss_gradient
-from tolerances import ROUNDING, relative_error
 
 import clsplat
-from clsplat.buffers import SplatBuffers, to_host
 from clsplat.checkpoint import Checkpoint
 from clsplat.config import TrainConfig
 from clsplat.device import Device, open_device
 from clsplat.errors import InputError, OutputError, TrainingError
 from clsplat.evaluate import evaluate
-from clsplat.kernels import KernelBuild
 from clsplat.loss import ImageLoss, LossValue
 from clsplat.noise import add_noise
-from clsplat.pipeline import Pipeline
-from clsplat.program import Real
 from clsplat.run_log import Progress
 from clsplat.scene import Scene, load_scene
 from clsplat.schema import Group
 from clsplat.splats import Splats
 from clsplat.trainer import Trainer
 from clsplat.training import train
-from clsplat.tuning import schedule_for
 
 # Every part of the strategy acts: growth from 2252 points to the cap, noise, all resolutions and SH degrees.
 CONFIG = TrainConfig(iterations=80, cap_max=2400, sh_degree=1, densify_interval=10, checkpoint_interval=30,
@@ -252,40 +245,6 @@ def test_regularisers_pull_opacity_and_scale_down(scene: Scene, default_device: 
     np.testing.assert_allclose(
         added, 20 * np.exp(first.log_scale.astype(float)) / (3 * len(first)), rtol=1e-3, atol=1e-7
     )
-
-
-# --- loss ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("real", "weight", "tolerance"),
-    [("double", 0.2, ROUNDING), ("double", 1.0, ROUNDING), ("float", 0.2, 1e-4)],
-)
-def test_loss_and_gradient_equal_the_reference(
-    default_device: Device, real: Real, weight: float, tolerance: float
-) -> None:
-    """An image that is no multiple of a tile; the truth is noise and blocks."""
-    if real == "double" and not default_device.has_fp64:
-        pytest.skip("no double precision")
-    rng = np.random.default_rng(0)
-    truth = rng.integers(0, 256, (CAMERA.height, CAMERA.width, 3)).astype(np.uint8)
-    truth[:14, :12] = 128
-    kernels = KernelBuild("gaussian", 0, schedule_for(default_device), real=real)
-    pipeline = Pipeline(default_device, kernels)
-    buffers = SplatBuffers.of(default_device, some_splats(shape="gaussian", sh_degree=0), kernels.dtype)
-    loss = ImageLoss(pipeline, weight)
-    for _ in range(2):  # buffers are used again
-        layout = loss.set_truth(truth)
-        pipeline.forward(buffers, CAMERA, (0.1, 0.2, 0.3))
-        gradient = loss.gradient(layout)
-    color = pipeline.read_image("color", layout)
-    planes = np.empty((3, layout.rows, layout.stride), kernels.dtype)
-    got = layout.unpack(to_host(default_device, gradient, planes))
-    value = loss.value()
-    target = truth / 255
-    assert value.total == pytest.approx(reference_loss(color, target, weight), rel=max(tolerance, 1e-9))
-    assert value.psnr == pytest.approx(-10 * np.log10(np.mean((color - target) ** 2)), abs=1e-3)
-    assert relative_error(got, reference_loss_gradient(color, target, weight)) < tolerance
 
 
 def test_rows_of_the_schema_fit_both_buffers() -> None:
