@@ -15,8 +15,8 @@ from .sort import radix_passes
 STAGES = {
     "project": ("project_splats",),
     "depth sort": ("depth_span", "depth_histogram", "depth_scatter", "depth_buckets", "fill_iota"),
-    "binning": ("count_tiles", "total_tiles", "list_isects", "count_isects", "emit_isects"),
-    "tile sort": ("find_tile_ranges",),
+    "binning": ("count_tiles", "total_tiles", "count_isects", "emit_isects"),
+    "tile sort": ("list_isects", "find_tile_ranges"),
     "rasterize": ("rasterize",),
     "loss": ("unpack_image", "image_loss", "image_loss_vjp"),
     "rasterize_vjp": ("rasterize_vjp",),
@@ -84,7 +84,8 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
     if is_cpu:
         listing = {
             "depth sort": Work(40 * n),  # keys three times; pairs and numbers written, pairs twice read
-            "binning": Work(52 * n + 8 * isects),  # orders and boxes, boxes in order; ids and splats
+            "binning": Work(28 * n),  # order, boxes, boxes in order
+            "tile sort": Work(20 * n + 8 * isects + 8 * tiles),  # order, boxes, each splat's range; ids and splats
         }
     else:
         listing = {
