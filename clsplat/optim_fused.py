@@ -20,7 +20,6 @@ from .sghmc import STREAM, Sghmc
 from .skew_map import SkewMap
 
 _PARTS = 5  # of geometry in a step (cl/optim.cl)
-_CPU_GROUP = 8  # work-items of a step: fewer cost a call each, more spill their private arrays
 
 
 class Rows:
@@ -61,7 +60,6 @@ class FusedOptimizer:
         self.device, self.kernels, self.splats, self.rules = device, kernels, splats, rules
         self.program = kernels.optim_program(device)
         self._group = lane_group(device)
-        self._step_group = _CPU_GROUP if device.info.type == "CPU" else GROUP_ITEMS
         self.steps = 0
         schema, dtype = splats.schema, splats.dtype
         # Of the size of the splats' own buffers, so that one spare serves all; the skew's rows are not used.
@@ -90,7 +88,7 @@ class FusedOptimizer:
             of_skew = _corrections(skew.steps)
         penalty = self.rules.penalty(self.splats.n)
         self.program.step_splats(
-            (self._columns, _PARTS + sh_coefficients(sh_degree)), (self._step_group, 1), geom=self.splats.geom,
+            (self._columns, _PARTS + sh_coefficients(sh_degree)), (GROUP_ITEMS, 1), geom=self.splats.geom,
             grad_geom=grads.geom, geom_m=self.first.geom, geom_v=self.second.geom, sh=self.splats.sh, grad_sh=grads.sh,
             sh_m=self.first.sh, sh_v=self.second.sh, **rows, rates=self._rates, capacity=self.splats.capacity,
             sh_degree=sh_degree, base_learns=int(blocks.base), means_learn=int(blocks.base and sghmc is None),
