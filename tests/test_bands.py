@@ -19,6 +19,7 @@ from clsplat.config import TrainConfig
 from clsplat.device import SCHEDULES, Device, open_device
 from clsplat.errors import DeviceError
 from clsplat.kernels import KernelBuild
+from clsplat.memory import Estimate, check, room_for_isects
 from clsplat.pairs import count_pairs
 from clsplat.pipeline import Pipeline, most_isects
 from clsplat.scene import load_scene
@@ -205,3 +206,14 @@ def test_the_limit_follows_the_device(devices: list[Device]) -> None:
     assert most_isects(device, kernels) == 1000
     device.info = replace(device.info, global_mem_bytes=1 << 50)
     assert most_isects(device, kernels) == MAX_ISECTS
+
+
+def test_isects_alone_refuse_no_run(devices: list[Device]) -> None:
+    """1000 MB of them are cut into bands where splats and images leave 300 MB, not where they leave 60."""
+    device, needed = told(devices[0], "CPU"), Estimate(500 * 10**6, 10**9, 200 * 10**6, 60, 10**6)
+    device.info = replace(device.info, max_alloc_bytes=1 << 30, global_mem_bytes=10**9)
+    check(needed, device)
+    assert room_for_isects(needed, device) == 300 * 10**6 * 2 // 180
+    device.info = replace(device.info, global_mem_bytes=760 * 10**6)
+    with pytest.raises(DeviceError, match="the run needs about"):
+        check(needed, device)
