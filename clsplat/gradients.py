@@ -11,6 +11,8 @@ from .device import Device
 from .harmonics import sh_basis
 from .schema import Array, Schema
 
+COMPACT_ROWS = 6  # of colour: its gradient, and a direction
+
 
 class CompactGradients(ParameterBuffers):
     """Gradients of all parameters, those of SH coefficients by the two things that they are the product of.
@@ -22,7 +24,7 @@ class CompactGradients(ParameterBuffers):
 
     def __init__(self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating]) -> None:
         self.sh_degree = schema.sh_degree
-        fields = (replace(field, width=6) if field.name == "sh" else field for field in schema)
+        fields = (replace(field, width=COMPACT_ROWS) if field.name == "sh" else field for field in schema)
         super().__init__(device, Schema(tuple(fields)), capacity, dtype)
 
     def written_out(self, n: int) -> dict[str, Array]:

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from .config import TrainConfig
 from .device import Device
 from .errors import DeviceError
+from .gradients import COMPACT_ROWS
 from .kernels import KernelBuild
 from .pipeline import ImageLayout, isect_bytes
 from .schema import Group
 from .skew_map import SkewMap
 
-_ROLES = 5  # value, gradient, two moments, and the copy that relocation swaps with
+_ROLES = 5  # value, gradient, two moments, and the copy that relocation swaps with; of colour the gradient is compact
 _IMAGE_PLANES = 3 + 1 + 9 + 3  # colour, T, gradients of SSIM's maps, v_color
 # Splat-tile pairs of an image: about 100 a tile, however few the splats, and 4 more a splat. At the end of runs on
 # three real scenes of 400-px photos with 5 000 and 20 000 splats there were 0.5 to 0.8 times as many.
@@ -58,10 +59,11 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, tru
     screen = (kernels.record + kernels.v_record) * real + 4 * _SCREEN_WORDS
     isect = isect_bytes(kernels)
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
-    extra = 8 * SkewMap(config.map).width if config.map else 0  # s, gradient, moments, and a spare of each
+    extra = 6 * SkewMap(config.map).width if config.map else 0  # s, moments, and a spare of each
     extra += 0 if config.position_optimizer == "adam" else 6  # momentum
     buffers = [rows[Group.SH] * n * real, 9 * layout.plane * real]
-    return Estimate(n * ((_ROLES * sum(rows.values()) + extra) * real + screen), n_isects * isect,
+    splat = _ROLES * rows[Group.GEOM] + (_ROLES - 1) * rows[Group.SH] + COMPACT_ROWS + extra
+    return Estimate(n * (splat * real + screen), n_isects * isect,
                     _IMAGE_PLANES * layout.plane * real + truth_bytes, isect, max(buffers))
 
 

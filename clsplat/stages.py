@@ -101,6 +101,6 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
         "rasterize_vjp": Work((12 + record + v_record) * isects + 6 * real * pixels,
                               pairs * (forward + backward + BLEND_VJP)),
         "gather": Work((8 + v_record) * n + v_record * isects),
-        "project_vjp": Work(n * (real * (2 * geometry + 2 * colour + 3 + 6) + v_record + 4)),
-        "step": Work(7 * real * n * (geometry + colour), ADAM * n * (geometry + colour)),
+        "project_vjp": Work(n * (real * (2 * geometry + colour + 6 + 3 + 6) + v_record + 4)),  # colour read, 6 out
+        "step": Work(real * n * (7 * geometry + 6 * colour + 6), ADAM * n * (geometry + colour)),
     }

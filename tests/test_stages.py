@@ -80,7 +80,7 @@ def test_work_is_counted_from_sizes() -> None:
     assert work["depth sort"].bytes == 10 * 40
     assert work["binning"].bytes == 10 * 28
     assert work["tile sort"].bytes == 10 * 20 + 50 * 8 + 2 * 8
-    assert work["step"].bytes == 7 * 4 * 10 * (11 + 12)
+    assert work["step"].bytes == 4 * 10 * (7 * 11 + 6 * 12 + 6)
     assert set(work) < set(STAGES)
     skewed = work_of(KernelBuild("skew-normal", 1, SCHEDULES["cpu16"]), Sizes(10, 50, 512, 1000, 1), is_cpu=False)
     assert skewed["rasterize"].flops == 1000 * (52 + 10)
