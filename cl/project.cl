@@ -172,7 +172,6 @@ kernel void project_splats_vjp(
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n_splats) return;
-    const splat_terms s = splat_project(geom + first, capacity, cam);
     const vreal zero = (vreal)0;
 
     real flag[LANES], seen_rgb[3][LANES];
@@ -182,6 +181,13 @@ kernel void project_splats_vjp(
         for (int c = 0; c < 3; ++c) seen_rgb[c][l] = records[(ulong)i * RECORD + 2 + c] > 0 ? flag[l] : 0;
     }
     const vmask seen = lanes_load(flag) > zero;
+    if (!lanes_any(seen)) {  // zeros, as below
+        for (int row = 0; row < GEOM_ROWS; ++row) lanes_store(zero, grad_geom + first + row * capacity);
+        const int rows = compact ? 6 : 3 * (sh_degree + 1) * (sh_degree + 1);
+        for (int row = 0; row < rows; ++row) lanes_store(zero, grad_sh + first + row * capacity);
+        return;
+    }
+    const splat_terms s = splat_project(geom + first, capacity, cam);
 
     vreal v[SHAPE_V + 3];
     for (int j = 0; j < SHAPE_V + 3; ++j)

@@ -92,12 +92,12 @@ class KernelBuild:
 
     def optim_program(self, device: Device) -> Program:
         """The step with its skew map and regularisers, noise and gathers."""
-        wanted = ("ROW_", "LANES", "SKEW_", "SLANT_", "OPACITY_", "SH_")
+        wanted = ("ROW_", "LANES", "SKEW_", "SLANT_", "OPACITY_", "SH_", "GEOM_")
         defines = {k: v for k, v in self._defines().items() if k.startswith(wanted)}
         # 1 - beta is a constant of its own: as a difference of float32 it is off by 1e-5.
         defines |= {"ADAM_BETA1": adam.BETA1, "ADAM_BETA2": adam.BETA2, "ADAM_EPS": adam.EPS,
                     "ADAM_REST1": 1.0 - adam.BETA1, "ADAM_REST2": 1.0 - adam.BETA2,
-                    "SKEW_MAP": SKEW_MAPS.index(self.skew_map), "GEOM_ROWS": self.schema.rows(Group.GEOM)}
+                    "SKEW_MAP": SKEW_MAPS.index(self.skew_map)}
         files = ("lanes.clh", "algebra.clh", "opacity.clh", "harmonics.clh", "skew_map.clh", "noise.clh", "optim.cl")
         return build(device, files, defines, self.real)
 
@@ -118,7 +118,7 @@ class KernelBuild:
         return rows | {
             "TILE": TILE, "BATCH": BATCH, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y,
             "GROUP": self.schedule.group, "VECS": self.schedule.vecs, "LANES": self.lanes,
-            "SH_DEGREE": self.sh_degree,
+            "SH_DEGREE": self.sh_degree, "GEOM_ROWS": schema.rows(Group.GEOM),
             "WITH_DEPTH": int(self.with_depth), "WITH_V_ALPHA": int(self.with_v_alpha),
             "NORMALISATION": NORMALISATIONS.index(self.normalisation),
             "PEAK_STEPS": 3 if self.real == "float" else 4,

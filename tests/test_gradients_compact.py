@@ -26,10 +26,11 @@ def test_the_basis(degree: int) -> None:
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_written_out_they_are_the_backward_s_own(device: Device, degree: int) -> None:
-    """One image, both ways; all else to the bit. Some colours are clamped at 0 and some splats unseen."""
-    arrays = random_splats(3, 40, 3, np.float32)
+    """One image, both ways; all else to the bit. Some colours are clamped at 0, and splats unseen, 32 of them in a row."""
+    arrays = random_splats(3, 80, 3, np.float32)
     arrays["sh"][::5, 0] -= 3
-    arrays["mean"][:4] += 100
+    unseen = np.r_[:4, 32:64]
+    arrays["mean"][unseen] += 100
     splats = Splats("gaussian", for_shape(arrays, "gaussian"))
     kernels = KernelBuild("gaussian", 3, default_schedule(device.cl_device))
     pipeline = Pipeline(device, kernels)
@@ -41,11 +42,14 @@ def test_written_out_they_are_the_backward_s_own(device: Device, degree: int) ->
     given = np.random.default_rng(4).standard_normal((frame.layout.height, frame.layout.width, 3))
     to_device(device, v_color, frame.layout.pack(given, kernels.dtype))
     for grads in (whole, compact):
+        grads.upload({name: np.ones_like(array) for name, array in grads.download(buffers.n).items()})
         pipeline.backward(frame, v_color, grads)
     expected, got = whole.download(buffers.n), compact.written_out(buffers.n)
     assert np.any(expected["sh"][:, 0] == 0)
     assert np.any(expected["sh"][:, 0] != 0)
     used = (degree + 1) ** 2
+    for name, array in expected.items():
+        assert not array[unseen, :used].any() if name == "sh" else not array[unseen].any(), name
     np.testing.assert_allclose(got["sh"][:, :used], expected["sh"][:, :used], rtol=1e-6,
                                atol=1e-6 * np.abs(expected["sh"]).max())
     for name in set(expected) - {"sh"}:
