@@ -26,7 +26,7 @@ def test_the_basis(degree: int) -> None:
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_written_out_they_are_the_backward_s_own(device: Device, degree: int) -> None:
-    """One image, both ways; all else to the bit. Some colours are clamped at 0, and splats unseen, 32 of them in a row."""
+    """One image, both ways; all else to the bit. Some colours are clamped at 0, and 32 splats in a row unseen."""
     arrays = random_splats(3, 80, 3, np.float32)
     arrays["sh"][::5, 0] -= 3
     unseen = np.r_[:4, 32:64]
