@@ -13,7 +13,7 @@ from .pipeline import ImageLayout, Pipeline
 from .program import lane_group
 
 _LEAST_ROWS = 32  # of a work-item, which blurs ten rows beyond them
-_ITEMS_PER_UNIT = {"CPU": 8, "GPU": 2048}  # so many that no compute unit of the device waits long for the last
+_ITEMS_PER_UNIT = {"CPU": 6, "GPU": 2048}  # so many that no compute unit of the device waits long for the last
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,17 @@ def test_segments_of_rows_change_no_gradient(device: Device, monkeypatch: pytest
         assert value.total == pytest.approx(found[0][0].total, rel=1e-6)
 
 
+def test_strips_change_no_gradient(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A strip is 640 px wide; here five vectors are cut into strips of 1, 2 and 3."""
+    color, truth = pair(21, 75)
+    whole = compared(loss_of(device), color, truth)
+    for strip in (1, 2, 3):
+        monkeypatch.setattr(KernelBuild, "strip", strip)
+        value, gradient = compared(loss_of(device), color, truth)
+        np.testing.assert_array_equal(gradient, whole[1])
+        assert value.total == pytest.approx(whole[0].total, rel=1e-6)
+
+
 def test_work_for_every_unit_and_no_segment_too_short(devices: list[Device]) -> None:
     loss = loss_of(devices[0])
     rows = [loss._rows(strips, 480) for strips in (1, 3, 1000)]
