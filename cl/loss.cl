@@ -7,10 +7,10 @@
 //   2 cov = h_s - h_d                  var_x + var_y = h_s + h_d
 // Four maps to blur instead of five, and where x is close to y less cancels.
 //
-// A work-item goes down a strip of up to STRIP vectors (one, with one lane), `segment` rows of it: it blurs each row, keeps the last 11 in a
-// ring, and blurs the columns from there, so that no blurred map is ever stored. Global size: (at least the strips,
-// segments, 3 channels).
-// Images are planar with a zero margin (see raster.cl), the truth as bytes.
+// A work-item goes down a strip of up to STRIP vectors (one, with one lane), `segment` rows of it: it blurs each row,
+// keeps the last 11 in a ring, and blurs the columns from there, so that no blurred map is ever stored. Global size:
+// (at least the strips, segments, 3 channels). Images are planar with a zero margin (see raster.cl), the truth as
+// bytes.
 
 #define SSIM_C1 R(0.0001)
 #define SSIM_C2 R(0.0009)
