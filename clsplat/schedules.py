@@ -1,4 +1,4 @@
-"""What changes during a run as a function of the iteration alone: learning rate, SH degree, resolution.
+"""What changes during a run: learning rate and SH degree with the iteration, resolution also with the splats.
 
 Iterations count from 1, as in 3DGS; every function also accepts 0.
 """
@@ -13,6 +13,7 @@ from .errors import InputError
 
 # (fraction of the run, downscale): coarse to fine, the last half at full resolution.
 COARSE_TO_FINE = ((0.0, 4), (0.2, 2), (0.5, 1))
+FRACTION_PER_PIXEL = 0.2  # of the run that an image serves for each pixel that a splat has in it
 
 
 def exponential_decay(start: float, end: float, steps: int) -> Callable[[int], float]:
@@ -95,3 +96,22 @@ def downscale_at(schedule: Sequence[tuple[int, int]], iteration: int) -> int:
         if iteration >= first:
             current = downscale
     return current
+
+
+def downscale_for(schedule: Sequence[tuple[int, int]], iteration: int, iterations: int, n_splats: int,
+                  pixels: float) -> int:
+    """Downscale of `iteration`: the schedule's, or a finer one of it where splats are short of pixels.
+
+    Few splats learn as much from a small image as from a large one; many have learnt soon what there is in it.
+
+    Parameters
+    ----------
+    schedule : from `resolution_schedule`. iterations : length of the run.
+    pixels : of an image at full size.
+    """
+    latest = downscale_at(schedule, iteration)
+    for _, downscale in schedule:
+        part = FRACTION_PER_PIXEL * pixels / (downscale**2 * max(n_splats, 1))  # of the run
+        if downscale == 1 or (downscale <= latest and iteration < part * iterations):
+            return downscale
+    return 1

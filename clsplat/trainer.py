@@ -163,7 +163,7 @@ class Trainer:
         config = self.config
         self.iteration += 1
         it = self.iteration
-        truth = self.truths.get(*self.views.next(it))
+        truth = self.truths.get(*self.views.next(it, self.splats.n))
         degree = sh_degree_at(it, self.sh_interval, config.sh_degree)
         frame = self.pipeline.forward(self.splats, truth.camera, config.background, degree)
         v_color = self.loss.gradient(truth.layout, self.truths.planes(truth))

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clsplat.errors import InputError
-from clsplat.schedules import downscale_at, exponential_decay, resolution_schedule, sh_degree_at
+from clsplat.schedules import downscale_at, downscale_for, exponential_decay, resolution_schedule, sh_degree_at
 
 
 def test_decay_is_log_linear_and_constant_beyond() -> None:
@@ -60,3 +60,24 @@ def test_any_run_starts_at_zero_refines_and_ends_at_full_resolution(iterations: 
 def test_resolution_schedule_rejects(stages: list[tuple[float, int]]) -> None:
     with pytest.raises(InputError, match="resolution schedule"):
         resolution_schedule(100, stages)
+
+
+def test_splats_short_of_pixels_go_on_to_larger_images() -> None:
+    schedule, pixels = resolution_schedule(1000), 160_000
+    few = [downscale_for(schedule, i, 1000, 1000, pixels) for i in range(1000)]
+    assert few == [downscale_at(schedule, i) for i in range(1000)]
+    # One pixel a splat at 1/4, four at 1/2: the latter serve to the schedule's end.
+    assert [downscale_for(schedule, i, 1000, 10_000, pixels) for i in (0, 199, 200, 499, 500)] == [4, 4, 2, 2, 1]
+    assert [downscale_for(schedule, i, 1000, 40_000, pixels) for i in (0, 49, 50, 199, 200)] == [4, 4, 2, 2, 1]
+    assert [downscale_for(schedule, i, 1000, 400_000, pixels) for i in (0, 4, 5, 19, 20)] == [4, 4, 2, 2, 1]
+    assert downscale_for([(0, 1)], 0, 1000, 10, 1) == 1
+    assert downscale_for(schedule, 0, 1000, 0, pixels) == 4
+
+
+@given(iteration=st.integers(0, 1000), splats=st.integers(0, 10**6), pixels=st.integers(1, 10**6))
+def test_no_downscale_is_coarser_than_the_schedules(iteration: int, splats: int, pixels: int) -> None:
+    schedule = resolution_schedule(1000)
+    chosen = downscale_for(schedule, iteration, 1000, splats, pixels)
+    assert chosen <= downscale_at(schedule, iteration)
+    assert chosen <= downscale_for(schedule, iteration, 1000, max(splats - 1, 0), pixels)
+    assert chosen >= downscale_for(schedule, iteration + 1, 1000, splats, pixels)
