@@ -2,7 +2,7 @@
 //
 // geom, sh: component-major parameter buffers [rows, capacity] (clsplat/schema.py); rows by build constants.
 // Screen record of splat i: RECORD reals at records[i * RECORD]:
-//   mean_px x, y [px]; colour r, g, b; depth (camera z); first and last pixel row it can reach; shape's p.
+//   mean_px x, y [px]; colour r, g, b; depth (camera z); first and last pixel row, then column, it can reach; shape's p.
 
 #define CULLED_KEY 0xFFFFFFFFu
 #define COV2D_MAX R(1e12)  // px^2: a wider splat would overflow float32 on the way, and is no longer a splat
@@ -99,7 +99,7 @@ kernel void project_splats(
 
     vreal out[RECORD];
     extents box;
-    shape_project(s.s, s.b0, s.b1, s.cov2d, out + 8, &box);
+    shape_project(s.s, s.b0, s.b1, s.cov2d, out + HEAD, &box);
     out[0] = s.to_px.x;
     out[1] = s.to_px.y;
     out[5] = s.c.z;
@@ -120,6 +120,8 @@ kernel void project_splats(
     const vreal y_hi = floor(lanes_clamp(out[1] + box.down - half_px, -far, far));
     out[6] = y_lo;
     out[7] = y_hi;
+    out[8] = x_lo;
+    out[9] = x_hi;
     const vmask seen = s.in_front & (box.left + box.right > (vreal)0) & (x_lo <= x_hi) & (y_lo <= y_hi)
                      & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height)
                      & (s.cov2d.xx < (vreal)COV2D_MAX) & (s.cov2d.yy < (vreal)COV2D_MAX);

@@ -1,46 +1,118 @@
 // raster.cl: blend the isects of each tile front to back, and the gradient of that.
 //
-// One group of GROUP work-items per tile of TILE x TILE pixels; each item owns VECS runs ("rows") of LANES pixels,
-// so GROUP * VECS * LANES = TILE * TILE. Run number r = v * GROUP + item: CPU schedules walk a splat's own rows
-// with accumulators in L1, GPU schedules (VECS = 1) keep one pixel in registers. Splats come in batches of BATCH,
-// staged in local memory. Images are planar with a margin: plane c, pixel (x, y) at
+// One group of GROUP work-items per tile of TILE x TILE pixels; each item owns VECS blocks of LANES pixels (cl/lanes.clh),
+// so GROUP * VECS * LANES = TILE * TILE. Block number b = v * GROUP + item, rows of blocks one after another: CPU schedules
+// walk the blocks that a splat reaches with accumulators in L1, GPU schedules (VECS = 1) keep one pixel in registers.
+// Splats come in batches of BATCH, staged in local memory. Images are planar with a margin: plane c, pixel (x, y) at
 // c * plane + (y + MARGIN_Y) * stride + x + MARGIN_X; pixels beyond width or height are written as 0.
 
-#define RUNS_PER_ROW (TILE / LANES)
+#define BLOCKS_X (TILE / BLOCK_W)
 #define V_RECORD (SHAPE_V + 3)
 
-// Copies a batch of records; `lists` holds isect ids in depth order.
+// The screen records of a batch; `lists` holds isect ids in depth order. A group copies them to local memory; a single
+// work-item has them in its cache already and keeps where they are.
+#if GROUP == 1
+typedef global const real *staged_record;
+#define BATCH_MEMORY staged_record batch[BATCH]
 static inline void stage_batch(global const uint *lists, global const uint *isect_splat, global const real *records,
-                        uint start, int n, local real *batch) {
+                               uint start, int n, staged_record *batch) {
+    for (int k = 0; k < n; ++k) batch[k] = records + (ulong)isect_splat[lists[start + k]] * RECORD;
+}
+#define batch_record(k) (batch[k])
+#else
+typedef local const real *staged_record;
+#define BATCH_MEMORY local real batch[BATCH * RECORD]
+static inline void stage_batch(global const uint *lists, global const uint *isect_splat, global const real *records,
+                               uint start, int n, local real *batch) {
     for (int k = LID; k < n; k += GROUP) {
         global const real *from = records + (ulong)isect_splat[lists[start + k]] * RECORD;
         for (int j = 0; j < RECORD; ++j) batch[k * RECORD + j] = from[j];
     }
     group_barrier();
 }
-
-// Transmittance before any splat; pixels outside the image count as finished.
-static inline vreal fresh_T(int x, int y, int width, int height) {
-    const vmask inside = ((vreal)x + lanes_iota() < (vreal)width) & lanes_mask(y < height);
-    return lanes_if(inside, (vreal)1, (vreal)-1);
+#define batch_record(k) (batch + (k) * RECORD)
+#endif
+static inline void read_record(staged_record from, real *rec) {
+    UNROLL for (int j = 0; j < RECORD; ++j) rec[j] = from[j];
 }
 
-// Runs [first, last) of this item that the splat's pixel rows can touch.
-static inline int first_run(const real *rec, int tile_y) {
-    const int row = max((int)rec[6] - tile_y, 0);
-    return row * RUNS_PER_ROW / GROUP;
-}
-static inline int past_run(const real *rec, int tile_y) {
-    const int rows = min((int)rec[7] - tile_y + 1, TILE);
-    return (rows * RUNS_PER_ROW + GROUP - 1) / GROUP;
+// Column and row of a block's first pixel.
+static inline int block_column(int tile_x, int v) { return tile_x + (v * GROUP + LID) % BLOCKS_X * BLOCK_W; }
+static inline int block_row(int tile_y, int v) { return tile_y + (v * GROUP + LID) / BLOCKS_X * BLOCK_H; }
+static inline ulong block_at(int x, int y, int stride) { return (ulong)(y + MARGIN_Y) * stride + x + MARGIN_X; }
+
+// Centres of an item's pixels [px]; transmittance before any splat: pixels outside the image count as finished.
+static inline void start_blocks(int tile_x, int tile_y, int width, int height, vreal *px, vreal *py, vreal *T) {
+    for (int v = 0; v < VECS; ++v) {
+        px[v] = (vreal)(block_column(tile_x, v) + R(0.5)) + lanes_block_x();
+        py[v] = (vreal)(block_row(tile_y, v) + R(0.5)) + lanes_block_y();
+        T[v] = lanes_if((px[v] < (vreal)width) & (py[v] < (vreal)height), (vreal)1, (vreal)-1);
+    }
 }
 
-// What the forward tells the gradient about an isect: the runs in which it met a live pixel, a bit each. Where a work-item
-// has them all, and in vectors: of a group each item would know its own only.
-#define TELLS_RUNS (GROUP == 1 && LANES > 1)
+// The blocks of an item that a splat can reach. Where a work-item has all of the tile's, and in vectors: a bit each, those in
+// the splat's box that shape_reaches, tested LANES blocks at once. The forward keeps them for the gradient (isect_blocks).
+// Elsewhere first and past-the-end of those in the splat's pixel rows.
+#define CULLS_BLOCKS (GROUP == 1 && LANES > 1)
+#if CULLS_BLOCKS
+
+typedef uint block_set;
+#define ALL_BLOCKS (0xFFFFFFFFu >> (32 - VECS))
+#define no_blocks_left(set) ((set) == 0)
+#define next_block(set) (31 - (int)clz((set) & -(set)))
+#define without_next(set) ((set) & ((set) - 1))
+
+// Columns and rows of the first pixels of blocks LANES part, ..., LANES part + LANES - 1.
+static inline vreal corners_x(int part) {
+    const vreal number = lanes_iota() + (vreal)(part * LANES);
+    return (number - (real)BLOCKS_X * floor(number * (R(1.0) / BLOCKS_X))) * (real)BLOCK_W;
+}
+static inline vreal corners_y(int part) {
+    return floor((lanes_iota() + (vreal)(part * LANES)) * (R(1.0) / BLOCKS_X)) * (real)BLOCK_H;
+}
+
+static inline block_set blocks_reached(const real *rec, int tile_x, int tile_y) {
+    vmask bits = lanes_mask(0);
+    for (int part = 0; part < VECS / LANES; ++part) {
+        const vreal x = corners_x(part) + (vreal)tile_x, y = corners_y(part) + (vreal)tile_y;
+        const vmask in_box = (x <= (vreal)rec[9]) & (x + (real)(BLOCK_W - 1) >= (vreal)rec[8])
+                           & (y <= (vreal)rec[7]) & (y + (real)(BLOCK_H - 1) >= (vreal)rec[6]);
+        const vreal dx = x + R(0.5) * BLOCK_W - rec[0], dy = y + R(0.5) * BLOCK_H - rec[1];
+        bits |= in_box & shape_reaches(dx, dy, rec + HEAD) & lanes_bits(part * LANES);
+    }
+    return (uint)lanes_or(bits);
+}
+
+// Blocks with a pixel that is not finished.
+static inline block_set live_blocks(const vreal *T) {
+    block_set live = 0;
+    for (int v = 0; v < VECS; ++v) live |= lanes_any(lanes_not(BLEND_DONE(T[v]))) ? 1u << v : 0u;
+    return live;
+}
+
+#else
+
+typedef int2 block_set;
+#define no_blocks_left(set) ((set).x >= (set).y)
+#define next_block(set) ((set).x)
+#define without_next(set) ((set) + (int2)(1, 0))
+
+static inline block_set blocks_reached(const real *rec, int tile_x, int tile_y) {
+    const int top = max((int)rec[6] - tile_y, 0) / BLOCK_H, bottom = min((int)rec[7] - tile_y, TILE - 1) / BLOCK_H;
+    return (int2)(top * BLOCKS_X / GROUP, ((bottom + 1) * BLOCKS_X + GROUP - 1) / GROUP);
+}
+
+#endif
+
+// Whether any pixel of the item is not finished.
+static inline int any_live(const vreal *T) {
+    int live = 0;
+    for (int v = 0; v < VECS && !live; ++v) live = lanes_any(lanes_not(BLEND_DONE(T[v])));
+    return live;
+}
 
 // color [3 planes], transmittance [plane] (final T), depth [plane] (sum of weight * z; only if WITH_DEPTH).
-// isect_runs [n_isects], by unsorted isect id: see TELLS_RUNS.
+// isect_blocks [n_isects], by unsorted isect id, only where CULLS_BLOCKS: the blocks in which it was blended.
 GROUP_ATTRIBUTE
 kernel void rasterize(
     global const uint2 *restrict tile_ranges,
@@ -50,7 +122,7 @@ kernel void rasterize(
     global real *restrict color,
     global real *restrict transmittance,
     global real *restrict depth,
-    global uint *restrict isect_runs,
+    global uint *restrict isect_blocks,
     int width,
     int height,
     int tiles_x,
@@ -60,20 +132,18 @@ kernel void rasterize(
     real background_g,
     real background_b)
 {
-    local real batch[BATCH * RECORD];
+    BATCH_MEMORY;
     local real scratch[GROUP_SCRATCH(1)];
     const int tile = get_group_id(0);
     const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
     const uint2 range = tile_ranges[tile];
 
-    vreal T[VECS], red[VECS], green[VECS], blue[VECS];
+    vreal px[VECS], py[VECS], T[VECS], red[VECS], green[VECS], blue[VECS];
+    start_blocks(tile_x, tile_y, width, height, px, py, T);
 #if WITH_DEPTH
     vreal z[VECS];
 #endif
     for (int v = 0; v < VECS; ++v) {
-        const int run = v * GROUP + LID;
-        const int x = tile_x + run % RUNS_PER_ROW * LANES, y = tile_y + run / RUNS_PER_ROW;
-        T[v] = fresh_T(x, y, width, height);
         red[v] = green[v] = blue[v] = (vreal)0;
 #if WITH_DEPTH
         z[v] = (vreal)0;
@@ -82,26 +152,36 @@ kernel void rasterize(
 
     for (uint start = range.x; start < range.y; start += BATCH) {
         const int n = min((int)(range.y - start), BATCH);
+#if CULLS_BLOCKS
+        const block_set live = live_blocks(T);
+        if (!live) break;
+#else
+        if (!group_any(any_live(T), scratch)) break;
+#endif
         stage_batch(lists, isect_splat, records, start, n, batch);
+#if CULLS_BLOCKS  // all first: the loop below then knows at once where to go
+        block_set reached[BATCH];
         for (int k = 0; k < n; ++k) {
             real rec[RECORD];
-            for (int j = 0; j < RECORD; ++j) rec[j] = batch[k * RECORD + j];
-            const int past = past_run(rec, tile_y);
-#if TELLS_RUNS
-            vmask changed = lanes_mask(0);
+            read_record(batch_record(k), rec);
+            reached[k] = blocks_reached(rec, tile_x, tile_y) & live;
+            isect_blocks[lists[start + k]] = reached[k];
+        }
 #endif
-            for (int v = first_run(rec, tile_y); v < past; ++v) {
-                const int run = v * GROUP + LID;
-                const real x = tile_x + run % RUNS_PER_ROW * LANES + R(0.5) - rec[0];
-                const real dy = tile_y + run / RUNS_PER_ROW + R(0.5) - rec[1];
+        for (int k = 0; k < n; ++k) {
+            real rec[RECORD];
+            read_record(batch_record(k), rec);
+#if CULLS_BLOCKS
+            block_set blocks = reached[k];
+#else
+            block_set blocks = blocks_reached(rec, tile_x, tile_y);
+#endif
+            for (; !no_blocks_left(blocks); blocks = without_next(blocks)) {
+                const int v = next_block(blocks);
                 shape_pixel pixel;
-                vreal alpha = shape_alpha((vreal)x + lanes_iota(), dy, rec + 8, &pixel);
-                const vreal T_before = T[v];
+                vreal alpha = shape_alpha(px[v] - rec[0], py[v] - rec[1], rec + HEAD, &pixel);
                 vmask hit;
                 const vreal weight = blend(&alpha, &T[v], &hit);
-#if TELLS_RUNS
-                changed |= (hit | (T[v] != T_before)) & (mask_int)(1 << v);
-#endif
                 red[v] = lanes_mad(weight, (vreal)rec[2], red[v]);
                 green[v] = lanes_mad(weight, (vreal)rec[3], green[v]);
                 blue[v] = lanes_mad(weight, (vreal)rec[4], blue[v]);
@@ -109,28 +189,20 @@ kernel void rasterize(
                 z[v] = lanes_mad(weight, (vreal)rec[5], z[v]);
 #endif
             }
-#if TELLS_RUNS
-            isect_runs[lists[start + k]] = (uint)lanes_or(changed);
-#endif
         }
-        int any_live = 0;
-        for (int v = 0; v < VECS && !any_live; ++v) any_live = lanes_any(lanes_not(BLEND_DONE(T[v])));
-        if (!group_any(any_live, scratch)) break;
     }
 
     for (int v = 0; v < VECS; ++v) {
-        const int run = v * GROUP + LID;
-        const int x = tile_x + run % RUNS_PER_ROW * LANES, y = tile_y + run / RUNS_PER_ROW;
-        const vmask inside = ((vreal)x + lanes_iota() < (vreal)width) & lanes_mask(y < height);
-        const ulong at = (ulong)(y + MARGIN_Y) * stride + x + MARGIN_X;
+        const vmask inside = (px[v] < (vreal)width) & (py[v] < (vreal)height);
+        const ulong at = block_at(block_column(tile_x, v), block_row(tile_y, v), stride);
         const vreal zero = (vreal)0;
         T[v] = fabs(T[v]);
-        lanes_store(lanes_if(inside, lanes_mad(T[v], (vreal)background_r, red[v]), zero), color + at);
-        lanes_store(lanes_if(inside, lanes_mad(T[v], (vreal)background_g, green[v]), zero), color + at + plane);
-        lanes_store(lanes_if(inside, lanes_mad(T[v], (vreal)background_b, blue[v]), zero), color + at + 2 * plane);
-        lanes_store(lanes_if(inside, T[v], zero), transmittance + at);
+        lanes_store_block(lanes_if(inside, lanes_mad(T[v], (vreal)background_r, red[v]), zero), color + at, stride);
+        lanes_store_block(lanes_if(inside, lanes_mad(T[v], (vreal)background_g, green[v]), zero), color + at + plane, stride);
+        lanes_store_block(lanes_if(inside, lanes_mad(T[v], (vreal)background_b, blue[v]), zero), color + at + 2 * plane, stride);
+        lanes_store_block(lanes_if(inside, T[v], zero), transmittance + at, stride);
 #if WITH_DEPTH
-        lanes_store(lanes_if(inside, z[v], zero), depth + at);
+        lanes_store_block(lanes_if(inside, z[v], zero), depth + at, stride);
 #endif
     }
 }
@@ -149,7 +221,7 @@ kernel void rasterize_vjp(
     global const real *restrict transmittance,
     global const real *restrict v_color,
     global const real *restrict v_alpha,
-    global const uint *restrict isect_runs,
+    global const uint *restrict isect_blocks,
     global real *restrict isect_grads,
     int width,
     int height,
@@ -157,31 +229,30 @@ kernel void rasterize_vjp(
     int stride,
     ulong plane)
 {
-    local real batch[BATCH * RECORD];
+    BATCH_MEMORY;
     local real scratch[GROUP_SCRATCH(V_RECORD)];
     const int tile = get_group_id(0);
     const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
     const uint2 range = tile_ranges[tile];
 
-    vreal T[VECS], rest[VECS], v_red[VECS], v_green[VECS], v_blue[VECS];
+    vreal px[VECS], py[VECS], T[VECS], rest[VECS], v_red[VECS], v_green[VECS], v_blue[VECS];
+    start_blocks(tile_x, tile_y, width, height, px, py, T);
     for (int v = 0; v < VECS; ++v) {
-        const int run = v * GROUP + LID;
-        const int x = tile_x + run % RUNS_PER_ROW * LANES, y = tile_y + run / RUNS_PER_ROW;
-        const ulong at = (ulong)(y + MARGIN_Y) * stride + x + MARGIN_X;
-        T[v] = fresh_T(x, y, width, height);
-        v_red[v] = lanes_load(v_color + at);
-        v_green[v] = lanes_load(v_color + at + plane);
-        v_blue[v] = lanes_load(v_color + at + 2 * plane);
-        rest[v] = v_red[v] * lanes_load(color + at) + v_green[v] * lanes_load(color + at + plane)
-                + v_blue[v] * lanes_load(color + at + 2 * plane);
+        const ulong at = block_at(block_column(tile_x, v), block_row(tile_y, v), stride);
+        v_red[v] = lanes_load_block(v_color + at, stride);
+        v_green[v] = lanes_load_block(v_color + at + plane, stride);
+        v_blue[v] = lanes_load_block(v_color + at + 2 * plane, stride);
+        rest[v] = v_red[v] * lanes_load_block(color + at, stride) + v_green[v] * lanes_load_block(color + at + plane, stride)
+                + v_blue[v] * lanes_load_block(color + at + 2 * plane, stride);
 #if WITH_V_ALPHA
-        rest[v] -= lanes_load(transmittance + at) * lanes_load(v_alpha + at);
+        rest[v] -= lanes_load_block(transmittance + at, stride) * lanes_load_block(v_alpha + at, stride);
 #endif
     }
 
     bool finished = false;
     for (uint start = range.x; start < range.y; start += BATCH) {
         const int n = min((int)(range.y - start), BATCH);
+        finished = finished || !group_any(any_live(T), scratch);
         if (finished) {  // uniform over the group
             for (int k = LID; k < n; k += GROUP)
                 for (int j = 0; j < V_RECORD; ++j) isect_grads[(ulong)lists[start + k] * V_RECORD + j] = 0;
@@ -190,21 +261,19 @@ kernel void rasterize_vjp(
         stage_batch(lists, isect_splat, records, start, n, batch);
         for (int k = 0; k < n; ++k) {
             real rec[RECORD];
-            for (int j = 0; j < RECORD; ++j) rec[j] = batch[k * RECORD + j];
+            read_record(batch_record(k), rec);
             vreal sums[V_RECORD];
-            for (int j = 0; j < V_RECORD; ++j) sums[j] = (vreal)0;
-#if TELLS_RUNS
-            const uint told = isect_runs[lists[start + k]];
-            const int first = popcount((told & -told) - 1u), past = 32 - clz(told);
+            UNROLL for (int j = 0; j < V_RECORD; ++j) sums[j] = (vreal)0;
+#if CULLS_BLOCKS
+            block_set blocks = isect_blocks[lists[start + k]];
 #else
-            const int first = first_run(rec, tile_y), past = past_run(rec, tile_y);
+            block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
-            for (int v = first; v < past; ++v) {
-                const int run = v * GROUP + LID;
-                const vreal dx = (vreal)(tile_x + run % RUNS_PER_ROW * LANES + R(0.5) - rec[0]) + lanes_iota();
-                const real dy = tile_y + run / RUNS_PER_ROW + R(0.5) - rec[1];
+            for (; !no_blocks_left(blocks); blocks = without_next(blocks)) {
+                const int v = next_block(blocks);
+                const vreal dx = px[v] - rec[0], dy = py[v] - rec[1];
                 shape_pixel pixel;
-                const vreal raw_alpha = shape_alpha(dx, dy, rec + 8, &pixel);
+                const vreal raw_alpha = shape_alpha(dx, dy, rec + HEAD, &pixel);
                 vreal alpha = raw_alpha;
                 const vreal T_before = T[v];
                 vmask hit;
@@ -212,19 +281,16 @@ kernel void rasterize_vjp(
                 const vreal g = lanes_mad(v_red[v], rec[2], lanes_mad(v_green[v], rec[3], v_blue[v] * rec[4]));
                 rest[v] = lanes_mad(-weight, g, rest[v]);
                 const vreal v_a = lanes_mad(T_before, g, -rest[v] / ((vreal)1 - alpha));
-                shape_alpha_vjp(dx, dy, rec + 8, pixel, lanes_if(hit, blend_clamp_vjp(raw_alpha, v_a), (vreal)0),
+                shape_alpha_vjp(dx, dy, rec + HEAD, pixel, lanes_if(hit, blend_clamp_vjp(raw_alpha, v_a), (vreal)0),
                                 sums);
                 sums[SHAPE_V] = lanes_mad(weight, v_red[v], sums[SHAPE_V]);
                 sums[SHAPE_V + 1] = lanes_mad(weight, v_green[v], sums[SHAPE_V + 1]);
                 sums[SHAPE_V + 2] = lanes_mad(weight, v_blue[v], sums[SHAPE_V + 2]);
             }
             real own[V_RECORD];
-            for (int j = 0; j < V_RECORD; ++j) own[j] = lanes_sum(sums[j]);
+            lanes_sums(sums, V_RECORD, own);
             group_sum_store(own, V_RECORD, scratch, isect_grads + (ulong)lists[start + k] * V_RECORD);
         }
-        int any_live = 0;
-        for (int v = 0; v < VECS && !any_live; ++v) any_live = lanes_any(lanes_not(BLEND_DONE(T[v])));
-        finished = !group_any(any_live, scratch);
     }
 }
 

@@ -20,6 +20,7 @@ BATCH = 64
 
 ALPHA_MIN, ALPHA_MAX, T_MIN = 1.0 / 255.0, 0.99, 1e-4  # of gsplat and 3DGS
 LOW_PASS = 0.3  # px^2
+RECORD_HEAD = 10  # HEAD of cl/shape/contract.clh
 NEAR = 0.01  # world units
 
 _LOWER = ("lanes.clh", "group.clh", "algebra.clh", "opacity.clh", "harmonics.clh", "camera/pinhole.clh",
@@ -58,7 +59,7 @@ class KernelBuild:
     @property
     def record(self) -> int:
         """Reals of a screen record."""
-        return 8 + shape_named(self.shape).record
+        return RECORD_HEAD + shape_named(self.shape).record
 
     @property
     def v_record(self) -> int:

@@ -173,7 +173,7 @@ class Pipeline:
                 (band.past * group,), (group,), tile_ranges=pool.get("tile_ranges", 0), lists=lists,
                 isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0), color=pool.get("color", 0),
                 transmittance=pool.get("transmittance", 0), v_color=v_color,
-                v_alpha=v_color if v_alpha is None else v_alpha, isect_runs=pool.get("isect_runs", 0),
+                v_alpha=v_color if v_alpha is None else v_alpha, isect_blocks=pool.get("isect_blocks", 0),
                 isect_grads=isect_grads, width=layout.width, height=layout.height, tiles_x=layout.tiles_x,
                 stride=layout.stride, plane=layout.plane,
             )
@@ -274,7 +274,7 @@ class Pipeline:
             (band.past * group,), (group,), tile_ranges=pool.get("tile_ranges", 0), lists=self._lists,
             isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0),
             color=self.image(prefix + "color", layout, 3), transmittance=self.image(prefix + "transmittance", layout),
-            depth=self.image(prefix + "depth", layout), isect_runs=pool.get("isect_runs", 4 * band.n_isects),
+            depth=self.image(prefix + "depth", layout), isect_blocks=pool.get("isect_blocks", 4 * band.n_isects),
             width=layout.width, height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride,
             plane=layout.plane, background_r=r, background_g=g, background_b=b,
         )

@@ -3,7 +3,7 @@
 Oclgrind 21.10 follows what kernels write and what a whole-buffer write from the host brings, but loses track
 of host writes at an offset, of fills, and of buffers whose memory served another one before. So this process
 replaces the first two by kernels and frees no buffer. It also misreads the halves of a vector (`v.hi`), so
-lanes_sum and lanes_or go lane by lane.
+lanes_sum, lanes_sums and lanes_or go lane by lane.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ inline real lanes_sum_one_by_one(vreal v) {
     for (int l = 0; l < LANES; ++l) sum += part[l];
     return sum;
 }
+#define lanes_sums(v, n, out) for (int j_ = 0; j_ < (n); ++j_) (out)[j_] = lanes_sum((v)[j_])
 #define lanes_or lanes_or_one_by_one
 inline mask_int lanes_or_one_by_one(vmask m) {
     mask_int part[LANES], bits = 0;
