@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from kernel_checks import Case
 from reference_scenes import for_shape, random_camera, random_splats
+from reference_skewed import SKEWED
 from test_footprint import strongly_skewed
 
 from clsplat.buffers import SplatBuffers, to_host
@@ -15,9 +16,8 @@ from clsplat.pipeline import Pipeline
 from clsplat.shapes import SHAPES, shape_named
 
 WIDTH, HEIGHT = 83, 61
-# Blocks looked at, as a multiple of those in which something shows: measured 1.04 to 1.11 for shapes with one side,
-# 1.12 to 1.17 for skew-normals, 1.31 for two sides.
-MOST = 1.4
+# Blocks looked at, as a multiple of those in which something shows: measured 1.02 to 1.04, and 1.18 to 1.24 with a skew.
+MOST, MOST_SKEWED = 1.08, 1.3
 
 
 def one_splat(shape: str, seed: int, needle: bool) -> Case:
@@ -31,7 +31,7 @@ def one_splat(shape: str, seed: int, needle: bool) -> Case:
     return Case(wanted, random_camera(seed, WIDTH, HEIGHT), shape, "peak", np.float32)
 
 
-@pytest.mark.parametrize("schedule", ["cpu16", "cpu8"])
+@pytest.mark.parametrize("schedule", ["cpu16", pytest.param("cpu8", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, schedule: str) -> None:
     form = Schedule.parse(schedule)
@@ -59,5 +59,6 @@ def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, sc
         visible = (alpha != 0).reshape(seen.shape[0], block_height, seen.shape[1], 4).any(axis=(1, 3))
         assert not (visible & ~seen).any()
         looked_at, shows = looked_at + seen.sum(), shows + visible.sum()
-    assert shows > 1000
-    assert shows <= looked_at <= MOST * shows, looked_at / shows
+    assert shows > 400
+    most = MOST_SKEWED if shape in SKEWED and shape != "gaussian" else MOST
+    assert shows <= looked_at <= most * shows, looked_at / shows
