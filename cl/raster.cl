@@ -13,12 +13,12 @@
 // work-item has them in its cache already and keeps where they are.
 #if GROUP == 1
 typedef global const real *staged_record;
-#define BATCH_MEMORY staged_record batch[BATCH]
+#define BATCH_MEMORY uint batch[BATCH]
 static inline void stage_batch(global const uint *lists, global const uint *isect_splat, global const real *records,
-                               uint start, int n, staged_record *batch) {
-    for (int k = 0; k < n; ++k) batch[k] = records + (ulong)isect_splat[lists[start + k]] * RECORD;
+                               uint start, int n, uint *batch) {
+    for (int k = 0; k < n; ++k) batch[k] = isect_splat[lists[start + k]];
 }
-#define batch_record(k) (batch[k])
+#define batch_record(k) (records + (ulong)batch[k] * RECORD)
 #else
 typedef local const real *staged_record;
 #define BATCH_MEMORY local real batch[BATCH * RECORD]

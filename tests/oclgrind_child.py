@@ -3,7 +3,7 @@
 Oclgrind 21.10 follows what kernels write and what a whole-buffer write from the host brings, but loses track
 of host writes at an offset, of fills, and of buffers whose memory served another one before. So this process
 replaces the first two by kernels and frees no buffer. It also misreads the halves of a vector (`v.hi`), so
-lanes_sum, lanes_sums and lanes_or go lane by lane.
+sums, ORs and blocks go lane by lane.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ kernel void put(global const uint *restrict from, global uint *restrict to, ulon
 kernel void zero(global uint *restrict to) { to[get_global_id(0)] = 0; }
 """
 
-PLAIN_SUM = """
+PLAIN_LANES = """
 #undef lanes_sum
 #define lanes_sum lanes_sum_one_by_one
 inline real lanes_sum_one_by_one(vreal v) {
@@ -40,7 +40,22 @@ inline real lanes_sum_one_by_one(vreal v) {
     for (int l = 0; l < LANES; ++l) sum += part[l];
     return sum;
 }
+#undef lanes_sums
 #define lanes_sums(v, n, out) for (int j_ = 0; j_ < (n); ++j_) (out)[j_] = lanes_sum((v)[j_])
+#undef lanes_load_block
+#undef lanes_store_block
+#define lanes_load_block(p, stride) load_block_one_by_one(p, stride)
+#define lanes_store_block(v, p, stride) store_block_one_by_one(v, p, stride)
+inline vreal load_block_one_by_one(global const real *p, int stride) {
+    real part[LANES];
+    for (int l = 0; l < LANES; ++l) part[l] = p[l / BLOCK_W * stride + l % BLOCK_W];
+    return lanes_load(part);
+}
+inline void store_block_one_by_one(vreal v, global real *p, int stride) {
+    real part[LANES];
+    lanes_store(v, part);
+    for (int l = 0; l < LANES; ++l) p[l / BLOCK_W * stride + l % BLOCK_W] = part[l];
+}
 #define lanes_or lanes_or_one_by_one
 inline mask_int lanes_or_one_by_one(vmask m) {
     mask_int part[LANES], bits = 0;
@@ -71,7 +86,7 @@ def make_traceable(device: Device) -> None:
         return kept[-1]
 
     def source(*names: str) -> str:
-        parts = [join(name) + (PLAIN_SUM if name == "lanes.clh" else "") for name in names]
+        parts = [join(name) + (PLAIN_LANES if name == "lanes.clh" else "") for name in names]
         return "".join(parts)
 
     device.alloc = keep  # type: ignore[method-assign]

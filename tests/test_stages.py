@@ -74,7 +74,7 @@ def test_work_is_counted_from_sizes() -> None:
     kernels = KernelBuild("gaussian", 1, SCHEDULES["cpu16"])
     work = work_of(kernels, Sizes(splats=10, isects=50, pixels=512, pairs=1000, sh_degree=1), is_cpu=True)
     assert work["rasterize"].flops == 1000 * (20 + 10)  # exponent 4, exp 15, opacity 1; blending 10
-    assert work["rasterize"].bytes == 50 * (12 + 4 * 12) + 4 * 4 * 512
+    assert work["rasterize"].bytes == 50 * (12 + 4 * 15) + 4 * 4 * 512
     assert work["rasterize_vjp"].flops == 1000 * (20 + 12 + 20)
     assert work["gather"].bytes == 10 * (8 + 4 * 9) + 50 * 4 * 9
     assert work["depth sort"].bytes == 10 * 40
