@@ -11,7 +11,7 @@
 
 // The screen records of a batch; `lists` holds isect ids in depth order. A group copies them to local memory; a single
 // work-item has them in its cache already and keeps where they are.
-#if GROUP == 1
+#if ALONE
 typedef global const real *staged_record;
 #define BATCH_MEMORY uint batch[BATCH]
 static inline void stage_batch(global const uint *lists, global const uint *isect_splat, global const real *records,
@@ -53,7 +53,7 @@ static inline void start_blocks(int tile_x, int tile_y, int width, int height, v
 // The blocks of an item that a splat can reach. Where a work-item has all of the tile's, and in vectors: a bit each, those in
 // the splat's box that shape_reaches, tested LANES blocks at once. The forward keeps them for the gradient (isect_blocks).
 // Elsewhere first and past-the-end of those in the splat's pixel rows.
-#define CULLS_BLOCKS (GROUP == 1 && LANES > 1)
+#define CULLS_BLOCKS (ALONE && LANES > 1)
 #if CULLS_BLOCKS
 
 typedef uint block_set;

@@ -16,7 +16,7 @@ from clsplat.pipeline import Pipeline
 from clsplat.shapes import SHAPES, shape_named
 
 WIDTH, HEIGHT = 83, 61
-# Blocks looked at, as a multiple of those in which something shows: measured 1.02 to 1.04, and 1.18 to 1.24 with a skew.
+# Blocks looked at, as a multiple of those in which something shows: measured 1.02 to 1.04, with a skew 1.18 to 1.24.
 MOST, MOST_SKEWED = 1.08, 1.3
 
 
