@@ -30,12 +30,6 @@
         for (int k = 0; k < TAPS - 1; ++k) \
             for (int map = 0; map < maps; ++map) ring[k][0][map] = ring[k + 1][0][map];
 
-// A vector at any address: of vload16, PoCL makes eight loads and as many shuffles where several overlap.
-typedef vreal vreal_anywhere __attribute__((aligned(sizeof(real))));
-#define row_load(p) ((vreal)*(global const vreal_anywhere *)(p))
-#define row_store(v, p) (*(global vreal_anywhere *)(p) = (v))
-#define own_load(p) ((vreal)*(const vreal_anywhere *)(p))
-#define own_store(v, p) (*(vreal_anywhere *)(p) = (v))
 #define truth_load(p) (lanes_uchar_to_real(p) * (real)(1.0 / 255.0))
 
 // Written out, as not every compiler unrolls: `pair(weight, k)` for both pixels k from the centre.
@@ -104,17 +98,17 @@ kernel void image_loss(
         if (row >= 0 && row < height) {
             const ulong at = own.at + (long)row * stride - SIDE * LANES;
             for (int v = 0; v < own.n + 2 * SIDE; ++v) {
-                const vreal x = row_load(rendered + at + v * LANES), y = truth_load(truth + at + v * LANES);
-                own_store(x + y, s_row + v * LANES);
-                own_store(x - y, d_row + v * LANES);
+                const vreal x = lanes_load(rendered + at + v * LANES), y = truth_load(truth + at + v * LANES);
+                lanes_store(x + y, s_row + v * LANES);
+                lanes_store(x - y, d_row + v * LANES);
             }
             for (int v = 0; v < own.n; ++v) {
                 const real *s_at = s_row + (SIDE + v) * LANES, *d_at = d_row + (SIDE + v) * LANES;
-                const vreal s = own_load(s_at), d = own_load(d_at);
+                const vreal s = lanes_load(s_at), d = lanes_load(d_at);
                 vreal s1 = WINDOW_5 * s, d1 = WINDOW_5 * d, s2 = s1 * s, d2 = d1 * d;
 #define ADD_PAIR(w, k) { \
-                const vreal sa = own_load(s_at - k), sb = own_load(s_at + k); \
-                const vreal da = own_load(d_at - k), db = own_load(d_at + k); \
+                const vreal sa = lanes_load(s_at - k), sb = lanes_load(s_at + k); \
+                const vreal da = lanes_load(d_at - k), db = lanes_load(d_at + k); \
                 s1 = lanes_mad(w, sa + sb, s1); \
                 d1 = lanes_mad(w, da + db, d1); \
                 s2 = lanes_mad(w, lanes_mad(sa, sa, sb * sb), s2); \
@@ -155,10 +149,10 @@ kernel void image_loss(
 
             const vmask inside = inside_image(own.first + v, width);
             const ulong at = centre + v * LANES;
-            row_store(lanes_if(inside, v_mean, zero), v_maps + at);
-            row_store(lanes_if(inside, v_hs, zero), v_maps + at + 3 * plane);
-            row_store(lanes_if(inside, v_hd, zero), v_maps + at + 6 * plane);
-            const vreal error = row_load(rendered + at) - truth_load(truth + at);  // 0 outside
+            lanes_store(lanes_if(inside, v_mean, zero), v_maps + at);
+            lanes_store(lanes_if(inside, v_hs, zero), v_maps + at + 3 * plane);
+            lanes_store(lanes_if(inside, v_hd, zero), v_maps + at + 6 * plane);
+            const vreal error = lanes_load(rendered + at) - truth_load(truth + at);  // 0 outside
             l1 += fabs(error);
             ssims += lanes_if(inside, ssim, zero);
             squares = lanes_mad(error, error, squares);
@@ -197,12 +191,12 @@ kernel void image_loss_vjp(
             global const real *from = v_maps + own.at + (long)row * stride;
             for (int v = 0; v < own.n; ++v, from += LANES) {
                 global const real *hs = from + 3 * plane, *hd = from + 6 * plane;
-                vreal v_mean = WINDOW_5 * row_load(from);
-                vreal v_hs = WINDOW_5 * row_load(hs), v_hd = WINDOW_5 * row_load(hd);
+                vreal v_mean = WINDOW_5 * lanes_load(from);
+                vreal v_hs = WINDOW_5 * lanes_load(hs), v_hd = WINDOW_5 * lanes_load(hd);
 #define ADD_PAIR(w, k) \
-                v_mean = lanes_mad(w, row_load(from - k) + row_load(from + k), v_mean); \
-                v_hs = lanes_mad(w, row_load(hs - k) + row_load(hs + k), v_hs); \
-                v_hd = lanes_mad(w, row_load(hd - k) + row_load(hd + k), v_hd);
+                v_mean = lanes_mad(w, lanes_load(from - k) + lanes_load(from + k), v_mean); \
+                v_hs = lanes_mad(w, lanes_load(hs - k) + lanes_load(hs + k), v_hs); \
+                v_hd = lanes_mad(w, lanes_load(hd - k) + lanes_load(hd + k), v_hd);
                 PAIRS_OF_WINDOW(ADD_PAIR)
 #undef ADD_PAIR
                 PUT(0, v_mean);
@@ -226,10 +220,10 @@ kernel void image_loss_vjp(
             PAIRS_OF_WINDOW(ADD_PAIR)
 #undef ADD_PAIR
             const ulong at = centre + v * LANES;
-            const vreal x = row_load(rendered + at), y = truth_load(truth + at);
+            const vreal x = lanes_load(rendered + at), y = truth_load(truth + at);
             const vreal v_ssim = lanes_mad(x + y, v_hs, lanes_mad(x - y, v_hd, v_mean));
             const vreal sign_l1 = lanes_if(x > y, (vreal)1, lanes_if(x < y, (vreal)-1, zero));
-            row_store(lanes_if(inside_image(own.first + v, width), l1_scale * sign_l1 - ssim_scale * v_ssim, zero),
+            lanes_store(lanes_if(inside_image(own.first + v, width), l1_scale * sign_l1 - ssim_scale * v_ssim, zero),
                       v_color + at);
         }
     }

@@ -295,6 +295,7 @@ kernel void rasterize_vjp(
 }
 
 // moments [V_RECORD, capacity]: each splat's isects summed in order. Overwrites, or goes on with the sum that is there.
+// Global size: splats / LANES.
 kernel void gather_isect_grads(
     global const uint2 *restrict splat_isects,
     global const real *restrict isect_grads,
@@ -303,12 +304,16 @@ kernel void gather_isect_grads(
     uint n_splats,
     int go_on)
 {
-    const uint i = get_global_id(0);
-    if (i >= n_splats) return;
-    real sums[V_RECORD];
-    for (int j = 0; j < V_RECORD; ++j) sums[j] = go_on ? moments[i + j * capacity] : 0;
-    const uint2 range = splat_isects[i];
-    for (uint isect = range.x; isect < range.y; ++isect)
-        for (int j = 0; j < V_RECORD; ++j) sums[j] += isect_grads[(ulong)isect * V_RECORD + j];
-    for (int j = 0; j < V_RECORD; ++j) moments[i + j * capacity] = sums[j];
+    const uint first = get_global_id(0) * LANES;
+    if (first >= n_splats) return;
+    real sums[V_RECORD][LANES];
+    for (uint l = 0; l < LANES; ++l) {
+        const uint2 range = first + l < n_splats ? splat_isects[first + l] : (uint2)(0, 0);
+        real own[V_RECORD];
+        for (int j = 0; j < V_RECORD; ++j) own[j] = go_on ? moments[first + l + j * capacity] : 0;
+        for (uint isect = range.x; isect < range.y; ++isect)
+            UNROLL for (int j = 0; j < V_RECORD; ++j) own[j] += isect_grads[(ulong)isect * V_RECORD + j];
+        for (int j = 0; j < V_RECORD; ++j) sums[j][l] = own[j];
+    }
+    for (int j = 0; j < V_RECORD; ++j) lanes_store(lanes_load(sums[j]), moments + first + j * capacity);
 }

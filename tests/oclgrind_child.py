@@ -58,8 +58,8 @@ inline void store_block_one_by_one(vreal v, global real *p, int stride) {
 }
 #define lanes_or lanes_or_one_by_one
 inline mask_int lanes_or_one_by_one(vmask m) {
-    mask_int part[LANES], bits = 0;
-    lanes_store(m, part);
+    const mask_int *part = (const mask_int *)&m;
+    mask_int bits = 0;
     for (int l = 0; l < LANES; ++l) bits |= part[l];
     return bits;
 }
