@@ -18,7 +18,7 @@ DIFFERENCES = 1e-6
 # Colour, alpha of a float32 render against float64, absolute, images below 256 pixels. A coordinate below 64
 # rounds by 4e-6 px (1.5e-5 below 256), which a splat no narrower than sqrt(0.3) px turns into 1.1 times that;
 # a conic of condition 1e2 adds 6e-8 * 1e2 relative to q <= 11 near the rim, where alpha is small; exp is good
-# to 1.2e-7, Phi to 2.6e-7, peak to 3e-7. Weights sum to at most 1. Measured: 2e-6. Depth: the same, times the
+# to 3.2e-7, Phi to 2.7e-7, peak to 3e-7. Weights sum to at most 1. Measured: 2e-6. Depth: the same, times the
 # largest camera z. Pixels at a threshold jump by far more: comparisons leave them out
 # (kernel_checks.Case.decided).
 IMAGE_FLOAT32 = 1e-5
