@@ -13,7 +13,8 @@ from .errors import InputError
 
 # (fraction of the run, downscale): coarse to fine, the last half at full resolution.
 COARSE_TO_FINE = ((0.0, 4), (0.2, 2), (0.5, 1))
-FRACTION_PER_PIXEL = 0.2  # of the run that an image serves for each pixel that a splat has in it
+MANY_PIXELS = 8.0  # of the image for each splat: above it coarse stages last longer
+LONGEST = 1.3  # times as long: full resolution from 0.65 of the run
 
 
 def exponential_decay(start: float, end: float, steps: int) -> Callable[[int], float]:
@@ -98,20 +99,14 @@ def downscale_at(schedule: Sequence[tuple[int, int]], iteration: int) -> int:
     return current
 
 
-def downscale_for(schedule: Sequence[tuple[int, int]], iteration: int, iterations: int, n_splats: int,
-                  pixels: float) -> int:
-    """Downscale of `iteration`: the schedule's, or a finer one of it where splats are short of pixels.
+def downscale_for(schedule: Sequence[tuple[int, int]], iteration: int, n_splats: int, pixels: float) -> int:
+    """Downscale of `iteration`: the schedule's, later where splats are few: they learn as much from small images.
 
-    Few splats learn as much from a small image as from a large one; many have learnt soon what there is in it.
+    From MANY_PIXELS to twice as many pixels a splat, the stages grow longer, by LONGEST at most.
 
     Parameters
     ----------
-    schedule : from `resolution_schedule`. iterations : length of the run.
-    pixels : of an image at full size.
+    schedule : from `resolution_schedule`. pixels : of an image at full size.
     """
-    latest = downscale_at(schedule, iteration)
-    for _, downscale in schedule:
-        part = FRACTION_PER_PIXEL * pixels / (downscale**2 * max(n_splats, 1))  # of the run
-        if downscale == 1 or (downscale <= latest and iteration < part * iterations):
-            return downscale
-    return 1
+    plenty = min(max(pixels / (MANY_PIXELS * max(n_splats, 1)) - 1.0, 0.0), 1.0)
+    return downscale_at(schedule, int(iteration / (1.0 + (LONGEST - 1.0) * plenty)))

@@ -30,5 +30,4 @@ class ViewSampler:
         """Index of an iteration's view (from 1), and the downscale of its image that suits so many splats."""
         if not self.queue:
             self.queue = self.rng.permutation(len(self.views)).tolist()
-        return self.queue.pop(), downscale_for(
-            self.stages, iteration - 1, self.iterations, n_splats, self._pixels)
+        return self.queue.pop(), downscale_for(self.stages, iteration - 1, n_splats, self._pixels)

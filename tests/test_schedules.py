@@ -62,22 +62,22 @@ def test_resolution_schedule_rejects(stages: list[tuple[float, int]]) -> None:
         resolution_schedule(100, stages)
 
 
-def test_splats_short_of_pixels_go_on_to_larger_images() -> None:
+def test_few_splats_stay_longer_with_small_images() -> None:
     schedule, pixels = resolution_schedule(1000), 160_000
-    few = [downscale_for(schedule, i, 1000, 1000, pixels) for i in range(1000)]
-    assert few == [downscale_at(schedule, i) for i in range(1000)]
-    # One pixel a splat at 1/4, four at 1/2: the latter serve to the schedule's end.
-    assert [downscale_for(schedule, i, 1000, 10_000, pixels) for i in (0, 199, 200, 499, 500)] == [4, 4, 2, 2, 1]
-    assert [downscale_for(schedule, i, 1000, 40_000, pixels) for i in (0, 49, 50, 199, 200)] == [4, 4, 2, 2, 1]
-    assert [downscale_for(schedule, i, 1000, 400_000, pixels) for i in (0, 4, 5, 19, 20)] == [4, 4, 2, 2, 1]
-    assert downscale_for([(0, 1)], 0, 1000, 10, 1) == 1
-    assert downscale_for(schedule, 0, 1000, 0, pixels) == 4
+    for many in (20_000, 10**6):  # 8 pixels a splat and fewer
+        assert [downscale_for(schedule, i, many, pixels) for i in (0, 199, 200, 499, 500)] == [4, 4, 2, 2, 1]
+    for few in (10_000, 1, 0):  # 16 and more
+        assert [downscale_for(schedule, i, few, pixels) for i in (0, 259, 260, 649, 650)] == [4, 4, 2, 2, 1]
+    # 12 pixels a splat: half of the way
+    assert [downscale_for(schedule, i, 13_333, pixels) for i in (0, 229, 231, 574, 576)] == [4, 4, 2, 2, 1]
+    assert downscale_for([(0, 1)], 0, 10, 1) == 1
 
 
 @given(iteration=st.integers(0, 1000), splats=st.integers(0, 10**6), pixels=st.integers(1, 10**6))
-def test_no_downscale_is_coarser_than_the_schedules(iteration: int, splats: int, pixels: int) -> None:
+def test_no_downscale_is_finer_than_the_schedules(iteration: int, splats: int, pixels: int) -> None:
     schedule = resolution_schedule(1000)
-    chosen = downscale_for(schedule, iteration, 1000, splats, pixels)
-    assert chosen <= downscale_at(schedule, iteration)
-    assert chosen <= downscale_for(schedule, iteration, 1000, max(splats - 1, 0), pixels)
-    assert chosen >= downscale_for(schedule, iteration + 1, 1000, splats, pixels)
+    chosen = downscale_for(schedule, iteration, splats, pixels)
+    assert chosen >= downscale_at(schedule, iteration)
+    assert chosen <= downscale_for(schedule, iteration, max(splats - 1, 0), pixels)
+    assert chosen >= downscale_for(schedule, iteration + 1, splats, pixels)
+    assert downscale_for(schedule, 1000, splats, pixels) == 1

@@ -30,7 +30,7 @@ def test_size_goes_with_iteration_and_splats(views: list[View]) -> None:
     large = [View(view.name, Camera(480, 360, 400, 400, 240, 180, view.camera.cam_from_world), view.image)
              for view in views]
     sampler = ViewSampler(large, 1000, True, np.random.default_rng(0), [])
-    assert [sampler.next(iteration, 100)[1] for iteration in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
-    # 480 x 360 px: half a pixel a splat at 1/4, two at 1/2
-    assert [sampler.next(iteration, 21_600)[1] for iteration in (1, 100, 101, 400, 401)] == [4, 4, 2, 2, 1]
+    # 480 x 360 px: 8 pixels a splat, and many more
+    assert [sampler.next(iteration, 21_600)[1] for iteration in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
+    assert [sampler.next(iteration, 100)[1] for iteration in (1, 260, 261, 650, 651)] == [4, 4, 2, 2, 1]
     assert ViewSampler(large, 1000, False, np.random.default_rng(0), []).next(1, 1)[1] == 1
