@@ -21,7 +21,7 @@ class ViewSampler:
 
     def __init__(self, views: list[View], iterations: int, coarse_to_fine: bool, rng: np.random.Generator,
                  queue: list[int]) -> None:
-        self.views, self.iterations, self.rng, self.queue = views, iterations, rng, list(queue)
+        self.views, self.rng, self.queue = views, rng, list(queue)
         side = min(min(view.camera.width, view.camera.height) for view in views)
         self._pixels = statistics.median(view.camera.width * view.camera.height for view in views)
         self.stages = resolution_schedule(iterations, image_side=side) if coarse_to_fine else [(0, 1)]
