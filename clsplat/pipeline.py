@@ -179,7 +179,8 @@ class Pipeline:
             )
             self.program.gather_isect_grads.over(
                 -(-splats.n // self.kernels.lanes), self.group, splat_isects=pool.get("splat_isects", 0),
-                isect_grads=isect_grads, moments=moments, capacity=splats.capacity, n_splats=splats.n, go_on=int(band.first > 0),
+                isect_grads=isect_grads, moments=moments, capacity=splats.capacity, n_splats=splats.n,
+                go_on=int(band.first > 0),
             )
         self.program.project_splats_vjp.over(
             -(-splats.n // self.kernels.lanes), self.group, geom=splats.geom, sh=splats.sh,
