@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+from .morton import morton_order
 from .schema import Array, sh_coefficients
 from .shapes import DEFAULT_SHAPE, shape_named
 from .splats import Splats
@@ -37,6 +38,8 @@ def initial_splats(
 ) -> tuple[Splats, str]:
     """Splats to start from and one sentence on where they come from.
 
+    Splats made from points follow a Morton curve, those of a model keep their order.
+
     Parameters
     ----------
     scene : its points and training cameras are used.
@@ -57,6 +60,8 @@ def initial_splats(
         splats, message = _from_model(init, shape, cap, sh_degree, normalisation)
     elif init in ("sfm", "random"):
         xyz, rgb, message = _points(scene, init, cap, rng)
+        order = morton_order(xyz)
+        xyz, rgb = xyz[order], rgb[order]
         splats = Splats.from_points(xyz, rgb, shape=shape, sh_degree=sh_degree, normalisation=normalisation,
                                     opacity=opacity, scale_factor=scale_factor)
     else:
