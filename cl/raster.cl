@@ -176,10 +176,17 @@ kernel void rasterize(
 #else
             block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
+            // Alpha of all blocks before any is blended: a CPU holds fewer operations in flight than one block's chain from
+            // pixel to transmittance has, and two short chains keep it busier than a long one.
+            vreal alphas[VECS];
+            for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
+                const int v = next_block(set);
+                shape_pixel pixel;
+                alphas[v] = shape_alpha(px[v] - rec[0], py[v] - rec[1], rec + HEAD, &pixel);
+            }
             for (; !no_blocks_left(blocks); blocks = without_next(blocks)) {
                 const int v = next_block(blocks);
-                shape_pixel pixel;
-                vreal alpha = shape_alpha(px[v] - rec[0], py[v] - rec[1], rec + HEAD, &pixel);
+                vreal alpha = alphas[v];
                 vmask hit;
                 const vreal weight = blend(&alpha, &T[v], &hit);
                 red[v] = lanes_mad(weight, (vreal)rec[2], red[v]);
@@ -269,11 +276,17 @@ kernel void rasterize_vjp(
 #else
             block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
+            vreal alphas[VECS];  // first, as above
+            shape_pixel pixels[VECS];
+            for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
+                const int v = next_block(set);
+                alphas[v] = shape_alpha(px[v] - rec[0], py[v] - rec[1], rec + HEAD, &pixels[v]);
+            }
             for (; !no_blocks_left(blocks); blocks = without_next(blocks)) {
                 const int v = next_block(blocks);
                 const vreal dx = px[v] - rec[0], dy = py[v] - rec[1];
-                shape_pixel pixel;
-                const vreal raw_alpha = shape_alpha(dx, dy, rec + HEAD, &pixel);
+                const shape_pixel pixel = pixels[v];
+                const vreal raw_alpha = alphas[v];
                 vreal alpha = raw_alpha;
                 const vreal T_before = T[v];
                 vmask hit;
