@@ -3,7 +3,7 @@
 // One group of GROUP work-items per tile of TILE x TILE pixels; each item owns VECS blocks of LANES pixels (cl/lanes.clh),
 // so GROUP * VECS * LANES = TILE * TILE. Block number b = v * GROUP + item, rows of blocks one after another: CPU schedules
 // walk the blocks that a splat reaches with accumulators in L1, GPU schedules (VECS = 1) keep one pixel in registers.
-// Splats come in batches of BATCH, staged in local memory. Images are planar with a margin: plane c, pixel (x, y) at
+// Splats come in batches of BATCH. Images are planar with a margin: plane c, pixel (x, y) at
 // c * plane + (y + MARGIN_Y) * stride + x + MARGIN_X; pixels beyond width or height are written as 0.
 
 #define BLOCKS_X (TILE / BLOCK_W)
@@ -57,7 +57,6 @@ static inline void start_blocks(int tile_x, int tile_y, int width, int height, v
 #if CULLS_BLOCKS
 
 typedef uint block_set;
-#define ALL_BLOCKS (0xFFFFFFFFu >> (32 - VECS))
 #define no_blocks_left(set) ((set) == 0)
 #define next_block(set) (31 - (int)clz((set) & -(set)))
 #define without_next(set) ((set) & ((set) - 1))

@@ -64,11 +64,15 @@ def copy(device: Device, source: Any, target: Any, nbytes: int) -> None:
         device.observe("copy", (nbytes,), cl.enqueue_copy(device.queue, target, source, byte_count=nbytes))
 
 
-def send_to_device(device: Device, buffer: Any, array: NDArray[Any]) -> Any:
-    """Copy an array into a buffer without waiting. Keep what is returned until the copy is done: letting go waits."""
+def send_to_device(device: Device, buffer: Any, array: NDArray[Any], queue: Any = None, after: Any = None) -> Any:
+    """Copy an array into a buffer without waiting, on the device's or another queue, after an event if one is given.
+
+    Keep what is returned until the copy is done: letting go waits.
+    """
     import pyopencl as cl
 
-    event = cl.enqueue_copy(device.queue, buffer, np.ascontiguousarray(array), is_blocking=False)
+    event = cl.enqueue_copy(queue or device.queue, buffer, np.ascontiguousarray(array), is_blocking=False,
+                            wait_for=None if after is None else [after])
     device.observe("upload", (array.nbytes,), event)
     return event
 

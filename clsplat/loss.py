@@ -10,7 +10,7 @@ import numpy as np
 
 from .buffers import to_host
 from .pipeline import ImageLayout, Pipeline
-from .program import lane_group
+from .program import GROUP_ITEMS, lane_group
 
 _LEAST_ROWS = 32  # of a work-item, which blurs ten rows beyond them
 _ITEMS_PER_UNIT = {"CPU": 6, "GPU": 2048}  # so many that no compute unit of the device waits long for the last
@@ -44,7 +44,7 @@ class ImageLoss:
         self.device, self.kernels = pipeline.device, pipeline.kernels
         self.program = self.kernels.loss_program(self.device)
         # One lane, an item a pixel column: groups that read whole lines of memory.
-        self._group = lane_group(self.device) if self.kernels.lanes > 1 else 64
+        self._group = lane_group(self.device) if self.kernels.lanes > 1 else GROUP_ITEMS
         self._sums: tuple[Any, int, int] | None = None
 
     def gradient(self, layout: ImageLayout, truth: Any) -> Any:

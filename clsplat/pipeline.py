@@ -258,13 +258,9 @@ class Pipeline:
     def _list(self, frame: Frame, band: Band) -> None:
         """The band's isects onto the device."""
         n_tiles = frame.layout.tiles_x * frame.layout.tiles_y
-        if not frame.splats.n:
+        if not frame.splats.n or len(frame.bands) > 1:  # tiles that the binner leaves alone are empty
             self.pool.zeroed("tile_ranges", 8 * n_tiles)
-            self._lists = self.pool.get("isect_splat", 0)
-            return
-        if len(frame.bands) > 1:
-            self.pool.zeroed("tile_ranges", 8 * n_tiles)
-        self._lists = self.binner.list_isects(band)
+        self._lists = self.binner.list_isects(band) if frame.splats.n else self.pool.get("isect_splat", 0)
 
     def _rasterize(self, layout: ImageLayout, band: Band, prefix: str,
                    background: tuple[float, float, float] = (0, 0, 0)) -> Any:
@@ -289,5 +285,5 @@ def most_isects(device: Device, kernels: KernelBuild) -> int:
 
 
 def isect_bytes(kernels: KernelBuild) -> int:
-    """Device memory for an isect: its gradient record; tile, id and their pairs (if sorted), splat, runs."""
+    """Device memory for an isect: its gradient record; tile, id and their pairs (if sorted), splat, blocks."""
     return kernels.v_record * kernels.dtype.itemsize + 4 * 6

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from .buffers import Pool
+from .buffers import Pool, send_to_device
 from .camera import Camera
 from .device import Device
 from .images import ImageU8, resize_area
@@ -112,11 +110,9 @@ class Truths:
             profiling = cl.command_queue_properties.PROFILING_ENABLE
             self._queue = cl.CommandQueue(self.device.context, properties=profiling)
         slot = self._slot = (self._slot + 1) % _SLOTS
-        packed, reader = self.pool.get(f"bytes{slot}", image.nbytes), self._unpacked[slot]
-        event = cl.enqueue_copy(self._queue, packed, np.ascontiguousarray(image), is_blocking=False,
-                                wait_for=None if reader is None else [reader])
+        packed = self.pool.get(f"bytes{slot}", image.nbytes)
+        event = send_to_device(self.device, packed, image, self._queue, self._unpacked[slot])
         self._queue.flush()
-        self.device.observe("upload", (image.nbytes,), event)
         return _Upload(slot, packed, event)
 
 

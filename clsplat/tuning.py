@@ -17,6 +17,7 @@ import numpy as np
 
 from . import __version__
 from .atomic import atomic_writer
+from .binaries import cache_folder
 from .buffers import ParameterBuffers, SplatBuffers
 from .camera import Camera
 from .device import SCHEDULES, Device, Schedule, default_schedule
@@ -102,8 +103,7 @@ def _key(device: Device) -> str:
 
 
 def _cache_path() -> Path:
-    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
-    return Path(home) / "clsplat" / "schedules.json"
+    return cache_folder() / "schedules.json"
 
 
 def _read_cache() -> dict[str, str]:
