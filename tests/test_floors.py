@@ -19,8 +19,8 @@ FLOORS = """
     atomic compare_table interrupt presets run_log runtime schema signatures capture_world
     camera device images metrics optim_reference plan ply_header profiles rotations schedules validity colmap_files
     binaries cameras_json capture checkpoint colmap launches noise shapes
-    opacities ply program sghmc skew_map
-    adc config densify kernels regularisers scene splats
+    chart_style opacities ply program sghmc skew_map
+    adc charts config densify kernels regularisers scene splats
     blocks buffers camera_path convert initialise model_folder strategy synthetic systems view_sampler
     gradients limits optim_rules sort
     binning optim_fused optim_host stages
@@ -38,6 +38,7 @@ OWNERS = {
     "pyopencl": {"buffers", "device", "program", "truths"},
     "pycolmap": {"colmap"},
     "PIL": {"images"},
+    "matplotlib": {"chart_style"},
     "click": set(),  # the command line's
 }
 

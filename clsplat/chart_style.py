@@ -1,0 +1,128 @@
+"""How every chart looks, and how it is written: the only module that imports matplotlib.
+
+Colours are told apart with the common kinds of colour blindness (Okabe and Ito 2008, the yellow darkened); each shape
+has one, the same in every chart, and a marker besides. Files are the same bytes for the same data.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from .atomic import atomic_writer
+from .errors import OutputError
+from .shapes import SHAPES
+
+MISSING = "charts need matplotlib: install it with pip install 'clsplat[charts]'"
+FORMATS = ("png", "svg")
+WIDTH = 9.0  # inches of a full chart: 900 px in a README at 100 dots per inch
+INK, FAINT, MARK = "#262626", "#d9d9d9", "#d55e00"
+# Shapes of one family have colours of one family.
+_COLOURS = ("#262626", "#0072b2", "#56b4e9", "#009e73", "#cc79a7", "#d55e00", "#e69f00", "#8c8c1e")
+_MARKERS = ("o", "s", "D", "^", "v", "P", "X", "h")
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1, 1.3)), (0, (6, 1.3, 1, 1.3)), (0, (3, 1.2, 1, 1.2, 1, 1.2)))
+_STYLE = {
+    "figure.dpi": 100, "savefig.dpi": 200, "font.size": 9, "axes.titlesize": 10, "axes.labelsize": 9,
+    "legend.fontsize": 8.5, "xtick.labelsize": 8.5, "ytick.labelsize": 8.5, "font.family": "DejaVu Sans",
+    "text.color": INK, "axes.labelcolor": INK, "axes.edgecolor": "#8c8c8c", "xtick.color": INK, "ytick.color": INK,
+    "xtick.major.size": 3, "ytick.major.size": 3, "axes.linewidth": 0.8, "axes.spines.top": False,
+    "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.7, "lines.linewidth": 1.6, "lines.markersize": 5, "legend.frameon": False,
+    "svg.hashsalt": "clsplat", "figure.facecolor": "white", "savefig.facecolor": "white",
+}  # fmt: skip
+
+
+def available() -> bool:
+    """Whether charts can be drawn here."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
+@contextmanager
+def drawing(out: str | Path, width: float = WIDTH, height: float = 4.0) -> Iterator[Any]:
+    """An empty figure to draw on, written as `out`.png and `out`.svg when the block ends well.
+
+    Parameters
+    ----------
+    out : path without a suffix, or with that of one of the two.
+    width, height : inches; 100 dots an inch on a page, 200 in the PNG.
+
+    Raises
+    ------
+    OutputError : matplotlib is not installed, or a file cannot be written.
+    """
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise OutputError(MISSING) from None
+    style: Any = dict(matplotlib.rcParamsDefault)
+    with matplotlib.rc_context(style | _STYLE | {"backend": "agg"}):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        yield figure
+        for path in chart_paths(out):
+            content = io.BytesIO()
+            kind = path.suffix[1:]
+            figure.savefig(content, format=kind, metadata={"Date": None} if kind == "svg" else {"Software": None})
+            with atomic_writer(path) as stream:
+                stream.write(content.getvalue())
+
+
+def chart_paths(out: str | Path) -> list[Path]:
+    """The files of the chart `out`: PNG and SVG."""
+    path = Path(out)
+    stem = path.with_suffix("") if path.suffix[1:] in FORMATS else path
+    return [stem.with_name(f"{stem.name}.{kind}") for kind in FORMATS]
+
+
+def shape_colour(shape: str) -> str:
+    """Its colour; ink for a shape that is not known."""
+    return dict(zip(SHAPES, _COLOURS, strict=True)).get(shape, INK)
+
+
+def looks(systems: dict[str, str]) -> dict[str, dict[str, Any]]:
+    """Keywords of `Axes.plot` for systems, label to shape: the shape's colour and marker, and dashes within it."""
+    seen: dict[str, int] = {}
+    found = {}
+    for label, shape in systems.items():
+        place = seen.setdefault(shape, 0)
+        seen[shape] += 1
+        marker = dict(zip(SHAPES, _MARKERS, strict=True)).get(shape, "o")
+        found[label] = {"color": shape_colour(shape), "marker": marker, "linestyle": _DASHES[place % len(_DASHES)],
+                        "markerfacecolor": shape_colour(shape) if place % 2 == 0 else "white",
+                        "markeredgecolor": shape_colour(shape)}
+    return found
+
+
+def short_count(number: float, _: object = None) -> str:
+    """950, 1k, 2.5k, 1M: for ticks and labels."""
+    for unit, letter in ((1e6, "M"), (1e3, "k")):
+        if abs(number) >= 0.9995 * unit:
+            return f"{number / unit:.3g}{letter}"
+    return f"{number:.3g}"
+
+
+def log_axis(axis: Any, low: float, high: float) -> None:
+    """Ticks at 1, 2, 5 of each decade (1 alone over many decades), as `short_count`.
+
+    Parameters
+    ----------
+    axis : `Axes.xaxis` or `yaxis`, on a logarithmic scale. low, high : what it shows.
+    """
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+    marks = (1.0,) if high / low > 1e3 else (1.0, 2.0, 5.0) if high / low > 2.5 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+    ticks = [mark * 10.0**power for power in range(-9, 13) for mark in marks if low <= mark * 10.0**power <= high]
+    axis.set_major_locator(FixedLocator(ticks))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(short_count))
+
+
+def tile(corner: tuple[float, float], fill: str, label: str | None = None) -> Any:
+    """A unit square, as a cell of a table or, with a label, in a legend."""
+    from matplotlib.patches import Rectangle
+
+    return Rectangle(corner, 1, 1, facecolor=fill, edgecolor=FAINT if label else "white", linewidth=1.2, label=label)
