@@ -18,6 +18,8 @@ _FROM_MEASURED = {"PSNR": ("psnr", 1.0, 2), "SSIM": ("ssim", 1.0, 4), "seconds":
 def summarise(records: Sequence[Record]) -> list[Record]:
     """One row for each scene, cap and system, in the order of their first runs within scene and cap.
 
+    Repeated runs do not count: `repeats` tells of them.
+
     Returns
     -------
     Rows with "scene", "cap", "iterations", "system", "config" (all options but the seed), "seeds", "failed" (messages
@@ -27,13 +29,41 @@ def summarise(records: Sequence[Record]) -> list[Record]:
     """
     groups: dict[str, list[Record]] = {}
     for record in records:
-        groups.setdefault(_group_key(record), []).append(record)
+        if not record.get("repeat"):
+            groups.setdefault(_group_key(record), []).append(record)
     rows = [_row(group) for group in groups.values()]
     for row, said in zip(rows, [_differing(row, rows) for row in rows], strict=True):
         row["system"] += said
     places = {scene: place for place, scene in enumerate(dict.fromkeys(row["scene"] for row in rows))}
     rows.sort(key=lambda row: (places[row["scene"]], row["cap"]))
     return rows
+
+
+def repeats(records: Sequence[Record]) -> list[Record]:
+    """What the runs that were made more than once say of determinism: a row for each, in the order of the first.
+
+    Returns
+    -------
+    Rows with "scene", "cap", "system", "seed", "runs", "same" (whether all made the same splats, bit by bit) and
+    "spread" (of PSNR, maximum less minimum, dB). Only runs of one device, driver, schedule and version are compared;
+    failed runs are left out.
+    """
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        if record.get("digest"):
+            where = [record[key] for key in ("device", "driver", "schedule", "version")]
+            groups.setdefault(json.dumps([_group_key(record), record["config"]["seed"], where]), []).append(record)
+    return [{"scene": scene_title(group[0]), "cap": group[0]["config"]["cap_max"], "system": group[0]["system"],
+             "seed": group[0]["config"]["seed"], "runs": len(group),
+             "same": len({record["digest"] for record in group}) == 1,
+             "spread": max(record["psnr"] for record in group) - min(record["psnr"] for record in group)}
+            for group in groups.values() if len(group) > 1]
+
+
+def scene_title(record: Record) -> str:
+    """Name and size of a record's scene."""
+    scene = record["scene"]
+    return f"{scene['name']} {scene['width']}x{scene['height']}"
 
 
 def cells(row: Record) -> tuple[str, ...]:
@@ -58,6 +88,12 @@ def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
     said += [f"{row['system']} on {row['scene']} at cap {row['cap']}: {fault}" for row in rows
              for key, fault in (("cap_held", "more splats than the cap"), ("finite", "parameters that are not finite"))
              if row["seeds"] and not row[key] and not row["failed"]]
+    again = repeats(records)
+    if again:
+        same = sum(row["same"] for row in again)
+        said.append(f"repeated: {same} of {len(again)} runs gave the same splats each time, bit by bit")
+        said += [f"{row['system']} on {row['scene']} at cap {row['cap']}, seed {row['seed']}: {row['runs']} runs "
+                 f"differ, PSNR by {row['spread']:.4f} dB" for row in again if not row["same"]]
     by_key: tuple[tuple[str, Callable[[Record], Any]], ...] = (
         ("device", lambda record: f"{record['device']} ({record['driver']})"),
         ("schedule", lambda record: record["schedule"]), ("version", lambda record: f"clsplat {record['version']}"),
@@ -84,9 +120,8 @@ def _group_key(record: Record) -> str:
 
 def _row(group: Sequence[Record]) -> Record:
     first = group[0]
-    size = first["scene"]
     row: Record = {
-        "scene": f"{size['name']} {size['width']}x{size['height']}", "cap": first["config"]["cap_max"],
+        "scene": scene_title(first), "cap": first["config"]["cap_max"],
         "iterations": first["config"]["iterations"], "system": first["system"],
         "config": {key: value for key, value in first["config"].items() if key != "seed"},
         "seeds": [record["config"]["seed"] for record in group],

@@ -134,13 +134,16 @@ class Trainer:
                 self.step()
                 it = self.iteration
                 ends = it == config.iterations
+                measured = it in config.test_iterations and bool(self.scene.test)
+                if measured:
+                    self.device.queue.finish()  # what is pending is training time
                 if it % LOG_INTERVAL == 0 or ends:
                     value = self.loss.value()
                     self.seconds += time.perf_counter() - start
                     self._report(value, log, since, started)
                 else:
                     self.seconds += time.perf_counter() - start
-                if it in config.test_iterations and self.scene.test:
+                if measured:
                     self.evaluations[it] = self.evaluate(self.scene.test)
                     self.evaluation_seconds[it] = self.seconds
                     log.write({"iteration": it, "seconds": self.seconds, "test_psnr": self.evaluations[it].psnr,

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from cli_runner import small_capture
 
 from clsplat import compare as module
-from clsplat.compare import Run, compare, scene_identity
-from clsplat.compare_table import HEAD, MEASURED, Record, cells, markdown, notes, summarise
+from clsplat.compare import Run, compare, curve_iterations, digest, scene_identity
+from clsplat.compare_table import HEAD, MEASURED, Record, cells, markdown, notes, repeats, summarise
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError, TrainingError
 from clsplat.evaluate import evaluate
@@ -141,6 +143,62 @@ def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp
     assert [record["system"] for record in records] == ["gaussian", "default", "gaussian:growth=1.1"]
     compare([scene], systems, tmp_path, [CAP], [0], SHORT)
     assert len(counted) == 4
+
+
+def test_a_curve_is_measured_along_the_run(scene: Scene, tmp_path: Path) -> None:
+    systems = parse_systems("gaussian")
+    compare([scene], systems, tmp_path, [CAP], [0], SHORT)
+    (plain,) = done(tmp_path)
+    assert plain["curve"] is None
+    records = compare([scene], systems, tmp_path, [CAP], [0, 1], SHORT, curve=4)
+    assert records == done(tmp_path)
+    assert [record["config"]["seed"] for record in records] == [0, 1], "the run without a curve was replaced"
+    first = records[0]
+    assert (first["digest"], first["psnr"]) == (plain["digest"], plain["psnr"]), "measuring changes nothing"
+    assert [point["iteration"] for point in first["curve"]] == list(curve_iterations(20, 4)) == [1, 3, 7, 20]
+    last = first["curve"][-1]
+    assert (last["psnr"], last["ssim"], last["seconds"]) == (first["psnr"], first["ssim"], first["seconds"])
+    seconds = [point["seconds"] for point in first["curve"]]
+    assert seconds == sorted(set(seconds))
+    compare([scene], systems, tmp_path, [CAP], [0], SHORT)
+    assert done(tmp_path) == records, "a curve is not thrown away"
+
+
+def test_repeats_are_the_same_bits(scene: Scene, tmp_path: Path) -> None:
+    records = compare([scene], parse_systems("gaussian"), tmp_path, [CAP], [0, 1], SHORT, repeat=2)
+    assert [(r["config"]["seed"], r["repeat"]) for r in records] == [(0, 0), (0, 1), (1, 0)]
+    first, again, other = (record["digest"] for record in records)
+    assert first == again != other
+    (row,) = summarise(records)
+    assert row["seeds"] == [0, 1], "repeats do not count in the mean"
+    assert "repeated: 1 of 1 runs gave the same splats each time, bit by bit" in notes(records, [row])
+    assert len(compare([scene], parse_systems("gaussian"), tmp_path, [CAP], [0, 1], SHORT, repeat=2)) == 3
+
+
+def test_repeats_that_differ_are_told() -> None:
+    records = [recorded(TrainConfig(), "a", digest=text, repeat=place, psnr=20.0 + place)
+               for place, text in enumerate("xy")]
+    (row,) = repeats(records)
+    assert (row["same"], row["spread"], row["runs"]) == (False, 1.0, 2)
+    assert any("2 runs differ, PSNR by 1.0000 dB" in line for line in notes(records, summarise(records)))
+    assert not repeats([records[0], records[1] | {"device": "other"}]), "bits are promised on one device only"
+    assert not repeats([recorded(TrainConfig(), "a")] * 2), "records of before there were digests"
+
+
+def test_digest_sees_names_shapes_types_and_bits() -> None:
+    zeros = np.zeros((2, 3), np.float32)
+    arrays = [{"a": zeros}, {"b": zeros}, {"a": zeros.T}, {"a": zeros.astype(np.int32)}, {"a": -zeros}]
+    assert len({digest(each) for each in arrays}) == len(arrays)
+    assert digest({"a": zeros, "b": zeros}) == digest({"b": zeros.copy(), "a": zeros})
+
+
+def test_curve_iterations() -> None:
+    points = curve_iterations(1000, 12)
+    assert (len(points), points[0], points[-1]) == (12, 16, 1000)
+    assert max(b / a for a, b in pairwise(points)) < 1.6
+    assert curve_iterations(1000, 0) == ()
+    assert curve_iterations(1, 12) == (1,)
+    assert curve_iterations(1000, 1) == (1000,)
 
 
 def test_failed_runs_are_told_and_the_comparison_goes_on(scene: Scene, tmp_path: Path,
