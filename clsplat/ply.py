@@ -3,25 +3,38 @@
 Columns in this order, all float32: `x y z`, `nx ny nz` (zeros), `f_dc_0..2`, `f_rest_*` (channel-major: all
 of red, then green, then blue), `opacity` (logit), `scale_0..2` (natural log), `rot_0..3` (w, x, y, z, any
 norm), then the shape's own columns. The header names the kernel:
-`comment clsplat shape=<name> normalisation=<peak|pdf|none>`.
+`comment clsplat shape=<name> normalisation=<peak|pdf|none>`. Compact files (ply_compact.py) leave out what no splat
+uses, and have what few splats use in elements after the vertices.
 """
 
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .atomic import atomic_writer
 from .errors import InputError
-from .ply_header import BYTE_ORDER, REAL_TYPES, Header, read_header
-from .schema import CORE, LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, Array, Field, Group, Schema, public_shape
+from .ply_body import read_body
+from .ply_compact import Table, filled_in, plan_layout, side_fields, side_tables
+from .ply_header import REAL_TYPES, Header, read_header
+from .schema import (
+    CORE,
+    LOG_SCALE,
+    MEAN,
+    OPACITY_LOGIT,
+    QUAT,
+    Array,
+    Field,
+    Group,
+    Schema,
+    public_shape,
+    sh_coefficients,
+    sh_field,
+)
 from .shapes import GAUSSIAN, NORMALISATIONS, SHAPES, Shape, check_normalisation, shape_named
 from .validity import check_arrays, first_fault, sh_degree_for
 
@@ -46,7 +59,7 @@ class PlyModel:
 
 
 def read_ply(path: str | os.PathLike[str]) -> PlyModel:
-    """Read a splat model: binary of either byte order, or ascii; properties in any order, found by name.
+    """Read a splat model: binary of either byte order, or ascii; whole or compact; properties found by name.
 
     A file without clsplat's comment is the first shape that has just its columns, else Gaussian. A file with it must
     have all columns of its shape. Normals are ignored.
@@ -63,13 +76,16 @@ def read_ply(path: str | os.PathLike[str]) -> PlyModel:
             _refuse_point_cloud(path, header)
             shape, normalisation = _kernel(path, header)
             schema = _schema(path, header, shape)
-            columns = _read_ascii(path, stream, header) if header.encoding == "ascii" else None
-            if columns is None:
-                columns = _read_binary(path, stream, header)
+            moved = side_fields(path, header, schema)
+            body = read_body(path, stream, header)
     except OSError as error:
         reason = error.strerror or str(error)
         raise InputError(f"{path}: cannot be read ({reason}); check name and rights") from error
-    arrays = {field.name: _gather(field, columns, header.count) for field in schema}
+    columns = {name: values for name, values in body["vertex"].items() if name not in _NORMALS}
+    arrays = {field.name: _gather(field, columns, header.count) for field in schema if field not in moved.values()}
+    if len(header.elements) > 1:
+        arrays = filled_in(path, header, body, schema, arrays)
+        schema = shape.schema(sh_degree_for(arrays))
     for field in schema:
         fault = first_fault(field, arrays[field.name])
         if fault is not None:
@@ -81,14 +97,15 @@ def read_ply(path: str | os.PathLike[str]) -> PlyModel:
     return PlyModel(shape.name, normalisation, arrays)
 
 
-def write_ply(
-    path: str | os.PathLike[str], shape: str, normalisation: str, arrays: Mapping[str, Array]
-) -> None:
+def write_ply(path: str | os.PathLike[str], shape: str, normalisation: str, arrays: Mapping[str, Array],
+              compact: bool = False) -> None:
     """Write a splat model, binary little-endian float32 (float64 is rounded), atomically.
 
     Parameters
     ----------
     arrays : every field of the shape, by name, in its public shape.
+    compact : leave out what the splats do not use (ply_compact.py); `read_ply` gives the same splats, with SH up to
+        the highest band in use.
 
     Raises
     ------
@@ -101,23 +118,29 @@ def write_ply(
     schema = shape_named(shape).schema(sh_degree_for(single))
     check_arrays(schema, single)
     n = len(single["mean"])
-    columns: dict[str, Array] = dict.fromkeys(_file_order(schema), np.zeros(n, dtype=np.float32))
+    tables: list[Table] = []
+    if compact:
+        layout = plan_layout(schema, single)
+        tables = side_tables(schema, single, layout)
+        single["sh"] = single["sh"][:, : sh_coefficients(layout.base)]
+        fields = [sh_field(layout.base) if f.group is Group.SH else f for f in schema if f.name not in layout.sparse]
+        schema = Schema(tuple(fields))
+    names = [name for name in _file_order(schema) if not compact or name not in _NORMALS]
+    columns: dict[str, Array] = dict.fromkeys(names, np.zeros(n, dtype=np.float32))
     for field in schema:
         values = single[field.name]
         flat = _channel_major(values) if field.group is Group.SH else values.reshape(n, field.width)
         columns.update(zip(field.ply, flat.T, strict=True))
-    head = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment {_COMMENT} shape={shape} normalisation={normalisation}",
-        f"element vertex {n}",
-        *(f"property float {name}" for name in columns),
-        "end_header",
-    ]
-    table = np.stack(list(columns.values()), axis=1, dtype="<f4")
+    head = ["ply", "format binary_little_endian 1.0", f"comment {_COMMENT} shape={shape} normalisation={normalisation}"]
+    for element, table in (("vertex", columns), *tables):
+        head.append(f"element {element} {len(next(iter(table.values())))}")
+        head += [f"property {'float' if values.dtype.kind == 'f' else 'uint'} {name}" for name, values in table.items()]
     with atomic_writer(path) as stream:
-        stream.write("".join(line + "\n" for line in head).encode("ascii"))
-        stream.write(table.tobytes())
+        stream.write("".join(line + "\n" for line in (*head, "end_header")).encode("ascii"))
+        for table in (columns, *(table for _, table in tables)):
+            # Floats and uints alike are words of four bytes, rows of them one array.
+            words = [values.astype(values.dtype.newbyteorder("<")).view("<u4") for values in table.values()]
+            stream.write(np.stack(words, axis=1).tobytes())
 
 
 def _file_order(schema: Schema) -> list[str]:
@@ -175,7 +198,8 @@ def _kernel(path: Path, header: Header) -> tuple[Shape, str]:
         except InputError as error:
             raise InputError(f"{path}: comment {comment[:80]!r}: {error}") from None
     columns = {shape.name: {name for field in shape.fields for name in field.ply} for shape in SHAPES.values()}
-    own = set(header.names) & set().union(*columns.values())  # of any shape
+    held = [name for element in header.elements for name in element.names]
+    own = set(held) & set().union(*columns.values())  # of any shape
     if not own:
         return GAUSSIAN, NORMALISATIONS[0]
     # Where none has just these, the one that lacks least: what it lacks is then named.
@@ -191,7 +215,8 @@ def _schema(path: Path, header: Header, shape: Shape) -> Schema:
         counts = ", ".join(str(count) for count in _REST_COUNTS)
         raise InputError(f"{path}: has {rest} properties f_rest_*; SH degree 0 to 3 has one of {counts}")
     schema = shape.schema(_REST_COUNTS.index(rest))
-    needed = set(_file_order(schema)) - set(_NORMALS)
+    moved = {name for field in side_fields(path, header, schema).values() for name in field.ply}
+    needed = set(_file_order(schema)) - set(_NORMALS) - moved
     missing = [name for name in _file_order(schema) if name in needed - names]
     if missing:
         own = any(missing[0] in field.ply for field in shape.fields)
@@ -204,46 +229,3 @@ def _schema(path: Path, header: Header, shape: Shape) -> Schema:
         if kind not in REAL_TYPES:
             raise InputError(f"{path}: property {name!r} has type {kind}; expected float or double")
     return schema
-
-
-def _read_binary(path: Path, stream: BinaryIO, header: Header) -> dict[str, Array]:
-    order = BYTE_ORDER[header.encoding]
-    dtype = np.dtype([(name, order + REAL_TYPES[kind]) for kind, name in header.properties])
-    expected = header.count * dtype.itemsize
-    available = os.fstat(stream.fileno()).st_size - stream.tell()
-    if available != expected:
-        raise _wrong_size(path, header, f"{expected} bytes", f"{available}", available < expected)
-    table: NDArray[Any] = np.frombuffer(stream.read(expected), dtype=dtype)
-    used = [(kind, name) for kind, name in header.properties if name not in _NORMALS]
-    return {name: table[name].astype(REAL_TYPES[kind]) for kind, name in used}
-
-
-def _read_ascii(path: Path, stream: BinaryIO, header: Header) -> dict[str, Array]:
-    width = len(header.properties)
-    expected = header.count * width
-    text = stream.read()
-    # Every value takes a digit and a separator, so the file's size bounds the count.
-    if 2 * expected > len(text) + 1:
-        raise _wrong_size(path, header, f"{expected} values", f"{len(text)} bytes", True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # how NumPy reports text that is no number
-        try:
-            values = np.fromstring(text, dtype=np.float64, sep=" ") if text.strip() else np.empty(0)
-        except (DeprecationWarning, ValueError):
-            raise InputError(f"{path}: the ascii body holds text that is no number; export again") from None
-    if values.size != expected:
-        raise _wrong_size(path, header, f"{expected} values", f"{values.size}", values.size < expected)
-    table = values.reshape(header.count, width)
-    with np.errstate(over="ignore"):  # what overflows is found and named by the check
-        return {
-            name: table[:, i].astype(REAL_TYPES[kind])
-            for i, (kind, name) in enumerate(header.properties)
-            if name not in _NORMALS
-        }
-
-
-def _wrong_size(path: Path, header: Header, expected: str, found: str, short: bool) -> InputError:
-    problem = "is truncated" if short else "has extra data at its end"
-    return InputError(
-        f"{path}: {problem}: {header.count} vertices need {expected}, found {found}; copy or export it again"
-    )

@@ -73,9 +73,15 @@ class Splats:
         model = read_ply(path)
         return cls(model.shape, model.arrays, model.normalisation)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a PLY in float32, atomically. Raises OutputError where it cannot be written."""
-        write_ply(path, self._shape, self._normalisation, self._arrays)
+    def save(self, path: str | os.PathLike[str], compact: bool = False) -> None:
+        """Write a PLY in float32, atomically. Raises OutputError where it cannot be written.
+
+        Parameters
+        ----------
+        compact : leave out what the splats do not use (see ply_compact.py). Files for other programs are best whole:
+            some readers know one element only, and none but clsplat's the columns that moved to others.
+        """
+        write_ply(path, self._shape, self._normalisation, self._arrays, compact)
 
     @classmethod
     def from_points(

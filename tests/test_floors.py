@@ -18,7 +18,7 @@ FLOORS = """
     errors flops harmonics morton
     atomic compare_table interrupt presets run_log runtime schema signatures capture_world
     camera device images metrics optim_reference plan ply_header profiles rotations schedules validity colmap_files
-    binaries cameras_json capture checkpoint colmap launches noise shapes
+    binaries cameras_json capture checkpoint colmap launches noise ply_body ply_compact shapes
     chart_style opacities ply program sghmc skew_map
     adc charts config densify kernels regularisers scene splats
     blocks buffers camera_path convert initialise model_folder strategy synthetic systems view_sampler
