@@ -226,7 +226,10 @@ kernel void project_splats_vjp(
 
     vreal v_rgb[3], inv_norm, v_basis[SH_COUNT];
     for (int c = 0; c < 3; ++c) v_rgb[c] = lanes_if(lanes_load(seen_rgb[c]) > zero, v[SHAPE_V + c], zero);
-    const vec3 direction = unit_direction(cam, s.mean, &inv_norm);
+    // Of splats that are not seen the mean may be anything, and 0 times a NaN would reach the colour.
+    vec3 direction = unit_direction(cam, s.mean, &inv_norm);
+    direction = (vec3){lanes_if(seen, direction.x, zero), lanes_if(seen, direction.y, zero),
+                       lanes_if(seen, direction.z, zero)};
     const int used = (sh_degree + 1) * (sh_degree + 1);
     if (compact) {
         vec3_store((vec3){v_rgb[0], v_rgb[1], v_rgb[2]}, grad_sh + first, capacity);

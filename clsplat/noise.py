@@ -25,6 +25,8 @@ _MASK = 0xFFFFFFFF
 # are nearly transparent are moved.
 GATE_SHARPNESS = 100.0
 GATE_OFFSET = 0.5
+# Extent of the scenes that the constants of 3DGS-MCMC and SSS belong to [world units].
+PUBLISHED_EXTENT = 7.45176
 
 
 def philox4x32(counter: FourWords, key: tuple[int, int]) -> FourWords:
@@ -67,6 +69,15 @@ def normal3(seed: int, iteration: int, n: int, stream: int = 0) -> NDArray[np.fl
     radius2, angle2 = np.sqrt(-2.0 * np.log(u2)), 2.0 * np.pi * u3
     normals = (radius01 * np.cos(angle01), radius01 * np.sin(angle01), radius2 * np.cos(angle2))
     return np.stack(normals, axis=1).astype(np.float32)
+
+
+def noise_amount(noise_lr: float, mean_lr: float, extent: float) -> float:
+    """What the noise is multiplied by, from its rate and the positions' (which has the extent in it).
+
+    As published, rate times rate, it grows with the covariance: as the extent's third power, so in large units splats
+    would leave the scene. Beyond PUBLISHED_EXTENT it grows with the extent alone.
+    """
+    return noise_lr * mean_lr * min(PUBLISHED_EXTENT / extent, 1.0) ** 2
 
 
 def noise_gate(strength: Array) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .blocks import Blocks, active_blocks
 from .config import TrainConfig
 from .errors import InputError
+from .noise import PUBLISHED_EXTENT
 from .regularisers import Penalty
 from .schema import Array, Field, Schema
 from .sghmc import Coefficients, Sghmc
@@ -52,9 +53,14 @@ class Rules:
         return rates
 
     def penalty(self, n: int) -> Penalty:
-        """The regularisers of n splats: the config's weights are those of means over splats."""
+        """The regularisers of n splats: the config's weights are those of means over splats.
+
+        Scales are taken in world units, as published, and in larger scenes than that in units of the extent: else
+        they would outweigh the images.
+        """
         config = self.config
-        return Penalty(config.opacity_reg / n, config.scale_reg / (3 * n), config.bisect_reg / n)
+        scale = config.scale_reg * min(PUBLISHED_EXTENT / self.extent, 1.0)
+        return Penalty(config.opacity_reg / n, scale / (3 * n), config.bisect_reg / n)
 
     @cached_property
     def map(self) -> SkewMap | None:

@@ -24,6 +24,7 @@ from .kernels import MARGIN_X, MARGIN_Y, NEAR, TILE, KernelBuild
 from .program import lane_group
 
 SIGNALS = 3  # screen gradient, depth gradient, times seen
+TIMES_SEEN = 2
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .noise import PUBLISHED_EXTENT as SSS_EXTENT
 from .noise import covariance_times, noise_gate
 from .schema import Array
 
-SSS_EXTENT = 7.45176
 STREAM = 1  # of noise.normal3
 _SMALLEST_EXTENT = 1e-6  # cameras in one place have none
 

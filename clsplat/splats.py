@@ -18,6 +18,7 @@ from .validity import check_arrays, sh_degree_for
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 _MIN_SQUARED_DISTANCE = 1e-7  # 3DGS's floor, for points that coincide
+_MIN_OF_TYPICAL = 1e-2  # where the scene is small: of the median squared distance
 _OPACITIES = (1e-12, 1.0 - 1e-7)  # whose raw values are finite
 
 
@@ -127,7 +128,10 @@ class Splats:
         if sh_degree not in range(MAX_SH_DEGREE + 1):
             raise InputError(f"points: sh_degree is {sh_degree}; choose 0 to {MAX_SH_DEGREE}")
         n = len(points)
-        squared = np.maximum(_squared_spacing(points), _MIN_SQUARED_DISTANCE)
+        squared = _squared_spacing(points)
+        typical = float(np.median(squared)) if n else 0.0
+        floor = min(_MIN_SQUARED_DISTANCE, _MIN_OF_TYPICAL * typical) if typical else _MIN_SQUARED_DISTANCE
+        squared = np.maximum(squared, floor)
         sh = np.zeros((n, sh_coefficients(sh_degree), 3))
         sh[:, 0] = (colours - 0.5) / SH_C0
         arrays = {

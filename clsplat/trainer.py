@@ -24,9 +24,11 @@ from .kernels import KernelBuild
 from .loss import ImageLoss, LossValue
 from .memory import check, estimate, peak_bytes, room_for_isects
 from .model_folder import ModelFolder
+from .noise import noise_amount
 from .opacities import finite_rows
 from .optim import make_optimizer
-from .pipeline import ImageLayout, Pipeline, most_isects
+from .pipeline import TIMES_SEEN, ImageLayout, Pipeline, most_isects
+from .rate_limits import check_rates
 from .render import Renderer
 from .run_log import Progress, RunLog
 from .scene import Scene, View
@@ -76,6 +78,7 @@ class Trainer:
                  progress: Callable[[Progress], None] | None = None, device: Device | None = None) -> None:
         if not scene.train:
             raise InputError(f"{scene.path}: no training views: all are test views")
+        check_rates(config)
         self.scene, self.config, self.progress = scene, config, progress
         self.device = device or open_device(config.device)
         # A resumed run keeps its schedule: another one would round otherwise.
@@ -179,12 +182,16 @@ class Trainer:
             self.optim_program.mcmc_noise.over(
                 -(-self.splats.n // self.kernels.lanes), self.pipeline.group, geom=self.splats.geom,
                 capacity=self.splats.capacity, n_splats=self.splats.n, seed_lo=config.seed & 0xFFFFFFFF,
-                seed_hi=config.seed >> 32, iteration=it, amount=config.noise_lr * mean_lr)
+                seed_hi=config.seed >> 32, iteration=it,
+                amount=noise_amount(config.noise_lr, mean_lr, self.scene.extent))
 
     def densify(self) -> None:
         """One action of the strategy."""
         moment = Moment(self.iteration, self.densify_last, self.growth, self.scene.extent)
         arrays, signals = self.splats.download(self.splats.n), self.pipeline.read_signals(self.splats.n)
+        if self.splats.n and not signals[TIMES_SEEN].any():
+            raise TrainingError(f"iteration {self.iteration}: no image shows any splat (transparent, or outside): "
+                                "check what training starts from (init) and the learning rates")
         self.optimizer.apply(plan(self.config, arrays, signals, self.rng, moment))
         self.pipeline.reset_signals()
 

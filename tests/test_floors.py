@@ -21,7 +21,7 @@ FLOORS = """
     binaries cameras_json capture checkpoint colmap launches noise ply_body ply_compact shapes
     chart_style opacities ply program sghmc skew_map
     adc charts config densify kernels regularisers scene splats
-    blocks buffers camera_path convert initialise model_folder strategy synthetic systems view_sampler
+    blocks buffers camera_path convert initialise model_folder rate_limits strategy synthetic systems view_sampler
     gradients limits optim_rules sort
     binning optim_fused optim_host stages
     optim pipeline

@@ -80,8 +80,7 @@ def test_random_points_fill_the_cube_around_the_cameras(init: str, n_points: int
     assert len(splats) == 3000
     offset = (splats.mean - np.array([5.0, 0, 0])) / (RANDOM_EXTENT * 2.0)
     assert np.abs(offset).max() <= 1 + 1e-6
-    assert np.abs(offset.mean(axis=0)).max() < 0.06
-    assert offset.std() == pytest.approx(3**-0.5, rel=0.05)
+    assert offset.std() == pytest.approx(3**-0.5, rel=0.1)
     assert "at random" in message
     assert (f"the scene has {n_points} points" in message) == (init == "sfm")
 
@@ -168,3 +167,43 @@ def test_a_skewed_model_of_another_normalisation_is_refused(tmp_path: Path) -> N
 def test_what_cannot_be_used(options: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
         initial_splats(scene(10), **options)
+
+
+def test_random_points_lie_where_two_cameras_look() -> None:
+    """Cameras at (4, 0, 0) and (6, 0, 0) look along z."""
+    source = scene(0)
+    for view, x in zip(source.train, (4.0, 6.0), strict=True):
+        pose = np.eye(4)
+        pose[0, 3] = -x
+        view.camera = Camera(20, 10, 5, 5, 10, 5, pose)
+    splats, _ = initial_splats(source, cap=300, init="random")
+    for x in (4.0, 6.0):
+        local = splats.mean - (x, 0.0, 0.0)
+        assert (local[:, 2] > 0).all()
+        assert (np.abs(local[:, :2]) <= local[:, 2:] * (2.0, 1.0)).all()
+
+
+def test_points_in_one_place_are_one_splat() -> None:
+    source = scene(40)
+    source.points.xyz[20:] = source.points.xyz[:20]
+    splats, message = initial_splats(source)
+    assert message == "20 splats from the scene's points"
+    assert len(np.unique(splats.mean, axis=0)) == len(splats) == 20
+    source.points.xyz[:] = 1.0
+    splats, message = initial_splats(source, cap=30)
+    assert "at random" in message
+    assert "40 points in 1 places" in message
+
+
+def test_a_scene_before_the_near_plane_is_refused() -> None:
+    source = scene(60)
+    source.points.xyz[:, 2] = np.abs(source.points.xyz[:, 2]) + 4
+    initial_splats(source)
+    source.points.xyz *= 1e-3
+    for view, x in zip(source.train, (4e-3, 6e-3), strict=True):
+        pose = np.eye(4)
+        pose[0, 3] = -x
+        view.camera = view.camera.posed(pose)
+    source.path = "yard"
+    with pytest.raises(InputError, match=r"^yard: 100% of what its cameras see is nearer .* about 100 times as large"):
+        initial_splats(source)

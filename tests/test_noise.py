@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from clsplat.noise import add_noise, noise_gate, normal3, philox4x32
+from clsplat.noise import PUBLISHED_EXTENT, add_noise, noise_amount, noise_gate, normal3, philox4x32
 
 # Known answers of the Random123 library: counter, key, output.
 KNOWN = [
@@ -85,3 +85,13 @@ def test_opaque_splats_stay_and_the_dtype_is_kept() -> None:
     assert moved.dtype == np.float32
     np.testing.assert_array_equal(moved[:2], 1)
     assert np.abs(moved[2] - 1).max() > 0.1
+
+
+def test_noise_grows_with_the_scene_and_not_faster() -> None:
+    """The step is covariance times amount, and the rate of the means has the extent in it."""
+    def step(extent: float) -> float:
+        return extent**2 * noise_amount(5e5, 1e-4 * extent, extent)
+
+    assert step(PUBLISHED_EXTENT) == pytest.approx(5e5 * 1e-4 * PUBLISHED_EXTENT**3)
+    assert step(0.5 * PUBLISHED_EXTENT) == pytest.approx(step(PUBLISHED_EXTENT) / 8)
+    assert step(1e3 * PUBLISHED_EXTENT) == pytest.approx(1e3 * step(PUBLISHED_EXTENT))

@@ -214,3 +214,12 @@ def test_unusable_points_are_named() -> None:
     ):
         with pytest.raises(InputError, match=said):
             call()
+
+
+def test_first_scales_follow_the_units_of_the_scene() -> None:
+    """The floor under the distances of near points gives way where all are near."""
+    points = np.random.default_rng(3).normal(size=(60, 3))
+    points[1] = points[0]
+    colours = np.full((60, 3), 0.5)
+    normal, small = (Splats.from_points(points * unit, colours, sh_degree=0) for unit in (1.0, 1e-5))
+    np.testing.assert_allclose(small.log_scale, normal.log_scale + np.log(1e-5), rtol=1e-5)

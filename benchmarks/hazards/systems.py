@@ -1,0 +1,37 @@
+"""What is put at risk: shapes with their parameterisations, and optimizers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from clsplat.shapes import SHAPES
+from clsplat.skew_map import MAPS
+
+
+@dataclass(frozen=True)
+class System:
+    """A column of the table: a shape and the map of its skew ("" without one)."""
+
+    shape: str
+    skew_map: str = ""
+
+    @property
+    def label(self) -> str:
+        return f"{self.shape}:{self.skew_map}" if self.skew_map else self.shape
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of TrainConfig."""
+        return {"shape": self.shape} | ({"skew_map": self.skew_map} if self.skew_map else {})
+
+
+SYSTEMS = tuple(System(shape.name, skew_map) for shape in SHAPES.values()
+                for skew_map in (MAPS[shape.skew_form] if shape.skew_form else ("",)))
+
+# Positions by Adam under adaptive density control (the default), with relocation and noise, and by SGHMC.
+OPTIMIZERS: dict[str, dict[str, Any]] = {
+    "adam": {},
+    "mcmc": {"strategy": "mcmc", "growth": 1.0},
+    "sghmc": {"position_optimizer": "sghmc"},
+}

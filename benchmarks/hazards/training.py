@@ -1,0 +1,229 @@
+"""Training hazards: the small scene and its options with something wrong, beside the same run with nothing wrong."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import clsplat
+from clsplat.config import TrainConfig
+from clsplat.device import Device
+from clsplat.errors import ClsplatError
+from clsplat.evaluate import evaluate
+from clsplat.initialise import initial_splats
+from clsplat.render import Renderer
+from clsplat.scene import Scene
+from clsplat.shapes import SHAPES
+from clsplat.splats import Splats
+
+from . import worlds
+from .crafted import unit
+from .systems import OPTIMIZERS, System
+
+ITERATIONS, CAP, SH_DEGREE = 200, 400, 1
+TOLERANCE_DB = 0.5
+RATES = ("position_lr_init", "position_lr_final", "opacity_lr", "scaling_lr", "rotation_lr", "feature_lr", "normal_lr",
+         "beta_lr", "nu_lr")
+
+Start = Callable[[Splats], Splats]  # what the first splats are turned into
+
+
+@dataclass(frozen=True)
+class Hazard:
+    """One row of the table.
+
+    Parameters
+    ----------
+    world : makes the scene out of the benign one.
+    options : of TrainConfig, on top of the optimizer's; rates: all of them times this.
+    start : changes the splats that training starts from.
+    only : optimizers that it is about; all by default.
+    shapes : a test of which shapes it is about.
+    """
+
+    world: Callable[[Scene], Scene] = lambda scene: scene
+    options: dict[str, Any] = field(default_factory=dict)
+    rates: float = 1.0
+    start: Start | None = None
+    only: tuple[str, ...] = tuple(OPTIMIZERS)
+    of: Callable[[System], bool] = lambda system: True
+
+
+def changed(splats: Splats, every: int = 10, **values: Any) -> Splats:
+    """With other values in every tenth splat, or in all."""
+    arrays = splats.to_numpy()
+    for name, new in values.items():
+        arrays[name][::every] = new[::every]
+    return Splats(splats.shape, arrays, splats.normalisation)
+
+
+def needles(splats: Splats) -> Splats:
+    """1:10^4."""
+    log_scale = splats.log_scale.copy()
+    log_scale[:, 1:] += np.float32(np.log(1e-4))
+    return changed(splats, log_scale=log_scale)
+
+
+def own_at_bound(splats: Splats) -> Splats:
+    """The shape's own fields at their limits in all splats, in directions of their own."""
+    rng, values = np.random.default_rng(1), splats.to_numpy()
+    for own in SHAPES[splats.shape].fields:
+        if own.limit is not None:
+            values[own.name] = (own.limit * unit(rng.normal(size=values[own.name].shape))).astype(np.float32)
+        elif own.bounds is not None:
+            values[own.name] = np.resize(np.array(own.bounds, np.float32), len(splats))
+    return Splats(splats.shape, values, splats.normalisation)
+
+
+def has_own_limit(system: System) -> bool:
+    return any(own.limit is not None or own.bounds is not None for own in SHAPES[system.shape].fields)
+
+
+def is_skewed(system: System) -> bool:
+    return SHAPES[system.shape].skew_form is not None
+
+
+def scale_of(splats: Splats, factor: float) -> Splats:
+    return changed(splats, log_scale=splats.log_scale + np.float32(np.log(factor)))
+
+
+def opacity_of(splats: Splats, value: float, every: int = 10) -> Splats:
+    raw = np.full(len(splats), SHAPES[splats.shape].raw_opacity(np.float64(value)), np.float32)
+    return changed(splats, every, **{name: raw for name in splats.arrays if name.startswith("opacity")})
+
+
+TRAINING: dict[str, Hazard] = {
+    "all rates x10": Hazard(rates=10),
+    "all rates x100": Hazard(rates=100),
+    "rate of skew x100": Hazard(options={"skew_lr": 0.25}, of=is_skewed),
+    "rate of rotation x100": Hazard(options={"rotation_lr": 0.1}),
+    "SGHMC, C x100": Hazard(options={"sghmc_friction": 1.2e4}, only=("sghmc",)),
+    "SGHMC as SSS, C x100": Hazard(options={"sghmc_friction": 1.2e4, "position_optimizer": "sghmc-sss",
+                                            "sghmc_burn_in": 0.0}, only=("sghmc",)),
+    "SGHMC as SSS, scene x100": Hazard(lambda s: worlds.in_units(s, 100), only=("sghmc",),
+                                       options={"position_optimizer": "sghmc-sss", "sghmc_burn_in": 0.0}),
+    "scene x1e-3": Hazard(lambda s: worlds.in_units(s, 1e-3)),
+    "scene x1e-2": Hazard(lambda s: worlds.in_units(s, 1e-2)),
+    "scene x1e2": Hazard(lambda s: worlds.in_units(s, 1e2)),
+    "scene x1e4": Hazard(lambda s: worlds.in_units(s, 1e4)),
+    "one image": Hazard(lambda s: worlds.of_first(s, 1)),
+    "two images": Hazard(lambda s: worlds.of_first(s, 2)),
+    "one photo exposed twice as long": Hazard(worlds.badly_exposed),
+    "random initialisation": Hazard(options={"init": "random"}),
+    "points doubled": Hazard(lambda s: worlds.with_points(s, "doubled")),
+    "points all in one place": Hazard(lambda s: worlds.with_points(s, "coincident")),
+    "points far out": Hazard(lambda s: worlds.with_points(s, "outliers")),
+    "four points": Hazard(lambda s: worlds.with_points(s, "four")),
+    "a tenth needles 1:10^4": Hazard(start=needles),
+    "start: skew (own) at its bound": Hazard(start=own_at_bound, of=has_own_limit),
+    "a tenth 100 times as large": Hazard(start=lambda s: scale_of(s, 100)),
+    "a tenth 1e-6 times as large": Hazard(start=lambda s: scale_of(s, 1e-6)),
+    "a tenth of opacity 0.9999": Hazard(start=lambda s: opacity_of(s, 0.9999)),
+    "a tenth of opacity 1/255": Hazard(start=lambda s: opacity_of(s, 1 / 255)),
+    "all transparent": Hazard(start=lambda s: opacity_of(s, 1e-3, every=1)),
+    "relocation every 5 iterations": Hazard(start=own_at_bound, only=("mcmc",),
+                                            options={"densify_interval": 5, "densify_until": 1.0, "opacity_reg": 0.05}),
+    "numpy optimizer, rates x100": Hazard(rates=100, options={"optimizer": "numpy"}, only=("adam",)),
+}
+
+
+@dataclass
+class Trainings:
+    """Runs on one device, each twin once."""
+
+    device: Device
+    iterations: int = ITERATIONS
+    twins: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.renderer = Renderer(self.device)
+
+    def row(self, name: str, system: System, optimizer: str) -> dict[str, Any]:
+        """One hazard, one system, one optimizer."""
+        hazard, scene = TRAINING[name], worlds.capture()
+        twin = self.twin(system, optimizer)
+        world = hazard.world(scene)
+        result = self.run(world, system, optimizer, hazard)
+        judged = [view.name for view in (world.test or world.train)]
+        row: dict[str, Any] = {key: result[key] for key in ("finite", "message", "seconds", "diverged_at")}
+        row |= {"psnr": None, "twin_psnr": float(np.mean([twin[name] for name in judged]))}
+        if not result["finite"]:
+            return row | {"verdict": "fails"}
+        if result["message"]:
+            return row | {"verdict": "stops"}
+        psnr = float(np.mean([result["psnr"][view] for view in judged]))
+        lost = row["twin_psnr"] - psnr
+        return row | {"psnr": psnr, "lost_db": lost, "verdict": "survives" if lost <= TOLERANCE_DB else "loses"}
+
+    def twin(self, system: System, optimizer: str) -> dict[str, float]:
+        """PSNR of every view after a run with nothing wrong."""
+        key = (system.label, optimizer)
+        if key not in self.twins:
+            self.twins[key] = self.run(worlds.capture(), system, optimizer, Hazard())["psnr"]
+        return self.twins[key]
+
+    def run(self, world: Scene, system: System, optimizer: str, hazard: Hazard) -> dict[str, Any]:
+        """Train into a folder, and look into every file of it."""
+        config = TrainConfig(**(system.options | {"iterations": self.iterations, "cap_max": CAP, "sh_degree": SH_DEGREE,
+                                                  "densify_interval": 20, "checkpoint_interval": 50}
+                                | OPTIMIZERS[optimizer] | rates_of(hazard, system) | hazard.options))
+        found: dict[str, Any] = {"message": "", "psnr": {}, "diverged_at": None}
+        start = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "model"
+            if hazard.start is not None:
+                first, _ = initial_splats(world, config.shape, config.cap_max, SH_DEGREE, opacity=config.init_opacity,
+                                          scale_factor=config.init_scale)
+                file = Path(folder) / "start.ply"
+                hazard.start(first).save(file)
+                config = TrainConfig.from_json(config.to_json() | {"init": str(file)})
+            try:
+                model = clsplat.train(world, config, output=out)
+                found["psnr"] = {name: view["PSNR"] for name, view in evaluate(
+                    self.renderer, model.splats, world.views).per_view.items()}
+            except ClsplatError as error:
+                found["message"] = str(error).replace(folder, "")
+            found["seconds"] = time.perf_counter() - start
+            found["finite"] = all(finite_file(path) for path in out.rglob("*.ply"))
+            found["diverged_at"] = diverged_at(out / "log.jsonl")
+        return found
+
+
+def rates_of(hazard: Hazard, system: System) -> dict[str, Any]:
+    """Every rate of the config times the hazard's factor."""
+    if hazard.rates == 1:
+        return {}
+    plain = TrainConfig(**system.options)
+    values = {name: hazard.rates * getattr(plain, name) for name in RATES}
+    skew = [own.lr for own in SHAPES[system.shape].fields if own.name == "skew"]
+    return values | ({"skew_lr": hazard.rates * skew[0]} if skew else {})
+
+
+def finite_file(path: Path) -> bool:
+    """Whether a written model loads, which it does not with a NaN or an infinity."""
+    try:
+        splats = Splats.load(path)
+    except ClsplatError:
+        return False
+    return all(bool(np.isfinite(values).all()) for values in splats.arrays.values())
+
+
+def diverged_at(log: Path) -> int | None:
+    """The first reported iteration from which on the loss stays above the first report's."""
+    if not log.exists():
+        return None
+    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    losses = [(row["iteration"], row["loss"]) for row in rows if "loss" in row]
+    bad = None
+    for iteration, loss in reversed(losses[1:]):
+        if loss <= losses[0][1]:
+            break
+        bad = iteration
+    return bad

@@ -1,0 +1,73 @@
+"""Small scenes to train on, and what can be wrong with them."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.camera import Camera
+from clsplat.capture import write_capture
+from clsplat.colmap import Points
+from clsplat.scene import Scene, View, load_scene
+
+WIDTH, HEIGHT, VIEWS = 64, 48, 26
+
+
+@cache
+def capture() -> Scene:
+    """A procedural capture of 26 views, four of them test views; some 2400 points."""
+    with tempfile.TemporaryDirectory() as folder:
+        return load_scene(write_capture(Path(folder) / "capture", WIDTH, HEIGHT, VIEWS))
+
+
+def in_units(scene: Scene, scale: float) -> Scene:
+    """The same world with all lengths times `scale`."""
+    def camera(of: Camera) -> Camera:
+        pose = of.cam_from_world.copy()
+        pose[:3, 3] *= scale
+        return of.posed(pose)
+
+    views = [View(view.name, camera(view.camera), view.image) for view in scene.views]
+    return rebuilt(scene, views, scene.points.xyz * scale)
+
+
+def of_first(scene: Scene, n: int) -> Scene:
+    """Only n of the training views, and no test view: these are measured instead."""
+    return rebuilt(scene, scene.train[:n], scene.points.xyz)
+
+
+def badly_exposed(scene: Scene, gain: float = 2.0) -> Scene:
+    """One training photo taken with another exposure, its highlights clipped."""
+    odd = scene.train[3]
+    bright = np.minimum(odd.image.astype(np.float64) * gain, 255).astype(np.uint8)
+    views = [replace(view, image=bright) if view is odd else view for view in scene.views]
+    return rebuilt(scene, views, scene.points.xyz)
+
+
+def with_points(scene: Scene, kind: str) -> Scene:
+    """Points as structure from motion should not give them."""
+    xyz = scene.points.xyz.copy()
+    rows = np.arange(len(xyz))
+    if kind == "doubled":  # each of half of the points twice
+        xyz = xyz[rows // 2 * 2]
+    elif kind == "coincident":
+        xyz = np.repeat(xyz.mean(axis=0, keepdims=True), len(xyz), axis=0)
+    elif kind == "outliers":  # a hundredth of them far out
+        xyz[::100] = (xyz[::100] - xyz.mean(axis=0)) * 1e6
+    elif kind == "four":
+        rows = rows[:: len(rows) // 4][:4]
+        return rebuilt(scene, scene.views, xyz[rows], rows)
+    else:
+        raise ValueError(kind)
+    return rebuilt(scene, scene.views, xyz)
+
+
+def rebuilt(scene: Scene, views: list[View], xyz: np.ndarray, rows: np.ndarray | None = None) -> Scene:
+    """Of other views and positions; `rows` of the points' other properties, all by default."""
+    points, keep = scene.points, slice(None) if rows is None else rows
+    names = frozenset(view.name for view in views) & scene.test_names
+    return Scene(scene.name, scene.path, views, Points(xyz, points.rgb[keep], points.track_length[keep]), names)
