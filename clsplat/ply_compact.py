@@ -97,6 +97,15 @@ def movable(schema: Schema) -> list[Field]:
     return [f for f in schema if f.name not in core and f.neutral_from is None and not f.nonzero]
 
 
+def layout_bytes(schema: Schema, layout: Layout, n: int) -> int:
+    """Bytes of a compact file of n splats, without its header."""
+    k = sh_coefficients(layout.base)
+    words = n * (3 * k + sum(f.width for f in schema if f.name != "sh" and f.name not in layout.sparse))
+    words += sum((1 + schema[name].width) * len(rows) for name, rows in layout.sparse.items())
+    words += sum((1 + 3 * (sh_coefficients(band) - k)) * len(rows) for band, rows in layout.bands.items())
+    return 4 * words
+
+
 def rest_columns(band: int, base: int) -> dict[str, tuple[int, int]]:
     """(coefficient, channel) of each f_rest_* of a file of degree `band`, without those up to `base`."""
     per_channel = sh_coefficients(band) - 1

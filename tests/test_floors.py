@@ -16,20 +16,22 @@ ROOT = Path(__file__).resolve().parent.parent
 # A module imports modules of lower floors only.
 FLOORS = """
     errors flops harmonics morton
-    atomic compare_table interrupt presets run_log runtime schema signatures capture_world
+    atomic budget_rules compare_table interrupt presets run_log runtime schema signatures capture_world
     camera device images metrics optim_reference plan ply_header profiles rotations schedules validity colmap_files
     binaries cameras_json capture checkpoint colmap launches noise ply_body ply_compact shapes
     chart_style opacities ply program sghmc skew_map
     adc charts config densify kernels regularisers scene splats
-    blocks buffers camera_path convert initialise model_folder rate_limits strategy synthetic systems view_sampler
-    gradients limits optim_rules sort
+    blocks buffers camera_path complexity convert initialise model_folder rate_limits strategy synthetic systems \
+    validation view_sampler
+    budget_state gradients limits optim_rules sort
     binning optim_fused optim_host stages
     optim pipeline
     loss memory pairs truths tuning
     render
-    evaluate
-    trainer
-    bench compare training
+    evaluate needs
+    prune trainer
+    bench compare shrink training
+    budget
 """
 FLOOR = {name: level for level, line in enumerate(FLOORS.split("\n")) for name in line.split()}
 
