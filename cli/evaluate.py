@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from clsplat.complexity import complexity
 from clsplat.errors import InputError
 from clsplat.metrics import DEFAULT_PROTOCOL, PROTOCOLS, Protocol, protocol_named
 from clsplat.model_folder import read_json, write_json
@@ -110,10 +111,9 @@ def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol
     colour = model.background if background is None else background
     measured = evaluate(renderer, model.splats, list(views), colour, protocol, on_view)
     splats = model.splats
-    n_parameters = sum(array.size for array in splats.to_numpy().values())
     result = {
-        "SSIM": measured.ssim, "PSNR": measured.psnr, "render_ms": measured.render_ms, "splats": len(splats),
-        "bytes": model.ply.stat().st_size, "parameters": n_parameters,
+        "SSIM": measured.ssim, "PSNR": measured.psnr, "render_ms": measured.render_ms,
+        "bytes": model.ply.stat().st_size, **complexity(splats).to_json(),
         "shape": splats.shape, "normalisation": splats.normalisation, "set": view_set, "views": len(views),
         "background": list(colour), "device": str(renderer.device.info), "protocol": protocol.describe(),
     }

@@ -9,6 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .budget import Budgeted, train_budget
+    from .budget_rules import BudgetOptions
     from .camera import Camera
     from .config import TrainConfig
     from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
@@ -23,12 +25,12 @@ _HOME = {
     "Camera": "camera", "ClsplatError": "errors", "DeviceError": "errors", "InputError": "errors",
     "OutputError": "errors", "TrainingError": "errors", "Rendered": "render", "Renderer": "render",
     "Scene": "scene", "load_scene": "scene", "Splats": "splats", "TrainConfig": "config", "train": "training",
-    "Model": "training",
+    "Model": "training", "BudgetOptions": "budget_rules", "Budgeted": "budget", "train_budget": "budget",
 }
 
 __all__ = [
-    "Camera", "ClsplatError", "DeviceError", "InputError", "Model", "OutputError", "Rendered", "Renderer",
-    "Scene", "Splats", "TrainConfig", "TrainingError", "load_scene", "train",
+    "BudgetOptions", "Budgeted", "Camera", "ClsplatError", "DeviceError", "InputError", "Model", "OutputError",
+    "Rendered", "Renderer", "Scene", "Splats", "TrainConfig", "TrainingError", "load_scene", "train", "train_budget",
 ]
 
 

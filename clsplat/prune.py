@@ -67,7 +67,7 @@ class Judge:
     """PSNR of models on some views, the mean over them [dB]."""
 
     def __init__(self, renderer: Renderer, views: Sequence[View],
-                 background: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+                 background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         self.renderer, self.views, self.background = renderer, views, background
 
     def __call__(self, splats: Splats) -> float:

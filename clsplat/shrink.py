@@ -16,7 +16,7 @@ from typing import Any
 from .config import TrainConfig
 from .device import Device
 from .needs import measure
-from .prune import splat_scores, strongest
+from .prune import Judge, splat_scores, strongest
 from .render import Renderer
 from .run_log import Progress
 from .scene import Scene, View
@@ -36,6 +36,28 @@ def without_quarter(splats: Splats, views: Sequence[View], renderer: Renderer,
     needs = measure(renderer, splats, views, background, seed, parts=False)
     keep = max(int(KEPT * len(splats)), count or 1)
     return strongest(splats, splat_scores(splats, needs), min(keep, len(splats)))
+
+
+def trained_rounds(scene: Scene, splats: Splats, judge: Judge, floor: float, iterations: int, device: Device,
+                   progress: Callable[[Progress], None] | None = None) -> Splats:
+    """Rounds for a model whose run is not known, until the judge's PSNR falls below the floor; the last good one.
+
+    Rates are those that a run of clsplat's defaults, ten times as long as a round, ends with.
+
+    Parameters
+    ----------
+    iterations : of a round.
+    """
+    config = TrainConfig(shape=splats.shape, normalisation=splats.normalisation, iterations=10 * iterations,
+                         background=judge.background)
+    good = splats
+    while len(splats) > 1:
+        fewer = without_quarter(splats, scene.train, judge.renderer, judge.background)
+        splats = fine_tune(scene, fewer, config, iterations, device, progress)
+        if judge(splats) < floor:
+            break
+        good = splats
+    return good
 
 
 def fine_tune(scene: Scene, splats: Splats, config: TrainConfig, iterations: int, device: Device,
