@@ -78,6 +78,20 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
         return tuple(int(part) for part in parts)
 
 
+class Decibels(click.ParamType):  # type: ignore[type-arg]
+    """A number of decibels: 0.1, 0.1dB."""
+
+    name = "dB"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        if isinstance(value, (int, float)):
+            return float(value)
+        match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(dB)?\s*", value, re.I)
+        if match is None:
+            self.fail(f"{value!r} is no number of decibels: give for example 0.1 or 0.1dB", param, ctx)
+        return float(match[1])
+
+
 class SpacedLists(click.Command):
     """A command that also takes 3DGS's form of a list, `--save_iterations 1000 2000`."""
 

@@ -2,36 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from clsplat.errors import InputError, OutputError
 
 from .models import LoadedModel, load_model, scene_of
-from .options import PATH, device_option, iteration_option, quiet_option, scene_options
+from .options import PATH, Decibels, device_option, iteration_option, quiet_option, scene_options
 from .progress import TrainingDisplay
 
 if TYPE_CHECKING:
     from clsplat.prune import Pruned
     from clsplat.scene import Scene
-
-
-class Decibels(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
-    """A number of decibels: 0.1, 0.1dB."""
-
-    name = "dB"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        if isinstance(value, (int, float)):
-            return float(value)
-        match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(dB)?\s*", value, re.I)
-        if match is None:
-            self.fail(f"{value!r} is no number of decibels: give for example 0.1 or 0.1dB", param, ctx)
-        return float(match[1])
 
 
 @click.command("prune")

@@ -12,6 +12,7 @@ from clsplat.errors import InputError, OutputError
 from clsplat.model_folder import ModelFolder
 from clsplat.presets import PRESETS, with_preset
 
+from .budget import budget_options, options_of, run_search, stored_search
 from .options import (
     PATH,
     SpacedLists,
@@ -47,6 +48,7 @@ INTERRUPTED = 130
 @quiet_option
 @click.option("--preset", type=click.Choice(list(PRESETS)),
               help="A published system: kernel, optimizer, strategy and constants; other options replace constants.")
+@budget_options
 @config_options()
 @click.pass_context
 def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, model_path: Path | None,
@@ -54,13 +56,15 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
     """Learn a splat model of SCENE, a folder with photos in images/ and a COLMAP model in sparse/.
 
     Writes config.json, cameras.json, log.jsonl, checkpoint.npz and point_cloud/iteration_N/point_cloud.ply
-    into the model's folder. Ctrl-C saves a checkpoint; --resume goes on from it.
+    into the model's folder. Ctrl-C saves a checkpoint; --resume goes on from it. With --budget auto also budget.json
+    and the growth curve; the small model is the last point cloud.
     """
     if resume and overwrite:
         raise click.UsageError("give --resume or --overwrite, not both")
     if scene and source_path and scene != source_path:
         raise click.UsageError(f"two scenes: {scene} and {source_path}")
     path = scene or source_path
+    search = options_of(values)
     options = config_values(ctx, values)
     if preset is not None:
         options = with_preset(preset, options)
@@ -72,7 +76,13 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
         model_path = Path("output") / path.resolve().name
     folder = ModelFolder(model_path)
     if resume:
-        stored_config, stored_scene = _stored_run(folder)
+        stored = stored_search(model_path)
+        if search is not None and stored is None:
+            raise InputError(f"{model_path}: no search to resume from: start without --resume")
+        if stored is not None:
+            stored_config, search, stored_scene = stored[0], search or stored[1], stored[2]
+        else:
+            stored_config, stored_scene = _stored_run(folder)
         options, reading = stored_config | options, stored_scene | reading
         path = path or Path(reading["path"])
     elif folder.is_used and not overwrite:
@@ -81,6 +91,9 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
     assert path is not None
     config = TrainConfig(**options)
     loaded, record = read_scene(path, reading, config.background)
+    if search is not None:
+        run_search(ctx, loaded, config, search, model_path, record, resume, overwrite, quiet)
+        return
     model = run_training(loaded, config, model_path, record, resume, overwrite, quiet)
     if not model.finished:
         say_stopped(ctx, model)

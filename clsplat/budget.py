@@ -33,7 +33,7 @@ from .prune import Judge, Thresholds, apply_thresholds, prune, within_bytes
 from .render import Renderer
 from .run_log import Progress
 from .scene import Scene
-from .shrink import SETTLING, fine_tune, without_quarter
+from .shrink import SETTLING, fine_tune, without_messages, without_quarter
 from .splats import Splats
 from .trainer import Trainer
 from .training import train
@@ -220,7 +220,7 @@ class _Search:
 
     def run_of(self, config: TrainConfig) -> tuple[Splats, float]:
         """A training run without the held-out views; and its seconds."""
-        model = Trainer(self.split, config, progress=self.progress, device=self.device).run()
+        model = Trainer(self.split, config, progress=without_messages(self.progress), device=self.device).run()
         return model.splats, round(model.seconds, 2)
 
     def row(self, splats: Splats, seconds: float) -> Row:

@@ -74,8 +74,21 @@ def fine_tune(scene: Scene, splats: Splats, config: TrainConfig, iterations: int
     with tempfile.TemporaryDirectory() as folder:
         start = Path(folder) / "start.ply"
         splats.save(start)
-        trainer = Trainer(scene, fine_tuning(config, splats, iterations, start, rate), device=device, progress=progress)
+        trainer = Trainer(scene, fine_tuning(config, splats, iterations, start, rate), device=device,
+                          progress=without_messages(progress))
     return trainer.run().splats
+
+
+def without_messages(progress: Callable[[Progress], None] | None) -> Callable[[Progress], None] | None:
+    """The same, told of iterations only: where parts of a run start from is no news."""
+    if progress is None:
+        return None
+
+    def told(report: Progress) -> None:
+        if not report.message:
+            progress(report)
+
+    return told
 
 
 def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Path, rate: float = 1.0) -> TrainConfig:

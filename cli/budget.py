@@ -1,0 +1,133 @@
+"""`clsplat train --budget auto`: the search for the smallest model, its messages, and its chart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import click
+
+from clsplat.budget_rules import TOLERANCE, BudgetOptions
+from clsplat.budget_state import FILE, BudgetState
+from clsplat.config import TrainConfig
+from clsplat.errors import InputError, OutputError
+
+from .options import Decibels, F
+from .progress import TrainingDisplay
+
+if TYPE_CHECKING:
+    from clsplat.budget import Budgeted
+    from clsplat.scene import Scene
+
+INTERRUPTED = 130
+KEYS = ("budget", "budget_tolerance", "target_psnr", "max_bytes")
+
+
+def budget_options(function: F) -> F:
+    """`--budget`, `--budget-tolerance`, `--target-psnr` and `--max-bytes`."""
+    for option in (
+        click.option("--max-bytes", type=click.IntRange(min=1), metavar="N",
+                     help="The best model whose file has at most N bytes; implies --budget auto."),
+        click.option("--target-psnr", type=Decibels(), metavar="DB",
+                     help="The smallest model with that PSNR on validation views; implies --budget auto."),
+        click.option("--budget-tolerance", type=Decibels(), metavar="DB",
+                     help="PSNR on validation views that fewer splats and parameters may cost; implies --budget "
+                          f"auto.  [default: {TOLERANCE:g}]"),
+        click.option("--budget", type=click.Choice(["auto"]),
+                     help="Find the smallest model that the scene needs, on views held out of the training set. "
+                          "--cap-max is the most splats that are tried. Takes about three runs' time."),
+    ):
+        function = option(function)
+    return function
+
+
+def options_of(values: dict[str, Any]) -> BudgetOptions | None:
+    """The search asked for, if any; takes its options out of `values`."""
+    given = {key: values.pop(key) for key in KEYS}
+    if all(value is None for value in given.values()):
+        return None
+    tolerance = given["budget_tolerance"]
+    return BudgetOptions(TOLERANCE if tolerance is None else tolerance, given["target_psnr"], given["max_bytes"])
+
+
+def stored_search(folder: Path) -> tuple[dict[str, Any], BudgetOptions, dict[str, Any]] | None:
+    """Options of the run, of the search, and the scene, where a search is to be resumed."""
+    if not (folder / FILE).is_file():
+        return None
+    state = BudgetState(folder)
+    state.load()
+    try:
+        config = TrainConfig.from_json(state.values["config"])
+        options = BudgetOptions(**state.values["options"])
+        scene = dict(state.values["scene"])
+        scene["path"] = str(scene["path"])
+    except (InputError, KeyError, TypeError) as error:
+        raise InputError(f"{state.path}: damaged ({error}): start again with --overwrite") from None
+    if "final" in state.values:
+        raise InputError(f"{folder}: the search is finished: nothing to resume")
+    return {name: getattr(config, name) for name in state.values["config"]}, options, scene
+
+
+def run_search(ctx: click.Context, scene: Scene, config: TrainConfig, options: BudgetOptions, model_path: Path,
+               record: dict[str, Any], resume: bool, overwrite: bool, quiet: bool) -> None:
+    """Search with a live display, and say what was found."""
+    from clsplat.budget import train_budget
+
+    result: Budgeted | None = None
+    try:
+        with TrainingDisplay(quiet) as display:
+            result = train_budget(scene, config, options, display, output=model_path, resume=resume,
+                                  overwrite=overwrite, extra=record)
+    except KeyboardInterrupt:
+        _say_stopped(ctx, model_path)
+    if not result.finished:
+        _say_stopped(ctx, model_path)
+    chart = draw_growth(result, model_path)
+    if quiet:
+        return
+    for line in lines_of(result):
+        click.echo(line)
+    if chart is not None:
+        click.echo(chart)
+    if scene.test:
+        from clsplat.evaluate import evaluate
+        from clsplat.render import Renderer
+
+        metrics = evaluate(Renderer(config.device), result.splats, scene.test, config.background)
+        click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
+
+
+def lines_of(result: Budgeted) -> list[str]:
+    """What the search found."""
+    report, final = result.report, result.report["final"]
+    held_out = report["held_out"]
+    seconds = sum(row["seconds"] for row in (*report["growth"], *report["rounds"])) + report["refit"]["seconds"]
+    lines = [f"growth: pays up to {report['knee']} splats",
+             f"rounds: {report['rounds'][report['chosen']]['splats']} of {report['rounds'][0]['splats']} splats stay",
+             f"validation views: PSNR {held_out['psnr_pruned']:.2f} dB, with all splats and parameters "
+             f"{report['rounds'][0]['psnr']:.2f} dB",
+             f"{result.path}: {final['splats']} splats, {final['skewed_fraction']:.0%} skewed, "
+             f"{final['parameters_in_use']} parameters, {final['bytes'] / 1e6:.2f} MB; {seconds:.0f} s in all"]
+    return lines + [f"warning: {final['missed']}"] * (final["missed"] is not None)
+
+
+def draw_growth(result: Budgeted, model_path: Path) -> str | None:
+    """Write growth.png and growth.svg; what to say of them, nothing where matplotlib is not installed."""
+    from clsplat.charts import growth_chart
+
+    report = result.report
+    rows = [{"splats": row["splats"], "psnr": row["psnr"]} for row in report["growth"]]
+    knee = next(row["splats"] for row in report["growth"] if row["cap"] == report["knee"])
+    held_out = report["held_out"]
+    star = {"splats": held_out["splats"], "psnr": held_out["psnr_pruned"], "label": "held-out run, pruned"}
+    whole = {"splats": report["rounds"][0]["splats"], "psnr": report["rounds"][0]["psnr"], "label": "held-out run"}
+    try:
+        files = growth_chart([*rows, whole, star], knee, model_path / "growth")
+    except OutputError:
+        return None
+    return f"growth curve: {', '.join(str(file) for file in files)}"
+
+
+def _say_stopped(ctx: click.Context, model_path: Path) -> NoReturn:
+    click.echo(f"stopped; what is done is kept; to go on: clsplat train --resume -m {model_path}", err=True)
+    ctx.exit(INTERRUPTED)
