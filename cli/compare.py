@@ -26,7 +26,7 @@ from .progress import TrainingDisplay, duration, table
 from .train import SCENE_KEYS, read_scene
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from clsplat.compare import Run
     from clsplat.compare_table import Record
@@ -57,21 +57,10 @@ def compare_systems(ctx: click.Context, /, scenes: tuple[Path, ...], output: Pat
     from clsplat.compare import compare
     from clsplat.compare_table import HEAD, cells, notes, summarise
 
-    common = config_values(ctx, values)
-    reading = {key: values[key] for key in SCENE_KEYS if key in values and is_given(ctx, key)} | {"eval": True}
-    names = [path.resolve().name for path in scenes]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"two scenes are called {name}: rename one of the folders")
-    background = common.get("background", (0.0, 0.0, 0.0))
-
-    def loaded() -> Iterator[Scene]:
-        for path in scenes:
-            yield read_scene(path, reading, background)[0]
-
+    common, loaded = options_and_scenes(ctx, scenes, values)
     with TrainingDisplay(quiet) as display:
-        records = compare(loaded(), parse_systems(systems), output, _flat(caps) or [5000], _flat(seeds) or [0], common,
-                          save_models=save_models, progress=display, on_run=None if quiet else _say)
+        records = compare(loaded, parse_systems(systems), output, flat(caps) or [5000], flat(seeds) or [0], common,
+                          save_models=save_models, progress=display, on_run=None if quiet else say_run)
     if not quiet:
         rows = summarise(records)
         click.echo(table(HEAD, map(cells, rows)))
@@ -79,12 +68,25 @@ def compare_systems(ctx: click.Context, /, scenes: tuple[Path, ...], output: Pat
             click.echo(note)
 
 
-def _flat(groups: tuple[tuple[int, ...], ...]) -> list[int]:
+def options_and_scenes(ctx: click.Context, paths: Sequence[Path],
+                       values: dict[str, Any]) -> tuple[dict[str, Any], Iterator[Scene]]:
+    """Options of training that stand on the command line, and the scenes, each read when it is asked for."""
+    common = config_values(ctx, values)
+    reading = {key: values[key] for key in SCENE_KEYS if key in values and is_given(ctx, key)} | {"eval": True}
+    names = [path.resolve().name for path in paths]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two scenes are called {name}: rename one of the folders")
+    background = common.get("background", (0.0, 0.0, 0.0))
+    return common, (read_scene(path, reading, background)[0] for path in paths)
+
+
+def flat(groups: tuple[tuple[int, ...], ...]) -> list[int]:
     """All numbers once, in the order given."""
     return list(dict.fromkeys(number for group in groups for number in group))
 
 
-def _say(run: Run, record: Record | None) -> None:
+def say_run(run: Run, record: Record | None) -> None:
     """Name a run before it starts, and its result after it."""
     if record is None:
         click.echo(str(run), err=True)

@@ -20,6 +20,7 @@ COMMANDS = {
     "render": ("clsplat_cli.render:render", "Render a model or any splat PLY."),
     "eval": ("clsplat_cli.evaluate:evaluate_models", "Measure models on the views they were not trained on."),
     "compare": ("clsplat_cli.compare:compare_systems", "Train published systems side by side and tabulate them."),
+    "frontier": ("clsplat_cli.frontier:draw_frontier", "Sweep systems and caps, and chart quality against cost."),
     "bench": ("clsplat_cli.bench:bench", "Time the stages of training and rendering on this device."),
     "convert": ("clsplat_cli.convert:convert_model", "Write a model as another shape, with the same images."),
 }

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import importlib.util
 import io
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +19,18 @@ from .atomic import atomic_writer
 from .errors import OutputError
 from .shapes import SHAPES
 
+Label = tuple[float, float, str, str]  # x, y, text, colour
+Box = tuple[float, float, float, float]  # left, bottom, right, top
 MISSING = "charts need matplotlib: install it with pip install 'clsplat[charts]'"
 FORMATS = ("png", "svg")
 WIDTH = 9.0  # inches of a full chart: 900 px in a README at 100 dots per inch
-INK, FAINT, MARK = "#262626", "#d9d9d9", "#d55e00"
+INK, FAINT, FRONT, MARK = "#262626", "#d9d9d9", "#c4c4c4", "#d55e00"
 # Shapes of one family have colours of one family.
 _COLOURS = ("#262626", "#0072b2", "#56b4e9", "#009e73", "#cc79a7", "#d55e00", "#e69f00", "#8c8c1e")
+_CATEGORIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8c8c1e", "#56b4e9", "#e69f00", "#262626")
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X", "h")
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1, 1.3)), (0, (6, 1.3, 1, 1.3)), (0, (3, 1.2, 1, 1.2, 1, 1.2)))
+_LEGEND_COLUMNS = 4
 _STYLE = {
     "figure.dpi": 100, "savefig.dpi": 200, "font.size": 9, "axes.titlesize": 10, "axes.labelsize": 9,
     "legend.fontsize": 8.5, "xtick.labelsize": 8.5, "ytick.labelsize": 8.5, "font.family": "DejaVu Sans",
@@ -83,18 +89,24 @@ def shape_colour(shape: str) -> str:
     return dict(zip(SHAPES, _COLOURS, strict=True)).get(shape, INK)
 
 
+def category_colour(place: int) -> str:
+    """Colour of the `place`th of some categories that are no shapes."""
+    return _CATEGORIES[place % len(_CATEGORIES)]
+
+
 def looks(systems: dict[str, str]) -> dict[str, dict[str, Any]]:
     """Keywords of `Axes.plot` for systems, label to shape: the shape's colour and marker, and dashes within it."""
     seen: dict[str, int] = {}
     found = {}
-    for label, shape in systems.items():
+    # A system called by its shape is the plain one of its colour, whatever stands before it.
+    for label, shape in sorted(systems.items(), key=lambda item: item[0] != item[1]):
         place = seen.setdefault(shape, 0)
         seen[shape] += 1
         marker = dict(zip(SHAPES, _MARKERS, strict=True)).get(shape, "o")
         found[label] = {"color": shape_colour(shape), "marker": marker, "linestyle": _DASHES[place % len(_DASHES)],
                         "markerfacecolor": shape_colour(shape) if place % 2 == 0 else "white",
                         "markeredgecolor": shape_colour(shape)}
-    return found
+    return {label: found[label] for label in systems}
 
 
 def short_count(number: float, _: object = None) -> str:
@@ -126,3 +138,87 @@ def tile(corner: tuple[float, float], fill: str, label: str | None = None) -> An
     from matplotlib.patches import Rectangle
 
     return Rectangle(corner, 1, 1, facecolor=fill, edgecolor=FAINT if label else "white", linewidth=1.2, label=label)
+
+
+def star(shape: str) -> dict[str, Any]:
+    """Keywords of `Axes.plot` for the point of a run that chose its own number of splats."""
+    return {"marker": "*", "markersize": 14, "color": shape_colour(shape), "markeredgecolor": INK,
+            "markeredgewidth": 0.9, "linestyle": "none", "zorder": 5}
+
+
+def system_legend(figure: Any, styles: dict[str, dict[str, Any]], stars: dict[str, str] | None = None) -> None:
+    """All systems below the panels.
+
+    Parameters
+    ----------
+    styles : of `looks`. stars : label to shape of those drawn as stars.
+    """
+    from matplotlib.lines import Line2D
+
+    lines = styles | {label: star(shape) | {"markersize": 11} for label, shape in (stars or {}).items()}
+    handles = [Line2D([], [], label=label, **style) for label, style in lines.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), _LEGEND_COLUMNS), handlelength=3)
+
+
+def legend_rows(entries: int) -> int:
+    """Lines of a legend, each about 0.2 inches high."""
+    return -(-entries // _LEGEND_COLUMNS)
+
+
+def place_labels(figure: Any, labels: Sequence[tuple[Any, Sequence[Label]]], *, every: bool = False,
+                 size: float = 7.5) -> None:
+    """Write beside points where no curve, point or other label is.
+
+    Call it last: the room is that of the layout as it is.
+
+    Parameters
+    ----------
+    labels : axes and the labels on them, the most important first.
+    every : write those for which there is no room as well, where they hide least.
+    size : of the letters, points.
+    """
+    figure.draw_without_rendering()
+    for axes, points in labels:
+        _place(axes, points, every, size, figure.dpi / 72)
+
+
+def _place(axes: Any, points: Sequence[Label], every: bool, size: float, dot: float) -> None:
+    """The labels of one panel; `dot` is a point's pixels."""
+    box, near = axes.bbox, 3 * dot
+    marked = [line for line in axes.lines if line.get_marker() not in ("None", "", None)]
+    taken = [(x - near, y - near, x + near, y + near) for line in marked for x, y in _pixels(line, near)]
+    for x, y, text, colour in points:
+        at_x, at_y = axes.transData.transform((x, y))
+        width, height = 0.62 * size * len(text) * dot, 1.05 * size * dot
+        best: tuple[int, Box, tuple[float, float]] | None = None
+        # Above a front and to its left there is nothing, so that comes first.
+        for across, up in ((-1.0, 0.7), (0, 1.2), (-1, 0), (1, -0.7), (1, 0.7), (1, 0), (0, -1.2), (-1, -0.7)):
+            left = at_x + across * 6 * dot - width * (1 - across) / 2
+            bottom = at_y + up * 8 * dot - height / 2
+            spot = (left, bottom, left + width, bottom + height)
+            if not (box.x0 <= left and spot[2] <= box.x1 and box.y0 <= bottom and spot[3] <= box.y1):
+                continue
+            hidden = sum(_overlap(spot, other) for other in taken)
+            if best is None or hidden < best[0]:
+                best = hidden, spot, (across, up)
+        if best is not None and (every or not best[0]):
+            _, _, (across, up) = best
+            axes.annotate(text, (x, y), (across * 6, up * 8), textcoords="offset points", color=colour, va="center",
+                          ha=("right", "center", "left")[int(across) + 1], fontsize=size)
+            taken.append(best[1])
+
+
+def _pixels(line: Any, step: float) -> list[tuple[float, float]]:
+    """Places on a line's path, at most `step` pixels apart; of a line without strokes its points."""
+    path = line.get_path()
+    corners = line.get_transform().transform(path.vertices).tolist()
+    found = [(x, y) for x, y in corners]
+    if line.get_linestyle() != "None":
+        for (x, y), (next_x, next_y) in pairwise(corners):
+            parts = int(math.hypot(next_x - x, next_y - y) // step) + 1
+            found += [(x + (next_x - x) * n / parts, y + (next_y - y) * n / parts) for n in range(1, parts)]
+    return found
+
+
+def _overlap(a: Box, b: Box) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

@@ -1,12 +1,28 @@
-"""Charts of single questions: growth and its knee, hazards and shapes. Plain data in, PNG and SVG out."""
+"""Charts of single questions: growth and its knee, hazards, seeds, arithmetic. Plain data in, PNG and SVG out."""
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .chart_style import INK, MARK, WIDTH, chart_paths, drawing, log_axis, short_count, tile
+from .chart_style import (
+    INK,
+    MARK,
+    WIDTH,
+    Label,
+    category_colour,
+    chart_paths,
+    drawing,
+    log_axis,
+    looks,
+    place_labels,
+    shape_colour,
+    short_count,
+    system_legend,
+    tile,
+)
 from .errors import InputError
 
 # Colour of a cell, and of the text on it.
@@ -105,4 +121,103 @@ def heat_map(table: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path]:
         used = [name for name in VERDICTS if any(verdict == name for verdict, _ in by.values())]
         figure.legend(handles=[tile((0, 0), VERDICTS[name][0], name) for name in used], loc="outside lower center",
                       ncols=len(used), handlelength=1.4)
+    return chart_paths(out)
+
+
+def seeds_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path]:
+    """Test PSNR of each seed, and beside it of one seed repeated; a panel a scene.
+
+    A dot is a seed, the bar their median; diamonds are repeats of one seed, and "=" says that their splats are the same
+    bit by bit. Below each name stands the spread, maximum less minimum, of seeds and of repeats.
+
+    rows : of `frontier_data.seed_rows`. out : path without a suffix.
+
+    Raises
+    ------
+    InputError : no rows. OutputError : no matplotlib, or not writable.
+    """
+    if not rows:
+        raise InputError(f"{out}: a chart of seeds needs several seeds")
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    with drawing(out, WIDTH, 3.6 * len(scenes) + 0.2) as figure:
+        for panel, scene in zip(figure.subplots(len(scenes), squeeze=False)[:, 0], scenes, strict=True):
+            own = [row for row in rows if row["scene"] == scene]
+            names = []
+            for place, system in enumerate(dict.fromkeys(row["system"] for row in own)):
+                names.append(_strip(panel, place, system, [row for row in own if row["system"] == system]))
+            panel.set_xticks(range(len(names)), names, fontsize=7.5)
+            panel.set(ylabel="test PSNR [dB]", xlim=(-0.6, len(names) - 0.4))
+            panel.set_title(f"{scene}, cap {short_count(own[0]['cap'])}, {own[0]['iterations']} iterations")
+            panel.grid(False, axis="x")
+    return chart_paths(out)
+
+
+def _strip(panel: Any, place: int, system: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Draw one system's runs; returns its name and spreads for the axis."""
+    colour = shape_colour(rows[0]["shape"])
+    seeds = sorted((row["seed"], row["psnr"]) for row in rows if not row["repeat"])
+    values = [psnr for _, psnr in seeds]
+    # Side by side, so that equal values are both seen.
+    across = [place - 0.18 + 0.05 * (number - (len(seeds) - 1) / 2) for number in range(len(seeds))]
+    panel.plot(across, values, marker="o", linestyle="none", color=colour, markersize=5.5, alpha=0.85)
+    middle = statistics.median(values)
+    panel.plot([place - 0.36, place], [middle, middle], color=colour, linewidth=2)
+    name = "-\n".join(system.rsplit("-", 1)) if len(system) > 14 else system
+    said = f"{name}\nseeds {max(values) - min(values):.2f} dB"
+    again = [row for row in rows if any(row["seed"] == other["seed"] and other["repeat"] for other in rows)]
+    if again:
+        repeated = [row["psnr"] for row in again]
+        panel.plot([place + 0.15 + 0.07 * number for number in range(len(again))], repeated, marker="D", markersize=4.5,
+                   linestyle="none", color=colour, markerfacecolor="white")
+        same = "=" if len({row["digest"] for row in again}) == 1 else "≠"
+        panel.annotate(same, (place + 0.15 + 0.07 * len(again), repeated[-1]), va="center", fontsize=9)
+        said += f"\nrepeats {max(repeated) - min(repeated):.2f} dB"
+    return said
+
+
+def arithmetic_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path]:
+    """Error of image and gradient against relative time, of variants of the arithmetic; a colour a kind.
+
+    Parameters
+    ----------
+    rows : each with "variant", "kind" (such as "Phi" or "cutoff"), "shape", "image_error" and "gradient_error"
+        (against float64; relative), "raster_ms" and "raster_vjp_ms" [ms]. Times are relative to the row of the same
+        shape that has the variant "default", else to its first.
+    out : path without a suffix.
+
+    Raises
+    ------
+    InputError : no rows. OutputError : no matplotlib, or not writable.
+    """
+    if not rows:
+        raise InputError(f"{out}: a chart of arithmetic needs variants")
+    base: dict[str, Mapping[str, Any]] = {}
+    for row in rows:
+        if row["variant"] == "default" or row["shape"] not in base:
+            base[row["shape"]] = row
+    kinds = {kind: place for place, kind in enumerate(dict.fromkeys(row["kind"] for row in rows))}
+    shapes = looks({shape: shape for shape in base})
+    panels_of = (("image_error", "raster_ms", "image", "rendering"),
+                 ("gradient_error", "raster_vjp_ms", "gradient", "its gradient"))
+    with drawing(out, WIDTH, 4.8) as figure:
+        panels = figure.subplots(1, 2)
+        labels: list[tuple[Any, list[Label]]] = []
+        for axes, (error, time, what, task) in zip(panels, panels_of, strict=True):
+            points: list[Label] = []
+            for row in rows:
+                if row[error] > 0:  # what is exact has no place on this axis
+                    colour = category_colour(kinds[row["kind"]])
+                    points.append((row[time] / base[row["shape"]][time], row[error], row["variant"], colour))
+                    axes.plot(*points[-1][:2], marker=shapes[row["shape"]]["marker"], color=colour, markersize=6)
+            axes.axvline(1, color=INK, linewidth=0.8, zorder=0.5)
+            labels.append((axes, points))
+            axes.set(yscale="log", xlabel=f"time of {task}, relative to the default")
+            axes.set_ylabel(f"relative error of the {what}")
+            axes.margins(0.16)
+        entries = {kind: {"color": category_colour(place), "marker": "o", "linestyle": "none"}
+                   for kind, place in kinds.items()}
+        marks = {shape: {"color": INK, "marker": style["marker"], "markerfacecolor": "white", "linestyle": "none"}
+                 for shape, style in shapes.items()}
+        system_legend(figure, entries | marks)
+        place_labels(figure, labels, every=True)
     return chart_paths(out)

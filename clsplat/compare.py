@@ -62,7 +62,6 @@ class RunFile:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / RUNS
-        self.records: list[Record] = []
         text = ""
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -70,25 +69,19 @@ class RunFile:
                 text = self.path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise OutputError(f"{self.path}: cannot be used ({error}): choose another folder") from None
-        for line in text.splitlines():
-            try:
-                record = json.loads(line)
-            except ValueError:
-                continue  # cut short by a crash: that run is done again
-            if isinstance(record, dict) and record.keys() >= _KEYS:
-                self.records.append(record)
+        self.records = parse_runs(text)
         self._separator = "" if not text or text.endswith("\n") else "\n"
 
     def find(self, scene: Mapping[str, Any], system: str, config: TrainConfig, repeat: int = 0) -> Record | None:
         """The record of a run, if it is done."""
-        wanted = (scene, system, _identity(config.to_json()), repeat)
-        return next((record for record in self.records if _key(record) == wanted), None)
+        wanted = run_key({"scene": scene, "system": system, "config": config.to_json(), "repeat": repeat})
+        return next((record for record in self.records if run_key(record) == wanted), None)
 
     def add(self, record: Record) -> None:
         """Append a record, or put it in the place of the same run's; OutputError where it cannot be written."""
         record = json.loads(json.dumps(record))
         for place, other in enumerate(self.records):
-            if _key(other) == _key(record):
+            if run_key(other) == run_key(record):
                 self.records[place] = record
                 with atomic_writer(self.path) as whole:
                     whole.write("".join(json.dumps(line) + "\n" for line in self.records).encode())
@@ -101,6 +94,19 @@ class RunFile:
             raise OutputError(f"{self.path}: cannot be written ({error.strerror or error}): free some space") from None
         self._separator = ""
         self.records.append(record)
+
+
+def parse_runs(text: str) -> list[Record]:
+    """The records of a runs.jsonl; a line cut short by a crash is left out: that run is done again."""
+    records = []
+    for line in text.splitlines():
+        try:
+            record = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(record, dict) and record.keys() >= _KEYS:
+            records.append(record)
+    return records
 
 
 def compare(scenes: Iterable[Scene], systems: Sequence[System], output: str | Path, caps: Sequence[int],
@@ -254,12 +260,7 @@ _KEYS = {"scene", "system", "config", "failed", "finite", "cap_held", "device", 
          "protocol", *MEASURED}
 
 
-def _key(record: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What makes a record the one of a run."""
-    return record["scene"], record["system"], _identity(record["config"]), record.get("repeat", 0)
-
-
-def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A config's values as JSON has them, without those that change nothing."""
-    values: dict[str, Any] = json.loads(json.dumps({key: config[key] for key in config if key not in FREE_OPTIONS}))
-    return values
+def run_key(record: Mapping[str, Any]) -> str:
+    """What makes a record the one of a run: scene, system, options that change something, and which repeat it is."""
+    options = {key: value for key, value in record["config"].items() if key not in FREE_OPTIONS}
+    return json.dumps([record["scene"], record["system"], options, record.get("repeat", 0)], sort_keys=True)

@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from frontier_records import recorded, seeds, sweep
 
-from clsplat import charts
-from clsplat.chart_style import chart_paths, drawing, looks, shape_colour, short_count
-from clsplat.charts import VERDICTS, growth_chart, heat_map
+from clsplat import charts, frontier_charts
+from clsplat.chart_style import _STYLE, chart_paths, drawing, looks, place_labels, shape_colour, short_count
+from clsplat.charts import VERDICTS, arithmetic_chart, growth_chart, heat_map, seeds_chart
 from clsplat.errors import InputError, OutputError
+from clsplat.frontier_charts import equal_chart, size_chart, time_chart
+from clsplat.frontier_data import curve_rows, equal_rows, point_rows, seed_rows
 from clsplat.shapes import SHAPES
 
 CURVE: list[dict[str, Any]] = [{"splats": 4000, "psnr": 21.5}, {"splats": 1000, "psnr": 18.0},
@@ -20,7 +23,7 @@ CURVE: list[dict[str, Any]] = [{"splats": 4000, "psnr": 21.5}, {"splats": 1000, 
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The figures that are drawn, which are written as well."""
+    """The figures that are drawn; they are written as well, small."""
     figures: list[Any] = []
     context = charts.drawing
 
@@ -35,12 +38,18 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         def __exit__(self, *error: Any) -> Any:
             return self.context.__exit__(*error)
 
-    monkeypatch.setattr(charts, "drawing", Kept)
+    for module in (charts, frontier_charts):
+        monkeypatch.setattr(module, "drawing", Kept)
+    monkeypatch.setitem(_STYLE, "savefig.dpi", 40)
     return figures
 
 
 def words(axes: Any) -> list[str]:
     return [text.get_text() for text in axes.texts]
+
+
+def legend_of(figure: Any) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].texts]
 
 
 def test_growth_chart(tmp_path: Path, drawn: list[Any]) -> None:
@@ -55,7 +64,7 @@ def test_growth_chart(tmp_path: Path, drawn: list[Any]) -> None:
     assert "[dB]" in axes.get_ylabel()
 
 
-def test_charts_are_the_same_bytes(tmp_path: Path) -> None:
+def test_charts_are_the_same_bytes(tmp_path: Path, drawn: list[Any]) -> None:
     first, second = (growth_chart(CURVE, None, tmp_path / name) for name in "ab")
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
 
@@ -77,10 +86,100 @@ def test_heat_map(tmp_path: Path, drawn: list[Any]) -> None:
     assert [label.get_text() for label in axes.get_yticklabels()] == ["needles", "one image", "survived"]
     assert [label.get_text() for label in axes.get_xticklabels()] == ["gaussian", "student-t"]
     assert words(axes) == ["+0.1", "-1.2", "NaN", "", "1/2", "0/1"], "a place without a cell counts nowhere"
-    legend = [text.get_text() for text in drawn[0].legends[0].texts]
-    assert legend == ["survives", "loses", "fails"]
+    assert legend_of(drawn[0]) == ["survives", "loses", "fails"]
     with pytest.raises(InputError, match="unknown verdict 'maybe'"):
         heat_map([cells[0] | {"verdict": "maybe"}], tmp_path / "heat")
+
+
+def test_size_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    rows = point_rows(sweep())
+    size_chart(rows, tmp_path / "size")
+    render, size, splats = drawn[0].axes
+    assert [axes.get_xlabel() for axes in (render, size, splats)] == ["render time [ms]", "file [MB]", "splats"]
+    assert legend_of(drawn[0]) == ["gaussian", "default", "auto default"]
+    front, gaussian, default, star = splats.lines
+    assert list(front.get_xdata()) == [1000, 1500, 4000]
+    assert front.get_drawstyle() == "steps-post"
+    assert (list(gaussian.get_xdata()), list(gaussian.get_ydata())) == ([1000, 2000, 4000], [20, 21, 22])
+    assert (star.get_marker(), star.get_color()) == ("*", default.get_color())
+    assert gaussian.get_color() == shape_colour("gaussian") != default.get_color()
+    assert list(size.lines[1].get_xdata()) == pytest.approx([0.2, 0.4, 0.8])
+    assert set(words(splats)) == {"auto", "1k", "4k"}, "the front is labelled, all else is not"
+
+
+def test_time_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    runs = [recorded("gaussian", curve=sweep()[0]["curve"]), recorded("3dgs", curve=sweep()[1]["curve"])]
+    time_chart(curve_rows(runs), tmp_path / "time")
+    psnr, ssim = drawn[0].axes
+    assert (psnr.get_ylabel(), ssim.get_ylabel(), ssim.get_xlabel()) == (
+        "test PSNR [dB]", "test SSIM", "training time [s]")  # fmt: skip
+    assert list(psnr.lines[0].get_xdata()) == [0.1, 0.4, 2.0, 10.0]
+    assert list(ssim.lines[1].get_ydata()) == [row["ssim"] for row in runs[1]["curve"]]
+    assert psnr.lines[0].get_color() == psnr.lines[1].get_color(), "one shape"
+    assert psnr.lines[0].get_linestyle() != psnr.lines[1].get_linestyle()
+    best = max(row["psnr"] for row in runs[1]["curve"])
+    assert best - 5.2 < psnr.get_ylim()[0] < best - 1 < best < psnr.get_ylim()[1]
+
+
+def test_equal_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    equal_chart(equal_rows(point_rows(sweep()), "gaussian"), "gaussian", tmp_path / "equal")
+    (axes,) = drawn[0].axes
+    reached, bound = axes.lines[:2]
+    assert list(reached.get_xdata()) == [2000, 4000]
+    assert list(reached.get_ydata()) == pytest.approx([100 / 2**0.5] * 2)
+    assert (list(bound.get_xdata()), bound.get_markerfacecolor()) == ([1000], "white")
+    out_of_reach = [row for row in equal_rows(point_rows(sweep()), "default") if row["ratio"] is None]
+    with pytest.raises(InputError, match="needs points"):
+        equal_chart(out_of_reach, "default", tmp_path / "none")
+
+
+def test_seeds_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    rows = seed_rows(seeds())
+    rows[-1] |= {"psnr": 20.5, "digest": "another"}
+    seeds_chart(rows, tmp_path / "seeds")
+    (axes,) = drawn[0].axes
+    assert [label.get_text() for label in axes.get_xticklabels()] == [
+        "gaussian\nseeds 0.40 dB\nrepeats 0.00 dB", "3dgs\nseeds 0.40 dB\nrepeats 0.50 dB"]  # fmt: skip
+    assert words(axes) == ["=", "≠"]
+    dots, median, repeats = axes.lines[:3]
+    assert sorted(dots.get_ydata()) == pytest.approx([20.0, 20.1, 20.2, 20.3, 20.4])
+    assert list(median.get_ydata()) == [20.2, 20.2]
+    assert list(repeats.get_ydata()) == [20.0] * 3
+    with pytest.raises(InputError, match="several seeds"):
+        seeds_chart([], tmp_path / "none")
+
+
+def test_arithmetic_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    rows = [{"variant": variant, "kind": kind, "shape": shape, "image_error": error, "gradient_error": 10 * error,
+             "raster_ms": ms, "raster_vjp_ms": 3 * ms, "psnr_change": 0.0}
+            for shape, ms in (("gaussian", 5.0), ("skew-normal", 8.0))
+            for variant, kind, error, ms in (("erfc", "Phi", 1e-7, 2 * ms), ("default", "default", 1e-6, ms),
+                                             ("double", "exact", 0.0, 4 * ms))]
+    arithmetic_chart(rows, tmp_path / "arithmetic")
+    image, gradient = drawn[0].axes
+    marked = [line for line in image.lines if line.get_marker() != "None"]
+    assert [line.get_xdata()[0] for line in marked] == [2, 1, 2, 1], "relative to each shape's own default"
+    assert [line.get_ydata()[0] for line in marked] == [1e-7, 1e-6] * 2, "what is exact has no place on a log axis"
+    assert marked[0].get_color() == marked[2].get_color()
+    assert marked[0].get_marker() != marked[2].get_marker()
+    assert sorted(words(gradient)) == ["default", "default", "erfc", "erfc"], "every variant is named"
+    assert legend_of(drawn[0]) == ["Phi", "default", "exact", "gaussian", "skew-normal"]
+
+
+def test_labels_keep_clear_of_points_and_of_each_other(tmp_path: Path) -> None:
+    with drawing(tmp_path / "labels", 2, 2) as figure:
+        axes = figure.add_subplot(xlim=(0, 1), ylim=(0, 1))
+        places = [(0.5 + 0.01 * n, 0.5 + 0.01 * n) for n in range(12)]
+        axes.plot(*zip(*places, strict=True), marker="o", linestyle="none")
+        points = [(x, y, "label", "black") for x, y in places]
+        place_labels(figure, [(axes, points)])
+        few = list(axes.texts)
+        boxes = [text.get_window_extent() for text in few]
+        assert 0 < len(few) < len(points)
+        assert not any(a.overlaps(b) for n, a in enumerate(boxes) for b in boxes[:n])
+        assert not any(box.contains(*axes.transData.transform(place)) for box in boxes for place in places)
+        place_labels(figure, [(axes, points)], every=True)
+        assert len(axes.texts) == len(few) + len(points)
 
 
 def test_colours_are_told_apart() -> None:

@@ -17,10 +17,11 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = """
     errors flops harmonics morton
     atomic budget_rules compare_table interrupt presets run_log runtime schema signatures capture_world
-    camera device images metrics optim_reference plan ply_header profiles rotations schedules validity colmap_files
-    binaries cameras_json capture checkpoint colmap launches noise ply_body ply_compact shapes
+    camera device frontier_data html_report images metrics optim_reference plan ply_header profiles rotations schedules \
+    validity colmap_files
+    binaries cameras_json capture checkpoint colmap frontier_tables launches noise ply_body ply_compact shapes
     chart_style opacities ply program sghmc skew_map
-    adc charts config densify kernels regularisers scene splats
+    adc charts config densify frontier_charts kernels regularisers scene splats
     blocks buffers camera_path complexity convert initialise model_folder rate_limits strategy synthetic systems \
     validation view_sampler
     budget_state gradients limits optim_rules sort
@@ -31,7 +32,7 @@ FLOORS = """
     evaluate needs
     prune trainer
     bench compare shrink training
-    budget
+    budget frontier
 """
 FLOOR = {name: level for level, line in enumerate(FLOORS.split("\n")) for name in line.split()}
 
