@@ -111,3 +111,24 @@ def test_time_to_quality(tmp_path: Path, tmp_path_factory: pytest.TempPathFactor
     out.write_text(json.dumps(rows[0]) + "\n")
     printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
     assert "| 12.5 | 17.5 |  |  | 100 | 20.0 | 38.0 | 100 | 23.00 |" in printed.splitlines()[-1]
+
+
+def test_frontier(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    out = tmp_path / "frontier"
+    command = [sys.executable, str(BENCHMARKS / "frontier.py"), "--out", str(out)]
+    options = ["--smoke", "--scenes", scene.name]
+    done = subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
+    runs = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
+    assert len(runs) == 2 + 2 + 8, "what two groups want is trained once"
+    assert [run["config"]["cap_max"] for run in runs if run["curve"]] == [60, 60]
+    assert "repeated: 2 of 2 runs gave the same splats each time" in done.stdout
+    assert {path.stem for path in (out / "charts").glob("*.png")} >= {"size", "time", "seeds"}
+    assert (out / "report.html").is_file()
+    automatic = runs[0] | {"system": "auto", "psnr": 90.0}
+    (tmp_path / "budget").mkdir()
+    (tmp_path / "budget" / "runs.jsonl").write_text(json.dumps(automatic) + "\n")
+    printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
+    assert "| yard 48x36 | auto | 90.00 |" in printed
+    assert "render_ms bytes splats |" in printed
