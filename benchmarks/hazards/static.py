@@ -73,7 +73,7 @@ def judged(shape: str, arrays: crafted.Arrays, single: Renderer, double: Rendere
     good = image_error <= IMAGE_TOLERANCE and error <= GRADIENT_TOLERANCE
     return {"finite": finite, "image_error": number(image_error), "gradient_error": number(error), "field": worst,
             "decided": float(decided.mean()), "message": "",
-            "verdict": "fails" if not finite else "survives" if good else "loses digits"}
+            "verdict": "fails" if not finite else "survives" if good else "loses"}
 
 
 def worst_field(got: dict[str, NDArray[Any]], want: dict[str, NDArray[Any]]) -> tuple[str, float]:

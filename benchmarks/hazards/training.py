@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from clsplat.device import Device
 from clsplat.errors import ClsplatError
 from clsplat.evaluate import evaluate
 from clsplat.initialise import initial_splats
+from clsplat.program import OPTIONS_VARIABLE
 from clsplat.render import Renderer
 from clsplat.scene import Scene
 from clsplat.shapes import SHAPES
@@ -45,7 +48,8 @@ class Hazard:
     options : of TrainConfig, on top of the optimizer's; rates: all of them times this.
     start : changes the splats that training starts from.
     only : optimizers that it is about; all by default.
-    shapes : a test of which shapes it is about.
+    of : which systems it is about.
+    build : options of every kernel build. other_device : run on the second usable device.
     """
 
     world: Callable[[Scene], Scene] = lambda scene: scene
@@ -54,6 +58,8 @@ class Hazard:
     start: Start | None = None
     only: tuple[str, ...] = tuple(OPTIMIZERS)
     of: Callable[[System], bool] = lambda system: True
+    build: str = ""
+    other_device: bool = False
 
 
 def changed(splats: Splats, every: int = 10, **values: Any) -> Splats:
@@ -130,24 +136,34 @@ TRAINING: dict[str, Hazard] = {
     "all transparent": Hazard(start=lambda s: opacity_of(s, 1e-3, every=1)),
     "relocation every 5 iterations": Hazard(start=own_at_bound, only=("mcmc",),
                                             options={"densify_interval": 5, "densify_until": 1.0, "opacity_reg": 0.05}),
-    "numpy optimizer, rates x100": Hazard(rates=100, options={"optimizer": "numpy"}, only=("adam",)),
+    "NumPy optimizer": Hazard(options={"optimizer": "numpy"}, only=("adam",)),
+    "fast-math build": Hazard(build="-cl-fast-relaxed-math", only=("adam",)),
+    "another OpenCL runtime": Hazard(other_device=True, only=("adam",)),
 }
 
 
 @dataclass
 class Trainings:
-    """Runs on one device, each twin once."""
+    """Runs on one device, each twin once.
+
+    Parameters
+    ----------
+    other : a second device, or None.
+    """
 
     device: Device
+    other: Device | None = None
     iterations: int = ITERATIONS
     twins: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.renderer = Renderer(self.device)
 
-    def row(self, name: str, system: System, optimizer: str) -> dict[str, Any]:
-        """One hazard, one system, one optimizer."""
+    def row(self, name: str, system: System, optimizer: str) -> dict[str, Any] | None:
+        """One hazard, one system, one optimizer; None where there is nothing to run."""
         hazard, scene = TRAINING[name], worlds.capture()
+        if hazard.other_device and self.other is None or not hazard.of(system) or optimizer not in hazard.only:
+            return None
         twin = self.twin(system, optimizer)
         world = hazard.world(scene)
         result = self.run(world, system, optimizer, hazard)
@@ -174,9 +190,11 @@ class Trainings:
         config = TrainConfig(**(system.options | {"iterations": self.iterations, "cap_max": CAP, "sh_degree": SH_DEGREE,
                                                   "densify_interval": 20, "checkpoint_interval": 50}
                                 | OPTIMIZERS[optimizer] | rates_of(hazard, system) | hazard.options))
+        device = self.other if hazard.other_device and self.other is not None else self.device
+        config = replace(config, device=device.info.index)
         found: dict[str, Any] = {"message": "", "psnr": {}, "diverged_at": None}
         start = time.perf_counter()
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory() as folder, build_options(hazard.build):
             out = Path(folder) / "model"
             if hazard.start is not None:
                 first, _ = initial_splats(world, config.shape, config.cap_max, SH_DEGREE, opacity=config.init_opacity,
@@ -189,11 +207,26 @@ class Trainings:
                 found["psnr"] = {name: view["PSNR"] for name, view in evaluate(
                     self.renderer, model.splats, world.views).per_view.items()}
             except ClsplatError as error:
-                found["message"] = str(error).replace(folder, "")
+                found["message"] = str(error)
             found["seconds"] = time.perf_counter() - start
             found["finite"] = all(finite_file(path) for path in out.rglob("*.ply"))
             found["diverged_at"] = diverged_at(out / "log.jsonl")
         return found
+
+
+@contextmanager
+def build_options(options: str) -> Iterator[None]:
+    """Of every kernel built meanwhile."""
+    before = os.environ.get(OPTIONS_VARIABLE)
+    if options:
+        os.environ[OPTIONS_VARIABLE] = options
+    try:
+        yield
+    finally:
+        if options:
+            os.environ.pop(OPTIONS_VARIABLE)
+            if before is not None:
+                os.environ[OPTIONS_VARIABLE] = before
 
 
 def rates_of(hazard: Hazard, system: System) -> dict[str, Any]:
