@@ -6,8 +6,8 @@
     python benchmarks/frontier.py --smoke --scenes NAME --out DIR
 
 Every run is a line of results/frontier/runs.jsonl (see `clsplat compare`) and is made once: kill and restart at will.
-The charts also show the runs of results/budget (`--budget auto`, benchmarks/budget.py) and results/arithmetic.jsonl, where
-they are there. Fox is read at half size, for seeds at a quarter: what the seconds allow.
+The charts also show the runs of results/budget (`--budget auto`, benchmarks/budget.py) and results/arithmetic.jsonl,
+where they are there. Fox is read at half size, for seeds at a quarter: what the seconds allow.
 """
 
 from __future__ import annotations

@@ -31,6 +31,9 @@ _CATEGORIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8c8c1e", "#56b4e9",
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X", "h")
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1, 1.3)), (0, (6, 1.3, 1, 1.3)), (0, (3, 1.2, 1, 1.2, 1, 1.2)))
 _LEGEND_COLUMNS = 4
+# Of a label beside its point: across in 6 points, up in 8. Above a front and to its left there is nothing.
+_SPOTS = ((-1.0, 0.7), (0.0, 1.2), (-1.0, 0.0), (1.0, -0.7), (1.0, 0.7), (1.0, 0.0), (0.0, -1.2), (-1.0, -0.7))
+_FAR_SPOTS = ((-1.0, 1.7), (1.0, 1.7), (-1.0, -1.7), (1.0, -1.7), (0.0, 2.2), (0.0, -2.2))
 _STYLE = {
     "figure.dpi": 100, "savefig.dpi": 200, "font.size": 9, "axes.titlesize": 10, "axes.labelsize": 9,
     "legend.fontsize": 8.5, "xtick.labelsize": 8.5, "ytick.labelsize": 8.5, "font.family": "DejaVu Sans",
@@ -69,6 +72,7 @@ def drawing(out: str | Path, width: float = WIDTH, height: float = 4.0) -> Itera
     with matplotlib.rc_context(style | _STYLE | {"backend": "agg"}):
         figure = Figure(figsize=(width, height), layout="constrained")
         yield figure
+        _settle(figure)
         for path in chart_paths(out):
             content = io.BytesIO()
             kind = path.suffix[1:]
@@ -169,7 +173,7 @@ def place_labels(figure: Any, labels: Sequence[tuple[Any, Sequence[Label]]], *, 
                  size: float = 7.5) -> None:
     """Write beside points where no curve, point or other label is.
 
-    Call it last: the room is that of the layout as it is.
+    Call it last: the layout is settled by it.
 
     Parameters
     ----------
@@ -177,9 +181,16 @@ def place_labels(figure: Any, labels: Sequence[tuple[Any, Sequence[Label]]], *, 
     every : write those for which there is no room as well, where they hide least.
     size : of the letters, points.
     """
-    figure.draw_without_rendering()
+    _settle(figure)
     for axes, points in labels:
         _place(axes, points, every, size, figure.dpi / 72)
+
+
+def _settle(figure: Any) -> None:
+    """Lay out once and for all, not again for each file."""
+    if figure.get_constrained_layout():
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
 
 
 def _place(axes: Any, points: Sequence[Label], every: bool, size: float, dot: float) -> None:
@@ -191,9 +202,8 @@ def _place(axes: Any, points: Sequence[Label], every: bool, size: float, dot: fl
         at_x, at_y = axes.transData.transform((x, y))
         width, height = 0.62 * size * len(text) * dot, 1.05 * size * dot
         best: tuple[int, Box, tuple[float, float]] | None = None
-        # Above a front and to its left there is nothing, so that comes first.
-        for across, up in ((-1.0, 0.7), (0, 1.2), (-1, 0), (1, -0.7), (1, 0.7), (1, 0), (0, -1.2), (-1, -0.7)):
-            left = at_x + across * 6 * dot - width * (1 - across) / 2
+        for across, up in _SPOTS + _FAR_SPOTS * every:
+            left = at_x + across * 6 * dot - width * (1 - min(max(across, -1), 1)) / 2
             bottom = at_y + up * 8 * dot - height / 2
             spot = (left, bottom, left + width, bottom + height)
             if not (box.x0 <= left and spot[2] <= box.x1 and box.y0 <= bottom and spot[3] <= box.y1):
@@ -204,7 +214,7 @@ def _place(axes: Any, points: Sequence[Label], every: bool, size: float, dot: fl
         if best is not None and (every or not best[0]):
             _, _, (across, up) = best
             axes.annotate(text, (x, y), (across * 6, up * 8), textcoords="offset points", color=colour, va="center",
-                          ha=("right", "center", "left")[int(across) + 1], fontsize=size)
+                          ha="center" if abs(across) < 1 else "left" if across > 0 else "right", fontsize=size)
             taken.append(best[1])
 
 

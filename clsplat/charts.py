@@ -16,7 +16,6 @@ from .chart_style import (
     chart_paths,
     drawing,
     log_axis,
-    looks,
     place_labels,
     shape_colour,
     short_count,
@@ -28,6 +27,9 @@ from .errors import InputError
 # Colour of a cell, and of the text on it.
 VERDICTS = {"survives": ("#bfe3d8", INK), "stops": ("#c3d9ef", INK), "loses": ("#f6d98f", INK),
             "fails": ("#c2410c", "white"), "not run": ("#f2f2f2", "#666666")}
+
+_ARITHMETIC = (("image_error", "raster_ms", "image", "rendering"),
+               ("gradient_error", "raster_vjp_ms", "gradient", "its gradient"))
 
 
 def growth_chart(records: Sequence[Mapping[str, Any]], knee: int | None, out: str | Path) -> list[Path]:
@@ -176,7 +178,7 @@ def _strip(panel: Any, place: int, system: str, rows: Sequence[Mapping[str, Any]
 
 
 def arithmetic_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path]:
-    """Error of image and gradient against relative time, of variants of the arithmetic; a colour a kind.
+    """Error of image and gradient against relative time, of variants of the arithmetic; a row a shape.
 
     Parameters
     ----------
@@ -195,29 +197,23 @@ def arithmetic_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list
     for row in rows:
         if row["variant"] == "default" or row["shape"] not in base:
             base[row["shape"]] = row
-    kinds = {kind: place for place, kind in enumerate(dict.fromkeys(row["kind"] for row in rows))}
-    shapes = looks({shape: shape for shape in base})
-    panels_of = (("image_error", "raster_ms", "image", "rendering"),
-                 ("gradient_error", "raster_vjp_ms", "gradient", "its gradient"))
-    with drawing(out, WIDTH, 4.8) as figure:
-        panels = figure.subplots(1, 2)
+    colours = {kind: category_colour(place) for place, kind in enumerate(dict.fromkeys(row["kind"] for row in rows))}
+    with drawing(out, WIDTH, 3.8 * len(base) + 0.8) as figure:
         labels: list[tuple[Any, list[Label]]] = []
-        for axes, (error, time, what, task) in zip(panels, panels_of, strict=True):
-            points: list[Label] = []
-            for row in rows:
-                if row[error] > 0:  # what is exact has no place on this axis
-                    colour = category_colour(kinds[row["kind"]])
-                    points.append((row[time] / base[row["shape"]][time], row[error], row["variant"], colour))
-                    axes.plot(*points[-1][:2], marker=shapes[row["shape"]]["marker"], color=colour, markersize=6)
-            axes.axvline(1, color=INK, linewidth=0.8, zorder=0.5)
-            labels.append((axes, points))
-            axes.set(yscale="log", xlabel=f"time of {task}, relative to the default")
-            axes.set_ylabel(f"relative error of the {what}")
-            axes.margins(0.16)
-        entries = {kind: {"color": category_colour(place), "marker": "o", "linestyle": "none"}
-                   for kind, place in kinds.items()}
-        marks = {shape: {"color": INK, "marker": style["marker"], "markerfacecolor": "white", "linestyle": "none"}
-                 for shape, style in shapes.items()}
-        system_legend(figure, entries | marks)
+        for line, (shape, default) in zip(figure.subplots(len(base), 2, squeeze=False), base.items(), strict=True):
+            own = [row for row in rows if row["shape"] == shape]
+            for axes, (error, time, what, task) in zip(line, _ARITHMETIC, strict=True):
+                # What is exact has no place on a logarithmic axis.
+                points = [(row[time] / default[time], row[error], row["variant"], colours[row["kind"]]) for row in own
+                          if row[error] > 0]
+                for x, y, _, colour in points:
+                    axes.plot(x, y, marker="o", color=colour, markersize=6)
+                axes.axvline(1, color=INK, linewidth=0.8, zorder=0.5)
+                axes.set(yscale="log", title=shape, xlabel=f"time of {task}, relative to the default")
+                axes.set_ylabel(f"relative error of the {what}")
+                axes.margins(0.16)
+                labels.append((axes, points))
+        system_legend(figure, {kind: {"color": colour, "marker": "o", "linestyle": "none"}
+                               for kind, colour in colours.items()})
         place_labels(figure, labels, every=True)
     return chart_paths(out)

@@ -16,6 +16,7 @@ TINY = ["--iterations", "8", "--sh-degree", "0", "--densify-interval", "5", "--c
 
 def test_frontier_sweeps_and_draws(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory,
                                    monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(chart_style._STYLE, "savefig.dpi", 40)
     scene, out = small_capture(tmp_path_factory), tmp_path / "out"
     arguments = ("frontier", scene, "-o", out, "--cap-max", "30", "60", *TINY)
     first = run(*arguments)
