@@ -3,9 +3,11 @@
 Everything is decided on validation views, held out of the training set (validation.py); test views are never looked at.
 
     growth    short runs (a quarter of the iterations), the cap doubling, until two doublings have gained less than the
-              tolerance; the knee is the smallest cap within half of it of the best
+              tolerance; the knee is the smallest cap that is as good as the best, within half of it or, where views
+              differ by more, within the standard error of the difference
     rounds    a whole run at the knee, then rounds that remove a quarter of the splats and train the others on
-              (shrink.py), until PSNR is lower by half the tolerance than the run's; then a last part at lower rates
+              (shrink.py), until two have a PSNR that is lower by half the tolerance than the run's; the fewest splats
+              that have not are taken, and trained a last part at lower rates
     parts     of that model, the fields and bands that the other half allows (prune.py)
     refit     the same with all training views: the run at the knee, as many rounds, the thresholds found before
 
@@ -16,13 +18,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .budget_rules import FEWEST, BudgetOptions, Row, chosen_of, growth_caps, growth_is_over, knee_of, meets
+from .budget_rules import FEWEST, BudgetOptions, Row, chosen_of, growth_caps, growth_is_over, knee_of, rounds_are_over
 from .budget_state import BudgetState
 from .complexity import complexity
 from .config import TrainConfig
@@ -137,7 +140,9 @@ class _Search:
             config = dataclasses.replace(self.config, cap_max=cap, iterations=iterations, densify_interval=interval,
                                          save_iterations=(), test_iterations=())
             splats, seconds = self.run_of(config)
-            rows = [*rows, {"cap": cap, "splats": len(splats), "psnr": self.judge(splats), "seconds": seconds}]
+            views = self.judge.per_view(splats)
+            rows = [*rows, {"cap": cap, "splats": len(splats), "psnr": statistics.fmean(views), "views": views,
+                            "seconds": seconds}]
             self.state.put("growth", rows)
             if len(splats) < cap:  # it grows no further by itself
                 break
@@ -154,7 +159,7 @@ class _Search:
             self.state.save("held_out_0", splats)
             self.state.put("rounds", [self.row(splats, seconds)])
         rows: list[Row] = values["rounds"]
-        while rows[-1]["splats"] > FEWEST and meets(rows[-1], rows[0], goal) is not False:
+        while not rounds_are_over(rows, goal):
             start = time.perf_counter()
             splats = self.round(self.split, self.state.model(f"held_out_{len(rows) - 1}"), len(rows))
             self.state.save(f"held_out_{len(rows)}", splats)

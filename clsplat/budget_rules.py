@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import statistics
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,10 +11,11 @@ from .errors import InputError
 
 TOLERANCE = 0.1  # dB
 FIRST_CAP = 1000
-PATIENCE = 2  # doublings that may gain nothing before growth stops
+PATIENCE = 2  # doublings that may gain too little before growth stops, and rounds that may lose too much
 FEWEST = 50  # splats: no round goes below
 
-Row = dict[str, Any]  # a model: "splats", "psnr", and "cap" (growth) or "fitted_psnr" (where bytes are limited)
+# A model: "splats", "psnr", and "cap" and "views" (growth), or "fitted_psnr" (rounds, where bytes are limited).
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -59,12 +62,29 @@ def growth_is_over(rows: list[Row], options: BudgetOptions) -> bool:
 
 def knee_of(rows: list[Row], options: BudgetOptions) -> int:
     """The cap beyond which growth does not pay."""
-    best = max(row["psnr"] for row in rows)
-    enough = best - 0.5 * options.tolerance
-    if options.target_psnr is not None:
-        enough = min(enough, options.target_psnr)
-    cap: int = next(row["cap"] for row in rows if row["psnr"] >= enough)
+    best = max(rows, key=lambda row: float(row["psnr"]))
+
+    def is_enough(row: Row) -> bool:
+        if options.target_psnr is not None and row["psnr"] >= options.target_psnr:
+            return True
+        allowed = max(0.5 * options.tolerance, standard_error(best["views"], row["views"]))
+        return bool(best["psnr"] - row["psnr"] <= allowed)
+
+    cap: int = next(row["cap"] for row in rows if is_enough(row))
     return cap
+
+
+def standard_error(first: list[float], second: list[float]) -> float:
+    """Of the mean difference of two models on the same views; 0 of a single view, which tells nothing of it."""
+    differences = [a - b for a, b in zip(first, second, strict=True)]
+    return statistics.stdev(differences) / math.sqrt(len(differences)) if len(differences) > 1 else 0.0
+
+
+def rounds_are_over(rows: list[Row], options: BudgetOptions) -> bool:
+    """Whether fewer splats would not do: the last models were not good enough, or hardly a splat is left."""
+    last = rows[-PATIENCE:]
+    return rows[-1]["splats"] <= FEWEST or (len(last) == PATIENCE and all(
+        meets(row, rows[0], options) is False for row in last))
 
 
 def meets(row: Row, first: Row, options: BudgetOptions) -> bool | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import asdict
 from pathlib import Path
@@ -31,7 +32,8 @@ class BudgetState:
     def begin(self, config: TrainConfig, options: BudgetOptions, scene: dict[str, Any]) -> None:
         """Forget what a former search found."""
         shutil.rmtree(self.folder, ignore_errors=True)
-        self.values = {"config": config.to_json(), "options": asdict(options), "scene": scene}
+        values = {"config": config.to_json(), "options": asdict(options), "scene": scene}
+        self.values = json.loads(json.dumps(values))  # as a search that is resumed reads them
         write_json(self.path, self.values)
 
     def load(self) -> None:

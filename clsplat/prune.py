@@ -71,11 +71,14 @@ class Judge:
         self.renderer, self.views, self.background = renderer, views, background
 
     def __call__(self, splats: Splats) -> float:
+        return statistics.fmean(self.per_view(splats))
+
+    def per_view(self, splats: Splats) -> list[float]:
+        """PSNR of each view; 0 of a model without splats."""
         if not len(splats):
-            return 0.0
-        return statistics.fmean(
-            min(psnr(self.renderer.render(splats, view.camera, self.background).color, view.image), MAX_PSNR)
-            for view in self.views)
+            return [0.0] * len(self.views)
+        return [min(psnr(self.renderer.render(splats, view.camera, self.background).color, view.image), MAX_PSNR)
+                for view in self.views]
 
 
 def prune(splats: Splats, views: Sequence[View], judge: Judge, tolerance: float, kinds: Sequence[str] = tuple(SHARES),
