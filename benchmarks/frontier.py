@@ -51,7 +51,7 @@ class Group(NamedTuple):
 # `presets` before `caps`: the runs that both want are then made once, with their curves.
 GROUPS = {
     "presets": Group((*KERNELS, *PRESETS), (5000,), curve=12),
-    "caps": Group(KERNELS, (1000, 2500, 5000, 10_000, 20_000, 50_000)),
+    "caps": Group(KERNELS, (500, 1000, 2500, 5000, 10_000, 20_000, 50_000)),
     "seeds": Group(tuple(SHAPES), (1000,), 300, seeds=5, repeat=3, scenes={"fox": 4}),
 }
 SMOKE = {

@@ -30,7 +30,7 @@ _TEXT = {
     "size": ("Quality against render time, bytes and splats",
              "Each point is a training run, or the mean over its seeds. Grey: the Pareto front, which no other point "
              "beats in both; its points are labelled by the cap on splats. A star chose its own number of splats. "
-             "Render time is the median over the test views, on the host's clock."),
+             "Render time is the median over the test views of the fastest of five renders, on the host's clock."),
     "equal": ("Splats needed at equal quality",
               "How many splats a system needs for the PSNR that the reference has at each of its caps, linear in log "
               "splats between runs. Hollow, or ≤: its smallest model is better already. Dashed: 70 %."),
