@@ -101,13 +101,12 @@ def lines_of(result: Budgeted) -> list[str]:
     """What the search found."""
     report, final = result.report, result.report["final"]
     held_out = report["held_out"]
-    seconds = sum(row["seconds"] for row in (*report["growth"], *report["rounds"])) + report["refit"]["seconds"]
     lines = [f"growth: pays up to {report['knee']} splats",
              f"rounds: {report['rounds'][report['chosen']]['splats']} of {report['rounds'][0]['splats']} splats stay",
              f"validation views: PSNR {held_out['psnr_pruned']:.2f} dB, with all splats and parameters "
              f"{report['rounds'][0]['psnr']:.2f} dB",
              f"{result.path}: {final['splats']} splats, {final['skewed_fraction']:.0%} skewed, "
-             f"{final['parameters_in_use']} parameters, {final['bytes'] / 1e6:.2f} MB; {seconds:.0f} s in all"]
+             f"{final['parameters_in_use']} parameters, {final['bytes'] / 1e6:.2f} MB; {result.seconds:.0f} s in all"]
     return lines + [f"warning: {final['missed']}"] * (final["missed"] is not None)
 
 
@@ -119,10 +118,9 @@ def draw_growth(result: Budgeted, model_path: Path) -> str | None:
     rows = [{"splats": row["splats"], "psnr": row["psnr"]} for row in report["growth"]]
     knee = next(row["splats"] for row in report["growth"] if row["cap"] == report["knee"])
     held_out = report["held_out"]
-    star = {"splats": held_out["splats"], "psnr": held_out["psnr_pruned"], "label": "held-out run, pruned"}
-    whole = {"splats": report["rounds"][0]["splats"], "psnr": report["rounds"][0]["psnr"], "label": "held-out run"}
+    star = {"splats": held_out["splats"], "psnr": held_out["psnr_pruned"], "label": "chosen, pruned"}
     try:
-        files = growth_chart([*rows, whole, star], knee, model_path / "growth")
+        files = growth_chart([*rows, star], knee, model_path / "growth", report["rounds"])
     except OutputError:
         return None
     return f"growth curve: {', '.join(str(file) for file in files)}"

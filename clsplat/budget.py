@@ -62,6 +62,14 @@ class Budgeted:
     finished: bool
     report: dict[str, Any]
 
+    @property
+    def seconds(self) -> float:
+        """Of all stages: growth, held-out run, rounds, parts, refit."""
+        report = self.report
+        stages = [*report.get("growth", []), *report.get("rounds", []), report.get("held_out", {}),
+                  report.get("refit", {})]
+        return float(sum(stage.get("seconds", 0.0) for stage in stages))
+
 
 def train_budget(scene: Scene, config: TrainConfig | None = None, options: BudgetOptions | None = None,
                  progress: Report | None = None, *, output: str | Path, resume: bool = False, overwrite: bool = False,
@@ -169,7 +177,7 @@ class _Search:
 
     def find_parts(self) -> None:
         """Fields and bands that the validation views do not miss."""
-        values = self.state.values
+        values, start = self.state.values, time.perf_counter()
         splats = self.settle(self.split, self.state.model(f"held_out_{values['chosen']}"), values["chosen"])
         now = self.judge(splats)
         allowed = 0.5 * self.options.tolerance
@@ -180,7 +188,7 @@ class _Search:
         if self.options.max_bytes is not None:
             small = self.fitted(small, self.split) or small
         self.state.put("held_out", {"psnr": now, "psnr_pruned": self.judge(small), "costs": found.costs,
-                                    **complexity(small).to_json()})
+                                    "seconds": round(time.perf_counter() - start, 2), **complexity(small).to_json()})
         self.state.put("thresholds", {"fields": found.thresholds.fields, "bands": found.thresholds.bands})
 
     def finish(self) -> Budgeted:

@@ -32,7 +32,8 @@ _ARITHMETIC = (("image_error", "raster_ms", "image", "rendering"),
                ("gradient_error", "raster_vjp_ms", "gradient", "its gradient"))
 
 
-def growth_chart(records: Sequence[Mapping[str, Any]], knee: int | None, out: str | Path) -> list[Path]:
+def growth_chart(records: Sequence[Mapping[str, Any]], knee: int | None, out: str | Path,
+                 rounds: Sequence[Mapping[str, Any]] = ()) -> list[Path]:
     """Validation PSNR against splats, with the knee marked.
 
     Parameters
@@ -41,6 +42,7 @@ def growth_chart(records: Sequence[Mapping[str, Any]], knee: int | None, out: st
         each is a star, named.
     knee : splats of the record that was chosen; None: none is marked.
     out : path without a suffix.
+    rounds : likewise "splats" and "psnr", of a longer run whose splats became fewer again: a curve of their own.
 
     Returns
     -------
@@ -61,16 +63,19 @@ def growth_chart(records: Sequence[Mapping[str, Any]], knee: int | None, out: st
             axes.axvline(knee, color=MARK, linewidth=1, linestyle=(0, (4, 2)), zorder=0.5)
             axes.plot([knee], chosen[:1], marker="o", markersize=11, markerfacecolor="none", markeredgewidth=2,
                       color=MARK, linestyle="none", label=f"knee: {short_count(knee)} splats, {chosen[0]:.2f} dB")
+        if rounds:
+            axes.plot([row["splats"] for row in rounds], [row["psnr"] for row in rounds], marker="s", markersize=5,
+                      color="#0072b2", linestyle="--", clip_on=False, label="whole run, then fewer splats")
         stars = [record for record in records if record.get("label")]
         for star in stars:
             axes.plot([star["splats"]], [star["psnr"]], marker="*", markersize=13, linestyle="none", color="#0072b2",
                       markeredgecolor="white", zorder=4,
                       label=f"{star['label']}: {short_count(star['splats'])} splats, {star['psnr']:.2f} dB")
-        sizes = [splats for splats, _ in curve] + [star["splats"] for star in stars]
+        sizes = [splats for splats, _ in curve] + [row["splats"] for row in (*stars, *rounds)]
         low, high = min(sizes) / 1.2, max(sizes) * 1.2
         axes.set_xlim(low, high)
         log_axis(axes.xaxis, low, high)
-        axes.legend(loc="lower right")
+        axes.legend(loc="best")
     return chart_paths(out)
 
 
