@@ -57,7 +57,7 @@ GROUPS = {
 SMOKE = {
     "presets": Group(KERNELS[:2], (60,), 4, curve=2),
     "caps": Group(KERNELS[:2], (30, 60), 4),
-    "seeds": Group(KERNELS[:2], (30,), 3, seeds=3, repeat=2),
+    "seeds": Group(KERNELS[:1], (30,), 3, seeds=3, repeat=2),
 }
 
 
