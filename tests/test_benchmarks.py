@@ -74,6 +74,26 @@ def test_systems(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> No
     assert any(expected in line for line in page.splitlines() if line.startswith("| skew-normal | ")), page
 
 
+def test_budget(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    out = tmp_path / "budget"
+    command = [sys.executable, str(BENCHMARKS / "budget.py"), "--out", str(out)]
+    for _ in range(2):
+        subprocess.run([*command, "--smoke", "--scenes", scene.name, "--work", str(tmp_path / "work")], env=environment,
+                       capture_output=True, text=True, check=True)
+    (row,) = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
+    assert row["system"].startswith("auto skew-normal")
+    assert row["splats"] == row["budget"]["final"]["splats"] <= 60
+    assert {"device", "driver", "schedule", "commit", "psnr", "render_ms"} <= set(row)
+    best = row | {"system": "skew-normal", "splats": 2 * row["splats"], "bytes": 4 * row["bytes"],
+                  "psnr": row["psnr"] + 0.5, "seconds": 0.5 * row["seconds"]}
+    (tmp_path / "frontier").mkdir()
+    (tmp_path / "frontier" / "runs.jsonl").write_text(json.dumps(best) + "\n")
+    printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
+    assert "| -0.50 | 50% | 25% | 2.0 |" in printed.splitlines()[-1], printed
+
+
 def test_startup(tmp_path: Path) -> None:
     out = tmp_path / "startup.jsonl"
     command = [sys.executable, str(BENCHMARKS / "startup.py"), "--smoke", "--out", str(out)]
