@@ -19,6 +19,8 @@ COMMANDS = {
     "train": ("clsplat_cli.train:train", "Learn a splat model of a scene."),
     "render": ("clsplat_cli.render:render", "Render a model or any splat PLY."),
     "eval": ("clsplat_cli.evaluate:evaluate_models", "Measure models on the views they were not trained on."),
+    "info": ("clsplat_cli.info:show_info", "Count a model's splats, skew, SH coefficients, parameters and bytes."),
+    "prune": ("clsplat_cli.prune:prune_model", "Leave out of a model what its images do not miss."),
     "compare": ("clsplat_cli.compare:compare_systems", "Train published systems side by side and tabulate them."),
     "frontier": ("clsplat_cli.frontier:draw_frontier", "Sweep systems and caps, and chart quality against cost."),
     "bench": ("clsplat_cli.bench:bench", "Time the stages of training and rendering on this device."),
