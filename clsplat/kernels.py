@@ -14,7 +14,6 @@ from .schema import Group, Schema
 from .shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, shape_named
 from .skew_map import SKEW_MAPS
 
-TILE = 16
 MARGIN_X, MARGIN_Y = 16, 8  # zero margin of every image plane: the SSIM window reaches 5 pixels out
 BATCH = 64
 
@@ -71,6 +70,11 @@ class KernelBuild:
         return self.schedule.lanes
 
     @property
+    def block_bytes(self) -> int:
+        """Of an isect's set of blocks, a bit each (cl/raster.cl)."""
+        return 8 if self.schedule.vecs > 32 else 4
+
+    @property
     def strip(self) -> int:
         """Vectors of a row that a work-item of the loss blurs.
 
@@ -121,7 +125,7 @@ class KernelBuild:
             f"ROW_{field.name.upper()}": schema.offset(field.name) for field in schema.group(Group.GEOM)
         }
         return rows | {
-            "TILE": TILE, "BATCH": BATCH, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y,
+            "TILE": self.schedule.tile, "BATCH": BATCH, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y,
             "GROUP": self.schedule.group, "VECS": self.schedule.vecs, "LANES": self.lanes,
             "SH_DEGREE": self.sh_degree, "GEOM_ROWS": schema.rows(Group.GEOM),
             "WITH_DEPTH": int(self.with_depth), "WITH_V_ALPHA": int(self.with_v_alpha),
