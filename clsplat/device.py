@@ -43,6 +43,8 @@ class Schedule:
             raise DeviceError(f"schedule {self}: GROUPxVECSxLANES must multiply to 64, 256 or 1024")
         if self.lanes not in (1, 8, 16):
             raise DeviceError(f"schedule {self}: LANES must be 1, 8 or 16 (cl/lanes.clh)")
+        if self.group == 1 and self.lanes > 1 and self.vecs > 64:
+            raise DeviceError(f"schedule {self}: a work-item has at most 64 vectors (a bit each, cl/raster.cl)")
         if self.group > 1 and self.group % 32:  # sums go by parts of 16; PoCL 3.1 gets groups of 16 wrong
             raise DeviceError(f"schedule {self}: GROUP must be 1 or a multiple of 32 (cl/group.clh)")
 

@@ -272,9 +272,10 @@ class Pipeline:
             (band.past * group,), (group,), tile_ranges=pool.get("tile_ranges", 0), lists=self._lists,
             isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0),
             color=self.image(prefix + "color", layout, 3), transmittance=self.image(prefix + "transmittance", layout),
-            depth=self.image(prefix + "depth", layout), isect_blocks=pool.get("isect_blocks", self.kernels.block_bytes * band.n_isects),
-            width=layout.width, height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride,
-            plane=layout.plane, background_r=r, background_g=g, background_b=b,
+            depth=self.image(prefix + "depth", layout),
+            isect_blocks=pool.get("isect_blocks", self.kernels.block_bytes * band.n_isects), width=layout.width,
+            height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane, background_r=r,
+            background_g=g, background_b=b,
         )
 
 

@@ -10,8 +10,7 @@ from reference_skewed import SKEWED
 from test_footprint import strongly_skewed
 
 from clsplat.buffers import SplatBuffers, to_host
-from clsplat.device import Device, Schedule
-from clsplat.device import TILES
+from clsplat.device import TILES, Device, Schedule
 from clsplat.kernels import KernelBuild
 from clsplat.pipeline import Pipeline
 from clsplat.shapes import SHAPES, shape_named

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # A module imports modules of lower floors only.
 FLOORS = """
     errors flops harmonics morton
-    atomic compare_table interrupt presets run_log runtime schema signatures capture_world
+    arithmetic atomic compare_table interrupt presets run_log runtime schema signatures capture_world
     camera device images metrics optim_reference plan ply_header profiles rotations schedules validity colmap_files
     binaries cameras_json capture checkpoint colmap launches noise shapes
     opacities ply program sghmc skew_map

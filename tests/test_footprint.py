@@ -21,8 +21,7 @@ from tolerances import IMAGE_FLOAT32, ROUNDING
 
 from clsplat.buffers import SplatBuffers, to_host
 from clsplat.camera import Camera
-from clsplat.device import Device, default_schedule
-from clsplat.device import TILES
+from clsplat.device import TILES, Device, default_schedule
 from clsplat.kernels import ALPHA_MIN, KernelBuild
 from clsplat.pipeline import Pipeline
 from clsplat.splats import Splats

@@ -16,9 +16,8 @@ from tolerances import GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, SAME_FLOAT32, 
 
 from clsplat.buffers import ParameterBuffers, SplatBuffers, to_device
 from clsplat.camera import Camera
-from clsplat.device import SCHEDULES, Device, Schedule, default_schedule
+from clsplat.device import SCHEDULES, TILES, Device, Schedule, default_schedule
 from clsplat.errors import InputError
-from clsplat.device import TILES
 from clsplat.kernels import BATCH, NEAR, KernelBuild
 from clsplat.pipeline import Pipeline
 from clsplat.render import Renderer
