@@ -9,6 +9,21 @@
 #define BLOCKS_X (TILE / BLOCK_W)
 #define V_RECORD (SHAPE_V + 3)
 
+#if VECS > 32
+#define BITS 64
+typedef ulong block_bits;  // an isect's blocks, where CULLS_BLOCKS
+#else
+#define BITS 32
+typedef uint block_bits;
+#endif
+
+#ifndef SHAPE_PLAIN  // no splat of such a shape is a Gaussian at less cost
+#define shape_is_plain(p) false
+#define shape_alpha_plain(dx, dy, p) ((vreal)0)
+#define shape_alpha_plain_vjp(dx, dy, alpha, v_alpha, v)
+#define shape_sums_plain(sums)
+#endif
+
 // The screen records of a batch; `lists` holds isect ids in depth order. A group copies them to local memory; a single
 // work-item has them in its cache already and keeps where they are.
 #if ALONE
@@ -16,7 +31,10 @@ typedef global const real *staged_record;
 #define BATCH_MEMORY uint batch[BATCH]
 static inline void stage_batch(global const uint *lists, global const uint *isect_splat, global const real *records,
                                uint start, int n, uint *batch) {
-    for (int k = 0; k < n; ++k) batch[k] = isect_splat[lists[start + k]];
+    for (int k = 0; k < n; ++k) {
+        batch[k] = isect_splat[lists[start + k]];
+        prefetch_reals(records + (ulong)batch[k] * RECORD, RECORD);
+    }
 }
 #define batch_record(k) (records + (ulong)batch[k] * RECORD)
 #else
@@ -56,36 +74,43 @@ static inline void start_blocks(int tile_x, int tile_y, int width, int height, v
 #define CULLS_BLOCKS (ALONE && LANES > 1)
 #if CULLS_BLOCKS
 
-typedef uint block_set;
+typedef block_bits block_set;
 #define no_blocks_left(set) ((set) == 0)
-#define next_block(set) (31 - (int)clz((set) & -(set)))
+#define next_block(set) (BITS - 1 - (int)clz((set) & -(set)))
 #define without_next(set) ((set) & ((set) - 1))
+#define PARTS ((VECS + LANES - 1) / LANES)  // vectors of blocks
 
-// Columns and rows of the first pixels of blocks LANES part, ..., LANES part + LANES - 1.
-static inline vreal corners_x(int part) {
-    const vreal number = lanes_iota() + (vreal)(part * LANES);
+// Columns and rows of the first pixels of LANES blocks from number `first` on.
+static inline vreal corners_x(int first) {
+    const vreal number = lanes_iota() + (vreal)first;
     return (number - (real)BLOCKS_X * floor(number * (R(1.0) / BLOCKS_X))) * (real)BLOCK_W;
 }
-static inline vreal corners_y(int part) {
-    return floor((lanes_iota() + (vreal)(part * LANES)) * (R(1.0) / BLOCKS_X)) * (real)BLOCK_H;
+static inline vreal corners_y(int first) {
+    return floor((lanes_iota() + (vreal)first) * (R(1.0) / BLOCKS_X)) * (real)BLOCK_H;
 }
 
 static inline block_set blocks_reached(const real *rec, int tile_x, int tile_y) {
-    vmask bits = lanes_mask(0);
-    for (int part = 0; part < VECS / LANES; ++part) {
-        const vreal x = corners_x(part) + (vreal)tile_x, y = corners_y(part) + (vreal)tile_y;
-        const vmask in_box = (x <= (vreal)rec[9]) & (x + (real)(BLOCK_W - 1) >= (vreal)rec[8])
-                           & (y <= (vreal)rec[7]) & (y + (real)(BLOCK_H - 1) >= (vreal)rec[6]);
-        const vreal dx = x + R(0.5) * BLOCK_W - rec[0], dy = y + R(0.5) * BLOCK_H - rec[1];
-        bits |= in_box & shape_reaches(dx, dy, rec + HEAD) & lanes_bits(part * LANES);
+    vmask bits[BITS / 32];
+    for (int word = 0; word < BITS / 32; ++word) bits[word] = lanes_mask(0);
+    UNROLL for (int part = 0; part < PARTS; ++part) {
+        const int first = part * LANES, top = tile_y + first / BLOCKS_X * BLOCK_H;
+        if (PARTS == 1 || (rec[7] >= (real)top && rec[6] < (real)(top + LANES / BLOCKS_X * BLOCK_H))) {
+            const vreal x = corners_x(first) + (vreal)tile_x, y = corners_y(first) + (vreal)tile_y;
+            const vmask in_box = (x <= (vreal)rec[9]) & (x + (real)(BLOCK_W - 1) >= (vreal)rec[8])
+                               & (y <= (vreal)rec[7]) & (y + (real)(BLOCK_H - 1) >= (vreal)rec[6]);
+            const vreal dx = x + R(0.5) * BLOCK_W - rec[0], dy = y + R(0.5) * BLOCK_H - rec[1];
+            bits[first / 32] |= in_box & shape_reaches(dx, dy, rec + HEAD) & lanes_bits(first % 32);
+        }
     }
-    return (uint)lanes_or(bits);
+    block_set reached = 0;
+    for (int word = 0; word < BITS / 32; ++word) reached |= (block_set)(uint)lanes_or(bits[word]) << (32 * word);
+    return reached & (~(block_set)0 >> (BITS - VECS));  // fewer blocks than lanes: the rest lies outside of the tile
 }
 
 // Blocks with a pixel that is not finished.
 static inline block_set live_blocks(const vreal *T) {
     block_set live = 0;
-    for (int v = 0; v < VECS; ++v) live |= lanes_any(lanes_not(BLEND_DONE(T[v]))) ? 1u << v : 0u;
+    for (int v = 0; v < VECS; ++v) live |= (block_set)(lanes_any(lanes_not(BLEND_DONE(T[v]))) ? 1 : 0) << v;
     return live;
 }
 
@@ -121,7 +146,7 @@ kernel void rasterize(
     global real *restrict color,
     global real *restrict transmittance,
     global real *restrict depth,
-    global uint *restrict isect_blocks,
+    global block_bits *restrict isect_blocks,
     int width,
     int height,
     int tiles_x,
@@ -178,11 +203,17 @@ kernel void rasterize(
             // Alpha of all blocks before any is blended: a CPU holds fewer operations in flight than one block's chain from
             // pixel to transmittance has, and two short chains keep it busier than a long one.
             vreal alphas[VECS];
-            for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
-                const int v = next_block(set);
-                shape_pixel pixel;
-                alphas[v] = shape_alpha(px[v] - rec[0], py[v] - rec[1], rec + HEAD, &pixel);
-            }
+            if (shape_is_plain(rec + HEAD))
+                for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
+                    const int v = next_block(set);
+                    alphas[v] = shape_alpha_plain(px[v] - rec[0], py[v] - rec[1], rec + HEAD);
+                }
+            else
+                for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
+                    const int v = next_block(set);
+                    shape_pixel pixel;
+                    alphas[v] = shape_alpha(px[v] - rec[0], py[v] - rec[1], rec + HEAD, &pixel);
+                }
             for (; !no_blocks_left(blocks); blocks = without_next(blocks)) {
                 const int v = next_block(blocks);
                 vreal alpha = alphas[v];
@@ -227,7 +258,7 @@ kernel void rasterize_vjp(
     global const real *restrict transmittance,
     global const real *restrict v_color,
     global const real *restrict v_alpha,
-    global const uint *restrict isect_blocks,
+    global const block_bits *restrict isect_blocks,
     global real *restrict isect_grads,
     int width,
     int height,
@@ -277,14 +308,20 @@ kernel void rasterize_vjp(
 #endif
             vreal alphas[VECS];  // first, as above
             shape_pixel pixels[VECS];
-            for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
-                const int v = next_block(set);
-                alphas[v] = shape_alpha(px[v] - rec[0], py[v] - rec[1], rec + HEAD, &pixels[v]);
-            }
+            const bool plain = shape_is_plain(rec + HEAD);
+            if (plain)
+                for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
+                    const int v = next_block(set);
+                    alphas[v] = shape_alpha_plain(px[v] - rec[0], py[v] - rec[1], rec + HEAD);
+                }
+            else
+                for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
+                    const int v = next_block(set);
+                    alphas[v] = shape_alpha(px[v] - rec[0], py[v] - rec[1], rec + HEAD, &pixels[v]);
+                }
             for (; !no_blocks_left(blocks); blocks = without_next(blocks)) {
                 const int v = next_block(blocks);
                 const vreal dx = px[v] - rec[0], dy = py[v] - rec[1];
-                const shape_pixel pixel = pixels[v];
                 const vreal raw_alpha = alphas[v];
                 vreal alpha = raw_alpha;
                 const vreal T_before = T[v];
@@ -293,14 +330,18 @@ kernel void rasterize_vjp(
                 const vreal g = lanes_mad(v_red[v], rec[2], lanes_mad(v_green[v], rec[3], v_blue[v] * rec[4]));
                 rest[v] = lanes_mad(-weight, g, rest[v]);
                 const vreal v_a = lanes_mad(T_before, g, -rest[v] / ((vreal)1 - alpha));
-                shape_alpha_vjp(dx, dy, rec + HEAD, pixel, lanes_if(hit, blend_clamp_vjp(raw_alpha, v_a), (vreal)0),
-                                sums);
+                const vreal v_raw = lanes_if(hit, blend_clamp_vjp(raw_alpha, v_a), (vreal)0);
+                if (plain)
+                    shape_alpha_plain_vjp(dx, dy, raw_alpha, v_raw, sums);
+                else
+                    shape_alpha_vjp(dx, dy, rec + HEAD, pixels[v], v_raw, sums);
                 sums[SHAPE_V] = lanes_mad(weight, v_red[v], sums[SHAPE_V]);
                 sums[SHAPE_V + 1] = lanes_mad(weight, v_green[v], sums[SHAPE_V + 1]);
                 sums[SHAPE_V + 2] = lanes_mad(weight, v_blue[v], sums[SHAPE_V + 2]);
             }
             real own[V_RECORD];
             lanes_sums(sums, V_RECORD, own);
+            if (plain) shape_sums_plain(own);
             group_sum_store(own, V_RECORD, scratch, isect_grads + (ulong)lists[start + k] * V_RECORD);
         }
     }

@@ -69,7 +69,7 @@ def cut(count: Callable[[int, int], int], tiles_x: int, tiles_y: int, limit: int
         if n_isects <= limit:
             return (Band(first, past, n_isects),)
         if n_tiles == 1:
-            raise DeviceError(f"{n_isects} splats over one tile of 16x16 px, and buffers for {limit} at most: "
+            raise DeviceError(f"{n_isects} splats over one tile, and buffers for {limit} at most: "
                               "use fewer splats (--cap-max) or another --device")
         unit = tiles_x if n_tiles > tiles_x else 1
         middle = first + n_tiles // unit // 2 * unit

@@ -12,7 +12,7 @@ import numpy as np
 from .errors import DeviceError
 from .runtime import register_pip_runtime
 
-TILE_PIXELS = 256  # a tile is 16 x 16 pixels, whoever owns them
+TILES = (16, 8, 32)  # sides of a tile [px]; the first is what schedules are measured with
 MIB = 1 << 20
 _EAGER_BYTES = 16 * MIB  # buffers from this size on are claimed at once, so that lack of memory shows here
 
@@ -29,19 +29,30 @@ LESS_MEMORY = "use fewer splats (--cap-max), smaller images (-r 2, 4, 8) or anot
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """How one tile's 256 pixels are shared out: work-items x vectors per work-item x lanes per vector."""
+    """How one tile's pixels are shared out: work-items x vectors per work-item x lanes per vector.
+
+    The product is the tile: 256 for 16x16 px, 64 for 8x8, 1024 for 32x32.
+    """
 
     group: int
     vecs: int
     lanes: int
 
     def __post_init__(self) -> None:
-        if min(self.group, self.vecs, self.lanes) < 1 or self.group * self.vecs * self.lanes != TILE_PIXELS:
-            raise DeviceError(f"schedule {self}: GROUPxVECSxLANES must multiply to {TILE_PIXELS}")
+        if min(self.group, self.vecs, self.lanes) < 1 or self.tile not in TILES:
+            raise DeviceError(f"schedule {self}: GROUPxVECSxLANES must multiply to 64, 256 or 1024")
         if self.lanes not in (1, 8, 16):
             raise DeviceError(f"schedule {self}: LANES must be 1, 8 or 16 (cl/lanes.clh)")
+        if self.group == 1 and self.lanes > 1 and self.vecs > 64:
+            raise DeviceError(f"schedule {self}: a work-item has at most 64 vectors (a bit each, cl/raster.cl)")
         if self.group > 1 and self.group % 32:  # sums go by parts of 16; PoCL 3.1 gets groups of 16 wrong
             raise DeviceError(f"schedule {self}: GROUP must be 1 or a multiple of 32 (cl/group.clh)")
+
+    @property
+    def tile(self) -> int:
+        """Side of a tile [px]; 0 where the product is none's."""
+        pixels = self.group * self.vecs * self.lanes
+        return next((side for side in TILES if side * side == pixels), 0)
 
     def __str__(self) -> str:
         return f"{self.group}x{self.vecs}x{self.lanes}"
@@ -181,7 +192,7 @@ def default_schedule(cl_device: Any) -> Schedule:
 
     if cl_device.type & cl.device_type.CPU:
         return SCHEDULES["cpu16"]
-    return SCHEDULES["gpu256"] if cl_device.max_work_group_size >= TILE_PIXELS else SCHEDULES["gpu64"]
+    return SCHEDULES["gpu256"] if cl_device.max_work_group_size >= SCHEDULES["gpu256"].group else SCHEDULES["gpu64"]
 
 
 def list_devices() -> list[DeviceInfo]:

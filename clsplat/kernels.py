@@ -8,13 +8,13 @@ from functools import cached_property
 import numpy as np
 
 from . import optim_reference as adam
+from .arithmetic import DEFAULT_ARITHMETIC, Arithmetic
 from .device import Device, Schedule
 from .program import Define, Program, Real, build
 from .schema import Group, Schema
 from .shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, shape_named
 from .skew_map import SKEW_MAPS
 
-TILE = 16
 MARGIN_X, MARGIN_Y = 16, 8  # zero margin of every image plane: the SSIM window reaches 5 pixels out
 BATCH = 64
 
@@ -23,7 +23,7 @@ LOW_PASS = 0.3  # px^2
 RECORD_HEAD = 10  # HEAD of cl/shape/contract.clh
 NEAR = 0.01  # world units
 
-_LOWER = ("lanes.clh", "group.clh", "algebra.clh", "opacity.clh", "harmonics.clh", "camera/pinhole.clh",
+_LOWER = ("lanes.clh", "forms.clh", "group.clh", "algebra.clh", "opacity.clh", "harmonics.clh", "camera/pinhole.clh",
           "blend.clh", "shape/contract.clh")
 
 
@@ -46,6 +46,7 @@ class KernelBuild:
     alpha_min: float = ALPHA_MIN
     alpha_max: float = ALPHA_MAX
     t_min: float = T_MIN
+    arithmetic: Arithmetic = DEFAULT_ARITHMETIC
 
     @cached_property
     def schema(self) -> Schema:
@@ -55,6 +56,11 @@ class KernelBuild:
     @property
     def dtype(self) -> np.dtype[np.floating]:
         return np.dtype(np.float32 if self.real == "float" else np.float64)
+
+    @property
+    def sh_dtype(self) -> np.dtype[np.floating]:
+        """Of colour on the device."""
+        return np.dtype(np.float16) if self.arithmetic.half_sh else self.dtype
 
     @property
     def record(self) -> int:
@@ -69,6 +75,11 @@ class KernelBuild:
     @property
     def lanes(self) -> int:
         return self.schedule.lanes
+
+    @property
+    def block_bytes(self) -> int:
+        """Of an isect's set of blocks, a bit each (cl/raster.cl)."""
+        return 8 if self.schedule.vecs > 32 else 4
 
     @property
     def strip(self) -> int:
@@ -120,8 +131,8 @@ class KernelBuild:
         rows: dict[str, Define] = {
             f"ROW_{field.name.upper()}": schema.offset(field.name) for field in schema.group(Group.GEOM)
         }
-        return rows | {
-            "TILE": TILE, "BATCH": BATCH, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y,
+        return rows | self.arithmetic.defines() | {
+            "TILE": self.schedule.tile, "BATCH": BATCH, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y,
             "GROUP": self.schedule.group, "VECS": self.schedule.vecs, "LANES": self.lanes,
             "SH_DEGREE": self.sh_degree, "GEOM_ROWS": schema.rows(Group.GEOM),
             "WITH_DEPTH": int(self.with_depth), "WITH_V_ALPHA": int(self.with_v_alpha),

@@ -55,7 +55,7 @@ class ImageLoss:
         truth : buffer of bytes [3, rows, stride] in the layout (truths.py).
         """
         image, kernels = self.pipeline.image, self.kernels
-        strips = -(-layout.tiles_x * 16 // (kernels.lanes * kernels.strip))
+        strips = -(-layout.tiles_x * layout.tile // (kernels.lanes * kernels.strip))
         segment = self._rows(strips, layout.height)
         segments = -(-layout.height // segment)
         n_parts = 3 * segments * strips

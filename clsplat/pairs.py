@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from .buffers import to_host
-from .kernels import TILE
 from .pipeline import Frame, Pipeline
 
 
 def count_pairs(pipeline: Pipeline, frame: Frame) -> int:
     """Useful pairs of the pipeline's last frame; runs the pixel formula of every isect once more."""
     kernels, layout, pool = pipeline.kernels, frame.layout, pipeline.pool
-    n_counts = layout.tiles_x * layout.tiles_y * TILE * TILE // kernels.lanes
+    n_counts = layout.tiles_x * layout.tiles_y * layout.tile**2 // kernels.lanes
     counts = pool.get("pair_counts", 4 * n_counts)
     useful = 0
     for _, lists in pipeline.bands(frame):

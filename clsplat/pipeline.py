@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from .binning import MAX_ISECTS, Band, cut, make_binner
 from .buffers import ParameterBuffers, Pool, SplatBuffers, fill_zero, send_to_device, to_device, to_host
 from .camera import Camera
-from .device import Device
+from .device import TILES, Device
 from .gradients import CompactGradients
-from .kernels import MARGIN_X, MARGIN_Y, NEAR, TILE, KernelBuild
+from .kernels import MARGIN_X, MARGIN_Y, NEAR, KernelBuild
 from .program import lane_group
 
 SIGNALS = 3  # screen gradient, depth gradient, times seen
@@ -33,23 +33,24 @@ class ImageLayout:
 
     width: int
     height: int
+    tile: int = TILES[0]
 
     @property
     def tiles_x(self) -> int:
-        return -(-self.width // TILE)
+        return -(-self.width // self.tile)
 
     @property
     def tiles_y(self) -> int:
-        return -(-self.height // TILE)
+        return -(-self.height // self.tile)
 
     @property
     def stride(self) -> int:
         """Pixels from one row to the next."""
-        return self.tiles_x * TILE + 2 * MARGIN_X
+        return self.tiles_x * self.tile + 2 * MARGIN_X
 
     @property
     def rows(self) -> int:
-        return self.tiles_y * TILE + 2 * MARGIN_Y
+        return self.tiles_y * self.tile + 2 * MARGIN_Y
 
     @property
     def plane(self) -> int:
@@ -133,7 +134,7 @@ class Pipeline:
         ------
         DeviceError : more splats over one tile than fit.
         """
-        layout = ImageLayout(camera.width, camera.height)
+        layout = ImageLayout(camera.width, camera.height, self.kernels.schedule.tile)
         degree = self.kernels.sh_degree if sh_degree is None else min(sh_degree, self.kernels.sh_degree)
         bands = self._project(splats, camera, layout, degree)
         self.frame = Frame(layout, degree, splats, bands)
@@ -272,9 +273,10 @@ class Pipeline:
             (band.past * group,), (group,), tile_ranges=pool.get("tile_ranges", 0), lists=self._lists,
             isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0),
             color=self.image(prefix + "color", layout, 3), transmittance=self.image(prefix + "transmittance", layout),
-            depth=self.image(prefix + "depth", layout), isect_blocks=pool.get("isect_blocks", 4 * band.n_isects),
-            width=layout.width, height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride,
-            plane=layout.plane, background_r=r, background_g=g, background_b=b,
+            depth=self.image(prefix + "depth", layout),
+            isect_blocks=pool.get("isect_blocks", self.kernels.block_bytes * band.n_isects), width=layout.width,
+            height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane, background_r=r,
+            background_g=g, background_b=b,
         )
 
 

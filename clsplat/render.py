@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .arithmetic import DEFAULT_ARITHMETIC, Arithmetic
 from .buffers import ParameterBuffers, SplatBuffers, to_device
 from .camera import Camera
 from .device import Device, Schedule, open_device
@@ -47,6 +48,7 @@ class Renderer:
     precision : "float32" or "float64".
     schedule : how a tile's pixels are shared out; None lets the device choose.
     alpha_min, alpha_max, t_min : blending thresholds; (0, 1, 0) makes the image smooth, for gradient checks.
+    arithmetic : forms of exp and Phi, and how colour is kept: speed against accuracy.
 
     Raises
     ------
@@ -55,7 +57,7 @@ class Renderer:
 
     def __init__(self, device: str | Device | None = None, precision: str = "float32", *,
                  schedule: Schedule | None = None, alpha_min: float = ALPHA_MIN, alpha_max: float = ALPHA_MAX,
-                 t_min: float = T_MIN) -> None:
+                 t_min: float = T_MIN, arithmetic: Arithmetic = DEFAULT_ARITHMETIC) -> None:
         if precision not in PRECISIONS:
             raise InputError(f"precision {precision!r}: choose float32 or float64")
         self.device = device if isinstance(device, Device) else open_device(device)
@@ -63,7 +65,7 @@ class Renderer:
         if precision == "float64" and not self.device.has_fp64:
             raise DeviceError(f"device {self.device.info} has no double precision: "
                               "use float32 or another --device")
-        self.schedule = schedule
+        self.schedule, self.arithmetic = schedule, arithmetic
         self._thresholds = (alpha_min, alpha_max, t_min)
         self._pipelines: dict[KernelBuild, Pipeline] = {}
         self._uploaded: tuple[Splats, SplatBuffers] | None = None
@@ -125,7 +127,8 @@ class Renderer:
         schedule = self.schedule or schedule_for(self.device)
         alpha_min, alpha_max, t_min = self._thresholds
         kernels = KernelBuild(splats.shape, splats.sh_degree, schedule, splats.normalisation, real,
-                              alpha_min=alpha_min, alpha_max=alpha_max, t_min=t_min).for_rendering()
+                              alpha_min=alpha_min, alpha_max=alpha_max, t_min=t_min,
+                              arithmetic=self.arithmetic).for_rendering()
         if kernels not in self._pipelines:
             self._pipelines[kernels] = Pipeline(self.device, kernels)
         return self._pipelines[kernels]
@@ -134,7 +137,8 @@ class Renderer:
         """Splats are immutable: the same object need not travel twice."""
         if self._uploaded is None or self._uploaded[0] is not splats:
             self._uploaded = None
-            self._uploaded = (splats, SplatBuffers.of(self.device, splats, pipeline.kernels.dtype))
+            kernels = pipeline.kernels
+            self._uploaded = (splats, SplatBuffers.of(self.device, splats, kernels.dtype, sh_dtype=kernels.sh_dtype))
         return self._uploaded[1]
 
 

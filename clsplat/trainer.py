@@ -86,9 +86,9 @@ class Trainer:
         self.kernels = KernelBuild(config.shape, config.sh_degree, schedule, config.normalisation,
                                    skew_map=config.map or SKEW_MAPS[0])
         largest = max((view.camera for view in scene.train), key=lambda c: c.width * c.height)
-        budget = truth_budget(self.device)
-        self.memory = estimate(config, self.kernels, ImageLayout(largest.width, largest.height),
-                               truth_bytes(scene.train, budget))
+        budget, tile = truth_budget(self.device), self.kernels.schedule.tile
+        self.memory = estimate(config, self.kernels, ImageLayout(largest.width, largest.height, tile),
+                               truth_bytes(scene.train, budget, tile))
         check(self.memory, self.device)
         self.rng = np.random.default_rng(config.seed)
         self.iteration, self.seconds = 0, 0.0

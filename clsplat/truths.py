@@ -50,7 +50,7 @@ class Truths:
     """
 
     def __init__(self, device: Device, kernels: KernelBuild, views: Sequence[View], budget: int) -> None:
-        self.device, self.views, self.budget = device, views, budget
+        self.device, self.views, self.budget, self.tile = device, views, budget, kernels.schedule.tile
         self.program = kernels.loss_program(device)
         self.pool = Pool(device)
         self._downscale = 0
@@ -78,7 +78,7 @@ class Truths:
         else:
             view = self.views[index]
             camera, image = (view.camera, view.image) if downscale == 1 else reduced(view, downscale)
-        layout = ImageLayout(camera.width, camera.height)
+        layout = ImageLayout(camera.width, camera.height, self.tile)
         nbytes = _PLANES * layout.plane
         stays = self._kept_bytes + nbytes <= self.budget
         buffer = self.device.alloc(nbytes) if stays else self.pool.get("truth", nbytes)
@@ -127,7 +127,7 @@ def truth_budget(device: Device) -> int:
     return device.info.global_mem_bytes // 4
 
 
-def truth_bytes(views: Sequence[View], budget: int) -> int:
-    """Most device memory that `Truths` of these views holds."""
-    sizes = [_PLANES * ImageLayout(view.camera.width, view.camera.height).plane for view in views]
+def truth_bytes(views: Sequence[View], budget: int, tile: int) -> int:
+    """Most device memory that `Truths` of these views holds, with tiles of this side."""
+    sizes = [_PLANES * ImageLayout(view.camera.width, view.camera.height, tile).plane for view in views]
     return min(sum(sizes), budget) + (_SLOTS + 1) * max(sizes)

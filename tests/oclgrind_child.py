@@ -3,7 +3,7 @@
 Oclgrind 21.10 follows what kernels write and what a whole-buffer write from the host brings, but loses track
 of host writes at an offset, of fills, and of buffers whose memory served another one before. So this process
 replaces the first two by kernels and frees no buffer. It also misreads the halves of a vector (`v.hi`), so
-sums, ORs and blocks go lane by lane.
+sums, ORs and blocks go lane by lane; and it knows no prefetch.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ kernel void put(global const uint *restrict from, global uint *restrict to, ulon
 kernel void zero(global uint *restrict to) { to[get_global_id(0)] = 0; }
 """
 
-PLAIN_LANES = """
+LANES_ONE_BY_ONE = """
 #undef lanes_sum
 #define lanes_sum lanes_sum_one_by_one
 inline real lanes_sum_one_by_one(vreal v) {
@@ -65,6 +65,11 @@ inline mask_int lanes_or_one_by_one(vmask m) {
 }
 """
 
+NO_PREFETCH = """
+#undef prefetch_reals
+#define prefetch_reals(p, n)
+"""
+
 FAULTS = """
 kernel void beyond(global uint *restrict x) { x[16] = 1; }
 kernel void unwritten(global uint *restrict x) { if (x[3] == 7) x[4] = 1; }
@@ -76,21 +81,27 @@ kernel void race(global uint *restrict x) {
 """
 
 
+def append_to_sources(more: dict[str, str]) -> None:
+    """Text to follow files of these names wherever they are built in."""
+    join = program.source
+
+    def source(*names: str) -> str:
+        return "".join(join(name) + more.get(name, "") for name in names)
+
+    program.source = source
+
+
 def make_traceable(device: Device) -> None:
     """Host writes that Oclgrind can follow; sums that it does not misread."""
     kept: list[Any] = []
-    alloc, join = device.alloc, program.source
+    alloc = device.alloc
 
     def keep(nbytes: int) -> Any:
         kept.append(alloc(nbytes))
         return kept[-1]
 
-    def source(*names: str) -> str:
-        parts = [join(name) + (PLAIN_LANES if name == "lanes.clh" else "") for name in names]
-        return "".join(parts)
-
     device.alloc = keep  # type: ignore[method-assign]
-    program.source = source
+    append_to_sources({"lanes.clh": LANES_ONE_BY_ONE})
     helpers = program.build_text(device, HELPERS)
 
     def fill_zero(device: Device, buffer: Any, nbytes: int) -> None:
@@ -171,6 +182,7 @@ def faults(device: Device, mode: str) -> None:
 def main() -> None:
     what, mode = sys.argv[1:]
     device = open_device("oclgrind")
+    append_to_sources({"group.clh": NO_PREFETCH})
     if mode == "uninitialized":
         make_traceable(device)
     {"render": render_some, "render-all": render_all, "sort": sort_and_scan, "faults": faults}[what](device, mode)

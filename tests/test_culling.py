@@ -10,8 +10,8 @@ from reference_skewed import SKEWED
 from test_footprint import strongly_skewed
 
 from clsplat.buffers import SplatBuffers, to_host
-from clsplat.device import Device, Schedule
-from clsplat.kernels import TILE, KernelBuild
+from clsplat.device import TILES, Device, Schedule
+from clsplat.kernels import KernelBuild
 from clsplat.pipeline import Pipeline
 from clsplat.shapes import SHAPES, shape_named
 
@@ -37,7 +37,7 @@ def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, sc
     form = Schedule.parse(schedule)
     kernels = KernelBuild(shape, 3, form)
     pipeline = Pipeline(device, kernels)
-    columns, block_height = TILE // 4, form.lanes // 4
+    columns, block_height = TILES[0] // 4, form.lanes // 4
     looked_at = shows = 0
     for seed in range(40):
         case = one_splat(shape, seed, needle=seed % 4 == 0)
@@ -49,10 +49,10 @@ def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, sc
         assert frame.n_isects == (right - left) * (bottom - top)
         number = np.arange(form.vecs)
         bits = (told[:, None] >> number.astype(np.uint32)) & 1
-        seen = np.zeros((frame.layout.tiles_y * TILE // block_height, frame.layout.tiles_x * columns), bool)
+        seen = np.zeros((frame.layout.tiles_y * TILES[0] // block_height, frame.layout.tiles_x * columns), bool)
         for isect in range(frame.n_isects):
             y, x = divmod(isect, right - left)
-            block_y = (top + y) * (TILE // block_height) + number // columns
+            block_y = (top + y) * (TILES[0] // block_height) + number // columns
             seen[block_y, (left + x) * columns + number % columns] = bits[isect] > 0
         alpha = np.zeros((seen.shape[0] * block_height, seen.shape[1] * 4))
         alpha[:HEIGHT, :WIDTH] = case.image.alpha

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # A module imports modules of lower floors only.
 FLOORS = """
     errors flops harmonics morton
-    atomic budget_rules compare_table interrupt presets run_log runtime schema signatures capture_world
+    arithmetic atomic budget_rules compare_table interrupt presets run_log runtime schema signatures capture_world
     camera device frontier_data html_report images metrics optim_reference plan ply_header profiles rotations \
     schedules validity colmap_files
     binaries cameras_json capture checkpoint colmap frontier_tables launches noise ply_body ply_compact shapes

@@ -21,8 +21,8 @@ from tolerances import IMAGE_FLOAT32, ROUNDING
 
 from clsplat.buffers import SplatBuffers, to_host
 from clsplat.camera import Camera
-from clsplat.device import Device, default_schedule
-from clsplat.kernels import ALPHA_MIN, TILE, KernelBuild
+from clsplat.device import TILES, Device, default_schedule
+from clsplat.kernels import ALPHA_MIN, KernelBuild
 from clsplat.pipeline import Pipeline
 from clsplat.splats import Splats
 
@@ -148,14 +148,14 @@ def test_boxes_hold_their_splats_and_little_else(device: Device, shape: str, tur
     slack = 1e-3  # px: float32 rounding of an extent
     assert (rows[:, 0] <= np.ceil(truth[:, 1] - 0.5 + slack)).all()
     assert (rows[:, 1] >= np.floor(truth[:, 3] - 0.5 - slack)).all()
-    first, last = np.ceil(truth[:, :2] - 0.5 + slack) // TILE, np.floor(truth[:, 2:] - 0.5 - slack) // TILE
+    first, last = np.ceil(truth[:, :2] - 0.5 + slack) // TILES[0], np.floor(truth[:, 2:] - 0.5 - slack) // TILES[0]
     some = (np.floor(truth[:, 2:] - 0.5) >= np.ceil(truth[:, :2] - 0.5)).all(1)
     assert (tiles[some, :2] <= first[some]).all()
     assert (tiles[some, 2:] >= last[some] + 1).all()
 
     height, true_height = rows[:, 1] - rows[:, 0] + 1, truth[:, 3] - truth[:, 1]
     area = (tiles[:, 2:] - tiles[:, :2]).prod(1)
-    true_area = (np.floor(truth[:, 2:] / TILE) - np.floor(truth[:, :2] / TILE) + 1).prod(1)
+    true_area = (np.floor(truth[:, 2:] / TILES[0]) - np.floor(truth[:, :2] / TILES[0]) + 1).prod(1)
     if shape == "gaussian":  # exact but for rounding
         assert (height <= true_height + 1.0 + slack).all()
         assert area.sum() <= 1.01 * true_area.sum()

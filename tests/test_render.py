@@ -16,9 +16,9 @@ from tolerances import GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, SAME_FLOAT32, 
 
 from clsplat.buffers import ParameterBuffers, SplatBuffers, to_device
 from clsplat.camera import Camera
-from clsplat.device import SCHEDULES, Device, Schedule, default_schedule
+from clsplat.device import SCHEDULES, TILES, Device, Schedule, default_schedule
 from clsplat.errors import InputError
-from clsplat.kernels import BATCH, NEAR, TILE, KernelBuild
+from clsplat.kernels import BATCH, NEAR, KernelBuild
 from clsplat.pipeline import Pipeline
 from clsplat.render import Renderer
 from clsplat.shapes import SHAPES
@@ -103,7 +103,7 @@ def thin_cases(shape: str) -> dict[str, Case]:
     """Images of odd sizes and counts of splats about the batch and the lanes; gradients of two fields."""
     fields = ("mean", "log_scale")
     cases = {}
-    for width, height in ((1, 1), (TILE, TILE), (TILE + 1, TILE - 1), (200, 5), (5, 130), (33, 64)):
+    for width, height in ((1, 1), (TILES[0], TILES[0]), (TILES[0] + 1, TILES[0] - 1), (200, 5), (5, 130), (33, 64)):
         camera = random_camera(5, width, height)
         cases[f"{width} x {height}"] = Case(random_splats(5, 12, 3), camera, shape, fields=fields)
     for n in (1, 7, 8, 9, 15, 16, 17, BATCH - 1, BATCH, BATCH + 1, 2 * BATCH + 1):

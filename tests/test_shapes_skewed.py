@@ -13,7 +13,7 @@ from reference import axes_of, kernel_values, project, projected_point, render_r
 from reference_formulas import jacobian
 from reference_scenes import for_shape, random_camera, random_splats
 from scipy.special import ndtr
-from tolerances import IMAGE_FLOAT32, ROUNDING, relative_error
+from tolerances import GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, relative_error
 
 from clsplat.camera import Camera
 from clsplat.device import Device
@@ -179,3 +179,13 @@ def test_long_slants_act_as_the_bound(make_renderer: MakeRenderer, device: Devic
     gradient = renderer.backward(np.ones((27, 41, 3)))["skew"]
     assert np.abs((gradient * unit).sum(1)).max() < ROUNDING * np.abs(gradient).max()
     assert np.abs(gradient).max() > 1e-3
+
+
+@pytest.mark.parametrize("shape", ["skew-normal", "skew-normal-direct"])
+def test_splats_without_skew_take_the_short_way_and_get_the_same(device: Device, make_renderer: MakeRenderer,
+                                                                 shape: str) -> None:
+    """Half of the splats have none: image and gradients are those of the reference, which knows no such way."""
+    arrays = random_splats(11, 16, 2)
+    arrays["skew"][::2] = 0.0
+    case = Case(arrays, random_camera(11, 37, 29), shape)
+    case.check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
