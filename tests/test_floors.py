@@ -18,11 +18,11 @@ FLOORS = """
     errors flops harmonics morton
     atomic compare_table interrupt presets run_log runtime schema signatures capture_world
     camera device images metrics optim_reference plan ply_header profiles rotations schedules validity colmap_files
-    binaries cameras_json capture checkpoint colmap launches noise shapes
+    binaries cameras_json capture checkpoint colmap launches noise optim_lazy shapes
     opacities ply program sghmc skew_map
     adc config densify kernels regularisers scene splats
     blocks buffers camera_path convert initialise model_folder strategy synthetic systems view_sampler
-    gradients limits optim_rules sort
+    gradients limits optim_rules optim_waiting sort
     binning optim_fused optim_host stages
     optim pipeline
     loss memory pairs truths tuning
