@@ -24,6 +24,7 @@ from .kernels import KernelBuild
 from .loss import ImageLoss, LossValue
 from .memory import check, estimate, peak_bytes, room_for_isects
 from .model_folder import ModelFolder
+from .morton import morton_order
 from .opacities import finite_rows
 from .optim import make_optimizer
 from .pipeline import ImageLayout, Pipeline, most_isects
@@ -184,7 +185,11 @@ class Trainer:
         moment = Moment(self.iteration, self.densify_last, self.growth, self.scene.extent)
         self.optimizer.settle()
         arrays, signals = self.splats.download(self.splats.n), self.pipeline.read_signals(self.splats.n)
-        self.optimizer.apply(plan(self.config, arrays, signals, self.rng, moment))
+        planned = plan(self.config, arrays, signals, self.rng, moment)
+        if self.config.visible_adam:  # splats seen together stay together
+            mean = planned.values.get("mean", arrays["mean"][planned.source])
+            planned = planned.permuted(morton_order(mean), self.splats.n)
+        self.optimizer.apply(planned)
         self.pipeline.reset_signals()
 
     def snapshot(self) -> Splats:
