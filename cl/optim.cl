@@ -1,35 +1,7 @@
-// optim.cl: one step of all parameters: fused Adam (Kingma & Ba 2015) over component-major buffers, with regularisers and the
-// skew map's chain rule; SGHMC for positions, MCMC noise, and the kernels that move splats about. The NumPy forms are in
-// clsplat/optim_host.py, optim_reference.py, regularisers.py, sghmc.py, skew_map.py and noise.py; a test compares them
-// step for step.
-
-static inline vreal adam_direction(vreal grad, global real *m_at, global real *v_at, real correct1, real correct2) {
-    const vreal m = lanes_load(m_at) * ADAM_BETA1 + grad * ADAM_REST1;
-    const vreal v = lanes_load(v_at) * ADAM_BETA2 + grad * grad * ADAM_REST2;
-    lanes_store(m, m_at);
-    lanes_store(v, v_at);
-    return m * correct1 / (sqrt(v * correct2) + (vreal)ADAM_EPS);
-}
-
-// The moments of a buffer [rows, capacity], from a splat's column on, and their corrections 1 / (1 - beta^step).
-typedef struct {
-    global real *m, *v;
-    real correct1, correct2;
-} adam_moments;
-
-static inline void adam_step(vreal grad, real lr, global real *value, adam_moments adam, const ulong at) {
-    const vreal old = lanes_load(value + at);
-    lanes_store(old - lr * adam_direction(grad, adam.m + at, adam.v + at, adam.correct1, adam.correct2), value + at);
-}
-
-// The same on the logarithm of a positive value, which stays within its bounds.
-static inline void adam_step_bounded(
-    vreal grad, real lr, real low, real high, global real *value, adam_moments adam, const ulong at)
-{
-    const vreal old = lanes_load(value + at);
-    const vreal step = adam_direction(grad * old, adam.m + at, adam.v + at, adam.correct1, adam.correct2);
-    lanes_store(lanes_clamp(old * exp(-lr * step), low, high), value + at);
-}
+// optim.cl: one step of all parameters, or of those of splats that were seen: Adam with regularisers and the skew map's chain
+// rule; SGHMC for positions, MCMC noise, and the kernels that move splats about. The NumPy forms are in
+// clsplat/optim_host.py, optim_reference.py, optim_lazy.py, regularisers.py, sghmc.py, skew_map.py and noise.py; a test
+// compares them step for step.
 
 // Coefficient k of the colour. grad_sh [6, capacity]: the gradient of the colour and the direction (cl/project.cl), whose
 // product with the basis is formed here.
@@ -50,6 +22,9 @@ static inline void step_coefficient(
 #define PART_OWN 3  // opacities, and the shape's own but the skew
 #define PART_SKEW 4
 #define PARTS 5     // then one a coefficient of the colour
+#ifdef ROW_SKEW
+#define PART_MAPS (SKEW_ROTATES ? PART_QUAT : PART_SKEW)  // has the trainable skew
+#endif
 
 // Rows of a part, skew left out.
 static inline uint2 part_rows(uint part) {
@@ -66,6 +41,39 @@ static inline uint2 part_rows(uint part) {
     }
 }
 #define PART_ROWS 4  // at most
+
+// Steps that were sat out, of a coefficient of the colour, of a part's rows, and of the trainable skew.
+static inline void catch_up_coefficient(
+    uint k, adam_wait wait, real lr, global real *sh, adam_moments adam, const ulong capacity)
+{
+    for (int c = 0; c < 3; ++c) adam_catch_up(wait, lr, 0, 0, sh, adam, (3 * k + c) * capacity);
+}
+static inline void catch_up_rows(uint2 rows, constant real *waits, int steps, bool keeps_moments, global real *geom,
+                                 adam_moments adam, constant real *rates, const ulong capacity)
+{
+    const bool means = rows.x == ROW_MEAN;
+    const adam_wait wait = waited_steps(waits, steps, means ? DRIFT_MEAN : DRIFT, keeps_moments);
+    for (uint row = rows.x; row < rows.y; ++row)
+        adam_catch_up(wait, means ? (real)1 : rates[row], rates[GEOM_ROWS + row], rates[2 * GEOM_ROWS + row], geom, adam,
+                      row * capacity);
+}
+#ifdef ROW_SKEW
+static inline void catch_up_skew(constant real *waits, int steps, bool keeps_moments, real lr, global real *skew_s,
+                                 adam_moments adam, const ulong capacity)
+{
+    const adam_wait wait = waited_steps(waits, steps, DRIFT_SKEW, keeps_moments);
+    for (int row = 0; row < SKEW_WIDTH; ++row) adam_catch_up(wait, lr, 0, 0, skew_s, adam, row * capacity);
+}
+
+// The kernel's skew from the trainable one, and from the rotation where the map looks at it.
+static inline void map_skew(global real *geom, global const real *skew_s, const ulong capacity) {
+    vec3 skew = skew_of(skew_s, capacity);
+#if SKEW_ROTATES
+    skew = mat3_apply_transposed(quat_rotation(quat_load(geom + ROW_QUAT * capacity, capacity)), skew);
+#endif
+    vec3_store(skew, geom + ROW_SKEW * capacity, capacity);
+}
+#endif
 
 // Adds to g, the gradients of a part's rows, those of opacity_scale * sum(|opacity|) + scale_scale * sum(scale)
 // (3DGS-MCMC's regularisers) and, where a splat has two opacities, whose mean counts then, of
@@ -93,7 +101,9 @@ static inline void regularise(uint part, vreal *g, global const real *geom, cons
 // grad_geom may change where the skew's map depends on the rotation. rates [3, GEOM_ROWS]: the rate (of the means
 // mean_lr instead), and the bounds of what is stepped in the logarithm (0, 0 without). The skew follows the trainable one,
 // skew_s with skew_m, skew_v [SKEW_WIDTH, capacity] (of any content in shapes without), which learns if skew_learns; all
-// else learns if base_learns. Global size: (capacity / LANES, PARTS + coefficients of the degree).
+// else learns if base_learns. Parts from `lazy_from` on are stepped only in vectors of splats that wake_vectors woke, after
+// the steps that they sat out (ages, waits: not looked at if there is no such part).
+// Global size: (capacity / LANES, PARTS + coefficients of the degree).
 kernel void step_splats(
     global real *restrict geom,
     global real *restrict grad_geom,
@@ -107,6 +117,9 @@ kernel void step_splats(
     global real *restrict skew_m,
     global real *restrict skew_v,
     constant real *restrict rates,
+    global const int2 *restrict ages,
+    constant real *restrict waits,
+    uint lazy_from,
     ulong capacity,
     int sh_degree,
     uint base_learns,
@@ -126,21 +139,32 @@ kernel void step_splats(
 {
     const ulong i = get_global_id(0) * LANES;
     const uint part = get_global_id(1);
+    int2 age = (int2)(0, 0);
+    if (part >= lazy_from) {
+        age = ages[get_global_id(0)];
+        if (age.x < 0) return;
+    }
     if (part >= PARTS) {
         const adam_moments adam = {sh_m + i, sh_v + i, correct1, correct2};
         const uint k = part - PARTS;
-        if (base_learns) step_coefficient(k, sh_degree, k == 0 ? sh_lr : sh_rest_lr, sh + i, grad_sh + i, adam, capacity);
+        const real lr = k == 0 ? sh_lr : sh_rest_lr;
+        if (age.x > 0) catch_up_coefficient(k, waited_steps(waits, age.x, DRIFT, false), lr, sh + i, adam, capacity);
+        if (base_learns) step_coefficient(k, sh_degree, lr, sh + i, grad_sh + i, adam, capacity);
         return;
     }
     geom += i;
     grad_geom += i;
     const uint2 rows = part_rows(part);
+    const adam_moments adam = {geom_m + i, geom_v + i, correct1, correct2};
+    if (age.x > 0) catch_up_rows(rows, waits, age.x, false, geom, adam, rates, capacity);
     vreal g[PART_ROWS];
     for (uint row = rows.x; row < rows.y; ++row) g[row - rows.x] = lanes_load(grad_geom + row * capacity);
     if (opacity_scale > 0 || scale_scale > 0 || bisect_scale > 0)
         regularise(part, g, geom, capacity, opacity_scale, scale_scale, bisect_scale);
 #ifdef ROW_SKEW
-    const bool maps = part == (SKEW_ROTATES ? PART_QUAT : PART_SKEW) && (skew_learns || SKEW_ROTATES);
+    const adam_moments adam_s = {skew_m + i, skew_v + i, skew_correct1, skew_correct2};
+    if (age.y > 0 && part == PART_MAPS) catch_up_skew(waits, age.y, false, skew_lr, skew_s + i, adam_s, capacity);
+    const bool maps = part == PART_MAPS && (skew_learns || SKEW_ROTATES || age.y > 0);
     vreal v_s[SKEW_WIDTH];
     if (maps) {
         vec3 v = vec3_load(grad_geom + ROW_SKEW * capacity, capacity);
@@ -155,7 +179,6 @@ kernel void step_splats(
         skew_of_vjp(skew_s + i, v, v_s, capacity);
     }
 #endif
-    const adam_moments adam = {geom_m + i, geom_v + i, correct1, correct2};
     if (part == PART_MEAN ? means_learn : base_learns)
         for (uint row = rows.x; row < rows.y; ++row) {
             const real lr = part == PART_MEAN ? mean_lr : rates[row];
@@ -167,14 +190,9 @@ kernel void step_splats(
         }
 #ifdef ROW_SKEW
     if (!maps) return;
-    const adam_moments adam_s = {skew_m + i, skew_v + i, skew_correct1, skew_correct2};
     if (skew_learns)
         for (int row = 0; row < SKEW_WIDTH; ++row) adam_step(v_s[row], skew_lr, skew_s + i, adam_s, row * capacity);
-    vec3 skew = skew_of(skew_s + i, capacity);
-#if SKEW_ROTATES
-    skew = mat3_apply_transposed(quat_rotation(quat_load(geom + ROW_QUAT * capacity, capacity)), skew);
-#endif
-    vec3_store(skew, geom + ROW_SKEW * capacity, capacity);
+    map_skew(geom, skew_s + i, capacity);
 #endif
 }
 

@@ -77,7 +77,8 @@ static inline vec3 unit_direction(constant real *cam, vec3 mean, vreal *inv_norm
 }
 
 // records [n, RECORD], depth_key [n] (monotonic in depth; CULLED_KEY when unseen), tile_rect [n] (first and
-// past-the-end tile, x then y). Overwrites. Global size: splats / LANES.
+// past-the-end tile, x then y). Overwrites, but for the records of vectors of which no splat is seen.
+// Global size: splats / LANES.
 kernel void project_splats(
     global const real *restrict geom,
     global const sh_real *restrict sh,
@@ -104,14 +105,6 @@ kernel void project_splats(
     out[1] = s.to_px.y;
     out[5] = s.c.z;
 
-    vreal basis[SH_COUNT], inv_norm;
-    sh_basis(unit_direction(cam, s.mean, &inv_norm), sh_degree, basis);
-    const int used = (sh_degree + 1) * (sh_degree + 1);
-    vreal rgb[3] = {(vreal)R(0.5), (vreal)R(0.5), (vreal)R(0.5)};
-    for (int k = 0; k < used; ++k)
-        for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * sh_load(sh + first + (ulong)(3 * k + c) * capacity);
-    for (int c = 0; c < 3; ++c) out[2 + c] = max(rgb[c], (vreal)0);
-
     // Pixels whose centres lie in the box; a NaN anywhere fails the comparison and culls the splat.
     const vreal far = (vreal)R(1e6), half_px = (vreal)R(0.5);
     const vreal x_lo = ceil(lanes_clamp(out[0] - box.left - half_px, -far, far));
@@ -125,7 +118,22 @@ kernel void project_splats(
     const vmask seen = s.in_front & (box.left + box.right > (vreal)0) & (x_lo <= x_hi) & (y_lo <= y_hi)
                      & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height)
                      & (s.cov2d.xx < (vreal)COV2D_MAX) & (s.cov2d.yy < (vreal)COV2D_MAX);
+    if (!lanes_any(seen)) {  // neither colour is read nor a record written
+        for (int l = 0; l < LANES && first + l < n_splats; ++l) {
+            depth_key[first + l] = CULLED_KEY;
+            tile_rect[first + l] = (int4)(0, 0, 0, 0);
+        }
+        return;
+    }
     const vreal seen_real = lanes_if(seen, (vreal)1, (vreal)0);
+
+    vreal basis[SH_COUNT], inv_norm;
+    sh_basis(unit_direction(cam, s.mean, &inv_norm), sh_degree, basis);
+    const int used = (sh_degree + 1) * (sh_degree + 1);
+    vreal rgb[3] = {(vreal)R(0.5), (vreal)R(0.5), (vreal)R(0.5)};
+    for (int k = 0; k < used; ++k)
+        for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * sh_load(sh + first + (ulong)(3 * k + c) * capacity);
+    for (int c = 0; c < 3; ++c) out[2 + c] = max(rgb[c], (vreal)0);
 
     real lane[LANES][RECORD], edge[5][LANES];
     real column[LANES];
@@ -177,17 +185,18 @@ kernel void project_splats_vjp(
     const vreal zero = (vreal)0;
 
     real flag[LANES], seen_rgb[3][LANES];
-    for (int l = 0; l < LANES; ++l) {
-        const uint i = min(first + l, n_splats - 1);
-        flag[l] = first + l < n_splats && depth_key[i] != CULLED_KEY ? 1 : 0;
-        for (int c = 0; c < 3; ++c) seen_rgb[c][l] = records[(ulong)i * RECORD + 2 + c] > 0 ? flag[l] : 0;
-    }
+    for (int l = 0; l < LANES; ++l)
+        flag[l] = first + l < n_splats && depth_key[min(first + l, n_splats - 1)] != CULLED_KEY ? 1 : 0;
     const vmask seen = lanes_load(flag) > zero;
     if (!lanes_any(seen)) {  // zeros, as below
         for (int row = 0; row < GEOM_ROWS; ++row) lanes_store(zero, grad_geom + first + row * capacity);
         const int rows = compact ? 6 : 3 * (sh_degree + 1) * (sh_degree + 1);
         for (int row = 0; row < rows; ++row) lanes_store(zero, grad_sh + first + row * capacity);
         return;
+    }
+    for (int l = 0; l < LANES; ++l) {
+        const ulong i = min(first + l, n_splats - 1);
+        for (int c = 0; c < 3; ++c) seen_rgb[c][l] = records[i * RECORD + 2 + c] > 0 ? flag[l] : 0;
     }
     const splat_terms s = splat_project(geom + first, capacity, cam);
 

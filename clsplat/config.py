@@ -95,6 +95,8 @@ class TrainConfig:
     checkpoint_interval : iterations between checkpoints; 0: only at the end.
     save_iterations : when to write a PLY, beside the end.
     test_iterations : when to measure the test views; for the log only.
+    visible_adam : step only splats that the image saw, and their neighbours in memory; the others later, at once. With
+        regularisers, noise or SGHMC the geometry is stepped as ever.
     optimizer : "fused" (on the device) or "numpy" (the reference).
     device : as `--device`.
     """
@@ -150,6 +152,7 @@ class TrainConfig:
     checkpoint_interval: int = 1000
     save_iterations: tuple[int, ...] = ()
     test_iterations: tuple[int, ...] = ()
+    visible_adam: bool = False
     optimizer: str = "fused"
     device: str | None = None
 

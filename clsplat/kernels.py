@@ -113,8 +113,9 @@ class KernelBuild:
         # 1 - beta is a constant of its own: as a difference of float32 it is off by 1e-5.
         defines |= {"ADAM_BETA1": adam.BETA1, "ADAM_BETA2": adam.BETA2, "ADAM_EPS": adam.EPS,
                     "ADAM_REST1": 1.0 - adam.BETA1, "ADAM_REST2": 1.0 - adam.BETA2,
-                    "SKEW_MAP": SKEW_MAPS.index(self.skew_map)}
-        files = ("lanes.clh", "algebra.clh", "opacity.clh", "harmonics.clh", "skew_map.clh", "noise.clh", "optim.cl")
+                    "SKEW_MAP": SKEW_MAPS.index(self.skew_map), "ADAM_WAITS": adam.WAITS}
+        files = ("lanes.clh", "algebra.clh", "opacity.clh", "harmonics.clh", "skew_map.clh", "noise.clh", "adam.clh",
+                 "optim.cl", "lazy.cl")
         return build(device, files, defines, self.real)
 
     def for_rendering(self) -> KernelBuild:

@@ -15,6 +15,7 @@ from .optim_fused import FusedOptimizer
 from .optim_host import HostOptimizer
 from .optim_rules import Rules
 from .plan import Plan
+from .schema import Array
 
 
 class Optimizer(Protocol):
@@ -24,8 +25,9 @@ class Optimizer(Protocol):
     (skew_map.py), all else by Adam. A block that does not learn (blocks.py) keeps values, moments and step count.
     """
 
-    def step(self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int) -> None:
-        """One step on all splats, regularisers included.
+    def step(self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int,
+             depth_key: Any = None) -> None:
+        """One step on all splats, or with `visible_adam` on those seen (optim_lazy.py); regularisers included.
 
         Parameters
         ----------
@@ -33,13 +35,20 @@ class Optimizer(Protocol):
         mean_lr : Adam's rate of the means at this iteration, scene extent and rate factor included [world units].
         sh_degree : SH bands above it stay.
         iteration : from 1; decides which blocks learn, and the noise.
+        depth_key : buffer (cl/project.cl) of the image that the gradients belong to; with `visible_adam` only.
         """
 
+    def settle(self) -> None:
+        """Do all steps that splats sat out, so that the buffers hold what `read` returns."""
+
+    def read(self) -> dict[str, Array]:
+        """Public arrays of the splats, without anything pending; what is pending stays so."""
+
     def apply(self, plan: Plan) -> None:
-        """Move, add, remove and reset splats as planned."""
+        """Move, add, remove and reset splats as planned, from what they are once settled."""
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Everything but the splats themselves, for a checkpoint; the same keys from both optimizers."""
+        """Everything but the buffers' splats, for a checkpoint; the same keys from both optimizers."""
 
     def load_state(self, state: dict[str, NDArray[Any]]) -> None:
         """Go on from `state`; raises InputError when an entry is missing or unknown."""
@@ -51,4 +60,4 @@ def make_optimizer(device: Device, kernels: KernelBuild, splats: SplatBuffers, c
     rules = Rules(config, extent)
     if config.optimizer == "fused":
         return FusedOptimizer(device, kernels, splats, rules)
-    return HostOptimizer(splats, rules)
+    return HostOptimizer(splats, rules, kernels.lanes)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .buffers import ParameterBuffers, SplatBuffers, fill_zero, to_device, to_host
+from .buffers import copy as copy_buffer
 from .device import Device
 from .gradients import CompactGradients
 from .kernels import KernelBuild
+from .optim_lazy import Steps
 from .optim_reference import BETA1, BETA2
 from .optim_rules import Rules
+from .optim_waiting import Waiting
 from .plan import Plan
 from .program import GROUP_ITEMS, lane_group
 from .schema import Array, Group, Schema, sh_coefficients
@@ -20,6 +24,7 @@ from .sghmc import STREAM, Sghmc
 from .skew_map import SkewMap
 
 _PARTS = 5  # of geometry in a step (cl/optim.cl)
+_NO_PART = 1 << 31
 
 
 class Rows:
@@ -74,30 +79,52 @@ class FusedOptimizer:
         self._rates = device.alloc(table.nbytes)
         to_device(device, self._rates, table)
         self._sh_rates = rules.sh_rates(schema.rows(Group.SH), dtype)
+        self.waiting = Waiting(splats, kernels) if rules.config.visible_adam else None
+        self._lazy_from = _NO_PART if self.waiting is None else 0 if rules.geometry_waits else _PARTS
 
-    def step(self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int) -> None:
+    def step(self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int,
+             depth_key: Any = None) -> None:
         blocks, skew, sghmc = self.rules.blocks(iteration), self.skew, self.rules.sghmc
+        if self.waiting is not None:
+            self.waiting.wake(self._counts, blocks, depth_key)
         self.steps += blocks.base
         if blocks.base and sghmc is not None and self.momentum is not None:  # first: it sees the old covariance
             self._sghmc(sghmc, self.momentum, grads, mean_lr, iteration)
-        rows = {"skew_s": grads.geom, "skew_m": grads.geom, "skew_v": grads.geom}  # not looked at
-        of_skew = _corrections(0)
         if skew is not None:
             skew.steps += blocks.skew
-            rows = {"skew_s": skew.s.buffer, "skew_m": skew.first.buffer, "skew_v": skew.second.buffer}
-            of_skew = _corrections(skew.steps)
+        of_skew = _corrections(self._counts[1])
         penalty = self.rules.penalty(self.splats.n)
         self.program.step_splats(
             (self._columns, _PARTS + sh_coefficients(sh_degree)), (GROUP_ITEMS, 1), geom=self.splats.geom,
-            grad_geom=grads.geom, geom_m=self.first.geom, geom_v=self.second.geom, sh=self.splats.sh, grad_sh=grads.sh,
-            sh_m=self.first.sh, sh_v=self.second.sh, **rows, rates=self._rates, capacity=self.splats.capacity,
-            sh_degree=sh_degree, base_learns=int(blocks.base), means_learn=int(blocks.base and sghmc is None),
-            skew_learns=int(skew is not None and blocks.skew), mean_lr=mean_lr, sh_lr=self._sh_rates[0],
-            sh_rest_lr=self._sh_rates[-1], skew_lr=self.rules.rates.get("skew", 0.0), **_corrections(self.steps),
+            grad_geom=grads.geom, sh=self.splats.sh, grad_sh=grads.sh, **self._state_arguments(), sh_degree=sh_degree,
+            base_learns=int(blocks.base), means_learn=int(blocks.base and sghmc is None),
+            skew_learns=int(blocks.skew), mean_lr=mean_lr, **_corrections(self.steps),
             skew_correct1=of_skew["correct1"], skew_correct2=of_skew["correct2"], opacity_scale=penalty.opacity,
             scale_scale=penalty.scale, bisect_scale=penalty.bisect)
+        if self.waiting is not None:
+            self.waiting.drifts.advance(blocks, self._counts, mean_lr)
+
+    def settle(self) -> None:
+        if self.waiting is not None:
+            self.waiting.wake(self._counts)
+            self._settle(self.splats, None if self.skew is None else self.skew.s.buffer, keeps_moments=False)
+
+    def read(self) -> dict[str, Array]:
+        if self.waiting is None:
+            return self.splats.download(self.splats.n)
+        for group in Group:
+            copy_buffer(self.device, self.splats.buffers[group], self.spare[group], self.splats.group_bytes(group))
+        settled = copy.copy(self.splats)
+        settled.buffers = self.spare
+        if self.skew is not None:
+            s = self.skew.s
+            copy_buffer(self.device, s.buffer, s.spare, s.width * s.capacity * s.dtype.itemsize)
+        self.waiting.wake(self._counts, peeks=True)
+        self._settle(settled, None if self.skew is None else self.skew.s.spare, keeps_moments=True)
+        return settled.download(settled.n)
 
     def apply(self, plan: Plan) -> None:
+        self.settle()
         splats, n_old, n_new = self.splats, self.splats.n, len(plan.source)
         source = self._indices(plan.source)
         fresh = plan.fresh.copy()
@@ -124,6 +151,8 @@ class FusedOptimizer:
         splats.n = n_new
         self._set_values(plan, source)
         self._reset_fields(plan.reset_fields)
+        if self.waiting is not None:
+            self.waiting.none_waits(self._counts)
 
     def state(self) -> dict[str, NDArray[Any]]:
         n = self.splats.n
@@ -135,7 +164,7 @@ class FusedOptimizer:
                       "second.skew": self.skew.second.get(n)}
         if self.momentum is not None:
             state["momentum"] = self.momentum.get(n)
-        return state
+        return state if self.waiting is None else state | self.waiting.state()
 
     def load_state(self, state: dict[str, NDArray[Any]]) -> None:
         self.rules.check_state(state, self.splats.schema)
@@ -149,11 +178,35 @@ class FusedOptimizer:
             self.skew.second.set(state["second.skew"])
         if self.momentum is not None:
             self.momentum.set(state["momentum"])
+        if self.waiting is not None:
+            self.waiting.load_state(state, self._counts)
+
+    @property
+    def _counts(self) -> Steps:
+        return self.steps, 0 if self.skew is None else self.skew.steps
 
     @property
     def _columns(self) -> int:
         """Work-items of a kernel over all splats."""
         return -(-self.splats.n // (self.kernels.lanes * GROUP_ITEMS)) * GROUP_ITEMS
+
+    def _state_arguments(self) -> dict[str, Any]:
+        """Arguments that step_splats and settle_splats share; what the shape or the options lack is not looked at."""
+        skew, waiting = self.skew, self.waiting
+        rows = [self.first.geom] * 3 if skew is None else [skew.s.buffer, skew.first.buffer, skew.second.buffer]
+        return {"geom_m": self.first.geom, "geom_v": self.second.geom, "sh_m": self.first.sh, "sh_v": self.second.sh,
+                "skew_s": rows[0], "skew_m": rows[1], "skew_v": rows[2], "rates": self._rates,
+                "ages": self._rates if waiting is None else waiting.ages,
+                "waits": self._rates if waiting is None else waiting.table, "lazy_from": self._lazy_from,
+                "capacity": self.splats.capacity, "sh_lr": self._sh_rates[0], "sh_rest_lr": self._sh_rates[-1],
+                "skew_lr": self.rules.rates.get("skew", 0.0)}
+
+    def _settle(self, splats: SplatBuffers, skew_s: Any, keeps_moments: bool) -> None:
+        """The steps that woken splats sat out, on these values."""
+        arguments = self._state_arguments() | ({} if skew_s is None else {"skew_s": skew_s})
+        self.program.settle_splats(
+            (self._columns, _PARTS + sh_coefficients(splats.schema.sh_degree)), (GROUP_ITEMS, 1), geom=splats.geom,
+            sh=splats.sh, keeps_moments=int(keeps_moments), **arguments)
 
     def _sghmc(self, sghmc: Sghmc, momentum: Rows, grads: CompactGradients, mean_lr: float, iteration: int) -> None:
         c, seed = self.rules.coefficients(sghmc, iteration, mean_lr), self.rules.config.seed

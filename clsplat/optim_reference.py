@@ -10,11 +10,12 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .schema import Array
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15  # 3DGS
+WAITS = 256  # one more than the steps that a splat may sit out (optim_lazy.py)
 
 
 class NumpyAdam:
@@ -41,20 +42,25 @@ class NumpyAdam:
         """Begin a step: the bias corrections follow the count."""
         self.step_count += 1
 
-    def direction(self, name: str, grad: Array) -> Array:
-        """Take a gradient into the moments of `name`; the bias-corrected direction, to be scaled by a rate.
+    def direction(self, name: str, grad: Array, rows: slice | NDArray[np.int64] = slice(None)) -> Array:
+        """Take a gradient of some splats, `rows`, into the moments of `name`.
+
+        Returns
+        -------
+        Their bias-corrected direction, to be scaled by a rate.
 
         Raises
         ------
         KeyError : no such name. ValueError : the gradient has another shape than the parameter.
         """
-        m, v = self.first[name], self.second[name]
+        m, v = self.first[name][rows], self.second[name][rows]
         if grad.shape != m.shape:
             raise ValueError(f"{name}: gradient {grad.shape}, parameter {m.shape}")
         m *= self.beta1
         m += (1.0 - self.beta1) * grad
         v *= self.beta2
         v += (1.0 - self.beta2) * (grad * grad)
+        self.first[name][rows], self.second[name][rows] = m, v
         correction1 = 1.0 - self.beta1**self.step_count
         correction2 = math.sqrt(1.0 - self.beta2**self.step_count)
         ascent: Array = (m / correction1) / (np.sqrt(v) / correction2 + self.eps)

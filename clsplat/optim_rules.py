@@ -82,16 +82,25 @@ class Rules:
         return sghmc.coefficients(iteration, mean_lr / factor, factor)
 
     def blocks(self, iteration: int) -> Blocks:
-        """The blocks that learn at `iteration`."""
-        return active_blocks(iteration, self.config)
+        """The blocks that learn at `iteration`; of shapes without a skew that is no block."""
+        base, skew = active_blocks(iteration, self.config)
+        return Blocks(base, skew and self.map is not None)
 
     def base_fields(self, schema: Schema) -> tuple[Field, ...]:
         """All fields but the skew: the base block."""
         return tuple(field for field in schema if field.name != "skew")
 
+    @property
+    def geometry_waits(self) -> bool:
+        """Whether with `visible_adam` geometry waits as colour does: nothing else moves splats, or looks at them."""
+        config = self.config
+        pulled = config.opacity_reg or config.scale_reg or config.bisect_reg
+        return not (pulled or config.noise_lr or self.sghmc)
+
     def check_state(self, state: Mapping[str, NDArray[Any]], schema: Schema) -> None:
         """Raises InputError naming an entry that an optimizer's state lacks, or has and should not."""
         wanted = {"steps"} | {f"{role}.{name}" for role in ("first", "second") for name in schema.names}
         wanted |= ({"skew_s"} if self.map else set()) | ({"momentum"} if self.sghmc else set())
+        wanted |= {"waiting.last", "waiting.drifts"} if self.config.visible_adam else set()
         if odd := sorted(wanted ^ set(state)):
             raise InputError(f"optimizer state: missing or unknown entry {odd[0]!r}: start without --resume")

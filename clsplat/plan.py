@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,15 @@ class Plan:
     relocated: int = 0
     added: int = 0
     removed: int = 0
+
+    def permuted(self, order: NDArray[np.int64], n_old: int) -> Plan:
+        """The same splats in another order: `order` holds the plan's rows. n_old : splats before the plan."""
+        states, fresh = self.state_source, self.fresh
+        if states is None:
+            rows = np.arange(len(self.source))
+            states, fresh = np.minimum(rows, n_old - 1), fresh | (rows >= n_old)
+        values = {name: array[order] for name, array in self.values.items()}
+        return replace(self, source=self.source[order], values=values, fresh=fresh[order], state_source=states[order])
 
     def apply(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """The parameters after the plan (copies); the device's gather must do the same."""

@@ -22,7 +22,7 @@ STAGES = {
     "rasterize_vjp": ("rasterize_vjp",),
     "gather": ("gather_isect_grads",),
     "project_vjp": ("project_splats_vjp",),
-    "step": ("step_splats", "sghmc_step", "mcmc_noise"),
+    "step": ("wake_vectors", "step_splats", "settle_splats", "sghmc_step", "mcmc_noise"),
     "strategy": ("gather_columns", "zero_columns"),
     "transfers": TRANSFERS,
 }

@@ -24,6 +24,7 @@ from .kernels import KernelBuild
 from .loss import ImageLoss, LossValue
 from .memory import check, estimate, peak_bytes, room_for_isects
 from .model_folder import ModelFolder
+from .morton import morton_order
 from .noise import noise_amount
 from .opacities import finite_rows
 from .optim import make_optimizer
@@ -175,7 +176,8 @@ class Trainer:
         v_color = self.loss.gradient(truth.layout, self.truths.planes(truth))
         self.pipeline.backward(frame, v_color, self.grads)
         mean_lr = self.scene.extent * self.mean_rate(it)
-        self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it)
+        self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it,
+                            self.pipeline.pool.get("depth_key_kept", 0))
         if self.densify_first <= it <= self.densify_last and it % config.densify_interval == 0:
             self.densify()
         if config.noise_lr and active_blocks(it, config).base:
@@ -188,16 +190,21 @@ class Trainer:
     def densify(self) -> None:
         """One action of the strategy."""
         moment = Moment(self.iteration, self.densify_last, self.growth, self.scene.extent)
+        self.optimizer.settle()
         arrays, signals = self.splats.download(self.splats.n), self.pipeline.read_signals(self.splats.n)
         if self.splats.n and not signals[TIMES_SEEN].any():
             raise TrainingError(f"iteration {self.iteration}: no image shows any splat (transparent, or outside): "
                                 "check what training starts from (init) and the learning rates")
-        self.optimizer.apply(plan(self.config, arrays, signals, self.rng, moment))
+        planned = plan(self.config, arrays, signals, self.rng, moment)
+        if self.config.visible_adam:  # splats seen together stay together
+            mean = planned.values.get("mean", arrays["mean"][planned.source])
+            planned = planned.permuted(morton_order(mean), self.splats.n)
+        self.optimizer.apply(planned)
         self.pipeline.reset_signals()
 
     def snapshot(self) -> Splats:
         """The splats as they are now, on the host, without those that are not finite."""
-        arrays = self.splats.download(self.splats.n)
+        arrays = self.optimizer.read()
         sound = finite_rows(arrays)
         if len(sound) and not sound.any():
             raise TrainingError(f"iteration {self.iteration}: no splat is finite any more: lower the learning rates")

@@ -162,7 +162,7 @@ class Trainings:
     def row(self, name: str, system: System, optimizer: str) -> dict[str, Any] | None:
         """One hazard, one system, one optimizer; None where there is nothing to run."""
         hazard, scene = TRAINING[name], worlds.capture()
-        if hazard.other_device and self.other is None or not hazard.of(system) or optimizer not in hazard.only:
+        if (hazard.other_device and self.other is None) or not hazard.of(system) or optimizer not in hazard.only:
             return None
         twin = self.twin(system, optimizer)
         world = hazard.world(scene)
