@@ -50,9 +50,20 @@ def options_of(values: dict[str, Any]) -> BudgetOptions | None:
     return BudgetOptions(TOLERANCE if tolerance is None else tolerance, given["target_psnr"], given["max_bytes"])
 
 
+def is_search(folder: Path) -> bool:
+    """Whether a search has left its findings in a folder."""
+    return (folder / FILE).is_file()
+
+
+def forget_search(folder: Path) -> None:
+    """Before another run takes the folder: what a search left there is not of it."""
+    if is_search(folder):
+        BudgetState(folder).remove()
+
+
 def stored_search(folder: Path) -> tuple[dict[str, Any], BudgetOptions, dict[str, Any]] | None:
     """Options of the run, of the search, and the scene, where a search is to be resumed."""
-    if not (folder / FILE).is_file():
+    if not is_search(folder):
         return None
     state = BudgetState(folder)
     state.load()

@@ -12,7 +12,7 @@ from clsplat.errors import InputError, OutputError
 from clsplat.model_folder import ModelFolder
 from clsplat.presets import PRESETS, with_preset
 
-from .budget import budget_options, options_of, run_search, stored_search
+from .budget import budget_options, forget_search, is_search, options_of, run_search, stored_search
 from .options import (
     PATH,
     SpacedLists,
@@ -85,7 +85,7 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
             stored_config, stored_scene = _stored_run(folder)
         options, reading = stored_config | options, stored_scene | reading
         path = path or Path(reading["path"])
-    elif folder.is_used and not overwrite:
+    elif (folder.is_used or is_search(model_path)) and not overwrite:
         # train() says so too, but only after the scene is read.
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
     assert path is not None
@@ -94,6 +94,7 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
     if search is not None:
         run_search(ctx, loaded, config, search, model_path, record, resume, overwrite, quiet)
         return
+    forget_search(model_path)
     model = run_training(loaded, config, model_path, record, resume, overwrite, quiet)
     if not model.finished:
         say_stopped(ctx, model)

@@ -67,6 +67,11 @@ class BudgetState:
         """The model of a stage that is done."""
         return Splats.load(self.folder / f"{name}.ply")
 
+    def remove(self) -> None:
+        """Delete budget.json and the stages' models."""
+        self.end()
+        self.path.unlink(missing_ok=True)
+
     def end(self) -> None:
         """The stages' models are no longer needed."""
         shutil.rmtree(self.folder, ignore_errors=True)

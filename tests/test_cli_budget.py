@@ -135,6 +135,9 @@ def test_an_interrupted_search_says_how_to_go_on(scene: Path, tmp_path: Path, mo
     assert result.exit_code == 130
     assert result.stderr.splitlines()[-1] == (
         f"stopped; what is done is kept; to go on: clsplat train --resume -m {tmp_path / 'model'}")
+    assert "already holds a model" in error_of("train", scene, "-m", tmp_path / "model", *SEARCH)
     said = clsplat("train", "--resume", "-m", tmp_path / "model")
     assert "validation views: PSNR" in said
     assert np.isfinite(Splats.load(ModelFolder(tmp_path / "model").latest_ply()[0]).mean).all()
+    clsplat("train", scene, "-m", tmp_path / "model", "--overwrite", "-q", *SEARCH)
+    assert not (tmp_path / "model" / "budget.json").exists(), "another run's folder now"
