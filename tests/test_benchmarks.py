@@ -152,3 +152,22 @@ def test_frontier(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> N
     printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
     assert "| yard 48x36 | auto | 90.00 |" in printed
     assert "render_ms bytes splats |" in printed
+
+
+def test_visible_adam(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    out = tmp_path / "visible.jsonl"
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    command = [sys.executable, str(BENCHMARKS / "visible_adam.py"), "--smoke", "--scenes", f"{scene.name}:1:60",
+               "--out", str(out)]
+    for _ in range(2):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [(row["task"], row["options"]) for row in rows] == [
+        (task, f"visible_adam={on}") for task in ("wide", "train") for on in ("false", "true")]
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit", "load"} <= set(row)
+        assert 0 < row["splats_seen"] <= row["vectors_seen"] <= 1
+        assert 0 < row["step_ms"] < row["device_ms"]
+        assert f"| {row['wall_ms']:.1f} |" in done.stdout
+    assert rows[0]["splats_seen"] < 0.8
