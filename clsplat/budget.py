@@ -6,8 +6,8 @@ Everything is decided on validation views, held out of the training set (validat
               tolerance; the knee is the smallest cap that is as good as the best, within half of it or, where views
               differ by more, within the standard error of the difference
     rounds    a whole run at the knee, then rounds that remove a quarter of the splats and train the others on
-              (shrink.py), until two have a PSNR that is lower by half the tolerance than the run's; the fewest splats
-              that have not are taken, and trained a last part at lower rates
+              (shrink.py), until two have a PSNR that is lower by half the tolerance than the best so far, which most
+              often is not the first; the fewest splats that have not are taken, and trained a last part at lower rates
     parts     of that model, the fields and bands that the other half allows (prune.py)
     refit     the same with all training views: the run at the knee, as many rounds, the thresholds found before
 

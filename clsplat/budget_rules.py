@@ -84,12 +84,14 @@ def rounds_are_over(rows: list[Row], options: BudgetOptions) -> bool:
     """Whether fewer splats would not do: the last models were not good enough, or hardly a splat is left."""
     last = rows[-PATIENCE:]
     return rows[-1]["splats"] <= FEWEST or (len(last) == PATIENCE and all(
-        meets(row, rows[0], options) is False for row in last))
+        meets(row, rows, options) is False for row in last))
 
 
-def meets(row: Row, first: Row, options: BudgetOptions) -> bool | None:
-    """Whether a model of the rounds is good enough; None: not yet small enough."""
-    floor = first["psnr"] - 0.5 * options.tolerance if options.target_psnr is None else options.target_psnr
+def meets(row: Row, rows: list[Row], options: BudgetOptions) -> bool | None:
+    """Whether a model of the rounds is good enough beside the others; None: not yet small enough."""
+    floor = options.target_psnr
+    if floor is None:
+        floor = max(other["psnr"] for other in rows) - 0.5 * options.tolerance
     if options.max_bytes is not None and row["fitted_psnr"] is None:
         return None
     return bool(row["psnr"] >= floor)
@@ -105,5 +107,5 @@ def chosen_of(rows: list[Row], options: BudgetOptions) -> int:
         if options.target_psnr is not None:
             floor = min(options.target_psnr, max(fitting))
         return max(i for i, row in enumerate(rows) if row["fitted_psnr"] is not None and row["fitted_psnr"] >= floor)
-    good = [i for i, row in enumerate(rows) if meets(row, rows[0], options)]
+    good = [i for i, row in enumerate(rows) if meets(row, rows, options)]
     return good[-1] if good else max(range(len(rows)), key=lambda i: rows[i]["psnr"])
