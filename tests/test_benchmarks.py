@@ -152,3 +152,18 @@ def test_frontier(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> N
     printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
     assert "| yard 48x36 | auto | 90.00 |" in printed
     assert "render_ms bytes splats |" in printed
+
+
+def test_stability(tmp_path: Path) -> None:
+    out = tmp_path / "stability.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "stability.py"), "--out", str(out)]
+    kinds = ["--kinds", "static", "training", "arithmetic", "--smoke"]
+    for _ in range(2):
+        subprocess.run([*command, *kinds], capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert len(rows) == len({(row["kind"], row["hazard"], row["system"]) for row in rows}), "each once"
+    assert {row["kind"] for row in rows} == {"static", "training", "arithmetic"}
+    assert all(row["finite"] for row in rows)
+    printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
+    assert "| all rates x10 | stops |" in printed
+    assert "0 of them with a number that is not finite" in printed
