@@ -6,9 +6,9 @@ Everything is decided on validation views, held out of the training set (validat
               tolerance; the knee is the smallest cap that is as good as the best, within half of it or, where views
               differ by more, within the standard error of the difference
     rounds    a whole run at the knee, then rounds that remove a quarter of the splats and train the others on
-              (shrink.py), until two have a PSNR that is lower by half the tolerance than the run's; the fewest splats
-              that have not are taken, and trained a last part at lower rates
-    parts     of that model, the fields and bands that the other half allows (prune.py)
+              (shrink.py), until two have a PSNR that is lower by a quarter of the tolerance than the best so far, which
+              most often is not the first; the fewest splats that have not are taken, and trained on at lower rates
+    parts     of that model, the fields and bands that the last quarter allows (prune.py)
     refit     the same with all training views: the run at the knee, as many rounds, the thresholds found before
 
 A target of PSNR or bytes replaces the tolerance as what ends the rounds. Finished stages are kept (budget_state.py).
@@ -25,7 +25,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .budget_rules import FEWEST, BudgetOptions, Row, chosen_of, growth_caps, growth_is_over, knee_of, rounds_are_over
+from .budget_rules import (
+    FEWEST,
+    PARTS_SHARE,
+    BudgetOptions,
+    Row,
+    chosen_of,
+    growth_caps,
+    growth_is_over,
+    knee_of,
+    rounds_are_over,
+)
 from .budget_state import BudgetState
 from .complexity import complexity
 from .config import TrainConfig
@@ -180,7 +190,7 @@ class _Search:
         values, start = self.state.values, time.perf_counter()
         splats = self.settle(self.split, self.state.model(f"held_out_{values['chosen']}"), values["chosen"])
         now = self.judge(splats)
-        allowed = 0.5 * self.options.tolerance
+        allowed = PARTS_SHARE * self.options.tolerance
         if self.options.target_psnr is not None:
             allowed = max(now - self.options.target_psnr, 0.0)
         found = prune(splats, self.split.train, self.judge, allowed, ("fields", "bands"), self.config.seed)

@@ -10,6 +10,7 @@ from typing import Any
 from .errors import InputError
 
 TOLERANCE = 0.1  # dB
+KNEE_SHARE, ROUNDS_SHARE, PARTS_SHARE = 0.5, 0.25, 0.25  # of the tolerance: together they may cost all of it
 FIRST_CAP = 1000
 PATIENCE = 2  # doublings that may gain too little before growth stops, and rounds that may lose too much
 FEWEST = 50  # splats: no round goes below
@@ -67,7 +68,7 @@ def knee_of(rows: list[Row], options: BudgetOptions) -> int:
     def is_enough(row: Row) -> bool:
         if options.target_psnr is not None and row["psnr"] >= options.target_psnr:
             return True
-        allowed = max(0.5 * options.tolerance, standard_error(best["views"], row["views"]))
+        allowed = max(KNEE_SHARE * options.tolerance, standard_error(best["views"], row["views"]))
         return bool(best["psnr"] - row["psnr"] <= allowed)
 
     cap: int = next(row["cap"] for row in rows if is_enough(row))
@@ -84,12 +85,14 @@ def rounds_are_over(rows: list[Row], options: BudgetOptions) -> bool:
     """Whether fewer splats would not do: the last models were not good enough, or hardly a splat is left."""
     last = rows[-PATIENCE:]
     return rows[-1]["splats"] <= FEWEST or (len(last) == PATIENCE and all(
-        meets(row, rows[0], options) is False for row in last))
+        meets(row, rows, options) is False for row in last))
 
 
-def meets(row: Row, first: Row, options: BudgetOptions) -> bool | None:
-    """Whether a model of the rounds is good enough; None: not yet small enough."""
-    floor = first["psnr"] - 0.5 * options.tolerance if options.target_psnr is None else options.target_psnr
+def meets(row: Row, rows: list[Row], options: BudgetOptions) -> bool | None:
+    """Whether a model of the rounds is good enough beside the others; None: not yet small enough."""
+    floor = options.target_psnr
+    if floor is None:
+        floor = max(other["psnr"] for other in rows) - ROUNDS_SHARE * options.tolerance
     if options.max_bytes is not None and row["fitted_psnr"] is None:
         return None
     return bool(row["psnr"] >= floor)
@@ -101,9 +104,9 @@ def chosen_of(rows: list[Row], options: BudgetOptions) -> int:
         fitting = [row["fitted_psnr"] for row in rows if row["fitted_psnr"] is not None]
         if not fitting:
             return len(rows) - 1
-        floor = max(fitting) - 0.5 * options.tolerance
+        floor = max(fitting) - ROUNDS_SHARE * options.tolerance
         if options.target_psnr is not None:
             floor = min(options.target_psnr, max(fitting))
         return max(i for i, row in enumerate(rows) if row["fitted_psnr"] is not None and row["fitted_psnr"] >= floor)
-    good = [i for i, row in enumerate(rows) if meets(row, rows[0], options)]
+    good = [i for i, row in enumerate(rows) if meets(row, rows, options)]
     return good[-1] if good else max(range(len(rows)), key=lambda i: rows[i]["psnr"])

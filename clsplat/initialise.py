@@ -94,8 +94,8 @@ def _points(
     count = min(cap, RANDOM_POINTS)
     placed = _random_points(scene, count, rng)
     rgb = rng.integers(0, 256, (count, 3), dtype=np.uint8)
-    there = f"{found} points" if len(apart) == found else f"{found} points in {len(apart)} places"
-    why = "" if init == "random" else f" (the scene has {there})"
+    there = f"{found} points" if len(apart) == found else f"{found} points, {len(apart)} of them apart"
+    why = "" if init == "random" else f" (the scene has {there}): expect less than from good points"
     return placed, rgb, f"{count} splats at random around the cameras{why}"
 
 

@@ -17,6 +17,7 @@ from .shapes import Shape
 Reals = NDArray[np.float64]
 
 THINNEST = 1e-37  # its raw value is finite in float32
+FARTHEST = 1e15  # coordinate; what SGHMC has thrown beyond never comes back, and breaks the bounds of viewers
 
 _NAMES = ("opacity_logit", "opacity_minus_logit")
 
@@ -27,8 +28,9 @@ def opacity_names(arrays: Mapping[str, Array]) -> tuple[str, ...]:
 
 
 def finite_rows(arrays: Mapping[str, Array]) -> NDArray[np.bool_]:
-    """(N,) whether all parameters of a splat are finite."""
+    """(N,) whether all parameters of a splat are finite, and its position is one that can be squared in float32."""
     finite = np.ones(len(arrays["mean"]), np.bool_)
+    finite &= (np.abs(arrays["mean"]) <= FARTHEST).all(axis=1)  # False for a NaN
     for array in arrays.values():
         finite &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     return finite

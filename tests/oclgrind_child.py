@@ -1,4 +1,4 @@
-"""Run under Oclgrind by test_oclgrind.py: `python oclgrind_child.py render|render-all|sort|faults uninitialized|races`.
+"""Run under Oclgrind by test_oclgrind.py: `python oclgrind_child.py WHAT uninitialized|races` (WHAT: see `main`).
 
 Oclgrind 21.10 follows what kernels write and what a whole-buffer write from the host brings, but loses track
 of host writes at an offset, of fills, and of buffers whose memory served another one before. So this process
@@ -9,6 +9,7 @@ sums, ORs and blocks go lane by lane; and it knows no prefetch.
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,9 @@ SCHEDULES = {
     "races": ("1x16x16", "1x32x8", "1x256x1", "64x4x1", "256x1x1"),
     "uninitialized": ("1x16x16", "1x256x1", "64x4x1"),
 }
+
+HAZARDS = ("at and behind the near plane", "centroid and location across it", "values that overflow",
+           "screen-filling, 3e5 px", "needles 1:10^4", "opacity 1")
 
 HELPERS = """
 kernel void put(global const uint *restrict from, global uint *restrict to, ulong at)
@@ -150,6 +154,21 @@ def render_and_back(device: Device, shapes: tuple[str, ...], schedules: tuple[st
             assert all(np.abs(value).max() > 0 for value in gradients.values())
 
 
+def render_hazards(device: Device, mode: str) -> None:
+    """Crafted splats (benchmarks/hazards), whatever their images and gradients are."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+    from hazards import crafted
+
+    renderer = render.Renderer(device, schedule=Schedule.parse("1x16x16"))
+    for name in HAZARDS:
+        for shape in ("gaussian", "skew-normal-direct"):
+            arrays = crafted.STATIC[name](SHAPES[shape])
+            if arrays:
+                splats = Splats(shape, {key: values[:16].astype(np.float32) for key, values in arrays.items()})
+                image = renderer.render(splats, crafted.camera())
+                renderer.backward(np.ones_like(image.color))
+
+
 def sort_and_scan(device: Device, mode: str) -> None:
     """The sorter, over a block boundary; the order by depth of few work-items, over one of chunks and small buckets."""
     rng = np.random.default_rng(0)
@@ -185,7 +204,8 @@ def main() -> None:
     append_to_sources({"group.clh": NO_PREFETCH})
     if mode == "uninitialized":
         make_traceable(device)
-    {"render": render_some, "render-all": render_all, "sort": sort_and_scan, "faults": faults}[what](device, mode)
+    {"render": render_some, "render-all": render_all, "render-hazards": render_hazards, "sort": sort_and_scan,
+     "faults": faults}[what](device, mode)
     device.queue.finish()
     print("finished")
 

@@ -171,3 +171,37 @@ def test_visible_adam(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) 
         assert 0 < row["step_ms"] < row["device_ms"]
         assert f"| {row['wall_ms']:.1f} |" in done.stdout
     assert rows[0]["splats_seen"] < 0.8
+
+
+def test_stability(tmp_path: Path) -> None:
+    out = tmp_path / "stability.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "stability.py"), "--out", str(out)]
+    kinds = ["--kinds", "static", "training", "arithmetic", "--smoke"]
+    for _ in range(2):
+        subprocess.run([*command, *kinds], capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert len(rows) == len({(row["kind"], row["hazard"], row["system"]) for row in rows}), "each once"
+    assert {row["kind"] for row in rows} == {"static", "training", "arithmetic"}
+    assert all(row["finite"] for row in rows)
+    printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
+    assert "| all rates x10 | stops |" in printed
+    assert "0 of them with a number that is not finite" in printed
+
+
+@pytest.mark.slow
+def test_arithmetic(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    out = tmp_path / "arithmetic.jsonl"
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    command = [sys.executable, str(BENCHMARKS / "arithmetic.py"), "--smoke", "--scenes", scene.name, "--out", str(out)]
+    for _ in range(2):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["variant"] for row in rows] == ["default", "exp builtin"], "each once, also when it is called again"
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit", "load"} <= set(row)
+        assert 0 < row["image_error"] < 1e-4
+        assert 0 < row["gradient_error"] < 1e-2
+        assert row["raster_ms"] > 0
+        assert f"| {row['variant']} | {row['image_error']:.1e} |" in done.stdout
+    assert rows[0]["relative_ms"] == 1

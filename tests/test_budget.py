@@ -83,8 +83,9 @@ def test_rounds_go_on_until_two_have_lost_too_much() -> None:
 
 def test_the_fewest_splats_that_are_good_enough() -> None:
     shrinking = rows(30.0, 30.2, 30.1, 29.96, 29.8)
-    assert chosen_of(shrinking, AUTO) == 3
-    assert [meets(row, shrinking[0], AUTO) for row in shrinking] == [True, True, True, True, False]
+    assert [meets(row, shrinking, AUTO) for row in shrinking] == [False, True, False, False, False]
+    assert chosen_of(shrinking, AUTO) == 1, "the best seen counts, not the first"
+    assert chosen_of(shrinking, BudgetOptions(1.0)) == 3
     assert chosen_of(shrinking, BudgetOptions(target_psnr=30.15)) == 1
     assert chosen_of(shrinking, BudgetOptions(target_psnr=40)) == 1, "out of reach: the best"
     limited = rows(30.0, 30.2, 30.1, 29.96, 29.8)
@@ -92,7 +93,7 @@ def test_the_fewest_splats_that_are_good_enough() -> None:
         row["fitted_psnr"] = fitted
     assert chosen_of(limited, BudgetOptions(max_bytes=1000)) == 3
     assert chosen_of(limited, BudgetOptions(max_bytes=1000, target_psnr=27.2)) == 4
-    assert meets(limited[0], limited[0], BudgetOptions(max_bytes=1000)) is None
+    assert meets(limited[0], limited, BudgetOptions(max_bytes=1000)) is None
     assert chosen_of(rows(30.0, 29.0, fitted_psnr=None), BudgetOptions(max_bytes=1)) == 1
 
 
@@ -140,7 +141,7 @@ def test_a_search_finds_a_smaller_model(searched: clsplat.Budgeted) -> None:
     rounds = report["chosen"]
     assert rounds >= 1
     assert len(searched.splats) == report["rounds"][rounds]["splats"] == report["final"]["splats"]
-    assert report["held_out"]["psnr_pruned"] >= report["held_out"]["psnr"] - 0.2
+    assert report["held_out"]["psnr_pruned"] >= report["held_out"]["psnr"] - 0.1
     assert report["final"]["bytes"] == searched.path.stat().st_size
     assert report["final"]["missed"] is None
     loaded = Splats.load(searched.path)

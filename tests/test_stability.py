@@ -38,7 +38,9 @@ def test_crafted_splats(hazard: str, shape: str, devices: list[Device], make_ren
     if not arrays:
         pytest.skip("nothing of this shape is at risk")
     row = static.judged(shape, arrays, make_renderer(devices[0]), *[make_renderer(devices[0], "float64")] * 2)
-    assert row["verdict"] == ("stops" if "beyond" in hazard or "NaN" in hazard else "survives"), row
+    # Of needles as long as ten images float32 loses the gradient of the scale (benchmarks/STABILITY.md).
+    expected = "stops" if "beyond" in hazard or "NaN" in hazard else "loses" if "400 px" in hazard else "survives"
+    assert row["verdict"] == expected, row
     assert row["finite"]
     assert bool(row["message"]) == (row["verdict"] == "stops")
 
@@ -95,3 +97,14 @@ def test_the_units_of_the_scene_do_not_matter(scene: Scene, devices: list[Device
         trainer.run()
         psnr.append(trainer.evaluate(trainer.scene.test).psnr)
     assert abs(psnr[0] - psnr[1]) < 0.5
+
+
+def test_splats_thrown_out_of_the_scene_do_not_reach_the_file(scene: Scene, devices: list[Device]) -> None:
+    config = TrainConfig(shape="gaussian", sh_degree=0, iterations=10, cap_max=50)
+    trainer = Trainer(scene, config, device=devices[0])
+    arrays = trainer.splats.download(trainer.splats.n)
+    arrays["mean"][3, 1], arrays["mean"][4, 0], arrays["mean"][5, 2] = 1e28, np.nan, -np.inf
+    trainer.splats.set(arrays)
+    kept = trainer.snapshot()
+    assert len(kept) == 47
+    np.testing.assert_array_equal(kept.mean, np.delete(arrays["mean"], [3, 4, 5], axis=0))

@@ -45,7 +45,7 @@ def capacity_row(hazard: str, shape: str, device: Device, smoke: bool = False) -
              "finite": all(bool(np.isfinite(grad).all()) for grad in got.values())}
     del line, renderer
     if band:
-        with mock.patch.object(pipeline, "most_isects", lambda *_: band):
+        with mock.patch.object(pipeline, "most_isects", return_value=band):
             other = gradients(Renderer(device), splats, camera, v_color)
         error = max(float(np.abs(got[name] - other[name]).max()) for name in got)
         return found | {"gradient_error": error, "verdict": "survives" if error == 0 and found["finite"] else "fails"}

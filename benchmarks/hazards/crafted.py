@@ -83,10 +83,10 @@ def own_at_bound(shape: Shape, factor: float = 1 - 1e-6) -> Arrays:
     return arrays if met else {}
 
 
-def needles(shape: Shape, turn: str = "any", ratio: float = 1e-4) -> Arrays:
-    """1:10^4, one long axis of 8 px; "any" direction, or "edge-on": a thin disk seen from its side."""
+def needles(shape: Shape, turn: str = "any", pixels: float = 8.0, ratio: float = 1e-4) -> Arrays:
+    """1:10^4, the long axis of so many pixels; "any" direction, or "edge-on": a thin disk seen from its side."""
     arrays = benign(shape)
-    log_scale = np.full((COUNT, 3), np.log(0.8))
+    log_scale = np.full((COUNT, 3), np.log(pixels * DEPTH / FOCAL))
     if turn == "any":
         log_scale[:, 1:] += np.log(ratio)
     else:
@@ -192,6 +192,7 @@ STATIC: dict[str, Craft] = {
     "skew (own field) at its bound": own_at_bound,
     "skew (own field) beyond it": lambda s: own_at_bound(s, 1.5),
     "needles 1:10^4": needles,
+    "needles 1:10^4, 400 px long": lambda s: needles(s, pixels=400.0),
     "disks 1:10^4, edge-on": lambda s: needles(s, "edge-on"),
     "sub-pixel, 1e-3 px": lambda s: sized(s, 1e-3),
     "sub-pixel, 1e-8 px": lambda s: sized(s, 1e-8),

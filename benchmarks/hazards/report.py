@@ -9,7 +9,9 @@ from typing import Any
 
 from clsplat.charts import heat_map
 
+from .crafted import STATIC
 from .systems import SYSTEMS
+from .training import TRAINING
 
 Row = dict[str, Any]
 ORDER = ("survives", "stops", "loses", "fails")  # the worst of a cell's runs counts
@@ -36,9 +38,11 @@ def cells(rows: Iterable[Row]) -> list[dict[str, str]]:
     for row in rows:
         by.setdefault((row["hazard"], row["system"]), []).append(row)
     systems = list(dict.fromkeys(system for _, system in by))
-    known = [system.label for system in SYSTEMS]
-    systems.sort(key=lambda name: known.index(name) if name in known else len(known))
-    hazards = list(dict.fromkeys(hazard for hazard, _ in by))
+    known = [name for system in SYSTEMS for name in (system.shape, system.label)]
+    systems.sort(key=known.index)
+    order = [*STATIC, *TRAINING]
+    hazards = sorted(dict.fromkeys(hazard for hazard, _ in by),
+                     key=lambda name: order.index(name) if name in order else len(order))
     table = []
     for hazard in hazards:
         for system in systems:
@@ -46,7 +50,8 @@ def cells(rows: Iterable[Row]) -> list[dict[str, str]]:
             if own is None:
                 table.append({"row": hazard, "column": system, "verdict": "not run", "text": ""})
                 continue
-            worst = max(own, key=lambda row: (ORDER.index(row["verdict"]), row.get("lost_db") or 0.0))
+            worst = max(own, key=lambda row: (ORDER.index(row["verdict"]),
+                                              row.get("lost_db") or row.get("gradient_error") or 0))
             table.append({"row": hazard, "column": system, "verdict": worst["verdict"], "text": text(worst)})
     return table
 
@@ -73,16 +78,16 @@ def grid(table: Sequence[dict[str, str]]) -> None:
 
 
 def counts(rows: Sequence[Row]) -> None:
-    """Files that are not finite, and how the runs of each shape ended."""
+    """Numbers that are not finite, and how the runs of each shape ended."""
     runs = [row for row in rows if row["kind"] in ("static", "training", "recovery")]
     if not runs:
         return
     print(f"\n{len(runs)} runs, {sum(not row['finite'] for row in runs)} of them with a number that is not finite.\n")
-    print("| system | " + " | ".join(ORDER) + " |\n|---|" + "---|" * len(ORDER))
+    print("| shape | " + " | ".join(ORDER) + " |\n|---|" + "---|" * len(ORDER))
     judged = [row for row in runs if row["kind"] != "recovery"]
-    for system in dict.fromkeys(row["system"] for row in judged):
-        own = [row["verdict"] for row in judged if row["system"] == system]
-        print(f"| {system} | " + " | ".join(str(own.count(verdict)) for verdict in ORDER) + " |")
+    for shape in dict.fromkeys(row["system"].partition(":")[0] for row in judged):
+        own = [row["verdict"] for row in judged if row["system"].partition(":")[0] == shape]
+        print(f"| {shape} | " + " | ".join(str(own.count(verdict)) for verdict in ORDER) + " |")
 
 
 def recovery(rows: Sequence[Row]) -> None:

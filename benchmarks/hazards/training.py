@@ -105,6 +105,8 @@ def opacity_of(splats: Splats, value: float, every: int = 10) -> Splats:
     return changed(splats, every, **{name: raw for name in splats.arrays if name.startswith("opacity")})
 
 
+TWO = ("adam", "mcmc")  # how positions move matters less than how splats are added and removed
+
 TRAINING: dict[str, Hazard] = {
     "all rates x10": Hazard(rates=10),
     "all rates x100": Hazard(rates=100),
@@ -123,17 +125,17 @@ TRAINING: dict[str, Hazard] = {
     "two images": Hazard(lambda s: worlds.of_first(s, 2)),
     "one photo exposed twice as long": Hazard(worlds.badly_exposed),
     "random initialisation": Hazard(options={"init": "random"}),
-    "points doubled": Hazard(lambda s: worlds.with_points(s, "doubled")),
-    "points all in one place": Hazard(lambda s: worlds.with_points(s, "coincident")),
-    "points far out": Hazard(lambda s: worlds.with_points(s, "outliers")),
-    "four points": Hazard(lambda s: worlds.with_points(s, "four")),
-    "a tenth needles 1:10^4": Hazard(start=needles),
-    "start: skew (own) at its bound": Hazard(start=own_at_bound, of=has_own_limit),
-    "a tenth 100 times as large": Hazard(start=lambda s: scale_of(s, 100)),
-    "a tenth 1e-6 times as large": Hazard(start=lambda s: scale_of(s, 1e-6)),
-    "a tenth of opacity 0.9999": Hazard(start=lambda s: opacity_of(s, 0.9999)),
-    "a tenth of opacity 1/255": Hazard(start=lambda s: opacity_of(s, 1 / 255)),
-    "all transparent": Hazard(start=lambda s: opacity_of(s, 1e-3, every=1)),
+    "points doubled": Hazard(lambda s: worlds.with_points(s, "doubled"), only=TWO),
+    "points all in one place": Hazard(lambda s: worlds.with_points(s, "coincident"), only=TWO),
+    "points far out": Hazard(lambda s: worlds.with_points(s, "outliers"), only=TWO),
+    "four points": Hazard(lambda s: worlds.with_points(s, "four"), only=TWO),
+    "a tenth needles 1:10^4": Hazard(start=needles, only=TWO),
+    "start: skew (own) at its bound": Hazard(start=own_at_bound, of=has_own_limit, only=TWO),
+    "a tenth 100 times as large": Hazard(start=lambda s: scale_of(s, 100), only=TWO),
+    "a tenth 1e-6 times as large": Hazard(start=lambda s: scale_of(s, 1e-6), only=TWO),
+    "a tenth of opacity 0.9999": Hazard(start=lambda s: opacity_of(s, 0.9999), only=TWO),
+    "a tenth of opacity 1/255": Hazard(start=lambda s: opacity_of(s, 1 / 255), only=TWO),
+    "all transparent": Hazard(start=lambda s: opacity_of(s, 1e-3, every=1), only=TWO),
     "relocation every 5 iterations": Hazard(start=own_at_bound, only=("mcmc",),
                                             options={"densify_interval": 5, "densify_until": 1.0, "opacity_reg": 0.05}),
     "NumPy optimizer": Hazard(options={"optimizer": "numpy"}, only=("adam",)),
@@ -154,6 +156,7 @@ class Trainings:
     device: Device
     other: Device | None = None
     iterations: int = ITERATIONS
+    views: int = worlds.VIEWS
     twins: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -161,7 +164,7 @@ class Trainings:
 
     def row(self, name: str, system: System, optimizer: str) -> dict[str, Any] | None:
         """One hazard, one system, one optimizer; None where there is nothing to run."""
-        hazard, scene = TRAINING[name], worlds.capture()
+        hazard, scene = TRAINING[name], worlds.capture(self.views)
         if (hazard.other_device and self.other is None) or not hazard.of(system) or optimizer not in hazard.only:
             return None
         twin = self.twin(system, optimizer)
@@ -182,7 +185,7 @@ class Trainings:
         """PSNR of every view after a run with nothing wrong."""
         key = (system.label, optimizer)
         if key not in self.twins:
-            self.twins[key] = self.run(worlds.capture(), system, optimizer, Hazard())["psnr"]
+            self.twins[key] = self.run(worlds.capture(self.views), system, optimizer, Hazard())["psnr"]
         return self.twins[key]
 
     def run(self, world: Scene, system: System, optimizer: str, hazard: Hazard) -> dict[str, Any]:
@@ -207,7 +210,7 @@ class Trainings:
                 found["psnr"] = {name: view["PSNR"] for name, view in evaluate(
                     self.renderer, model.splats, world.views).per_view.items()}
             except ClsplatError as error:
-                found["message"] = str(error)
+                found["message"] = str(error).replace(str(world.path), world.name)
             found["seconds"] = time.perf_counter() - start
             found["finite"] = all(finite_file(path) for path in out.rglob("*.ply"))
             found["diverged_at"] = diverged_at(out / "log.jsonl")

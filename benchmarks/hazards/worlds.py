@@ -18,10 +18,10 @@ WIDTH, HEIGHT, VIEWS = 64, 48, 26
 
 
 @cache
-def capture() -> Scene:
-    """A procedural capture of 26 views, four of them test views; some 2400 points."""
+def capture(views: int = VIEWS) -> Scene:
+    """A procedural capture, every 8th view a test view; some 2400 points."""
     with tempfile.TemporaryDirectory() as folder:
-        return load_scene(write_capture(Path(folder) / "capture", WIDTH, HEIGHT, VIEWS))
+        return load_scene(write_capture(Path(folder) / "capture", WIDTH, HEIGHT, views))
 
 
 def in_units(scene: Scene, scale: float) -> Scene:
