@@ -83,8 +83,7 @@ def run(name: str, shape: str, args: argparse.Namespace) -> None:
     cpu_seconds = time.process_time() - started
     measured = evaluate(Renderer(device), found.splats, scene.test, config.background)
     report, arrays = found.report, found.splats.arrays
-    kept = {key: report[key] for key in ("growth", "knee", "rounds", "chosen", "held_out", "thresholds", "refit",
-                                         "final")}
+    kept = {key: value for key, value in report.items() if key not in ("config", "options", "scene")}
     record: Record = dict.fromkeys(MEASURED) | {
         "scene": identity, "system": label, "config": config.to_json(), "failed": report["final"]["missed"],
         "finite": True, "cap_held": len(found.splats) <= args.cap, "device": str(device.info),

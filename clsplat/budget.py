@@ -3,9 +3,9 @@
 Everything is decided on validation views, held out of the training set (validation.py); test views are never looked at.
 
     growth    short runs (a quarter of the iterations), the cap doubling, until two doublings have gained less than the
-              tolerance; the knee is the smallest cap that is as good as the best, within half of it or, where views
-              differ by more, within the standard error of the difference
-    rounds    a whole run at the knee, then rounds that remove a quarter of the splats and train the others on
+              tolerance; the knee is the smallest cap within half of it of the best. Where a smaller cap is within the
+              standard error (over views) of the best, too, a whole run of each decides
+    rounds    from a whole run at the knee, rounds that remove a quarter of the splats and train the others on
               (shrink.py), until two have a PSNR that is lower by a quarter of the tolerance than the best so far, which
               most often is not the first; the fewest splats that have not are taken, and trained on at lower rates
     parts     of that model, the fields and bands that the last quarter allows (prune.py)
@@ -30,6 +30,7 @@ from .budget_rules import (
     PARTS_SHARE,
     BudgetOptions,
     Row,
+    candidates,
     chosen_of,
     growth_caps,
     growth_is_over,
@@ -76,8 +77,8 @@ class Budgeted:
     def seconds(self) -> float:
         """Of all stages: growth, held-out run, rounds, parts, refit."""
         report = self.report
-        stages = [*report.get("growth", []), *report.get("rounds", []), report.get("held_out", {}),
-                  report.get("refit", {})]
+        stages = [*report.get("growth", []), *report.get("whole", []), *report.get("rounds", [])[1:],
+                  report.get("held_out", {}), report.get("refit", {})]
         return float(sum(stage.get("seconds", 0.0) for stage in stages))
 
 
@@ -129,7 +130,8 @@ class _Search:
     def run(self) -> Budgeted:
         """All that is left to do."""
         values = self.state.values
-        for key, stage in (("knee", self.grow), ("chosen", self.shrink), ("thresholds", self.find_parts)):
+        stages = {"candidates": self.grow, "knee": self.decide, "chosen": self.shrink, "thresholds": self.find_parts}
+        for key, stage in stages.items():
             if key not in values:
                 stage()
         if "refit" not in values:
@@ -164,18 +166,29 @@ class _Search:
             self.state.put("growth", rows)
             if len(splats) < cap:  # it grows no further by itself
                 break
+        self.state.put("candidates", candidates(rows, self.options))
+
+    def decide(self) -> None:
+        """A whole run at each cap that may be the knee."""
+        rows: list[Row] = self.state.values.get("whole", [])
+        for cap in self.state.values["candidates"]:
+            if any(row["cap"] == cap for row in rows):
+                continue
+            self.say(f"held out: at most {cap} splats, {len(self.split.train)} training views, "
+                     f"{len(self.split.test)} validation views")
+            splats, seconds = self.run_of(dataclasses.replace(self.config, cap_max=cap, save_iterations=(),
+                                                              test_iterations=()))
+            self.state.save(f"whole_{cap}", splats)
+            rows = [*rows, {"cap": cap, **self.row(splats, seconds)}]
+            self.state.put("whole", rows)
         self.state.put("knee", knee_of(rows, self.options))
 
     def shrink(self) -> None:
-        """A whole run, then rounds."""
+        """Rounds."""
         values, goal = self.state.values, self.options
         if "rounds" not in values:
-            self.say(f"held out: at most {values['knee']} splats, {len(self.split.train)} training views, "
-                     f"{len(self.split.test)} validation views")
-            splats, seconds = self.run_of(dataclasses.replace(self.config, cap_max=values["knee"], save_iterations=(),
-                                                              test_iterations=()))
-            self.state.save("held_out_0", splats)
-            self.state.put("rounds", [self.row(splats, seconds)])
+            self.state.save("held_out_0", self.state.model(f"whole_{values['knee']}"))
+            self.state.put("rounds", [row for row in values["whole"] if row["cap"] == values["knee"]])
         rows: list[Row] = values["rounds"]
         while not rounds_are_over(rows, goal):
             start = time.perf_counter()

@@ -15,7 +15,7 @@ FIRST_CAP = 1000
 PATIENCE = 2  # doublings that may gain too little before growth stops, and rounds that may lose too much
 FEWEST = 50  # splats: no round goes below
 
-# A model: "splats", "psnr", and "cap" and "views" (growth), or "fitted_psnr" (rounds, where bytes are limited).
+# A model: "splats", "psnr"; "cap" (growth, whole runs), "views" (growth), "fitted_psnr" (where bytes are limited).
 Row = dict[str, Any]
 
 
@@ -61,18 +61,27 @@ def growth_is_over(rows: list[Row], options: BudgetOptions) -> bool:
     return bool(before) and max(row["psnr"] for row in rows) - max(before) < options.tolerance
 
 
-def knee_of(rows: list[Row], options: BudgetOptions) -> int:
-    """The cap beyond which growth does not pay."""
-    best = max(rows, key=lambda row: float(row["psnr"]))
+def candidates(rows: list[Row], options: BudgetOptions) -> list[int]:
+    """Caps that may be the knee, rising: the smallest that is as good as the best, and the smallest that may be.
 
-    def is_enough(row: Row) -> bool:
+    The latter differs from the best by less than the standard error: short runs cannot tell them apart, whole ones may.
+    """
+    for row in rows:
         if options.target_psnr is not None and row["psnr"] >= options.target_psnr:
-            return True
-        allowed = max(KNEE_SHARE * options.tolerance, standard_error(best["views"], row["views"]))
-        return bool(best["psnr"] - row["psnr"] <= allowed)
+            return [row["cap"]]
+    best = max(rows, key=lambda row: float(row["psnr"]))
+    gaps = [(row["cap"], best["psnr"] - row["psnr"], standard_error(best["views"], row["views"])) for row in rows]
+    share = KNEE_SHARE * options.tolerance
+    may_be = next(cap for cap, gap, error in gaps if gap <= max(share, error))
+    sure = next(cap for cap, gap, _ in gaps if gap <= share)
+    return sorted({may_be, sure})
 
-    cap: int = next(row["cap"] for row in rows if is_enough(row))
-    return cap
+
+def knee_of(whole: list[Row], options: BudgetOptions) -> int:
+    """The smallest cap of whole runs that is as good as the best of them."""
+    best = max(float(row["psnr"]) for row in whole)
+    knee: int = next(row["cap"] for row in whole if row["psnr"] >= best - KNEE_SHARE * options.tolerance)
+    return knee
 
 
 def standard_error(first: list[float], second: list[float]) -> float:
