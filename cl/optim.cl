@@ -233,7 +233,8 @@ kernel void sghmc_step(
     }
 }
 
-// mean += Sigma (xi gate amount), Sigma = R S S R', gate = sigmoid(0.5 - 100 opacity) (3DGS-MCMC, Kheradmand 2024).
+// mean += Sigma (xi gate amount), Sigma = R S S R', gate = sigmoid(0.5 - 100 opacity) (3DGS-MCMC, Kheradmand 2024), but by
+// `reach` at most: of a splat as large as the scene a step would lead out of it for good.
 kernel void mcmc_noise(
     global real *restrict geom,
     ulong capacity,
@@ -241,14 +242,16 @@ kernel void mcmc_noise(
     uint seed_lo,
     uint seed_hi,
     uint iteration,
-    real amount)
+    real amount,
+    real reach)
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n_splats) return;
     global real *at = geom + first;
     const vreal gate = amount * noise_gate(at, capacity);
     const vec3 step = scale3(normal3(first, (uint2)(seed_lo, seed_hi), iteration, 0), gate);
-    const vec3 moved = covariance_times(at, capacity, step);
+    vec3 moved = covariance_times(at, capacity, step);
+    moved = scale3(moved, min((vreal)1, reach / sqrt(max(dot3(moved, moved), (vreal)R(1e-30)))));
     vec3_store(add3(vec3_load(at + ROW_MEAN * capacity, capacity), moved), at + ROW_MEAN * capacity, capacity);
 }
 

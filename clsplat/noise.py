@@ -7,6 +7,8 @@ of them are exact in float32; only log, sqrt and sin/cos may differ by some ulp 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -80,6 +82,11 @@ def noise_amount(noise_lr: float, mean_lr: float, extent: float) -> float:
     return noise_lr * mean_lr * min(PUBLISHED_EXTENT / extent, 1.0) ** 2
 
 
+def noise_reach(extent: float) -> float:
+    """The farthest that noise moves a splat in one step [world units]."""
+    return 0.1 * extent
+
+
 def noise_gate(strength: Array) -> NDArray[np.float64]:
     """How much of the noise a splat takes, (N,), by its largest |opacity|: .62 at 0, .5 at .005, .01 at .05."""
     gate: NDArray[np.float64] = 1.0 / (1.0 + np.exp(GATE_SHARPNESS * strength.astype(np.float64) - GATE_OFFSET))
@@ -95,8 +102,8 @@ def covariance_times(quat: Array, log_scale: Array, vector: Array) -> NDArray[np
 
 
 def add_noise(mean: Array, quat: Array, log_scale: Array, strength: Array, seed: int, iteration: int,
-              amount: float) -> Array:
-    """Means after the noise step: mean + Sigma (xi gate amount).
+              amount: float, reach: float = math.inf) -> Array:
+    """Means after the noise step: mean + Sigma (xi gate amount), but by `reach` at most.
 
     Parameters
     ----------
@@ -110,7 +117,9 @@ def add_noise(mean: Array, quat: Array, log_scale: Array, strength: Array, seed:
     """
     xi = normal3(seed, iteration, len(mean)).astype(np.float64)
     step = xi * (noise_gate(strength) * amount)[:, None]
-    moved: Array = (mean + covariance_times(quat, log_scale, step)).astype(mean.dtype)
+    shift = covariance_times(quat, log_scale, step)
+    length = np.maximum(np.linalg.norm(shift, axis=1, keepdims=True), 1e-15)
+    moved: Array = (mean + shift * np.minimum(reach / length, 1.0)).astype(mean.dtype)
     return moved
 
 

@@ -25,7 +25,7 @@ from .loss import ImageLoss, LossValue
 from .memory import check, estimate, peak_bytes, room_for_isects
 from .model_folder import ModelFolder
 from .morton import morton_order
-from .noise import noise_amount
+from .noise import noise_amount, noise_reach
 from .opacities import finite_rows
 from .optim import make_optimizer
 from .pipeline import TIMES_SEEN, ImageLayout, Pipeline, most_isects
@@ -185,7 +185,7 @@ class Trainer:
                 -(-self.splats.n // self.kernels.lanes), self.pipeline.group, geom=self.splats.geom,
                 capacity=self.splats.capacity, n_splats=self.splats.n, seed_lo=config.seed & 0xFFFFFFFF,
                 seed_hi=config.seed >> 32, iteration=it,
-                amount=noise_amount(config.noise_lr, mean_lr, self.scene.extent))
+                amount=noise_amount(config.noise_lr, mean_lr, self.scene.extent), reach=noise_reach(self.scene.extent))
 
     def densify(self) -> None:
         """One action of the strategy."""

@@ -311,10 +311,12 @@ def test_mcmc_noise_follows_the_stronger_opacity_of_either_sign(devices: list[De
     buffers = SplatBuffers.of(device, splats, kernels.dtype)
     kernels.optim_program(device).mcmc_noise.over(
         -(-buffers.n // kernels.lanes), geom=buffers.geom, capacity=buffers.capacity, n_splats=buffers.n, seed_lo=3,
-        seed_hi=7, iteration=9, amount=50.0)
+        seed_hi=7, iteration=9, amount=50.0, reach=0.05)
     arrays = splats.to_numpy()
     strength = kind.strength(arrays)
     assert np.sum(strength < 0.05) > 5
-    expected = add_noise(splats.mean, splats.quat, splats.log_scale, strength, (7 << 32) + 3, 9, 50.0)
-    assert np.abs(expected - splats.mean).max() > 0.1
+    expected = add_noise(splats.mean, splats.quat, splats.log_scale, strength, (7 << 32) + 3, 9, 50.0, 0.05)
+    shifts = np.linalg.norm(expected - splats.mean, axis=1)
+    assert shifts.max() == pytest.approx(0.05, rel=1e-5), "held back"
+    assert 1e-3 < np.median(shifts[strength < 0.05]) <= 0.05 + 1e-6
     np.testing.assert_allclose(buffers.download(buffers.n)["mean"], expected, rtol=1e-6, atol=2e-5)

@@ -21,7 +21,7 @@ from clsplat.device import Device, open_device
 from clsplat.errors import InputError, OutputError, TrainingError
 from clsplat.evaluate import evaluate
 from clsplat.loss import ImageLoss, LossValue
-from clsplat.noise import add_noise
+from clsplat.noise import add_noise, noise_reach
 from clsplat.run_log import Progress
 from clsplat.scene import Scene, load_scene
 from clsplat.schema import Group
@@ -217,7 +217,8 @@ def test_noise_equals_numpy(scene: Scene, default_device: Device, tmp_path: Path
     moved = trainer.snapshot()
     amount = 5 * scene.extent
     expected = add_noise(
-        splats.mean, splats.quat, splats.log_scale, 1 / (1 + np.exp(-splats.opacity_logit)), config.seed, 1, amount
+        splats.mean, splats.quat, splats.log_scale, 1 / (1 + np.exp(-splats.opacity_logit)), config.seed, 1, amount,
+        noise_reach(scene.extent)
     )
     shift = np.abs(expected - splats.mean).max()
     assert shift > 1e-2
