@@ -145,7 +145,7 @@ def _chosen(views: list[NamedCamera], test_names: frozenset[str] | None, view_se
 
 
 def _orbit(model: LoadedModel, cameras: list[Camera], frames: int) -> list[NamedCamera]:
-    from clsplat.camera_path import orbit
+    from clsplat.paths_around import orbit
 
     return [NamedCamera(f"orbit_{index:03}", camera)
             for index, camera in enumerate(orbit(model.splats, cameras, frames))]

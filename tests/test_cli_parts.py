@@ -13,8 +13,8 @@ from clsplat_cli.outputs import output_stems
 from clsplat_cli.progress import TrainingDisplay, duration, table
 
 from clsplat.camera import Camera
-from clsplat.camera_path import look_at, orbit
 from clsplat.errors import InputError
+from clsplat.paths_around import look_at, orbit
 from clsplat.run_log import Progress
 from clsplat.splats import Splats
 

@@ -16,14 +16,15 @@ ROOT = Path(__file__).resolve().parent.parent
 # A module imports modules of lower floors only.
 FLOORS = """
     errors flops harmonics morton
-    arithmetic atomic budget_rules compare_table interrupt presets run_log runtime schema signatures capture_world
+    arithmetic atomic budget_rules compare_table interrupt json_fields presets run_log runtime schema signatures \
+    capture_world
     camera device frontier_data html_report images metrics optim_reference plan ply_header profiles rotations \
     schedules validity colmap_files
     binaries cameras_json capture checkpoint colmap frontier_tables launches noise optim_lazy ply_body ply_compact \
     shapes
-    chart_style opacities ply program sghmc skew_map
+    camera_path chart_style opacities ply program sghmc skew_map
     adc charts config densify frontier_charts kernels regularisers scene splats
-    blocks buffers camera_path complexity convert initialise model_folder rate_limits strategy synthetic systems \
+    blocks buffers complexity convert initialise model_folder paths_around rate_limits strategy synthetic systems \
     validation view_sampler
     budget_state gradients limits optim_rules optim_waiting sort
     binning optim_fused optim_host stages
