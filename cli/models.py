@@ -81,7 +81,7 @@ def scene_of(model: LoadedModel, source_path: Path | None = None, images: str | 
     path = source_path or record.get("path")
     if path is None:
         raise InputError(f"{model.path}: does not say which scene it shows: give the scene's folder with -s")
-    if source_path is None and not Path(path).is_dir():
+    if source_path is None and not Path(path).exists():
         raise InputError(f"{model.path}: its scene {path} is not there: give the scene's folder with -s")
     held_out = model.test_names
     scene = load_scene(path, images or record.get("images"),

@@ -146,7 +146,8 @@ def photo_options(function: F) -> F:
 def scene_options(function: F) -> F:
     """`-s`, `-i` and `-r`: where the photos are, and how large."""
     return click.option("-s", "--source-path", type=PATH,
-                        help="Scene: a folder with photos and a COLMAP model.")(photo_options(function))
+                        help="Scene: a folder with photos and a COLMAP model or transforms.json.")(
+                            photo_options(function))
 
 
 def split_options(function: F) -> F:

@@ -53,7 +53,8 @@ INTERRUPTED = 130
 @click.pass_context
 def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, model_path: Path | None,
           resume: bool, overwrite: bool, quiet: bool, preset: str | None, **values: Any) -> None:
-    """Learn a splat model of SCENE, a folder with photos in images/ and a COLMAP model in sparse/.
+    """Learn a splat model of SCENE, a folder with photos in images/ and a COLMAP model in sparse/, or with
+    transforms.json or transforms_train.json (NeRF's Blender sets, instant-ngp, nerfstudio).
 
     Writes config.json, cameras.json, log.jsonl, checkpoint.npz and point_cloud/iteration_N/point_cloud.ply
     into the model's folder. Ctrl-C saves a checkpoint; --resume goes on from it. With --budget auto also budget.json

@@ -20,6 +20,8 @@ from .camera import Camera
 from .colmap_files import check_binary_model, registered_images
 from .errors import InputError
 
+Lens = Any  # a pycolmap.Camera
+
 _PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 # Perspective models that are a plain pinhole when every distortion coefficient is 0.
 _DISTORTED_PINHOLES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
@@ -53,11 +55,12 @@ class Photo:
     ----------
     name : as COLMAP stores it, with `/` between folders.
     cam_from_world : (4, 4) world-to-camera pose.
+    lens : of the model, or of `make_lens`.
     """
 
     name: str
     cam_from_world: NDArray[np.float64]
-    _lens: Any
+    lens: Lens
 
     def fit(self, image: _images.ImageU8) -> tuple[_images.ImageU8, Camera]:
         """The photo as a pinhole image, and its camera.
@@ -75,7 +78,7 @@ class Photo:
         InputError : the image has another aspect than the camera, or the lens has no pinhole image.
         """
         height, width = image.shape[:2]
-        lens = _scaled(self._lens, width, height, self.name)
+        lens = _scaled(self.lens, width, height, self.name)
         if not _is_pinhole(lens):
             image, lens = _undistorted(image, lens, self.name)
             height, width = image.shape[:2]
@@ -102,11 +105,11 @@ def find_model(scene: Path) -> Path:
     InputError : the scene has no COLMAP model.
     """
     if not scene.is_dir():
-        raise InputError(f"{scene}: no such folder; give a scene folder with images/ and sparse/")
+        raise InputError(f"{scene}: no such folder; give a scene folder with images/ and sparse/, or transforms.json")
     sparse = scene / "sparse"
     if not sparse.is_dir():
         raise InputError(f"{scene}: no folder 'sparse'; a scene needs a COLMAP model in sparse/0 "
-                         "(run COLMAP's mapper on the photos)")
+                         "(run COLMAP's mapper on the photos), or a transforms.json")
     candidates = [sparse, *sorted(folder for folder in sparse.iterdir() if folder.is_dir())]
     models = [folder for folder in candidates if _suffix(folder)]
     if not models:
@@ -142,6 +145,11 @@ def read_model(folder: Path) -> Model:
         raise InputError(f"{folder}: {bad} points have a position that is not finite; the points3D file is "
                          "damaged: rebuild it")
     return Model(photos, points)
+
+
+def make_lens(model: str, width: int, height: int, params: list[float]) -> Lens:
+    """A lens by COLMAP's name of its model and its parameters [px, then distortion]."""
+    return _library().Camera(model=model, width=width, height=height, params=params)
 
 
 def _suffix(folder: Path) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,14 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from .camera import Camera
-from .cameras_json import IMAGE_SUFFIXES
-from .colmap import Photo, Points, find_model, read_model
+from .colmap import Photo, Points
 from .errors import InputError
 from .images import ImageU8, read_image, resize_area
+from .posed import Posed, posed_by_colmap
+from .transforms import find_transforms, posed_by_transforms
 
 MAX_WIDTH = 1600                # 3DGS: with resolution -1, wider images are reduced to this [px]
 _EXTENT_MARGIN = 1.1            # 3DGS: extent over the farthest camera's distance from their mean
-_FEW_REGISTERED = 0.8
 
 __all__ = ["MAX_WIDTH", "Points", "Scene", "View", "load_scene"]
 
@@ -47,7 +46,7 @@ class Scene:
     Parameters
     ----------
     name : of the scene's folder.
-    path : the scene's folder.
+    path : the scene's folder, or its transforms file.
     views : sorted by name.
     points : may be empty.
     test_names : names of the views held out for evaluation.
@@ -98,22 +97,24 @@ class Scene:
 def load_scene(path: str | os.PathLike[str], images: str | None = None, resolution: int = -1,
                test_every: int = 8, test_list: str | os.PathLike[str] | None = None, eval: bool = True,
                background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Scene:
-    """Read a scene: a folder with photos and a COLMAP model in `sparse`.
+    """Read a scene: a folder with photos and a COLMAP model in `sparse`, or with transforms.json.
 
     Parameters
     ----------
-    path : the scene's folder.
-    images : folder of the photos inside it; "images" by default. Reduced photos (images_4) scale the cameras.
+    path : the scene's folder, or one of its transforms files. A folder with both is read as COLMAP's.
+    images : folder of the photos inside it; "images" by default, or what transforms.json says. Reduced photos
+        (images_4) scale the cameras.
     resolution : 3DGS's -r: 1, 2, 4, 8 divide the size, another number is the width wanted [px]; -1 keeps the
         size but reduces images wider than 1600 px to that.
-    test_every : of the sorted names, each of this many is a test view, from the first on.
+    test_every : of the sorted names, each of this many is a test view, from the first on; where the scene's files
+        hold views out themselves (transforms_test.json, nerfstudio's lists), these are the test views instead.
     test_list : file with the names of the test views, one a line, instead of `test_every`.
     eval : False: no test view, learn from all.
     background : colour 0..1 under transparent pixels.
 
     Warns
     -----
-    UserWarning : the model registers fewer than 80 % of the photos in the folder.
+    UserWarning : the model registers fewer than 80 % of the photos in the folder, or photos are not there.
 
     Raises
     ------
@@ -122,50 +123,30 @@ def load_scene(path: str | os.PathLike[str], images: str | None = None, resoluti
     root = Path(path)
     if resolution < 1 and resolution != -1:
         raise InputError(f"resolution {resolution}: use 1, 2, 4, 8, a width in pixels, or -1")
-    model = read_model(find_model(root))
-    folder = _photo_folder(root, images or "images")
-    files = _photo_files(folder, [photo.name for photo in model.photos])
-    _warn_of_unregistered(folder, len(files))
-    names = [photo.name for photo in model.photos]
-    test_names = _test_names(names, test_every, test_list) if eval else frozenset()
+    posed = _posed(root, images)
+    test_names = _test_names(posed, test_every, test_list) if eval else frozenset()
 
     def view(photo: Photo) -> View:
-        return _view(photo, files[photo.name], resolution, background)
+        return _view(photo, posed.files[photo.name], resolution, background)
 
     with ThreadPoolExecutor() as pool:          # decoding and resizing run outside the interpreter lock
-        views = list(pool.map(view, model.photos))
-    return Scene(root.resolve().name, root, views, model.points, test_names)
+        views = list(pool.map(view, posed.photos))
+    folder = root.resolve()
+    return Scene((folder.parent if root.is_file() else folder).name, root, views, posed.points, test_names)
 
 
-def _photo_folder(root: Path, images: str) -> Path:
-    folder = root / images
-    if not folder.is_dir():
-        others = ", ".join(sorted(other.name for other in root.glob("images*") if other.is_dir()))
-        raise InputError(f"{folder}: no such folder of photos; " + (f"choose one of: {others}" if others else
-                         "put the photos there, or name their folder"))
-    return folder
+def _posed(root: Path, images: str | None) -> Posed:
+    transforms = find_transforms(root)
+    if transforms and not (root / "sparse").is_dir():
+        return posed_by_transforms(transforms, images)
+    return posed_by_colmap(root, images)
 
 
-def _photo_files(folder: Path, names: list[str]) -> dict[str, Path]:
-    files = {name: folder / name for name in names}
-    missing = [name for name, file in files.items() if not file.is_file()]
-    if missing:
-        some = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
-        raise InputError(f"{folder}: {len(missing)} of the model's {len(names)} images are missing: {some}; "
-                         "copy them there, or name another folder of photos")
-    return files
-
-
-def _warn_of_unregistered(folder: Path, registered: int) -> None:
-    photos = sum(1 for file in folder.rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
-    if registered < _FEW_REGISTERED * photos:
-        warnings.warn(f"{folder}: the model registers only {registered} of {photos} photos; parts of the "
-                      "scene may be missing. More overlap between photos helps.", stacklevel=3)
-
-
-def _test_names(names: list[str], test_every: int,
-                test_list: str | os.PathLike[str] | None) -> frozenset[str]:
-    if test_list is None:
+def _test_names(posed: Posed, test_every: int, test_list: str | os.PathLike[str] | None) -> frozenset[str]:
+    names = posed.names
+    if test_list is None and posed.test_names is not None:
+        chosen = sorted(posed.test_names)
+    elif test_list is None:
         if test_every < 2:
             raise InputError(f"test_every {test_every}: must be at least 2; "
                              "to learn from all views, turn eval off")

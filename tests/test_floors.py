@@ -15,23 +15,20 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # A module imports modules of lower floors only.
 FLOORS = """
-    errors flops harmonics morton
-    arithmetic atomic budget_rules compare_table interrupt json_fields presets run_log runtime schema signatures \
-    capture_world
-    camera device frontier_data html_report images metrics optim_reference plan ply_header profiles rotations \
-    schedules validity colmap_files
-    binaries cameras_json capture checkpoint colmap frontier_tables launches noise optim_lazy ply_body ply_compact \
-    shapes
-    camera_path chart_style opacities ply program sghmc skew_map
-    adc charts config densify frontier_charts kernels regularisers scene splats
-    blocks buffers complexity convert initialise model_folder paths_around rate_limits strategy synthetic systems \
-    validation view_sampler
-    budget_state gradients limits optim_rules optim_waiting sort
-    binning optim_fused optim_host stages
+    capture_world compare_table errors flops harmonics interrupt morton runtime schema
+    arithmetic atomic budget_rules camera device json_fields metrics optim_reference plan ply_header presets \
+    profiles rotations run_log schedules signatures validity
+    binaries cameras_json checkpoint colmap_files frontier_data html_report images launches noise optim_lazy \
+    ply_body ply_compact shapes
+    camera_path capture chart_style colmap frontier_tables opacities ply program sghmc skew_map
+    adc charts config densify frontier_charts kernels point_cloud posed regularisers splats
+    blocks buffers complexity convert model_folder paths_around rate_limits strategy systems transforms
+    budget_state gradients limits optim_rules optim_waiting scene sort
+    binning initialise optim_fused optim_host stages synthetic validation view_sampler
     optim pipeline
     loss memory pairs truths tuning
     render
-    evaluate needs
+    display evaluate needs
     prune trainer
     bench compare shrink training
     budget frontier
