@@ -58,13 +58,13 @@ def _refuse(bad: Mask, target: Shape, why: str, mend: str) -> None:
 # ---- the skew-normal's two forms ------------------------------------------------------------------------------
 
 
-def _direct(model: Model, target: Shape) -> Model:
+def direct_form(model: Model, target: Shape) -> Model:
     """From mean, covariance and shift m: scale matrix = covariance + shift shift', location = mean - shift."""
     m = _bounded(model["skew"], SKEW_MAX)
     t = np.sum(m * m, axis=1, keepdims=True)
     k = _displaced(t)
-    shift = _to_world(model, m)
-    frame, turned = _restretched(model, m, np.sqrt(1.0 + t))
+    shift = to_world(model, m)
+    frame, turned = restretched(model, m, np.sqrt(1.0 + t))
     unit = turned / np.sqrt(np.maximum(t, 1e-300))
     return model | frame | {"mean": model["mean"] - shift, "skew": unit * np.sqrt(k / (1.0 - k))}
 
@@ -79,8 +79,8 @@ def _centred(model: Model, target: Shape) -> Model:
     longest = math.sqrt(k / (1.0 - k))
     _refuse(length[:, 0] > SKEW_MAX * (1.0 + LIMIT_SLACK), target, f"have a skew above {longest:.3f}", "shorten it")
     unit = slant / np.sqrt(np.maximum(squared, 1e-300))
-    frame, turned = _restretched(model, unit, np.sqrt(1.0 - part))
-    shift = _to_world(model, unit * np.sqrt(part))
+    frame, turned = restretched(model, unit, np.sqrt(1.0 - part))
+    shift = to_world(model, unit * np.sqrt(part))
     return model | frame | {"mean": model["mean"] + shift, "skew": turned * np.minimum(length, SKEW_MAX)}
 
 
@@ -89,7 +89,7 @@ def _displaced(t: Reals | float) -> Reals | float:
     return 0.5 * math.pi * t / (1.0 + t)
 
 
-_SKEW_FORMS: dict[str, Callable[[Model, Shape], Model]] = {"centred": _centred, "direct": _direct}
+_SKEW_FORMS: dict[str, Callable[[Model, Shape], Model]] = {"centred": _centred, "direct": direct_form}
 
 
 def _bounded(vectors: Reals, limit: float) -> Reals:
@@ -99,13 +99,13 @@ def _bounded(vectors: Reals, limit: float) -> Reals:
     return short
 
 
-def _to_world(model: Model, vectors: Reals) -> Reals:
+def to_world(model: Model, vectors: Reals) -> Reals:
     """R S v (N, 3)."""
     moved: Reals = np.einsum("nij,nj->ni", rotations(model["quat"]), np.exp(model["log_scale"]) * vectors)
     return moved
 
 
-def _restretched(model: Model, along: Reals, factor: Reals) -> tuple[Model, Reals]:
+def restretched(model: Model, along: Reals, factor: Reals) -> tuple[Model, Reals]:
     """Rotation and scale of R S H H' S R', H = I but `factor` (N, 1) along the vectors `along` (N, 3); and the vectors
     in the new unit frame.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from cli_runner import clsplat, error_of, small_model
 
 from clsplat.cameras_json import read_cameras
+from clsplat.metrics import psnr
 from clsplat.model_folder import ModelFolder
 from clsplat.render import Renderer
 from clsplat.shapes import GAUSSIAN, SHAPES, SKEW_NORMAL, SKEW_NORMAL_DIRECT
@@ -54,13 +56,33 @@ def test_what_has_no_equal_is_refused(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     message = error_of("convert", model, out, "--shape", GAUSSIAN.name)
     assert f"of {len(Splats.load(ModelFolder(model).latest_ply()[0]))}" in message
+    assert message.endswith("; or --approximate")
     assert not out.exists()
+
+
+def test_nearest_gaussians_are_measured(model: Path, tmp_path: Path) -> None:
+    out, small = tmp_path / "out.ply", tmp_path / "out.splat"
+    said = clsplat("convert", model, out, "--shape", GAUSSIAN.name, "--approximate")
+    assert "each the nearest" in said
+    told = re.search(r"PSNR against the model's own images, (\d+) cameras: ([\d.]+) dB, worst ([\d.]+) dB", said)
+    assert told is not None
+    named, renderer = read_cameras(model / "cameras.json"), Renderer()
+    assert int(told[1]) == len(named)
+    ply = ModelFolder(model).latest_ply()[0]
+    models = (Splats.load(ply), Splats.load(out))
+    pairs = [[renderer.render(splats, entry.camera).color for splats in models] for entry in named]
+    assert float(told[2]) == pytest.approx(np.mean([psnr(*pair) for pair in pairs]), abs=0.006)
+    assert 18 < float(told[3]) <= float(told[2])
+    assert "PSNR against" in clsplat("convert", model, small, "--approximate")
+    assert small.stat().st_size == 32 * len(Splats.load(out))
+    assert "name cameras with --cameras" in clsplat("convert", ply, small, "--approximate", "--overwrite")
 
 
 def test_bad_input(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     assert "'cube'" in error_of("convert", model, out, "--shape", "cube", code=2)
-    assert "--shape" in error_of("convert", model, out, code=2)
+    assert "writes .ply and .splat files" in error_of("convert", model, tmp_path / "out.obj")
+    assert "leave --shape out" in error_of("convert", model, tmp_path / "out.splat", "--shape", "skew-normal")
     assert "no such model folder or PLY" in error_of("convert", tmp_path / "none", out, "--shape", "gaussian")
 
 
