@@ -72,7 +72,7 @@ def line_fits() -> NDArray[np.float64]:
         profile /= profile.max()
 
         def residual(p: NDArray[np.float64], profile: NDArray[np.float64] = profile) -> NDArray[np.float64]:
-            return p[2] * np.exp(-0.5 * ((_LINE - p[0]) / p[1]) ** 2) - profile
+            return np.asarray(p[2] * np.exp(-0.5 * ((_LINE - p[0]) / p[1]) ** 2) - profile)
 
         fits[row] = start = least_squares(residual, start).x
     return fits

@@ -39,7 +39,7 @@ def records(splats: Splats) -> NDArray[np.void]:
     opacity = GAUSSIAN.opacity(splats.opacity_logit.astype(np.float64))
     scale = np.exp(np.clip(splats.log_scale.astype(np.float64), -80.0, 80.0))
     quat = splats.quat.astype(np.float64)
-    unit = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    unit = np.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True), np.float64)
     table = np.empty(len(splats), RECORD)
     table["position"], table["scale"] = splats.mean, scale
     table["colour"][:, :3] = _bytes(0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64), 255.0)

@@ -126,8 +126,7 @@ class _Frame:
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
             raise InputError(f"{self.place}: transform_matrix has no rotation in its left 3 x 3 block; write the "
                              "poses again, without a scale")
-        pose: NDArray[np.float64] = np.linalg.inv(matrix @ _OPENCV_FROM_OPENGL)
-        return pose
+        return np.asarray(np.linalg.inv(matrix @ _OPENCV_FROM_OPENGL), np.float64)
 
     def lens(self) -> Lens:
         """The lens, of the size that the file gives, or the photo has."""
