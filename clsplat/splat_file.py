@@ -36,7 +36,7 @@ def write_splat(path: str | os.PathLike[str], splats: Splats) -> None:
 
 def records(splats: Splats) -> NDArray[np.void]:
     """(N,) of RECORD, the most important first."""
-    opacity = GAUSSIAN.opacity(splats.opacity_logit.astype(np.float64))
+    opacity: NDArray[np.float64] = GAUSSIAN.opacity(splats.opacity_logit.astype(np.float64)).astype(np.float64)
     scale = np.exp(np.clip(splats.log_scale.astype(np.float64), -80.0, 80.0))
     quat = splats.quat.astype(np.float64)
     unit = np.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True), np.float64)
