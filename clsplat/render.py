@@ -13,6 +13,7 @@ from .camera import Camera
 from .device import Device, Schedule, open_device
 from .errors import DeviceError, InputError
 from .kernels import ALPHA_MAX, ALPHA_MIN, T_MIN, KernelBuild
+from .pairs import pairs_per_pixel
 from .pipeline import Frame, Pipeline
 from .program import Real
 from .schema import Array
@@ -49,6 +50,7 @@ class Renderer:
     schedule : how a tile's pixels are shared out; None lets the device choose.
     alpha_min, alpha_max, t_min : blending thresholds; (0, 1, 0) makes the image smooth, for gradient checks.
     arithmetic : forms of exp and Phi, and how colour is kept: speed against accuracy.
+    keep : models that stay on the device, those last rendered.
 
     Raises
     ------
@@ -57,7 +59,7 @@ class Renderer:
 
     def __init__(self, device: str | Device | None = None, precision: str = "float32", *,
                  schedule: Schedule | None = None, alpha_min: float = ALPHA_MIN, alpha_max: float = ALPHA_MAX,
-                 t_min: float = T_MIN, arithmetic: Arithmetic = DEFAULT_ARITHMETIC) -> None:
+                 t_min: float = T_MIN, arithmetic: Arithmetic = DEFAULT_ARITHMETIC, keep: int = 1) -> None:
         if precision not in PRECISIONS:
             raise InputError(f"precision {precision!r}: choose float32 or float64")
         self.device = device if isinstance(device, Device) else open_device(device)
@@ -68,27 +70,38 @@ class Renderer:
         self.schedule, self.arithmetic = schedule, arithmetic
         self._thresholds = (alpha_min, alpha_max, t_min)
         self._pipelines: dict[KernelBuild, Pipeline] = {}
-        self._uploaded: tuple[Splats, SplatBuffers] | None = None
+        self._keep = keep
+        self._uploaded: list[tuple[Splats, SplatBuffers]] = []  # the last rendered last
         self._last: tuple[Pipeline, Frame] | None = None
 
-    def render(self, splats: Splats, camera: Camera, background: ArrayLike = (0.0, 0.0, 0.0)) -> Rendered:
+    def render(self, splats: Splats, camera: Camera, background: ArrayLike = (0.0, 0.0, 0.0),
+               sh_degree: int | None = None) -> Rendered:
         """Image of the splats (semantics: those of gsplat, see ARCHITECTURE.md).
 
         Parameters
         ----------
         background : three reals shown where transmittance is left.
+        sh_degree : highest band of colour shown; None: all.
         """
         rgb = np.asarray(background, np.float64)
         if rgb.shape != (3,) or not np.all(np.isfinite(rgb)):
             raise InputError(f"background {background!r}: expected three finite numbers R, G, B")
         pipeline = self._pipeline(splats)
         buffers = self._upload(splats, pipeline)
-        frame = pipeline.forward(buffers, camera, (float(rgb[0]), float(rgb[1]), float(rgb[2])))
+        frame = pipeline.forward(buffers, camera, (float(rgb[0]), float(rgb[1]), float(rgb[2])), sh_degree)
         self._last = (pipeline, frame)
-        layout = frame.layout
-        alpha = 1 - pipeline.read_image("transmittance", layout)[..., 0]
-        depth = pipeline.read_image("depth", layout)[..., 0]
-        return Rendered(pipeline.read_image("color", layout), alpha, depth)
+        return read_frame(pipeline, frame)
+
+    def count_splats(self) -> NDArray[np.float32]:
+        """(H, W) splats that each pixel of the last render takes in (see `pairs.pairs_per_pixel`).
+
+        Raises
+        ------
+        InputError : nothing rendered yet.
+        """
+        if self._last is None:
+            raise InputError("count_splats: render an image first")
+        return pairs_per_pixel(*self._last)
 
     def backward(self, v_color: ArrayLike, v_alpha: ArrayLike | None = None) -> dict[str, Array]:
         """Gradients of the last render's loss with respect to the raw values.
@@ -135,11 +148,22 @@ class Renderer:
 
     def _upload(self, splats: Splats, pipeline: Pipeline) -> SplatBuffers:
         """Splats are immutable: the same object need not travel twice."""
-        if self._uploaded is None or self._uploaded[0] is not splats:
-            self._uploaded = None
+        known = next((item for item in self._uploaded if item[0] is splats), None)
+        if known is None:
+            del self._uploaded[: max(len(self._uploaded) + 1 - self._keep, 0)]  # first: memory may be short
             kernels = pipeline.kernels
-            self._uploaded = (splats, SplatBuffers.of(self.device, splats, kernels.dtype, sh_dtype=kernels.sh_dtype))
-        return self._uploaded[1]
+            known = (splats, SplatBuffers.of(self.device, splats, kernels.dtype, sh_dtype=kernels.sh_dtype))
+        else:
+            self._uploaded.remove(known)
+        self._uploaded.append(known)
+        return known[1]
+
+
+def read_frame(pipeline: Pipeline, frame: Frame) -> Rendered:
+    """The images of a pipeline's last frame, on the host."""
+    alpha = 1 - pipeline.read_image("transmittance", frame.layout)[..., 0]
+    depth = pipeline.read_image("depth", frame.layout)[..., 0]
+    return Rendered(pipeline.read_image("color", frame.layout), alpha, depth)
 
 
 def _image(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
