@@ -1,9 +1,11 @@
-"""Files of rendered views: their names, which come from foreign files, and their formats."""
+"""What rendered views are written to: images, whose names come from foreign files, and videos."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
+from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +16,8 @@ from clsplat.errors import InputError
 
 if TYPE_CHECKING:
     from clsplat.render import Rendered
+
+    from .options import RGB
 
 _FULL_SCALE = 65535
 
@@ -58,13 +62,17 @@ class ImageWriter:
     Parameters
     ----------
     format : "png" or "npy". extras : any of "alpha", "depth".
+    near_far : depths at the ends of the colour map, for coloured depth PNGs; None: 16 bits of grey.
+    background : behind coloured depth.
     """
 
-    def __init__(self, folder: Path, format: str, extras: Sequence[str] = ()) -> None:
+    def __init__(self, folder: Path, format: str, extras: Sequence[str] = (),
+                 near_far: tuple[float, float] | None = None, background: RGB = (0.0, 0.0, 0.0)) -> None:
         self.folder, self.format, self.extras = folder, format, extras
+        self.near_far, self.background = near_far, background
 
     def write(self, stem: str, image: Rendered) -> str | None:
-        """Write the files; the scale of a depth PNG to tell the user, else None."""
+        """Write the files; the scale of a grey depth PNG to tell the user, else None."""
         from clsplat.images import write_grey16, write_png
 
         planes = {"": image.color} | {f"_{name}": getattr(image, name) for name in self.extras}
@@ -74,10 +82,55 @@ class ImageWriter:
             if self.format == "npy":
                 with atomic_writer(path) as stream:
                     np.save(stream, np.ascontiguousarray(plane, np.float32))
-            elif ending == "_depth":
+            elif ending != "_depth":
+                write_png(path, plane)
+            elif self.near_far is not None:
+                from clsplat.display import depth_picture
+
+                write_png(path, depth_picture(image, self.near_far, self.background))
+            else:
                 farthest = float(plane.max()) or 1.0
                 write_grey16(path, np.rint(plane * (_FULL_SCALE / farthest)).astype(np.uint16))
                 note = f"{path.name}: {_FULL_SCALE} = {farthest:.6g} world units"
-            else:
-                write_png(path, plane)
         return note
+
+
+class VideoFiles:
+    """A video of the colours, and beside it `NAME_alpha` and `NAME_depth` if wanted; use as a context manager.
+
+    Parameters
+    ----------
+    path : of the colours' video. fps : frames a second.
+    extras, near_far, background : as in ImageWriter; the depths need a range.
+
+    Raises
+    ------
+    InputError : no known kind of video, or the encoder is not installed.
+    """
+
+    def __init__(self, path: Path, fps: float, extras: Sequence[str] = (),
+                 near_far: tuple[float, float] | None = None, background: RGB = (0.0, 0.0, 0.0)) -> None:
+        from clsplat.video import VideoWriter
+
+        self.near_far, self.background = near_far, background
+        paths = {"colour": path} | {extra: path.with_name(f"{path.stem}_{extra}{path.suffix}") for extra in extras}
+        self.writers = {mode: VideoWriter(file, fps) for mode, file in paths.items()}
+        self._open = ExitStack()
+
+    def __enter__(self) -> VideoFiles:
+        with ExitStack() as opening:
+            for writer in self.writers.values():
+                opening.enter_context(writer)
+            self._open = opening.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self._open.__exit__(kind, error, trace)
+
+    def write(self, stem: str, image: Rendered) -> None:
+        """Add the view to every video."""
+        from clsplat.display import picture_of
+
+        for mode, writer in self.writers.items():
+            writer.write(picture_of(image, mode, self.background, self.near_far))

@@ -1,17 +1,20 @@
-"""`clsplat render`: images, alpha and depth of a model or of any splat PLY."""
+"""`clsplat render`: images, alpha and depth of a model or of any splat PLY, and videos of them."""
 
 from __future__ import annotations
 
 import statistics
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from clsplat.camera_path import DEFAULT_FPS, write_path
 from clsplat.cameras_json import NamedCamera, bare_name, img_names, read_cameras, write_cameras
 from clsplat.errors import InputError
+from clsplat.paths_between import resized_by_height
 
 from .models import LoadedModel, load_model, scene_of
 from .options import (
@@ -25,51 +28,66 @@ from .options import (
     scene_options,
     set_option,
 )
-from .outputs import ImageWriter, output_stems
+from .outputs import ImageWriter, VideoFiles, output_stems
+from .path_options import Range, named, path_of, path_options, resized
 from .progress import counted
 
 if TYPE_CHECKING:
-    from clsplat.camera import Camera
+    from clsplat.render import Renderer
+
+_SAMPLES = 12  # frames that the range of depths is taken from, at a quarter of the size
 
 
 @click.command()
 @click.argument("model", required=False, type=PATH, metavar="MODEL_OR_PLY")
 @click.option("-m", "--model-path", type=PATH, help="The same as MODEL_OR_PLY.")
-@click.option("-o", "--output", type=PATH, required=True, metavar="DIR", help="Where the images go.")
+@click.option("-o", "--output", type=PATH, metavar="DIR", help="Where the images go.")
+@click.option("--video", type=PATH, metavar="FILE", help="Write a video (.mp4), instead of images or beside them.")
 @click.option("--cameras", type=PATH, metavar="FILE", help="Render the cameras of this cameras.json.")
 @scene_options
 @set_option
-@click.option("--path", type=click.Choice(["orbit"]), help="Render a path around the scene.")
-@click.option("--frames", type=click.IntRange(min=1), default=60, show_default=True,
-              help="Images of the path.")
+@path_options
 @click.option("--format", "format", type=click.Choice(["png", "npy"]), default="png", show_default=True,
               help="png: 8 bits, rounded; npy: float32 as rendered.")
 @click.option("--alpha", is_flag=True, help="Also write alpha.")
 @click.option("--depth", is_flag=True, help="Also write depth, the alpha-weighted sum of camera z "
-                                            "(png: 16 bits, full scale is printed).")
+                                            "(png: 16 bits, full scale is printed; video: colours).")
+@click.option("--depth-colours", "--depth-colors", is_flag=True,
+              help="Write mean depth in colours, not in 16 bits of grey.")
+@click.option("--depth-range", type=Range(), help="Depths at the ends of the colours.  [default: those seen]")
 @background_options
 @iteration_option
 @device_option
 @quiet_option
-def render(model: Path | None, model_path: Path | None, output: Path, cameras: Path | None,
+def render(model: Path | None, model_path: Path | None, output: Path | None, video: Path | None, cameras: Path | None,
            source_path: Path | None, images: str | None, resolution: int | None, view_set: str | None,
-           path: str | None, frames: int, format: str, alpha: bool, depth: bool, background: RGB | None,
+           path: str | None, keys: str | None, closed: bool, frames: int | None, seconds: float | None,
+           fps: float | None, size: tuple[int, int] | None, save_path: Path | None, format: str, alpha: bool,
+           depth: bool, depth_colours: bool, depth_range: tuple[float, float] | None, background: RGB | None,
            white_background: bool, iteration: int | None, device: str | None, quiet: bool) -> None:
     """Render MODEL_OR_PLY: a model's folder, or any splat PLY.
 
     The views: all of --cameras, or the test views of the scene given with -s; with a model's folder alone its
-    own test views. Where none were held out: all. --path orbit turns around what the cameras look at; with a
-    PLY alone around its middle, the y axis pointing down.
+    own test views. Where none were held out: all. --path orbit, ellipse and spiral go around what these cameras
+    look at; with a PLY alone around its middle, the y axis pointing down.
     """
     from_scene = source_path is not None or images is not None or resolution is not None
     if cameras is not None and from_scene:
         raise click.UsageError("give --cameras or a scene (-s, -i, -r), not both")
     if path is not None and view_set is not None:
         raise click.UsageError("give --path or --set, not both")
+    if path is None and (keys or closed or frames or seconds or save_path):
+        raise click.UsageError("--keys, --closed, --frames, --seconds and --save-path belong to --path")
+    if output is None and video is None:
+        raise click.UsageError("give -o DIR for images, --video FILE, or both")
     given = model or model_path
     if given is None or (model and model_path and model != model_path):
         raise click.UsageError("give one model folder or PLY file")
     colour = background_of(background, white_background)
+    if video is not None:
+        from clsplat.video import VideoWriter
+
+        VideoWriter(video, fps or 1.0)  # a wrong name or a missing encoder is told before anything is loaded
     loaded = load_model(given, iteration)
     test_names, source = loaded.test_names, loaded.path
     if cameras is not None:
@@ -81,44 +99,91 @@ def render(model: Path | None, model_path: Path | None, output: Path, cameras: P
         test_names, source = scene.test_names, scene.path
     else:
         views = _recorded_cameras(loaded)
-    if path is not None:
-        views = _orbit(loaded, [view.camera for view in views], frames)
+    if path is None:
+        views = _resized(_chosen(views, test_names, view_set, source), size)
+        rate = fps or DEFAULT_FPS
     else:
-        views = _chosen(views, test_names, view_set, source)
+        along = resized(path_of(loaded, views, source, path, keys, closed, frames, seconds, fps), size)
+        views, rate = named(along, path), along.fps
+        if save_path is not None:
+            write_path(save_path, along)
     colour = loaded.background if colour is None else colour
-    seconds = render_views(loaded, views, output, colour, device, format, alpha, depth, quiet)
-    if path is not None:
+    extras = [name for name, wanted in (("alpha", alpha), ("depth", depth or depth_colours)) if wanted]
+    milliseconds = render_views(loaded, views, output, colour, device, format, extras, quiet, video, rate,
+                                depth_range, depth_colours)
+    if path is not None and output is not None:
         write_cameras(output / "cameras.json", views)
     if not quiet:
-        size = f"{views[0].camera.width}x{views[0].camera.height}"
-        click.echo(f"{output}: {len(views)} images, the first {size} px, {1e3 * seconds:.1f} ms each")
+        shown = f"{views[0].camera.width}x{views[0].camera.height}"
+        if output is not None:
+            click.echo(f"{output}: {len(views)} images, the first {shown} px, {milliseconds:.1f} ms each")
+        if video is not None:
+            click.echo(f"{video}: {len(views)} frames of {shown} px, {len(views) / rate:.4g} s at {rate:g} a second, "
+                       f"{milliseconds:.1f} ms each")
 
 
-def render_views(model: LoadedModel, views: Sequence[NamedCamera], output: Path, background: RGB,
-                 device: str | None = None, format: str = "png", alpha: bool = False, depth: bool = False,
-                 quiet: bool = False) -> float:
-    """Render and write all views; the median wall time of a render after the first [s].
+def render_views(model: LoadedModel, views: Sequence[NamedCamera], output: Path | None, background: RGB,
+                 device: str | None = None, format: str = "png", extras: Sequence[str] = (), quiet: bool = False,
+                 video: Path | None = None, fps: float = 30.0, depth_range: tuple[float, float] | None = None,
+                 depth_colours: bool = False) -> float:
+    """Render and write all views, one at a time; the median wall time of a render after the first [ms].
+
+    Parameters
+    ----------
+    output : folder of the images, or None. video : file of the video, or None.
+    extras : any of "alpha", "depth". depth_range : of coloured depths; None: what is seen along the views.
 
     Raises
     ------
     InputError : views whose files would be the same, or lie outside `output`.
-    OutputError : `output` cannot be written.
+    OutputError : a file cannot be written.
     """
     from clsplat.render import Renderer
 
-    extras = [name for name, wanted in (("alpha", alpha), ("depth", depth)) if wanted]
     stems = output_stems([view.name for view in views], extras, keep_suffix=format == "npy")
-    writer = ImageWriter(output, format, extras)
     renderer = Renderer(device)
-    times = []
-    for stem, view in counted(list(zip(stems, views, strict=True)), "rendering", quiet):
-        start = time.perf_counter()
-        image = renderer.render(model.splats, view.camera, background)
-        times.append(time.perf_counter() - start)
-        note = writer.write(stem, image)
-        if note and not quiet:
-            click.echo(note)
-    return statistics.median(times[1:] or times)  # the first one builds and uploads
+    if "depth" in extras and (depth_colours or video is not None) and depth_range is None:
+        depth_range = _depths_seen(renderer, model, views)
+    times: list[float] = []
+    with ExitStack() as files:
+        sinks: list[ImageWriter | VideoFiles] = []
+        if output is not None:
+            sinks.append(ImageWriter(output, format, extras, depth_range if depth_colours else None, background))
+        if video is not None:
+            sinks.append(files.enter_context(VideoFiles(video, fps, extras, depth_range, background)))
+        try:
+            for stem, view in counted(list(zip(stems, views, strict=True)), "rendering", quiet):
+                start = time.perf_counter()
+                image = renderer.render(model.splats, view.camera, background)
+                times.append(time.perf_counter() - start)
+                notes = [sink.write(stem, image) for sink in sinks]
+                for note in notes:
+                    if note and not quiet:
+                        click.echo(note)
+        except KeyboardInterrupt:
+            done = f"{len(times)} of {len(views)} frames were rendered"
+            click.echo(f"{video}: not written, as only {done}" if video else f"{output}: {done}", err=True)
+            raise
+    return 1e3 * statistics.median(times[1:] or times)  # the first one builds and uploads
+
+
+def _depths_seen(renderer: Renderer, model: LoadedModel, views: Sequence[NamedCamera]) -> tuple[float, float]:
+    """One range for the whole path, so that its colours do not flicker: over a few small frames."""
+    from clsplat.display import depth_range
+
+    step = -(-len(views) // _SAMPLES)
+    ranges = []
+    for view in views[::step]:
+        camera = view.camera
+        small = camera.resized(max(1, camera.width // 4), max(1, camera.height // 4))
+        ranges.append(depth_range(renderer.render(model.splats, small)))
+    return min(near for near, _ in ranges), max(far for _, far in ranges)
+
+
+def _resized(views: list[NamedCamera], size: tuple[int, int] | None) -> list[NamedCamera]:
+    if size is None:
+        return views
+    return [NamedCamera(view.name, resized_by_height(view.camera, *size)) for view in views]
 
 
 def _recorded_cameras(model: LoadedModel) -> list[NamedCamera]:
@@ -142,10 +207,3 @@ def _chosen(views: list[NamedCamera], test_names: frozenset[str] | None, view_se
     if not test:
         raise InputError(f"{source}: no test views are known: train with --eval, or use --set all")
     return test if view_set == "test" else [view for view in views if view.name not in names]
-
-
-def _orbit(model: LoadedModel, cameras: list[Camera], frames: int) -> list[NamedCamera]:
-    from clsplat.paths_around import orbit
-
-    return [NamedCamera(f"orbit_{index:03}", camera)
-            for index, camera in enumerate(orbit(model.splats, cameras, frames))]

@@ -21,15 +21,26 @@ def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     ------
     OutputError : the folder or the file cannot be written.
     """
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        yield stream
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """As `atomic_writer`, for what must be given a file's name: one to write to, with the suffix of `path`.
+
+    Raises
+    ------
+    OutputError : the folder or the file cannot be written.
+    """
     target = Path(path)
     # Beside the target, because os.replace is atomic within one file system only. Not tempfile: its files are
     # private to the user (mode 0600), and the mode would stay.
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp{target.suffix}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with temporary.open("wb") as stream:
-                yield stream
+            yield temporary
             os.replace(temporary, target)
         finally:
             temporary.unlink(missing_ok=True)

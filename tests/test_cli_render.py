@@ -16,12 +16,14 @@ from cli_runner import (
     WIDTH,
     clsplat,
     error_of,
+    run,
     small_capture,
     small_model,
 )
 from PIL import Image
 
 from clsplat.cameras_json import read_cameras
+from clsplat.display import depth_picture
 from clsplat.metrics import protocol_named
 from clsplat.render import Renderer
 from clsplat.scene import load_scene
@@ -114,6 +116,100 @@ def test_render_orbit_looks_at_the_scene(model: Path, tmp_path: Path) -> None:
         assert np.hypot(*camera.position[:2]) == pytest.approx(3.6, rel=0.05)
         assert camera.rotation[1] @ [0, 0, 1] < -0.8
     clsplat("render", ply(model), "--path", "orbit", "--frames", "1", "-o", tmp_path / "alone")
+
+
+@pytest.mark.parametrize("kind", ["ellipse", "spiral"])
+def test_render_other_paths(model: Path, tmp_path: Path, kind: str) -> None:
+    clsplat("render", model, "--path", kind, "--seconds", "0.1", "-o", tmp_path / "r", "--size", "40x30")
+    assert files(tmp_path / "r") == {"cameras.json", *(f"{kind}_{n:03}.png" for n in range(3))}
+    assert Image.open(tmp_path / "r" / f"{kind}_000.png").size == (40, 30)
+
+
+def test_render_between_chosen_cameras_and_along_the_saved_path(model: Path, tmp_path: Path) -> None:
+    """The frames at the keys are those cameras' images; the path's file gives the same frames, or as many as asked."""
+    named = {item.name: item.camera for item in read_cameras(model / "cameras.json")}
+    clsplat("render", model, "--path", "interpolate", "--keys", "view_003, view_004.png,view_006", "--frames", "5",
+            "--save-path", tmp_path / "path.json", "-o", tmp_path / "r")
+    splats = Splats.load(ply(model))
+    for frame, key in (("frame_000", "view_003"), ("frame_004", "view_006")):
+        got = np.asarray(Image.open(tmp_path / "r" / f"{frame}.png")).astype(int)
+        wanted = 255 * np.clip(Renderer().render(splats, named[key]).color, 0, 1)
+        assert np.abs(got - wanted).max() < 1.5
+    clsplat("render", ply(model), "--path", tmp_path / "path.json", "-o", tmp_path / "again")
+    for index in range(5):
+        first, again = (np.asarray(Image.open(tmp_path / folder / f"frame_{index:03}.png")).astype(int)
+                        for folder in ("r", "again"))
+        assert np.abs(first - again).max() <= 1
+    clsplat("render", ply(model), "--path", tmp_path / "path.json", "--frames", "9", "-o", tmp_path / "more")
+    assert len(files(tmp_path / "more")) == 10
+    clsplat("render", ply(model), "--path", model / "cameras.json", "-o", tmp_path / "list")
+    assert len(files(tmp_path / "list")) == N_VIEWS + 1
+
+
+def test_coloured_depth_has_one_range_for_the_path(model: Path, tmp_path: Path) -> None:
+    clsplat("render", model, "--path", "orbit", "--frames", "2", "-o", tmp_path / "r", "--depth-colours",
+            "--depth-range", "1,9")
+    camera = read_cameras(tmp_path / "r" / "cameras.json")[1].camera
+    wanted = depth_picture(Renderer().render(Splats.load(ply(model)), camera), (1, 9))
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "r" / "orbit_001_depth.png")), wanted)
+
+
+def test_render_videos_of_colour_depth_and_alpha(model: Path, tmp_path: Path) -> None:
+    """Real files, decoded: as many frames as asked, of an even size, each near the image that was rendered."""
+    imageio = pytest.importorskip("imageio.v2", reason="the extra `video` is not installed")
+    pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
+    out = clsplat("render", model, "--path", "orbit", "--frames", "4", "--fps", "10", "--size", "49x35", "-o",
+                  tmp_path / "r", "--video", tmp_path / "v" / "turn.mp4", "--depth", "--alpha")
+    assert "4 frames of 49x35 px, 0.4 s at 10 a second" in out
+    assert files(tmp_path / "v") == {"turn.mp4", "turn_depth.mp4", "turn_alpha.mp4"}
+    for name in ("turn", "turn_depth", "turn_alpha"):
+        with imageio.get_reader(tmp_path / "v" / f"{name}.mp4") as reader:
+            assert (reader.get_meta_data()["size"], reader.get_meta_data()["fps"]) == ((50, 36), 10)
+            frames = list(reader.iter_data())
+        assert len(frames) == 4
+        if name == "turn":
+            for index, frame in enumerate(frames):
+                image = np.asarray(Image.open(tmp_path / "r" / f"orbit_{index:03}.png")).astype(int)
+                assert np.abs(image - frame[:35, :49]).mean() < 6
+    clsplat("render", model, "--path", "orbit", "--frames", "2", "--video", tmp_path / "only.mp4")
+    assert (tmp_path / "only.mp4").stat().st_size > 500
+
+
+def test_an_interrupted_video_says_so_and_leaves_nothing(model: Path, tmp_path: Path,
+                                                         monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
+    real, calls = Renderer.render, []
+
+    def interrupted(self: Renderer, *args: object) -> object:
+        calls.append(args)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(self, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Renderer, "render", interrupted)
+    result = run("render", model, "--path", "orbit", "--frames", "5", "--video", tmp_path / "v.mp4")
+    assert result.exit_code == 130
+    assert result.stderr.splitlines() == [
+        f"{tmp_path / 'v.mp4'}: not written, as only 2 of 5 frames were rendered", "error: interrupted"]
+    assert files(tmp_path) == set()
+
+
+def test_bad_path_flags_and_files(model: Path, tmp_path: Path) -> None:
+    out = ["-o", tmp_path / "r"]
+    (tmp_path / "p.json").write_text('{"render_width": 20, "render_height": 10, "camera_path": [{"fov": 50}]}')
+    message = error_of("render", model, "--path", tmp_path / "p.json", *out)
+    assert "p.json: camera_path[0]: key 'camera_to_world' is missing" in message
+    assert "no such file; give one, or orbit, ellipse" in error_of("render", model, "--path", "orbti", *out)
+    assert "choose --keys from view_000" in error_of("render", model, "--path", "interpolate", "--keys", "x", *out)
+    assert "no cameras to interpolate" in error_of("render", ply(model), "--path", "interpolate", *out)
+    assert "not both" in error_of("render", model, "--path", "orbit", "--frames", "2", "--seconds", "1", *out, code=2)
+    assert "belong to --path interpolate" in error_of("render", model, "--path", "orbit", "--keys", "a", *out, code=2)
+    assert "belong to --path" in error_of("render", model, "--frames", "2", *out, code=2)
+    assert "-o DIR for images" in error_of("render", model, code=2)
+    assert "no size" in error_of("render", model, "--path", "orbit", "--size", "0x3", *out, code=2)
+    assert "no range" in error_of("render", model, "--depth-range", "3,1", *out, code=2)
+    assert "v.avi: no video" in error_of("render", model, "--path", "orbit", "--video", tmp_path / "v.avi")
+    assert files(tmp_path) == {"p.json"}
 
 
 def test_folders_in_image_names_are_kept(model: Path, tmp_path: Path) -> None:

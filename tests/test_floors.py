@@ -15,23 +15,25 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # A module imports modules of lower floors only.
 FLOORS = """
-    capture_world compare_table errors flops harmonics interrupt morton runtime schema
+    capture_world compare_table errors flops harmonics interrupt morton runtime schema viewer_queue \
+    viewer_settings
     arithmetic atomic budget_rules camera device json_fields metrics optim_reference plan ply_header presets \
     profiles rotations run_log schedules signatures validity
     binaries cameras_json checkpoint colmap_files frontier_data html_report images launches noise optim_lazy \
-    ply_body ply_compact shapes
-    camera_path capture chart_style colmap frontier_tables opacities ply program sghmc skew_map
-    adc charts config densify frontier_charts kernels point_cloud posed regularisers splats
-    blocks buffers complexity convert model_folder paths_around rate_limits strategy systems transforms
-    budget_state gradients limits optim_rules optim_waiting scene sort
+    paths_between ply_body ply_compact shapes video viewer_camera
+    camera_path capture chart_style colmap frontier_tables opacities ply program sghmc skew_map viewer_start
+    adc charts config densify frontier_charts kernels point_cloud posed regularisers splats viewer_recording
+    blocks buffers complexity convert model_folder paths_around rate_limits splat_file strategy systems transforms
+    budget_state gradients limits nearest optim_rules optim_waiting placing scene sort
     binning initialise optim_fused optim_host stages synthetic validation view_sampler
     optim pipeline
     loss memory pairs truths tuning
     render
     display evaluate needs
-    prune trainer
-    bench compare shrink training
-    budget frontier
+    prune trainer viewer_source
+    bench compare shrink training viewer
+    budget frontier viewer_page viewer_training
+    viewer_server
 """
 FLOOR = {name: level for level, line in enumerate(FLOORS.split("\n")) for name in line.split()}
 
@@ -41,6 +43,9 @@ OWNERS = {
     "pycolmap": {"colmap"},
     "PIL": {"images"},
     "matplotlib": {"chart_style"},
+    "viser": {"viewer_page", "viewer_server"},
+    "imageio": {"video"},
+    "imageio_ffmpeg": {"video"},
     "click": set(),  # the command line's
 }
 
