@@ -33,7 +33,6 @@ _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1, 1.3)), (0, (6, 1.3, 1, 1
 _LEGEND_COLUMNS = 4
 # Of a label beside its point: across in 6 points, up in 8. Above a front and to its left there is nothing.
 _SPOTS = ((-1.0, 0.7), (0.0, 1.2), (-1.0, 0.0), (1.0, -0.7), (1.0, 0.7), (1.0, 0.0), (0.0, -1.2), (-1.0, -0.7))
-_FAR_SPOTS = ((-1.0, 1.7), (1.0, 1.7), (-1.0, -1.7), (1.0, -1.7), (0.0, 2.2), (0.0, -2.2))
 _STYLE = {
     "figure.dpi": 100, "savefig.dpi": 200, "font.size": 9, "axes.titlesize": 10, "axes.labelsize": 9,
     "legend.fontsize": 8.5, "xtick.labelsize": 8.5, "ytick.labelsize": 8.5, "font.family": "DejaVu Sans",
@@ -169,21 +168,19 @@ def legend_rows(entries: int) -> int:
     return -(-entries // _LEGEND_COLUMNS)
 
 
-def place_labels(figure: Any, labels: Sequence[tuple[Any, Sequence[Label]]], *, every: bool = False,
-                 size: float = 7.5) -> None:
-    """Write beside points where no curve, point or other label is.
+def place_labels(figure: Any, labels: Sequence[tuple[Any, Sequence[Label]]], *, size: float = 7.5) -> None:
+    """Write beside points where no curve, point or other label is; without room for it a label is left out.
 
     Call it last: the layout is settled by it.
 
     Parameters
     ----------
     labels : axes and the labels on them, the most important first.
-    every : write those for which there is no room as well, where they hide least.
     size : of the letters, points.
     """
     _settle(figure)
     for axes, points in labels:
-        _place(axes, points, every, size, figure.dpi / 72)
+        _place(axes, points, size, figure.dpi / 72)
 
 
 def _settle(figure: Any) -> None:
@@ -193,7 +190,7 @@ def _settle(figure: Any) -> None:
         figure.set_layout_engine("none")
 
 
-def _place(axes: Any, points: Sequence[Label], every: bool, size: float, dot: float) -> None:
+def _place(axes: Any, points: Sequence[Label], size: float, dot: float) -> None:
     """The labels of one panel; `dot` is a point's pixels."""
     box, near = axes.bbox, 3 * dot
     marked = [line for line in axes.lines if line.get_marker() not in ("None", "", None)]
@@ -201,21 +198,16 @@ def _place(axes: Any, points: Sequence[Label], every: bool, size: float, dot: fl
     for x, y, text, colour in points:
         at_x, at_y = axes.transData.transform((x, y))
         width, height = 0.62 * size * len(text) * dot, 1.05 * size * dot
-        best: tuple[int, Box, tuple[float, float]] | None = None
-        for across, up in _SPOTS + _FAR_SPOTS * every:
+        for across, up in _SPOTS:
             left = at_x + across * 6 * dot - width * (1 - min(max(across, -1), 1)) / 2
             bottom = at_y + up * 8 * dot - height / 2
             spot = (left, bottom, left + width, bottom + height)
-            if not (box.x0 <= left and spot[2] <= box.x1 and box.y0 <= bottom and spot[3] <= box.y1):
-                continue
-            hidden = sum(_overlap(spot, other) for other in taken)
-            if best is None or hidden < best[0]:
-                best = hidden, spot, (across, up)
-        if best is not None and (every or not best[0]):
-            _, _, (across, up) = best
-            axes.annotate(text, (x, y), (across * 6, up * 8), textcoords="offset points", color=colour, va="center",
-                          ha="center" if abs(across) < 1 else "left" if across > 0 else "right", fontsize=size)
-            taken.append(best[1])
+            inside = box.x0 <= left and spot[2] <= box.x1 and box.y0 <= bottom and spot[3] <= box.y1
+            if inside and not any(_overlap(spot, other) for other in taken):
+                axes.annotate(text, (x, y), (across * 6, up * 8), textcoords="offset points", color=colour, va="center",
+                              ha="center" if abs(across) < 1 else "left" if across > 0 else "right", fontsize=size)
+                taken.append(spot)
+                break
 
 
 def _pixels(line: Any, step: float) -> list[tuple[float, float]]:

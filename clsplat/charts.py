@@ -28,8 +28,8 @@ from .errors import InputError
 VERDICTS = {"survives": ("#bfe3d8", INK), "stops": ("#c3d9ef", INK), "loses": ("#f6d98f", INK),
             "fails": ("#c2410c", "white"), "not run": ("#f2f2f2", "#666666")}
 
-_ARITHMETIC = (("image_error", "raster_ms", "image", "rendering"),
-               ("gradient_error", "raster_vjp_ms", "gradient", "its gradient"))
+_ARITHMETIC = (("image_error", "raster", "image", "rendering"),
+               ("gradient_error", "raster_vjp", "gradient", "its gradient"))
 
 
 def growth_chart(records: Sequence[Mapping[str, Any]], knee: int | None, out: str | Path,
@@ -187,38 +187,34 @@ def arithmetic_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list
 
     Parameters
     ----------
-    rows : each with "variant", "kind" (such as "Phi" or "cutoff"), "shape", "image_error" and "gradient_error"
-        (against float64; relative), "raster_ms" and "raster_vjp_ms" [ms]. Times are relative to the row of the same
-        shape that has the variant "default", else to its first.
+    rows : of `frontier_data.arithmetic_rows`; those without an error have no place here.
     out : path without a suffix.
 
     Raises
     ------
     InputError : no rows. OutputError : no matplotlib, or not writable.
     """
+    rows = [row for row in rows if row["image_error"] is not None]
     if not rows:
         raise InputError(f"{out}: a chart of arithmetic needs variants")
-    base: dict[str, Mapping[str, Any]] = {}
-    for row in rows:
-        if row["variant"] == "default" or row["shape"] not in base:
-            base[row["shape"]] = row
+    shapes = list(dict.fromkeys(row["shape"] for row in rows))
     colours = {kind: category_colour(place) for place, kind in enumerate(dict.fromkeys(row["kind"] for row in rows))}
-    with drawing(out, WIDTH, 3.8 * len(base) + 0.8) as figure:
+    with drawing(out, WIDTH, 3.8 * len(shapes) + 0.8) as figure:
         labels: list[tuple[Any, list[Label]]] = []
-        for line, (shape, default) in zip(figure.subplots(len(base), 2, squeeze=False), base.items(), strict=True):
-            own = [row for row in rows if row["shape"] == shape]
+        for line, shape in zip(figure.subplots(len(shapes), 2, squeeze=False), shapes, strict=True):
             for axes, (error, time, what, task) in zip(line, _ARITHMETIC, strict=True):
-                # What is exact has no place on a logarithmic axis.
-                points = [(row[time] / default[time], row[error], row["variant"], colours[row["kind"]]) for row in own
-                          if row[error] > 0]
+                # What is exact has no place on a logarithmic axis. The far ones are named first: they differ most.
+                own = sorted((row for row in rows if row["shape"] == shape and row[error] > 0),
+                             key=lambda row: (row["variant"] != "default", -abs(row[time] - 1)))
+                points = [(row[time], row[error], row["variant"], colours[row["kind"]]) for row in own]
                 for x, y, _, colour in points:
                     axes.plot(x, y, marker="o", color=colour, markersize=6)
                 axes.axvline(1, color=INK, linewidth=0.8, zorder=0.5)
                 axes.set(yscale="log", title=shape, xlabel=f"time of {task}, relative to the default")
-                axes.set_ylabel(f"relative error of the {what}")
+                axes.set_ylabel(f"error of the {what}")
                 axes.margins(0.16)
                 labels.append((axes, points))
         system_legend(figure, {kind: {"color": colour, "marker": "o", "linestyle": "none"}
                                for kind, colour in colours.items()})
-        place_labels(figure, labels, every=True)
+        place_labels(figure, labels)
     return chart_paths(out)

@@ -13,8 +13,17 @@ from .compare import RUNS, Run, compare, parse_runs, run_key
 from .compare_table import HEAD, Record, cells, notes, summarise
 from .errors import InputError
 from .frontier_charts import equal_chart, size_chart, time_chart
-from .frontier_data import Row, auto_rows, curve_rows, equal_rows, point_rows, seed_rows, write_rows
-from .frontier_tables import NONE, Table, auto_table, equal_table, seed_table
+from .frontier_data import (
+    Row,
+    arithmetic_rows,
+    auto_rows,
+    curve_rows,
+    equal_rows,
+    point_rows,
+    seed_rows,
+    write_rows,
+)
+from .frontier_tables import NONE, Table, arithmetic_table, auto_table, equal_table, seed_table
 from .html_report import Section, write_page
 from .run_log import Progress
 from .scene import Scene
@@ -38,7 +47,11 @@ _TEXT = {
               "Test PSNR of runs that differ in the seed alone, their median, and beside them (diamonds) one seed "
               "trained again; = : the same splats, bit by bit. Spread: maximum less minimum."),
     "arithmetic": ("Arithmetic",
-                   "Errors against float64 on trained scenes, and time, relative to the default's."),
+                   "What forms of exp and Φ, half-precision colour, cutoffs, tiles and lanes cost and gain on trained "
+                   "scenes: errors against the double build with the same rule, of cutoffs against one without, beside "
+                   "the time relative to the default's; geometric means over the scenes. Where there is no room for a "
+                   "name, see the table. Normalisations are other models: their line is the PSNR that training with "
+                   "them ends at, against the default's."),
 }
 
 
@@ -105,7 +118,7 @@ def write_report(folder: str | Path, records: Sequence[Record], *, reference: st
     ----------
     records : of `compare` or `read_runs`; the first of equal runs counts.
     reference : system that the others' splats are counted against; None: the first that was swept.
-    arithmetic : rows of `charts.arithmetic_chart`.
+    arithmetic : records of `frontier_data.arithmetic_rows`.
 
     Returns
     -------
@@ -120,13 +133,13 @@ def write_report(folder: str | Path, records: Sequence[Record], *, reference: st
     folder, kept = Path(folder), distinct(records)
     points, seeds = point_rows(kept), seed_rows(kept)
     first = reference or next((point["system"] for point in points if not point["auto"]), "")
-    equal, auto = equal_rows(points, first), auto_rows(points)
+    equal, auto, forms = equal_rows(points, first), auto_rows(points), arithmetic_rows(arithmetic)
     parts: list[tuple[str, Sequence[Row], Callable[[Any, Path], list[Path]], Table]] = [
         ("size", points, size_chart, auto_table(auto)),
         ("equal", equal, lambda rows, out: equal_chart(rows, first, out), equal_table(equal, first)),
         ("time", curve_rows(kept), time_chart, NONE),
         ("seeds", seeds, seeds_chart, seed_table(seeds)),
-        ("arithmetic", arithmetic, arithmetic_chart, NONE)]
+        ("arithmetic", forms, arithmetic_chart, arithmetic_table(forms))]
     written: list[Path] = []
     sections = [_protocol(kept)]
     for name, rows, draw, (head, lines) in parts:

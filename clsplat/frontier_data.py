@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import math
+import statistics
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -142,6 +143,39 @@ def auto_rows(points: Sequence[Row]) -> list[Row]:
                 "bytes_ratio": best and own["bytes"] / best["bytes"],
                 "front": " ".join(cost for cost in COSTS if own[f"front_{cost}"])})
     return rows
+
+
+def arithmetic_rows(records: Sequence[Row]) -> list[Row]:
+    """Variants of the arithmetic, their errors and times over scenes.
+
+    Parameters
+    ----------
+    records : lines of benchmarks/arithmetic.py: "scene", "shape", "variant", "kind", "image_error", "gradient_error"
+        (None where a variant is another model), "psnr_change" [dB], "raster_ms", "raster_vjp_ms".
+
+    Returns
+    -------
+    For each shape and variant: "shape", "variant", "kind", "scenes" (how many), geometric means of the errors, and of
+    "raster" and "raster_vjp", the times over those of the variant "default" in the same scene; the mean "psnr_change".
+    """
+    base = {(row["scene"], row["shape"]): row for row in records if row["variant"] == "default"}
+    rows: list[Row] = []
+    for shape, variant in dict.fromkeys((row["shape"], row["variant"]) for row in records):
+        own = [row for row in records if (row["shape"], row["variant"]) == (shape, variant)]
+        timed = [row for row in own if row["image_error"] is not None and (row["scene"], shape) in base]
+        ratios = {name: _geometric([row[f"{name}_ms"] / base[row["scene"], shape][f"{name}_ms"] for row in timed])
+                  for name in ("raster", "raster_vjp")}
+        rows.append({"shape": shape, "variant": variant, "kind": own[0]["kind"], "scenes": len(own)}
+                    | {name: _geometric([row[name] for row in timed]) for name in ("image_error", "gradient_error")}
+                    | ratios | {"psnr_change": statistics.fmean(row["psnr_change"] for row in own)})
+    return rows
+
+
+def _geometric(values: Sequence[float]) -> float | None:
+    """The geometric mean, 0 if any is, None of none."""
+    if not values:
+        return None
+    return statistics.geometric_mean(values) if min(values) > 0 else 0.0
 
 
 def splats_needed(curve: Sequence[tuple[float, float]], psnr: float) -> float | None:

@@ -56,6 +56,18 @@ def seed_table(rows: Sequence[Row]) -> Table:
     return head, lines
 
 
+def arithmetic_table(rows: Sequence[Row]) -> Table:
+    """Variants of the arithmetic. rows : of `frontier_data.arithmetic_rows`."""
+    head = ("shape", "variant", "scenes", "image error", "gradient error", "render time of default",
+            "gradient time of default", "PSNR change [dB]")
+    lines: list[tuple[str, ...]] = []
+    for row in rows:
+        errors = ("" if row[name] is None else f"{row[name]:.1e}" for name in ("image_error", "gradient_error"))
+        times = ("" if row[name] is None else f"{row[name]:.2f}" for name in ("raster", "raster_vjp"))
+        lines.append((row["shape"], row["variant"], str(row["scenes"]), *errors, *times, f"{row['psnr_change']:+.3f}"))
+    return head, lines
+
+
 def repeated(rows: Sequence[Row]) -> list[Row]:
     """Of one system's rows those of the seed that was trained more than once."""
     seeds = {row["seed"] for row in rows if row["repeat"]}

@@ -14,7 +14,8 @@ from clsplat.chart_style import _STYLE, chart_paths, drawing, looks, place_label
 from clsplat.charts import VERDICTS, arithmetic_chart, growth_chart, heat_map, seeds_chart
 from clsplat.errors import InputError, OutputError
 from clsplat.frontier_charts import equal_chart, size_chart, time_chart
-from clsplat.frontier_data import curve_rows, equal_rows, point_rows, seed_rows
+from clsplat.frontier_data import arithmetic_rows, curve_rows, equal_rows, point_rows, seed_rows
+from clsplat.frontier_tables import arithmetic_table
 from clsplat.shapes import SHAPES
 
 CURVE: list[dict[str, Any]] = [{"splats": 4000, "psnr": 21.5}, {"splats": 1000, "psnr": 18.0},
@@ -150,19 +151,28 @@ def test_seeds_chart(tmp_path: Path, drawn: list[Any]) -> None:
 
 
 def test_arithmetic_chart(tmp_path: Path, drawn: list[Any]) -> None:
-    rows = [{"variant": variant, "kind": kind, "shape": shape, "image_error": error, "gradient_error": 10 * error,
-             "raster_ms": ms, "raster_vjp_ms": 3 * ms, "psnr_change": 0.0}
-            for shape, ms in (("gaussian", 5.0), ("skew-normal", 8.0))
-            for variant, kind, error, ms in (("erfc", "Phi", 1e-7, 2 * ms), ("default", "default", 1e-6, ms),
-                                             ("double", "exact", 0.0, 4 * ms))]
+    records = [{"scene": scene, "variant": variant, "kind": kind, "shape": shape, "image_error": error * worse,
+                "gradient_error": 10 * error * worse, "raster_ms": ms * slow, "raster_vjp_ms": 3 * ms * slow,
+                "psnr_change": -0.1 * worse}
+               for scene, slow, worse in (("near", 1.0, 0.5), ("far", 7.0, 2.0))
+               for shape, ms in (("gaussian", 5.0), ("skew-normal", 8.0))
+               for variant, kind, error, ms in (("erfc", "Phi", 1e-7, 2 * ms), ("default", "default", 1e-6, ms),
+                                                ("double", "exact", 0.0, 4 * ms))]
+    models = [{"scene": "near", "shape": "skew-normal", "variant": "normalisation pdf", "kind": "normalisation",
+               "image_error": None, "gradient_error": None, "psnr_change": 0.25}]
+    rows = arithmetic_rows([*records, *models])
     arithmetic_chart(rows, tmp_path / "arithmetic")
     assert [axes.get_title() for axes in drawn[0].axes] == ["gaussian", "gaussian", "skew-normal", "skew-normal"]
     for axes, scale in zip(drawn[0].axes, (1, 10, 1, 10), strict=True):
         marked = [line for line in axes.lines if line.get_marker() != "None"]
-        assert [line.get_xdata()[0] for line in marked] == [2, 1], "relative to each shape's own default"
-        assert [line.get_ydata()[0] for line in marked] == [1e-7 * scale, 1e-6 * scale], "what is exact has no place"
-        assert sorted(words(axes)) == ["default", "erfc"], "every variant is named"
-    assert legend_of(drawn[0]) == ["Phi", "default", "exact"]
+        assert [line.get_xdata()[0] for line in marked] == pytest.approx([1, 2]), "of its own scene and shape's default"
+        assert [line.get_ydata()[0] for line in marked] == pytest.approx([1e-6 * scale, 1e-7 * scale])
+        assert sorted(words(axes)) == ["default", "erfc"], "every variant is named, what is exact has no place"
+    assert sorted(legend_of(drawn[0])) == ["Phi", "default", "exact"]
+    head, lines = arithmetic_table(rows)
+    assert {len(line) for line in lines} == {len(head)}
+    assert lines[0] == ("gaussian", "erfc", "2", "1.0e-07", "1.0e-06", "2.00", "2.00", "-0.125")
+    assert lines[-1] == ("skew-normal", "normalisation pdf", "1", "", "", "", "", "+0.250")
 
 
 def test_labels_keep_clear_of_points_and_of_each_other(tmp_path: Path) -> None:
@@ -177,8 +187,6 @@ def test_labels_keep_clear_of_points_and_of_each_other(tmp_path: Path) -> None:
         assert 0 < len(few) < len(points)
         assert not any(a.overlaps(b) for n, a in enumerate(boxes) for b in boxes[:n])
         assert not any(box.contains(*axes.transData.transform(place)) for box in boxes for place in places)
-        place_labels(figure, [(axes, points)], every=True)
-        assert len(axes.texts) == len(few) + len(points)
 
 
 def test_colours_are_told_apart() -> None:
