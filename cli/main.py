@@ -17,6 +17,7 @@ COMMANDS = {
     "devices": ("clsplat_cli.devices:devices", "List the OpenCL devices and try each."),
     "demo": ("clsplat_cli.demo:demo", "Make a small scene, train on it, render and measure: a first trial."),
     "train": ("clsplat_cli.train:train", "Learn a splat model of a scene."),
+    "view": ("clsplat_cli.view:view", "Walk through a model in the browser."),
     "render": ("clsplat_cli.render:render", "Render a model or any splat PLY."),
     "eval": ("clsplat_cli.evaluate:evaluate_models", "Measure models on the views they were not trained on."),
     "info": ("clsplat_cli.info:show_info", "Count a model's splats, skew, SH coefficients, parameters and bytes."),
@@ -24,6 +25,7 @@ COMMANDS = {
     "compare": ("clsplat_cli.compare:compare_systems", "Train published systems side by side and tabulate them."),
     "frontier": ("clsplat_cli.frontier:draw_frontier", "Sweep systems and caps, and chart quality against cost."),
     "bench": ("clsplat_cli.bench:bench", "Time the stages of training and rendering on this device."),
+    "blender-addon": ("clsplat_cli.blender_addon:build_addon", "Build the Blender add-on as a zip."),
     "convert": ("clsplat_cli.convert:convert_model", "Write a model as another shape, with the same images."),
 }
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it

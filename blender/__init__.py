@@ -1,0 +1,20 @@
+"""The Blender add-on: splats as objects, rendered by clsplat.
+
+`lens.py` and `pictures.py` know no `bpy`; everything that does is imported when Blender registers the add-on.
+"""
+
+from __future__ import annotations
+
+
+def register() -> None:
+    """Called by Blender when the add-on is enabled."""
+    from . import registry
+
+    registry.register()
+
+
+def unregister() -> None:
+    """Called by Blender when the add-on is disabled."""
+    from . import registry
+
+    registry.unregister()

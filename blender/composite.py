@@ -1,0 +1,125 @@
+"""Splats and Blender's own picture in one image: two scenes, and nodes that put the nearer over the farther."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from .engine import IDNAME
+from .errors import reported
+
+_SUFFIX = " splats"
+_NEW = bpy.app.version >= (5, 0, 0)  # the compositor's nodes are a group, and partly the shaders'
+
+
+def composite(scene: Any, engine: str) -> Any:
+    """Render `scene`'s meshes with `engine`, its splats with clsplat, and combine both pixel by pixel.
+
+    The splats are rendered in a second scene of the same objects and camera. Each pixel shows the nearer of the two
+    over the farther one, by depth and alpha; where splats lie before and behind a surface in one pixel, their mean
+    depth decides for all of them. Again after objects were added: the second scene is made anew.
+
+    Returns
+    -------
+    The second scene.
+    """
+    for layer in scene.view_layers:
+        layer.use_pass_z = True
+    before = bpy.data.scenes.get(scene.name + _SUFFIX)
+    if before is not None:
+        bpy.data.scenes.remove(before)
+    splats = scene.copy()
+    splats.name = scene.name + _SUFFIX
+    splats.render.engine = IDNAME
+    splats.render.film_transparent = True
+    _use_nodes(splats, None)
+    for layer in splats.view_layers:
+        layer.use_pass_z = True
+    scene.render.engine = engine
+    tree, sink = _tree(scene)
+    ours, theirs = _layers(tree, splats, 0), _layers(tree, scene, -300)
+    nearer = tree.nodes.new(_named("ShaderNodeMath", "CompositorNodeMath"))
+    nearer.operation, nearer.location = "LESS_THAN", (300, -300)
+    tree.links.new(ours.outputs["Depth"], nearer.inputs[0])
+    tree.links.new(theirs.outputs["Depth"], nearer.inputs[1])
+    before, behind = _over(tree, theirs, ours, 100), _over(tree, ours, theirs, -100)
+    mix = tree.nodes.new(_named("ShaderNodeMix", "CompositorNodeMixRGB"))
+    mix.location = (700, 0)
+    if mix.bl_idname == "ShaderNodeMix":
+        mix.data_type = "RGBA"
+        factor, first, second = mix.inputs["Factor"], *[
+            socket for socket in mix.inputs if socket.name in ("A", "B") and socket.type == "RGBA"]
+        result = next(socket for socket in mix.outputs if socket.type == "RGBA")
+    else:
+        factor, first, second, result = *mix.inputs[:3], mix.outputs[0]
+    for source, target in ((nearer.outputs[0], factor), (behind.outputs[0], first), (before.outputs[0], second),
+                           (result, sink)):
+        tree.links.new(source, target)
+    return splats
+
+
+def _use_nodes(scene: Any, tree: Any) -> None:
+    """Give the scene a compositing tree, or none."""
+    if _NEW:
+        scene.compositing_node_group = tree
+    else:
+        scene.use_nodes = tree is not None
+
+
+def _tree(scene: Any) -> tuple[Any, Any]:
+    """An empty compositing tree of the scene, and the socket that its image goes into."""
+    if _NEW:
+        tree = bpy.data.node_groups.new(f"{scene.name} clsplat", "CompositorNodeTree")
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        scene.compositing_node_group = tree
+        node = tree.nodes.new("NodeGroupOutput")
+    else:
+        scene.use_nodes = True
+        tree = scene.node_tree
+        tree.nodes.clear()
+        node = tree.nodes.new("CompositorNodeComposite")
+    node.location = (900, 0)
+    return tree, node.inputs["Image"]
+
+
+def _layers(tree: Any, scene: Any, height: int) -> Any:
+    node = tree.nodes.new("CompositorNodeRLayers")
+    node.scene, node.location = scene, (0, height)
+    return node
+
+
+def _over(tree: Any, background: Any, foreground: Any, height: int) -> Any:
+    """A node with one image over another."""
+    node = tree.nodes.new("CompositorNodeAlphaOver")
+    node.location = (300, height)
+    images = [socket for socket in node.inputs if socket.type == "RGBA"]
+    tree.links.new(background.outputs["Image"], images[0])
+    tree.links.new(foreground.outputs["Image"], images[1])
+    return node
+
+
+def _named(*kinds: str) -> str:
+    """The kind of node that this Blender has in its compositor."""
+    return kinds[0] if _NEW else kinds[1]
+
+
+class Composite(bpy.types.Operator):  # type: ignore[misc]
+    """Render meshes with one of Blender's engines, and put splats before and behind them by depth"""
+
+    bl_idname = "clsplat.composite"
+    bl_label = "Composite With Meshes"
+    bl_options = {"REGISTER", "UNDO"}
+
+    engine: bpy.props.EnumProperty(name="Engine", items=[  # type: ignore[valid-type]
+        ("CYCLES", "Cycles", "Path tracing"), ("BLENDER_EEVEE", "EEVEE", "Needs a graphics card"),
+        ("BLENDER_WORKBENCH", "Workbench", "Needs a graphics card")])
+
+    @reported
+    def execute(self, context: Any) -> set[str]:
+        splats = composite(context.scene, self.engine)
+        self.report({"INFO"}, f"the scene {splats.name} renders the splats, the compositor puts both together")
+        return {"FINISHED"}
+
+
+CLASSES = (Composite,)

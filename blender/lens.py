@@ -1,0 +1,146 @@
+"""Blender's camera values and clsplat's pinhole, exactly, either way. Knows no `bpy`.
+
+Blender measures a camera in the sensor's millimetres and in shares of one side of the image, the *fitted* one: the
+width for HORIZONTAL, the height for VERTICAL, for AUTO whichever shows more of the world. AUTO takes the sensor's width
+for either. With pixels of aspect a = pixel_aspect_y / pixel_aspect_x, in widths of a pixel the image is `width` by
+`a height`; so with `fitted` = width or a height
+
+    fx = lens / sensor * fitted        cx = width / 2 - shift_x fitted
+    fy = fx / a                        cy = height / 2 + shift_y fitted / a
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.camera import Camera
+from clsplat.camera_path import cam_from_world_of, pose_of
+from clsplat.errors import InputError
+
+SENSOR = 36.0  # Blender's own sensor width [mm]
+_KINDS = {"ORTHO": "orthographic", "PANO": "panoramic", "CUSTOM": "custom"}
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Values of a Blender camera, under Blender's names.
+
+    Attributes
+    ----------
+    lens, sensor_width, sensor_height : [mm]. sensor_fit : "AUTO", "HORIZONTAL" or "VERTICAL".
+    shift_x, shift_y : shares of the fitted side, right and up.
+    type : "PERSP" or another, which is refused.
+    """
+
+    lens: float = 50.0
+    sensor_width: float = SENSOR
+    sensor_height: float = 24.0
+    sensor_fit: str = "AUTO"
+    shift_x: float = 0.0
+    shift_y: float = 0.0
+    type: str = "PERSP"
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Size of the image [px] and aspect of its pixels, as in Blender's output settings.
+
+    Attributes
+    ----------
+    border : left, bottom, right, top as shares of the image, or None: the part that is to be seen.
+    """
+
+    width: int
+    height: int
+    pixel_aspect_x: float = 1.0
+    pixel_aspect_y: float = 1.0
+    border: tuple[float, float, float, float] | None = None
+
+    @staticmethod
+    def of_settings(resolution_x: int, resolution_y: int, percentage: int, pixel_aspect_x: float = 1.0,
+                    pixel_aspect_y: float = 1.0, border: tuple[float, float, float, float] | None = None) -> Raster:
+        """From Blender's settings; sizes are cut off to whole pixels, as Blender does."""
+        return Raster(max(1, resolution_x * percentage // 100), max(1, resolution_y * percentage // 100),
+                      pixel_aspect_x, pixel_aspect_y, border)
+
+    @property
+    def pixels(self) -> tuple[int, int, int, int]:
+        """Left, bottom, right and top of the part that is to be seen, from below [px]."""
+        if self.border is None:
+            return 0, 0, self.width, self.height
+        left, bottom, right, top = self.border
+        return int(left * self.width), int(bottom * self.height), int(right * self.width), int(top * self.height)
+
+
+def camera_of(lens: Lens, raster: Raster, matrix_world: ArrayLike, name: str = "camera") -> Camera:
+    """The pinhole of a Blender camera, for the whole image.
+
+    Parameters
+    ----------
+    matrix_world : (4, 4) camera to world, x right, y up, z back; its scale does not matter.
+    name : for messages.
+
+    Raises
+    ------
+    InputError : no perspective camera, or one with a sheared transform.
+    """
+    if lens.type != "PERSP":
+        raise InputError(f"{name} is {_KINDS.get(lens.type, lens.type)}: set its type to Perspective")
+    aspect = raster.pixel_aspect_y / raster.pixel_aspect_x
+    wide = raster.width * raster.pixel_aspect_x >= raster.height * raster.pixel_aspect_y
+    horizontal = wide if lens.sensor_fit == "AUTO" else lens.sensor_fit == "HORIZONTAL"
+    sensor = lens.sensor_height if lens.sensor_fit == "VERTICAL" else lens.sensor_width
+    fitted = raster.width if horizontal else aspect * raster.height
+    fx = lens.lens / sensor * fitted
+    cx = raster.width / 2 - lens.shift_x * fitted
+    cy = raster.height / 2 + lens.shift_y * fitted / aspect
+    pose = np.array(matrix_world, np.float64)
+    pose[:3, :3] /= np.maximum(np.linalg.norm(pose[:3, :3], axis=0), 1e-30)
+    try:
+        return Camera(raster.width, raster.height, fx, fx / aspect, cx, cy, cam_from_world_of(pose))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
+def camera_of_matrices(view: ArrayLike, projection: ArrayLike, width: int, height: int) -> Camera:
+    """The pinhole of a viewport: world to view (4, 4), and OpenGL's projection (4, 4).
+
+    Raises
+    ------
+    InputError : an orthographic projection.
+    """
+    lens, pose = np.array(projection, np.float64), np.array(view, np.float64)
+    if abs(lens[3, 2]) < 0.5:
+        raise InputError("the view is orthographic: press 5 on the number pad for perspective")
+    world = np.linalg.inv(pose)
+    world[:3, :3] /= np.linalg.norm(world[:3, :3], axis=0)
+    # Clip x = (P00 x + P02 z) / -z runs from -1 to 1 over the width, y likewise, upwards.
+    return Camera(width, height, lens[0, 0] * width / 2, lens[1, 1] * height / 2, (1 - lens[0, 2]) * width / 2,
+                  (1 + lens[1, 2]) * height / 2, cam_from_world_of(world))
+
+
+def lens_of(camera: Camera) -> tuple[Lens, tuple[float, float]]:
+    """Blender's values of a pinhole, fitted to the width, and the pixel aspects x and y (the smaller is 1)."""
+    aspect = camera.fx / camera.fy
+    if math.isclose(aspect, 1.0, rel_tol=1e-6):
+        aspect = 1.0
+    lens = Lens(camera.fx * SENSOR / camera.width, SENSOR, SENSOR * camera.height / camera.width, "HORIZONTAL",
+                0.5 - camera.cx / camera.width, (camera.cy - camera.height / 2) * aspect / camera.width)
+    return lens, (max(1.0, 1.0 / aspect), max(1.0, aspect))
+
+
+def matrix_world_of(camera: Camera) -> NDArray[np.float64]:
+    """Camera to world (4, 4) in Blender's axes."""
+    return pose_of(camera)
+
+
+def moved(camera: Camera, scale: float, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Camera:
+    """The camera that sees x as `camera` sees s R x + t; its depths are those of `camera` over s."""
+    pose = np.eye(4)
+    pose[:3, :3] = camera.rotation @ rotation
+    pose[:3, 3] = (camera.rotation @ translation + camera.translation) / scale
+    return camera.posed(pose)

@@ -1,0 +1,165 @@
+"""What Blender's render result is made of: splats of several objects in one image, in Blender's colours. No `bpy`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.placing import joined, placed, similarity
+from clsplat.render import Rendered, Renderer
+from clsplat.splats import Splats
+
+from .lens import moved
+
+Pixels = NDArray[np.float32]
+
+NOTHING = 1e10  # Blender's depth where nothing is
+_SEEN = 1 / 255  # alpha from which a pixel has a depth
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """An object of splats: its name, its PLY, and its (4, 4) matrix to world."""
+
+    name: str
+    ply: Path
+    matrix: NDArray[np.float64]
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Equal for the same file, unchanged, at the same place."""
+        status = self.ply.stat()
+        return (str(self.ply), status.st_mtime_ns, status.st_size, self.matrix.tobytes())
+
+
+class Studio:
+    """Renders objects of splats, and keeps what it has read and joined until it changes.
+
+    Parameters
+    ----------
+    device : as `clsplat.Renderer` takes it.
+    """
+
+    def __init__(self, device: str | None = None) -> None:
+        self.renderer = Renderer(device)
+        self._lock = Lock()  # Blender renders in a thread of its own while the viewport draws
+        self._files: dict[tuple[object, ...], Splats] = {}
+        self._joined: tuple[tuple[object, ...], Splats] | None = None
+        self._clipped: tuple[Splats, bytes, Splats] | None = None
+
+    def render(self, objects: Sequence[Placed], camera: Camera, clip: tuple[float, float] = (0.0, np.inf)) -> Rendered:
+        """The objects' splats before black; depths in world units.
+
+        One object is seen by a camera that is moved instead, which leaves its splats, and the image's bits, as
+        `clsplat render` has them.
+
+        Parameters
+        ----------
+        clip : nearest and farthest depth of a splat's centre that is shown [world units].
+
+        Raises
+        ------
+        InputError : a PLY that cannot be read, a transform that splats cannot follow, or shapes that do not mix; names
+            the object.
+        """
+        with self._lock:
+            return self._render(objects, camera, clip)
+
+    def _render(self, objects: Sequence[Placed], camera: Camera, clip: tuple[float, float]) -> Rendered:
+        objects = [item for item in objects if len(self._read(item))]
+        if not objects:
+            nothing = np.zeros((camera.height, camera.width), np.float32)
+            return Rendered(np.zeros((camera.height, camera.width, 3), np.float32), nothing, nothing)
+        if len(objects) > 1:
+            return self.renderer.render(self._between(self._together(objects), camera, clip), camera)
+        scale, rotation, translation = placement(objects[0])
+        camera = moved(camera, scale, rotation, translation)
+        near, far = clip[0] / scale, clip[1] / scale
+        image = self.renderer.render(self._between(self._read(objects[0]), camera, (near, far)), camera)
+        return Rendered(image.color, image.alpha, image.depth * np.float32(scale))
+
+    def _read(self, item: Placed) -> Splats:
+        try:
+            key = item.key[:3]
+        except OSError as error:
+            raise InputError(f"{item.name}: {item.ply}: {error.strerror}; choose its PLY again") from None
+        if key not in self._files:
+            self._files = {other: splats for other, splats in self._files.items() if other[0] != key[0]}
+            try:
+                self._files[key] = Splats.load(item.ply)
+            except InputError as error:
+                raise InputError(f"{item.name}: {error}") from None
+        return self._files[key]
+
+    def _together(self, objects: Sequence[Placed]) -> Splats:
+        key = tuple(item.key for item in objects)
+        if self._joined is None or self._joined[0] != key:
+            for item in objects:
+                placement(item)
+            self._joined = (key, joined([placed(self._read(item), item.matrix) for item in objects]))
+        return self._joined[1]
+
+    def _between(self, splats: Splats, camera: Camera, clip: tuple[float, float]) -> Splats:
+        """Those whose centres lie between the clip distances; the same object while they stay the same."""
+        depth = splats.mean @ camera.rotation[2].astype(np.float32) + np.float32(camera.translation[2])
+        inside = (depth >= clip[0]) & (depth <= clip[1])
+        if inside.all():
+            return splats
+        mask = inside.tobytes()
+        if self._clipped is None or self._clipped[0] is not splats or self._clipped[1] != mask:
+            self._clipped = (splats, mask, splats.select(inside))
+        return self._clipped[2]
+
+
+def placement(item: Placed) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """An object's scale, rotation and translation; raises InputError, naming it, for a transform that splats cannot
+    follow."""
+    try:
+        return similarity(item.matrix)
+    except InputError as error:
+        raise InputError(f"{item.name}: {error}") from None
+
+
+def to_linear(encoded: Pixels) -> Pixels:
+    """sRGB's curve undone (IEC 61966-2-1): display values to light."""
+    low, high = encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4
+    linear: Pixels = np.where(encoded <= 0.04045, low, high).astype(np.float32)
+    return linear
+
+
+def combined(image: Rendered, background: Sequence[float] | None, linear: bool = True) -> Pixels:
+    """Blender's Combined pass (H, W, 4): premultiplied, from the bottom row up.
+
+    Splats are learnt from photos, so their colours and their blending are those of display values. Blender's are
+    light; its Standard view turns them back into the same bytes.
+
+    Parameters
+    ----------
+    image : before black. background : display values of what lies behind; None: transparent.
+    linear : turn display values into light; not where Blender's view shows values as they are (Raw).
+    """
+    cover = np.clip(image.alpha, 0.0, 1.0)[..., None].astype(np.float32)
+    colour = image.color.astype(np.float32)
+    curve = to_linear if linear else np.asarray
+    if background is not None:
+        behind = (1 - image.alpha[..., None]) * np.asarray(background, np.float32)
+        pixels = [curve(colour + behind.astype(np.float32)), np.ones_like(cover)]
+    else:
+        straight = np.divide(colour, cover, out=np.zeros_like(colour), where=cover > 0)
+        pixels = [curve(straight) * cover, cover]
+    return np.ascontiguousarray(np.concatenate(pixels, axis=2)[::-1], np.float32)
+
+
+def depths(image: Rendered) -> Pixels:
+    """Blender's Depth pass (H, W): mean depth along the view axis, `NOTHING` where nothing is seen; from the bottom row
+    up."""
+    solid = image.alpha >= _SEEN
+    mean = np.divide(image.depth, image.alpha, out=np.full(image.depth.shape, NOTHING, image.depth.dtype), where=solid)
+    return np.ascontiguousarray(mean[::-1], np.float32)

@@ -1,0 +1,261 @@
+"""Runs in a Python with bpy: the add-on's scenes, one after the other; facts go to standard output as JSON.
+
+    python blender_child.py FOLDER      FOLDER holds model.ply, other.ply, cameras.json, camera_path.json, addon.zip
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(sys.argv[1])
+os.environ["BLENDER_USER_RESOURCES"] = str(FOLDER / "user")  # before bpy is loaded: nothing of the user's is touched
+
+import bpy  # noqa: E402, I001  # first: it brings the others
+import addon_utils  # noqa: E402
+import numpy as np  # noqa: E402
+from mathutils import Matrix, Vector  # noqa: E402
+
+ADDON = "bl_ext.user_default.clsplat"
+Facts = dict[str, Any]
+
+
+def scene() -> Any:
+    """A fresh file with the engine chosen and nothing in it."""
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    made = bpy.context.scene
+    made.render.engine = "CLSPLAT"
+    made.view_settings.view_transform = "Standard"
+    made.render.image_settings.file_format = "PNG"
+    made.render.film_transparent = False
+    made.render.dither_intensity = 0.0  # noise of one step, which Blender adds by default
+    return made
+
+
+def rendered(name: str, **extra: Any) -> str:
+    """The file of a frame, or the message of Blender's report area."""
+    file = FOLDER / f"{name}.png"
+    bpy.context.scene.render.filepath = str(file)
+    try:
+        bpy.ops.render.render(write_still=True, **extra)
+    except RuntimeError as error:
+        return str(error)
+    return str(file)
+
+
+def reported(operator: Callable[..., Any], **values: Any) -> str:
+    """An operator's message, or its result."""
+    try:
+        return str(operator(**values))
+    except RuntimeError as error:
+        return str(error)
+
+
+def splats(name: str = "model.ply", **values: Any) -> Any:
+    bpy.ops.clsplat.import_splats(filepath=str(FOLDER / name), **values)
+    return bpy.context.view_layer.objects.active
+
+
+def cameras() -> Any:
+    bpy.ops.clsplat.import_cameras(filepath=str(FOLDER / "cameras.json"))
+    return bpy.context.scene.camera
+
+
+# ---- the scenes ------------------------------------------------------------------------------
+
+
+def install() -> Facts:
+    start = time.perf_counter()
+    bpy.ops.extensions.package_install_files(filepath=str(FOLDER / "addon.zip"), repo="user_default",
+                                             enable_on_install=True)
+    return {"enabled": ADDON in bpy.context.preferences.addons, "seconds": time.perf_counter() - start}
+
+
+def imported() -> Facts:
+    scene()
+    item = splats()
+    mesh = item.data
+    colours = np.empty(4 * len(mesh.vertices), np.float32)
+    mesh.attributes["color"].data.foreach_get("color", colours)
+    thinned = splats(points=10)
+    return {"points": len(mesh.vertices), "attributes": sorted(mesh.attributes.keys()), "ply": item.clsplat_ply,
+            "rotation": list(item.rotation_euler), "first": list(mesh.vertices[0].co),
+            "colour": colours[:4].tolist(), "thinned": len(thinned.data.vertices)}
+
+
+def frames() -> Facts:
+    """Each camera of cameras.json, without and with a transform that the cameras share as children."""
+    made = scene()
+    item = splats()
+    cameras()
+    found = {}
+    for camera in [each for each in made.objects if each.type == "CAMERA"]:
+        made.camera = camera
+        found[camera.name] = rendered(f"plain_{camera.name}")
+    item.matrix_world = Matrix.Translation((3, -2, 1)) @ Matrix.Rotation(0.7, 4, (1, 2, 3)) @ Matrix.Scale(2.5, 4)
+    found["moved"] = rendered("moved")
+    item.matrix_world = Matrix.Identity(4)
+    made.clsplat_background = (0.2, 0.5, 1.0)
+    found["background"] = rendered("background")
+    made.render.film_transparent = True
+    found["transparent"] = rendered("transparent")
+    made.view_settings.view_transform = "Raw"
+    found["raw"] = rendered("raw")
+    made.view_settings.view_transform, made.render.film_transparent = "Standard", False
+    made.clsplat_background = (0.0, 0.0, 0.0)
+    made.render.use_border, made.render.border_min_x, made.render.border_max_x = True, 0.25, 0.75
+    made.render.border_min_y, made.render.border_max_y, made.render.use_crop_to_border = 0.5, 1.0, True
+    found["border"] = rendered("border")
+    made.render.use_crop_to_border = False
+    found["border_whole"] = rendered("border_whole")
+    return {"files": found}
+
+
+def together() -> Facts:
+    """Two objects, one of them turned, scaled and moved."""
+    scene()
+    splats(upright=False)
+    other = splats("other.ply", upright=False)
+    other.matrix_world = Matrix.Translation((0.3, 0.2, 0)) @ Matrix.Rotation(0.7, 4, (1, 2, 3)) @ Matrix.Scale(0.5, 4)
+    bpy.context.view_layer.update()
+    bpy.context.view_layer.objects.active = bpy.data.objects["model"]
+    cameras()
+    return {"file": rendered("together"), "matrix": [list(row) for row in other.matrix_world]}
+
+
+def animation() -> Facts:
+    made = scene()
+    splats()
+    bpy.ops.clsplat.import_cameras(filepath=str(FOLDER / "camera_path.json"))
+    made.render.filepath = str(FOLDER / "animation_")
+    bpy.ops.render.render(animation=True)
+    bpy.ops.clsplat.export_cameras(filepath=str(FOLDER / "exported_path.json"), content="PATH")
+    made.frame_set(made.frame_start)
+    bpy.ops.object.select_all(action="DESELECT")
+    bpy.ops.clsplat.export_cameras(filepath=str(FOLDER / "exported_cameras.json"), content="CAMERAS")
+    return {"frames": [made.frame_start, made.frame_end], "fps": made.render.fps / made.render.fps_base,
+            "files": sorted(str(path) for path in FOLDER.glob("animation_*.png"))}
+
+
+def projections() -> Facts:
+    """Points through Blender's own projection matrix, for lenses of all kinds."""
+    made, rng, cases = scene(), np.random.default_rng(0), []
+    data = bpy.data.cameras.new("c")
+    item = bpy.data.objects.new("c", data)
+    made.collection.objects.link(item)
+    made.camera = item
+    for fit in ("AUTO", "HORIZONTAL", "VERTICAL"):
+        for width, height in ((64, 48), (48, 64)):
+            for aspects in ((1.0, 1.0), (1.0, 1.7), (1.4, 1.0)):
+                data.sensor_fit = fit
+                data.lens, data.sensor_width, data.sensor_height = rng.uniform((20, 20, 15), (60, 40, 30)).tolist()
+                data.shift_x, data.shift_y = rng.uniform(-0.4, 0.4, 2).tolist()
+                data.clip_start = 0.3
+                item.matrix_world = (Matrix.Translation(rng.normal(size=3).tolist())
+                                     @ Matrix.Rotation(rng.uniform(0, 3), 4, Vector(rng.normal(size=3).tolist()))
+                                     @ Matrix.Scale(1.5, 4))
+                made.render.resolution_x, made.render.resolution_y = width * 2, height * 2
+                made.render.resolution_percentage = 50
+                made.render.pixel_aspect_x, made.render.pixel_aspect_y = aspects
+                bpy.context.view_layer.update()
+                matrix = item.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=width, y=height,
+                                                 scale_x=aspects[0], scale_y=aspects[1])
+                view = item.matrix_world.normalized().inverted()
+                cases.append({
+                    "lens": [data.lens, data.sensor_width, data.sensor_height, fit, data.shift_x, data.shift_y],
+                    "raster": [width, height, *aspects], "world": [list(row) for row in item.matrix_world],
+                    "view": [list(row) for row in view], "projection": [list(row) for row in matrix]})
+    return {"cases": cases}
+
+
+def faults() -> Facts:
+    made, told = scene(), {}
+    told["no camera"] = rendered("fault")
+    item = splats()
+    camera = cameras()
+    camera.data.type = "ORTHO"
+    told["orthographic"] = rendered("fault")
+    camera.data.type = "PANO"
+    told["panoramic"] = rendered("fault")
+    camera.data.type = "PERSP"
+    item.scale = (1, 1, 2)
+    told["stretched"] = rendered("fault")
+    item.scale = (1, 1, 1)
+    item.clsplat_ply = str(FOLDER / "gone.ply")
+    told["missing"] = rendered("fault")
+    item.clsplat_ply = str(FOLDER / "cameras.json")
+    told["no PLY"] = rendered("fault")
+    told["import"] = reported(bpy.ops.clsplat.import_splats, filepath=str(FOLDER / "cameras.json"))
+    told["cameras"] = reported(bpy.ops.clsplat.import_cameras, filepath=str(FOLDER / "model.ply"))
+    made.camera = None
+    told["export"] = reported(bpy.ops.clsplat.export_cameras, filepath=str(FOLDER / "x.json"), content="PATH")
+    bpy.data.objects.remove(item)
+    made.camera = camera
+    told["nothing"] = rendered("nothing")
+    return told
+
+
+def clipped() -> Facts:
+    made = scene()
+    splats()
+    camera = cameras()
+    camera.data.clip_end = 1e-3 + camera.data.clip_start
+    return {"file": rendered("clipped"), "engine": made.render.engine}
+
+
+def composited() -> Facts:
+    """A plane through the middle of the splats, square to the view, that covers the left half of the image."""
+    made = scene()
+    splats(upright=False)
+    camera = cameras()
+    made.render.engine = "CYCLES"
+    made.cycles.samples, made.cycles.device = 1, "CPU"
+    made.cycles.use_denoising = False
+    made.world = None
+    facing = camera.matrix_world
+    depth = json.loads((FOLDER / "facts.json").read_text())["depth"]
+    corners = [facing @ Vector((x, y, -depth)) for x, y in ((-9, -9), (0, -9), (0, 9), (-9, 9))]
+    mesh = bpy.data.meshes.new("plane")
+    mesh.from_pydata(corners, [], [(0, 1, 2, 3)])
+    plane = bpy.data.objects.new("plane", mesh)
+    made.collection.objects.link(plane)
+    material = bpy.data.materials.new("green")
+    if bpy.app.version < (5, 0, 0):
+        material.use_nodes = True
+    nodes = material.node_tree
+    nodes.nodes.clear()
+    emission, output = nodes.nodes.new("ShaderNodeEmission"), nodes.nodes.new("ShaderNodeOutputMaterial")
+    emission.inputs["Color"].default_value = (0, 1, 0, 1)
+    nodes.links.new(emission.outputs[0], output.inputs["Surface"])
+    mesh.materials.append(material)
+    told = reported(bpy.ops.clsplat.composite, engine="CYCLES")
+    return {"told": told, "file": rendered("composited"), "scenes": [each.name for each in bpy.data.scenes]}
+
+
+def gone() -> Facts:
+    addon_utils.disable(ADDON)
+    left = hasattr(bpy.types.Object, "clsplat_ply")
+    addon_utils.enable(ADDON)
+    return {"left": left, "again": hasattr(bpy.types.Object, "clsplat_ply")}
+
+
+def main() -> None:
+    facts: Facts = {"blender": bpy.app.version_string}
+    for case in (install, imported, frames, together, animation, projections, faults, clipped, composited, gone):
+        start = time.perf_counter()
+        try:
+            facts[case.__name__] = case()
+        except Exception:
+            facts[case.__name__] = {"failed": traceback.format_exc()}
+        facts[case.__name__]["took"] = time.perf_counter() - start
+    (FOLDER / "out.json").write_text(json.dumps(facts))
+
+
+if __name__ == "__main__":
+    main()
