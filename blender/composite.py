@@ -48,11 +48,11 @@ def composite(scene: Any, engine: str) -> Any:
     mix.location = (700, 0)
     if mix.bl_idname == "ShaderNodeMix":
         mix.data_type = "RGBA"
-        factor, first, second = mix.inputs["Factor"], *[
-            socket for socket in mix.inputs if socket.name in ("A", "B") and socket.type == "RGBA"]
+        factor = mix.inputs["Factor"]
+        first, second = (socket for socket in mix.inputs if socket.name in ("A", "B") and socket.type == "RGBA")
         result = next(socket for socket in mix.outputs if socket.type == "RGBA")
     else:
-        factor, first, second, result = *mix.inputs[:3], mix.outputs[0]
+        factor, first, second, result = mix.inputs[0], mix.inputs[1], mix.inputs[2], mix.outputs[0]
     for source, target in ((nearer.outputs[0], factor), (behind.outputs[0], first), (before.outputs[0], second),
                            (result, sink)):
         tree.links.new(source, target)

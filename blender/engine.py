@@ -57,7 +57,7 @@ def objects_of(depsgraph: Any) -> list[Placed]:
 
 def is_linear(scene: Any) -> bool:
     """Whether the view turns light into display values; Raw shows values as they are."""
-    return scene.view_settings.view_transform != "Raw"
+    return bool(scene.view_settings.view_transform != "Raw")
 
 
 class ClsplatRenderEngine(bpy.types.RenderEngine):  # type: ignore[misc]

@@ -116,7 +116,7 @@ def camera_of_matrices(view: ArrayLike, projection: ArrayLike, width: int, heigh
     lens, pose = np.array(projection, np.float64), np.array(view, np.float64)
     if abs(lens[3, 2]) < 0.5:
         raise InputError("the view is orthographic: press 5 on the number pad for perspective")
-    world = np.linalg.inv(pose)
+    world = np.asarray(np.linalg.inv(pose), np.float64)
     world[:3, :3] /= np.linalg.norm(world[:3, :3], axis=0)
     # Clip x = (P00 x + P02 z) / -z runs from -1 to 1 over the width, y likewise, upwards.
     return Camera(width, height, lens[0, 0] * width / 2, lens[1, 1] * height / 2, (1 - lens[0, 2]) * width / 2,

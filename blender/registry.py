@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
 
 from . import cameras, composite, engine, panels, splat_object
@@ -43,7 +45,7 @@ def unregister() -> None:
         bpy.utils.unregister_class(cls)
 
 
-def _suiting_panels() -> list[type]:
+def _suiting_panels() -> list[Any]:
     """Panels of output, camera and film that Blender shows for its simple engines."""
     return [panel for panel in bpy.types.Panel.__subclasses__()
             if "BLENDER_RENDER" in getattr(panel, "COMPAT_ENGINES", ()) and panel.__name__ not in _FOREIGN]

@@ -1,6 +1,9 @@
-"""Runs in a Python with bpy: the add-on's scenes, one after the other; facts go to standard output as JSON.
+"""Runs in a Python with bpy: the add-on's scenes, one after the other.
 
-    python blender_child.py FOLDER      FOLDER holds model.ply, other.ply, cameras.json, camera_path.json, addon.zip
+    python blender_child.py FOLDER [viewport]
+
+FOLDER holds model.ply, other.ply, cameras.json, camera_path.json and addon.zip; facts go to out.json, those of the
+viewport, which needs OpenGL, to viewport.json.
 """
 
 from __future__ import annotations
@@ -10,8 +13,9 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 FOLDER = Path(sys.argv[1])
@@ -245,17 +249,71 @@ def gone() -> Facts:
     return {"left": left, "again": hasattr(bpy.types.Object, "clsplat_ply")}
 
 
-def main() -> None:
+def viewport() -> Facts:
+    """The engine's own drawing, in Blender's offscreen buffer: still, moving, and of an orthographic view."""
+    import gpu
+
+    engine = sys.modules[f"{ADDON}.engine"]
+
+    class Drawing(engine.ClsplatRenderEngine):  # type: ignore[misc,name-defined]
+        bl_idname = "CLSPLAT_TEST"
+        bl_label = "viewport"
+        bl_use_gpu_context = True
+
+        def render(self, depsgraph: Any) -> None:
+            item = depsgraph.scene.camera
+            size = depsgraph.scene.render.resolution_x, depsgraph.scene.render.resolution_y
+            lens = item.calc_matrix_camera(depsgraph, x=size[0], y=size[1])
+            view = item.matrix_world.normalized().inverted()
+            data = SimpleNamespace(view_matrix=view, window_matrix=lens)
+            context = SimpleNamespace(region=SimpleNamespace(width=size[0], height=size[1]), region_data=data,
+                                      space_data=SimpleNamespace(clip_start=0.01, clip_end=100.0))
+            offscreen = gpu.types.GPUOffScreen(*size, format="RGBA32F")
+            across = Matrix(((2 / size[0], 0, 0, -1), (0, 2 / size[1], 0, -1), (0, 0, 1, 0), (0, 0, 0, 1)))
+            shown = []
+            with offscreen.bind():
+                gpu.matrix.load_matrix(Matrix.Identity(4))
+                gpu.matrix.load_projection_matrix(across)
+                buffer = gpu.state.active_framebuffer_get()
+                for index in range(4):
+                    if index == 2:  # one step to the side on a machine so slow that it must be coarse
+                        data.view_matrix = Matrix.Translation((0.1, 0, 0)) @ view
+                        self._speed = 1.0
+                    buffer.clear(color=(0, 0, 0, 0))
+                    self.view_draw(context, depsgraph)
+                    pixels = buffer.read_color(0, 0, *size, 4, 0, "FLOAT")
+                    pixels.dimensions = 4 * size[0] * size[1]
+                    shown.append(np.array(pixels, np.float32).reshape(size[1], size[0], 4)[::-1])
+                data.window_matrix = Matrix.OrthoProjection("XY", 4)
+                self.view_draw(context, depsgraph)
+            np.save(FOLDER / "viewport.npy", shown)
+
+    made = scene()
+    splats()
+    cameras()
+    bpy.utils.register_class(Drawing)
+    made.render.engine = "CLSPLAT_TEST"
+    bpy.ops.render.render()
+    return {"drawn": (FOLDER / "viewport.npy").is_file()}
+
+
+CASES = (install, imported, frames, together, animation, projections, faults, clipped, composited, gone)
+
+
+def main(cases: Sequence[Callable[[], Facts]], file: str) -> None:
     facts: Facts = {"blender": bpy.app.version_string}
-    for case in (install, imported, frames, together, animation, projections, faults, clipped, composited, gone):
+    for case in cases:
         start = time.perf_counter()
         try:
             facts[case.__name__] = case()
         except Exception:
             facts[case.__name__] = {"failed": traceback.format_exc()}
         facts[case.__name__]["took"] = time.perf_counter() - start
-    (FOLDER / "out.json").write_text(json.dumps(facts))
+    (FOLDER / file).write_text(json.dumps(facts))
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[2:] == ["viewport"]:
+        main((install, viewport), "viewport.json")
+    else:
+        main(CASES, "out.json")

@@ -240,14 +240,18 @@ def blender(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
     write_path(folder / "camera_path.json", CameraPath(tuple(interpolate(cameras, 4)), 12.5))
     (folder / "addon.zip").write_bytes(addon_zip([]))
     (folder / "facts.json").write_text(json.dumps({"depth": plane_depth(cameras[0])}))
-    done = subprocess.run([python, CHILD, folder], check=False, capture_output=True, text=True, timeout=300,
-                          env=os.environ | {"CLSPLAT_BUILD_OPTIONS": ""})
+    done = child(python, folder)
     assert (folder / "out.json").exists(), done.stdout + done.stderr
     facts = json.loads((folder / "out.json").read_text())
     for name, fact in facts.items():
         assert "failed" not in fact, f"{name}: {fact['failed']}"
     assert "Traceback" not in done.stderr, done.stderr
     return folder, facts
+
+
+def child(python: str, folder: Path, *cases: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([python, CHILD, folder, *cases], check=False, capture_output=True, text=True, timeout=300,
+                          env=os.environ | {"CLSPLAT_BUILD_OPTIONS": ""})
 
 
 def picture(path: Path | str) -> np.ndarray:
@@ -386,3 +390,27 @@ def test_meshes_and_splats_hide_each_other(blender: tuple[Path, dict[str, Any]])
     assert green[:, 1].min() > 240
     assert green[:, [0, 2]].max() < 20
     assert np.abs(got - plain)[:, half + 1 :][opaque[:, half + 1 :]].max() <= 6
+
+
+def test_the_viewport_shows_the_splats_coarsely_while_moving_then_in_full(blender: tuple[Path, dict[str, Any]]) -> None:
+    """The engine's own drawing into Blender's offscreen buffer, read back: light, in 16-bit reals, which Blender
+    turns into display values when the region is done."""
+    folder, _ = blender
+    done = child(blenders_python() or "", folder, "viewport")
+    if not (folder / "viewport.json").exists():
+        pytest.skip(f"Blender has no OpenGL here: {done.stderr.strip().splitlines()[-1:]}")
+    fact = json.loads((folder / "viewport.json").read_text())["viewport"]
+    assert fact.get("drawn"), fact
+    assert "Traceback" not in done.stdout + done.stderr, done.stderr
+    first, again, moving, settled = np.load(folder / "viewport.npy")
+    camera = read_cameras(folder / "cameras.json")[0].camera
+    for drawn, seen in ((first, camera), (again, camera), (settled, aside(camera, 0.1))):
+        assert np.abs(255 * encoded(drawn[..., :3]) - expected(some_splats(), seen)).max() <= 2
+    assert np.ptp(moving[..., :3], axis=(0, 1)).max() == 0  # a single pixel over the whole region
+
+
+def aside(camera: Camera, step: float) -> Camera:
+    """The camera, seeing everything a step further to the right."""
+    pose = camera.cam_from_world.copy()
+    pose[0, 3] += step
+    return camera.posed(pose)
