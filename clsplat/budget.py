@@ -6,8 +6,9 @@ Everything is decided on validation views, held out of the training set (validat
               tolerance; the knee is the smallest cap within half of it of the best. Where a smaller cap is within the
               standard error (over views) of the best, too, a whole run of each decides
     rounds    from a whole run at the knee, rounds that remove a quarter of the splats and train the others on
-              (shrink.py), until two have a PSNR that is lower by a quarter of the tolerance than the best so far, which
-              most often is not the first; the fewest splats that have not are taken, and trained on at lower rates
+              (shrink.py), until two have a PSNR lower than the best so far, which most often is not the first, by more
+              than a quarter of the tolerance and what the knee has left of its half; the fewest splats that have not
+              are taken, and trained on at lower rates
     parts     of that model, the fields and bands that the last quarter allows (prune.py)
     refit     the same with all training views: the run at the knee, as many rounds, the thresholds found before
 
@@ -188,7 +189,9 @@ class _Search:
         values, goal = self.state.values, self.options
         if "rounds" not in values:
             self.state.save("held_out_0", self.state.model(f"whole_{values['knee']}"))
-            self.state.put("rounds", [row for row in values["whole"] if row["cap"] == values["knee"]])
+            knee = next(row for row in values["whole"] if row["cap"] == values["knee"])
+            best = max(row["psnr"] for row in values["whole"])
+            self.state.put("rounds", [knee | {"lost": best - knee["psnr"]}])
         rows: list[Row] = values["rounds"]
         while not rounds_are_over(rows, goal):
             start = time.perf_counter()

@@ -15,7 +15,8 @@ FIRST_CAP = 1000
 PATIENCE = 2  # doublings that may gain too little before growth stops, and rounds that may lose too much
 FEWEST = 50  # splats: no round goes below
 
-# A model: "splats", "psnr"; "cap" (growth, whole runs), "views" (growth), "fitted_psnr" (where bytes are limited).
+# A model: "splats", "psnr"; "cap" (growth, whole runs), "views" (growth), "fitted_psnr" (where bytes are limited);
+# "lost" (the first of the rounds): how much lower its PSNR is than that of the best whole run.
 Row = dict[str, Any]
 
 
@@ -101,10 +102,15 @@ def meets(row: Row, rows: list[Row], options: BudgetOptions) -> bool | None:
     """Whether a model of the rounds is good enough beside the others; None: not yet small enough."""
     floor = options.target_psnr
     if floor is None:
-        floor = max(other["psnr"] for other in rows) - ROUNDS_SHARE * options.tolerance
+        floor = max(other["psnr"] for other in rows) - rounds_allowed(rows, options)
     if options.max_bytes is not None and row["fitted_psnr"] is None:
         return None
     return bool(row["psnr"] >= floor)
+
+
+def rounds_allowed(rows: list[Row], options: BudgetOptions) -> float:
+    """PSNR that rounds may lose [dB]: their share of the tolerance, and what the knee has left of its own."""
+    return (KNEE_SHARE + ROUNDS_SHARE) * options.tolerance - float(rows[0].get("lost", KNEE_SHARE * options.tolerance))
 
 
 def chosen_of(rows: list[Row], options: BudgetOptions) -> int:
@@ -113,7 +119,7 @@ def chosen_of(rows: list[Row], options: BudgetOptions) -> int:
         fitting = [row["fitted_psnr"] for row in rows if row["fitted_psnr"] is not None]
         if not fitting:
             return len(rows) - 1
-        floor = max(fitting) - ROUNDS_SHARE * options.tolerance
+        floor = max(fitting) - rounds_allowed(rows, options)
         if options.target_psnr is not None:
             floor = min(options.target_psnr, max(fitting))
         return max(i for i, row in enumerate(rows) if row["fitted_psnr"] is not None and row["fitted_psnr"] >= floor)

@@ -20,6 +20,7 @@ from clsplat.budget_rules import (
     growth_is_over,
     knee_of,
     meets,
+    rounds_allowed,
     rounds_are_over,
     standard_error,
 )
@@ -90,6 +91,10 @@ def test_the_fewest_splats_that_are_good_enough() -> None:
     assert [meets(row, shrinking, AUTO) for row in shrinking] == [False, True, False, False, False]
     assert chosen_of(shrinking, AUTO) == 1, "the best seen counts, not the first"
     assert chosen_of(shrinking, BudgetOptions(1.0)) == 3
+    knee = [shrinking[0] | {"lost": 0.0}, *shrinking[1:]]
+    assert rounds_allowed(shrinking, AUTO) == pytest.approx(0.025)
+    assert rounds_allowed(knee, AUTO) == pytest.approx(0.075), "the knee has left its half"
+    assert chosen_of(knee, BudgetOptions(0.3)) > chosen_of(shrinking, BudgetOptions(0.3))
     assert chosen_of(shrinking, BudgetOptions(target_psnr=30.15)) == 1
     assert chosen_of(shrinking, BudgetOptions(target_psnr=40)) == 1, "out of reach: the best"
     limited = rows(30.0, 30.2, 30.1, 29.96, 29.8)
