@@ -18,7 +18,8 @@ def composite(scene: Any, engine: str) -> Any:
 
     The splats are rendered in a second scene of the same objects and camera. Each pixel shows the nearer of the two
     over the farther one, by depth and alpha; where splats lie before and behind a surface in one pixel, their mean
-    depth decides for all of them. Again after objects were added: the second scene is made anew.
+    depth decides for all of them. Both films become transparent, so that edges are smooth: the world still lights the
+    meshes, and is not seen. Again after objects were added: the second scene is made anew.
 
     Returns
     -------
@@ -32,7 +33,7 @@ def composite(scene: Any, engine: str) -> Any:
     splats = scene.copy()
     splats.name = scene.name + _SUFFIX
     splats.render.engine = IDNAME
-    splats.render.film_transparent = True
+    splats.render.film_transparent = scene.render.film_transparent = True
     _use_nodes(splats, None)
     for layer in splats.view_layers:
         layer.use_pass_z = True
