@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+import numpy as np
 
 from clsplat.camera_path import DEFAULT_FPS, write_path
 from clsplat.cameras_json import NamedCamera, bare_name, img_names, read_cameras, write_cameras
@@ -35,6 +36,7 @@ from .progress import counted
 if TYPE_CHECKING:
     from clsplat.render import Renderer
 
+_QUARTILES = (0.25, 0.75)  # of their ranges' near and far ends
 _SAMPLES = 12  # frames that the range of depths is taken from, at a quarter of the size
 
 
@@ -177,7 +179,8 @@ def _depths_seen(renderer: Renderer, model: LoadedModel, views: Sequence[NamedCa
         camera = view.camera
         small = camera.resized(max(1, camera.width // 4), max(1, camera.height // 4))
         ranges.append(depth_range(renderer.render(model.splats, small)))
-    return min(near for near, _ in ranges), max(far for _, far in ranges)
+    near, far = np.quantile(ranges, _QUARTILES, axis=0).diagonal()  # a frame inside a wall does not stretch it
+    return float(near), float(far)
 
 
 def _resized(views: list[NamedCamera], size: tuple[int, int] | None) -> list[NamedCamera]:
