@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -25,11 +26,14 @@ from .options import (
     split_options,
 )
 from .progress import TrainingDisplay, duration
+from .view import server_options
 
 if TYPE_CHECKING:
     from clsplat.evaluate import Evaluation
     from clsplat.scene import Scene
     from clsplat.training import Model
+
+    from .live import LiveView
 
 SCENE_KEYS = ("images", "resolution", "test_every", "test_list", "eval")
 INTERRUPTED = 130
@@ -48,11 +52,14 @@ INTERRUPTED = 130
 @quiet_option
 @click.option("--preset", type=click.Choice(list(PRESETS)),
               help="A published system: kernel, optimizer, strategy and constants; other options replace constants.")
+@click.option("--view", is_flag=True, help="Show the run in the browser while it trains.")
+@server_options
 @budget_options
 @config_options()
 @click.pass_context
 def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, model_path: Path | None,
-          resume: bool, overwrite: bool, quiet: bool, preset: str | None, **values: Any) -> None:
+          resume: bool, overwrite: bool, quiet: bool, preset: str | None, view: bool, port: int, host: str,
+          **values: Any) -> None:
     """Learn a splat model of SCENE, a folder with photos in images/ and a COLMAP model in sparse/, or with
     transforms.json or transforms_train.json (NeRF's Blender sets, instant-ngp, nerfstudio).
 
@@ -66,6 +73,8 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
         raise click.UsageError(f"two scenes: {scene} and {source_path}")
     path = scene or source_path
     search = options_of(values)
+    if view and search is not None:
+        raise click.UsageError("--view shows one run: leave out --budget, or look at the result with clsplat view")
     options = config_values(ctx, values)
     if preset is not None:
         options = with_preset(preset, options)
@@ -93,10 +102,13 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
     config = TrainConfig(**options)
     loaded, record = read_scene(path, reading, config.background)
     if search is not None:
+        if view:
+            raise click.UsageError(f"{model_path} is a search of many runs: resume it without --view")
         run_search(ctx, loaded, config, search, model_path, record, resume, overwrite, quiet)
         return
-    forget_search(model_path)
-    model = run_training(loaded, config, model_path, record, resume, overwrite, quiet)
+    with _viewer(loaded, config, model_path, host, port, quiet) if view else nullcontext() as live:
+        forget_search(model_path)
+        model = run_training(loaded, config, model_path, record, resume, overwrite, quiet, live)
     if not model.finished:
         say_stopped(ctx, model)
     if not quiet:
@@ -121,13 +133,20 @@ def read_scene(path: Path, reading: dict[str, Any],
 
 
 def run_training(scene: Scene, config: TrainConfig, model_path: Path, record: dict[str, Any],
-                 resume: bool = False, overwrite: bool = False, quiet: bool = False) -> Model:
-    """Train with a live display."""
+                 resume: bool = False, overwrite: bool = False, quiet: bool = False,
+                 live: LiveView | None = None) -> Model:
+    """Train with a live display, and a page in the browser if `live` is given."""
     from clsplat.training import train as train_model
 
     with TrainingDisplay(quiet) as display:
-        return train_model(scene, config, display, output=model_path, resume=resume, overwrite=overwrite,
-                           extra=record)
+        return train_model(scene, config, live.told(display) if live else display, output=model_path, resume=resume,
+                           overwrite=overwrite, extra=record, visit=live.visit if live else None)
+
+
+def _viewer(scene: Scene, config: TrainConfig, model_path: Path, host: str, port: int, quiet: bool) -> LiveView:
+    from .live import LiveView
+
+    return LiveView(scene, config, model_path, host, port, quiet)
 
 
 def test_metrics(model: Model, scene: Scene) -> Evaluation | None:

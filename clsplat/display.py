@@ -111,7 +111,8 @@ def colour_map(values: Array) -> Picture:
 
 def to_bytes(values: Array) -> Picture:
     """Reals to bytes as PNG files have them: clipped to 0..1, rounded; NaN becomes 0."""
-    return np.rint(np.nan_to_num(np.clip(values, 0.0, 1.0), nan=0.0) * 255.0).astype(np.uint8)
+    rounded: Picture = np.rint(np.nan_to_num(np.clip(values, 0.0, 1.0), nan=0.0) * 255.0).astype(np.uint8)
+    return rounded
 
 
 def depth_range(image: Rendered) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -40,6 +41,8 @@ from .strategy import Moment, plan
 from .truths import Truths, truth_budget, truth_bytes
 from .tuning import schedule_for
 from .view_sampler import ViewSampler
+
+Visit = Callable[["Trainer", threading.Event], None]
 
 LOG_INTERVAL = 50  # iterations between lines of log.jsonl and calls of `progress`
 
@@ -127,8 +130,14 @@ class Trainer:
                                  checkpoint.queue if checkpoint else [])
         self._plan_schedules()
 
-    def run(self, folder: ModelFolder | None = None) -> Model:
-        """Train to the end, or to Ctrl-C; saves into `folder` on the way."""
+    def run(self, folder: ModelFolder | None = None, visit: Visit | None = None) -> Model:
+        """Train to the end, or to Ctrl-C; saves into `folder` on the way.
+
+        Parameters
+        ----------
+        visit : called after each iteration with this trainer and the event that ends the run; its time is none of
+            training's. It must leave the run as it is.
+        """
         config = self.config
         log = RunLog(None if folder is None else folder.log_path, self.iteration)
         started, since = time.perf_counter(), self.iteration
@@ -158,6 +167,10 @@ class Trainer:
                                                     and it % config.checkpoint_interval == 0)):
                     log.flush()
                     self.checkpoint().save(folder.checkpoint_path)
+                if visit is not None:
+                    start = time.perf_counter()
+                    visit(self, stop)
+                    started += time.perf_counter() - start
         if folder is not None and self.iteration < config.iterations:
             log.flush()
             self.checkpoint().save(folder.checkpoint_path)

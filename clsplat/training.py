@@ -13,14 +13,14 @@ from .errors import InputError, OutputError
 from .model_folder import ModelFolder
 from .run_log import Progress
 from .scene import Scene
-from .trainer import Model, Trainer
+from .trainer import Model, Trainer, Visit
 
 __all__ = ["Model", "Progress", "train"]
 
 
 def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[Progress], None] | None = None, *,
           output: str | Path | None = None, resume: bool = False, overwrite: bool = False,
-          extra: dict[str, Any] | None = None) -> Model:
+          extra: dict[str, Any] | None = None, visit: Visit | None = None) -> Model:
     """Learn a splat model of a scene's training views.
 
     Parameters
@@ -31,6 +31,7 @@ def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[P
         options such as `device`.
     overwrite : allow replacing a model in `output`.
     extra : more keys for config.json's "scene" (how it was read), beside its path and test views.
+    visit : see `Trainer.run`.
 
     Raises
     ------
@@ -56,7 +57,7 @@ def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[P
         views = [*scene.test, *scene.train]
         names = img_names([view.name for view in views])
         folder.write_cameras([NamedCamera(n, view.camera) for n, view in zip(names, views, strict=True)])
-    return trainer.run(folder)
+    return trainer.run(folder, visit)
 
 
 def _fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:

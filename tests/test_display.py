@@ -34,7 +34,7 @@ WIDTH, HEIGHT = 41, 27  # cuts tiles and blocks
 
 
 def model(shape: str = "skew-normal", n: int = 40) -> Splats:
-    return Splats(shape, for_shape(random_splats(3, n, 2, np.float32), shape))
+    return Splats(shape, for_shape(random_splats(3, n, 3, np.float32), shape))
 
 
 def camera() -> Camera:
@@ -44,7 +44,7 @@ def camera() -> Camera:
 def one_splat(**fields: object) -> Splats:
     """A large, nearly opaque splat two units before the camera of `facing`."""
     arrays = {"mean": [[0, 0, 2]], "quat": [[1, 0, 0, 0]], "log_scale": [[1, 1, -3]], "opacity_logit": [9.0],
-              "sh": np.zeros((1, 1, 3))} | fields
+              "sh": np.zeros((1, 16, 3))} | fields
     return Splats("skew-normal", {name: np.asarray(values, np.float32) for name, values in arrays.items()})
 
 
