@@ -27,7 +27,7 @@ class Preferences(bpy.types.AddonPreferences):  # type: ignore[misc]
             column = self.layout.column(align=True)
             column.alert = True
             column.label(text="clsplat is not installed in Blender's Python. In a terminal:", icon="ERROR")
-            column.label(text=f'"{sys.executable}" -m pip install clsplat')
+            column.label(text=f'"{sys.executable}" -m pip install FOLDER_OF_CLSPLAT')
             column.label(text="or build this add-on with its wheels: clsplat blender-addon --wheels DIR")
         else:
             self.layout.label(text=f"clsplat {clsplat.__version__}")

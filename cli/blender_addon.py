@@ -33,7 +33,7 @@ _PLATFORMS = {r"linux.*x86_64": "linux-x64", r"win_amd64": "windows-x64", r"win_
 def build_addon(output: Path, wheels: Path | None) -> None:
     """Build the Blender add-on as a zip: in Blender, Edit > Preferences > Get Extensions > Install from Disk.
 
-    The add-on needs clsplat in Blender's own Python: `PYTHON -m pip install clsplat` with the Python that the
+    The add-on needs clsplat in Blender's own Python: `PYTHON -m pip install FOLDER_OF_CLSPLAT` with the Python that the
     add-on's preferences name. Or put it into the zip: `pip wheel --wheel-dir DIR .` in clsplat's folder with a
     Python of Blender's version, then `clsplat blender-addon --wheels DIR`.
     """
