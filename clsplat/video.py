@@ -17,8 +17,9 @@ from .errors import InputError, OutputError
 SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv")
 _QUALITY = "18"  # x264's rate factor: hardly told from the frames
 # Colours by BT.709 and said so, as players otherwise guess by the size of the image.
-_OUTPUT = ["-crf", _QUALITY, "-vf", "scale=out_color_matrix=bt709:out_range=tv", "-colorspace", "bt709",
-           "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv", "-movflags", "+faststart"]
+_COLOURS = ("scale=out_color_matrix=bt709:out_range=tv,"
+            "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv")
+_OUTPUT = ["-crf", _QUALITY, "-vf", _COLOURS, "-movflags", "+faststart"]
 
 
 class VideoWriter:

@@ -8,6 +8,7 @@ viewport, which needs OpenGL, to viewport.json.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import sys
@@ -143,7 +144,13 @@ def animation() -> Facts:
     made.frame_set(made.frame_start)
     bpy.ops.object.select_all(action="DESELECT")
     bpy.ops.clsplat.export_cameras(filepath=str(FOLDER / "exported_cameras.json"), content="CAMERAS")
-    return {"frames": [made.frame_start, made.frame_end], "fps": made.render.fps / made.render.fps_base,
+    turns = []
+    for frame in range(made.frame_start, made.frame_end + 1):
+        made.frame_set(frame)
+        turns.append(made.camera.rotation_quaternion.copy())
+    nearest = min(first.dot(second) for first, second in itertools.pairwise(turns))
+    return {"frames": [made.frame_start, made.frame_end], "nearest": nearest,
+            "fps": made.render.fps / made.render.fps_base,
             "files": sorted(str(path) for path in FOLDER.glob("animation_*.png"))}
 
 

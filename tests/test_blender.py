@@ -237,7 +237,8 @@ def blender(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
     some_splats(1, "gaussian").save(folder / "other.ply")
     cameras = [facing(0.0), facing(1.2, 3.0, (7.0, -4.0)), facing(2.5, 5.0)]
     write_cameras(folder / "cameras.json", [NamedCamera(f"view_{n}", each) for n, each in enumerate(cameras)])
-    write_path(folder / "camera_path.json", CameraPath(tuple(interpolate(cameras, 4)), 12.5))
+    around = [facing(angle) for angle in (0.0, 2.0, 4.0)]
+    write_path(folder / "camera_path.json", CameraPath(tuple(interpolate(around, 4)), 12.5))
     (folder / "addon.zip").write_bytes(addon_zip([]))
     (folder / "facts.json").write_text(json.dumps({"depth": plane_depth(cameras[0])}))
     done = child(python, folder)
@@ -331,6 +332,7 @@ def test_paths_come_in_as_animations_and_go_out_again(blender: tuple[Path, dict[
     assert (fact["frames"], fact["fps"], len(fact["files"])) == ([1, 4], pytest.approx(12.5), 4)
     for file, camera in zip(fact["files"], path.cameras, strict=True):
         assert np.abs(picture(file)[..., :3] - expected(some_splats(), camera)).max() <= 1
+    assert fact["nearest"] > 0  # quaternions do not go the long way round between frames
     back = read_path(folder / "exported_path.json")
     assert back.fps == pytest.approx(12.5)
     for left, right in zip((*back.cameras, read_cameras(folder / "exported_cameras.json")[0].camera),
