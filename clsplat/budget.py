@@ -49,6 +49,7 @@ from .render import Renderer
 from .run_log import Progress
 from .scene import Scene
 from .shrink import SETTLING, fine_tune, without_messages, without_quarter
+from .sole_writer import sole_writer
 from .splats import Splats
 from .trainer import Trainer
 from .training import train
@@ -107,12 +108,13 @@ def train_budget(scene: Scene, config: TrainConfig | None = None, options: Budge
         state.check(config, options)
     elif (folder.is_used or state.path.exists()) and not overwrite:
         raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
-    else:
-        folder.prepare()
-        folder.clear()
-        record = {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names)}
-        state.begin(config, options, record | (extra or {}))
-    return _Search(scene, config, options, progress, state, folder, extra or {}).run()
+    folder.prepare()
+    with sole_writer(folder.path):
+        if not resume:
+            folder.clear()
+            record = {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names)}
+            state.begin(config, options, record | (extra or {}))
+        return _Search(scene, config, options, progress, state, folder, extra or {}).run()
 
 
 class _Search:

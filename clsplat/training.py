@@ -13,6 +13,7 @@ from .errors import InputError, OutputError
 from .model_folder import ModelFolder
 from .run_log import Progress
 from .scene import Scene
+from .sole_writer import sole_writer
 from .trainer import Model, Trainer, Visit
 
 __all__ = ["Model", "Progress", "train"]
@@ -36,8 +37,8 @@ def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[P
     Raises
     ------
     InputError : no training views, or a checkpoint that does not fit. OutputError : `output` holds a model and
-    neither resume nor overwrite is given, or cannot be written. DeviceError : not enough memory.
-    TrainingError : the loss is not finite; the last checkpoint is kept.
+    neither resume nor overwrite is given, another run writes into it, or it cannot be written. DeviceError : not enough
+    memory. TrainingError : the loss is not finite; the last checkpoint is kept.
     """
     config = config or TrainConfig()
     folder = None if output is None else ModelFolder(output)
@@ -48,16 +49,17 @@ def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[P
         elif folder.is_used and not overwrite:
             raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
         folder.prepare()
-    trainer = Trainer(scene, config, checkpoint, progress)
-    if folder is not None:
-        if checkpoint is None:
-            folder.clear()
-        record = {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names)}
-        folder.write_config({"config": config.to_json(), "scene": record | (extra or {})})
-        views = [*scene.test, *scene.train]
-        names = img_names([view.name for view in views])
-        folder.write_cameras([NamedCamera(n, view.camera) for n, view in zip(names, views, strict=True)])
-    return trainer.run(folder, visit)
+    with sole_writer(None if folder is None else folder.path):
+        trainer = Trainer(scene, config, checkpoint, progress)
+        if folder is not None:
+            if checkpoint is None:
+                folder.clear()
+            record = {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names)}
+            folder.write_config({"config": config.to_json(), "scene": record | (extra or {})})
+            views = [*scene.test, *scene.train]
+            names = img_names([view.name for view in views])
+            folder.write_cameras([NamedCamera(n, view.camera) for n, view in zip(names, views, strict=True)])
+        return trainer.run(folder, visit)
 
 
 def _fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:

@@ -18,7 +18,7 @@ FLOORS = """
     capture_world compare_table errors flops harmonics interrupt morton runtime schema viewer_queue \
     viewer_settings
     arithmetic atomic budget_rules camera device json_fields metrics optim_reference plan ply_header presets \
-    profiles rotations run_log schedules signatures validity
+    profiles rotations run_log schedules signatures sole_writer validity
     binaries cameras_json checkpoint colmap_files frontier_data html_report images launches noise optim_lazy \
     paths_between ply_body ply_compact shapes video viewer_camera
     camera_path capture chart_style colmap frontier_tables opacities ply program sghmc skew_map viewer_start
