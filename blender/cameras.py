@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from clsplat.camera import Camera
     from clsplat.camera_path import CameraPath
 
+_CLIP = (0.01, 1e5)  # world units; clsplat's own near plane, and beyond any sky
 _FILTER = bpy.props.StringProperty(default="*.json", options={"HIDDEN"})
 
 
@@ -28,6 +29,7 @@ def add_camera(context: Any, camera: Camera, name: str, parent: Any = None) -> A
     item = bpy.data.objects.new(name, bpy.data.cameras.new(name))
     item.parent = parent
     item.rotation_mode = "QUATERNION"
+    item.data.clip_start, item.data.clip_end = _CLIP
     set_camera(item, camera)
     context.collection.objects.link(item)
     return item

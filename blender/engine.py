@@ -68,6 +68,7 @@ class ClsplatRenderEngine(bpy.types.RenderEngine):  # type: ignore[misc]
     bl_use_preview = False
     bl_use_postprocess = True
     bl_use_shading_nodes_custom = False
+    bl_use_eevee_viewport = True  # the viewport's Material Preview shows the meshes
 
     # An instance's own once set; not in __init__, whose arguments differ between versions of Blender.
     _drawn: Any = None  # texture of the viewport
