@@ -6,16 +6,19 @@
 The server is a process of its own; the client walks along a path between training cameras as a browser does: a pose
 every 16 ms, whether pictures come or not, and decodes what comes. Each picture carries the number of its pose in its
 corner, as blocks that JPEG keeps. Latency: from sending a pose to having decoded the first picture of it or of a later
-one. Still: from the last pose to the decoded full picture, of which 150 ms are the wait for the camera to rest.
+one. After rest: from a single pose to the decoded first and full picture; the full one waits 150 ms for the camera to
+rest, and without that wait it tells how many full ones there could be in a second.
 
-Watching: iterations a second of the same run with nobody, and with a client that moves all the time; wall time of the
-loop as the run's log has it, and of the whole command.
+Watching: the same run without a viewer, with one that nobody looks at, and with a client whose camera moves all the
+time, in turn: wall time from the first line of the run to its last, that of the whole command, and processor time, which
+tells more than the wall where the machine has other work.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import statistics
 import subprocess
@@ -33,6 +36,7 @@ sys.path.insert(0, str(common.ROOT / "tests"))
 
 KEYS, FRAMES = 4, 4000  # training cameras on the path, poses between them
 POSE_SECONDS = 0.016
+REST = 0.15  # seconds, of clsplat/viewer.py
 BITS, BLOCK = 12, 8  # of a pose's number; side of a bit [px]
 SCENES = {"fox": 2, "kitchen": -1}  # with their -r
 
@@ -225,6 +229,7 @@ def walk(scene: str, model: Path, window: str, args: argparse.Namespace) -> None
            "fps_moving": len(moving) / (end - start),
            "moving_width_px": [min(sides), statistics.median(sides), max(sides)], "latency_ms": quantiles(latencies),
            "first_after_rest_ms": quantiles(first), "full_after_rest_ms": quantiles(full),
+           "fps_still": 1.0 / (statistics.median(full) - REST),
            "bytes_moving": statistics.median(item[4] for item in moving), "bytes_full": walker.seen[-1][4],
            "seconds": end - start}
     common.append(args.out, row)
@@ -245,28 +250,30 @@ def watch_training(scene: str, args: argparse.Namespace) -> None:
     from clsplat.device import open_device
     from clsplat.tuning import schedule_for
 
-    taken: dict[str, list[tuple[float, float]]] = {"unwatched": [], "nobody": [], "watched": []}
+    taken: dict[str, list[tuple[float, float, float]]] = {"unwatched": [], "nobody": [], "watched": []}
     pictures: list[int] = []
     with tempfile.TemporaryDirectory() as scratch:
         for round_ in range(args.rounds):
             for kind, times in taken.items():
                 model = Path(scratch) / f"{kind}{round_}"
                 start = time.perf_counter()
-                log = run_once(training_command(scene, model, args), kind, pictures)
-                times.append((log, time.perf_counter() - start))
-                print(scene, kind, f"{times[-1][0]:.2f} s of training, {times[-1][1]:.2f} s in all", flush=True)
+                loop, processor = run_once(training_command(scene, model, args), kind, pictures)
+                times.append((loop, time.perf_counter() - start, processor))
+                print(scene, kind, "loop {:.2f} s, command {:.2f} s, processor {:.2f} s".format(*times[-1]), flush=True)
     device = open_device(args.device)
-    median = {kind: [statistics.median(values) for values in zip(*times, strict=True)] for kind, times in taken.items()}
+    named = {}
+    for place, name in enumerate(("loop", "command", "processor")):
+        medians = {kind: statistics.median(run[place] for run in times) for kind, times in taken.items()}
+        named[f"{name}_seconds"] = medians
+        named[f"{name}_more"] = {kind: value / medians["unwatched"] - 1 for kind, value in medians.items()}
     row = {"task": "train --view", "scene": scene, "iterations": args.iterations, "cap_max": args.cap_max,
-           **common.environment(device, schedule_for(device)), "loop_seconds": {k: v[0] for k, v in median.items()},
-           "command_seconds": {k: v[1] for k, v in median.items()}, "pictures": pictures, "runs": taken,
-           "slower_loop": {k: v[0] / median["unwatched"][0] - 1 for k, v in median.items()}}
+           **common.environment(device, schedule_for(device)), **named, "pictures": pictures, "runs": taken}
     common.append(args.out, row)
     print(json.dumps(row), flush=True)
 
 
-def run_once(command: list[str], kind: str, pictures: list[int]) -> float:
-    """One run; the wall time of its loop [s], from the first line of its log to the last."""
+def run_once(command: list[str], kind: str, pictures: list[int]) -> tuple[float, float]:
+    """One run; the wall time of its loop, from its first line to its last, and its processor time [s]."""
     extra = [] if kind == "unwatched" else ["--view", "--port", "0"]
     process = subprocess.Popen([*command, *extra], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     assert process.stderr is not None
@@ -277,14 +284,15 @@ def run_once(command: list[str], kind: str, pictures: list[int]) -> float:
             watcher = Watcher(int(found[1]))
         if re.match(r"\d+/\d+", line) or "about" in line:
             marks.append(time.perf_counter())
-    assert process.wait() == 0
+    _, status, usage = os.wait4(process.pid, 0)
     if watcher:
         pictures.append(watcher.close())
-    return marks[-1] - marks[0]
+    assert status == 0
+    return marks[-1] - marks[0], usage.ru_utime + usage.ru_stime
 
 
 class Watcher:
-    """A client whose camera never rests."""
+    """A client whose camera never rests, a pose every 16 ms or so."""
 
     def __init__(self, port: int) -> None:
         from viewer_client import Client

@@ -129,6 +129,7 @@ def test_view_shows_a_file_that_changes_and_ends_with_ctrl_c(viewing: tuple[Comm
     assert len(command.said.splitlines()) == 1, command.said
 
 
+@pytest.mark.slow
 def test_train_view_shows_the_run(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
     from viewer_client import Client

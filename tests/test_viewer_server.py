@@ -33,6 +33,9 @@ from clsplat.viewer_settings import Settings
 from clsplat.viewer_source import ModelSource
 from clsplat.viewer_start import Known, start_of
 
+# The server silences these warnings of viser's, but pytest has its own filters.
+pytestmark = [pytest.mark.filterwarnings("ignore:Queued a"), pytest.mark.filterwarnings(r"ignore:\[viser\]")]
+
 LABELS = ("Show", "Background", "Jump to", "Seconds a key")
 BACKGROUND = (0.0, 0.0, 1.0)
 
@@ -168,7 +171,7 @@ def test_senseless_messages_change_nothing(running: Running, capfd: pytest.Captu
     for message in SENSELESS:
         with Client(running.server.port) as client:
             client.look()
-            client.still()
+            client.picture()
             if isinstance(message, bytes):
                 client.send_raw(message)
             else:

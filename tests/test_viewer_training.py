@@ -39,7 +39,8 @@ def pose_of(scene: Scene) -> Pose:
     return Pose((1, 0, 0, 0), tuple(camera.position), 1.0, 64, 48)
 
 
-@pytest.mark.parametrize("config", [CONFIG, LAZY], ids=["dense", "visible"])
+@pytest.mark.parametrize("config", [
+    pytest.param(CONFIG, id="dense"), pytest.param(LAZY, id="visible", marks=pytest.mark.slow)])
 def test_a_run_that_is_watched_has_the_bits_of_one_that_is_not(scene: Scene, config: TrainConfig) -> None:
     unseen = train(scene, config).splats.to_numpy()
     view, shots = TrainingView(config, share=1e9), list[Shot]()
