@@ -56,6 +56,11 @@ def _safe(name: str) -> str:
     return str(PurePosixPath(*parts))
 
 
+def beside(video: Path, extra: str) -> Path:
+    """The file of a video's alpha or depth."""
+    return video.with_name(f"{video.stem}_{extra}{video.suffix}")
+
+
 class ImageWriter:
     """Writes one view's colour, and alpha and depth if wanted.
 
@@ -113,7 +118,7 @@ class VideoFiles:
         from clsplat.video import VideoWriter
 
         self.near_far, self.background = near_far, background
-        paths = {"colour": path} | {extra: path.with_name(f"{path.stem}_{extra}{path.suffix}") for extra in extras}
+        paths = {"colour": path} | {extra: beside(path, extra) for extra in extras}
         self.writers = {mode: VideoWriter(file, fps) for mode, file in paths.items()}
         self._open = ExitStack()
 

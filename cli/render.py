@@ -29,7 +29,7 @@ from .options import (
     scene_options,
     set_option,
 )
-from .outputs import ImageWriter, VideoFiles, output_stems
+from .outputs import ImageWriter, VideoFiles, beside, output_stems
 from .path_options import Range, named, path_of, path_options, resized
 from .progress import counted
 
@@ -120,7 +120,8 @@ def render(model: Path | None, model_path: Path | None, output: Path | None, vid
         if output is not None:
             click.echo(f"{output}: {len(views)} images, the first {shown} px, {milliseconds:.1f} ms each")
         if video is not None:
-            click.echo(f"{video}: {len(views)} frames of {shown} px, {len(views) / rate:.4g} s at {rate:g} a second, "
+            files = ", ".join([str(video), *(beside(video, extra).name for extra in extras)])
+            click.echo(f"{files}: {len(views)} frames of {shown} px, {len(views) / rate:.4g} s at {rate:g} a second, "
                        f"{milliseconds:.1f} ms each")
 
 
