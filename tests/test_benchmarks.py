@@ -32,6 +32,7 @@ def test_train_scenes(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) 
     assert f"{row['psnr']:.3f}" in done.stdout
 
 
+@pytest.mark.slow
 def test_stages(tmp_path: Path) -> None:
     out = tmp_path / "stages.jsonl"
     command = [sys.executable, str(BENCHMARKS / "stages.py"), "--out", str(out)]
@@ -54,6 +55,7 @@ def test_stages(tmp_path: Path) -> None:
     assert all("| 0.50 | 1.00 |" in line for line in lines), printed
 
 
+@pytest.mark.slow
 def test_systems(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scene = small_capture(tmp_path_factory)
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
@@ -94,6 +96,7 @@ def test_budget(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Non
     assert "| -0.50 | 50% | 25% | 2.0 |" in printed.splitlines()[-1], printed
 
 
+@pytest.mark.slow
 def test_startup(tmp_path: Path) -> None:
     out = tmp_path / "startup.jsonl"
     command = [sys.executable, str(BENCHMARKS / "startup.py"), "--smoke", "--out", str(out)]
@@ -106,6 +109,7 @@ def test_startup(tmp_path: Path) -> None:
         assert f"| {row['task']} |" in printed
 
 
+@pytest.mark.slow
 def test_scalar(tmp_path: Path) -> None:
     out = tmp_path / "scalar.jsonl"
     command = [sys.executable, str(BENCHMARKS / "scalar.py"), "--smoke", "--out", str(out)]
@@ -116,6 +120,7 @@ def test_scalar(tmp_path: Path) -> None:
     assert f"| {row['raster_ratio']:.1f} |" in printed
 
 
+@pytest.mark.slow
 def test_time_to_quality(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scene = small_capture(tmp_path_factory)
     out = tmp_path / "times.jsonl"
@@ -133,6 +138,7 @@ def test_time_to_quality(tmp_path: Path, tmp_path_factory: pytest.TempPathFactor
     assert "| 12.5 | 17.5 |  |  | 100 | 20.0 | 38.0 | 100 | 23.00 |" in printed.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_frontier(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scene = small_capture(tmp_path_factory)
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
@@ -173,6 +179,7 @@ def test_visible_adam(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) 
     assert rows[0]["splats_seen"] < 0.8
 
 
+@pytest.mark.slow
 def test_stability(tmp_path: Path) -> None:
     out = tmp_path / "stability.jsonl"
     command = [sys.executable, str(BENCHMARKS / "stability.py"), "--out", str(out)]

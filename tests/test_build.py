@@ -32,10 +32,12 @@ def all_builds() -> Iterator[KernelBuild]:
 
 
 def some_builds() -> Iterator[KernelBuild]:
-    """Shapes x schedules x precisions, and each other option at each of its values."""
+    """Shapes x precisions on a CPU's and a GPU's schedule, and each other option at each of its values."""
     cpu = SCHEDULES["cpu16"]
-    for shape, schedule, real in itertools.product(SHAPES, SCHEDULES.values(), REALS):
+    for shape, schedule, real in itertools.product(SHAPES, (cpu, SCHEDULES["gpu256"]), REALS):
         yield KernelBuild(shape, 3, schedule, real=real).for_rendering()
+    for schedule, real in itertools.product(SCHEDULES.values(), REALS):
+        yield KernelBuild(DEFAULT_SHAPE, 3, schedule, real=real).for_rendering()
     for shape, normalisation in KERNELS:
         yield KernelBuild(shape, 3, cpu, normalisation).for_rendering()
     for i, skew_map in enumerate(SKEW_MAPS):

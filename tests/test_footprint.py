@@ -27,6 +27,7 @@ from clsplat.pipeline import Pipeline
 from clsplat.splats import Splats
 
 SHAPES = list(SKEWED)  # those of another falloff: test_shapes_radial.py
+QUICK = ("gaussian", "skew-normal")
 
 
 def strongly_skewed(seed: int, n: int) -> Arrays:
@@ -56,7 +57,9 @@ def single_splats(shape: str, normalisation: str, dtype: type) -> list[Case]:
 
 
 @pytest.mark.parametrize(("shape", "precision", "tolerance"), [
-    *((shape, "float32", IMAGE_FLOAT32) for shape in SHAPES), ("skew-normal", "float64", ROUNDING),
+    *(pytest.param(shape, "float32", IMAGE_FLOAT32, marks=[] if shape in QUICK else pytest.mark.slow)
+      for shape in SHAPES),
+    ("skew-normal", "float64", ROUNDING),
 ])  # fmt: skip
 def test_no_pixel_is_lost(make_renderer: MakeRenderer, device: Device, shape: str, precision: str,
                           tolerance: float) -> None:
@@ -69,6 +72,7 @@ def test_no_pixel_is_lost(make_renderer: MakeRenderer, device: Device, shape: st
     assert covered > 50 * 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("normalisation", ["pdf", "none"])
 def test_no_pixel_is_lost_in_other_normalisations(make_renderer: MakeRenderer, device: Device,
                                                   normalisation: str) -> None:
