@@ -1,7 +1,7 @@
 """How fast the viewer is: pictures a second, from a camera's move to its picture, and what watching costs a run.
 
     python benchmarks/viewer.py                      # moving and still, on the scenes' models
-    python benchmarks/viewer.py --training           # runs with and without a watcher, in turn
+    python benchmarks/viewer.py --training           # what watching costs a run
 
 The server is a process of its own; the client walks along a path between training cameras as a browser does: a pose
 every 16 ms, whether pictures come or not, and decodes what comes. Each picture carries the number of its pose in its
@@ -9,17 +9,14 @@ corner, as blocks that JPEG keeps. Latency: from sending a pose to having decode
 one. After rest: from a single pose to the decoded first and full picture; the full one waits 150 ms for the camera to
 rest, and without that wait it tells how many full ones there could be in a second.
 
-Watching: the same run without a viewer, with one that nobody looks at, and with a client whose camera moves all the
-time, in turn: wall time from the first line of the run to its last, that of the whole command, and processor time, which
-tells more than the wall where the machine has other work.
+Watching: one run in stretches of iterations, in turn without a viewer, with a client that rests (it gets a picture now
+and then) and with one that moves all the time; each stretch's time against those without a viewer before and after it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import re
 import statistics
 import subprocess
 import sys
@@ -37,6 +34,9 @@ sys.path.insert(0, str(common.ROOT / "tests"))
 KEYS, FRAMES = 4, 4000  # training cameras on the path, poses between them
 POSE_SECONDS = 0.016
 REST = 0.15  # seconds, of clsplat/viewer.py
+KINDS = ("unwatched", "resting", "moving")
+STRETCH = 25  # iterations
+SETTLED = 2  # rounds of stretches that do not count: the first visit builds kernels
 BITS, BLOCK = 12, 8  # of a pose's number; side of a bit [px]
 SCENES = {"fox": 2, "kitchen": -1}  # with their -r
 
@@ -49,14 +49,17 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="that the camera moves")
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--cap-max", type=int, default=20000)
-    parser.add_argument("--rounds", type=int, default=3, help="runs of each kind with --training")
     parser.add_argument("--training", action="store_true")
     parser.add_argument("--device")
     parser.add_argument("--out", type=Path, default=common.RESULTS / "viewer.jsonl")
     parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--watch", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.serve:
         serve(args.serve, args.device)
+        return
+    if args.watch:
+        watch(args.watch)
         return
     for scene in args.scenes:
         if args.training:
@@ -246,79 +249,91 @@ def quantiles(seconds: list[float]) -> dict[str, float]:
 
 
 def watch_training(scene: str, args: argparse.Namespace) -> None:
-    """The same run unwatched, served to nobody, and watched, in turn; appends a line."""
+    """One run in stretches without a viewer, with a client at rest and with one that moves; appends a line."""
+    from clsplat.config import TrainConfig
     from clsplat.device import open_device
+    from clsplat.scene import load_scene
+    from clsplat.training import train
     from clsplat.tuning import schedule_for
+    from clsplat.viewer_server import Server
+    from clsplat.viewer_start import start_of
+    from clsplat.viewer_training import TrainingView
 
-    taken: dict[str, list[tuple[float, float, float]]] = {"unwatched": [], "nobody": [], "watched": []}
-    pictures: list[int] = []
-    with tempfile.TemporaryDirectory() as scratch:
-        for round_ in range(args.rounds):
-            for kind, times in taken.items():
-                model = Path(scratch) / f"{kind}{round_}"
-                start = time.perf_counter()
-                loop, processor = run_once(training_command(scene, model, args), kind, pictures)
-                times.append((loop, time.perf_counter() - start, processor))
-                print(scene, kind, "loop {:.2f} s, command {:.2f} s, processor {:.2f} s".format(*times[-1]), flush=True)
+    loaded = load_scene(common.data_folder() / scene, resolution=SCENES.get(scene, -1), eval=True)
+    config = TrainConfig(iterations=args.iterations, cap_max=args.cap_max, device=args.device)
+    view = TrainingView(config)
+    server = Server(view.viewer, start_of(loaded.points.xyz, [item.camera for item in loaded.train]), port=0)
+    watcher = subprocess.Popen([sys.executable, __file__, "--watch", str(server.port)], stdin=subprocess.PIPE,
+                               stdout=subprocess.PIPE, text=True)
+    assert watcher.stdin is not None
+    assert watcher.stdout is not None
+    watcher.stdout.readline()  # it is connected
+    seconds: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    now = ["unwatched", time.perf_counter()]
+
+    def visit(trainer: Any, stop: Any) -> None:
+        if now[0] != "unwatched" or trainer.iteration == 1:  # the first visit builds kernels
+            view.visit(trainer, stop)
+        else:
+            view._left = view._clock()  # unwatched time earns no time for pictures
+        if trainer.iteration % STRETCH == 0:
+            trainer.device.queue.finish()
+            seconds[now[0]].append(time.perf_counter() - now[1])
+            now[0] = KINDS[trainer.iteration // STRETCH % len(KINDS)]
+            watcher.stdin.write(now[0] + "\n")
+            watcher.stdin.flush()
+            now[1] = time.perf_counter()
+
+    train(loaded, config, visit=visit)
+    watcher.stdin.close()
+    pictures = json.loads(watcher.stdout.readline())
+    watcher.wait(20)
+    server.close()
+    rounds = min(map(len, seconds.values()))
+    times = np.array([seconds[kind][:rounds] for kind in KINDS])[:, SETTLED:]
+    # Each stretch against the mean of the unwatched ones before and after it: other work on the machine weighs on both.
+    plain = 0.5 * (times[0, :-1] + times[0, 1:])
+    more = {kind: quartiles(times[place, :-1] / plain - 1.0) for place, kind in enumerate(KINDS) if place}
     device = open_device(args.device)
-    named = {}
-    for place, name in enumerate(("loop", "command", "processor")):
-        medians = {kind: statistics.median(run[place] for run in times) for kind, times in taken.items()}
-        named[f"{name}_seconds"] = medians
-        named[f"{name}_more"] = {kind: value / medians["unwatched"] - 1 for kind, value in medians.items()}
     row = {"task": "train --view", "scene": scene, "iterations": args.iterations, "cap_max": args.cap_max,
-           **common.environment(device, schedule_for(device)), **named, "pictures": pictures, "runs": taken}
+           **common.environment(device, schedule_for(device)), "stretch": STRETCH, "stretches": times.shape[1],
+           "more_time": more, "seconds": {kind: float(times[place].sum()) for place, kind in enumerate(KINDS)},
+           "pictures_a_second": {kind: count / sum(seconds[kind]) for kind, count in pictures.items()}}
     common.append(args.out, row)
     print(json.dumps(row), flush=True)
 
 
-def run_once(command: list[str], kind: str, pictures: list[int]) -> tuple[float, float]:
-    """One run; the wall time of its loop, from its first line to its last, and its processor time [s]."""
-    extra = [] if kind == "unwatched" else ["--view", "--port", "0"]
-    process = subprocess.Popen([*command, *extra], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    assert process.stderr is not None
-    marks: list[float] = []
-    watcher: Any = None
-    for line in process.stderr:
-        if (found := re.search(r"127\.0\.0\.1:(\d+)", line)) and kind == "watched":
-            watcher = Watcher(int(found[1]))
-        if re.match(r"\d+/\d+", line) or "about" in line:
-            marks.append(time.perf_counter())
-    _, status, usage = os.wait4(process.pid, 0)
-    if watcher:
-        pictures.append(watcher.close())
-    assert status == 0
-    return marks[-1] - marks[0], usage.ru_utime + usage.ru_stime
+def quartiles(values: Any) -> list[float]:
+    """Lower quartile, median, upper quartile."""
+    return np.round(np.quantile(values, (0.25, 0.5, 0.75)), 4).tolist()
 
 
-class Watcher:
-    """A client whose camera never rests, a pose every 16 ms or so."""
+def watch(port: int) -> None:
+    """A client that does as it is told by lines of its input; counts pictures by what it did."""
+    from viewer_client import Client
 
-    def __init__(self, port: int) -> None:
-        from viewer_client import Client
+    kind = [KINDS[0]]
 
-        self._client, self._done, self._pictures = Client(port), False, 0
-        self._thread = threading.Thread(target=self._walk)
-        self._thread.start()
+    def listen() -> None:
+        for line in sys.stdin:
+            kind[0] = line.strip()
+        kind[0] = ""
 
-    def close(self) -> int:
-        """How many pictures it got."""
-        self._done = True
-        self._thread.join()
-        return self._pictures
-
-    def _walk(self) -> None:
+    counts = dict.fromkeys(KINDS, 0)
+    with Client(port) as client:
+        client.look((0.0, 0.0, -2.0), width=1280, height=720)
+        print("connected", flush=True)
+        threading.Thread(target=listen, daemon=True).start()
         step = 0
-        try:
-            while not self._done:
-                self._client.look((np.sin(step / 50.0), 0.0, -2.0), width=1280, height=720)
+        while kind[0]:
+            if kind[0] == "moving":
+                client.look((np.sin(step / 50.0), 0.0, -2.0), width=1280, height=720)
                 step += 1
-                self._client.receive(POSE_SECONDS)
-                self._pictures += len(self._client.pictures)
-                self._client.pictures.clear()
-                self._client.received.clear()
-        except Exception as error:  # the run has ended, and its server with it
-            print("watcher:", type(error).__name__, file=sys.stderr)
+            client.receive(POSE_SECONDS)
+            counts[kind[0] or KINDS[0]] += len(client.pictures)
+            client.pictures.clear()
+            client.received.clear()
+    print(json.dumps(counts), flush=True)
 
 
 if __name__ == "__main__":

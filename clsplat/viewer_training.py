@@ -20,9 +20,9 @@ from .trainer import Trainer
 from .viewer import SECONDS, Viewer
 from .viewer_settings import Settings
 
-SHARE = 0.04  # of the time, that pictures may take from a run
+SHARE = 0.03  # of the time, that pictures may take from a run; its browsers' messages take another hundredth or two
 QUICK = 0.025  # seconds for a picture of a moving camera: so they come at least now and then
-_MOST_CREDIT = 0.05  # seconds of pictures at once, after a while without any
+_MOST_CREDIT = 0.2  # seconds of pictures at once, saved for when a camera moves
 _REFRESH = 2.0  # seconds between pictures of a camera that is still
 _PAUSE_STEP = 0.1  # seconds in which Ctrl-C is seen while paused
 
@@ -83,7 +83,7 @@ class TrainingView:
         self.viewer = Viewer(self.source, Settings(background=config.background), QUICK, clock)
         self._share, self._clock = share, clock
         self._paused = threading.Event()
-        self._credit, self._left, self._refreshed = 0.0, math.inf, -math.inf
+        self._credit, self._left, self._refreshed, self._cost = 0.0, math.inf, -math.inf, 0.0
 
     def toggle(self) -> bool:
         """Pause the run, or let it go on; whether it now waits."""
@@ -101,14 +101,17 @@ class TrainingView:
         now = self._clock()
         self._credit = min(self._credit + self._share * max(now - self._left, 0.0), _MOST_CREDIT)
         if self._credit > 0.0:
-            if now - self._refreshed > _REFRESH:
+            fresh = now - self._refreshed > _REFRESH and self._credit >= self._cost
+            if fresh:
                 self._refreshed = now
                 self.viewer.refresh()
             if self.viewer.wishes.waiting:
                 trainer.device.queue.finish()  # what the iteration still has to do is training time
                 start = self._clock()
                 self.viewer.serve()
-                self._credit -= self._clock() - start
+                spent = self._clock() - start
+                self._credit -= spent
+                self._cost = min(spent, _MOST_CREDIT) if fresh else self._cost
         while self._paused.is_set() and not stop.is_set():
             self.viewer.serve(_PAUSE_STEP)
         self._left = self._clock()

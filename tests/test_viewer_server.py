@@ -231,6 +231,15 @@ def test_a_path_is_recorded_and_saved(running: Running, tmp_path: Path) -> None:
             client.until(f"{step + 1} key")
         client.set("Save", True)
         client.until(plain("camera_path_001.json"))
+        client.set("Play", True)
+        walked: list[float] = []
+        while len(walked) < 5:
+            assert client.receive(5.0)
+            walked = [message["position"][0] for message in client.received
+                      if message["type"] == "SetCameraPositionMessage" and not message["initial"]]
+        client.set("Stop", True)
+        assert walked == sorted(walked)
+        assert 0.0 < walked[-1] < 2.0
         client.set("Download", True)
         client.drain(0.3)
         started = [m for m in client.received if m["type"] == "FileTransferStartDownload"]
