@@ -166,10 +166,12 @@ class Walker:
 
     def wait_for(self, number: int, full: bool, timeout: float = 60.0) -> float:
         """When a picture of this pose came, of full size if wanted."""
+        from clsplat.viewer_settings import DEFAULT_SIZE
+
         end = time.perf_counter() + timeout
         while time.perf_counter() < end:
             for moment, shown, width, height, _ in self.seen[-4:]:
-                if shown >= number and (not full or max(width, height) == min(max(self.size), 1280)):
+                if shown >= number and (not full or max(width, height) == min(max(self.size), DEFAULT_SIZE)):
                     return moment
             time.sleep(0.001)
         raise RuntimeError(f"no picture of pose {number}")
