@@ -24,8 +24,8 @@ def summarise(records: Sequence[Record]) -> list[Record]:
     -------
     Rows with "scene", "cap", "iterations", "system", "config" (all options but the seed), "seeds", "failed" (messages
     by seed), "finite", "cap_held" (over all its runs), and for each of MEASURED {"mean", "half_spread"}, the latter
-    being half of maximum less minimum; None where every run failed. Systems of the same name but other options are
-    told apart in "system" by the options in which they differ.
+    being half of maximum less minimum; None where every run failed or none measured it. Systems of the same name but
+    other options are told apart in "system" by the options in which they differ.
     """
     groups: dict[str, list[Record]] = {}
     for record in records:
@@ -131,8 +131,9 @@ def _row(group: Sequence[Record]) -> Record:
     }
     done = [record for record in group if not record["failed"]]
     for key in MEASURED:
-        values = [record[key] for record in done]
-        row[key] = {"mean": statistics.fmean(values), "half_spread": (max(values) - min(values)) / 2} if done else None
+        values = [record[key] for record in done if record[key] is not None]
+        row[key] = None if not values else {
+            "mean": statistics.fmean(values), "half_spread": (max(values) - min(values)) / 2}
     return row
 
 

@@ -240,6 +240,8 @@ def test_mean_and_half_spread() -> None:
     assert row["psnr"] == {"mean": 21.5, "half_spread": 1.75}
     texts = dict(zip(HEAD, cells(row), strict=True))
     assert (texts["PSNR"], texts["SSIM"], texts["seeds"]) == ("21.50 ± 1.75", "0.5000 ± 0.0000", "3")
+    (some,) = summarise([records[0] | {"cpu_seconds": None}, records[1] | {"cpu_seconds": 8.0}])
+    assert some["cpu_seconds"]["mean"] == 8.0, "of the runs that measured it"
     (alone,) = summarise(records[:1])
     assert cells(alone)[HEAD.index("PSNR")] == "20.00"
 
