@@ -6,7 +6,6 @@ Pictures are (H, W, 3) bytes. Depth, counts and skew go through one colour map, 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +30,7 @@ _CONTROL = np.array([(57, 2, 75), (60, 27, 136), (18, 68, 165), (12, 106, 148), 
 _STEPS = np.linspace(0.0, 1.0, 256)
 _TABLE = np.stack([np.interp(_STEPS, np.linspace(0.0, 1.0, len(_CONTROL)), channel) for channel in _CONTROL.T], axis=1)
 _QUANTILES = (0.02, 0.98)  # of depths: a few stray splats do not stretch the range
+_SAMPLES = 50_000  # pixels that are enough for quantiles
 _SOLID = 0.5  # alpha from which a pixel has a say in the range of depths
 
 
@@ -67,12 +67,12 @@ def picture_of(image: Rendered, mode: str = "colour", background: ArrayLike = _B
     if mode == "depth":
         return depth_picture(image, near_far, background)
     if mode == "alpha":
-        return to_bytes(image.alpha[..., None].repeat(3, axis=2))
+        return to_bytes(image.alpha)[..., None].repeat(3, axis=2)
     if mode == "splats":
         assert counts is not None
         return count_picture(counts)
     if mode == "skew":
-        return _over(colour_map(_divided(image.color[..., 0], image.alpha)), image.alpha, background)
+        return _over(_divided(image.color[..., 0], image.alpha), image.alpha, background)
     return to_bytes(image.color)
 
 
@@ -104,14 +104,17 @@ def skew_magnitude(splats: Splats) -> NDArray[np.float64]:
 
 def colour_map(values: Array) -> Picture:
     """(..., 3) bytes of values 0..1, dark to bright; what lies beyond takes the end's, NaN the dark one."""
-    index = np.rint(np.nan_to_num(np.clip(values, 0.0, 1.0), nan=0.0) * (len(_TABLE) - 1)).astype(np.intp)
-    colours: Picture = np.rint(_TABLE).astype(np.uint8)[index]
+    colours: Picture = np.take(np.rint(_TABLE).astype(np.uint8), to_bytes(values), axis=0)
     return colours
 
 
 def to_bytes(values: Array) -> Picture:
     """Reals to bytes as PNG files have them: clipped to 0..1, rounded; NaN becomes 0."""
-    rounded: Picture = np.rint(np.nan_to_num(np.clip(values, 0.0, 1.0), nan=0.0) * 255.0).astype(np.uint8)
+    reals = np.atleast_1d(np.clip(values, 0.0, 1.0))
+    if np.isnan(reals).any():
+        np.nan_to_num(reals, copy=False, nan=0.0)
+    reals *= 255.0
+    rounded: Picture = np.rint(reals, out=reals).astype(np.uint8).reshape(np.shape(values))
     return rounded
 
 
@@ -121,6 +124,7 @@ def depth_range(image: Rendered) -> tuple[float, float]:
     for least in (_SOLID, 1.0 / 255.0):
         seen = depths[(image.alpha > least) & (depths > 0.0) & np.isfinite(depths)]
         if len(seen):
+            seen = seen[:: max(len(seen) // _SAMPLES, 1)]
             near, far = (float(depth) for depth in np.quantile(seen, _QUANTILES))
             return near, max(far, 1.001 * near)
     return 1.0, 2.0
@@ -139,9 +143,8 @@ def depth_picture(image: Rendered, near_far: tuple[float, float] | None = None,
     near, far = near_far or depth_range(image)
     if not 0.0 < near < far < math.inf:
         raise InputError(f"depth: near {near:g} and far {far:g}; expected 0 < near < far, both finite")
-    depths = np.clip(_divided(image.depth, image.alpha).astype(np.float64), near, far)
-    values = (1.0 / depths - 1.0 / far) / (1.0 / near - 1.0 / far)
-    return _over(colour_map(values), image.alpha, background)
+    depths = np.clip(_divided(image.depth, image.alpha), near, far)
+    return _over((1.0 / depths - 1.0 / far) / (1.0 / near - 1.0 / far), image.alpha, background)
 
 
 def count_picture(counts: Array) -> Picture:
@@ -155,7 +158,11 @@ def _divided(sums: Array, alpha: Array) -> Array:
     return mean
 
 
-def _over(colours: Picture, alpha: Array, background: Sequence[float] | ArrayLike) -> Picture:
-    """Colours before a background, as far as alpha covers it."""
-    cover = np.nan_to_num(np.clip(alpha, 0.0, 1.0), nan=0.0)[..., None]
-    return to_bytes(cover * (colours / 255.0) + (1.0 - cover) * np.asarray(background, np.float64))
+def _over(values: Array, alpha: Array, background: ArrayLike) -> Picture:
+    """Values by the colour map before a background, as far as alpha covers it."""
+    cover = np.clip(alpha, 0.0, 1.0, dtype=np.float32)[..., None]
+    shown = np.take((_TABLE / 255.0).astype(np.float32), to_bytes(values), axis=0)
+    shown *= cover
+    if np.any(background):
+        shown += (1.0 - cover) * np.asarray(background, np.float32)
+    return to_bytes(shown)

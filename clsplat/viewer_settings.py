@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 RGB = tuple[float, float, float]
 
 SMALLEST, LARGEST = 64, 4096  # longest side of a picture [px]
-DEFAULT_SIZE = 1280
+DEFAULT_SIZE = 1920
 
 
 @dataclass(frozen=True)
