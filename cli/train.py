@@ -10,7 +10,7 @@ import click
 
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError, OutputError
-from clsplat.model_folder import ModelFolder
+from clsplat.model_folder import ModelFolder, read_json
 from clsplat.presets import PRESETS, with_preset
 
 from .budget import budget_options, forget_search, is_search, options_of, run_search, stored_search
@@ -52,14 +52,16 @@ INTERRUPTED = 130
 @quiet_option
 @click.option("--preset", type=click.Choice(list(PRESETS)),
               help="A published system: kernel, optimizer, strategy and constants; other options replace constants.")
+@click.option("--config", "config_file", type=PATH, metavar="FILE",
+              help="Options from a former run's config.json, or a JSON object of options; those given here replace them.")
 @click.option("--view", is_flag=True, help="Show the run in the browser while it trains.")
 @server_options
 @budget_options
 @config_options()
 @click.pass_context
 def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, model_path: Path | None,
-          resume: bool, overwrite: bool, quiet: bool, preset: str | None, view: bool, port: int, host: str,
-          **values: Any) -> None:
+          resume: bool, overwrite: bool, quiet: bool, preset: str | None, config_file: Path | None, view: bool,
+          port: int, host: str, **values: Any) -> None:
     """Learn a splat model of SCENE, a folder with photos in images/ and a COLMAP model in sparse/, or with
     transforms.json or transforms_train.json (NeRF's Blender sets, instant-ngp, nerfstudio).
 
@@ -76,6 +78,8 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
     if view and search is not None:
         raise click.UsageError("--view shows one run: leave out --budget, or look at the result with clsplat view")
     options = config_values(ctx, values)
+    if config_file is not None:
+        options = _options_in(config_file) | options
     if preset is not None:
         options = with_preset(preset, options)
     reading = {key: values[key] for key in SCENE_KEYS if is_given(ctx, key)}
@@ -176,6 +180,20 @@ def report(model: Model, metrics: Evaluation | None) -> None:
     if metrics is not None:
         click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, "
                    f"SSIM {metrics.ssim:.4f}")
+
+
+def _options_in(file: Path) -> dict[str, Any]:
+    """TrainConfig's arguments that a JSON file has."""
+    values = read_json(file)
+    values = values.get("config", values)
+    try:
+        config = TrainConfig.from_json(values)
+        return {name: getattr(config, name) for name in values}
+    except (AttributeError, TypeError, ValueError) as error:
+        raise InputError(f"{file}: not options of a run ({error}): give a config.json, or an object such as "
+                         '{"iterations": 2000}') from None
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
 
 
 def _stored_run(folder: ModelFolder) -> tuple[dict[str, Any], dict[str, Any]]:
