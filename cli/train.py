@@ -53,7 +53,7 @@ INTERRUPTED = 130
 @click.option("--preset", type=click.Choice(list(PRESETS)),
               help="A published system: kernel, optimizer, strategy and constants; other options replace constants.")
 @click.option("--config", "config_file", type=PATH, metavar="FILE",
-              help="Options from a former run's config.json, or a JSON object of options; those given here replace them.")
+              help="Options from a former run's config.json, or a JSON object of some; those given replace them.")
 @click.option("--view", is_flag=True, help="Show the run in the browser while it trains.")
 @server_options
 @budget_options
