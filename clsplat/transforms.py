@@ -32,6 +32,8 @@ FILE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+_MAX_SIDE = 1 << 20  # of an image [px]
+_LARGEST = 1e30  # of a number; float32 holds it
 _COLMAP = ("colmap/sparse/0", "sparse/0")  # nerfstudio's place for the model, and COLMAP's own
 _SUFFIXES = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
 
@@ -132,8 +134,8 @@ class _Frame:
         """The lens, of the size that the file gives, or the photo has."""
         size = image_size(self.file)
         width, height = int(self.number_of("w", size[0])), int(self.number_of("h", size[1]))
-        if width < 1 or height < 1:
-            raise InputError(f"{self.place}: w x h is {width} x {height}; both must be at least 1")
+        if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
+            raise InputError(f"{self.place}: w x h is {width} x {height}; both must be 1 to {_MAX_SIDE}")
         fx = self.focal("fl_x", "camera_angle_x", width)
         fy = self.focal("fl_y", "camera_angle_y", height, fx)
         if fx is None or fy is None:
@@ -171,7 +173,7 @@ class _Frame:
         value = self.value(key)
         if value is None:
             return default
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _LARGEST:
             raise InputError(f"{self.place}: {key} is {str(value)[:40]!r}; it must be a number")
         return float(value)
 
@@ -226,15 +228,18 @@ class _Document:
     def listed(self, key: str | None = None) -> set[str]:
         """Names in nerfstudio's list `key`, or in all of its lists."""
         keys = ("train_filenames", "val_filenames", "test_filenames") if key is None else (key,)
-        names = [name for key in keys for name in self.values.get(key) or ()]
-        if not all(isinstance(name, str) for name in names):
+        lists = [self.values.get(key) or [] for key in keys]
+        if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
             raise InputError(f"{self.path}: {' or '.join(keys)} is no list of photos; remove it or name files")
+        names = [name for names in lists for name in names]
         return {self.name_of(self.photo_file(name)) for name in names}
 
     def points(self) -> Points:
         """The file's points, those of the COLMAP model behind it, or none."""
         folder, named = self.path.parent, self.values.get("ply_file_path")
         if isinstance(named, str) and named:
+            if not named.isprintable():
+                raise InputError(f"{self.path}: ply_file_path {named!r} is no name of a file; name a PLY, or remove it")
             return read_point_cloud(folder / named)
         if (folder / "points3d.ply").is_file():
             return read_point_cloud(folder / "points3d.ply")
@@ -248,7 +253,7 @@ class _Document:
         """Points of the COLMAP model, moved as its poses were."""
         matrix = _matrix(self.values["applied_transform"])
         scale = self.values.get("applied_scale", 1.0)
-        if matrix is None or isinstance(scale, bool) or not isinstance(scale, (int, float)) or not scale > 0:
+        if matrix is None or isinstance(scale, bool) or not isinstance(scale, (int, float)) or not 0 < scale < _LARGEST:
             raise InputError(f"{self.path}: applied_transform must be 3 x 4 numbers and applied_scale above 0")
         moved: NDArray[np.float64] = scale * (xyz @ matrix[:3, :3].T + matrix[:3, 3])
         return moved
@@ -258,7 +263,7 @@ def _matrix(given: Any) -> NDArray[np.float64] | None:
     """(4, 4) of a nested list of 4 x 4 or 3 x 4 finite numbers, else None."""
     try:
         matrix = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         return None
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])

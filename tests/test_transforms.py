@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from scenes_data import scene_folder
 from small_scene import CX, CY, FX, FY, HEIGHT, NAMES, WIDTH, cloud, model_views, photo_of, write_garden
 
@@ -184,6 +187,9 @@ def in_frame(**values: Any) -> Callable[[Values], Values]:
         (changed(frames=[3]), "frame 0: has no file_path"),
         (changed(fl_x=None, fl_y=None), "has neither fl_x nor camera_angle_x"),
         (changed(fl_x=-3), "fl_x is -3; it must be above 0"),
+        (changed(fl_x=10**400), "it must be a number"),
+        (changed(w=1e9), "w x h is 1000000000 x 30"),
+        (changed(test_filenames=True), "is no list of photos"),
         (changed(fl_x="wide"), "fl_x is 'wide'; it must be a number"),
         (changed(fl_x=None, fl_y=None, camera_angle_x=4.0), "camera_angle_x is 4; an angle of view is below pi"),
         (changed(w=0), "w x h is 0 x 30"),
@@ -241,3 +247,36 @@ def test_lego_has_its_own_split() -> None:
     scene = load_scene(scene_folder("lego"), resolution=4, background=(1.0, 1.0, 1.0))
     assert (len(scene.train), len(scene.test)) == (100, 25)
     assert scene.views[0].image[0, 0].tolist() == [255, 255, 255]
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=3), max_leaves=6)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_fuzz_succeeds_or_says_why(folder: Path, data: st.DataObject) -> None:
+    """Any value of the file, at any depth, replaced by anything: a scene, or one line that names the file."""
+    whole = LENS | {"k1": 0.0, "camera_model": "OPENCV", "test_filenames": [f"images/{NAMES[1]}"],
+                    "ply_file_path": "", "applied_transform": np.eye(4).tolist(), "frames": frames()[:3]}
+    for _ in range(data.draw(st.integers(1, 3))):
+        inner: Any = whole
+        while True:
+            keys = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
+            if not keys:
+                break
+            key = data.draw(st.sampled_from(keys))
+            if not isinstance(inner[key], (dict, list)) or not inner[key] or data.draw(st.booleans()):
+                inner[key] = data.draw(ANYTHING)
+                break
+            inner = inner[key]
+    file = write(folder, whole)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            said = f"{len(posed_by_transforms([file]).photos)} photos"
+        except InputError as error:
+            said = str(error).removeprefix(str(folder))
+    assert said.endswith(" photos") or said.startswith("/"), "the file is named"
+    assert "\n" not in said
