@@ -35,7 +35,7 @@ def budget_options(function: F) -> F:
                           f"auto.  [default: {TOLERANCE:g}]"),
         click.option("--budget", type=click.Choice(["auto"]),
                      help="Find the smallest model that the scene needs, on views held out of the training set. "
-                          "--cap-max is the most splats that are tried. Takes about three runs' time."),
+                          "--cap-max is the most splats that are tried. Takes the time of five to nine runs."),
     ):
         function = option(function)
     return function
