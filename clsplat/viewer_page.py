@@ -117,7 +117,7 @@ class Page:
         gui = self.client.gui
         with gui.add_folder("Cameras"):
             shown = gui.add_checkbox("Show cameras", False,
-                                     hint="Blue: trained on; orange: held out. Click one to jump to it")
+                                     hint="Blue: trained on; orange: held out. Click the lines of one to jump to it")
             shown.on_update(lambda _: self._show_cameras(shown.value))
             jump = gui.add_dropdown("Jump to", (_NOWHERE, *self._cameras))
             jump.on_update(lambda _: self._jump(self._cameras.get(jump.value)))
