@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
@@ -22,7 +23,7 @@ KEPT = 4  # models on the device at once: looker-ons with other caps, or at the 
 
 
 class Source(Protocol):
-    """Something that pictures can be made of, by one thread.
+    """Something that pictures can be made of.
 
     Attributes
     ----------
@@ -58,6 +59,7 @@ class ModelSource:
 
     def __init__(self, splats: Splats, device: str | None = None, keep: int = KEPT) -> None:
         self.renderer = Renderer(device, keep=keep)
+        self._rendering = threading.Lock()  # a renderer is of one thread at a time
         self._keep = keep
         self.show(splats)
 
@@ -80,8 +82,10 @@ class ModelSource:
 
     def picture(self, camera: Camera, settings: Settings) -> Picture:
         """What the camera sees; at full settings the bytes of `clsplat render`."""
-        splats = self._shown.part(settings.cap, settings.mode)
-        return picture(self.renderer, splats, camera, settings.mode, settings.background, sh_degree=settings.sh_degree)
+        with self._rendering:
+            splats = self._shown.part(settings.cap, settings.mode)
+            return picture(self.renderer, splats, camera, settings.mode, settings.background,
+                           sh_degree=settings.sh_degree)
 
 
 class _Shown:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -306,6 +307,15 @@ def test_a_full_picture_is_the_render(source: ModelSource, position: tuple[float
     shown = source.picture(camera, Settings(background=BACKGROUND))
     assert np.array_equal(shown, to_bytes(Renderer().render(model(), camera, BACKGROUND).color))
     assert (shown != shown[0, 0]).any() == (position[2] == -3.0)
+
+
+def test_pictures_may_be_asked_for_by_several_threads(source: ModelSource) -> None:
+    cameras = [random_camera(seed, 41 + 16 * seed, 27) for seed in range(4)]
+    alone = [source.picture(camera, Settings()) for camera in cameras]
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(5):
+            together = list(pool.map(lambda camera: source.picture(camera, Settings()), cameras))
+            assert all(map(np.array_equal, alone, together))
 
 
 def test_a_camera_inside_a_splat_sees_something(source: ModelSource) -> None:

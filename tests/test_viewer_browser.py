@@ -104,7 +104,7 @@ def test_it_shows_the_scene_and_follows_the_mouse(server: Server, page: Page) ->
     mouse.down()
     mouse.move(250, 300, steps=5)
     mouse.up()
-    page.wait_for_timeout(1500)
+    page.wait_for_timeout(1000)
     moved = shot(page)
     assert not like(moved, front)
     assert moved.reshape(-1, 3).std(axis=0).max() > 20, "no empty page"
