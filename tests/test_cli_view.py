@@ -108,6 +108,7 @@ def viewing(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         command.process.kill()
 
 
+@pytest.mark.slow
 def test_view_shows_a_file_that_changes_and_ends_with_ctrl_c(viewing: tuple[Command, Path]) -> None:
     from viewer_client import Client
 
@@ -162,6 +163,7 @@ def test_train_view_shows_the_run(tmp_path: Path, tmp_path_factory: pytest.TempP
             command.process.kill()
 
 
+@pytest.mark.slow
 def test_a_watched_model_has_the_same_bits(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
     model = small_model(tmp_path_factory)

@@ -110,6 +110,7 @@ def test_it_shows_the_scene_and_follows_the_mouse(server: Server, page: Page) ->
     assert moved.reshape(-1, 3).std(axis=0).max() > 20, "no empty page"
 
 
+@pytest.mark.slow
 def test_it_jumps_to_a_camera_and_changes_what_is_shown(server: Server, page: Page) -> None:
     source = server.viewer.source
     jump = page.get_by_label("Jump to")

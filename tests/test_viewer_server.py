@@ -8,8 +8,10 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,7 +84,17 @@ def expected(settings: Settings, position: tuple[float, float, float] = (0, 0, -
 
 def close_to(shown: np.ndarray, picture: np.ndarray) -> bool:
     """Equal but for JPEG's losses."""
-    return bool(np.abs(shown.astype(int) - picture).mean() < 4.0)
+    return shown.shape == picture.shape and bool(np.abs(shown.astype(int) - picture).mean() < 4.0)
+
+
+def shows(client: Client, picture: np.ndarray) -> bool:
+    """Whether a browser gets this picture before long."""
+    end = time.monotonic() + 10.0
+    while not (client.pictures and close_to(client.last(), picture)):
+        if time.monotonic() > end:
+            return False
+        client.receive(0.1)
+    return True
 
 
 def test_a_busy_port_is_one_line(running: Running) -> None:
@@ -105,32 +117,25 @@ def test_an_address_that_is_not_ours_is_one_line(running: Running, host: str) ->
 def test_a_browser_sees_the_render(running: Running) -> None:
     with Client(running.server.port) as client:
         client.look()
-        assert close_to(client.still(), expected(Settings(background=BACKGROUND)))
+        assert shows(client, expected(Settings(background=BACKGROUND)))
         client.look((0, 0, -5))
-        further = client.still()
-        assert close_to(further, expected(Settings(background=BACKGROUND), (0, 0, -5)))
-        assert not close_to(further, expected(Settings(background=BACKGROUND)))
+        assert shows(client, expected(Settings(background=BACKGROUND), (0, 0, -5)))
+        assert not close_to(client.last(), expected(Settings(background=BACKGROUND)))
 
 
 def test_two_browsers_see_what_each_has_chosen(running: Running) -> None:
     with Client(running.server.port) as one, Client(running.server.port) as two:
         one.look()
         two.look()
-        one.still()
-        two.still()
         one.set("Show", "Depth")
         two.set("Background", [255, 0, 0])
-        one.drain(0.3)
-        two.drain(0.3)
-        assert close_to(one.last(), expected(Settings(mode="depth", background=BACKGROUND)))
-        assert close_to(two.last(), expected(Settings(background=(1.0, 0.0, 0.0))))
+        assert shows(one, expected(Settings(mode="depth", background=BACKGROUND)))
+        assert shows(two, expected(Settings(background=(1.0, 0.0, 0.0))))
         two.set("Splats", 5)
         two.set("SH degree", 0)
-        two.drain(0.3)
-        assert close_to(two.last(), expected(Settings(background=(1.0, 0.0, 0.0), cap=5, sh_degree=0)))
+        assert shows(two, expected(Settings(background=(1.0, 0.0, 0.0), cap=5, sh_degree=0)))
         one.set("Resolution", 64)
-        one.drain(0.3)
-        assert one.last().shape == (43, 64, 3)
+        one.still((43, 64))
 
 
 def test_lines_that_break_in_mid_frame_harm_nobody(running: Running) -> None:
@@ -144,7 +149,7 @@ def test_lines_that_break_in_mid_frame_harm_nobody(running: Running) -> None:
             client.look((0, 0, -4 - number))
             client.vanish() if number % 2 else client.close()
         steady.look((0, 0, -4))
-        assert close_to(steady.still(), expected(Settings(background=BACKGROUND), (0, 0, -4)))
+        assert shows(steady, expected(Settings(background=BACKGROUND), (0, 0, -4)))
         for _ in range(50):
             if running.viewer.count == 1:
                 break
@@ -180,27 +185,30 @@ def test_senseless_messages_change_nothing(running: Running, capfd: pytest.Captu
                 client.drain(0.05)
     with Client(running.server.port) as client:
         client.look()
-        assert close_to(client.still(), expected(Settings(background=BACKGROUND)))
+        assert shows(client, expected(Settings(background=BACKGROUND)))
         assert running.viewer.settings == Settings(background=BACKGROUND)
     assert "Traceback" not in "".join(capfd.readouterr())
 
 
-@pytest.mark.parametrize("camera", [
+ABSURD: list[dict[str, Any]] = [
     {"position": (float("nan"), 0, 0)}, {"position": (1e300, 0, 0)}, {"fov": float("nan")}, {"fov": 1e9}, {"fov": -1.0},
     {"width": 10**12, "height": -4}, {"width": 0, "height": 0}, {"wxyz": (0, 0, 0, 0)}, {"wxyz": (float("inf"),) * 4},
-], ids=str)  # fmt: skip
-def test_absurd_cameras_harm_nobody(running: Running, camera: dict[str, object]) -> None:
+]  # fmt: skip
+
+
+def test_absurd_cameras_harm_nobody(running: Running) -> None:
     with Client(running.server.port) as client:
-        client.look(**camera)  # type: ignore[arg-type]
-        client.picture()
+        for camera in ABSURD:
+            client.look(**camera)
+            client.picture()
         client.look()
-        assert close_to(client.still(), expected(Settings(background=BACKGROUND)))
+        assert shows(client, expected(Settings(background=BACKGROUND)))
 
 
 def test_an_absurd_camera_sees_the_background(running: Running) -> None:
     with Client(running.server.port) as client:
         client.look(fov=3.1)
-        assert close_to(client.still(), np.broadcast_to((0, 0, 255), (64, 96, 3)))
+        assert shows(client, np.broadcast_to((0, 0, 255), (64, 96, 3)))
 
 
 def test_the_panel_jumps_to_cameras(running: Running) -> None:
