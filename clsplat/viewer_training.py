@@ -101,7 +101,8 @@ class TrainingView:
         now = self._clock()
         self._credit = min(self._credit + self._share * max(now - self._left, 0.0), _MOST_CREDIT)
         if self._credit > 0.0:
-            fresh = now - self._refreshed > _REFRESH and self._credit >= self._cost
+            due = now - self._refreshed > _REFRESH and self._credit >= self._cost
+            fresh = due and self.viewer.count > 0
             if fresh:
                 self._refreshed = now
                 self.viewer.refresh()
