@@ -20,7 +20,7 @@ from .trainer import Trainer
 from .viewer import SECONDS, Viewer
 from .viewer_settings import Settings
 
-SHARE = 0.025  # of the time, that pictures may take from a run; what browsers say takes another hundredth or two
+SHARE = 0.015  # of the time, that pictures may take from a run; what browsers say takes another hundredth or two
 QUICK = 0.025  # seconds for a picture of a moving camera: so they come at least now and then
 _MOST_CREDIT = 0.2  # seconds of pictures at once, saved for when a camera moves
 _REFRESH = 2.0  # seconds between pictures of a camera that is still
