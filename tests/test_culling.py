@@ -30,9 +30,13 @@ def one_splat(shape: str, seed: int, needle: bool) -> Case:
     wanted = for_shape(random_splats(seed, 1, 3) | arrays, shape)
     return Case(wanted, random_camera(seed, WIDTH, HEIGHT), shape, "peak", np.float32)
 
+# One of each kind of bound; the others with -m slow.
+FAMILIES = ("gaussian", "skew-normal", "half-gaussian", "generalised-exponential")
+
 
 @pytest.mark.parametrize("schedule", ["cpu16", pytest.param("cpu8", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", [shape if shape in FAMILIES else pytest.param(shape, marks=pytest.mark.slow)
+                                   for shape in SHAPES])
 def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, schedule: str) -> None:
     form = Schedule.parse(schedule)
     kernels = KernelBuild(shape, 3, form)

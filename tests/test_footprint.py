@@ -28,6 +28,7 @@ from clsplat.splats import Splats
 
 SHAPES = list(SKEWED)  # those of another falloff: test_shapes_radial.py
 QUICK = ("gaussian", "skew-normal")
+SOME_SLOW = [shape if shape in QUICK else pytest.param(shape, marks=pytest.mark.slow) for shape in SHAPES]
 
 
 def strongly_skewed(seed: int, n: int) -> Arrays:
@@ -123,7 +124,7 @@ def kernel_boxes(device: Device, shape: str, arrays: Arrays,
     return records[:, 6:8].astype(np.float64), tiles.astype(np.float64)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", SOME_SLOW)
 @pytest.mark.parametrize("turned", [False, True])
 def test_boxes_hold_their_splats_and_little_else(device: Device, shape: str, turned: bool) -> None:
     """Splats of hundreds of pixels, so that rounding to pixels (rows) and tiles (columns) weighs little.
