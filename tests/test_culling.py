@@ -30,6 +30,7 @@ def one_splat(shape: str, seed: int, needle: bool) -> Case:
     wanted = for_shape(random_splats(seed, 1, 3) | arrays, shape)
     return Case(wanted, random_camera(seed, WIDTH, HEIGHT), shape, "peak", np.float32)
 
+
 # One of each kind of bound; the others with -m slow.
 FAMILIES = ("gaussian", "skew-normal", "half-gaussian", "generalised-exponential")
 
