@@ -10,23 +10,19 @@ from numpy.typing import NDArray
 from .errors import InputError
 from .kernels import NEAR
 from .morton import morton_order
+from .random_points import random_points, seen
 from .schema import Array, sh_coefficients
 from .shapes import DEFAULT_SHAPE, shape_named
 from .splats import Splats
 
 if TYPE_CHECKING:
-    from .camera import Camera
     from .scene import Scene
 
 # 3DGS-MCMC's start: small and half opaque (3DGS: opacity 0.1, scale factor 1).
 OPACITY = 0.5
 SCALE_FACTOR = 0.1
 RANDOM_POINTS = 100_000  # 3DGS
-RANDOM_EXTENT = 3.0  # half side of the cube of random points, in scene extents (3DGS-MCMC)
 FEWEST_POINTS = 4  # a point and its three neighbours give the first scale
-SEEN_BY = 2  # cameras that must see a random point, where there are as many: from one alone its place stays unknown
-_DRAWS = 16  # of random points, of which those are kept
-_LOOKING = 32  # cameras, to find out who sees them
 _TOO_NEAR = 0.1  # of what cameras see may be nearer than the near plane
 _LOOKED_AT = 2000  # points, to find that out
 
@@ -92,11 +88,11 @@ def _points(
         keep = best_observed(xyz, tracks, cap, scene)
         return xyz[keep], rgb[keep], f"{cap} splats from the scene's points: the best observed of {len(apart)}"
     count = min(cap, RANDOM_POINTS)
-    placed = _random_points(scene, count, rng)
+    placed = random_points(scene, count, rng)
     rgb = rng.integers(0, 256, (count, 3), dtype=np.uint8)
     there = f"{found} points" if len(apart) == found else f"{found} points, {len(apart)} of them apart"
     why = "" if init == "random" else f" (the scene has {there}): expect less than from good points"
-    return placed, rgb, f"{count} splats at random around the cameras{why}"
+    return placed, rgb, f"{count} splats at random where the cameras look{why}"
 
 
 def distinct(xyz: Array) -> NDArray[np.int64]:
@@ -113,39 +109,13 @@ def distinct(xyz: Array) -> NDArray[np.int64]:
 def check_size(scene: Scene) -> None:
     """Raises InputError where what the cameras see lies before the near plane: such a scene cannot be rendered."""
     xyz = scene.points.xyz[:: -(-len(scene.points.xyz) // _LOOKED_AT) or 1]
-    depths = [depth[inside] for depth, inside in (_seen(view.camera, xyz) for view in scene.train)]
+    depths = [depth[inside] for depth, inside in (seen(view.camera, xyz) for view in scene.train)]
     depth = np.concatenate(depths) if depths else np.zeros(0)
     if not len(depth) or np.mean(depth < NEAR) <= _TOO_NEAR:
         return
     factor = 10.0 ** np.ceil(np.log10(10 * NEAR / np.median(depth)))
     raise InputError(f"{scene.path}: {np.mean(depth < NEAR):.0%} of what its cameras see is nearer than the near plane "
                      f"({NEAR:g} units): make the reconstruction about {factor:g} times as large")
-
-
-def _seen(camera: Camera, xyz: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """(P,) depths of points, and whether they lie before the camera and inside its image."""
-    local = xyz @ camera.rotation.T + camera.translation
-    depth = local[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixel = local[:, :2] / depth[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    inside: NDArray[np.bool_] = (depth > 0) & ((pixel >= 0) & (pixel < (camera.width, camera.height))).all(axis=1)
-    return depth, inside
-
-
-def _random_points(scene: Scene, count: int, rng: np.random.Generator) -> Array:
-    """(count, 3) in a cube around the cameras, those that cameras see before others."""
-    centres = np.array([view.camera.position for view in scene.train])
-    # One camera, or several in one place, tell nothing of the size.
-    half_side = RANDOM_EXTENT * (scene.extent if scene.extent > 0 else 1.0)
-    cameras = [view.camera for view in scene.train[:: -(-len(scene.train) // _LOOKING)]]
-    kept, rest = np.zeros((0, 3)), np.zeros((0, 3))
-    for _ in range(_DRAWS):
-        drawn = centres.mean(axis=0) + rng.uniform(-half_side, half_side, (count, 3))
-        seen = np.sum([_seen(camera, drawn)[1] for camera in cameras], axis=0) >= min(SEEN_BY, len(cameras))
-        kept, rest = np.concatenate([kept, drawn[seen]]), drawn[~seen]
-        if len(kept) >= count:
-            break
-    return np.concatenate([kept, rest])[:count]
 
 
 def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene: Scene) -> NDArray[np.int64]:

@@ -25,8 +25,8 @@ FLOORS = """
     adc charts config densify frontier_charts kernels point_cloud posed regularisers splats viewer_recording
     blocks buffers complexity convert model_folder paths_around rate_limits splat_file strategy systems transforms
     budget_state gradients limits nearest optim_rules optim_waiting placing scene sort
-    binning initialise optim_fused optim_host stages synthetic validation view_sampler
-    optim pipeline
+    binning optim_fused optim_host random_points stages synthetic validation view_sampler
+    initialise optim pipeline
     loss memory pairs truths tuning
     render
     display evaluate needs

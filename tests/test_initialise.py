@@ -11,7 +11,7 @@ import pytest
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.initialise import RANDOM_EXTENT, RANDOM_POINTS, initial_splats
+from clsplat.initialise import RANDOM_POINTS, initial_splats
 from clsplat.morton import morton_order
 from clsplat.shapes import SHAPES
 from clsplat.splats import Splats
@@ -75,20 +75,17 @@ def test_a_cap_leaves_no_part_of_the_scene_empty() -> None:
 
 
 @pytest.mark.parametrize(("init", "n_points"), [("random", 50), ("sfm", 0), ("sfm", 3)])
-def test_random_points_fill_the_cube_around_the_cameras(init: str, n_points: int) -> None:
+def test_scenes_without_points_start_at_random(init: str, n_points: int) -> None:
     splats, message = initial_splats(scene(n_points), cap=3000, init=init)
     assert len(splats) == 3000
-    offset = (splats.mean - np.array([5.0, 0, 0])) / (RANDOM_EXTENT * 2.0)
-    assert np.abs(offset).max() <= 1 + 1e-6
-    assert offset.std() == pytest.approx(3**-0.5, rel=0.1)
-    assert "at random" in message
+    assert "at random where the cameras look" in message
     assert (f"the scene has {n_points} points" in message) == (init == "sfm")
 
 
 def test_random_points_have_their_own_limit_and_need_no_extent() -> None:
     splats, _ = initial_splats(scene(0, extent=0.0), shape="gaussian", sh_degree=0, init="random")
     assert len(splats) == RANDOM_POINTS
-    assert np.ptp(splats.mean[:, 0]) > RANDOM_EXTENT
+    assert np.ptp(splats.mean[:, 0]) > 1
 
 
 def test_the_same_seed_gives_the_same_splats() -> None:
@@ -167,20 +164,6 @@ def test_a_skewed_model_of_another_normalisation_is_refused(tmp_path: Path) -> N
 def test_what_cannot_be_used(options: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
         initial_splats(scene(10), **options)
-
-
-def test_random_points_lie_where_two_cameras_look() -> None:
-    """Cameras at (4, 0, 0) and (6, 0, 0) look along z."""
-    source = scene(0)
-    for view, x in zip(source.train, (4.0, 6.0), strict=True):
-        pose = np.eye(4)
-        pose[0, 3] = -x
-        view.camera = Camera(20, 10, 5, 5, 10, 5, pose)
-    splats, _ = initial_splats(source, cap=300, init="random")
-    for x in (4.0, 6.0):
-        local = splats.mean - (x, 0.0, 0.0)
-        assert (local[:, 2] > 0).all()
-        assert (np.abs(local[:, :2]) <= local[:, 2:] * (2.0, 1.0)).all()
 
 
 def test_points_in_one_place_are_one_splat() -> None:
