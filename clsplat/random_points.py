@@ -27,8 +27,9 @@ def random_points(scene: Scene, count: int, rng: np.random.Generator) -> Array:
     """(count, 3) points, half of them where most cameras look, the others where two do.
 
     They are even in space contracted around the point nearest to all optical axes (Barron et al. 2022, Mip-NeRF 360,
-    eq. 10), with the cameras' median distance as its unit: far points are rare. On validation views (3000 splats, 600 iterations, one seed; a cube around the cameras in brackets): lego 24.2
-    (12.5), fox 22.9 (20.1), kitchen 18.6 dB (16.2).
+    eq. 10), with the cameras' median distance as its unit: far points are rare. On validation views (3000 splats, 600
+    iterations, one seed; a cube around the cameras in brackets): lego 24.2 (12.5), fox 22.9 (20.1), kitchen 18.6 dB
+    (16.2).
     """
     cameras = [view.camera for view in scene.train[:: -(-len(scene.train) // _LOOKING)]]
     centres = np.array([view.camera.position for view in scene.train])
