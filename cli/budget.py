@@ -11,6 +11,7 @@ from clsplat.budget_rules import TOLERANCE, BudgetOptions
 from clsplat.budget_state import FILE, BudgetState
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError, OutputError
+from clsplat.sole_writer import sole_writer
 
 from .options import Decibels, F
 from .progress import TrainingDisplay
@@ -56,9 +57,10 @@ def is_search(folder: Path) -> bool:
 
 
 def forget_search(folder: Path) -> None:
-    """Before another run takes the folder: what a search left there is not of it."""
+    """Before another run takes the folder: what a search left there is not of it. OutputError while it is going on."""
     if is_search(folder):
-        BudgetState(folder).remove()
+        with sole_writer(folder):
+            BudgetState(folder).remove()
 
 
 def stored_search(folder: Path) -> tuple[dict[str, Any], BudgetOptions, dict[str, Any]] | None:

@@ -10,7 +10,7 @@ import click
 from clsplat.errors import InputError, OutputError
 from clsplat.shapes import GAUSSIAN, SHAPES
 
-from .models import LoadedModel, load_model
+from .models import LoadedModel, load_model, recorded_cameras
 from .options import PATH, device_option, iteration_option, quiet_option
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def convert_model(model: Path, output: Path, shape: str | None, approximate: boo
     target = shape or (GAUSSIAN.name if as_splat else loaded.splats.shape)
     if as_splat and target != GAUSSIAN.name:
         raise InputError(f"{output}: {_SPLAT} files hold Gaussians: leave --shape out, or write a .ply")
-    nearest = approximate and target == GAUSSIAN.name and _is_skewed(loaded.splats)
+    nearest = approximate and target == GAUSSIAN.name and loaded.splats.skew.any()
     if nearest:
         from clsplat.nearest import nearest_gaussians
 
@@ -60,7 +60,7 @@ def convert_model(model: Path, output: Path, shape: str | None, approximate: boo
         try:
             converted = convert(loaded.splats, target)
         except InputError as error:
-            hint = "; or --approximate" if target == GAUSSIAN.name and _is_skewed(loaded.splats) else ""
+            hint = "; or --approximate" if target == GAUSSIAN.name and loaded.splats.skew.any() else ""
             raise InputError(f"{error}{hint}") from None
     write_splat(output, converted) if as_splat else converted.save(output)
     if quiet:
@@ -70,10 +70,6 @@ def convert_model(model: Path, output: Path, shape: str | None, approximate: boo
     shown = _first_band(converted) if as_splat else converted
     if nearest or (as_splat and converted.sh_degree):
         click.echo(_cost(loaded, shown, cameras, device))
-
-
-def _is_skewed(splats: Splats) -> bool:
-    return "skew" in splats.arrays and bool(splats.arrays["skew"].any())
 
 
 def _first_band(splats: Splats) -> Splats:
@@ -86,19 +82,18 @@ def _first_band(splats: Splats) -> Splats:
 def _cost(loaded: LoadedModel, converted: Splats, cameras: Path | None, device: str | None) -> str:
     """How far the images are from the model's own."""
     from clsplat.cameras_json import read_cameras
+    from clsplat.evaluate import MAX_PSNR
     from clsplat.metrics import psnr
     from clsplat.render import Renderer
 
-    if cameras is None and loaded.folder is not None and loaded.folder.cameras_path.is_file():
-        cameras = loaded.folder.cameras_path
-    if cameras is None:
+    named = recorded_cameras(loaded) if cameras is None else read_cameras(cameras)
+    if not named:
         return "what that costs was not measured: name cameras with --cameras FILE"
     renderer, worst, total = Renderer(device), float("inf"), 0.0
-    named = read_cameras(cameras)
     for entry in named:
         own, new = (renderer.render(splats, entry.camera, loaded.background).color
                     for splats in (loaded.splats, converted))
-        value = min(psnr(own, new), 100.0)
+        value = min(psnr(own, new), MAX_PSNR)
         worst, total = min(worst, value), total + value
     return (f"PSNR against the model's own images, {len(named)} cameras: {total / len(named):.2f} dB, "
             f"worst {worst:.2f} dB")

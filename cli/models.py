@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import click
+
+from clsplat.cameras_json import NamedCamera, bare_name, read_cameras
 from clsplat.errors import InputError
 from clsplat.model_folder import ModelFolder
 from clsplat.splats import Splats
@@ -93,6 +96,26 @@ def scene_of(model: LoadedModel, source_path: Path | None = None, images: str | 
         raise InputError(f"{path}: lacks view {missing[0]!r}, a test view of {model.path}: "
                          "give the scene it was trained on with -s")
     return replace(scene, test_names=held_out)
+
+
+def recorded_cameras(model: LoadedModel) -> list[NamedCamera]:
+    """The cameras in the model's folder; none for a PLY or a folder without them."""
+    if model.folder is None or not model.folder.cameras_path.is_file():
+        return []
+    return read_cameras(model.folder.cameras_path)
+
+
+def both_forms(names: frozenset[str]) -> frozenset[str]:
+    """Names of images and their forms in cameras.json, which has them without the extension."""
+    return names | {bare_name(name) for name in names}
+
+
+def one_model(model: Path | None, model_path: Path | None) -> Path:
+    """The model given as an argument or as -m; raises click.UsageError unless there is one."""
+    given = model or model_path
+    if given is None or (model and model_path and model != model_path):
+        raise click.UsageError("give one model folder or PLY file")
+    return given
 
 
 def _recorded(folder: ModelFolder) -> tuple[RGB, dict[str, Any]]:

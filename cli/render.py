@@ -13,11 +13,11 @@ import click
 import numpy as np
 
 from clsplat.camera_path import DEFAULT_FPS, write_path
-from clsplat.cameras_json import NamedCamera, bare_name, img_names, read_cameras, write_cameras
+from clsplat.cameras_json import NamedCamera, named_cameras, read_cameras, write_cameras
 from clsplat.errors import InputError
 from clsplat.paths_between import resized_by_height
 
-from .models import LoadedModel, load_model, scene_of
+from .models import LoadedModel, both_forms, load_model, one_model, recorded_cameras, scene_of
 from .options import (
     PATH,
     RGB,
@@ -82,9 +82,7 @@ def render(model: Path | None, model_path: Path | None, output: Path | None, vid
         raise click.UsageError("--keys, --closed, --frames, --seconds and --save-path belong to --path")
     if output is None and video is None:
         raise click.UsageError("give -o DIR for images, --video FILE, or both")
-    given = model or model_path
-    if given is None or (model and model_path and model != model_path):
-        raise click.UsageError("give one model folder or PLY file")
+    given = one_model(model, model_path)
     colour = background_of(background, white_background)
     if video is not None:
         from clsplat.video import VideoWriter
@@ -96,11 +94,10 @@ def render(model: Path | None, model_path: Path | None, output: Path | None, vid
         views, source, view_set = read_cameras(cameras), cameras, view_set or "all"
     elif from_scene:
         scene = scene_of(loaded, source_path, images, resolution)
-        names = img_names([view.name for view in scene.views])
-        views = [NamedCamera(name, view.camera) for name, view in zip(names, scene.views, strict=True)]
+        views = named_cameras(scene.names, scene.cameras)
         test_names, source = scene.test_names, scene.path
     else:
-        views = _recorded_cameras(loaded)
+        views = recorded_cameras(loaded)
     if path is None:
         views = _resized(_chosen(views, test_names, view_set, source), size)
         rate = fps or DEFAULT_FPS
@@ -190,21 +187,13 @@ def _resized(views: list[NamedCamera], size: tuple[int, int] | None) -> list[Nam
     return [NamedCamera(view.name, resized_by_height(view.camera, *size)) for view in views]
 
 
-def _recorded_cameras(model: LoadedModel) -> list[NamedCamera]:
-    """The cameras in the model's folder; none for a PLY or a folder without them."""
-    if model.folder is None or not model.folder.cameras_path.is_file():
-        return []
-    return read_cameras(model.folder.cameras_path)
-
-
 def _chosen(views: list[NamedCamera], test_names: frozenset[str] | None, view_set: str | None,
             source: Path) -> list[NamedCamera]:
     """The test, train or all views; by default the test views, where there are any among them."""
     if not views:
         raise InputError(f"{source}: no cameras to render: give --cameras cameras.json, a scene with -s, "
                          "or --path orbit")
-    held_out = test_names or frozenset()
-    names = held_out | {bare_name(name) for name in held_out}  # cameras.json has them without the extension
+    names = both_forms(test_names or frozenset())
     test = [view for view in views if view.name in names]
     if view_set in (None, "all"):
         return test if test and view_set is None else views

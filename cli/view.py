@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from clsplat.cameras_json import named_cameras
 from clsplat.errors import ClsplatError, InputError
 from clsplat.model_folder import ModelFolder
 
-from .models import LoadedModel, load_model, scene_of
+from .models import LoadedModel, both_forms, load_model, one_model, recorded_cameras, scene_of
 from .options import (
     PATH,
     RGB,
@@ -70,9 +71,7 @@ def view(model: Path | None, model_path: Path | None, source_path: Path | None, 
     Ctrl-C ends it. From another machine: ssh -L 8080:localhost:8080 HOST, then open http://localhost:8080 here. A file
     that changes is read again.
     """
-    given = model or model_path
-    if given is None or (model and model_path and model != model_path):
-        raise click.UsageError("give one model folder or PLY file")
+    given = one_model(model, model_path)
     colour = background_of(background, white_background)
     require_viser()
     loaded = load_model(given, iteration)
@@ -91,19 +90,14 @@ def view(model: Path | None, model_path: Path | None, source_path: Path | None, 
 
 def known_cameras(model: LoadedModel, source_path: Path | None, images: str | None, resolution: int | None) -> Known:
     """Cameras of the scene given, else those in the model's folder; none are known of a PLY alone."""
-    from clsplat.cameras_json import NamedCamera, bare_name, img_names, read_cameras
     from clsplat.viewer_start import Known
 
     if source_path is not None or images is not None or resolution is not None:
         scene = scene_of(model, source_path, images, resolution)
-        names = img_names([item.name for item in scene.views])
-        cameras = [NamedCamera(name, item.camera) for name, item in zip(names, scene.views, strict=True)]
-        held_out = scene.test_names
-    elif model.folder is not None and model.folder.cameras_path.is_file():
-        cameras, held_out = read_cameras(model.folder.cameras_path), model.test_names or frozenset()
+        cameras, held_out = named_cameras(scene.names, scene.cameras), scene.test_names
     else:
-        return Known()
-    test = held_out | {bare_name(name) for name in held_out}
+        cameras, held_out = recorded_cameras(model), model.test_names or frozenset()
+    test = both_forms(held_out)
     return Known(tuple(item for item in cameras if item.name not in test),
                  tuple(item for item in cameras if item.name in test))
 

@@ -10,6 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from .errors import InputError
 
 
+def is_rotation(matrix: NDArray[np.float64]) -> bool:
+    """Whether (3, 3) turns and neither mirrors nor scales, to 1e-3."""
+    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(matrix) >= 0)
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """Intrinsics in pixels and a world-to-camera pose.
@@ -47,8 +52,7 @@ class Camera:
             pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
         if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
             raise InputError("camera: cam_from_world must be a finite (4, 4) or (3, 4) matrix")
-        rotation = pose[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        if not is_rotation(pose[:3, :3]):
             raise InputError("camera: cam_from_world's left 3x3 block must be a rotation matrix")
         pose.setflags(write=False)
         for name, value in zip(("width", "height"), (width, height), strict=True):

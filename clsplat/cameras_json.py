@@ -46,6 +46,11 @@ def img_names(names: Sequence[str]) -> list[str]:
     return bare if len(set(bare)) == len(bare) else list(names)
 
 
+def named_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> list[NamedCamera]:
+    """Cameras of image files, each under its `img_name`."""
+    return [NamedCamera(name, camera) for name, camera in zip(img_names(names), cameras, strict=True)]
+
+
 def read_cameras(path: str | os.PathLike[str]) -> list[NamedCamera]:
     """Cameras in file order; keys that clsplat does not know are ignored, `id` too.
 

@@ -74,13 +74,20 @@ def kind(given: object) -> str:
     return "a number"
 
 
-def _finite(given: object, key: str) -> float:
+def real_of(given: object) -> float | None:
+    """A JSON number, infinite where it is too large; None of anything else."""
     if isinstance(given, bool) or not isinstance(given, (int, float)):
-        raise InputError(f"key {key!r} is {kind(given)}; expected a number")
+        return None
     try:
-        real = float(given)
+        return float(given)
     except OverflowError:
-        real = math.inf
+        return math.inf
+
+
+def _finite(given: object, key: str) -> float:
+    real = real_of(given)
+    if real is None:
+        raise InputError(f"key {key!r} is {kind(given)}; expected a number")
     if not math.isfinite(real):
         raise InputError(f"key {key!r} is not finite; expected a number")
     return real

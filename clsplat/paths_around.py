@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from .camera import Camera
 from .errors import InputError
+from .looked_at import where_axes_meet
 from .splats import Splats
 
 Vector = NDArray[np.float64]
 
-# Least eigenvalue of the mean of I - d d' below which the optical axes d count as parallel (about 4 degrees).
-_PARALLEL = 5e-3
 # Variance of x axes about level, (6 degrees)^2, below which tilting up no further is worth it.
 _LEVELLING = 1e-2
 # Without cameras: 3DGS worlds come from cameras, whose y axis points down; 60 degrees across, 4:3.
@@ -199,13 +198,11 @@ def _upwards(cameras: Sequence[Camera]) -> Vector:
 
 def _looked_at(cameras: Sequence[Camera], means: Vector) -> Vector:
     """The point nearest to all optical axes; where they are parallel, at the splats' median depth."""
+    nearest = where_axes_meet(cameras)
+    if nearest is not None:
+        return nearest
     centres = np.array([camera.position for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    system = across.mean(axis=0)
-    if np.linalg.eigvalsh(system)[0] > _PARALLEL:
-        nearest: Vector = np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(cameras))
-        return nearest
     forward, centre = _unit(axes.sum(axis=0), axes[0]), centres.mean(axis=0)
     depths = (means - centre) @ forward
     ahead = depths[depths > 0]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from .looked_at import where_axes_meet
 from .schema import Array
 
 if TYPE_CHECKING:
@@ -17,8 +18,7 @@ if TYPE_CHECKING:
 SEEN_BY = 2  # cameras that must see a point, where there are as many: from one alone its place stays unknown
 MOST = 0.75  # of the cameras: half of the points are where so many look, if there is such a place
 _FARTHEST = 9.0  # from the middle, in median distances of the cameras
-_PARALLEL = 5e-3  # least eigenvalue of the mean of I - d d' below which the optical axes d count as parallel
-_AHEAD = 3.0  # of such cameras: how far before them the middle is taken to be, in scene extents
+_AHEAD = 3.0  # of parallel cameras: how far before them the middle is taken to be, in scene extents
 _DRAWS = 16  # of as many points as are wanted, of which those that are seen are kept
 _LOOKING = 32  # cameras, to find out who sees them
 
@@ -40,7 +40,7 @@ def random_points(scene: Scene, count: int, rng: np.random.Generator) -> Array:
     most, some, unseen = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
     for _ in range(_DRAWS):
         drawn = middle + unit * _uncontracted(count, rng)
-        lookers = np.sum([seen(camera, drawn)[1] for camera in cameras], axis=0)
+        lookers = _lookers(cameras, drawn)
         by_most = lookers >= max(few, MOST * len(cameras))
         most = np.concatenate([most, drawn[by_most]])
         some = np.concatenate([some, drawn[(lookers >= few) & ~by_most]])
@@ -52,7 +52,7 @@ def random_points(scene: Scene, count: int, rng: np.random.Generator) -> Array:
         if len(most) >= half:
             break
         drawn = middle + reach * _in_ball(count, rng)
-        lookers = np.sum([seen(camera, drawn)[1] for camera in cameras], axis=0)
+        lookers = _lookers(cameras, drawn)
         most = np.concatenate([most, drawn[lookers >= max(few, MOST * len(cameras))]])
     half = min(half, len(most))
     return np.concatenate([most[:half], some[: count - half], most[half:], unseen])[:count]
@@ -68,14 +68,18 @@ def seen(camera: Camera, xyz: Array) -> tuple[Array, NDArray[np.bool_]]:
     return depth, inside
 
 
+def _lookers(cameras: Sequence[Camera], xyz: Array) -> NDArray[np.int64]:
+    """(P,) how many cameras see each point."""
+    return np.asarray(np.sum([seen(camera, xyz)[1] for camera in cameras], axis=0), np.int64)
+
+
 def _middle(cameras: Sequence[Camera], extent: float) -> Array:
     """The point nearest to all optical axes; of parallel ones a point ahead."""
-    centres = np.array([camera.position for camera in cameras])
-    axes = np.array([camera.rotation[2] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    if np.linalg.eigvalsh(across.mean(axis=0))[0] < _PARALLEL:
-        return np.asarray(centres.mean(axis=0) + _AHEAD * extent * axes.mean(axis=0))
-    return np.asarray(np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centres)))
+    nearest = where_axes_meet(cameras)
+    if nearest is not None:
+        return nearest
+    centre = np.mean([camera.position for camera in cameras], axis=0)
+    return np.asarray(centre + _AHEAD * extent * np.mean([camera.rotation[2] for camera in cameras], axis=0))
 
 
 def _uncontracted(count: int, rng: np.random.Generator) -> Array:

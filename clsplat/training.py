@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from .cameras_json import NamedCamera, img_names
+from .cameras_json import named_cameras
 from .checkpoint import Checkpoint
 from .config import FREE_OPTIONS, TrainConfig
 from .errors import InputError, OutputError
@@ -57,8 +57,7 @@ def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[P
             record = {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names)}
             folder.write_config({"config": config.to_json(), "scene": record | (extra or {})})
             views = [*scene.test, *scene.train]
-            names = img_names([view.name for view in views])
-            folder.write_cameras([NamedCamera(n, view.camera) for n, view in zip(names, views, strict=True)])
+            folder.write_cameras(named_cameras([view.name for view in views], [view.camera for view in views]))
         return trainer.run(folder, visit)
 
 

@@ -9,7 +9,6 @@ already, and are put on points only where these come from the COLMAP model that 
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from collections.abc import Iterator
@@ -20,16 +19,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .camera import is_rotation
+from .camera_path import cam_from_world_of
 from .cameras_json import IMAGE_SUFFIXES
 from .colmap import Lens, Photo, Points, make_lens, read_model
 from .errors import InputError
 from .images import image_size
+from .json_fields import read_json, real_of
 from .point_cloud import read_point_cloud
 from .posed import Posed
 
 FILE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
 
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _MAX_SIDE = 1 << 20  # of an image [px]
@@ -124,11 +125,10 @@ class _Frame:
         matrix = _matrix(given)
         if matrix is None:
             raise InputError(f"{self.place}: transform_matrix must be 4 x 4 finite numbers; write the poses again")
-        rotation = matrix[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        if not is_rotation(matrix[:3, :3]):
             raise InputError(f"{self.place}: transform_matrix has no rotation in its left 3 x 3 block; write the "
                              "poses again, without a scale")
-        return np.asarray(np.linalg.inv(matrix @ _OPENCV_FROM_OPENGL), np.float64)
+        return cam_from_world_of(matrix)
 
     def lens(self) -> Lens:
         """The lens, of the size that the file gives, or the photo has."""
@@ -173,9 +173,10 @@ class _Frame:
         value = self.value(key)
         if value is None:
             return default
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _LARGEST:
+        real = real_of(value)
+        if real is None or not abs(real) < _LARGEST:
             raise InputError(f"{self.place}: {key} is {str(value)[:40]!r}; it must be a number")
-        return float(value)
+        return real
 
     def value(self, key: str) -> Any:
         """The frame's own value, else that of all frames."""
@@ -191,12 +192,7 @@ class _Document:
 
     @staticmethod
     def read(path: Path) -> _Document:
-        try:
-            values = json.loads(path.read_bytes())
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-        except (ValueError, RecursionError):
-            raise InputError(f"{path}: is no JSON; write the poses again") from None
+        values = read_json(path, "a transforms.json of NeRF, instant-ngp or nerfstudio")
         if not isinstance(values, dict) or not isinstance(values.get("frames"), list) or not values["frames"]:
             raise InputError(f"{path}: has no list 'frames'; give a transforms.json of NeRF, instant-ngp or nerfstudio")
         return _Document(path, values)
@@ -252,8 +248,8 @@ class _Document:
     def applied(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points of the COLMAP model, moved as its poses were."""
         matrix = _matrix(self.values["applied_transform"])
-        scale = self.values.get("applied_scale", 1.0)
-        if matrix is None or isinstance(scale, bool) or not isinstance(scale, (int, float)) or not 0 < scale < _LARGEST:
+        scale = real_of(self.values.get("applied_scale", 1.0))
+        if matrix is None or scale is None or not 0 < scale < _LARGEST:
             raise InputError(f"{self.path}: applied_transform must be 3 x 4 numbers and applied_scale above 0")
         moved: NDArray[np.float64] = scale * (xyz @ matrix[:3, :3].T + matrix[:3, 3])
         return moved

@@ -10,10 +10,10 @@ import numpy as np
 
 from .camera import Camera
 from .errors import InputError
+from .opacities import FARTHEST
 from .rotations import NORM_FLOOR, rotations
 
 WIDEST = math.radians(170.0)  # vertical field of view; beyond, every splat covers the image
-FARTHEST = 1e15  # coordinate; beyond, float32 cannot square it
 LARGEST_WINDOW = 16384  # px
 
 _STEP = 2.0**-0.25  # of the scale while moving: each step down halves the pixels of two steps before

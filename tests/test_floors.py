@@ -19,10 +19,11 @@ FLOORS = """
     viewer_settings
     arithmetic atomic budget_rules camera device json_fields metrics optim_reference plan ply_header presets \
     profiles rotations run_log schedules signatures sole_writer validity
-    binaries cameras_json checkpoint colmap_files frontier_data html_report images launches noise optim_lazy \
-    paths_between ply_body ply_compact shapes video viewer_camera
+    binaries cameras_json checkpoint colmap_files frontier_data html_report images launches looked_at noise \
+    optim_lazy paths_between ply_body ply_compact shapes video
     camera_path capture chart_style colmap frontier_tables opacities ply program sghmc skew_map viewer_start
-    adc charts config densify frontier_charts kernels point_cloud posed regularisers splats viewer_recording
+    adc charts config densify frontier_charts kernels point_cloud posed regularisers splats viewer_camera \
+    viewer_recording
     blocks buffers complexity convert model_folder paths_around rate_limits splat_file strategy systems transforms
     budget_state gradients limits nearest optim_rules optim_waiting placing scene sort
     binning optim_fused optim_host random_points stages synthetic validation view_sampler

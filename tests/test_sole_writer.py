@@ -9,7 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
+from clsplat_cli.budget import forget_search
 
+from clsplat.budget_state import FILE
 from clsplat.errors import OutputError
 from clsplat.sole_writer import sole_writer
 
@@ -59,3 +61,18 @@ def test_blocks_within_a_block_are_one_writer(tmp_path: Path) -> None:
 def refused(folder: Path) -> bool:
     done = subprocess.run([sys.executable, "-c", HOLD.replace("60", "0"), str(folder)], capture_output=True, text=True)
     return "another run writes into it" in done.stderr
+
+
+def test_a_search_that_goes_on_keeps_its_findings(tmp_path: Path) -> None:
+    """Whoever takes its folder with --overwrite meanwhile is refused before anything is removed."""
+    (tmp_path / FILE).write_text("{}")
+    process = holder(tmp_path)
+    try:
+        with pytest.raises(OutputError, match="another run writes into it"):
+            forget_search(tmp_path)
+        assert (tmp_path / FILE).exists()
+    finally:
+        process.kill()
+        process.wait(10)
+    forget_search(tmp_path)
+    assert not (tmp_path / FILE).exists()
