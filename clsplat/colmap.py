@@ -88,6 +88,40 @@ class Photo:
         except InputError as error:
             raise InputError(f"image {self.name!r}: {error}; rebuild the model") from None
 
+    def fit_mask(self, mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
+        """A mask of the photo as a mask of `fit`'s image: the nearest pixel, False outside the photo.
+
+        Parameters
+        ----------
+        mask : (h, w) bool, True where the photo counts; of the photo's size or a reduction of it.
+        width, height : of the photo as stored, before `fit` [px].
+
+        Returns
+        -------
+        (H, W) bool, of the size of `fit`'s image.
+
+        Raises
+        ------
+        InputError : the mask has another aspect than the photo, or what `fit` raises.
+        """
+        rows, columns = mask.shape
+        if abs(columns * height - rows * width) >= width + height:
+            raise InputError(f"image {self.name!r}: its mask is {columns}x{rows} px, the photo {width}x{height}; "
+                             "make the mask of the photo's size")
+        lens = _scaled(self.lens, width, height, self.name)
+        if _is_pinhole(lens):
+            if mask.shape == (height, width):
+                return mask.astype(bool)
+            down, across = np.mgrid[:height, :width] + 0.5
+        else:
+            across, down = _seen_from(_pinhole_of(lens, self.name), lens)
+        # Outside the outermost pixel centres the image is blank (bilinear); rays that no pixel sees are NaN.
+        inside = (across >= 0.5) & (across <= width - 0.5) & (down >= 0.5) & (down <= height - 0.5)
+        fitted = np.zeros(inside.shape, bool)
+        row, column = down[inside] * (rows / height), across[inside] * (columns / width)
+        fitted[inside] = mask[row.astype(int), column.astype(int)]
+        return fitted
+
 
 @dataclass(frozen=True, eq=False)
 class Model:
@@ -223,18 +257,42 @@ def _is_pinhole(lens: Any) -> bool:
 
 
 def _undistorted(image: _images.ImageU8, lens: Any, name: str) -> tuple[_images.ImageU8, Any]:
+    _pinhole_of(lens, name)
     pycolmap = _library()
     try:
         bitmap, pinhole = pycolmap.undistort_image(
             pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.ascontiguousarray(image)), lens)
     except (ValueError, RuntimeError, MemoryError) as error:
-        raise InputError(f"image {name!r}: its {lens.model.name} camera cannot be undistorted "
-                         f"({_reason(error)}); undistort the photos first") from None
+        raise _not_undistorted(lens, name, error) from None
+    return np.ascontiguousarray(bitmap.to_array()), pinhole
+
+
+def _pinhole_of(lens: Any, name: str) -> Any:
+    """The camera that `_undistorted` will give."""
+    pycolmap = _library()
+    try:
+        pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+    except (ValueError, RuntimeError, MemoryError) as error:
+        raise _not_undistorted(lens, name, error) from None
     # A panorama comes back as it was, and asking its camera for a focal length would end the process.
     if pinhole.model.name != "PINHOLE":
         raise InputError(f"image {name!r}: the camera model {lens.model.name} has no pinhole image; "
                          "make perspective views of it first")
-    return np.ascontiguousarray(bitmap.to_array()), pinhole
+    return pinhole
+
+
+def _not_undistorted(lens: Any, name: str, error: Exception) -> InputError:
+    return InputError(f"image {name!r}: its {lens.model.name} camera cannot be undistorted "
+                      f"({_reason(error)}); undistort the photos first")
+
+
+def _seen_from(pinhole: Any, lens: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where a lens puts the pixel centres of a pinhole camera: x and y [px], (H, W) each; NaN where nowhere."""
+    down, across = np.mgrid[: pinhole.height, : pinhole.width] + 0.5
+    rays = np.stack([(across - pinhole.principal_point_x) / pinhole.focal_length_x,
+                     (down - pinhole.principal_point_y) / pinhole.focal_length_y, np.ones(across.shape)], axis=2)
+    seen = np.asarray(lens.img_from_cam(rays.reshape(-1, 3)), np.float64).reshape(*across.shape, 2)
+    return seen[..., 0], seen[..., 1]
 
 
 def _reason(error: Exception) -> str:

@@ -63,6 +63,42 @@ def test_undistorted_photo_shows_points_where_its_camera_says(model: str, params
     assert (flat[:4].sum(), flat[-4:].sum()) == (0, 0)      # the ground is black, so is what the border gets
 
 
+@pytest.mark.parametrize(("model", "params"), [
+    ("PINHOLE", [300, 310, 190, 155]),
+    ("OPENCV", [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]),
+    ("OPENCV_FISHEYE", [200, 205, 202, 149, 0.02, 0.01, 0, 0]),
+])
+@pytest.mark.parametrize("reduced", [1, 2])
+def test_mask_follows_the_photo(model: str, params: list[float], reduced: int) -> None:
+    """A mask that is a threshold of the photo is that threshold of the fitted photo, but along edges."""
+    import pycolmap
+
+    photo = Photo("disc", np.eye(4), pycolmap.Camera(model=model, width=400, height=300, params=params))
+    y, x = np.mgrid[:300, :400] // reduced * reduced
+    mask = ((x - 120) ** 2 + (y - 100) ** 2 < 90**2) | (x > 330)
+    flat, camera = photo.fit(np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2))
+    fitted = photo.fit_mask(mask[::reduced, ::reduced], 400, 300)
+    assert fitted.dtype == bool
+    assert fitted.shape == (camera.height, camera.width)
+    assert not (fitted[flat[..., 0] == 0]).any()
+    assert fitted[flat[..., 0] == 255].all()
+    assert 0.2 < fitted.mean() < 0.6
+
+
+def test_mask_is_false_outside_the_photo() -> None:
+    import pycolmap
+
+    # This lens leaves a sliver of the fitted image blank.
+    params = [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]
+    photo = Photo("sliver", np.eye(4), pycolmap.Camera(model="OPENCV", width=400, height=300, params=params))
+    white, _ = photo.fit(np.full((300, 400, 3), 255, np.uint8))
+    fitted = photo.fit_mask(np.ones((300, 400), bool), 400, 300)
+    assert 0 < (~fitted).sum() < 100
+    np.testing.assert_array_equal(fitted, white[..., 0] == 255)
+    with pytest.raises(InputError, match=r"its mask is 300x400 px, the photo 400x300"):
+        photo.fit_mask(np.ones((400, 300), bool), 400, 300)
+
+
 def test_zero_distortion_is_a_plain_pinhole() -> None:
     import pycolmap
 
