@@ -1,4 +1,4 @@
-"""A report as one HTML page that needs nothing beside it: charts as inlined SVG, tables, no script."""
+"""A report as one HTML page that needs nothing beside it: charts as inlined SVG, tables, markup of the caller's."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ class Section:
 
     Parameters
     ----------
-    text : paragraphs. chart : an SVG file. head, lines : a table. files : links, relative to the page.
+    text : paragraphs. chart : an SVG file. head, lines : a table. markup : HTML of the caller's, put in as it is.
+    files : links, relative to the page.
     """
 
     title: str
@@ -45,11 +46,16 @@ class Section:
     chart: Path | None = None
     head: Sequence[str] = ()
     lines: Sequence[Sequence[str]] = ()
+    markup: str = ""
     files: Sequence[str] = ()
 
 
-def write_page(path: Path, title: str, sections: Sequence[Section]) -> Path:
+def write_page(path: Path, title: str, sections: Sequence[Section], style: str = "", script: str = "") -> Path:
     """Write the page; returns its path.
+
+    Parameters
+    ----------
+    style, script : CSS and JavaScript that the sections' markup needs.
 
     Raises
     ------
@@ -57,22 +63,24 @@ def write_page(path: Path, title: str, sections: Sequence[Section]) -> Path:
     """
     body = "".join(_section(section, number) for number, section in enumerate(sections, 1))
     page = (f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-            f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{_text(title)}</title>\n'
-            f"<style>{_STYLE}</style>\n</head>\n<body>\n<h1>{_text(title)}</h1>\n{body}</body>\n</html>\n")
+            f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
+            f"<style>{_STYLE}{style}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n{body}"
+            + (f"<script>{script}</script>\n" if script else "") + "</body>\n</html>\n")
     with atomic_writer(path) as stream:
         stream.write(page.encode())
     return path
 
 
 def _section(section: Section, number: int) -> str:
-    parts = [f"<h2>{_text(section.title)}</h2>\n"]
-    parts += [f"<p>{_text(paragraph)}</p>\n" for paragraph in section.text]
+    parts = [f"<h2>{escape(section.title)}</h2>\n"]
+    parts += [f"<p>{escape(paragraph)}</p>\n" for paragraph in section.text]
     if section.chart is not None:
         parts.append(f"<figure>{_inlined(section.chart, section.title, number)}</figure>\n")
     if section.lines:
         parts.append(_table(section.head, section.lines))
+    parts.append(section.markup)
     if section.files:
-        links = ", ".join(f'<a href="{_text(name)}">{_text(name)}</a>' for name in section.files)
+        links = ", ".join(f'<a href="{escape(name)}">{escape(name)}</a>' for name in section.files)
         parts.append(f'<p class="files">Data: {links}</p>\n')
     return "".join(parts)
 
@@ -80,13 +88,13 @@ def _section(section: Section, number: int) -> str:
 def _inlined(path: Path, title: str, number: int) -> str:
     """The SVG without its prologue, named for screen readers, with ids of its own among the page's charts."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.readescape(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error}): draw the chart again") from None
     drawing = text[max(text.find("<svg"), 0) :].strip()
     drawing = re.sub(r'( id="|href="#|url\(#)', rf"\g<1>c{number}-", drawing)
     drawing = re.sub(r"<metadata>.*?</metadata>", "", drawing, flags=re.S)
-    return drawing.replace("<svg", f'<svg role="img" aria-label="{_text(title)}"', 1)
+    return drawing.replace("<svg", f'<svg role="img" aria-label="{escape(title)}"', 1)
 
 
 def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
@@ -94,12 +102,13 @@ def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     words = [any(re.match(r"[^\W\d_]", line[column]) for line in lines) for column in range(len(head))]
 
     def row(tag: str, cells: Sequence[str]) -> str:
-        return "<tr>" + "".join(f"<{tag}{' class=text' if word else ''}>{_text(cell)}</{tag}>"
+        return "<tr>" + "".join(f"<{tag}{' class=text' if word else ''}>{escape(cell)}</{tag}>"
                                 for cell, word in zip(cells, words, strict=True)) + "</tr>\n"
 
     body = "".join(row("td", line) for line in lines)
     return f'<div class="table"><table>\n{row("th", head)}{body}</table></div>\n'
 
 
-def _text(text: str) -> str:
+def escape(text: str) -> str:
+    """Text as it stands in HTML, in attributes too."""
     return html.escape(text)

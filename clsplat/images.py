@@ -6,6 +6,7 @@ camera poses refer to the pixels as stored.
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 
@@ -81,6 +82,14 @@ def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU
         pixels = np.rint(np.clip(pixels, 0.0, 1.0) * 255.0).astype(np.uint8)
     with atomic_writer(path) as stream:
         Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="PNG")
+
+
+def encode_jpeg(pixels: ImageU8, quality: int = 88) -> bytes:
+    """(H, W, 3) as a JPEG file with colours at full resolution, for pages that hold their images themselves."""
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="JPEG", quality=quality, subsampling=0,
+                                                       optimize=True)
+    return stream.getvalue()
 
 
 def write_grey16(path: str | os.PathLike[str], array: NDArray[np.uint16]) -> None:
