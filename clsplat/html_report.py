@@ -88,7 +88,7 @@ def _section(section: Section, number: int) -> str:
 def _inlined(path: Path, title: str, number: int) -> str:
     """The SVG without its prologue, named for screen readers, with ids of its own among the page's charts."""
     try:
-        text = path.readescape(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error}): draw the chart again") from None
     drawing = text[max(text.find("<svg"), 0) :].strip()
