@@ -37,8 +37,8 @@ class Section:
 
     Parameters
     ----------
-    text : paragraphs. chart : an SVG file. head, lines : a table. markup : HTML of the caller's, put in as it is.
-    files : links, relative to the page.
+    text : paragraphs. chart : an SVG file. head, lines : a table. files : links, relative to the page.
+    markup : HTML of the caller's, put in as it is below the table.
     """
 
     title: str
@@ -46,8 +46,8 @@ class Section:
     chart: Path | None = None
     head: Sequence[str] = ()
     lines: Sequence[Sequence[str]] = ()
-    markup: str = ""
     files: Sequence[str] = ()
+    markup: str = ""
 
 
 def write_page(path: Path, title: str, sections: Sequence[Section], style: str = "", script: str = "") -> Path:
