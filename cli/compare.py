@@ -17,6 +17,7 @@ from .options import (
     SpacedLists,
     config_options,
     config_values,
+    hiding_options,
     is_given,
     photo_options,
     quiet_option,
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 @click.option("--cap-max", "caps", type=Numbers("caps"), multiple=True, help="Most splats.  [default: 5000]")
 @click.option("--seeds", type=Numbers("seeds", 0), multiple=True, help="A run for each.  [default: 0]")
 @photo_options
+@hiding_options
 @split_options
 @click.option("--save-models", is_flag=True, help="Keep the splats of each run, in DIR/models.")
 @quiet_option

@@ -11,7 +11,16 @@ from clsplat.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.systems import parse_systems
 
 from .compare import flat, options_and_scenes, say_run
-from .options import PATH, Numbers, SpacedLists, config_options, photo_options, quiet_option, split_options
+from .options import (
+    PATH,
+    Numbers,
+    SpacedLists,
+    config_options,
+    hiding_options,
+    photo_options,
+    quiet_option,
+    split_options,
+)
 from .progress import TrainingDisplay, table
 
 if TYPE_CHECKING:
@@ -37,6 +46,7 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
               help="Draw the runs of this folder as well, such as another comparison's.")
 @click.option("--charts-only", is_flag=True, help="Train nothing: draw what is there.")
 @photo_options
+@hiding_options
 @split_options
 @quiet_option
 @config_options("shape", "cap_max", "seed", "save_iterations", "test_iterations", "checkpoint_interval")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from clsplat.cameras_json import NamedCamera, bare_name, read_cameras
+from clsplat.config import ALPHA_USES
 from clsplat.errors import InputError
 from clsplat.model_folder import ModelFolder
 from clsplat.splats import Splats
@@ -89,7 +90,8 @@ def scene_of(model: LoadedModel, source_path: Path | None = None, images: str | 
     held_out = model.test_names
     scene = load_scene(path, images or record.get("images"),
                        record.get("resolution", -1) if resolution is None else resolution,
-                       eval=held_out is None, background=model.background)
+                       eval=held_out is None, background=model.background, masks=record.get("masks"),
+                       alpha=record.get("alpha", ALPHA_USES[0]))
     if held_out is None:
         return scene
     if missing := sorted(held_out - set(scene.names)):
@@ -128,7 +130,8 @@ def _recorded(folder: ModelFolder) -> tuple[RGB, dict[str, Any]]:
     rgb = config.get("background", [0, 0, 0])
     if not isinstance(rgb, list) or len(rgb) != 3 or not all(isinstance(part, (int, float)) for part in rgb):
         raise InputError(f"{file}: config.background is {rgb!r}: expected three numbers")
-    kinds = {"path": str, "images": str, "resolution": int, "test_names": list}
+    kinds = {"path": str, "images": str, "resolution": int, "masks": str, "alpha": str,
+             "test_names": list}
     for key, kind in kinds.items():
         if scene.get(key) is not None and not isinstance(scene[key], kind):
             raise InputError(f"{file}: scene.{key} is {scene[key]!r}: restore the file as it was written")

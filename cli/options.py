@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import click
 
 from clsplat.config import (
+    ALPHA_USES,
     ALTERNATIONS,
     OPTIMIZERS,
     POSITION_OPTIMIZERS,
@@ -148,6 +149,16 @@ def scene_options(function: F) -> F:
     return click.option("-s", "--source-path", type=PATH,
                         help="Scene: a folder with photos and a COLMAP model or transforms.json.")(
                             photo_options(function))
+
+
+def hiding_options(function: F) -> F:
+    """`--masks` and `--alpha`: which pixels of the photos count."""
+    function = click.option("--alpha", type=click.Choice(ALPHA_USES),
+                            help="Transparent photos: lay them over the background, or hide the transparent pixels.  "
+                                 "[default: background]")(function)
+    return click.option("--masks", metavar="NAME",
+                        help='Folder of masks inside the scene, black where a pixel is not to count; "none" for no '
+                             "masks.  [default: masks, where it is there]")(function)
 
 
 def split_options(function: F) -> F:

@@ -19,6 +19,7 @@ from .options import (
     SpacedLists,
     config_options,
     config_values,
+    hiding_options,
     is_given,
     overwrite_option,
     quiet_option,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
     from .live import LiveView
 
-SCENE_KEYS = ("images", "resolution", "test_every", "test_list", "eval")
+SCENE_KEYS = ("images", "resolution", "masks", "alpha", "test_every", "test_list", "eval")
 INTERRUPTED = 130
 
 
@@ -44,6 +45,7 @@ INTERRUPTED = 130
 @click.option("-m", "--model-path", "-o", "model_path", type=PATH,
               help="Folder of the model.  [default: output/<name of the scene>]")
 @scene_options
+@hiding_options
 @click.option("--eval", is_flag=True, help="Hold test views out of training, and measure them at the end.")
 @split_options
 @click.option("--resume", is_flag=True,

@@ -18,6 +18,7 @@ POSITION_OPTIMIZERS = ("adam", "sghmc", "sghmc-sss")
 ALTERNATIONS = ("off", "cyclic")
 RELOCATIONS = ("length", "length-squared", "opacity-only")
 SAMPLINGS = ("opacity", "pull")
+ALPHA_USES = ("background", "mask")  # of scene.load_scene, which needs an image library; the command line does not
 # Options that change nothing in the result: runs that differ in these alone are the same run.
 FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
 # What an option is where it is not given: what was best with that strategy on validation views (benchmarks/SYSTEMS.md).

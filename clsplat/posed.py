@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from .cameras_json import IMAGE_SUFFIXES
@@ -23,12 +23,14 @@ class Posed:
     files : where each photo is, by name.
     points : may be empty.
     test_names : photos that the files themselves hold out for evaluation; None where they do not say.
+    masks : files of masks that the files name, by their photos' names.
     """
 
     photos: list[Photo]
     files: dict[str, Path]
     points: Points
     test_names: frozenset[str] | None = None
+    masks: dict[str, Path] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,8 +13,10 @@ import numpy as np
 
 from .camera import Camera
 from .colmap import Photo, Points
+from .config import ALPHA_USES
 from .errors import InputError
 from .images import ImageU8, read_image, resize_area
+from .masks import FOLDER, NO_MASKS, Mask, mask_files, nearest, read_mask
 from .posed import Posed, posed_by_colmap
 from .transforms import find_transforms, posed_by_transforms
 
@@ -31,12 +34,16 @@ class View:
     ----------
     name : of the image file, as the model has it.
     camera : pinhole, of the image's size.
-    image : (H, W, 3) uint8.
+    image : (H, W, 3) uint8; a photo with transparency lies over the scene's background.
+    mask : (H, W), True where a pixel counts; None where all do.
+    alpha : (H, W) uint8, opacity of a photo with transparency; None for others.
     """
 
     name: str
     camera: Camera
     image: ImageU8
+    mask: Mask | None = None
+    alpha: ImageU8 | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +103,8 @@ class Scene:
 
 def load_scene(path: str | os.PathLike[str], images: str | None = None, resolution: int = -1,
                test_every: int = 8, test_list: str | os.PathLike[str] | None = None, eval: bool = True,
-               background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Scene:
+               background: tuple[float, float, float] = (0.0, 0.0, 0.0), masks: str | None = None,
+               alpha: str = ALPHA_USES[0]) -> Scene:
     """Read a scene: a folder with photos and a COLMAP model in `sparse`, or with transforms.json.
 
     Parameters
@@ -111,28 +119,62 @@ def load_scene(path: str | os.PathLike[str], images: str | None = None, resoluti
     test_list : file with the names of the test views, one a line, instead of `test_every`.
     eval : False: no test view, learn from all.
     background : colour 0..1 under transparent pixels.
+    masks : folder inside the scene of masks (masks.py); by default "masks" where there is one, or what
+        transforms.json says; "none" for no masks.
+    alpha : what the transparency of a photo is: "background", which its colours are laid over, or "mask", which hides
+        pixels less than half opaque.
 
     Warns
     -----
-    UserWarning : the model registers fewer than 80 % of the photos in the folder, or photos are not there.
+    UserWarning : the model registers fewer than 80 % of the photos in the folder, photos are not there or cannot be
+        read, or masks hide all of a photo; those are left out.
 
     Raises
     ------
-    InputError : a missing folder or photo, a damaged model or photo, sizes that do not fit, a bad option.
+    InputError : a missing folder or photo, a damaged model or mask, no readable photo, sizes that do not fit, a bad
+        option.
     """
     root = Path(path)
+    if alpha not in ALPHA_USES:
+        raise InputError(f"alpha {alpha!r}: choose one of {', '.join(ALPHA_USES)}")
     if resolution < 1 and resolution != -1:
         raise InputError(f"resolution {resolution}: use 1, 2, 4, 8, a width in pixels, or -1")
     posed = _posed(root, images)
     test_names = _test_names(posed, test_every, test_list) if eval else frozenset()
 
-    def view(photo: Photo) -> View:
-        return _view(photo, posed.files[photo.name], resolution, background)
+    hiding = _masks(root, posed, masks)
+
+    def view(photo: Photo) -> View | str:
+        return _view(photo, posed.files[photo.name], resolution, background, hiding.get(photo.name), alpha == "mask")
 
     with ThreadPoolExecutor() as pool:          # decoding and resizing run outside the interpreter lock
-        views = list(pool.map(view, posed.photos))
+        found = list(pool.map(view, posed.photos))
+    views = [view for view in found if isinstance(view, View)]
+    _warn_of_left_out(root, [reason for reason in found if isinstance(reason, str)], len(found))
     folder = root.resolve()
-    return Scene((folder.parent if root.is_file() else folder).name, root, views, posed.points, test_names)
+    return Scene((folder.parent if root.is_file() else folder).name, root, views, posed.points,
+                 test_names & {view.name for view in views})
+
+
+def _masks(root: Path, posed: Posed, folder: str | None) -> dict[str, Path]:
+    """Files of masks, by the names of their photos."""
+    if folder == NO_MASKS:
+        return {}
+    named = (root.parent if root.is_file() else root) / (folder or FOLDER)
+    if folder is not None and not named.is_dir():
+        raise InputError(f"{named}: no such folder of masks; name another, or {NO_MASKS!r} for no masks")
+    found = mask_files(named, posed.names)
+    if folder is not None and not found:
+        raise InputError(f"{named}: no mask of any photo in it; a mask of {posed.names[0]!r} is {posed.names[0]}.png")
+    return posed.masks | found
+
+
+def _warn_of_left_out(root: Path, reasons: list[str], n: int) -> None:
+    if len(reasons) == n:
+        raise InputError(f"{root}: none of its {n} photos can be used: {reasons[0]}")
+    if reasons:
+        warnings.warn(f"{root}: {len(reasons)} of {n} photos are left out: {'; '.join(reasons[:3])}"
+                      + ("; ..." if len(reasons) > 3 else ""), stacklevel=3)
 
 
 def _posed(root: Path, images: str | None) -> Posed:
@@ -172,12 +214,37 @@ def _read_names(path: Path) -> list[str]:
     return [line.strip() for line in lines if line.strip()]
 
 
-def _view(photo: Photo, file: Path, resolution: int, background: tuple[float, float, float]) -> View:
-    image, camera = photo.fit(_opaque(read_image(file), background))
+def _view(photo: Photo, file: Path, resolution: int, background: tuple[float, float, float], mask_file: Path | None,
+          alpha_hides: bool) -> View | str:
+    """The view, or why there is none."""
+    try:
+        stored = read_image(file)
+    except InputError as error:
+        return str(error)
+    height, width = stored.shape[:2]
+    counts = [] if mask_file is None else [read_mask(mask_file)]
+    alpha = stored[:, :, 3] if stored.shape[2] == 4 else None
+    if alpha is not None and alpha_hides:
+        counts.append(alpha >= 128)
+        alpha, stored = None, stored[:, :, :3]
+    image, camera = photo.fit(_opaque(stored, background))
+    masks = [photo.fit_mask(mask, width, height) for mask in counts]
+    alpha = None if alpha is None else photo.fit(_grey(alpha))[0][:, :, 0]
     width, height = _target_size(camera.width, camera.height, resolution)
     if (width, height) != (camera.width, camera.height):
         image, camera = resize_area(image, width, height), camera.resized(width, height)
-    return View(photo.name, camera, image)
+        masks = [nearest(mask, width, height) for mask in masks]
+        alpha = None if alpha is None else resize_area(_grey(alpha), width, height)[:, :, 0]
+    if not masks:
+        return View(photo.name, camera, image, None, alpha)
+    mask = np.logical_and.reduce(masks)
+    if not mask.any():
+        return f"{file}: its mask hides all of it"
+    return View(photo.name, camera, image, None if mask.all() else mask, alpha)
+
+
+def _grey(plane: ImageU8) -> ImageU8:
+    return np.repeat(plane[:, :, None], 3, axis=2)
 
 
 def _opaque(image: ImageU8, background: tuple[float, float, float]) -> ImageU8:

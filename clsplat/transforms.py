@@ -89,7 +89,8 @@ def posed_by_transforms(files: list[Path], images: str | None = None) -> Posed:
     used = set().union(*(document.listed() or kept for document in documents))
     kept = {name: frame for name, frame in kept.items() if name in used}
     return Posed([frame.photo() for frame in kept.values()], {name: frame.file for name, frame in kept.items()},
-                 documents[0].points(), test_names)
+                 documents[0].points(), test_names,
+                 {name: mask for name, frame in kept.items() for mask in [frame.mask_file()] if mask is not None})
 
 
 def _held_out(documents: list[_Document], kept: dict[str, _Frame]) -> frozenset[str] | None:
@@ -118,6 +119,15 @@ class _Frame:
 
     def photo(self) -> Photo:
         return Photo(self.name, self.pose(), self.lens())
+
+    def mask_file(self) -> Path | None:
+        """nerfstudio's mask_path."""
+        named = self.values.get("mask_path")
+        if named is None:
+            return None
+        if not isinstance(named, str) or not named.isprintable() or not named:
+            raise InputError(f"{self.place}: mask_path {named!r} is no name of a file; name a mask, or remove it")
+        return self.document.path.parent / named.replace("\\", "/")
 
     def pose(self) -> NDArray[np.float64]:
         """(4, 4) world-to-camera, OpenCV's axes."""

@@ -15,24 +15,25 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # A module imports modules of lower floors only.
 FLOORS = """
-    capture_world compare_table errors flops harmonics interrupt morton runtime schema viewer_queue \
+    capture_world compare_table errors eval_script flops harmonics interrupt morton runtime schema viewer_queue \
     viewer_settings
     arithmetic atomic budget_rules camera device json_fields metrics optim_reference plan ply_header presets \
     profiles rotations run_log schedules signatures sole_writer validity
     binaries cameras_json checkpoint colmap_files frontier_data html_report images launches looked_at noise \
     optim_lazy paths_between ply_body ply_compact shapes video
-    camera_path capture chart_style colmap frontier_tables opacities ply program sghmc skew_map viewer_start
-    adc charts config densify frontier_charts kernels point_cloud posed regularisers splats viewer_camera \
-    viewer_recording
-    blocks buffers complexity convert model_folder paths_around rate_limits splat_file strategy systems transforms
+    camera_path capture chart_style colmap frontier_tables masks opacities ply program sghmc skew_map viewer_start
+    adc charts config densify eval_histogram frontier_charts kernels point_cloud posed regularisers splats \
+    viewer_camera viewer_recording
+    blocks buffers complexity convert model_folder paths_around rate_limits splat_file spz_file strategy systems \
+    transforms
     budget_state gradients limits nearest optim_rules optim_waiting placing scene sort
     binning optim_fused optim_host random_points stages synthetic validation view_sampler
     initialise optim pipeline
     loss memory pairs truths tuning
     render
     display evaluate needs
-    prune trainer viewer_source
-    bench compare shrink training viewer
+    eval_images prune trainer viewer_source
+    bench compare eval_report shrink training viewer
     budget frontier viewer_page viewer_training
     viewer_server
 """

@@ -239,10 +239,15 @@ def test_model_without_images(folder: Path) -> None:
         load_scene(folder)
 
 
-def test_damaged_photo_is_named(folder: Path) -> None:
-    photo = folder / "images" / NAMES[2]
-    photo.write_bytes(photo.read_bytes()[:60])
-    with pytest.raises(InputError, match=NAMES[2]):
+def test_damaged_photo_is_named_and_left_out(folder: Path) -> None:
+    photos = [folder / "images" / name for name in NAMES]
+    photos[2].write_bytes(photos[2].read_bytes()[:60])
+    with pytest.warns(UserWarning, match=rf"1 of {N_VIEWS} photos are left out: .*{NAMES[2]}"):
+        scene = load_scene(folder)
+    assert scene.names == [name for name in NAMES if name != NAMES[2]]
+    for photo in photos:
+        photo.write_bytes(b"")
+    with pytest.raises(InputError, match=rf"none of its {N_VIEWS} photos can be used: .*{NAMES[0]}"):
         load_scene(folder)
 
 
