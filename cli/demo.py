@@ -13,7 +13,8 @@ from clsplat.config import TrainConfig
 from clsplat.errors import OutputError
 from clsplat.model_folder import ModelFolder
 
-from .evaluate import describe, measure_model
+from .eval_pages import ViewRecorder, write_model_page
+from .evaluate import REPORT, describe, measure_model
 from .models import load_model
 from .options import PATH, device_option, overwrite_option, quiet_option
 from .outputs import output_stems
@@ -55,7 +56,9 @@ def demo(ctx: click.Context, out: Path, iterations: int, cap_max: int, width: in
         say_stopped(ctx, model)
     trained = load_model(folder.path)
     renders = out / "renders"
-    result = measure_model(trained, scene, Renderer(device), renders=renders, quiet=quiet)
+    measured = measure_model(trained, scene, Renderer(device), renders=renders, recorder=ViewRecorder())
+    page = write_model_page(folder.path / REPORT, "the demo", [measured], [folder.path.name])
+    result = measured.result
     if quiet:
         return
     click.echo(f"\ntest views ({len(scene.test)}): PSNR {result['PSNR']:.2f} dB, SSIM {result['SSIM']:.4f}, "
@@ -63,7 +66,8 @@ def demo(ctx: click.Context, out: Path, iterations: int, cap_max: int, width: in
     click.echo(describe(DEFAULT_PROTOCOL))
     click.echo(f"all done in {duration(time.perf_counter() - start)}. Look at:")
     first = output_stems([scene.test[0].name])[0]
-    for path, what in ((renders / f"{first}.png", "a rendered test view"),
+    for path, what in ((page, "the test views beside their photos, in a browser"),
+                       (renders / f"{first}.png", "a rendered test view"),
                        (out / "scene" / "images" / scene.test[0].name, "the photo of it"),
                        (trained.ply, "the splats, for any viewer"),
                        (folder.path / "results.json", "the numbers")):
