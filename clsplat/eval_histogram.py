@@ -75,4 +75,5 @@ def _legend(labels: Sequence[str]) -> str:
 
 def _ceiling(share: float) -> float:
     """The next round number of per cents, one that four parts divide."""
-    return next(top for top in (4.0, 8.0, 12.0, 20.0, 40.0, 60.0, 80.0, 100.0) if top >= min(share, 100.0))
+    rounds = (4.0, 8.0, 12.0, 16.0, 20.0, 24.0, 32.0, 40.0, 60.0, 80.0, 100.0)
+    return next(top for top in rounds if top >= min(share, 100.0))

@@ -29,12 +29,14 @@ class Measured:
 
     Parameters
     ----------
-    label : as in tables. facts : lines of a table, what and how much.
+    label : as in tables. costs : cells of the first table by their headings, beside the metrics' means.
+    facts : lines of a table, what and how much.
     per_view : by metric ("PSNR", "SSIM", perhaps "LPIPS", "FLIP"), values by the views' names.
     shots : by the views' names.
     """
 
     label: str
+    costs: Mapping[str, str]
     facts: Sequence[tuple[str, str]]
     per_view: Mapping[str, Mapping[str, float]]
     shots: Mapping[str, Shot]
@@ -79,8 +81,9 @@ def write_eval_report(path: Path, models: Sequence[Measured], what: str, protoco
     summary = [f"PSNR {low:.2f} to {high:.2f} dB{' (means over the models)' if many else ''}; "
                f"the worst view is {worst_first[0]}."]
     sections = [
-        Section("Means", summary, head=("model", *(_UNITS.get(m, m) for m in _metrics(models))),
-                lines=[(model.label, *(_number(m, model.mean(m)) for m in _metrics(models))) for model in models]),
+        Section("Means", summary, head=("model", *(_UNITS.get(m, m) for m in _metrics(models)), *models[0].costs),
+                lines=[(model.label, *(_number(m, model.mean(m)) for m in _metrics(models)), *model.costs.values())
+                       for model in models]),
         Section("Views", ["Worst first; a click on a heading sorts by it."],
                 markup=_view_table(models, worst_first, shown)),
         Section("Images", _about_images(every, len(shown), len(names), full), markup="".join(shown.values())),
@@ -181,6 +184,7 @@ def _view(models: Sequence[Measured], name: str, full: float, stops: str, anchor
     numbers = "; ".join((f"{model.label}: " if len(models) > 1 else "")
                         + ", ".join(f"{metric} {_number(metric, model.per_view[metric][name])}"
                                     for metric in _metrics(models)) for model in models)
+    width, height = models[0].shots[name].size
     parts = [_wipe(models, name)]
     for model in models:
         shot, of = model.shots[name], f" of {model.label}" if len(models) > 1 else ""
@@ -188,7 +192,7 @@ def _view(models: Sequence[Measured], name: str, full: float, stops: str, anchor
         if shot.flip is not None:
             parts.append(_map(data_uri(map_of(shot.flip, 1.0, shot.hidden)), f"FLIP{of}", name, stops, 1.0))
     return (f'<h3 id="{anchor}">{escape(name)} <small>{escape(numbers)}</small></h3>\n'
-            f'<div class="images">{"".join(parts)}</div>\n')
+            f'<div class="images" style="--shape: {width / height:.4f}">{"".join(parts)}</div>\n')
 
 
 def _wipe(models: Sequence[Measured], name: str) -> str:

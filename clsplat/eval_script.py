@@ -8,7 +8,8 @@ th[aria-sort=ascending] button::after { content: " \\2191"; opacity: 1; }
 th[aria-sort=descending] button::after { content: " \\2193"; opacity: 1; }
 td.best { font-weight: 600; }
 .images { display: grid; gap: .8rem; grid-template-columns: repeat(auto-fit, minmax(min(19rem, 100%), 1fr)); }
-.images figure { margin: 0; padding: 0; border: 0; background: none; min-width: 0; }
+.images figure { margin: 0; padding: 0; border: 0; background: none; min-width: 0;
+                 max-width: calc(80vh * var(--shape)); }
 .wipe { position: relative; overflow: hidden; border-radius: 4px; --at: 50%; }
 .wipe img, .map img { display: block; width: 100%; height: auto; }
 .wipe img { position: absolute; inset: 0; height: 100%; display: none; }
@@ -32,7 +33,7 @@ figcaption select { font: inherit; max-width: 45%; }
 .histogram text { font-size: 12px; fill: #262626; } .histogram .grid { stroke: #e0e0e0; }
 .histogram figcaption { color: #262626; } .histogram span { margin-right: 1rem; white-space: nowrap; }
 .histogram i { display: inline-block; width: .8rem; height: .8rem; margin-right: .35rem; vertical-align: -.05rem; }
-tbody th { font-weight: normal; white-space: normal; overflow-wrap: anywhere; }
+tbody th { font-weight: normal; } td.text { white-space: normal; overflow-wrap: anywhere; }
 """
 
 # The wipe's handle is a range input over the image: mouse, touch and keyboard come with it.
