@@ -171,7 +171,7 @@ def test_eval_writes_the_page(tmp_path: Path, tmp_path_factory: pytest.TempPathF
     model = Path(shutil.copytree(small_model(tmp_path_factory), tmp_path / "model"))
     said = clsplat("eval", model, "--no-report")
     assert not (model / "report.html").exists()
-    assert "page" not in said
+    assert "page: " not in said
     assert f"page: {model / 'report.html'}" in clsplat("eval", model)
     text = (model / "report.html").read_text()
     assert "2 test views of yard: model" in text
