@@ -176,7 +176,8 @@ def test_eval_writes_the_page(tmp_path: Path, tmp_path_factory: pytest.TempPathF
     text = (model / "report.html").read_text()
     assert "2 test views of yard: model" in text
     assert [name in text for name in TEST_NAMES] == [True, True]
-    assert "iterations 60, cap-max 400, seed 0" in text
+    assert all(option in text for option in ("iterations 60,", "cap-max 400,", "sh-degree 1", "seed 0"))
+    assert "lambda-dssim" not in text, "a default"
     assert "Protocol clsplat. PSNR: per image, rounded to 8 bits." in text
     other = Path(shutil.copytree(model, tmp_path / "other" / "model"))
     (other / "report.html").unlink()
