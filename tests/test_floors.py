@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = """
     capture_world compare_table errors eval_script flops harmonics interrupt morton runtime schema viewer_queue \
     viewer_settings
-    arithmetic atomic budget_rules camera device json_fields metrics optim_reference plan ply_header presets \
-    profiles rotations run_log schedules signatures sole_writer validity
+    arithmetic atomic budget_rules camera device json_fields metrics optim_reference perceptual plan ply_header \
+    presets profiles rotations run_log schedules signatures sole_writer validity
     binaries cameras_json checkpoint colmap_files frontier_data html_report images launches looked_at noise \
     optim_lazy paths_between ply_body ply_compact shapes video
     camera_path capture chart_style colmap frontier_tables masks opacities ply program sghmc skew_map viewer_start
@@ -48,6 +48,9 @@ OWNERS = {
     "viser": {"viewer_page", "viewer_server"},
     "imageio": {"video"},
     "imageio_ffmpeg": {"video"},
+    "lpips": {"perceptual"},
+    "torch": {"perceptual"},
+    "flip_evaluator": {"perceptual"},
     "click": set(),  # the command line's
 }
 
