@@ -150,7 +150,6 @@ def test_real_flip() -> None:
 
 
 def test_real_lpips() -> None:
-    pytest.importorskip("lpips", reason="lpips is not installed (pip install clsplat[lpips])", exc_type=ImportError)
     try:
         lpips = Lpips()
     except InputError as error:
