@@ -1,34 +1,60 @@
 """Image files: reading, writing PNG, resizing. The only module that knows Pillow.
 
 Images are stored pixels: an EXIF orientation is not applied, because COLMAP and 3DGS do not apply it and
-camera poses refer to the pixels as stored.
+camera poses refer to the pixels as stored. Only photos that have no poses yet are read upright.
 """
 
 from __future__ import annotations
 
 import io
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 # At the top on purpose: Pillow must be loaded before pycolmap, or writing PNG corrupts the heap.
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 
 from .atomic import atomic_writer
 from .errors import InputError, OutputError
 
 ImageU8 = NDArray[np.uint8]
 
+JPEG_SUFFIXES = (".jpg", ".jpeg")
+_PHOTO_QUALITY = 97  # of a JPEG that is made of another: its error stays far below the first one's
 _ALPHA_MODES = ("RGBA", "RGBa", "LA", "La", "PA")
 _SIXTEEN_BIT_MODES = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 
 
-def read_image(path: str | os.PathLike[str]) -> ImageU8:
+@dataclass(frozen=True)
+class PhotoFacts:
+    """What a photo's header says.
+
+    Parameters
+    ----------
+    width, height : upright [px].
+    plain : 8-bit RGB or grey in JPEG or PNG, stored upright: every program reads the same pixels.
+    camera : maker, model and focal lengths by EXIF; photos with equal sizes and cameras have one lens.
+    exif : EXIF without the orientation, for a copy.
+    """
+
+    width: int
+    height: int
+    plain: bool
+    camera: tuple[str, ...]
+    exif: bytes
+
+
+def read_image(path: str | os.PathLike[str], upright: bool = False) -> ImageU8:
     """Pixels of an image file.
 
-    Grey and palette images become RGB; 16-bit grey is rounded to 8 bits.
+    Grey, palette and CMYK images become RGB; 16-bit grey is rounded to 8 bits, 16-bit colour keeps its high byte.
+
+    Parameters
+    ----------
+    upright : turn the image as its EXIF orientation says.
 
     Returns
     -------
@@ -38,8 +64,9 @@ def read_image(path: str | os.PathLike[str]) -> ImageU8:
     ------
     InputError : the file is missing, damaged, or no image of a known kind.
     """
-    with _open(path) as image:
+    with _open(path) as stored:
         try:
+            image = ImageOps.exif_transpose(stored) if upright else stored
             if image.mode in _SIXTEEN_BIT_MODES:
                 grey = (np.clip(np.asarray(image), 0, 65535).astype(np.uint32) + 128) // 257
                 return np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)
@@ -62,6 +89,31 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         return image.size
 
 
+def photo_facts(path: str | os.PathLike[str]) -> PhotoFacts:
+    """Size, kind and camera from the file's header alone.
+
+    Raises
+    ------
+    InputError : the file is missing or no image of a known kind.
+    """
+    with _open(path) as image:
+        try:
+            exif = image.getexif()
+            orientation = exif.pop(ExifTags.Base.Orientation, 1)
+            details = exif.get_ifd(ExifTags.IFD.Exif)
+            named = [exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model),
+                     details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)]
+            kept = exif.tobytes()
+        except Exception:  # a damaged EXIF block raises nearly anything; the pixels may be sound
+            orientation, named, kept = 1, [], b""
+        width, height = image.size[::-1] if orientation in (5, 6, 7, 8) else image.size
+        # Pillow shows 16-bit PNG in colour as RGB: the tile's raw mode tells.
+        deep = any(";16" in str(tile[-1]) for tile in getattr(image, "tile", ()))
+        plain = orientation == 1 and image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L") and not deep
+        plain = plain and "transparency" not in image.info
+        return PhotoFacts(width, height, plain, tuple(str(value) for value in named if value), kept)
+
+
 def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU8) -> None:
     """Write an image as 8-bit PNG, atomically.
 
@@ -82,6 +134,20 @@ def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU
         pixels = np.rint(np.clip(pixels, 0.0, 1.0) * 255.0).astype(np.uint8)
     with atomic_writer(path) as stream:
         Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="PNG")
+
+
+def write_photo(path: str | os.PathLike[str], pixels: ImageU8, exif: bytes = b"") -> None:
+    """Write (H, W, 3), or (H, W, 4) as PNG, atomically: JPEG of high quality by the name's ending, else PNG.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
+    jpeg = Path(path).suffix.lower() in JPEG_SUFFIXES
+    options = {"quality": _PHOTO_QUALITY, "subsampling": 0} if jpeg else {}
+    with atomic_writer(path) as stream:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="JPEG" if jpeg else "PNG", exif=exif,
+                                                           **options)
 
 
 def encode_jpeg(pixels: ImageU8, quality: int = 88) -> bytes:

@@ -21,16 +21,16 @@ FLOORS = """
     presets profiles rotations run_log schedules signatures sole_writer validity
     binaries cameras_json checkpoint colmap_files frontier_data html_report images launches looked_at noise \
     optim_lazy paths_between ply_body ply_compact shapes video
-    camera_path capture chart_style colmap frontier_tables masks opacities ply program sghmc skew_map viewer_start
-    adc charts config densify eval_histogram frontier_charts kernels point_cloud posed regularisers splats \
-    viewer_camera viewer_recording
-    blocks buffers complexity convert model_folder paths_around rate_limits splat_file spz_file strategy systems \
-    transforms
-    budget_state gradients limits nearest optim_rules optim_waiting placing scene sort
-    binning optim_fused optim_host random_points stages synthetic validation view_sampler
-    initialise optim pipeline
-    loss memory pairs truths tuning
-    render
+    camera_path capture chart_style frontier_tables lens masks opacities ply program sghmc skew_map viewer_start
+    adc charts colmap config densify eval_histogram frontier_charts kernels regularisers splats viewer_camera \
+    viewer_recording
+    blocks buffers complexity convert model_folder paths_around point_cloud posed rate_limits splat_file spz_file \
+    strategy systems
+    budget_state gradients limits nearest optim_rules optim_waiting placing sort transforms
+    binning optim_fused optim_host scene stages
+    optim pipeline random_points scene_info synthetic validation view_sampler
+    initialise loss memory pairs truths tuning
+    photos render
     display evaluate needs
     eval_images prune trainer viewer_source
     bench compare eval_report shrink training viewer
@@ -42,7 +42,7 @@ FLOOR = {name: level for level, line in enumerate(FLOORS.split("\n")) for name i
 # Libraries that only these modules import.
 OWNERS = {
     "pyopencl": {"buffers", "device", "program", "truths"},
-    "pycolmap": {"colmap"},
+    "pycolmap": {"lens"},
     "PIL": {"images"},
     "matplotlib": {"chart_style"},
     "viser": {"viewer_page", "viewer_server"},
