@@ -48,7 +48,7 @@ class LoadedModel:
 
 
 def load_model(path: Path, iteration: int | None = None) -> LoadedModel:
-    """A model folder (clsplat's or 3DGS's) at an iteration, the last by default, or a PLY.
+    """A model folder (clsplat's or 3DGS's) at an iteration, the last by default, or a file of splats.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def load_model(path: Path, iteration: int | None = None) -> LoadedModel:
     if path.is_file():
         if iteration is not None:
             raise InputError(f"{path}: --iteration is for model folders, this is a file")
-        return LoadedModel(path, path, Splats.load(path))
+        return LoadedModel(path, path, load_splats(path))
     if not path.is_dir():
         raise InputError(f"{path}: no such model folder or PLY file")
     folder = ModelFolder(path)
@@ -67,6 +67,19 @@ def load_model(path: Path, iteration: int | None = None) -> LoadedModel:
     if folder.config_path.is_file():
         background, scene = _recorded(folder)
     return LoadedModel(path, ply, Splats.load(ply), folder, found, background, scene)
+
+
+def load_splats(path: Path) -> Splats:
+    """What a .ply, .splat or .spz file holds; raises InputError."""
+    if path.suffix.lower() == ".splat":
+        from clsplat.splat_file import read_splat
+
+        return read_splat(path)
+    if path.suffix.lower() == ".spz":
+        from clsplat.spz_file import read_spz
+
+        return read_spz(path)
+    return Splats.load(path)
 
 
 def scene_of(model: LoadedModel, source_path: Path | None = None, images: str | None = None,

@@ -9,6 +9,7 @@ first, because viewers show what has arrived.
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from .shapes import GAUSSIAN
 from .splats import SH_C0, Splats
 
 RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("quaternion", "u1", 4)])
+
+_LOGIT_MAX = 15.0  # of an opacity of 0 or 255
+_LEAST_SCALE = 1e-30  # some files have zeros
 
 
 def write_splat(path: str | os.PathLike[str], splats: Splats) -> None:
@@ -32,6 +36,33 @@ def write_splat(path: str | os.PathLike[str], splats: Splats) -> None:
         raise InputError(f"{path}: .splat files hold Gaussians, not {splats.shape} splats; convert them first")
     with atomic_writer(path) as stream:
         stream.write(records(splats).tobytes())
+
+
+def read_splat(path: str | os.PathLike[str]) -> Splats:
+    """The Gaussians of a file, of SH degree 0.
+
+    Raises
+    ------
+    InputError : cannot be read, no whole number of splats, or an unusable value.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check name and rights") from None
+    if len(data) % RECORD.itemsize:
+        raise InputError(f"{path}: is no .splat file ({len(data)} bytes, no multiple of {RECORD.itemsize}); export it "
+                         "again")
+    table = np.frombuffer(data, RECORD)
+    with np.errstate(all="ignore"):  # what is not finite is found and named by the check
+        logit = np.clip(GAUSSIAN.raw_opacity(table["colour"][:, 3] / 255.0), -_LOGIT_MAX, _LOGIT_MAX)
+        arrays = {"mean": table["position"], "log_scale": np.log(np.maximum(table["scale"], _LEAST_SCALE)),
+                  "quat": table["quaternion"] / 128.0 - 1.0, "opacity_logit": logit,
+                  "sh": ((table["colour"][:, :3] / 255.0 - 0.5) / SH_C0)[:, None]}
+    try:
+        return Splats(GAUSSIAN.name, {name: values.astype(np.float32) for name, values in arrays.items()})
+    except InputError as error:
+        raise InputError(f"{path}: {error}; remove that splat or export again") from None
 
 
 def records(splats: Splats) -> NDArray[np.void]:

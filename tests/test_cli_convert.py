@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_runner import clsplat, error_of, small_model
+from clsplat_cli.models import load_splats
 
 from clsplat.cameras_json import read_cameras
 from clsplat.metrics import psnr
@@ -78,10 +79,45 @@ def test_nearest_gaussians_are_measured(model: Path, tmp_path: Path) -> None:
     assert "name cameras with --cameras" in clsplat("convert", ply, small, "--approximate", "--overwrite")
 
 
+def test_files_for_viewers_are_measured_as_written(model: Path, tmp_path: Path) -> None:
+    """And read back as models."""
+    named, renderer = read_cameras(model / "cameras.json"), Renderer()
+    truths = [renderer.render(Splats.load(ModelFolder(model).latest_ply()[0]), entry.camera).color for entry in named]
+    for name in ("out.spz", "out.splat"):
+        said = clsplat("convert", model, tmp_path / name, "--approximate")
+        told = re.search(r"([\d.]+) dB, worst", said)
+        assert told is not None
+        splats = load_splats(tmp_path / name)
+        shown = [renderer.render(splats, entry.camera).color for entry in named]
+        assert float(told[1]) == pytest.approx(np.mean([psnr(*pair) for pair in zip(truths, shown, strict=True)]),
+                                               abs=0.006)
+        clsplat("convert", tmp_path / name, tmp_path / f"{name}.ply")
+        np.testing.assert_array_equal(Splats.load(tmp_path / f"{name}.ply").mean, splats.mean)
+
+
+def test_a_ply_for_other_programs_has_3dgs_s_columns(model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.ply"
+    clsplat("convert", model, out, "--shape", "gaussian", "--approximate", "--sh-degree", "3", "-q")
+    head, body = out.read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property float ")]
+    assert names == ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)),
+                     *(f"f_rest_{i}" for i in range(45)), "opacity", *(f"scale_{i}" for i in range(3)),
+                     *(f"rot_{i}" for i in range(4))]
+    assert head.splitlines()[:2] == [b"ply", b"format binary_little_endian 1.0"]
+    rows = np.frombuffer(body, "<f4").reshape(-1, 62)
+    splats = Splats.load(out)
+    np.testing.assert_array_equal(rows[:, 3:6], 0)
+    np.testing.assert_array_equal(rows[:, [6, 9, 10, 24]], [[c[0, 0], c[1, 0], c[2, 0], c[1, 1]] for c in splats.sh])
+    assert not splats.sh[:, 4:].any()
+    said = clsplat("convert", out, out, "--sh-degree", "0", "--overwrite", "--cameras", model / "cameras.json")
+    assert "PSNR against" in said
+    assert Splats.load(out).sh_degree == 0
+
+
 def test_bad_input(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     assert "'cube'" in error_of("convert", model, out, "--shape", "cube", code=2)
-    assert "writes .ply and .splat files" in error_of("convert", model, tmp_path / "out.obj")
+    assert "writes .ply, .splat and .spz files" in error_of("convert", model, tmp_path / "out.obj")
     assert "leave --shape out" in error_of("convert", model, tmp_path / "out.splat", "--shape", "skew-normal")
     assert "no such model folder or PLY" in error_of("convert", tmp_path / "none", out, "--shape", "gaussian")
 

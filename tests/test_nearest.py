@@ -13,7 +13,7 @@ from scipy.special import ndtr
 from clsplat.convert import convert
 from clsplat.errors import InputError
 from clsplat.nearest import line_fits, nearest_gaussians
-from clsplat.shapes import SKEW_MAX, SLANT_MAX
+from clsplat.shapes import SHAPES, SKEW_MAX, SLANT_MAX
 from clsplat.splat_file import RECORD, write_splat
 from clsplat.splats import SH_C0, Splats
 
@@ -34,22 +34,27 @@ def moment_matched(splats: Splats) -> Splats:
 
 
 def test_fits_of_the_line_are_least_squares() -> None:
-    """No other centre, width or height is nearer; without slant nothing changes."""
+    """No other centre, width or height is nearer; without slant, or with equal opacities, there is nothing to fit."""
     z = np.linspace(-5, 6, 2001)
-    np.testing.assert_allclose(line_fits()[0], [0, 1, 1], atol=1e-6)
-    for slant in (1.0, 4.0, SLANT_MAX):
-        profile = np.exp(-z * z / 2) * ndtr(slant * z)
-        profile /= profile.max()
+    last = line_fits().shape[1] - 1
+    for ratio in range(last + 1):
+        np.testing.assert_allclose(line_fits()[0, ratio], [0, 1, 0.5 + 0.5 * ratio / last], atol=1e-6)
+    for slant in (1.0, 4.0, SLANT_MAX, np.inf):
+        row = -1 if np.isinf(slant) else round(5 * slant)
+        np.testing.assert_allclose(line_fits()[row, last], [0, 1, 1], atol=1e-6)
+        for ratio in (0.0, 0.3, 0.8):
+            side = np.heaviside(z, 0.5) if np.isinf(slant) else ndtr(slant * z)
+            profile = np.exp(-z * z / 2) * (ratio + (1 - ratio) * side)
 
-        def error(fit: np.ndarray, profile: np.ndarray = profile) -> float:
-            return float(np.sum((fit[2] * np.exp(-0.5 * ((z - fit[0]) / fit[1]) ** 2) - profile) ** 2))
+            def error(fit: np.ndarray, profile: np.ndarray = profile) -> float:
+                return float(np.sum((fit[2] * np.exp(-0.5 * ((z - fit[0]) / fit[1]) ** 2) - profile) ** 2))
 
-        best = line_fits()[round(10 * slant)]
-        for place in range(3):
-            for step in (-0.01, 0.01):
-                other = best.copy()
-                other[place] += step
-                assert error(other) > error(best)
+            best = line_fits()[row, round(ratio * last)]
+            for place in range(3):
+                for step in (-0.01, 0.01):
+                    other = best.copy()
+                    other[place] += step
+                    assert error(other) > error(best)
 
 
 @pytest.mark.parametrize("shape", ["skew-normal", "skew-normal-direct"])
@@ -80,9 +85,62 @@ def test_splats_without_skew_keep_their_bits() -> None:
     np.testing.assert_array_equal(nearest_gaussians(none).mean, splats.mean)
 
 
-def test_other_shapes_and_normalisations_are_refused() -> None:
-    with pytest.raises(InputError, match="half-gaussian splats have no nearest"):
-        nearest_gaussians(Splats("half-gaussian", for_shape(random_splats(7, 3, 0), "half-gaussian")))
+def image_errors(splats: Splats, others: list[Splats]) -> np.ndarray:
+    """Summed squared differences of alpha, one splat at a time, over a few views."""
+    errors = np.zeros(len(others))
+    for seed in (7, 8):
+        camera = random_camera(seed, 41, 27)
+        for i in range(len(splats)):
+            truth, *shown = (render_reference(model.select(np.arange(len(splats)) == i).arrays, camera, model.shape,
+                                              model.normalisation, alpha_min=0.0, t_min=0.0).alpha
+                             for model in (splats, *others))
+            errors += [float(np.sum((image - truth) ** 2)) for image in shown]
+    return errors
+
+
+def plain(splats: Splats, opacity: np.ndarray) -> Splats:
+    """The Gaussians of the same place, size and colour."""
+    core = {name: splats.arrays[name] for name in ("mean", "quat", "log_scale", "sh")}
+    return Splats("gaussian", core | {"opacity_logit": np.log(opacity) - np.log1p(-opacity)})
+
+
+@pytest.mark.parametrize("shape", ["half-gaussian", "bisected-skew"])
+def test_two_opacities_are_nearer_than_their_mean(shape: str) -> None:
+    arrays = for_shape(random_splats(7, 10, 0), shape)
+    arrays["opacity_minus_logit"] = arrays["opacity_logit"] + np.tile([-3.0, 3.0], 5)
+    splats = Splats(shape, arrays)
+    sides = [1 / (1 + np.exp(-arrays[name])) for name in ("opacity_logit", "opacity_minus_logit")]
+    near, mean = image_errors(splats, [nearest_gaussians(splats), plain(splats, 0.5 * (sides[0] + sides[1]))])
+    assert near < 0.6 * mean
+
+
+@pytest.mark.parametrize(("shape", "field", "values"), [
+    ("generalised-exponential", "beta", [0.7, 1.2, 3.0, 6.0]),
+    ("student-t", "nu", [1.0, 2.0, 4.0, 10.0]),
+])
+def test_round_profiles_are_nearer_than_the_plain_gaussian(shape: str, field: str, values: list[float]) -> None:
+    arrays = for_shape(random_splats(7, 12, 0), shape)
+    arrays["opacity_logit"] = np.linspace(0.3, 1.0, 12)  # signed or not
+    splats = Splats(shape, arrays | {field: np.repeat(values, 3)})
+    near, same = image_errors(splats, [nearest_gaussians(splats),
+                                       plain(splats, SHAPES[shape].opacity(arrays["opacity_logit"]))])
+    assert near < 0.6 * same
+
+
+def test_negative_opacities_are_left_out() -> None:
+    arrays = for_shape(random_splats(7, 6, 1), "student-t")
+    arrays["opacity_logit"] = np.array([0.5, -0.5, 0.2, 0.1, -1.0, 0.4])
+    near = nearest_gaussians(Splats("student-t", arrays))
+    np.testing.assert_array_equal(near.sh, arrays["sh"][arrays["opacity_logit"] > 0])
+
+
+def test_what_has_an_equal_is_converted() -> None:
+    splats = Splats("ges-modulation", for_shape(random_splats(7, 6, 1), "ges-modulation"))
+    for name, values in convert(splats, "gaussian").arrays.items():
+        np.testing.assert_array_equal(nearest_gaussians(splats).arrays[name], values)
+
+
+def test_other_normalisations_are_refused() -> None:
     with pytest.raises(InputError, match="normalisation 'pdf'"):
         nearest_gaussians(Splats("skew-normal", random_splats(7, 3, 0), "pdf"))
 
