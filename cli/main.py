@@ -20,7 +20,7 @@ COMMANDS = {
     "view": ("clsplat_cli.view:view", "Walk through a model in the browser."),
     "render": ("clsplat_cli.render:render", "Render a model or any splat PLY."),
     "eval": ("clsplat_cli.evaluate:evaluate_models", "Measure models on the views they were not trained on."),
-    "info": ("clsplat_cli.info:show_info", "Count a model's splats, skew, SH coefficients, parameters and bytes."),
+    "info": ("clsplat_cli.info:show_info", "Say what a model or a scene holds."),
     "prune": ("clsplat_cli.prune:prune_model", "Leave out of a model what its images do not miss."),
     "compare": ("clsplat_cli.compare:compare_systems", "Train published systems side by side and tabulate them."),
     "frontier": ("clsplat_cli.frontier:draw_frontier", "Sweep systems and caps, and chart quality against cost."),
