@@ -16,6 +16,7 @@ from clsplat.errors import ClsplatError
 COMMANDS = {
     "devices": ("clsplat_cli.devices:devices", "List the OpenCL devices and try each."),
     "demo": ("clsplat_cli.demo:demo", "Make a small scene, train on it, render and measure: a first trial."),
+    "reconstruct": ("clsplat_cli.reconstruct:reconstruct_scene", "Make a scene of photographs or a video: find poses."),
     "train": ("clsplat_cli.train:train", "Learn a splat model of a scene."),
     "view": ("clsplat_cli.view:view", "Walk through a model in the browser."),
     "render": ("clsplat_cli.render:render", "Render a model or any splat PLY."),
@@ -113,6 +114,8 @@ def _known_failure(error: Exception) -> str | None:
 
 def _show_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int,
                   file: TextIO | None = None, line: str | None = None) -> None:
+    if display := sys.modules.get("clsplat.progress_display"):  # where nothing is shown, it was never loaded
+        display.LiveLine.give_way()
     click.echo(f"warning: {_one_line(str(message))}", err=True)
 
 

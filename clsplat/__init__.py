@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .camera import Camera
     from .config import TrainConfig
     from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
+    from .progress_display import TrainingDisplay
     from .render import Rendered, Renderer
     from .scene import Scene, load_scene
     from .splats import Splats
@@ -26,11 +27,13 @@ _HOME = {
     "OutputError": "errors", "TrainingError": "errors", "Rendered": "render", "Renderer": "render",
     "Scene": "scene", "load_scene": "scene", "Splats": "splats", "TrainConfig": "config", "train": "training",
     "Model": "training", "BudgetOptions": "budget_rules", "Budgeted": "budget", "train_budget": "budget",
+    "TrainingDisplay": "progress_display",
 }
 
 __all__ = [
     "BudgetOptions", "Budgeted", "Camera", "ClsplatError", "DeviceError", "InputError", "Model", "OutputError",
-    "Rendered", "Renderer", "Scene", "Splats", "TrainConfig", "TrainingError", "load_scene", "train", "train_budget",
+    "Rendered", "Renderer", "Scene", "Splats", "TrainConfig", "TrainingDisplay", "TrainingError", "load_scene", "train",
+    "train_budget",
 ]
 
 
