@@ -3,12 +3,12 @@
 *Lopsided splats.* With its location as origin and its scale matrix as unit, such a splat is its greater opacity times
 exp(-z'z / 2) (r + (1 - r) Phi(lambda u'z)): r is 0 for skew-normals and else the ratio of the two opacities, lambda
 infinite where a plane cuts. Across u it is a Gaussian already. Along u it gets the Gaussian of least squared
-difference over the line, whose centre, width and height depend on lambda and r alone. It is nearer to the profile than
-the Gaussian of equal moments: for half-Gaussian edges (lambda = 10, r = 0) 26 % of its norm away instead of 36 %. Two or three
-Gaussians for a splat are nearer yet (12 and 5 %), but not in images: each is widened by the low-pass for itself, and
-seen along u they stand one behind the other. On kitchen (20 000 splats, |m| 0.91 of its limit in the median) the
-images' PSNR against the skewed model is 35.7 dB with equal moments, 36.4 dB with the nearest Gaussian, 36.6 dB at best with two
-for the large splats, and 34 to 36 dB with three.
+difference over the line, whose centre, width and height depend on lambda and r alone. It is nearer to the profile
+than the Gaussian of equal moments: for half-Gaussian edges (lambda = 10, r = 0) 26 % of its norm away instead of 36
+%. Two or three Gaussians for a splat are nearer yet (12 and 5 %), but not in images: each is widened by the low-pass
+for itself, and seen along u they stand one behind the other. On kitchen (20 000 splats, |m| 0.91 of its limit in the
+median) the images' PSNR against the skewed model is 35.7 dB with equal moments, 36.4 dB with the nearest Gaussian,
+36.6 dB at best with two for the large splats, and 34 to 36 dB with three.
 
 *Round profiles* (an exponent or degrees of freedom) get the Gaussian of least squared difference over the plane, down
 to where an opaque splat's alpha is 1/255. A negative opacity is in no Gaussian: such splats are left out.
