@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .atomic import atomic_writer
 from .errors import OutputError
 
 
@@ -35,18 +36,19 @@ class RunLog:
 
     def __init__(self, path: Path | None, iteration: int) -> None:
         self.path = path
-        if self.path is None:
+        if path is None:
             return
         kept = []
-        if iteration and self.path.is_file():
-            for line in self.path.read_text().splitlines():
+        if iteration and path.is_file():
+            for line in self._guard(path.read_bytes).splitlines():
                 try:
                     if json.loads(line)["iteration"] <= iteration:
-                        kept.append(line + "\n")
+                        kept.append(line + b"\n")
                 except (ValueError, KeyError, TypeError):
                     continue  # a line cut short by a crash
-        self._stream = self._guard(lambda: self.path.open("w"))  # type: ignore[union-attr]
-        self._guard(lambda: self._stream.writelines(kept))
+        with atomic_writer(path) as stream:  # a crash while it is written loses nothing
+            stream.writelines(kept)
+        self._stream = self._guard(lambda: path.open("a"))
 
     def write(self, values: dict[str, Any]) -> None:
         if self.path is not None:
