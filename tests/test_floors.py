@@ -18,15 +18,16 @@ FLOORS = """
     capture_world compare_table errors eval_script flops harmonics interrupt morton runtime schema viewer_queue \
     viewer_settings
     arithmetic atomic budget_rules camera device json_fields metrics optim_reference perceptual plan ply_header \
-    presets profiles rotations run_log schedules signatures sole_writer validity
+    presets profiles rotations schedules sfm_process signatures sole_writer validity
     binaries cameras_json checkpoint colmap_files frontier_data html_report images launches looked_at noise \
-    optim_lazy paths_between ply_body ply_compact shapes video
-    camera_path capture chart_style frontier_tables lens masks opacities ply program sghmc skew_map viewer_start
-    adc charts colmap config densify eval_histogram frontier_charts kernels regularisers splats viewer_camera \
-    viewer_recording
-    blocks buffers complexity convert model_folder paths_around point_cloud posed rate_limits splat_file spz_file \
-    strategy systems
-    budget_state gradients limits nearest optim_rules optim_waiting placing sort transforms
+    optim_lazy paths_between ply_body ply_compact run_log shapes video
+    camera_path capture chart_style frontier_tables lens masks opacities ply program progress_display sghmc \
+    skew_map viewer_start
+    adc charts colmap config densify eval_histogram frontier_charts kernels photo_folder regularisers sfm splats \
+    viewer_camera viewer_recording
+    blocks buffers complexity convert flat_model model_folder paths_around point_cloud posed rate_limits \
+    splat_file spz_file strategy systems video_frames
+    budget_state gradients limits nearest optim_rules optim_waiting placing reconstruct sort transforms
     binning optim_fused optim_host scene stages
     optim pipeline random_points scene_info synthetic validation view_sampler
     initialise loss memory pairs truths tuning
@@ -47,7 +48,7 @@ OWNERS = {
     "matplotlib": {"chart_style"},
     "viser": {"viewer_page", "viewer_server"},
     "imageio": {"video"},
-    "imageio_ffmpeg": {"video"},
+    "imageio_ffmpeg": {"video", "video_frames"},
     "lpips": {"perceptual"},
     "torch": {"perceptual"},
     "flip_evaluator": {"perceptual"},
