@@ -16,7 +16,7 @@ from .colmap_files import check_binary_model, registered_images
 from .errors import InputError
 from .lens import Lens, Photo, colmap_library, make_lens, reason_of
 
-__all__ = ["Lens", "Model", "Photo", "Points", "find_model", "make_lens", "read_model"]
+__all__ = ["Lens", "Model", "Photo", "Points", "find_model", "make_lens", "read_model", "read_photos", "read_points"]
 
 _FILES = ("cameras", "images", "points3D")
 
@@ -85,7 +85,7 @@ def read_model(folder: Path) -> Model:
     try:
         with _complete(folder, suffix) as whole:
             reconstruction = pycolmap.Reconstruction(str(whole))
-        photos, points = _photos(reconstruction), _points(reconstruction)
+        photos, points = read_photos(reconstruction), read_points(reconstruction)
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
         raise InputError(f"{folder}: COLMAP's reader refuses the model ({reason_of(error)}); the files are "
                          "damaged or do not belong together: copy or rebuild them") from None
@@ -120,7 +120,8 @@ def _complete(folder: Path, suffix: str) -> Iterator[Path]:
         yield whole
 
 
-def _photos(reconstruction: Any) -> list[Photo]:
+def read_photos(reconstruction: Any) -> list[Photo]:
+    """Registered photos of a pycolmap.Reconstruction, sorted by name."""
     photos = []
     for image_id in reconstruction.reg_image_ids():
         image = reconstruction.images[image_id]
@@ -131,7 +132,8 @@ def _photos(reconstruction: Any) -> list[Photo]:
     return sorted(photos, key=lambda photo: photo.name)
 
 
-def _points(reconstruction: Any) -> Points:
+def read_points(reconstruction: Any) -> Points:
+    """Points of a pycolmap.Reconstruction, by rising id."""
     found = reconstruction.points3D
     xyz, rgb = np.empty((len(found), 3)), np.empty((len(found), 3), np.uint8)
     track_length = np.empty(len(found), np.int64)

@@ -181,7 +181,7 @@ class ModelView:
 
 
 def write_binary_model(folder: Path, views: Sequence[ModelView], xyz: NDArray[np.float64],
-                       rgb: NDArray[np.uint8]) -> None:
+                       rgb: NDArray[np.uint8], error: NDArray[np.float64] | None = None) -> None:
     """Write cameras.bin, images.bin and points3D.bin; tracks follow from the views' observations.
 
     Parameters
@@ -190,6 +190,7 @@ def write_binary_model(folder: Path, views: Sequence[ModelView], xyz: NDArray[np
     views : the registered images; each gets its own id from 1 on, equal cameras share one.
     xyz : (P, 3) positions in the world.
     rgb : (P, 3) colours.
+    error : (P,) mean reprojection error of each point [px]; 0 where it is not given.
     """
     from scipy.spatial.transform import Rotation
 
@@ -206,9 +207,10 @@ def write_binary_model(folder: Path, views: Sequence[ModelView], xyz: NDArray[np
         images.append(observations.tobytes())
         for slot, point in enumerate(view.point_index):
             tracks[point].append((image_id, slot))
-    points = [_POINT.pack(index, *position, *(int(c) for c in colour), 0.0, len(track))
+    errors = np.zeros(len(xyz)) if error is None else error
+    points = [_POINT.pack(index, *position, *(int(c) for c in colour), off, len(track))
               + np.array(track, dtype="<u4").tobytes()
-              for index, (position, colour, track) in enumerate(zip(xyz, rgb, tracks, strict=True), start=1)]
+              for index, (position, colour, off, track) in enumerate(zip(xyz, rgb, errors, tracks, strict=True), 1)]
     _write(folder / "cameras.bin", len(cameras),
            (_CAMERA.pack(camera_id, _PINHOLE, int(key[0]), int(key[1])) + struct.pack("<4d", *key[2:])
             for key, camera_id in cameras.items()))

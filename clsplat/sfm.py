@@ -1,0 +1,120 @@
+"""Structure from motion on prepared photos, as a program of its own: `python -m clsplat.sfm JOB.json`.
+
+A process, because COLMAP's library may abort, cannot be interrupted by Ctrl-C, and must not share a process with
+another reader of its SQLite database (closing one connection drops the locks of the other). It tells what it does as
+JSON lines on standard output, and ends when its standard input does: with its parent.
+
+The job: `database`, `photos`, `masks` (folder or null), `groups` (lists of names that share a camera), `pairs` (file of
+names), `n_pairs`, `output`, `camera_model`, `max_size`, `seed`. The sparse models are left in `output`/0, 1, ...
+
+Photos are imported in their order and everything is seeded: the same photos give the same model.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from .lens import colmap_library, reason_of
+
+ENOUGH = 0.8  # of the photos registered; below, they are matched once more
+_PEAK = 0.003  # SIFT's contrast threshold; COLMAP's 0.0067 finds too little in small or soft photos
+
+
+def main(job_path: str) -> None:
+    """Run the job; an error becomes the last line."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        job = json.loads(Path(job_path).read_text(encoding="utf-8"))
+        _run(colmap_library(), job)
+    except Exception as error:  # whatever the library raises: the parent tells the user
+        _tell(error=reason_of(error))
+
+
+def _run(colmap: Any, job: dict[str, Any]) -> None:
+    photos = [name for group in job["groups"] for name in group]
+    _tell(stage="features", total=len(photos))
+    _find_features(colmap, job, photos)
+    _tell(stage="pairs", total=job["n_pairs"])
+    _match(colmap, job, guided=False)
+    models = _map(colmap, job, Path(job["output"]) / "plain", len(photos))
+    most = max(models.values(), default=0)
+    if most < ENOUGH * len(photos):
+        # Matches along epipolar lines: dearer and less exact, but photos far apart hang together by them.
+        _tell(stage="pairs again", total=job["n_pairs"])
+        database = colmap.Database.open(job["database"])
+        database.clear_matches()
+        database.clear_two_view_geometries()
+        database.close()
+        _match(colmap, job, guided=True)
+        again = _map(colmap, job, Path(job["output"]) / "guided", len(photos))
+        if max(again.values(), default=0) > most:
+            models = again
+    _tell(models=models)
+
+
+def _find_features(colmap: Any, job: dict[str, Any], photos: list[str]) -> None:
+    reader = colmap.ImageReaderOptions()
+    reader.camera_model = job["camera_model"]
+    if job["masks"]:
+        reader.mask_path = job["masks"]
+    colmap.Database.open(job["database"]).close()
+    for group in job["groups"]:  # in order, where the extraction's threads would number the photos by chance
+        colmap.import_images(job["database"], job["photos"], colmap.CameraMode.SINGLE, group, reader)
+    options = colmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.max_image_size = job["max_size"]
+    options.sift.peak_threshold = _PEAK
+    colmap.extract_features(job["database"], job["photos"], photos, colmap.CameraMode.AUTO, reader, options,
+                            colmap.Device.cpu)
+
+
+def _match(colmap: Any, job: dict[str, Any], guided: bool) -> None:
+    matching, pairing = colmap.FeatureMatchingOptions(), colmap.ImportedPairingOptions()
+    verification = colmap.TwoViewGeometryOptions()
+    matching.use_gpu = False
+    matching.guided_matching = guided
+    pairing.match_list_path = job["pairs"]
+    verification.ransac.random_seed = job["seed"]
+    colmap.match_image_pairs(job["database"], matching, pairing, verification, colmap.Device.cpu)
+
+
+def _map(colmap: Any, job: dict[str, Any], output: Path, photos: int) -> dict[str, int]:
+    """Models' folders and how many photos each registers."""
+    _tell(stage="photos placed", total=photos)
+    options = colmap.IncrementalPipelineOptions()
+    for part in (options, options.mapper, options.triangulation):
+        part.random_seed = job["seed"]
+    output.mkdir(parents=True)
+    placed = 0
+
+    def first_pair() -> None:
+        nonlocal placed
+        placed = 1
+        one_more()
+
+    def one_more() -> None:
+        nonlocal placed
+        placed += 1
+        _tell(done=placed)
+
+    models = colmap.incremental_mapping(job["database"], job["photos"], output, options,
+                                        initial_image_pair_callback=first_pair, next_image_callback=one_more)
+    return {str(output / str(index)): model.num_reg_images() for index, model in models.items()}
+
+
+def _tell(**event: Any) -> None:
+    print(json.dumps(event), flush=True)
+
+
+def _end_with_parent() -> None:
+    os.read(0, 1)  # not through sys.stdin, whose lock would trouble the interpreter's end
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
