@@ -58,10 +58,11 @@ static inline strip own_strip(int height, int stride, ulong plane, int segment) 
 
 static inline vmask inside_image(int vec, int width) { return (vreal)(vec * LANES) + lanes_iota() < (vreal)width; }
 
-// 8-bit interleaved RGB rows into planes [3] of bytes with a zero margin. Overwrites; global size: (stride, rows).
+// 8-bit interleaved rows of `channels` into planes of bytes with a zero margin. Overwrites; global size: (stride, rows).
 kernel void unpack_image(
     global const uchar *restrict bytes,
     global uchar *restrict truth,
+    int channels,
     int width,
     int height,
     ulong plane)
@@ -69,7 +70,8 @@ kernel void unpack_image(
     const int x = (int)get_global_id(0) - MARGIN_X, y = (int)get_global_id(1) - MARGIN_Y;
     const bool inside = x >= 0 && x < width && y >= 0 && y < height;
     const ulong at = get_global_id(1) * get_global_size(0) + get_global_id(0);
-    for (int c = 0; c < 3; ++c) truth[c * plane + at] = inside ? bytes[3 * ((ulong)y * width + x) + c] : (uchar)0;
+    for (int c = 0; c < channels; ++c)
+        truth[c * plane + at] = inside ? bytes[channels * ((ulong)y * width + x) + c] : (uchar)0;
 }
 
 // partial [3, channels, segments, strips]: sums of |x - y|, SSIM and (x - y)^2. v_maps [3, 3 planes]: gradient of SSIM

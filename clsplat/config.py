@@ -56,6 +56,12 @@ class TrainConfig:
     sh_interval : iterations from one SH degree to the next; 0: a tenth of the run, at most 1000.
     lambda_dssim : weight of 1 - SSIM against L1.
     background : behind the splats, R, G, B in 0..1.
+    random_background : train over another colour in each iteration; photos with transparency are laid over it too.
+    exposure : find an affine map of the colours of each training photo (exposure compensation); the mean of all stays
+        the identity.
+    exposure_rate : part of the way to the best one that a photo's exposure goes whenever it is trained on.
+    exposure_pull : how much the best one is drawn to the identity: as much as if that fraction of the photo's pixels
+        had colours of mean square 1 and no other exposure.
     seed : of everything random; the same seed gives the same bits on one device.
     coarse_to_fine : train on images at 1/4, then 1/2, then full size.
     position_lr_init : Adam's rate of positions at the start, times the scene extent.
@@ -116,6 +122,10 @@ class TrainConfig:
     sh_interval: int = 0
     lambda_dssim: float = 0.2
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    random_background: bool = False
+    exposure: bool = False
+    exposure_rate: float = 0.2
+    exposure_pull: float = 1e-2
     seed: int = 0
     coarse_to_fine: bool = True
     position_lr_init: float = 1.6e-4
@@ -174,14 +184,16 @@ class TrainConfig:
             _at_least(name, getattr(self, name), 1)
         for name in ("seed", "sh_interval", "checkpoint_interval", "position_lr_init", "position_lr_final",
                      "opacity_lr", "scaling_lr", "rotation_lr", "feature_lr", "opacity_reg",
-                     "scale_reg", "bisect_reg", "normal_lr", "beta_lr", "nu_lr", "noise_lr", "sghmc_friction",
-                     "sghmc_burn_in_friction", "grad_threshold", "depth_threshold", "opacity_reset", "dense_size"):
+                     "scale_reg", "bisect_reg", "exposure_pull", "normal_lr", "beta_lr", "nu_lr", "noise_lr",
+                     "sghmc_friction", "sghmc_burn_in_friction", "grad_threshold", "depth_threshold", "opacity_reset",
+                     "dense_size"):
             _at_least(name, getattr(self, name), 0)
         if self.skew_lr is not None:
             _at_least("skew_lr", self.skew_lr, 0)
         if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise InputError(f"sh_degree {self.sh_degree}: must be 0 to {MAX_SH_DEGREE}")
-        for name in ("lambda_dssim", "relocation_limit", "sghmc_burn_in", "alternation_warmup", "alternation_split"):
+        for name in ("lambda_dssim", "relocation_limit", "exposure_rate", "sghmc_burn_in", "alternation_warmup",
+                     "alternation_split"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{name} {getattr(self, name)}: must be 0 to 1")
         if self.position_lr_init <= 0 or self.position_lr_final <= 0:

@@ -15,6 +15,8 @@ from .schema import Group, Schema
 from .shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, shape_named
 from .skew_map import SKEW_MAPS
 
+PHOTO_VECS = 8  # vectors of a work-item of cl/photo.cl
+EXPOSURE_GROUP = 64
 MARGIN_X, MARGIN_Y = 16, 8  # zero margin of every image plane: the SSIM window reaches 5 pixels out
 BATCH = 64
 
@@ -105,6 +107,12 @@ class KernelBuild:
         defines: dict[str, Define] = {f"WINDOW_{i}": float(window[i]) for i in range(6)}
         defines |= {"LANES": self.lanes, "STRIP": self.strip, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y}
         return build(device, ("lanes.clh", "loss.cl"), defines, self.real)
+
+    def photo_program(self, device: Device) -> Program:
+        """Exposures, masks, transparency. Depends on lanes and precision only."""
+        defines: dict[str, Define] = {"LANES": self.lanes, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y,
+                                      "PHOTO_VECS": PHOTO_VECS, "EXPOSURE_GROUP": EXPOSURE_GROUP}
+        return build(device, ("lanes.clh", "photo.cl"), defines, self.real)
 
     def optim_program(self, device: Device) -> Program:
         """The step with its skew map and regularisers, noise and gathers."""

@@ -30,6 +30,10 @@ class ModelFolder:
         return self.path / "cameras.json"
 
     @property
+    def exposures_path(self) -> Path:
+        return self.path / "exposure.json"
+
+    @property
     def log_path(self) -> Path:
         return self.path / "log.jsonl"
 
@@ -79,8 +83,8 @@ class ModelFolder:
 
     def clear(self) -> None:
         """Remove what a former run wrote, and nothing else."""
-        for path in (self.checkpoint_path, self.log_path, self.config_path, self.cameras_path,
-                     self.path / "results.json", self.path / "per_view.json"):
+        for path in (self.checkpoint_path, self.log_path, self.config_path, self.cameras_path, self.exposures_path,
+                     *(self.path / name for name in ("results.json", "per_view.json", "report.html"))):
             path.unlink(missing_ok=True)
         for iteration in self.iterations():
             ply = self.ply_path(iteration)
@@ -99,6 +103,10 @@ class ModelFolder:
     def write_cameras(self, named: list[NamedCamera]) -> None:
         """3DGS's cameras.json."""
         write_cameras(self.cameras_path, named)
+
+    def write_exposures(self, by_photo: dict[str, list[list[float]]]) -> None:
+        """3DGS's exposure.json."""
+        write_json(self.exposures_path, by_photo)
 
     def save(self, splats: Splats, iteration: int) -> Path:
         """Write the point cloud of an iteration."""

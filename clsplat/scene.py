@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -45,6 +45,14 @@ class View:
     mask: Mask | None = None
     alpha: ImageU8 | None = None
 
+    def resized(self, width: int, height: int) -> View:
+        """The view at another size [px]."""
+        if (width, height) == (self.camera.width, self.camera.height):
+            return self
+        return View(self.name, self.camera.resized(width, height), resize_area(self.image, width, height),
+                    None if self.mask is None else nearest(self.mask, width, height),
+                    None if self.alpha is None else resize_area(_grey(self.alpha), width, height)[:, :, 0])
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -57,6 +65,7 @@ class Scene:
     views : sorted by name.
     points : may be empty.
     test_names : names of the views held out for evaluation.
+    background : colour 0..1 that photos with transparency lie over.
     """
 
     name: str
@@ -64,6 +73,7 @@ class Scene:
     views: list[View]
     points: Points
     test_names: frozenset[str] = frozenset()
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -139,10 +149,10 @@ def load_scene(path: str | os.PathLike[str], images: str | None = None, resoluti
         raise InputError(f"alpha {alpha!r}: choose one of {', '.join(ALPHA_USES)}")
     if resolution < 1 and resolution != -1:
         raise InputError(f"resolution {resolution}: use 1, 2, 4, 8, a width in pixels, or -1")
-    posed = _posed(root, images)
-    test_names = _test_names(posed, test_every, test_list) if eval else frozenset()
+    posed = read_posed(root, images)
+    test_names = chosen_tests(posed, test_every, test_list) if eval else frozenset()
 
-    hiding = _masks(root, posed, masks)
+    hiding = masks_of(root, posed, masks)
 
     def view(photo: Photo) -> View | str:
         return _view(photo, posed.files[photo.name], resolution, background, hiding.get(photo.name), alpha == "mask")
@@ -153,10 +163,10 @@ def load_scene(path: str | os.PathLike[str], images: str | None = None, resoluti
     _warn_of_left_out(root, [reason for reason in found if isinstance(reason, str)], len(found))
     folder = root.resolve()
     return Scene((folder.parent if root.is_file() else folder).name, root, views, posed.points,
-                 test_names & {view.name for view in views})
+                 test_names & {view.name for view in views}, background)
 
 
-def _masks(root: Path, posed: Posed, folder: str | None) -> dict[str, Path]:
+def masks_of(root: Path, posed: Posed, folder: str | None) -> dict[str, Path]:
     """Files of masks, by the names of their photos."""
     if folder == NO_MASKS:
         return {}
@@ -177,14 +187,14 @@ def _warn_of_left_out(root: Path, reasons: list[str], n: int) -> None:
                       + ("; ..." if len(reasons) > 3 else ""), stacklevel=3)
 
 
-def _posed(root: Path, images: str | None) -> Posed:
+def read_posed(root: Path, images: str | None) -> Posed:
     transforms = find_transforms(root)
     if transforms and not (root / "sparse").is_dir():
         return posed_by_transforms(transforms, images)
     return posed_by_colmap(root, images)
 
 
-def _test_names(posed: Posed, test_every: int, test_list: str | os.PathLike[str] | None) -> frozenset[str]:
+def chosen_tests(posed: Posed, test_every: int, test_list: str | os.PathLike[str] | None) -> frozenset[str]:
     names = posed.names
     if test_list is None and posed.test_names is not None:
         chosen = sorted(posed.test_names)
@@ -228,19 +238,16 @@ def _view(photo: Photo, file: Path, resolution: int, background: tuple[float, fl
         counts.append(alpha >= 128)
         alpha, stored = None, stored[:, :, :3]
     image, camera = photo.fit(_opaque(stored, background))
-    masks = [photo.fit_mask(mask, width, height) for mask in counts]
+    fitted = [photo.fit_mask(each, width, height) for each in counts]
+    mask = np.logical_and.reduce(fitted) if fitted else None
     alpha = None if alpha is None else photo.fit(_grey(alpha))[0][:, :, 0]
-    width, height = _target_size(camera.width, camera.height, resolution)
-    if (width, height) != (camera.width, camera.height):
-        image, camera = resize_area(image, width, height), camera.resized(width, height)
-        masks = [nearest(mask, width, height) for mask in masks]
-        alpha = None if alpha is None else resize_area(_grey(alpha), width, height)[:, :, 0]
-    if not masks:
-        return View(photo.name, camera, image, None, alpha)
-    mask = np.logical_and.reduce(masks)
-    if not mask.any():
+    view = View(photo.name, camera, image, mask, alpha)
+    view = view.resized(*_target_size(camera.width, camera.height, resolution))
+    if view.mask is None:
+        return view
+    if not view.mask.any():
         return f"{file}: its mask hides all of it"
-    return View(photo.name, camera, image, None if mask.all() else mask, alpha)
+    return replace(view, mask=None) if view.mask.all() else view
 
 
 def _grey(plane: ImageU8) -> ImageU8:

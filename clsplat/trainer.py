@@ -29,6 +29,7 @@ from .morton import morton_order
 from .noise import noise_amount, noise_reach
 from .opacities import finite_rows
 from .optim import make_optimizer
+from .photos import PhotoLoss, exposures_json, photo_bytes
 from .pipeline import TIMES_SEEN, ImageLayout, Pipeline, most_isects
 from .rate_limits import check_rates
 from .render import Renderer
@@ -38,7 +39,7 @@ from .schedules import exponential_decay, sh_degree_at
 from .skew_map import SKEW_MAPS
 from .splats import Splats
 from .strategy import Moment, plan
-from .truths import Truths, truth_budget, truth_bytes
+from .truths import Truths, truth_budget, truth_bytes, truth_channels
 from .tuning import schedule_for
 from .view_sampler import ViewSampler
 
@@ -91,8 +92,10 @@ class Trainer:
                                    skew_map=config.map or SKEW_MAPS[0])
         largest = max((view.camera for view in scene.train), key=lambda c: c.width * c.height)
         budget, tile = truth_budget(self.device), self.kernels.schedule.tile
-        self.memory = estimate(config, self.kernels, ImageLayout(largest.width, largest.height, tile),
-                               truth_bytes(scene.train, budget, tile))
+        channels = truth_channels(scene.train, config.random_background)
+        layout = ImageLayout(largest.width, largest.height, tile)
+        self.memory = estimate(config, self.kernels, layout, truth_bytes(scene.train, budget, tile, channels)
+                               + photo_bytes(layout, self.kernels.dtype.itemsize, config.exposure or channels > 3))
         check(self.memory, self.device)
         self.rng = np.random.default_rng(config.seed)
         self.iteration, self.seconds = 0, 0.0
@@ -116,11 +119,14 @@ class Trainer:
         self.splats.set(first)
         self.grads = CompactGradients(self.device, self.splats.schema, capacity, dtype)
         self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config, scene.extent)
-        if checkpoint is not None:
-            self.optimizer.load_state(checkpoint.optimizer)
-            self.pipeline.write_signals(checkpoint.signals, self.splats.capacity)
         self.loss = ImageLoss(self.pipeline, config.lambda_dssim)
-        self.truths = Truths(self.device, self.kernels, scene.train, budget)
+        self.truths = Truths(self.device, self.kernels, scene.train, budget, channels)
+        self.photos = PhotoLoss(self.loss, self.truths, config, scene.background)
+        if checkpoint is not None:
+            state = dict(checkpoint.optimizer)
+            self.photos.load_state(state)
+            self.optimizer.load_state(state)
+            self.pipeline.write_signals(checkpoint.signals, self.splats.capacity)
         self.optim_program = self.kernels.optim_program(self.device)
         self.renderer = Renderer(self.device)
         self.evaluations: dict[int, Evaluation] = {}
@@ -163,6 +169,9 @@ class Trainer:
                                "test_ssim": self.evaluations[it].ssim, "splats": self.splats.n})
                 if folder is not None and (it in config.save_iterations or ends):
                     folder.save(self.snapshot(), it)
+                    if config.exposure:
+                        names = [view.name for view in self.scene.train]
+                        folder.write_exposures(exposures_json(names, self.photos.exposures()))
                 if folder is not None and (ends or (config.checkpoint_interval
                                                     and it % config.checkpoint_interval == 0)):
                     log.flush()
@@ -185,8 +194,12 @@ class Trainer:
         it = self.iteration
         truth = self.truths.get(*self.views.next(it, self.splats.n))
         degree = sh_degree_at(it, self.sh_interval, config.sh_degree)
-        frame = self.pipeline.forward(self.splats, truth.camera, config.background, degree)
-        v_color = self.loss.gradient(truth.layout, self.truths.planes(truth))
+        background = config.background
+        if config.random_background:
+            r, g, b = self.rng.random(3).tolist()
+            background = r, g, b
+        frame = self.pipeline.forward(self.splats, truth.camera, background, degree)
+        v_color = self.photos.gradient(truth, background)
         self.pipeline.backward(frame, v_color, self.grads)
         mean_lr = self.scene.extent * self.mean_rate(it)
         self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it,
@@ -230,8 +243,8 @@ class Trainer:
     def checkpoint(self) -> Checkpoint:
         """Everything that the rest of the run depends on."""
         return Checkpoint(self.iteration, self.config.to_json(), self.splats.download(self.splats.n),
-                          self.optimizer.state(), dict(self.rng.bit_generator.state), self.views.queue,
-                          self.seconds, str(self.kernels.schedule), self.n_first,
+                          self.optimizer.state() | self.photos.state(), dict(self.rng.bit_generator.state),
+                          self.views.queue, self.seconds, str(self.kernels.schedule), self.n_first,
                           self.pipeline.read_signals(self.splats.n))
 
     def evaluate(self, views: list[View]) -> Evaluation:

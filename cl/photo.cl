@@ -1,0 +1,181 @@
+// photo.cl: what stands between a render and a photo of the scene: the photo's exposure, pixels that a mask hides, and
+// transparent pixels over a background that is not the one they were laid over.
+//
+// A photo's exposure E is 12 reals, three rows of three factors and an offset: photo = E (r, g, b, 1) of the render.
+// Where a mask hides a pixel, the photo is taken for right: there is no error, and no gradient.
+// Planes of bytes of a truth are r, g, b, and with 5 channels the mask (0 hides) and the opacity.
+// A work-item has PHOTO_VECS vectors of a row. Images are planar with a zero margin (see raster.cl).
+
+#define EXPOSURE 12
+#define SQUARES 10             // of the upper triangle of a 4 x 4 matrix, by rows
+#define SUMS (SQUARES + EXPOSURE)
+#define SATURATED R(0.98)      // a brighter photo says nothing of its exposure
+
+static inline vmask in_row(int vec, int width) { return (vreal)(vec * LANES) + lanes_iota() < (vreal)width; }
+
+// photo [3 planes]: the render as the photo's camera would show it; target [3 planes of bytes], written with 5 channels:
+// the truth over the background that the render has. shift: that background less the truth's, times 255.
+// Overwrites; global size: (at least the row's vectors / PHOTO_VECS, height).
+kernel void photo_of_render(
+    global const real *restrict color,
+    global const uchar *restrict truth,
+    global const real *restrict exposures,
+    global real *restrict photo,
+    global uchar *restrict target,
+    int view,
+    int channels,
+    int width,
+    int height,
+    int stride,
+    ulong plane,
+    real shift_r,
+    real shift_g,
+    real shift_b)
+{
+    const int vecs = (width + LANES - 1) / LANES, y = get_global_id(1);
+    const int first = get_global_id(0) * PHOTO_VECS, past = min(first + PHOTO_VECS, vecs);
+    global const real *row = exposures + EXPOSURE * view;
+    const real shift[3] = {shift_r, shift_g, shift_b};
+    const vreal zero = (vreal)0;
+    if (y >= height) return;
+    for (int vec = first; vec < past; ++vec) {
+        const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + vec * LANES;
+        const vmask inside = in_row(vec, width);
+        const vreal r = lanes_load(color + at), g = lanes_load(color + at + plane), b = lanes_load(color + at + 2 * plane);
+        vmask counts = inside;
+        vreal through = zero;
+        if (channels > 3) {
+            counts &= lanes_uchar_to_real(truth + at + 3 * plane) > zero;
+            through = (vreal)1 - lanes_uchar_to_real(truth + at + 4 * plane) * (real)(1.0 / 255.0);
+        }
+        for (int c = 0; c < 3; ++c) {
+            global const real *e = row + 4 * c;
+            vreal shown = lanes_mad(r, (vreal)e[0], lanes_mad(g, (vreal)e[1], lanes_mad(b, (vreal)e[2], (vreal)e[3])));
+            if (channels > 3) {
+                vreal wanted = lanes_mad(through, (vreal)shift[c], lanes_uchar_to_real(truth + at + c * plane));
+                wanted = lanes_if(inside, rint(lanes_clamp(wanted, 0, 255)), zero);
+                lanes_real_to_uchar(wanted, target + at + c * plane);
+                shown = lanes_if(counts, shown, wanted * (real)(1.0 / 255.0));
+            }
+            lanes_store(lanes_if(inside, shown, zero), photo + at + c * plane);
+        }
+    }
+}
+
+// v [3 planes], in place: from the gradient of the photo to that of the render. partial [SUMS, parts]: with x = (r, g, b, 1)
+// of the render and y the target, sums of x x' and of y x' over the pixels that count and are not saturated; target: the
+// truth itself with 3 channels. Same global size.
+kernel void photo_of_render_vjp(
+    global const real *restrict color,
+    global const uchar *restrict truth,
+    global const uchar *restrict target,
+    global const real *restrict exposures,
+    global real *restrict v,
+    global real *restrict partial,
+    int view,
+    int channels,
+    int width,
+    int height,
+    int stride,
+    ulong plane)
+{
+    const int vecs = (width + LANES - 1) / LANES, y = get_global_id(1);
+    const int first = get_global_id(0) * PHOTO_VECS, past = min(first + PHOTO_VECS, vecs);
+    global const real *row = exposures + EXPOSURE * view;
+    const vreal zero = (vreal)0;
+    vreal sums[SUMS];
+    for (int j = 0; j < SUMS; ++j) sums[j] = zero;
+    if (y >= height || first >= vecs) return;
+    for (int vec = first; vec < past; ++vec) {
+        const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + vec * LANES;
+        vmask counts = in_row(vec, width);
+        if (channels > 3) counts &= lanes_uchar_to_real(truth + at + 3 * plane) > zero;
+        vreal x[4], v_photo[3], wanted[3], most = zero;
+        for (int c = 0; c < 3; ++c) {
+            x[c] = lanes_load(color + at + c * plane);
+            wanted[c] = lanes_uchar_to_real(target + at + c * plane) * (real)(1.0 / 255.0);
+            most = max(most, wanted[c]);
+            v_photo[c] = lanes_if(counts, lanes_load(v + at + c * plane), zero);
+        }
+        for (int c = 0; c < 3; ++c)
+            lanes_store(lanes_mad(v_photo[0], (vreal)row[c],
+                                  lanes_mad(v_photo[1], (vreal)row[4 + c], v_photo[2] * (vreal)row[8 + c])),
+                        v + at + c * plane);
+        x[3] = lanes_if(counts & (most < (vreal)SATURATED), (vreal)1, zero);
+        for (int c = 0; c < 3; ++c) x[c] *= x[3];
+        int j = 0;
+        for (int a = 0; a < 4; ++a)
+            for (int b = a; b < 4; ++b, ++j) sums[j] = lanes_mad(x[a], x[b], sums[j]);
+        for (int c = 0; c < 3; ++c)
+            for (int b = 0; b < 4; ++b, ++j) sums[j] = lanes_mad(wanted[c], x[b], sums[j]);
+    }
+    const int items = (vecs + PHOTO_VECS - 1) / PHOTO_VECS;
+    const ulong parts = (ulong)items * height, part = (ulong)y * items + get_global_id(0);
+    for (int j = 0; j < SUMS; ++j) partial[j * parts + part] = lanes_sum(sums[j]);
+}
+
+// The exposure of least squares, S E' = T' with S and T those sums plus `pull` pixels' worth of the identity: by Cholesky.
+static inline void solve_exposure(local const real *sums, real pull, real *exposure) {
+    real l[4][4];
+    int j = 0;
+    for (int a = 0; a < 4; ++a)
+        for (int b = a; b < 4; ++b, ++j) l[b][a] = sums[j] + (a == b ? pull : 0);
+    for (int a = 0; a < 4; ++a)
+        for (int b = a; b < 4; ++b) {
+            for (int k = 0; k < a; ++k) l[b][a] -= l[b][k] * l[a][k];
+            l[b][a] = a == b ? sqrt(max(l[b][a], R(1e-20))) : l[b][a] / l[a][a];
+        }
+    for (int c = 0; c < 3; ++c) {
+        real *e = exposure + 4 * c;
+        for (int a = 0; a < 4; ++a) {
+            e[a] = sums[SQUARES + 4 * c + a] + (a == c ? pull : 0);
+            for (int k = 0; k < a; ++k) e[a] -= l[a][k] * e[k];
+            e[a] /= l[a][a];
+        }
+        for (int a = 3; a >= 0; --a) {
+            for (int k = a + 1; k < 4; ++k) e[a] -= l[k][a] * e[k];
+            e[a] /= l[a][a];
+        }
+    }
+}
+
+// A view's exposure goes the fraction `rate` of the way to that of least squares, which `pull`, a fraction of the pixels,
+// draws to the identity. What that moves the mean of all exposures by is taken off all of them: a gain of all photos and
+// its inverse in all splats would look the same, and views without a photo are shown with the mean.
+// exposures [views, EXPOSURE]. One group of EXPOSURE_GROUP.
+kernel void step_exposure(
+    global real *restrict exposures,
+    global const real *restrict partial,
+    int parts,
+    int view,
+    int views,
+    real rate,
+    real pull)
+{
+    local real shares[EXPOSURE_GROUP][SUMS], sums[SUMS], moved[EXPOSURE];
+    const int item = get_local_id(0);
+    for (int j = 0; j < SUMS; ++j) {
+        real sum = 0;
+        for (int part = item; part < parts; part += EXPOSURE_GROUP) sum += partial[(ulong)j * parts + part];
+        shares[item][j] = sum;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item < SUMS) {
+        real sum = 0;
+        for (int other = 0; other < EXPOSURE_GROUP; ++other) sum += shares[other][item];
+        sums[item] = sum;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0) {
+        const real pixels = sums[SQUARES - 1];
+        real best[EXPOSURE];
+        solve_exposure(sums, max(pull * pixels, R(1e-6)), best);
+        for (int j = 0; j < EXPOSURE; ++j)
+            moved[j] = pixels > 0 ? rate * (best[j] - exposures[EXPOSURE * view + j]) : 0;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int at = item; at < EXPOSURE * views; at += EXPOSURE_GROUP) {
+        const int j = at % EXPOSURE;
+        exposures[at] += (at / EXPOSURE == view ? moved[j] : 0) - moved[j] / views;
+    }
+}
