@@ -57,6 +57,7 @@ def build_all(device: Device, kernels: KernelBuild) -> None:
         return
     kernels.raster_program(device)
     kernels.loss_program(device)
+    kernels.photo_program(device)
     kernels.optim_program(device)
 
 

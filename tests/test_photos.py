@@ -217,7 +217,7 @@ def test_what_a_mask_hides_is_not_learned(capture: Scene) -> None:
         excess[masked] = np.mean([magenta(np.clip(Renderer().render(model, view.camera).color, 0, 1))
                                   - magenta(view.image / 255) for view in scene.test])
     assert excess[False] > 0.02
-    assert abs(excess[True]) < 0.2 * excess[False]
+    assert excess[True] < 0.2 * excess[False]
 
 
 def test_random_backgrounds_show_through_nothing_opaque(capture: Scene) -> None:
