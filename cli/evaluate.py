@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +46,8 @@ _DIGITS = {"PSNR": 3, "SSIM": 4, "LPIPS": 4, "FLIP": 4}
 @set_option
 @click.option("--compat", type=click.Choice(list(PROTOCOLS)), default=DEFAULT_PROTOCOL.name,
               show_default=True, help="How PSNR and SSIM are taken; 3dgs pads SSIM with zeros.")
+@click.option("--color-correct", is_flag=True,
+              help="PSNR and SSIM after the affine map of colours that brings each render nearest to its photo.")
 @click.option("--lpips", is_flag=True, help="Also LPIPS, by VGG16 (pip install 'clsplat[lpips]').")
 @click.option("--flip", is_flag=True, help="Also FLIP, and its maps on the page (pip install 'clsplat[flip]').")
 @click.option("--report", type=PATH, metavar="FILE",
@@ -56,10 +59,10 @@ _DIGITS = {"PSNR": 3, "SSIM": 4, "LPIPS": 4, "FLIP": 4}
 @device_option
 @quiet_option
 def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], source_path: Path | None,
-                    images: str | None, resolution: int | None, view_set: str | None, compat: str, lpips: bool,
-                    flip: bool, report: Path | None, no_report: bool, save_renders: Path | None,
-                    background: RGB | None, white_background: bool, iteration: int | None, device: str | None,
-                    quiet: bool) -> None:
+                    images: str | None, resolution: int | None, view_set: str | None, compat: str,
+                    color_correct: bool, lpips: bool, flip: bool, report: Path | None, no_report: bool,
+                    save_renders: Path | None, background: RGB | None, white_background: bool,
+                    iteration: int | None, device: str | None, quiet: bool) -> None:
     """Measure MODELS on their scenes' test views.
 
     Writes results.json, per_view.json and report.html, a page with the images, into each model's folder (with --set
@@ -75,7 +78,8 @@ def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], sou
         raise click.UsageError("give --report or --no-report, not both")
     if save_renders is not None and len({path.resolve().name for path in paths}) < len(paths):
         raise click.UsageError("--save-renders: models in folders of the same name; measure them one by one")
-    colour, protocol = background_of(background, white_background), protocol_named(compat)
+    colour = background_of(background, white_background)
+    protocol = replace(protocol_named(compat), corrected=color_correct)
     metrics = (Lpips(unit_range=protocol.name == "3dgs") if lpips else None, Flip() if flip else None)
     renderer = Renderer(device)
     measured, pages = [], []

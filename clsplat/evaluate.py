@@ -35,7 +35,7 @@ def evaluate(renderer: Renderer, splats: Splats, views: Sequence[View],
 
     Parameters
     ----------
-    views : at least one.
+    views : at least one; pixels that a mask hides are left out.
     on_view : called with each view and its render, to save it.
     """
     per_view: dict[str, dict[str, float]] = {}
@@ -45,7 +45,8 @@ def evaluate(renderer: Renderer, splats: Splats, views: Sequence[View],
         start = time.perf_counter()
         image = renderer.render(splats, view.camera, background)
         times.append(1e3 * (time.perf_counter() - start))
-        measured = protocol.measure(np.clip(image.color, 0, 1), view.image / np.float32(255))
+        measured = protocol.measure(np.clip(image.color, 0, 1), view.image / np.float32(255),
+                                    view.mask)
         per_view[view.name] = {name: min(value, MAX_PSNR) if math.isinf(value) else value
                                for name, value in measured.items()}
         if on_view is not None:

@@ -33,22 +33,35 @@ class Protocol:
     rounded : both images are rounded to 8 bits first.
     padding : SSIM over windows inside the image only ("valid"), or zeros around it and one window per
         pixel ("zero").
+    corrected : the first image is brought to the second one's exposure before, by `color_corrected`.
     """
 
     name: str
     rounded: bool
     padding: Padding
+    corrected: bool = False
 
-    def measure(self, a: NDArray[Any], b: NDArray[Any]) -> dict[str, float]:
-        """`{"PSNR": dB, "SSIM": -1..1}` of one image pair."""
-        return {"PSNR": psnr(a, b, self.rounded), "SSIM": ssim(a, b, self.padding, self.rounded)}
+    def measure(self, a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> dict[str, float]:
+        """`{"PSNR": dB, "SSIM": -1..1}` of one image pair.
+
+        Parameters
+        ----------
+        a, b : (H, W) or (H, W, C), a render and its photo, say.
+        mask : (H, W), True where a pixel counts; None where all do.
+        """
+        if self.corrected:
+            a = color_corrected(a, b, mask)
+        return {"PSNR": psnr(a, b, self.rounded, mask), "SSIM": ssim(a, b, self.padding, self.rounded, mask)}
 
     def describe(self) -> dict[str, str]:
         """What to write beside the numbers."""
         images = "rounded to 8 bits" if self.rounded else "real-valued, clipped to 0..1"
+        if self.corrected:
+            images = f"render in the photo's exposure (affine, least squares), {images}"
         area = "windows inside the image" if self.padding == "valid" else "zero padding"
         window = f"11x11, sigma 1.5, {area}"
-        return {"name": self.name, "PSNR": f"per image, {images}", "SSIM": f"{window}, {images}"}
+        name = f"{self.name}, colour-corrected" if self.corrected else self.name
+        return {"name": name, "PSNR": f"per image, {images}", "SSIM": f"{window}, {images}"}
 
 
 PROTOCOLS = {p.name: p for p in (Protocol("clsplat", True, "valid"), Protocol("3dgs", True, "zero"))}
@@ -63,24 +76,49 @@ def protocol_named(name: str) -> Protocol:
         raise InputError(f"unknown metrics protocol {name!r}: choose one of {', '.join(PROTOCOLS)}") from None
 
 
-def psnr(a: NDArray[Any], b: NDArray[Any], rounded: bool = True) -> float:
-    """Peak signal-to-noise ratio [dB] over all pixels and channels; infinite for equal images.
+def color_corrected(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    """Image `a` (H, W, 3), 0..1, through the affine map of colours that brings it nearest to `b`, in least squares.
+
+    For photos of unknown exposure, whose error would hide all others.
+
+    Parameters
+    ----------
+    mask : (H, W), True where a pixel counts.
+
+    Raises
+    ------
+    InputError : different or empty shapes, or not three channels.
+    """
+    x, y = _pair(a, b, rounded=False)
+    if x.shape[2:] != (3,):
+        raise InputError(f"colour correction: an image of shape {x.shape}; expected (H, W, 3)")
+    inputs = np.concatenate([x, np.ones((*x.shape[:2], 1))], axis=2)
+    counts = np.ones(x.shape[:2], bool) if mask is None else mask
+    found = np.linalg.lstsq(inputs[counts], y[counts], rcond=None)[0]
+    return np.clip(inputs @ found, 0.0, 1.0)
+
+
+def psnr(a: NDArray[Any], b: NDArray[Any], rounded: bool = True, mask: NDArray[np.bool_] | None = None) -> float:
+    """Peak signal-to-noise ratio [dB] over all pixels that count and channels; infinite for equal images.
 
     Parameters
     ----------
     a, b : (H, W) or (H, W, C), uint8 or real numbers that are clipped to 0..1.
     rounded : round both to 8 bits first, as files would.
+    mask : (H, W), True where a pixel counts; None where all do.
 
     Raises
     ------
     InputError : different or empty shapes.
     """
     x, y = _pair(a, b, rounded)
-    error = float(np.mean((x - y) ** 2))
+    squares = (x - y) ** 2
+    error = float(np.mean(squares if mask is None else squares[mask]))
     return float("inf") if error == 0.0 else -10.0 * float(np.log10(error))
 
 
-def ssim(a: NDArray[Any], b: NDArray[Any], padding: Padding = "valid", rounded: bool = True) -> float:
+def ssim(a: NDArray[Any], b: NDArray[Any], padding: Padding = "valid", rounded: bool = True,
+         mask: NDArray[np.bool_] | None = None) -> float:
     """Structural similarity, the mean over its map and over channels.
 
     Parameters
@@ -88,6 +126,8 @@ def ssim(a: NDArray[Any], b: NDArray[Any], padding: Padding = "valid", rounded: 
     a, b : (H, W) or (H, W, C), uint8 or real numbers that are clipped to 0..1.
     padding : "valid" uses windows inside the image only; "zero" sets zeros around it (3DGS).
     rounded : round both to 8 bits first, as files would.
+    mask : (H, W), True where a pixel counts; None where all do. Elsewhere `a` is taken to equal `b`, and windows around
+        such pixels do not count.
 
     Raises
     ------
@@ -99,6 +139,8 @@ def ssim(a: NDArray[Any], b: NDArray[Any], padding: Padding = "valid", rounded: 
     if padding == "valid" and min(x.shape[:2]) < 2 * SSIM_RADIUS + 1:
         size = f"{x.shape[1]}x{x.shape[0]} px"
         raise InputError(f"SSIM: an image of {size} is below its 11x11 window; use zero padding (3dgs)")
+    if mask is not None:
+        x = np.where(mask.reshape(*mask.shape, *[1] * (x.ndim - 2)), x, y)
     mean_x, mean_y = _blur(x), _blur(y)
     var_x = _blur(x * x) - mean_x * mean_x
     var_y = _blur(y * y) - mean_y * mean_y
@@ -107,8 +149,11 @@ def ssim(a: NDArray[Any], b: NDArray[Any], padding: Padding = "valid", rounded: 
     structure = (2 * cov + SSIM_C2) / (var_x + var_y + SSIM_C2)
     similarity = luminance * structure
     if padding == "valid":
-        similarity = similarity[SSIM_RADIUS:-SSIM_RADIUS, SSIM_RADIUS:-SSIM_RADIUS]
-    return float(np.mean(similarity))
+        inside = slice(SSIM_RADIUS, -SSIM_RADIUS)
+        similarity, mask = similarity[inside, inside], None if mask is None else mask[inside, inside]
+    # Where a mask leaves nothing inside the border, there is nothing to be unlike.
+    counted = similarity if mask is None else similarity[mask]
+    return float(np.mean(counted)) if counted.size else 1.0
 
 
 def _blur(image: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from clsplat.errors import InputError
-from clsplat.metrics import PROTOCOLS, protocol_named, psnr, ssim
+from clsplat.metrics import PROTOCOLS, color_corrected, protocol_named, psnr, ssim
 
 RNG = np.random.default_rng(5)
 A = RNG.random((17, 14, 3))
@@ -82,3 +83,39 @@ def test_unusable_images_are_named() -> None:
     assert 0 < ssim(A[:, :9], B[:, :9], "zero") < 1
     with pytest.raises(InputError, match="reflect"):
         ssim(A, B, "reflect")  # type: ignore[arg-type]
+
+
+# --- masks and exposures -------------------------------------------------------------------
+
+def test_masked_pixels_are_in_no_metric() -> None:
+    """Whatever stands there; PSNR is that of the other pixels, SSIM that of windows around them."""
+    mask = np.ones(A.shape[:2], bool)
+    mask[:, 9:] = False
+    wild = np.where(mask[:, :, None], A, RNG.random(A.shape))
+    for name in PROTOCOLS:
+        measured = [protocol_named(name).measure(a, B, mask) for a in (A, wild)]
+        assert measured[0] == measured[1]
+        assert measured[0]["PSNR"] == pytest.approx(psnr(A[:, :9], B[:, :9]))
+    filled = np.where(mask[:, :, None], A, B)
+    by_window = [ssim_by_windows(filled[:, i : i + 11], B[:, i : i + 11], "valid") for i in range(4)]
+    assert ssim(A, B, "valid", rounded=False, mask=mask) == pytest.approx(np.mean(by_window), abs=1e-12)
+
+
+def test_a_mask_that_leaves_no_window_is_no_nan() -> None:
+    mask = np.zeros(A.shape[:2], bool)
+    mask[0, 0] = True
+    assert ssim(A, B, mask=mask) == 1.0
+
+
+def test_colour_correction_undoes_an_affine_change() -> None:
+    matrix = np.array([[0.8, 0.05, 0.0], [0.0, 0.7, 0.1], [0.02, 0.0, 0.9]])
+    changed = A @ matrix.T + [0.01, 0.05, 0.0]
+    np.testing.assert_allclose(color_corrected(A, changed), changed, atol=1e-12)
+    mask = np.zeros(A.shape[:2], bool)
+    mask[4:12, 3:11] = True
+    np.testing.assert_allclose(color_corrected(A, np.where(mask[:, :, None], changed, 0.5), mask), changed, atol=1e-12)
+    with pytest.raises(InputError, match="colour correction"):
+        color_corrected(A[:, :, 0], A[:, :, 0])
+    protocol = dataclasses.replace(protocol_named("clsplat"), corrected=True)
+    assert protocol.measure(A, changed)["PSNR"] > 70
+    assert protocol.describe()["name"] == "clsplat, colour-corrected"
