@@ -8,9 +8,13 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clsplat import __version__
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError
+from clsplat.metrics import color_corrected
 
 from .models import LoadedModel
 
@@ -30,27 +34,31 @@ class ViewRecorder:
 
     Parameters
     ----------
-    lpips, flip : metrics to take. pages : keep images for a page.
+    lpips, flip : metrics to take. pages : keep images for a page. corrected : renders in their photos' exposure.
     per_view : by metric, values by the views' names. shots : by the views' names.
     """
 
     lpips: Lpips | None = None
     flip: Flip | None = None
     pages: bool = True
+    corrected: bool = False
     per_view: dict[str, dict[str, float]] = field(default_factory=dict)
     shots: dict[str, Shot] = field(default_factory=dict)
 
     def __call__(self, view: View, image: Rendered) -> None:
+        color: NDArray[Any] = image.color
+        if self.corrected:
+            color = color_corrected(np.clip(color, 0, 1), view.image / np.float32(255), view.mask)
         flip_map = None
         if self.lpips is not None:
-            self.per_view.setdefault("LPIPS", {})[view.name] = self.lpips(image.color, view.image, view.mask)
+            self.per_view.setdefault("LPIPS", {})[view.name] = self.lpips(color, view.image, view.mask)
         if self.flip is not None:
-            flip_map = self.flip(image.color, view.image, view.mask)
+            flip_map = self.flip(color, view.image, view.mask)
             self.per_view.setdefault("FLIP", {})[view.name] = self.flip.mean(flip_map, view.mask)
         if self.pages:
             from clsplat.eval_images import shot_of
 
-            self.shots[view.name] = shot_of(view.image, image.color, view.mask, flip_map)
+            self.shots[view.name] = shot_of(view.image, color, view.mask, flip_map)
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ _DIGITS = {"PSNR": 3, "SSIM": 4, "LPIPS": 4, "FLIP": 4}
 @click.option("--compat", type=click.Choice(list(PROTOCOLS)), default=DEFAULT_PROTOCOL.name,
               show_default=True, help="How PSNR and SSIM are taken; 3dgs pads SSIM with zeros.")
 @click.option("--color-correct", is_flag=True,
-              help="PSNR and SSIM after the affine map of colours that brings each render nearest to its photo.")
+              help="Measure and show renders after the affine map of colours that brings each nearest to its photo.")
 @click.option("--lpips", is_flag=True, help="Also LPIPS, by VGG16 (pip install 'clsplat[lpips]').")
 @click.option("--flip", is_flag=True, help="Also FLIP, and its maps on the page (pip install 'clsplat[flip]').")
 @click.option("--report", type=PATH, metavar="FILE",
@@ -90,7 +90,7 @@ def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], sou
         scene = scene_of(loaded, source_path, images, resolution)
         renders = save_renders and (save_renders / path.resolve().name if len(paths) > 1 else save_renders)
         measured.append(measure_model(loaded, scene, renderer, protocol, view_set or "test", colour, renders,
-                                      ViewRecorder(*metrics, pages=not no_report)))
+                                      ViewRecorder(*metrics, not no_report, color_correct)))
         if report is None and not no_report:
             page = loaded.folder.path / f"{Path(REPORT).stem}{_ending(view_set or 'test')}.html"
             pages.append(write_model_page(page, scene.name, measured[-1:], [path.resolve().name]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from base64 import b64encode
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ class Shot:
         return self.photo.shape[1], self.photo.shape[0]
 
 
-def shot_of(photo: Picture, color: NDArray[np.float32], mask: NDArray[np.bool_] | None = None,
+def shot_of(photo: Picture, color: NDArray[Any], mask: NDArray[np.bool_] | None = None,
             flip: NDArray[np.float32] | None = None) -> Shot:
     """A view's photo and render for the page.
 

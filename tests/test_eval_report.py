@@ -12,14 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_runner import TEST_NAMES, clsplat, error_of, small_model
+from clsplat_cli.eval_pages import ViewRecorder
 from PIL import Image
 
 from clsplat import eval_report
+from clsplat.camera import Camera
 from clsplat.display import colour_map
 from clsplat.errors import InputError
 from clsplat.eval_histogram import BINS, histogram, quantile, shares
 from clsplat.eval_images import LONGEST, full_scale, map_of, shot_of, veiled
 from clsplat.eval_report import Measured, write_eval_report
+from clsplat.render import Rendered
+from clsplat.scene import View
 
 WIDTH, HEIGHT = 60, 40
 URI = re.compile(r'<img ([^>]*)src="data:image/jpeg;base64,([^"]+)"')
@@ -187,6 +191,20 @@ def test_eval_writes_the_page(tmp_path: Path, tmp_path_factory: pytest.TempPathF
     assert str(other) in both, "two folders of one name are told apart"
     assert not (other / "report_train.html").exists()
     assert "not both" in error_of("eval", model, "--report", tmp_path / "x.html", "--no-report", code=2)
+
+
+def test_a_recorder_sees_renders_in_the_photos_exposure() -> None:
+    photo = np.ascontiguousarray(measured("one", n=1).shots["<0>.jpg"].photo[..., [0, 0, 0]])
+    photo[..., 1] //= 2
+    photo[:9, :, 2] = 7
+    view = View("a.png", Camera(WIDTH, HEIGHT, 50.0, 50.0, 30.0, 20.0, np.eye(4)), photo)
+    dark = Rendered((0.5 * photo / 255).astype(np.float32), np.ones((HEIGHT, WIDTH)), np.ones((HEIGHT, WIDTH)))
+    plain, corrected = ViewRecorder(), ViewRecorder(corrected=True)
+    plain(view, dark)
+    corrected(view, dark)
+    assert plain.shots["a.png"].error.max() > 20
+    assert corrected.shots["a.png"].error.max() <= 1
+    assert np.abs(corrected.shots["a.png"].render.astype(int) - photo).max() <= 1
 
 
 # --- in a browser --------------------------------------------------------------------------------
