@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from types import NoneType, UnionType
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from .errors import InputError
+from .json_fields import kind, real_of
 from .schema import MAX_SH_DEGREE
 from .shapes import DEFAULT_SHAPE, check_normalisation, shape_named
 from .skew_map import check_map, map_named
@@ -234,13 +236,37 @@ class TrainConfig:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> TrainConfig:
-        """The config that `to_json` gave; InputError on an unknown key."""
-        known = {field.name: field for field in dataclasses.fields(cls)}
+        """The config that `to_json` gave; InputError on an unknown key, or a value that is of no such kind."""
+        if not isinstance(values, dict):
+            raise InputError(f"config: is {kind(values)}; expected an object of options")
+        known, hints = {field.name: field for field in dataclasses.fields(cls)}, get_type_hints(cls)
         unknown = sorted(set(values) - set(known))
         if unknown:
             raise InputError(f"config: unknown option {unknown[0]!r}")
         given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        for key, value in given.items():
+            if not (_is_a(value, hints[key]) or (value is None and known[key].default is None)):
+                raise InputError(f"config: {key} is {kind(values[key])}; expected {_expected(hints[key])}")
         return cls(**given)
+
+
+def _is_a(value: Any, hint: Any) -> bool:
+    """Whether a value from JSON is of an option's type."""
+    if isinstance(hint, UnionType):
+        return any(_is_a(value, part) for part in get_args(hint))
+    if get_origin(hint) is tuple:
+        parts = get_args(hint)
+        same_length = parts[1:] == (...,) or (isinstance(value, tuple) and len(value) == len(parts))
+        return isinstance(value, tuple) and same_length and all(_is_a(part, parts[0]) for part in value)
+    if hint is float:
+        real = real_of(value)
+        return real is not None and math.isfinite(real)
+    return isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
+
+
+def _expected(hint: Any) -> str:
+    names = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+    return names.get(hint, "a list of numbers" if get_origin(hint) is tuple else "another kind of value, or null")
 
 
 def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
