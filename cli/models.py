@@ -11,6 +11,7 @@ import click
 from clsplat.cameras_json import NamedCamera, bare_name, read_cameras
 from clsplat.config import ALPHA_USES
 from clsplat.errors import InputError
+from clsplat.json_fields import real_of
 from clsplat.model_folder import ModelFolder
 from clsplat.splats import Splats
 
@@ -141,12 +142,15 @@ def _recorded(folder: ModelFolder) -> tuple[RGB, dict[str, Any]]:
     if not isinstance(config, dict) or not isinstance(scene, dict):
         raise InputError(f"{file}: config and scene must be objects: restore the file as it was written")
     rgb = config.get("background", [0, 0, 0])
-    if not isinstance(rgb, list) or len(rgb) != 3 or not all(isinstance(part, (int, float)) for part in rgb):
-        raise InputError(f"{file}: config.background is {rgb!r}: expected three numbers")
+    parts = [real_of(part) for part in rgb] if isinstance(rgb, list) else []
+    if len(parts) != 3 or not all(part is not None and 0 <= part <= 1 for part in parts):
+        raise InputError(f"{file}: config.background is {rgb!r}: expected three numbers from 0 to 1")
     kinds = {"path": str, "images": str, "resolution": int, "masks": str, "alpha": str,
              "test_names": list}
     for key, kind in kinds.items():
         if scene.get(key) is not None and not isinstance(scene[key], kind):
             raise InputError(f"{file}: scene.{key} is {scene[key]!r}: restore the file as it was written")
+    if not all(isinstance(name, str) for name in scene.get("test_names") or []):
+        raise InputError(f"{file}: scene.test_names must be names: restore the file as it was written")
     known = {key: value for key, value in scene.items() if value is not None}
     return (float(rgb[0]), float(rgb[1]), float(rgb[2])), known

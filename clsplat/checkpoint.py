@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,19 +67,51 @@ class Checkpoint:
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
             meta = json.loads(arrays.pop("meta").tobytes())
-            signals = arrays.pop("signals")
+            version = meta["version"]
         except FileNotFoundError:
             raise InputError(f"{path}: no checkpoint to resume from: start without --resume") from None
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: not a readable checkpoint ({error}): "
-                             "start again with --overwrite") from None
-        if meta.get("version") != VERSION:
-            found = meta.get("version")
-            raise InputError(f"{path}: checkpoint version {found}, this clsplat reads {VERSION}")
+        except _DAMAGE as error:
+            raise _unreadable(path, str(error)) from None
+        if version != VERSION:
+            raise InputError(f"{path}: checkpoint version {version}, this clsplat reads {VERSION}")
 
         def part(prefix: str) -> dict[str, Any]:
             return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
-        return cls(meta["iteration"], meta["config"], part("splats."), part("optimizer."), meta["rng"],
-                   meta["queue"], meta["seconds"], meta["schedule"],
-                   meta["n_first"], signals)
+        try:
+            checkpoint = cls(meta["iteration"], meta["config"], part("splats."), part("optimizer."), meta["rng"],
+                             meta["queue"], meta["seconds"], meta["schedule"], meta["n_first"], arrays["signals"])
+            checkpoint._check()
+        except _DAMAGE as error:
+            raise _unreadable(path, str(error)) from None
+        return checkpoint
+
+    def _check(self) -> None:
+        """Raises one of _DAMAGE where a value cannot be what `save` wrote. The zip's checksums find damage to bytes;
+        this finds a file that was put together by something else."""
+        for name, kind in _KINDS.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind) or isinstance(value, bool):
+                raise ValueError(f"its {name} is of another kind")
+        if self.iteration < 0 or self.n_first < 1 or not 0 <= self.seconds < math.inf:
+            raise ValueError("its iteration, n_first or seconds are out of range")
+        if not all(type(place) is int and place >= 0 for place in self.queue):
+            raise ValueError("its queue is none of views")
+        np.random.default_rng().bit_generator.state = self.rng
+        n = len(self.splats["mean"])
+        for group in (self.splats, self.optimizer, {"signals": self.signals}):
+            if not all(values.dtype.kind in "fiu" and values.ndim for values in group.values()):
+                raise ValueError("it holds something that is no array of numbers")
+        if any(len(values) != n for values in self.splats.values()) or self.signals.shape != (3, n):
+            raise ValueError("its arrays are not of the same splats")
+
+
+_KINDS = {"iteration": int, "config": dict, "rng": dict, "queue": list, "seconds": int | float, "schedule": str,
+          "n_first": int}
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, OverflowError, EOFError, RecursionError, zipfile.BadZipFile,
+           zlib.error)
+
+
+def _unreadable(path: Path, why: str) -> InputError:
+    return InputError(f"{path}: not a readable checkpoint ({why.splitlines()[0] if why else 'damaged'}): "
+                      "start again with --overwrite")

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from . import json_fields
 from .atomic import atomic_writer
 from .cameras_json import NamedCamera, write_cameras
 from .errors import InputError, OutputError
@@ -123,12 +124,7 @@ def write_json(path: Path, values: Any) -> None:
 
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON object; InputError names the file and what is wrong."""
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not valid JSON ({error})") from None
+    values = json_fields.read_json(path, "the file as clsplat wrote it")
     if not isinstance(values, dict):
         raise InputError(f"{path}: expected a JSON object")
     return values

@@ -37,8 +37,8 @@ def test_a_few_options_are_enough(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("text", "said"), [
-    ("[1]", "expected a JSON object"), ("{", "not valid JSON"), ('{"colour": 1}', "unknown option 'colour'"),
-    ('{"iterations": "many"}', "not options of a run"), ('{"config": 3}', "not options of a run"),
+    ("[1]", "expected a JSON object"), ("{", "is no JSON"), ('{"colour": 1}', "unknown option 'colour'"),
+    ('{"iterations": "many"}', "iterations is the text"), ('{"config": 3}', "config: is a number"),
     ('{"shape": "cube"}', "cube"),
 ])
 def test_what_is_no_file_of_options_is_named(scene: Path, tmp_path: Path, text: str, said: str) -> None:
