@@ -70,6 +70,46 @@ static inline splat_terms splat_project(global const real *geom, const ulong cap
     return s;
 }
 
+#if ANTIALIASED
+// What the low-pass leaves of a splat's height if it keeps the volume: sqrt(det(B B') / det(B B' + low-pass)), the filter on
+// the screen of Mip-Splatting (Yu et al. 2024, eq. 9, with a wider low-pass). Exact for kernels of a quadratic form; where a
+// splat has sides, its peak changes with them besides.
+#ifndef SHAPE_SIZE
+#define shape_size(s) ((vreal)1)
+#endif
+
+static inline vreal lowered(splat_params s, vec3 b0, vec3 b1) {
+    const vreal size = shape_size(s);
+    b0 = scale3(b0, size);
+    b1 = scale3(b1, size);
+    const vec3 area = cross3(b0, b1);
+    return sqrt(dot3(area, area) / cov2d_det(b0, b1));
+}
+
+// Adds to g, whose opacities are those after lowering, and makes them those before.
+static inline void lowered_vjp(splat_params s, vec3 b0, vec3 b1, shape_grads *g, vec3 *v_b0, vec3 *v_b1) {
+    const vreal size = shape_size(s);
+    const vec3 c0 = scale3(b0, size), c1 = scale3(b1, size);
+    const vec3 area = cross3(c0, c1);
+    const vreal flat = dot3(area, area), det = cov2d_det(c0, c1), factor = sqrt(flat / det);
+    const vreal v_factor = g->s.opacity * s.opacity + g->s.opacity_minus * s.opacity_minus;
+    g->s.opacity *= factor;
+    g->s.opacity_minus *= factor;
+    // factor^2 = flat/det, det = flat + low-pass (|c0|^2 + |c1|^2 + low-pass). A splat seen from its edge has no slope.
+    const vreal v_flat = lanes_if(factor > (vreal)R(1e-6), R(0.5) * v_factor * ((vreal)1 - factor * factor)
+                                  / (max(factor, (vreal)R(1e-6)) * det), (vreal)0);
+    const vreal v_squares = R(-0.5) * LOW_PASS * v_factor * factor / det;
+    const vec3 v_area = scale3(area, (real)2 * v_flat);
+    const vec3 v_c0 = add3(cross3(c1, v_area), scale3(c0, (real)2 * v_squares));
+    const vec3 v_c1 = add3(cross3(v_area, c0), scale3(c1, (real)2 * v_squares));
+    *v_b0 = add3(*v_b0, scale3(v_c0, size));
+    *v_b1 = add3(*v_b1, scale3(v_c1, size));
+#ifdef SHAPE_SIZE
+    g->s.beta += shape_size_vjp(s, dot3(v_c0, b0) + dot3(v_c1, b1));
+#endif
+}
+#endif
+
 static inline vec3 unit_direction(constant real *cam, vec3 mean, vreal *inv_norm) {
     const vec3 from = add3(mean, scale3(CAMERA_CENTRE(cam), (vreal)-1));
     *inv_norm = (vreal)1 / sqrt(max(dot3(from, from), (vreal)R(1e-30)));
@@ -100,7 +140,13 @@ kernel void project_splats(
 
     vreal out[RECORD];
     extents box;
-    shape_project(s.s, s.b0, s.b1, s.cov2d, out + HEAD, &box);
+    splat_params shown = s.s;
+#if ANTIALIASED
+    const vreal factor = lowered(s.s, s.b0, s.b1);
+    shown.opacity *= factor;
+    shown.opacity_minus *= factor;
+#endif
+    shape_project(shown, s.b0, s.b1, s.cov2d, out + HEAD, &box);
     out[0] = s.to_px.x;
     out[1] = s.to_px.y;
     out[5] = s.c.z;
@@ -205,11 +251,20 @@ kernel void project_splats_vjp(
         v[j] = lanes_if(seen, lanes_load(moments + first + j * capacity), zero);
 
     shape_grads g;
-    shape_project_vjp(s.s, s.b0, s.b1, s.cov2d, v, &g);
+    splat_params shown = s.s;
+#if ANTIALIASED
+    const vreal factor = lowered(s.s, s.b0, s.b1);
+    shown.opacity *= factor;
+    shown.opacity_minus *= factor;
+#endif
+    shape_project_vjp(shown, s.b0, s.b1, s.cov2d, v, &g);
 
     // cov2d = B B' + low-pass
-    const vec3 v_b0 = add3(g.b0, add3(scale3(s.b0, (real)2 * g.cov2d.xx), scale3(s.b1, g.cov2d.xy)));
-    const vec3 v_b1 = add3(g.b1, add3(scale3(s.b1, (real)2 * g.cov2d.yy), scale3(s.b0, g.cov2d.xy)));
+    vec3 v_b0 = add3(g.b0, add3(scale3(s.b0, (real)2 * g.cov2d.xx), scale3(s.b1, g.cov2d.xy)));
+    vec3 v_b1 = add3(g.b1, add3(scale3(s.b1, (real)2 * g.cov2d.yy), scale3(s.b0, g.cov2d.xy)));
+#if ANTIALIASED
+    lowered_vjp(s.s, s.b0, s.b1, &g, &v_b0, &v_b1);
+#endif
     // B = A R S
     vec3 v_scale = add3(mul3(v_b0, s.ar0), mul3(v_b1, s.ar1));
     const vec3 v_ar0 = mul3(v_b0, s.scale), v_ar1 = mul3(v_b1, s.scale);

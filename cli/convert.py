@@ -103,7 +103,7 @@ def _of_degree(splats: Splats, degree: int) -> Splats:
 
     sh = splats.sh[:, : sh_coefficients(degree)]
     sh = np.pad(sh, ((0, 0), (0, sh_coefficients(degree) - sh.shape[1]), (0, 0)))
-    return Splats(splats.shape, splats.to_numpy() | {"sh": sh}, splats.normalisation)
+    return splats.with_arrays(splats.to_numpy() | {"sh": sh})
 
 
 def _cost(loaded: LoadedModel, converted: Splats, cameras: Path | None, device: str | None) -> str:

@@ -43,6 +43,8 @@ class TrainConfig:
     ----------
     shape : the splat kernel.
     normalisation : of skewed kernels: what `opacity` means.
+    antialiased : let opacities fall as the low-pass widens small splats (Mip-Splatting's filter on the screen): a model
+        then looks alike in images of other sizes than those it was trained on.
     skew_map : from the trainable skew to the kernel's; "auto": cube-root for the centred form, polar for the direct.
     iterations : optimizer steps, one image each.
     cap_max : hard limit on splats.
@@ -112,6 +114,7 @@ class TrainConfig:
 
     shape: str = DEFAULT_SHAPE
     normalisation: str = "peak"
+    antialiased: bool = False
     skew_map: str = "auto"
     iterations: int = 7000
     cap_max: int = 100_000

@@ -46,7 +46,8 @@ def convert(splats: Splats, shape: str) -> Splats:
     else:
         model, normalisation = _gaussian(model, splats.normalisation, source, target), "peak"
     dtype = splats.mean.dtype
-    return Splats(shape, {name: values.astype(dtype) for name, values in model.items()}, normalisation)
+    return Splats(shape, {name: values.astype(dtype) for name, values in model.items()}, normalisation,
+                  splats.antialiased)
 
 
 def _refuse(bad: Mask, target: Shape, why: str, mend: str) -> None:

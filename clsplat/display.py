@@ -86,7 +86,7 @@ def model_for(splats: Splats, mode: str) -> Splats:
         return splats
     colour = np.zeros_like(splats.sh)
     colour[:, 0] = ((skew_magnitude(splats) - 0.5) / SH_C0)[:, None]
-    return Splats(splats.shape, {**splats.arrays, "sh": colour}, splats.normalisation)
+    return splats.with_arrays({**splats.arrays, "sh": colour})
 
 
 def skew_magnitude(splats: Splats) -> NDArray[np.float64]:

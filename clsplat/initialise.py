@@ -36,6 +36,7 @@ def initial_splats(
     seed: int = 0,
     *,
     normalisation: str = "peak",
+    antialiased: bool = False,
     opacity: float = OPACITY,
     scale_factor: float = SCALE_FACTOR,
 ) -> tuple[Splats, str]:
@@ -46,7 +47,7 @@ def initial_splats(
     Parameters
     ----------
     scene : its points and training cameras are used.
-    shape, sh_degree, normalisation : of the result.
+    shape, sh_degree, normalisation, antialiased : of the result.
     cap : most splats; of more points those with the longest tracks are kept, of a model the most opaque.
     init : "sfm", "random", or the path of a .ply model. "sfm" without points becomes "random" and says so.
     seed : of random points and of the first skew.
@@ -54,15 +55,15 @@ def initial_splats(
 
     Raises
     ------
-    InputError : cap below 1, unknown `init`, an unreadable model, or one with skew of another normalisation, or a
-        scene so small that it lies before the near plane.
+    InputError : cap below 1, unknown `init`, an unreadable model, one with skew of another normalisation, one that is
+        antialiased or not against what is asked for, or a scene so small that it lies before the near plane.
     """
     if cap < 1:
         raise InputError(f"cap {cap}: at least 1 splat is needed")
     check_size(scene)
     rng = np.random.default_rng(seed)
     if init.lower().endswith(".ply"):
-        splats, message = _from_model(init, shape, cap, sh_degree, normalisation)
+        splats, message = _from_model(init, shape, cap, sh_degree, normalisation, antialiased)
     elif init in ("sfm", "random"):
         xyz, rgb, message = _points(scene, init, cap, rng)
         order = morton_order(xyz)
@@ -145,12 +146,16 @@ def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene
     return np.sort(np.concatenate([first, rest])[:cap])
 
 
-def _from_model(path: str, shape: str, cap: int, sh_degree: int, normalisation: str) -> tuple[Splats, str]:
+def _from_model(path: str, shape: str, cap: int, sh_degree: int, normalisation: str,
+                antialiased: bool) -> tuple[Splats, str]:
     """A model from a file, in the wanted shape, SH degree and count."""
     loaded = Splats.load(path)
     if loaded.skew.any() and loaded.normalisation != normalisation:
         raise InputError(f"{path}: its normalisation is {loaded.normalisation}, not {normalisation}: "
                          f"choose normalisation {loaded.normalisation}")
+    if loaded.antialiased != antialiased:
+        raise InputError(f"{path}: its splats are {'' if loaded.antialiased else 'not '}antialiased: "
+                         f"{'use' if loaded.antialiased else 'leave out'} --antialiased")
     message = f"{len(loaded)} splats from {path}"
     if len(loaded) > cap:
         strength = shape_named(loaded.shape).strength(loaded.arrays)
@@ -159,7 +164,7 @@ def _from_model(path: str, shape: str, cap: int, sh_degree: int, normalisation: 
         loaded = loaded.select(keep)
     arrays = loaded.as_shape(shape).to_numpy()
     arrays["sh"] = _fit_bands(arrays["sh"], sh_coefficients(sh_degree))
-    return Splats(shape, arrays, normalisation=normalisation), message
+    return Splats(shape, arrays, normalisation, loaded.antialiased), message
 
 
 def _fit_bands(sh: Array, coefficients: int) -> Array:
@@ -182,4 +187,4 @@ def _started(splats: Splats, rng: np.random.Generator) -> Splats:
         else:
             direction = rng.standard_normal(values.shape)
             values[:] = field.start * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    return Splats(splats.shape, arrays, normalisation=splats.normalisation)
+    return splats.with_arrays(arrays)

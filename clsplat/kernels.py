@@ -49,6 +49,7 @@ class KernelBuild:
     alpha_max: float = ALPHA_MAX
     t_min: float = T_MIN
     arithmetic: Arithmetic = DEFAULT_ARITHMETIC
+    antialiased: bool = False
 
     @cached_property
     def schema(self) -> Schema:
@@ -145,7 +146,7 @@ class KernelBuild:
             "GROUP": self.schedule.group, "VECS": self.schedule.vecs, "LANES": self.lanes,
             "SH_DEGREE": self.sh_degree, "GEOM_ROWS": schema.rows(Group.GEOM),
             "WITH_DEPTH": int(self.with_depth), "WITH_V_ALPHA": int(self.with_v_alpha),
-            "NORMALISATION": NORMALISATIONS.index(self.normalisation),
+            "ANTIALIASED": int(self.antialiased), "NORMALISATION": NORMALISATIONS.index(self.normalisation),
             "PEAK_STEPS": 3 if self.real == "float" else 4,
             "SKEW_MAX": SKEW_MAX, "SLANT_MAX": SLANT_MAX, "OPACITY_SIGNED": int(shape_named(self.shape).signed),
             "LOW_PASS": LOW_PASS, "ALPHA_MIN": self.alpha_min, "ALPHA_MAX": self.alpha_max, "T_MIN": self.t_min,

@@ -95,7 +95,8 @@ def color_corrected(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | 
     inputs = np.concatenate([x, np.ones((*x.shape[:2], 1))], axis=2)
     counts = np.ones(x.shape[:2], bool) if mask is None else mask
     found = np.linalg.lstsq(inputs[counts], y[counts], rcond=None)[0]
-    return np.clip(inputs @ found, 0.0, 1.0)
+    corrected: NDArray[np.float64] = np.clip(inputs @ found, 0.0, 1.0)
+    return corrected
 
 
 def psnr(a: NDArray[Any], b: NDArray[Any], rounded: bool = True, mask: NDArray[np.bool_] | None = None) -> float:

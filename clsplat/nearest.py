@@ -67,7 +67,7 @@ def nearest_gaussians(splats: Splats) -> Splats:
     fitted = _lopsided(model, source) if parameter is None else _round(model, source, parameter)
     for name, values in fitted.items():
         arrays[name][changed] = values
-    return Splats(GAUSSIAN.name, arrays)
+    return Splats(GAUSSIAN.name, arrays, antialiased=splats.antialiased)
 
 
 def _lopsided(model: dict[str, Reals], source: Shape) -> dict[str, Reals]:

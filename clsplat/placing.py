@@ -67,7 +67,7 @@ def placed(splats: Splats, matrix: ArrayLike) -> Splats:
     }
     arrays = splats.to_numpy()
     arrays |= {name: values.astype(arrays[name].dtype) for name, values in changed.items()}
-    return Splats(splats.shape, arrays, splats.normalisation)
+    return splats.with_arrays(arrays)
 
 
 def turned_harmonics(sh: Array, rotation: Reals) -> Array:
@@ -93,10 +93,12 @@ def joined(parts: Sequence[Splats]) -> Splats:
 
     Raises
     ------
-    InputError : no parts, or shapes or normalisations that have no equal in each other.
+    InputError : no parts, or shapes or normalisations that have no equal in each other, or only some antialiased.
     """
     if not parts:
         raise InputError("join: no splats")
+    if len({part.antialiased for part in parts if len(part)}) > 1:
+        raise InputError("join: some of the models are antialiased, others are not; show one model at a time")
     shapes = list(dict.fromkeys(part.shape for part in parts))
     for shape in shapes:
         try:
@@ -118,5 +120,4 @@ def _stacked(parts: Sequence[Splats]) -> Splats:
               for name in parts[0].arrays if name != "sh"}
     arrays["sh"] = np.concatenate([np.pad(part.sh, ((0, 0), (0, coefficients - part.sh.shape[1]), (0, 0)))
                                    for part in parts])
-    normalisation = next((part.normalisation for part in parts if len(part)), parts[0].normalisation)
-    return Splats(parts[0].shape, arrays, normalisation)
+    return next((part for part in parts if len(part)), parts[0]).with_arrays(arrays)

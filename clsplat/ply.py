@@ -3,8 +3,9 @@
 Columns in this order, all float32: `x y z`, `nx ny nz` (zeros), `f_dc_0..2`, `f_rest_*` (channel-major: all
 of red, then green, then blue), `opacity` (logit), `scale_0..2` (natural log), `rot_0..3` (w, x, y, z, any
 norm), then the shape's own columns. The header names the kernel:
-`comment clsplat shape=<name> normalisation=<peak|pdf|none>`. Compact files (ply_compact.py) leave out what no splat
-uses, and have what few splats use in elements after the vertices.
+`comment clsplat shape=<name> normalisation=<peak|pdf|none>`. Models of antialiased training have
+`comment SplatRenderMode: mip`, as other programs write it. Compact files (ply_compact.py) leave out what no splat uses,
+and have what few splats use in elements after the vertices.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ from .validity import check_arrays, first_fault, sh_degree_for
 
 _NORMALS = ("nx", "ny", "nz")
 _COMMENT = "clsplat"
+_ANTIALIASED = "SplatRenderMode: mip"
+_ANTIALIASED_ELSEWHERE = "antialiased 1"  # PostShot's
 _REST_COUNTS = (0, 9, 24, 45)  # f_rest_* of SH degree 0 to 3
 
 
@@ -49,12 +52,13 @@ class PlyModel:
 
     Parameters
     ----------
-    shape, normalisation : names of the kernel and its normalisation.
+    shape, normalisation : names of the kernel and its normalisation. antialiased : see `Splats`.
     arrays : public arrays by field name; float32, or float64 where every property is `double`.
     """
 
     shape: str
     normalisation: str
+    antialiased: bool
     arrays: dict[str, Array]
 
 
@@ -94,11 +98,12 @@ def read_ply(path: str | os.PathLike[str]) -> PlyModel:
                 column = field.ply[_column(field, fault.component)]
             place = f"property {column}, vertex {fault.index}"
             raise InputError(f"{path}: {place}: {fault.what}; remove that splat or export again")
-    return PlyModel(shape.name, normalisation, arrays)
+    antialiased = any(comment in (_ANTIALIASED, _ANTIALIASED_ELSEWHERE) for comment in header.comments)
+    return PlyModel(shape.name, normalisation, antialiased, arrays)
 
 
 def write_ply(path: str | os.PathLike[str], shape: str, normalisation: str, arrays: Mapping[str, Array],
-              compact: bool = False) -> None:
+              compact: bool = False, antialiased: bool = False) -> None:
     """Write a splat model, binary little-endian float32 (float64 is rounded), atomically.
 
     Parameters
@@ -132,6 +137,7 @@ def write_ply(path: str | os.PathLike[str], shape: str, normalisation: str, arra
         flat = _channel_major(values) if field.group is Group.SH else values.reshape(n, field.width)
         columns.update(zip(field.ply, flat.T, strict=True))
     head = ["ply", "format binary_little_endian 1.0", f"comment {_COMMENT} shape={shape} normalisation={normalisation}"]
+    head += [f"comment {_ANTIALIASED}"] if antialiased else []
     for element, table in (("vertex", columns), *tables):
         head.append(f"element {element} {len(next(iter(table.values())))}")
         head += [f"property {'float' if values.dtype.kind == 'f' else 'uint'} {name}" for name, values in table.items()]

@@ -219,7 +219,7 @@ def without_field(splats: Splats, threshold: float, name: str, scores: Reals) ->
     own = splats.schema[name]
     arrays = splats.to_numpy()
     arrays[name][scores <= threshold] = own.neutral if own.width > 1 else own.neutral[0]
-    return Splats(splats.shape, arrays, splats.normalisation)
+    return splats.with_arrays(arrays)
 
 
 def without_bands(splats: Splats, threshold: float, lower: Sequence[Array], lost: Reals) -> Splats:
@@ -232,7 +232,7 @@ def without_bands(splats: Splats, threshold: float, lower: Sequence[Array], lost
         rows = (degrees == degree) & (used > degree)  # others keep their bits
         arrays["sh"][rows, : colours.shape[1]] = colours[rows]
         arrays["sh"][rows, colours.shape[1] :] = 0.0
-    return Splats(splats.shape, arrays, splats.normalisation)
+    return splats.with_arrays(arrays)
 
 
 def _farthest(scores: Reals, splats: Splats, now: float, floor: float, apply: Callable[[Splats, float], Splats],

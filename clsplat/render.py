@@ -141,7 +141,7 @@ class Renderer:
         alpha_min, alpha_max, t_min = self._thresholds
         kernels = KernelBuild(splats.shape, splats.sh_degree, schedule, splats.normalisation, real,
                               alpha_min=alpha_min, alpha_max=alpha_max, t_min=t_min,
-                              arithmetic=self.arithmetic).for_rendering()
+                              arithmetic=self.arithmetic, antialiased=splats.antialiased).for_rendering()
         if kernels not in self._pipelines:
             self._pipelines[kernels] = Pipeline(self.device, kernels)
         return self._pipelines[kernels]

@@ -48,8 +48,8 @@ def trained_rounds(scene: Scene, splats: Splats, judge: Judge, floor: float, ite
     ----------
     iterations : of a round.
     """
-    config = TrainConfig(shape=splats.shape, normalisation=splats.normalisation, iterations=10 * iterations,
-                         background=judge.background)
+    config = TrainConfig(shape=splats.shape, normalisation=splats.normalisation, antialiased=splats.antialiased,
+                         iterations=10 * iterations, background=judge.background)
     good = splats
     while len(splats) > 1:
         fewer = without_quarter(splats, scene.train, judge.renderer, judge.background)
@@ -103,8 +103,9 @@ def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Pat
             changes[option] = rate * value * config.rate_factor(field) / short.rate_factor(field)
     last = config.position_lr_final * config.rate_factor("mean") / short.rate_factor("mean")
     return dataclasses.replace(
-        short, shape=splats.shape, normalisation=splats.normalisation, sh_degree=splats.sh_degree, cap_max=len(splats),
-        init=str(start), coarse_to_fine=False, sh_interval=1, strategy="adc", densify_until=0.0, noise_lr=0.0,
-        position_optimizer="adam", alternation="off", save_iterations=(), test_iterations=(),
-        opacity_lr=rate * config.opacity_lr, feature_lr=rate * config.feature_lr,
-        position_lr_init=min(_WARM * last, config.position_lr_init), position_lr_final=last, **changes)
+        short, shape=splats.shape, normalisation=splats.normalisation, antialiased=splats.antialiased,
+        sh_degree=splats.sh_degree, cap_max=len(splats), init=str(start), coarse_to_fine=False, sh_interval=1,
+        strategy="adc", densify_until=0.0, noise_lr=0.0, position_optimizer="adam", alternation="off",
+        save_iterations=(), test_iterations=(), opacity_lr=rate * config.opacity_lr,
+        feature_lr=rate * config.feature_lr, position_lr_init=min(_WARM * last, config.position_lr_init),
+        position_lr_final=last, **changes)

@@ -33,20 +33,23 @@ class Splats:
         16, and the shape's own, such as skew (N, 3); the shape's own may be left out (neutral). Copied;
         float32 unless all are float64 arrays.
     normalisation : "peak", "pdf" or "none".
+    antialiased : whether opacities fall as the low-pass widens small splats (cl/project.cl), as they did in training.
 
     Raises
     ------
     InputError : an unknown name, a shape that does not fit, or an unusable value; names field and splat.
     """
 
-    __slots__ = ("_arrays", "_normalisation", "_schema", "_shape")
+    __slots__ = ("_antialiased", "_arrays", "_normalisation", "_schema", "_shape")
 
+    _antialiased: bool
     _arrays: dict[str, Array]
     _normalisation: str
     _schema: Schema
     _shape: str
 
-    def __init__(self, shape: str, arrays: Mapping[str, ArrayLike], normalisation: str = "peak") -> None:
+    def __init__(self, shape: str, arrays: Mapping[str, ArrayLike], normalisation: str = "peak",
+                 antialiased: bool = False) -> None:
         descriptor = shape_named(shape)
         double = all(getattr(values, "dtype", None) == np.float64 for values in arrays.values())
         dtype: np.dtype[Any] = np.dtype(np.float64 if double and arrays else np.float32)
@@ -65,6 +68,7 @@ class Splats:
             values.setflags(write=False)
         self._shape = descriptor.name
         self._normalisation = check_normalisation(normalisation)
+        self._antialiased = bool(antialiased)
         self._schema = schema
         self._arrays = {field.name: own[field.name] for field in schema}
 
@@ -72,7 +76,7 @@ class Splats:
     def load(cls, path: str | os.PathLike[str]) -> Splats:
         """Read a splat PLY; a plain 3DGS file gives Gaussians. Raises InputError (see `ply.read_ply`)."""
         model = read_ply(path)
-        return cls(model.shape, model.arrays, model.normalisation)
+        return cls(model.shape, model.arrays, model.normalisation, model.antialiased)
 
     def save(self, path: str | os.PathLike[str], compact: bool = False) -> None:
         """Write a PLY in float32, atomically. Raises OutputError where it cannot be written.
@@ -82,7 +86,7 @@ class Splats:
         compact : leave out what the splats do not use (see ply_compact.py). Files for other programs are best whole:
             some readers know one element only, and none but clsplat's the columns that moved to others.
         """
-        write_ply(path, self._shape, self._normalisation, self._arrays, compact)
+        write_ply(path, self._shape, self._normalisation, self._arrays, compact, self._antialiased)
 
     @classmethod
     def from_points(
@@ -154,6 +158,11 @@ class Splats:
         return self._normalisation
 
     @property
+    def antialiased(self) -> bool:
+        """Whether opacities fall as the low-pass widens small splats."""
+        return self._antialiased
+
+    @property
     def schema(self) -> Schema:
         """The fields that these splats have."""
         return self._schema
@@ -202,12 +211,16 @@ class Splats:
         return len(self.mean)
 
     def __repr__(self) -> str:
-        kind = f"{self.shape}, {self.normalisation}-normalised"
+        kind = f"{self.shape}, {self.normalisation}-normalised" + (", antialiased" if self.antialiased else "")
         return f"Splats({len(self)} x {kind}, SH degree {self.sh_degree})"
 
     def to_numpy(self) -> dict[str, Array]:
         """Writable copies of every field's array, by name."""
         return {name: values.copy() for name, values in self._arrays.items()}
+
+    def with_arrays(self, arrays: Mapping[str, ArrayLike]) -> Splats:
+        """Splats of the same kind with other arrays, any number of them. Raises InputError as `Splats` does."""
+        return Splats(self._shape, arrays, self._normalisation, self._antialiased)
 
     def select(self, indices: ArrayLike) -> Splats:
         """The splats at `indices` (whole numbers in any order, repeats allowed, or an (N,) boolean mask).
@@ -226,7 +239,7 @@ class Splats:
             taken = {name: values[chosen] for name, values in self._arrays.items()}
         except IndexError as error:
             raise InputError(f"select: {error}; there are {len(self)} splats") from None
-        return Splats(self._shape, taken, self._normalisation)
+        return self.with_arrays(taken)
 
     def as_shape(self, name: str) -> Splats:
         """The same splats as another shape: fields it lacks are dropped, fields it adds are neutral.
@@ -246,7 +259,7 @@ class Splats:
                 raise InputError(f"splats: {negative} of {len(self)} have a negative opacity, which shape {name} has "
                                  "not: remove them or choose another shape")
             arrays["opacity_logit"] = target.raw_opacity(np.clip(opacity, *_OPACITIES)).astype(raw.dtype)
-        return Splats(name, arrays, self._normalisation)
+        return Splats(name, arrays, self._normalisation, self._antialiased)
 
 
 def _real(name: str, values: ArrayLike, dtype: np.dtype[Any]) -> Array:

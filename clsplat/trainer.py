@@ -89,7 +89,7 @@ class Trainer:
         # A resumed run keeps its schedule: another one would round otherwise.
         schedule = Schedule.parse(checkpoint.schedule) if checkpoint else schedule_for(self.device)
         self.kernels = KernelBuild(config.shape, config.sh_degree, schedule, config.normalisation,
-                                   skew_map=config.map or SKEW_MAPS[0])
+                                   skew_map=config.map or SKEW_MAPS[0], antialiased=config.antialiased)
         largest = max((view.camera for view in scene.train), key=lambda c: c.width * c.height)
         budget, tile = truth_budget(self.device), self.kernels.schedule.tile
         channels = truth_channels(scene.train, config.random_background)
@@ -102,7 +102,8 @@ class Trainer:
         if checkpoint is None:
             start, message = initial_splats(
                 scene, config.shape, config.cap_max, config.sh_degree, config.init, config.seed,
-                normalisation=config.normalisation, opacity=config.init_opacity, scale_factor=config.init_scale)
+                normalisation=config.normalisation, antialiased=config.antialiased, opacity=config.init_opacity,
+                scale_factor=config.init_scale)
             first = start.to_numpy()
         else:
             first = checkpoint.splats  # not as Splats: it may hold splats that the strategy is yet to mend
@@ -236,7 +237,7 @@ class Trainer:
             raise TrainingError(f"iteration {self.iteration}: no splat is finite any more: lower the learning rates")
         try:
             return Splats(self.config.shape, {name: array[sound] for name, array in arrays.items()},
-                          self.config.normalisation)
+                          self.config.normalisation, self.config.antialiased)
         except InputError as error:
             raise TrainingError(f"iteration {self.iteration}: {error}: lower the learning rates") from None
 

@@ -55,6 +55,7 @@ class Case:
     fields: tuple[str, ...] | None = None  # gradients wanted; None = all
     seed: int = 0
     thresholds: dict[str, float] = field(default_factory=dict)
+    antialiased: bool = False
 
     @cached_property
     def values(self) -> Arrays:
@@ -62,17 +63,17 @@ class Case:
 
     @cached_property
     def splats(self) -> Splats:
-        return Splats(self.shape, self.values, self.normalisation)
+        return Splats(self.shape, self.values, self.normalisation, self.antialiased)
 
     @cached_property
     def image(self) -> Rendered:
         return render_reference(self.values, self.camera, self.shape, self.normalisation, BACKGROUND,
-                                **self.thresholds)
+                                antialiased=self.antialiased, **self.thresholds)
 
     @cached_property
     def gradients(self) -> Arrays:
         return reference_gradients(self.values, self.camera, *self.weights, self.shape, self.normalisation,
-                                   BACKGROUND, fields=self.fields, **self.thresholds)
+                                   BACKGROUND, fields=self.fields, antialiased=self.antialiased, **self.thresholds)
 
     @cached_property
     def decided(self) -> NDArray[np.bool_]:
@@ -83,7 +84,7 @@ class Case:
         if self.thresholds or not len(order):
             return np.ones(shape, bool)
         ordered = {name: value[order] for name, value in values.items()}
-        screen = project(ordered, self.camera, self.shape, self.normalisation)
+        screen = project(ordered, self.camera, self.shape, self.normalisation, antialiased=self.antialiased)
         raw = alpha_maps(screen, self.camera, 0.0, np.inf)
         behind = np.cumprod(1.0 - alpha_maps(screen, self.camera), axis=0)
         size = np.abs(raw)

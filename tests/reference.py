@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from reference_formulas import inverse_2x2, jacobian, normal_cdf, rotation, sh_basis
 from reference_radial import RADIAL
-from reference_shape import Array, Geometry, Kernel
+from reference_shape import LOW_PASS, Array, Geometry, Kernel
 from reference_skewed import SKEWED
 
 from clsplat.camera import Camera
@@ -63,8 +63,24 @@ def axes_of(arrays: Mapping[str, Array]) -> Array:
     return rotation(arrays["quat"]) * np.exp(arrays["log_scale"])[:, None, :]
 
 
+def lowered(kernel: Kernel, arrays: Mapping[str, Array], geometry: Geometry, shape: str) -> Kernel:
+    """The kernel times the share of its area that the low-pass does not add: the root of a ratio of determinants."""
+    size = REFERENCES[shape].size
+    widened = geometry.matrix2d()
+    low_pass = LOW_PASS * np.eye(2)
+    if size is not None:
+        widened = (size(arrays) ** 2)[:, None, None] * (widened - low_pass) + low_pass
+
+    def det(m: Array) -> Array:
+        return m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
+
+    factor = np.sqrt(np.where(det(widened - low_pass).real > 0.0, det(widened - low_pass), 0.0) / det(widened))
+    minus = None if kernel.amplitude_minus is None else factor * kernel.amplitude_minus
+    return kernel._replace(amplitude=factor * kernel.amplitude, amplitude_minus=minus)
+
+
 def project(arrays: Mapping[str, Array], camera: Camera, shape: str = "gaussian", normalisation: str = "peak",
-            sh_degree: int | None = None) -> Screen:
+            sh_degree: int | None = None, antialiased: bool = False) -> Screen:
     """Raw splats (fields as stored, real or complex) to the screen; `sh_degree` None means all stored."""
     world = projected_point(arrays, shape)
     point = world @ camera.rotation.T + camera.translation
@@ -72,6 +88,8 @@ def project(arrays: Mapping[str, Array], camera: Camera, shape: str = "gaussian"
     mean_px = point[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     geometry = Geometry(mean_px, jacobian(point, camera) @ camera.rotation, axes_of(arrays))
     kernel = REFERENCES[shape].kernel(arrays, geometry, normalisation)
+    if antialiased:
+        kernel = lowered(kernel, arrays, geometry, shape)
 
     stored = int(np.sqrt(arrays["sh"].shape[1])) - 1
     degree = stored if sh_degree is None else sh_degree
@@ -142,7 +160,7 @@ def visible_order(values: Mapping[str, Array], camera: Camera, shape: str) -> ND
 def render_reference(arrays: Mapping[str, ArrayLike], camera: Camera, shape: str = "gaussian",
                      normalisation: str = "peak", background: ArrayLike = (0.0, 0.0, 0.0),
                      alpha_min: float = 1 / 255, alpha_max: float = 0.99, t_min: float = 1e-4,
-                     sh_degree: int | None = None) -> Rendered:
+                     sh_degree: int | None = None, antialiased: bool = False) -> Rendered:
     """Render raw splats: `arrays` holds mean (N, 3), quat (N, 4), log_scale (N, 3), opacity_logit (N,),
     sh (N, K, 3) and the shape's own.
     """
@@ -152,7 +170,7 @@ def render_reference(arrays: Mapping[str, ArrayLike], camera: Camera, shape: str
     if len(order) == 0:
         color = np.broadcast_to(np.asarray(background, dtype=np.float64), (*size, 3)).copy()
         return Rendered(color, np.zeros(size), np.zeros(size))
-    screen = project({k: v[order] for k, v in values.items()}, camera, shape, normalisation, sh_degree)
+    screen = project({k: v[order] for k, v in values.items()}, camera, shape, normalisation, sh_degree, antialiased)
     alphas = alpha_maps(screen, camera, alpha_min, alpha_max)
     image = blend(alphas[:, None], screen.color[:, None], screen.depth[:, None], background, t_min)
     return Rendered(image.color.reshape(*size, 3), image.alpha.reshape(size), image.depth.reshape(size))
@@ -162,8 +180,8 @@ def reference_gradients(arrays: Mapping[str, ArrayLike], camera: Camera, v_color
                         v_alpha: ArrayLike | None = None, shape: str = "gaussian",
                         normalisation: str = "peak", background: ArrayLike = (0.0, 0.0, 0.0),
                         alpha_min: float = 1 / 255, alpha_max: float = 0.99, t_min: float = 1e-4,
-                        sh_degree: int | None = None, fields: Sequence[str] | None = None
-                        ) -> dict[str, Array]:
+                        sh_degree: int | None = None, fields: Sequence[str] | None = None,
+                        antialiased: bool = False) -> dict[str, Array]:
     """Gradient of sum(v_color * color) + sum(v_alpha * alpha) with respect to the raw values.
 
     Clamps and thresholds count as constant where they act. `v_color` is (H, W, 3), `v_alpha` (H, W) or
@@ -180,12 +198,12 @@ def reference_gradients(arrays: Mapping[str, ArrayLike], camera: Camera, v_color
     weights_alpha = np.zeros(len(weights))
     if v_alpha is not None:
         weights_alpha = np.asarray(v_alpha, dtype=np.float64).ravel()
-    screen = project({k: v[order] for k, v in values.items()}, camera, shape, normalisation, sh_degree)
+    screen = project({k: v[order] for k, v in values.items()}, camera, shape, normalisation, sh_degree, antialiased)
     alphas = list(alpha_maps(screen, camera, alpha_min, alpha_max)[:, None])
     colors, depths = list(screen.color[:, None]), list(screen.depth[:, None])
 
     for place, splat in enumerate(order):
-        bumped = project(one_step_each(values, splat, names), camera, shape, normalisation, sh_degree)
+        bumped = project(one_step_each(values, splat, names), camera, shape, normalisation, sh_degree, antialiased)
         replaced = [
             [*values_of[:place], new, *values_of[place + 1 :]]
             for values_of, new in (

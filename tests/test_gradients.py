@@ -54,7 +54,7 @@ def differences(renderer: Renderer, case: Case, field: str) -> np.ndarray:
         for multiple, factor in TWO_POINTS if field == "sh" else FIVE_POINTS:
             bumped = case.values[field].copy()
             bumped[index] += multiple * STEP
-            splats = Splats(case.shape, {**case.values, field: bumped}, case.normalisation)
+            splats = case.splats.with_arrays({**case.values, field: bumped})
             image = renderer.render(splats, case.camera, BACKGROUND)
             loss = (v_color * image.color).sum() + (v_alpha * image.alpha).sum()
             gradient[index] += factor * loss / STEP
