@@ -43,7 +43,9 @@ NOT_RUN = (
     (r"\.venv/bin/clsplat devices", "measures schedules; test_device.py and test_cli.py run it"),
     (r"clsplat view |clsplat train .*--view", "serves until it is stopped; test_cli_view.py runs it"),
 )  # fmt: skip
-SLOW = re.compile(r"clsplat (demo|compare|frontier|bench|reconstruct)|--budget|--target-psnr|--video|PHOTOS")
+# Minutes, or one more of a kind of which another is run.
+SLOW = re.compile(r"clsplat (demo|compare|frontier|bench|reconstruct|prune)|--(budget|target-psnr|video|config|report)"
+                  r"|PHOTOS|-r 2|\.splat|gaussians\.ply|-direct")
 REAL_PHOTOS = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data") / "sceaux_castle"
 # What every training command gets that does not say otherwise, and the values that stand in for those it has.
 FEW = {"--iterations": "8", "--cap-max": "60", "--seeds": "0", "--seed": "1"}
