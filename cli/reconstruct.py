@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from clsplat.errors import OutputError
-from clsplat.progress_display import LiveLine
+from clsplat.progress_display import PLAIN_INTERVAL, LiveLine
 
 from .options import PATH, overwrite_option, quiet_option
 from .progress import duration
@@ -54,6 +54,7 @@ def reconstruct_scene(photos: Path, scene: Path, overwrite: bool, quiet: bool, *
     result = run_reconstruction(photos, scene, ReconstructOptions(**values), overwrite, quiet)
     if not quiet:
         report(result)
+        click.echo(f"next: clsplat train {result.scene}")
 
 
 def run_reconstruction(photos: Path, scene: Path, options: ReconstructOptions, overwrite: bool,
@@ -66,10 +67,9 @@ def run_reconstruction(photos: Path, scene: Path, options: ReconstructOptions, o
 
 
 def report(result: Reconstructed) -> None:
-    """Say what came of it, and how to go on."""
+    """Say what came of it."""
     click.echo(f"{result.scene}: {result.registered} of {result.photos} photos placed, {result.points} points seen by "
                f"{result.track_length:.1f} photos each, {result.error:.2f} px off, in {duration(result.seconds)}")
-    click.echo(f"next: clsplat train {result.scene}")
 
 
 def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> Path:
@@ -112,7 +112,7 @@ class StepDisplay:
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
         self._line = LiveLine()
-        self._label = ""
+        self._label, self._begun = "", 0.0
 
     def __enter__(self) -> StepDisplay:
         return self
@@ -127,5 +127,8 @@ class StepDisplay:
         if step.label != self._label:
             self._line.close()
             self._line, self._label = LiveLine(), step.label
-        text = f"{step.label} {step.done}" + (f"/{step.total}" if step.total else "")
-        self._line.show(text, last=step.done == step.total)
+            self._begun = self._line.clock()
+        last = step.done == step.total
+        # What is done within the interval needs one line in a log.
+        if last or self._line.live or self._line.clock() - self._begun >= PLAIN_INTERVAL:
+            self._line.show(f"{step.label} {step.done}" + (f"/{step.total}" if step.total else ""), last)

@@ -11,6 +11,7 @@ import click
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError, OutputError
 from clsplat.model_folder import ModelFolder, read_json
+from clsplat.photo_folder import is_photographs, is_video
 from clsplat.presets import PRESETS, with_preset
 
 from .budget import budget_options, forget_search, is_search, options_of, run_search, stored_search
@@ -27,6 +28,7 @@ from .options import (
     split_options,
 )
 from .progress import TrainingDisplay, duration
+from .reconstruct import scene_of_photos
 from .view import server_options
 
 if TYPE_CHECKING:
@@ -65,7 +67,8 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
           resume: bool, overwrite: bool, quiet: bool, preset: str | None, config_file: Path | None, view: bool,
           port: int, host: str, **values: Any) -> None:
     """Learn a splat model of SCENE, a folder with photos in images/ and a COLMAP model in sparse/, or with
-    transforms.json or transforms_train.json (NeRF's Blender sets, instant-ngp, nerfstudio).
+    transforms.json or transforms_train.json (NeRF's Blender sets, instant-ngp, nerfstudio). A folder of photographs
+    alone, or a video, is reconstructed first, into NAME-scene beside the model's folder (see clsplat reconstruct).
 
     Writes config.json, cameras.json, log.jsonl, checkpoint.npz and point_cloud/iteration_N/point_cloud.ply
     into the model's folder. Ctrl-C saves a checkpoint; --resume goes on from it. With --budget auto also budget.json
@@ -89,7 +92,7 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
         raise click.UsageError("give the scene's folder")
     if model_path is None:
         assert path is not None
-        model_path = Path("output") / path.resolve().name
+        model_path = Path("output") / (path.stem if is_video(path) else path.resolve().name)
     folder = ModelFolder(model_path)
     if resume:
         stored = stored_search(model_path)
@@ -106,6 +109,8 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
     assert path is not None
     config = TrainConfig(**options)
+    if is_photographs(path):
+        path = scene_of_photos(path, model_path, overwrite, quiet)
     loaded, record = read_scene(path, reading, config.background)
     if search is not None:
         if view:

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from .errors import InputError, OutputError
 from .flat_model import SparseModel, write_flat_model, write_flat_photo
@@ -225,15 +225,16 @@ def _pairs(photos: int, sequential: bool) -> list[tuple[int, int]]:
 
 
 def _warn_of_rest(source: Path, ready: Sequence[Prepared], registered: Sequence[Prepared],
-                  models: dict[str, Any]) -> None:
+                  models: dict[str, int]) -> None:
     placed = {photo.staged for photo in registered}
     rest = [photo.source.name for photo in ready if photo.staged not in placed]
     if len(registered) < ENOUGH * len(ready):
         warnings.warn(f"{source}: only {len(registered)} of {len(ready)} photos could be placed; left out are "
                       f"{', '.join(rest[:3])}{', ...' if len(rest) > 3 else ''}. Take more photos in between, with "
                       "steps of a few degrees, sharp and of things at rest", stacklevel=3)
-    if len(models) > 1:
-        warnings.warn(f"{source}: the photos fall into {len(models)} parts that do not hang together; the largest "
+    parts = sum(size >= _FEWEST for size in models.values())
+    if rest and parts > 1:
+        warnings.warn(f"{source}: the photos fall into {parts} parts that do not hang together; the largest "
                       f"({len(registered)} photos) is kept", stacklevel=3)
 
 
