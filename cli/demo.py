@@ -56,7 +56,7 @@ def demo(ctx: click.Context, out: Path, iterations: int, cap_max: int, width: in
         say_stopped(ctx, model)
     trained = load_model(folder.path)
     renders = out / "renders"
-    measured = measure_model(trained, scene, Renderer(device), renders=renders, recorder=ViewRecorder())
+    measured = measure_model(trained, scene, Renderer(device), renders=renders, recorder=ViewRecorder(), quiet=quiet)
     page = write_model_page(folder.path / REPORT, "the demo", [measured], [folder.path.name])
     result = measured.result
     if quiet:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +30,7 @@ from .options import (
     set_option,
 )
 from .outputs import ImageWriter, output_stems
-from .progress import table
+from .progress import counted, table
 
 if TYPE_CHECKING:
     from clsplat.render import Rendered, Renderer
@@ -90,7 +91,7 @@ def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], sou
         scene = scene_of(loaded, source_path, images, resolution)
         renders = save_renders and (save_renders / path.resolve().name if len(paths) > 1 else save_renders)
         measured.append(measure_model(loaded, scene, renderer, protocol, view_set or "test", colour, renders,
-                                      ViewRecorder(*metrics, not no_report, color_correct)))
+                                      ViewRecorder(*metrics, not no_report, color_correct), quiet))
         if report is None and not no_report:
             page = loaded.folder.path / f"{Path(REPORT).stem}{_ending(view_set or 'test')}.html"
             pages.append(write_model_page(page, scene.name, measured[-1:], [path.resolve().name]))
@@ -105,12 +106,12 @@ def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], sou
 
 def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol: Protocol = DEFAULT_PROTOCOL,
                   view_set: str = "test", background: RGB | None = None, renders: Path | None = None,
-                  recorder: ViewRecorder | None = None) -> Measurement:
+                  recorder: ViewRecorder | None = None, quiet: bool = False) -> Measurement:
     """Render and measure one model's views, and write its results.json and per_view.json.
 
     Parameters
     ----------
-    recorder : of further metrics and of images for a page; None: neither.
+    recorder : of further metrics and of images for a page; None: neither. quiet : show no progress.
 
     Raises
     ------
@@ -128,13 +129,17 @@ def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol
     names = [view.name for view in views]
     stems = dict(zip(names, output_stems(names), strict=True)) if writer else {}
 
+    done = counted(names, "measuring", quiet)
+
     def on_view(view: View, image: Rendered) -> None:
+        next(done)
         if writer is not None:
             writer.write(stems[view.name], image)
         record(view, image)
 
     colour = model.background if background is None else background
-    measured = evaluate(renderer, model.splats, list(views), colour, protocol, on_view)
+    with closing(done):
+        measured = evaluate(renderer, model.splats, list(views), colour, protocol, on_view)
     splats = model.splats
     per_view = {metric: {name: values[metric] for name, values in measured.per_view.items()}
                 for metric in ("SSIM", "PSNR")} | record.per_view

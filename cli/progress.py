@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from typing import TypeVar
 
 from clsplat.progress_display import PLAIN_INTERVAL, LiveLine, TrainingDisplay, duration
@@ -12,7 +12,7 @@ __all__ = ["TrainingDisplay", "counted", "duration", "table"]
 T = TypeVar("T")
 
 
-def counted(items: Sequence[T], label: str, quiet: bool = False) -> Iterator[T]:
+def counted(items: Sequence[T], label: str, quiet: bool = False) -> Generator[T]:
     """The items, with a count that goes away at the end; where there is no terminal, a line every ten seconds."""
     line = LiveLine()
     begun = line.clock()
