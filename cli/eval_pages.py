@@ -109,7 +109,8 @@ def _facts(measured: Measurement) -> list[tuple[str, str]]:
     result, model = measured.result, measured.model
     facts = [
         ("file", str(model.ply)),
-        ("shape", f"{result['shape']} ({result['normalisation']})"),
+        ("shape", f"{result['shape']} ({result['normalisation']})"
+                  + (", antialiased" if model.splats.antialiased else "")),
         ("splats", f"{result['splats']}" + (f", {result['skewed']} of them skewed" if result["skewed"] else "")),
         ("SH degree", str(model.splats.sh_degree)),
         ("bytes", f"{result['bytes']} ({result['compact_bytes']} written compactly)"),

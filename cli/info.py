@@ -65,14 +65,14 @@ def _show_model(path: Path, iteration: int | None, as_json: bool) -> None:
         click.echo(json.dumps({"model": str(path), **found}))
         return
     click.echo(f"{loaded.ply}: {found['splats']} splats, shape {found['shape']}, SH degree {found['sh_degree']}, "
-               f"{found['bytes'] / 1e6:.2f} MB")
+               f"{'antialiased, ' if found['antialiased'] else ''}{found['bytes'] / 1e6:.2f} MB")
     click.echo(table(("", "in use", "of"), rows_of(found)))
 
 
 def described(splats: Splats, ply: Path) -> dict[str, Any]:
     """The model's complexity, and the bytes of its file."""
     return {"shape": splats.shape, "normalisation": splats.normalisation, "sh_degree": splats.sh_degree,
-            "bytes": ply.stat().st_size, **complexity(splats).to_json()}
+            "antialiased": splats.antialiased, "bytes": ply.stat().st_size, **complexity(splats).to_json()}
 
 
 def rows_of(found: dict[str, Any]) -> list[tuple[str, str, str]]:
