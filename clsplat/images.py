@@ -90,13 +90,15 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 
 
 def photo_facts(path: str | os.PathLike[str]) -> PhotoFacts:
-    """Size, kind and camera from the file's header alone.
+    """Size, kind and camera. The header is enough, but for PNG, where EXIF may stand at the end.
 
     Raises
     ------
     InputError : the file is missing or no image of a known kind.
     """
     with _open(path) as image:
+        # Pillow shows 16-bit PNG in colour as RGB: the tile's raw mode tells, as long as nothing is decoded.
+        deep = any(";16" in str(tile[-1]) for tile in getattr(image, "tile", ()))
         try:
             exif = image.getexif()
             orientation = exif.pop(ExifTags.Base.Orientation, 1)
@@ -107,8 +109,6 @@ def photo_facts(path: str | os.PathLike[str]) -> PhotoFacts:
         except Exception:  # a damaged EXIF block raises nearly anything; the pixels may be sound
             orientation, named, kept = 1, [], b""
         width, height = image.size[::-1] if orientation in (5, 6, 7, 8) else image.size
-        # Pillow shows 16-bit PNG in colour as RGB: the tile's raw mode tells.
-        deep = any(";16" in str(tile[-1]) for tile in getattr(image, "tile", ()))
         plain = orientation == 1 and image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L") and not deep
         plain = plain and "transparency" not in image.info
         return PhotoFacts(width, height, plain, tuple(str(value) for value in named if value), kept)
