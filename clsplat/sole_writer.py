@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from .atomic import remove_leftovers
 from .errors import OutputError
 
 try:
@@ -20,7 +21,7 @@ _held: set[Path] = set()
 
 @contextmanager
 def sole_writer(folder: Path | None) -> Iterator[None]:
-    """Keep other runs out of a folder while the block lasts.
+    """Keep other runs out of a folder while the block lasts; what a killed one has left half written is removed.
 
     The lock is the operating system's, on the folder itself: it ends with the process, however that ends. A block
     within a block of the same process, as of a search that trains, is the same writer. File systems that know no locks
@@ -48,6 +49,7 @@ def sole_writer(folder: Path | None) -> Iterator[None]:
                                   "folder") from None
         _held.add(path)
         try:
+            remove_leftovers(path)
             yield
         finally:
             _held.remove(path)

@@ -10,10 +10,11 @@ already, and are put on points only where these come from the COLMAP model that 
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ FILE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _MAX_SIDE = 1 << 20  # of an image [px]
+_LONGEST_NAME, _LONGEST_PATH = 240, 2000  # bytes; file systems take 255 and 4096
 _LARGEST = 1e30  # of a number; float32 holds it
 _COLMAP = ("colmap/sparse/0", "sparse/0")  # nerfstudio's place for the model, and COLMAP's own
 _SUFFIXES = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
@@ -125,7 +127,7 @@ class _Frame:
         named = self.values.get("mask_path")
         if named is None:
             return None
-        if not isinstance(named, str) or not named.isprintable() or not named:
+        if not isinstance(named, str) or not named.isprintable() or not _can_be_name(named):
             raise InputError(f"{self.place}: mask_path {named!r} is no name of a file; name a mask, or remove it")
         return self.document.path.parent / named.replace("\\", "/")
 
@@ -216,7 +218,9 @@ class _Document:
             yield _Frame(self, number, values, self.name_of(file), file)
 
     def photo_file(self, file_path: str, images: str | None = None) -> Path:
-        """The photo's file; Blender sets leave the suffix out."""
+        """The photo's file; Blender sets leave the suffix out. Raises InputError where no file can have the name."""
+        if not _can_be_name(file_path):
+            raise InputError(f"{self.path}: {ascii(file_path)[:60]} is no name of a photo; name a file beside it")
         relative = Path(file_path.replace("\\", "/"))
         if images is not None and not relative.is_absolute():
             relative = Path(images, *relative.parts[1:] if len(relative.parts) > 1 else relative.parts)
@@ -244,7 +248,7 @@ class _Document:
         """The file's points, those of the COLMAP model behind it, or none."""
         folder, named = self.path.parent, self.values.get("ply_file_path")
         if isinstance(named, str) and named:
-            if not named.isprintable():
+            if not named.isprintable() or not _can_be_name(named):
                 raise InputError(f"{self.path}: ply_file_path {named!r} is no name of a file; name a PLY, or remove it")
             return read_point_cloud(folder / named)
         if (folder / "points3d.ply").is_file():
@@ -263,6 +267,17 @@ class _Document:
             raise InputError(f"{self.path}: applied_transform must be 3 x 4 numbers and applied_scale above 0")
         moved: NDArray[np.float64] = scale * (xyz @ matrix[:3, :3].T + matrix[:3, 3])
         return moved
+
+
+def _can_be_name(text: str) -> bool:
+    """Whether a file can have this path, with a suffix added."""
+    path = PurePosixPath(text.replace("\\", "/"))
+    try:
+        parts = [len(os.fsencode(part)) for part in path.parts]
+        short = max(parts, default=0) <= _LONGEST_NAME and sum(parts) <= _LONGEST_PATH
+        return short and bool(path.name) and "\0" not in text
+    except UnicodeEncodeError:  # half of a surrogate pair
+        return False
 
 
 def _matrix(given: Any) -> NDArray[np.float64] | None:

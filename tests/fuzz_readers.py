@@ -89,6 +89,8 @@ def make_transforms(folder: Path) -> None:
         write_png(folder / "images" / view.name, photo_of(index))
         pose = np.linalg.inv(view.cam_from_world) @ np.diag([1.0, -1.0, -1.0, 1.0])
         frames.append({"file_path": f"images/{view.name}", "transform_matrix": pose.tolist()})
+    write_png(folder / "masks" / "shot_0.png", photo_of(0)[:, :, 1])
+    frames[0]["mask_path"] = "masks/shot_0.png"
     values = {"fl_x": FX, "fl_y": FY, "cx": 18.5, "cy": 16.25, "w": 40, "h": 30, "k1": 0.01, "k2": 0.0, "p1": 0.0,
               "p2": 0.0, "camera_model": "OPENCV", "frames": frames, "ply_file_path": "points.ply",
               "applied_transform": np.eye(4)[:3].tolist()}

@@ -35,7 +35,8 @@ _ODD_BYTES = [b"\0" * 8, b"\xff" * 8, b"\xff" * 4, b"\xff\xff\xff\x7f", b"\0\0\x
               (1 << 40).to_bytes(8, "little"), (1 << 62).to_bytes(8, "little"), (1 << 31).to_bytes(4, "little"),
               b"\n", b" ", b"-", b"\"", b"\xc3\x28", b"nan", b" 1e999 ", b" -1 ", b" 99999999999999999999 ", b"0x10"]
 _ODD_VALUES: list[Any] = [None, True, "", "x", "\0", "a\nb", -1, 0, 1, 2.5, 1e300, -1e300, 10**30, float("nan"),
-                          float("inf"), [], [1], [[]], {}, {"a": 1}, "../../etc", "/", ".", "é" * 300, [None] * 4]
+                          float("inf"), [], [1], [[]], {}, {"a": 1}, "../../etc", "/", ".", "é" * 300,
+                          "é" * 300 + "/a.png", "a/" * 3000, "\ud800", [None] * 4]
 
 
 class TooLong(BaseException):

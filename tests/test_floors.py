@@ -18,9 +18,9 @@ FLOORS = """
     capture_world compare_table errors eval_script flops harmonics interrupt morton runtime schema viewer_queue \
     viewer_settings
     arithmetic atomic budget_rules camera device json_fields metrics optim_reference perceptual plan ply_header \
-    presets profiles rotations schedules sfm_process signatures sole_writer validity
+    presets profiles rotations schedules sfm_process signatures validity
     binaries cameras_json checkpoint colmap_files frontier_data html_report images launches looked_at noise \
-    optim_lazy paths_between ply_body ply_compact run_log shapes video
+    optim_lazy paths_between ply_body ply_compact run_log shapes sole_writer video
     camera_path capture chart_style frontier_tables lens masks opacities ply program progress_display sghmc \
     skew_map viewer_start
     adc charts colmap config densify eval_histogram frontier_charts kernels photo_folder regularisers sfm splats \

@@ -280,3 +280,15 @@ def test_fuzz_succeeds_or_says_why(folder: Path, data: st.DataObject) -> None:
             said = str(error).removeprefix(str(folder))
     assert said.endswith(" photos") or said.startswith("/"), "the file is named"
     assert "\n" not in said
+
+
+@pytest.mark.parametrize("name", ["/", "..", "é" * 200, "é" * 200 + "/a.png", "a/" * 1500 + "b", "a\0b", "\ud800"])
+@pytest.mark.parametrize("key", ["file_path", "ply_file_path"])
+def test_what_no_file_can_be_called_is_refused(tmp_path: Path, key: str, name: str) -> None:
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    write_png(tmp_path / "a.png", np.zeros((4, 6, 3)))
+    values = {"fl_x": 5, "frames": [frame]}
+    (frame if key == "file_path" else values)[key] = name
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match=r"name|cannot be read"):
+        load_scene(tmp_path)
