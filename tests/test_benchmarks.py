@@ -160,6 +160,24 @@ def test_frontier(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> N
     assert "render_ms bytes splats |" in printed
 
 
+def test_photos(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    out = tmp_path / "photos.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "photos.py"), "--smoke", "--scenes", f"{scene.name}:1",
+               "--out", str(out), "--options", "", "exposure=true,antialiased=true"]
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    for _ in range(2):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["options"] for row in rows] == ["", "exposure=true,antialiased=true"], "each once"
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit"} <= set(row)
+        assert len(row["PSNR"]) > 1
+        assert row["corrected"] >= row["PSNR"][0] - 0.1
+        assert f"{row['corrected']:.2f}" in done.stdout
+
+
+@pytest.mark.slow
 def test_visible_adam(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scene = small_capture(tmp_path_factory)
     out = tmp_path / "visible.jsonl"
