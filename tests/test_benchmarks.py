@@ -160,6 +160,7 @@ def test_frontier(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> N
     assert "render_ms bytes splats |" in printed
 
 
+@pytest.mark.slow
 def test_photos(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scene = small_capture(tmp_path_factory)
     out = tmp_path / "photos.jsonl"
@@ -177,7 +178,6 @@ def test_photos(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Non
         assert f"{row['corrected']:.2f}" in done.stdout
 
 
-@pytest.mark.slow
 def test_visible_adam(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scene = small_capture(tmp_path_factory)
     out = tmp_path / "visible.jsonl"
