@@ -117,7 +117,7 @@ def fingerprint(path: Path) -> str:
 
 
 def prepare(photo: PhotoFile, number: int, photos: Path, masks: Path) -> Prepared | str:
-    """Read a photograph whole and put it into the working folder, upright; a mask into `masks`, as COLMAP wants it.
+    """Read a photograph whole and put it into the working folder, upright; a mask into `masks`, under COLMAP's name.
 
     Returns
     -------
@@ -138,8 +138,18 @@ def prepare(photo: PhotoFile, number: int, photos: Path, masks: Path) -> Prepare
         opaque = pixels[:, :, 3] >= _OPAQUE_ENOUGH
         mask = opaque if mask is None else mask & opaque
     if mask is not None:
-        write_png(masks / f"{staged}.png", np.where(mask, 255, 0).astype(np.uint8))
+        _write_mask(masks, staged, mask)
     return prepared
+
+
+def complete_masks(photos: Sequence[Prepared], masks: Path) -> Path | None:
+    """A mask for every photo, as COLMAP drops those without where others have one; None where none has."""
+    if not any(masks.iterdir()):
+        return None
+    for photo in photos:
+        if not (masks / f"{photo.staged}.png").exists():
+            _write_mask(masks, photo.staged, np.ones((photo.facts.height, photo.facts.width), bool))
+    return masks
 
 
 def same_camera(photos: Sequence[Prepared], mode: str) -> list[list[Prepared]]:
@@ -214,6 +224,10 @@ def _upright_mask(path: Path, photo: Path, facts: PhotoFacts) -> Mask:
         raise InputError(f"{path}: is {columns}x{rows} px, the photo {photo.name} {facts.width}x{facts.height}; "
                          "make the mask of the photo's size, upright")
     return nearest(mask, facts.width, facts.height)
+
+
+def _write_mask(folder: Path, staged: str, mask: Mask) -> None:
+    write_png(folder / f"{staged}.png", np.where(mask, 255, 0).astype(np.uint8))
 
 
 def _link(file: Path, target: Path) -> None:

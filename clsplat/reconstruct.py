@@ -17,7 +17,17 @@ from .errors import InputError, OutputError
 from .flat_model import SparseModel, write_flat_model, write_flat_photo
 from .json_fields import read_json
 from .model_folder import write_json
-from .photo_folder import PhotoFile, Prepared, find_photos, fingerprint, is_video, prepare, same_camera, unread_kinds
+from .photo_folder import (
+    PhotoFile,
+    Prepared,
+    complete_masks,
+    find_photos,
+    fingerprint,
+    is_video,
+    prepare,
+    same_camera,
+    unread_kinds,
+)
 from .sfm import ENOUGH
 from .sfm_process import Step, Tell, run_sfm
 from .video_frames import FRAMES, extract_frames
@@ -114,7 +124,7 @@ def reconstruct(photos: str | os.PathLike[str], scene: str | os.PathLike[str],
     _refuse_used(target, overwrite)
     start = time.perf_counter()
     say: Tell = tell or (lambda step: None)
-    with _unfinished(target) as work:
+    with _unfinished(target.absolute()) as work:
         if is_video(source):
             given = extract_frames(source, work / "frames", options.frames,
                                    lambda seen: say(Step("video frames looked at", seen)))
@@ -126,8 +136,9 @@ def reconstruct(photos: str | os.PathLike[str], scene: str | os.PathLike[str],
         pairs = _pairs(len(ready), _sequential(options, source, len(ready)))
         names = [photo.staged for photo in ready]
         (work / "pairs.txt").write_text("".join(f"{names[a]} {names[b]}\n" for a, b in pairs))
-        job = {"groups": groups, "n_pairs": len(pairs), "camera_model": options.camera_model,
-               "max_size": options.max_size, "seed": options.seed}
+        masks = complete_masks(ready, work / "masks")
+        job = {"masks": masks and str(masks), "groups": groups, "n_pairs": len(pairs),
+               "camera_model": options.camera_model, "max_size": options.max_size, "seed": options.seed}
         models = run_sfm(work, job, say, str(source))
         folder = max(models, key=lambda name: models[name])
         model = SparseModel(Path(folder))

@@ -4,8 +4,8 @@ A process, because COLMAP's library may abort, cannot be interrupted by Ctrl-C, 
 another reader of its SQLite database (closing one connection drops the locks of the other). It tells what it does as
 JSON lines on standard output, and ends when its standard input does: with its parent.
 
-The job: `database`, `photos`, `masks` (folder or null), `groups` (lists of names that share a camera), `pairs` (file of
-names), `n_pairs`, `output`, `camera_model`, `max_size`, `seed`. The sparse models are left in `output`/0, 1, ...
+The job: `database`, `photos`, `masks` (folder, or null), `groups` (lists of names that share a camera), `pairs` (file
+of names), `n_pairs`, `output`, `camera_model`, `max_size`, `seed`. The sparse models are left in `output`/0, 1, ...
 
 Photos are imported in their order and everything is seeded: the same photos give the same model.
 """

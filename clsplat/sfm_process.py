@@ -40,7 +40,7 @@ def run_sfm(work: Path, job: dict[str, Any], tell: Tell, source: str) -> dict[st
 
     Parameters
     ----------
-    work : folder with photos/, masks/ and pairs.txt. job : the rest of what sfm.py wants.
+    work : folder with photos/ and pairs.txt. job : the rest of what sfm.py wants.
     source : the photographs, for messages.
 
     Returns
@@ -52,10 +52,9 @@ def run_sfm(work: Path, job: dict[str, Any], tell: Tell, source: str) -> dict[st
     InputError : no model comes of the photos, or the library failed.
     """
     work = work.resolve()
-    masks = work / "masks"
     database = work / "database.db"
     whole = job | {"database": str(database), "photos": str(work / "photos"), "pairs": str(work / "pairs.txt"),
-                   "masks": str(masks) if any(masks.iterdir()) else None, "output": str(work / "sparse")}
+                   "output": str(work / "sparse")}
     (work / "job.json").write_text(json.dumps(whole), encoding="utf-8")
     log = work / "log.txt"
     with log.open("wb") as errors:

@@ -63,7 +63,7 @@ def _texture(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float
     """0..1: noise at three scales, smooth within each."""
     rng = np.random.default_rng(3)
     total = np.zeros(u.shape)
-    for cells, weight in ((4.0, 0.3), (11.0, 0.4), (19.0, 0.3)):
+    for cells, weight in ((2.5, 0.3), (6.0, 0.4), (13.0, 0.3)):
         table = rng.uniform(size=(256, 256))
         x, y = np.nan_to_num(u) * cells, np.nan_to_num(v) * cells
         column, row = np.floor(x).astype(int), np.floor(y).astype(int)

@@ -27,7 +27,8 @@ FLOORS = """
     viewer_camera viewer_recording
     blocks buffers complexity convert flat_model model_folder paths_around point_cloud posed rate_limits \
     splat_file spz_file strategy systems video_frames
-    budget_state gradients limits nearest optim_rules optim_waiting placing reconstruct sort transforms
+    budget_state camera_files gradients limits nearest optim_rules optim_waiting placing reconstruct sort \
+    transforms
     binning optim_fused optim_host scene stages
     optim pipeline random_points scene_info synthetic validation view_sampler
     initialise loss memory pairs truths tuning
