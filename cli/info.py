@@ -44,6 +44,7 @@ def show_info(paths: tuple[Path, ...], iteration: int | None, images: str | None
 
 
 def _is_scene(path: Path) -> bool:
+    from clsplat.photo_folder import is_photographs
     from clsplat.scene_info import is_scene
 
     if path.is_file() or not path.is_dir() or ModelFolder(path).iterations():
@@ -52,6 +53,8 @@ def _is_scene(path: Path) -> bool:
         return True
     if ModelFolder(path).is_used:
         return False  # a model without a point cloud yet: load_model says so
+    if is_photographs(path):
+        raise InputError(f"{path}: photographs without poses: clsplat reconstruct {path} -o SCENE finds them")
     raise InputError(f"{path}: neither a model (point_cloud/) nor a scene (sparse/ or transforms.json)")
 
 
@@ -107,6 +110,9 @@ def scene_rows(found: SceneInfo) -> list[tuple[str, str]]:
     """What, and how much of it."""
     rows = [("photos", f"{', '.join(f'{n} of {w}x{h} px' for (w, h), n in found.sizes) or 'none readable'}, "
                        f"{found.photo_bytes / 1e6:.1f} MB")]
+    if found.placed:
+        placed, given, error = found.placed
+        rows.append(("reconstructed", f"{placed} of {given} photos, {error:.2f} px off"))
     if found.unreadable:
         rows.append(("unreadable", _named(found.unreadable)))
     rows.append(("without a pose", _named(found.unregistered) if found.unregistered else "none"))

@@ -15,8 +15,10 @@ import numpy as np
 from .cameras_json import IMAGE_SUFFIXES
 from .errors import InputError
 from .images import image_size
+from .json_fields import read_json, real_of
 from .lens import is_pinhole
 from .posed import Posed
+from .reconstruct import RECORD
 from .scene import chosen_tests, masks_of, read_posed
 from .transforms import find_transforms
 
@@ -55,6 +57,7 @@ class SceneInfo:
     photo_bytes : of the posed photos' files. lenses : most used first.
     points : in the cloud. track_mean, track_median : photos that see a point; 0 where the files do not say.
     test : names of the test views. masked : photos with a mask.
+    placed : of a scene that `reconstruct` made: photos placed, photos given, mean reprojection error [px]; else None.
     """
 
     kind: str
@@ -69,6 +72,7 @@ class SceneInfo:
     track_median: float
     test: tuple[str, ...]
     masked: int
+    placed: tuple[int, int, float] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, as `clsplat info --json` prints them."""
@@ -78,6 +82,7 @@ class SceneInfo:
             "sizes": [{"width": size[0], "height": size[1], "photos": n} for size, n in self.sizes],
             "lenses": [asdict(lens) for lens in self.lenses], "points": self.points, "track_mean": self.track_mean,
             "track_median": self.track_median, "test": list(self.test), "masked": self.masked,
+            "placed": self.placed and dict(zip(("photos", "of", "error"), self.placed, strict=True)),
         }
 
 
@@ -112,7 +117,7 @@ def scene_info(path: str | os.PathLike[str], images: str | None = None, test_eve
         _lenses(posed), len(posed.points), float(tracks.mean()) if len(tracks) else 0.0,
         float(np.median(tracks)) if len(tracks) else 0.0,
         tuple(sorted(chosen_tests(posed, test_every, None))) if len(posed.photos) > 1 else (),
-        len(masks))
+        len(masks), _placed(root))
 
 
 def _unregistered(posed: Posed, masks: Iterable[Path]) -> tuple[str, ...]:
@@ -122,6 +127,18 @@ def _unregistered(posed: Posed, masks: Iterable[Path]) -> tuple[str, ...]:
     folder = Path(os.path.commonpath([file.parent for file in files]))
     others = (file for file in sorted(folder.rglob("*")) if file.suffix.lower() in IMAGE_SUFFIXES)
     return tuple(file.relative_to(folder).as_posix() for file in others if file not in known)
+
+
+def _placed(root: Path) -> tuple[int, int, float] | None:
+    if not (root / RECORD).is_file():
+        return None
+    record = read_json(root / RECORD, "a scene of clsplat reconstruct")
+    values = record if isinstance(record, dict) else {}
+    found = [real_of(values.get(key)) for key in ("registered", "photos", "error")]
+    registered, photos, error = (value if value is not None and math.isfinite(value) else -1.0 for value in found)
+    if min(registered, photos, error) < 0:
+        raise InputError(f"{root / RECORD}: registered, photos and error must be numbers; remove the file")
+    return int(registered), int(photos), error
 
 
 def _lenses(posed: Posed) -> tuple[LensUse, ...]:

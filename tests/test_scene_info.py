@@ -73,6 +73,18 @@ def test_transforms_with_distortion(tmp_path: Path) -> None:
         assert "points          0\n" in said
 
 
+def test_a_reconstructed_scene_says_how_it_went(tmp_path: Path) -> None:
+    garden = write_garden(tmp_path)
+    record = garden / "reconstruct.json"
+    record.write_text('{"photos": 12, "registered": 9, "error": 0.254}')
+    assert "reconstructed   9 of 12 photos, 0.25 px off" in clsplat("info", garden)
+    assert json.loads(clsplat("info", "--json", garden))["placed"] == {"photos": 9, "of": 12, "error": 0.254}
+    for bad in ('{"photos": 12}', "[]", '{"photos": "x", "registered": 9, "error": 1e999}'):
+        record.write_text(bad)
+        assert "reconstruct.json: registered, photos and error must be numbers" in error_of("info", garden)
+    assert "photographs without poses: clsplat reconstruct" in error_of("info", garden / "images")
+
+
 def test_models_and_scenes_are_told_apart(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     model, scene = small_model(tmp_path_factory), small_capture(tmp_path_factory)
     said = clsplat("info", model, scene)
