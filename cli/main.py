@@ -27,7 +27,8 @@ COMMANDS = {
     "frontier": ("clsplat_cli.frontier:draw_frontier", "Sweep systems and caps, and chart quality against cost."),
     "bench": ("clsplat_cli.bench:bench", "Time the stages of training and rendering on this device."),
     "blender-addon": ("clsplat_cli.blender_addon:build_addon", "Build the Blender add-on as a zip."),
-    "convert": ("clsplat_cli.convert:convert_model", "Write a model as another shape, with the same images."),
+    "convert": ("clsplat_cli.convert:convert_model", "Write a model as another shape, or as a file for other viewers."),
+    "cameras": ("clsplat_cli.cameras:write_cameras_of", "Write a scene's or model's cameras for other programs."),
 }
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 

@@ -160,24 +160,26 @@ def registered_images(folder: Path) -> int:
 
 @dataclass(frozen=True, eq=False)
 class ModelView:
-    """One registered image to write: its name, a PINHOLE camera and what it observes.
+    """One registered image to write: its name, its camera and what it observes.
 
     Parameters
     ----------
     name : file name inside the images folder.
     size : (width, height) [px].
-    intrinsics : (fx, fy, cx, cy) [px].
+    intrinsics : (fx, fy, cx, cy) [px], or the parameters of another model.
     cam_from_world : (4, 4) world-to-camera pose.
     pixels : (M, 2) observations [px], pixel centres at half-integers.
     point_index : (M,) index into the model's points of each observation.
+    model : COLMAP's id of the camera model; PINHOLE.
     """
 
     name: str
     size: tuple[int, int]
-    intrinsics: tuple[float, float, float, float]
+    intrinsics: tuple[float, ...]
     cam_from_world: NDArray[np.float64]
     pixels: NDArray[np.float64]
     point_index: NDArray[np.int64]
+    model: int = _PINHOLE
 
 
 def write_binary_model(folder: Path, views: Sequence[ModelView], xyz: NDArray[np.float64],
@@ -198,7 +200,7 @@ def write_binary_model(folder: Path, views: Sequence[ModelView], xyz: NDArray[np
     images: list[bytes] = []
     tracks: list[list[tuple[int, int]]] = [[] for _ in range(len(xyz))]
     for image_id, view in enumerate(views, start=1):
-        camera_id = cameras.setdefault((*view.size, *view.intrinsics), len(cameras) + 1)
+        camera_id = cameras.setdefault((view.model, *view.size, *view.intrinsics), len(cameras) + 1)
         qx, qy, qz, qw = Rotation.from_matrix(view.cam_from_world[:3, :3]).as_quat()
         images.append(_IMAGE.pack(image_id, qw, qx, qy, qz, *view.cam_from_world[:3, 3], camera_id))
         images.append(view.name.encode("utf-8") + b"\0" + _COUNT.pack(len(view.pixels)))
@@ -212,7 +214,7 @@ def write_binary_model(folder: Path, views: Sequence[ModelView], xyz: NDArray[np
               + np.array(track, dtype="<u4").tobytes()
               for index, (position, colour, off, track) in enumerate(zip(xyz, rgb, errors, tracks, strict=True), 1)]
     _write(folder / "cameras.bin", len(cameras),
-           (_CAMERA.pack(camera_id, _PINHOLE, int(key[0]), int(key[1])) + struct.pack("<4d", *key[2:])
+           (_CAMERA.pack(camera_id, *map(int, key[:3])) + struct.pack(f"<{len(key) - 3}d", *key[3:])
             for key, camera_id in cameras.items()))
     _write(folder / "images.bin", len(views), images)
     _write(folder / "points3D.bin", len(xyz), points)

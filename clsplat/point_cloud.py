@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from .atomic import atomic_writer
 from .colmap import Points
 from .errors import InputError
 from .ply_body import read_body
@@ -45,3 +46,14 @@ def read_point_cloud(path: str | os.PathLike[str]) -> Points:
     if all(name in columns for name in ("red", "green", "blue")):
         rgb = np.stack([np.clip(columns[name], 0, 255).astype(np.uint8) for name in ("red", "green", "blue")], axis=1)
     return Points(xyz, rgb, np.ones(len(xyz), np.int64))
+
+
+def write_point_cloud(path: str | os.PathLike[str], points: Points) -> None:
+    """Write positions (float32) and colours, binary; raises OutputError."""
+    columns = [("float", name) for name in "xyz"] + [("uchar", name) for name in ("red", "green", "blue")]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}",
+            *(f"property {kind} {name}" for kind, name in columns), "end_header"]
+    table = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    table["xyz"], table["rgb"] = points.xyz, points.rgb
+    with atomic_writer(path) as stream:
+        stream.write(("\n".join(head) + "\n").encode("ascii") + table.tobytes())

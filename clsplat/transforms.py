@@ -232,8 +232,9 @@ class _Document:
 
     def name_of(self, file: Path) -> str:
         """A photo's name: its path below the scene's folder, `/` between folders; elsewhere its file name."""
-        folder = self.path.parent
-        return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else file.name
+        # Without "..", which can lead out of the folder: images are written under these names.
+        folder, plain = (Path(os.path.normpath(path)) for path in (self.path.parent, file))
+        return plain.relative_to(folder).as_posix() if plain.is_relative_to(folder) else plain.name
 
     def listed(self, key: str | None = None) -> set[str]:
         """Names in nerfstudio's list `key`, or in all of its lists."""
