@@ -177,6 +177,11 @@ def test_options_in_the_text_exist() -> None:
                 assert not missing, f"{page}: {span}: clsplat {command[1]} has no {', '.join(missing)}"
 
 
+def test_every_command_is_in_the_guide() -> None:
+    guide = "\n".join(text for page, text in TEXTS.items() if page.startswith("docs/") or page == "README.md")
+    assert [name for name in COMMANDS if f"clsplat {name}" not in guide] == []
+
+
 @pytest.mark.parametrize("page", [page for page, text in TEXTS.items() if blocks(text, "python")])
 def test_python_runs(page: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory,
                      monkeypatch: pytest.MonkeyPatch) -> None:
