@@ -152,7 +152,7 @@ class Killer:
                 Checkpoint.load(model / "checkpoint.npz")
             for path in model.glob("point_cloud/*/point_cloud.ply"):
                 Splats.load(path)
-            for path in model.glob("*.json"):
+            for path in model.glob("[!.]*.json"):
                 json.loads(path.read_bytes())
         except (ClsplatError, ValueError) as error:
             self.faults.append(f"{place}: {error}")

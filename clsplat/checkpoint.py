@@ -73,7 +73,7 @@ class Checkpoint:
         except _DAMAGE as error:
             raise _unreadable(path, str(error)) from None
         if version != VERSION:
-            raise InputError(f"{path}: checkpoint version {version}, this clsplat reads {VERSION}")
+            raise InputError(f"{path}: checkpoint version {str(version)[:20]!r}, this clsplat reads {VERSION}")
 
         def part(prefix: str) -> dict[str, Any]:
             return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}

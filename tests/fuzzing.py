@@ -10,6 +10,7 @@ and the seed alone.
 
 from __future__ import annotations
 
+import copy
 import gzip
 import importlib
 import json
@@ -201,7 +202,7 @@ def odd_json(values: Any, rng: np.random.Generator) -> bytes:
             break
         parent = parents[rng.integers(len(parents))]
         keys = list(parent) if isinstance(parent, dict) else list(range(len(parent)))
-        odd = _ODD_VALUES[rng.integers(len(_ODD_VALUES))]
+        odd = copy.deepcopy(_ODD_VALUES[rng.integers(len(_ODD_VALUES))])
         if not keys:
             continue
         key = keys[rng.integers(len(keys))]
