@@ -4,6 +4,15 @@
 // Screen record of splat i: RECORD reals at records[i * RECORD]:
 //   mean_px x, y [px]; colour r, g, b; depth (camera z); first and last pixel row, then column, it can reach; shape's p.
 
+#ifndef SHAPE_SIZE
+#define shape_size(s) ((vreal)1)
+#define shape_size_vjp(s, v_size, g)
+#endif
+#ifndef SHAPE_DISPLACEMENT
+#define shape_displacement(s) zero3()
+#define shape_displacement_vjp(s, v_m, g)
+#endif
+
 #define CULLED_KEY 0xFFFFFFFFu
 #define COV2D_MAX R(1e12)  // px^2: a wider splat would overflow float32 on the way, and is no longer a splat
 
@@ -71,42 +80,54 @@ static inline splat_terms splat_project(global const real *geom, const ulong cap
 }
 
 #if ANTIALIASED
-// What the low-pass leaves of a splat's height if it keeps the volume: sqrt(det(B B') / det(B B' + low-pass)), the filter on
-// the screen of Mip-Splatting (Yu et al. 2024, eq. 9, with a wider low-pass). Exact for kernels of a quadratic form; where a
-// splat has sides, its peak changes with them besides.
-#ifndef SHAPE_SIZE
-#define shape_size(s) ((vreal)1)
-#endif
+// What the low-pass leaves of a splat's height if it keeps the volume: sqrt(det(M) / det(M + low-pass)), the filter on the
+// screen of Mip-Splatting (Yu et al. 2024, eq. 9, with a wider low-pass). M is B B', of the shape's own size, or with its
+// displacement m B (1 + m m') B'. Exact for kernels of a quadratic form; where a splat has sides, its peak changes besides.
+typedef struct {
+    vec3 b0, b1, area, m;
+    vreal size, along, stretch, flat, det, factor;  // along: area'm, stretch: 1 + m'm, flat: det(M)
+} lowering;
 
-static inline vreal lowered(splat_params s, vec3 b0, vec3 b1) {
-    const vreal size = shape_size(s);
-    b0 = scale3(b0, size);
-    b1 = scale3(b1, size);
-    const vec3 area = cross3(b0, b1);
-    return sqrt(dot3(area, area) / cov2d_det(b0, b1));
+static inline lowering lowered(splat_params s, vec3 b0, vec3 b1) {
+    lowering k;
+    k.size = shape_size(s);
+    k.m = shape_displacement(s);
+    k.b0 = scale3(b0, k.size);
+    k.b1 = scale3(b1, k.size);
+    k.area = cross3(k.b0, k.b1);
+    k.along = dot3(k.area, k.m);
+    k.stretch = (vreal)1 + dot3(k.m, k.m);
+    k.flat = k.stretch * dot3(k.area, k.area) - k.along * k.along;
+    const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
+    k.det = k.flat + LOW_PASS * (dot3(k.b0, k.b0) + dot3(k.b1, k.b1) + m0 * m0 + m1 * m1 + (vreal)LOW_PASS);
+    k.factor = sqrt(k.flat / k.det);
+    return k;
 }
 
-// Adds to g, whose opacities are those after lowering, and makes them those before.
-static inline void lowered_vjp(splat_params s, vec3 b0, vec3 b1, shape_grads *g, vec3 *v_b0, vec3 *v_b1) {
-    const vreal size = shape_size(s);
-    const vec3 c0 = scale3(b0, size), c1 = scale3(b1, size);
-    const vec3 area = cross3(c0, c1);
-    const vreal flat = dot3(area, area), det = cov2d_det(c0, c1), factor = sqrt(flat / det);
+static inline splat_params after(lowering k, splat_params s) {
+    s.opacity *= k.factor;
+    s.opacity_minus *= k.factor;
+    return s;
+}
+
+// Adds to g, whose opacities are those after lowering and become those before, and to the gradients of b0 and b1.
+static inline void lowered_vjp(lowering k, splat_params s, vec3 b0, vec3 b1, shape_grads *g, vec3 *v_b0, vec3 *v_b1) {
     const vreal v_factor = g->s.opacity * s.opacity + g->s.opacity_minus * s.opacity_minus;
-    g->s.opacity *= factor;
-    g->s.opacity_minus *= factor;
-    // factor^2 = flat/det, det = flat + low-pass (|c0|^2 + |c1|^2 + low-pass). A splat seen from its edge has no slope.
-    const vreal v_flat = lanes_if(factor > (vreal)R(1e-6), R(0.5) * v_factor * ((vreal)1 - factor * factor)
-                                  / (max(factor, (vreal)R(1e-6)) * det), (vreal)0);
-    const vreal v_squares = R(-0.5) * LOW_PASS * v_factor * factor / det;
-    const vec3 v_area = scale3(area, (real)2 * v_flat);
-    const vec3 v_c0 = add3(cross3(c1, v_area), scale3(c0, (real)2 * v_squares));
-    const vec3 v_c1 = add3(cross3(v_area, c0), scale3(c1, (real)2 * v_squares));
-    *v_b0 = add3(*v_b0, scale3(v_c0, size));
-    *v_b1 = add3(*v_b1, scale3(v_c1, size));
-#ifdef SHAPE_SIZE
-    g->s.beta += shape_size_vjp(s, dot3(v_c0, b0) + dot3(v_c1, b1));
-#endif
+    g->s.opacity *= k.factor;
+    g->s.opacity_minus *= k.factor;
+    // factor^2 = flat/det. A splat seen from its edge has no slope.
+    const vreal v_flat = lanes_if(k.factor > (vreal)R(1e-6), v_factor * ((vreal)1 - k.factor * k.factor)
+                                  / (max(k.factor, (vreal)R(1e-6)) * k.det), (vreal)0);
+    const vreal v_squares = -LOW_PASS * v_factor * k.factor / k.det;  // both twice as large, and halved below
+    const vec3 v_area = scale3(add3(scale3(k.area, k.stretch), scale3(k.m, -k.along)), v_flat);
+    const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
+    const vec3 v_c0 = add3(cross3(k.b1, v_area), scale3(add3(k.b0, scale3(k.m, m0)), v_squares));
+    const vec3 v_c1 = add3(cross3(v_area, k.b0), scale3(add3(k.b1, scale3(k.m, m1)), v_squares));
+    *v_b0 = add3(*v_b0, scale3(v_c0, k.size));
+    *v_b1 = add3(*v_b1, scale3(v_c1, k.size));
+    shape_size_vjp(s, dot3(v_c0, b0) + dot3(v_c1, b1), g);
+    const vec3 of_flat = add3(scale3(k.m, dot3(k.area, k.area)), scale3(k.area, -k.along));
+    shape_displacement_vjp(s, add3(scale3(of_flat, v_flat), scale3(add3(scale3(k.b0, m0), scale3(k.b1, m1)), v_squares)), g);
 }
 #endif
 
@@ -140,11 +161,11 @@ kernel void project_splats(
 
     vreal out[RECORD];
     extents box;
-    splat_params shown = s.s;
 #if ANTIALIASED
-    const vreal factor = lowered(s.s, s.b0, s.b1);
-    shown.opacity *= factor;
-    shown.opacity_minus *= factor;
+    const lowering low = lowered(s.s, s.b0, s.b1);
+    const splat_params shown = after(low, s.s);
+#else
+    const splat_params shown = s.s;
 #endif
     shape_project(shown, s.b0, s.b1, s.cov2d, out + HEAD, &box);
     out[0] = s.to_px.x;
@@ -251,11 +272,11 @@ kernel void project_splats_vjp(
         v[j] = lanes_if(seen, lanes_load(moments + first + j * capacity), zero);
 
     shape_grads g;
-    splat_params shown = s.s;
 #if ANTIALIASED
-    const vreal factor = lowered(s.s, s.b0, s.b1);
-    shown.opacity *= factor;
-    shown.opacity_minus *= factor;
+    const lowering low = lowered(s.s, s.b0, s.b1);
+    const splat_params shown = after(low, s.s);
+#else
+    const splat_params shown = s.s;
 #endif
     shape_project_vjp(shown, s.b0, s.b1, s.cov2d, v, &g);
 
@@ -263,7 +284,7 @@ kernel void project_splats_vjp(
     vec3 v_b0 = add3(g.b0, add3(scale3(s.b0, (real)2 * g.cov2d.xx), scale3(s.b1, g.cov2d.xy)));
     vec3 v_b1 = add3(g.b1, add3(scale3(s.b1, (real)2 * g.cov2d.yy), scale3(s.b0, g.cov2d.xy)));
 #if ANTIALIASED
-    lowered_vjp(s.s, s.b0, s.b1, &g, &v_b0, &v_b1);
+    lowered_vjp(low, s.s, s.b0, s.b1, &g, &v_b0, &v_b1);
 #endif
     // B = A R S
     vec3 v_scale = add3(mul3(v_b0, s.ar0), mul3(v_b1, s.ar1));

@@ -39,6 +39,7 @@ Bytes = NDArray[np.uint8]
 
 _HEADER = struct.Struct("<IIIBBBB")
 _MAGIC, _VERSION = 0x5053474E, 3
+_ANTIALIASED = 1  # flag
 _LARGEST = (1 << 23) - 1  # of a position
 _FRACTION_BITS = 20  # at most; a scene that reaches 8 units has these
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # components beside the largest
@@ -61,7 +62,8 @@ def write_spz(path: str | os.PathLike[str], splats: Splats) -> None:
         raise InputError(f"{path}: a splat lies {farthest:.3g} units away, .spz files reach {_LARGEST}: remove it, or "
                          "write a .ply")
     bits = min(_FRACTION_BITS, math.floor(math.log2(_LARGEST / max(farthest, 1e-30))))
-    head = _HEADER.pack(_MAGIC, _VERSION, len(splats), splats.sh_degree, bits, 0, 0)
+    head = _HEADER.pack(_MAGIC, _VERSION, len(splats), splats.sh_degree, bits,
+                        _ANTIALIASED * splats.antialiased, 0)
     opacity = GAUSSIAN.opacity(splats.opacity_logit.astype(np.float64))
     colour = _bytes(127.5 + 38.25 * splats.sh[:, 0])
     parts: list[NDArray[Any]] = [_positions(splats.mean, bits), _bytes(255.0 * opacity), colour,
@@ -85,7 +87,7 @@ def read_spz(path: str | os.PathLike[str]) -> Splats:
             head = stream.read(_HEADER.size)
             if len(head) < _HEADER.size:
                 raise InputError(f"{path}: is no .spz file (it ends in the header); export it again")
-            magic, version, n, degree, bits, _, _ = _HEADER.unpack(head)
+            magic, version, n, degree, bits, flags, _ = _HEADER.unpack(head)
             if magic != _MAGIC or version != _VERSION or degree > MAX_SH_DEGREE:
                 raise InputError(f"{path}: is no .spz file of version {_VERSION} with SH up to degree {MAX_SH_DEGREE}; "
                                  "write it as .ply with the program that made it")
@@ -110,7 +112,8 @@ def read_spz(path: str | os.PathLike[str]) -> Splats:
         logit = np.clip(GAUSSIAN.raw_opacity(opacity / 255.0), -_LOGIT_MAX, _LOGIT_MAX)
     arrays = {"mean": _places(places.reshape(n, 3, 3)) / 2.0**bits, "quat": _quaternions(rotation.view("<u4")),
               "log_scale": scale.reshape(n, 3) / 16.0 - 10.0, "opacity_logit": logit, "sh": sh}
-    return Splats(GAUSSIAN.name, {name: values.astype(np.float32) for name, values in arrays.items()})
+    return Splats(GAUSSIAN.name, {name: values.astype(np.float32) for name, values in arrays.items()},
+                  antialiased=bool(flags & _ANTIALIASED))
 
 
 def _places(low_first: Bytes) -> NDArray[np.int32]:

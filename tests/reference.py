@@ -63,18 +63,13 @@ def axes_of(arrays: Mapping[str, Array]) -> Array:
     return rotation(arrays["quat"]) * np.exp(arrays["log_scale"])[:, None, :]
 
 
-def lowered(kernel: Kernel, arrays: Mapping[str, Array], geometry: Geometry, shape: str) -> Kernel:
+def lowered(kernel: Kernel) -> Kernel:
     """The kernel times the share of its area that the low-pass does not add: the root of a ratio of determinants."""
-    size = REFERENCES[shape].size
-    widened = geometry.matrix2d()
-    low_pass = LOW_PASS * np.eye(2)
-    if size is not None:
-        widened = (size(arrays) ** 2)[:, None, None] * (widened - low_pass) + low_pass
-
     def det(m: Array) -> Array:
         return m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
 
-    factor = np.sqrt(np.where(det(widened - low_pass).real > 0.0, det(widened - low_pass), 0.0) / det(widened))
+    own = det(kernel.scale2d - LOW_PASS * np.eye(2))
+    factor = np.sqrt(np.where(own.real > 0.0, own, 0.0) / det(kernel.scale2d))
     minus = None if kernel.amplitude_minus is None else factor * kernel.amplitude_minus
     return kernel._replace(amplitude=factor * kernel.amplitude, amplitude_minus=minus)
 
@@ -89,7 +84,7 @@ def project(arrays: Mapping[str, Array], camera: Camera, shape: str = "gaussian"
     geometry = Geometry(mean_px, jacobian(point, camera) @ camera.rotation, axes_of(arrays))
     kernel = REFERENCES[shape].kernel(arrays, geometry, normalisation)
     if antialiased:
-        kernel = lowered(kernel, arrays, geometry, shape)
+        kernel = lowered(kernel)
 
     stored = int(np.sqrt(arrays["sh"].shape[1])) - 1
     degree = stored if sh_degree is None else sh_degree

@@ -32,13 +32,9 @@ def generalised_exponential(arrays: Mapping[str, Array], geometry: Geometry, nor
     return Kernel(geometry.point_px, geometry.matrix2d(), logistic(arrays["opacity_logit"]), falloff=falloff)
 
 
-def modulated_size(arrays: Mapping[str, Array]) -> Array:
-    return 2.0 * logistic(0.1 * (arrays["beta"] - 2.0))
-
-
 def ges_modulation(arrays: Mapping[str, Array], geometry: Geometry, normalisation: str) -> Kernel:
     """The Gaussian of scales times 2 sigma(0.1 (beta - 2))."""
-    size = modulated_size(arrays)
+    size = 2.0 * logistic(0.1 * (arrays["beta"] - 2.0))
     low_pass = LOW_PASS * np.eye(2)
     scale2d = (size * size)[:, None, None] * (geometry.matrix2d() - low_pass) + low_pass
     return Kernel(geometry.point_px, scale2d, logistic(arrays["opacity_logit"]))
@@ -46,6 +42,6 @@ def ges_modulation(arrays: Mapping[str, Array], geometry: Geometry, normalisatio
 
 RADIAL: dict[str, ShapeReference] = {
     "generalised-exponential": ShapeReference(("beta",), generalised_exponential),
-    "ges-modulation": ShapeReference(("beta",), ges_modulation, size=modulated_size),
+    "ges-modulation": ShapeReference(("beta",), ges_modulation),
     "student-t": ShapeReference(("nu",), student_t, signed=True),
 }

@@ -78,7 +78,6 @@ class ShapeReference:
     kernel : (arrays, geometry, normalisation) -> Kernel.
     centre : the point that is projected, in the unit frame from (x, y, z): arrays -> (B, 3); None for (x, y, z).
     direct : whether the field `skew` is the slant eta, and not the centred m.
-    size : factor of the scales before the low-pass, arrays -> (B,); None for 1.
     signed : whether opacities are tanh of the raw values, and not the logistic function.
     """
 
@@ -86,5 +85,4 @@ class ShapeReference:
     kernel: Callable[[Mapping[str, Array], Geometry, str], Kernel]
     centre: Callable[[Mapping[str, Array]], Array] | None = None
     direct: bool = False
-    size: Callable[[Mapping[str, Array]], Array] | None = None
     signed: bool = False

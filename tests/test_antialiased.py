@@ -16,6 +16,7 @@ from test_gradients import differences
 from tolerances import DIFFERENCES, GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, relative_error
 
 from clsplat.config import TrainConfig
+from clsplat.convert import convert
 from clsplat.device import Device
 from clsplat.errors import InputError
 from clsplat.placing import joined
@@ -54,9 +55,10 @@ def test_image_and_gradients_equal_the_reference(make_renderer: MakeRenderer, de
 
 
 @pytest.mark.parametrize("shape", [
-    "gaussian", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bisected-skew", "ges-modulation"))])
+    "skew-normal", *(pytest.param(name, marks=pytest.mark.slow)
+                     for name in ("gaussian", "bisected-skew", "ges-modulation"))])
 def test_double_precision_and_differences(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """One opacity, two, and a size that is learned."""
+    """One opacity, two, a displacement, and a size that is learned."""
     case_of(shape, dtype=np.float64).check(make_renderer(device, "float64"), ROUNDING, ROUNDING)
     few = Case(small_splats(4), random_camera(5, 23, 17), shape, dtype=np.float64, thresholds=SMOOTH, antialiased=True)
     renderer = make_renderer(device, "float64", **SMOOTH)
@@ -83,6 +85,18 @@ def test_a_small_splat_keeps_its_volume(make_renderer: MakeRenderer, device: Dev
         kept[antialiased] = np.array(sums) / sums[0]
     np.testing.assert_allclose(kept[True], 1.0, atol=0.02)
     assert kept[False][-1] > 2
+
+
+@pytest.mark.parametrize(("source", "target"), [("skew-normal", "skew-normal-direct"),
+                                                ("ges-modulation", "gaussian")])
+def test_exact_conversions_stay_exact(make_renderer: MakeRenderer, device: Device, source: str, target: str) -> None:
+    """Both forms have one volume on the screen."""
+    case = case_of(source)
+    renderer = make_renderer(device)
+    other = convert(case.splats, target)
+    assert other.antialiased
+    np.testing.assert_allclose(renderer.render(other, case.camera).color,
+                               renderer.render(case.splats, case.camera).color, atol=2e-5)
 
 
 @pytest.mark.parametrize("shape", ["skew-normal"])

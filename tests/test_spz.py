@@ -78,6 +78,13 @@ def test_far_positions_take_bits_from_the_fraction(tmp_path: Path) -> None:
     assert len(read_spz(tmp_path / "c.spz")) == 0
 
 
+def test_spz_says_whether_splats_are_antialiased(tmp_path: Path) -> None:
+    for antialiased in (False, True):
+        splats = Splats("gaussian", gaussians().arrays, antialiased=antialiased)
+        write_spz(tmp_path / "a.spz", splats)
+        assert read_spz(tmp_path / "a.spz").antialiased is antialiased
+
+
 def test_the_same_splats_are_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.spz", "b.spz"):
         write_spz(tmp_path / name, gaussians())
