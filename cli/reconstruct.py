@@ -80,25 +80,33 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
     OutputError : the scene that is there was made of other photos. Others as `reconstruct`.
     """
     from clsplat.photo_folder import find_photos, is_video
-    from clsplat.reconstruct import ReconstructOptions, made_from
+    from clsplat.reconstruct import ReconstructOptions, estimated_seconds, made_from
 
     scene = model.parent / f"{photos.resolve().stem if is_video(photos) else photos.resolve().name}-scene"
     options = ReconstructOptions()
     made = made_from(scene, photos)
     if made:
         if not quiet:
-            click.echo(f"{photos}: no poses; {scene} was reconstructed of it before and is used", err=True)
+            click.echo(f"{photos}: no poses: {scene} was reconstructed of it before and is used", err=True)
         return scene
     if made is False and not overwrite:
         raise OutputError(f"{scene}: was reconstructed of other photos than {photos} now has: use --overwrite to make "
                           f"it anew, or clsplat reconstruct {photos} -o OTHER and train on that")
     if not quiet:
-        what = f"the {options.frames} sharpest frames" if is_video(photos) else f"{len(find_photos(photos))} photos"
-        click.echo(f"{photos}: no poses; reconstructing {scene} of {what} first", err=True)
+        what = f"{options.frames} frames"
+        if not is_video(photos):
+            found = find_photos(photos)
+            what = f"{len(found)} photos, {_minutes(estimated_seconds(found, options))}"
+        click.echo(f"{photos}: no poses: reconstructing {scene} first ({what})", err=True)
     result = run_reconstruction(photos, scene, options, overwrite, quiet)
     if not quiet:
         report(result)
     return scene
+
+
+def _minutes(seconds: float) -> str:
+    """Roughly: an estimate is no better."""
+    return "about a minute" if seconds < 90 else f"about {round(seconds / 60)} min"
 
 
 class StepDisplay:

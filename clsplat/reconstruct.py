@@ -15,6 +15,7 @@ from typing import TypeVar
 
 from .errors import InputError, OutputError
 from .flat_model import SparseModel, write_flat_model, write_flat_photo
+from .images import PhotoFacts, photo_facts
 from .json_fields import read_json
 from .model_folder import write_json
 from .photo_folder import (
@@ -41,6 +42,7 @@ CAMERA_MODES = ("auto", "single", "per-image", "per-folder")
 MATCHERS = ("auto", "exhaustive", "sequential")
 RECORD = "reconstruct.json"  # in the scene: what it was made of and how
 EXHAUSTIVE = 150  # photos; of more, "auto" matches neighbours by name
+SMALL = 1000  # longest side [px] of photos that are searched at twice their size too, four times as long
 _OVERLAP = 10  # neighbours of a photo in a sequence
 _LOOP = 10  # every so many-th photo of a sequence is matched with all others of these, to close loops
 _FEWEST = 3
@@ -138,6 +140,7 @@ def reconstruct(photos: str | os.PathLike[str], scene: str | os.PathLike[str],
         (work / "pairs.txt").write_text("".join(f"{names[a]} {names[b]}\n" for a, b in pairs))
         masks = complete_masks(ready, work / "masks")
         job = {"masks": masks and str(masks), "groups": groups, "n_pairs": len(pairs),
+               "doubled": _longest_side(ready[len(ready) // 2].facts, options) < SMALL,
                "camera_model": options.camera_model, "max_size": options.max_size, "seed": options.seed}
         models = run_sfm(work, job, say, str(source))
         folder = max(models, key=lambda name: models[name])
@@ -155,6 +158,23 @@ def reconstruct(photos: str | os.PathLike[str], scene: str | os.PathLike[str],
             **{key: value for key, value in asdict(result).items() if key != "scene"}})
         _put(work / "scene", target)
     return result
+
+
+def estimated_seconds(photos: Sequence[PhotoFile], options: ReconstructOptions | None = None) -> float:
+    """Roughly how long `reconstruct` will take: from a header, figures of one CPU core, and the number of cores.
+
+    Raises
+    ------
+    InputError : the first photo cannot be read.
+    """
+    options = options or ReconstructOptions()
+    facts = photo_facts(photos[0].file)
+    side = _longest_side(facts, options)
+    megapixels = facts.width * facts.height * (side / max(facts.width, facts.height)) ** 2 / 1e6
+    features = min(1.0, 3.0 * megapixels)                          # of the most
+    pairs = len(_pairs(len(photos), _sequential(options, photos[0].file, len(photos))))
+    search = len(photos) * megapixels * (4.9 if side < SMALL else 1.2)
+    return (search + 0.2 * pairs * features**2 + 0.5 * len(photos)) / (os.cpu_count() or 1)
 
 
 def made_from(scene: Path, photos: Path) -> bool | None:
@@ -217,6 +237,11 @@ def _prepared(given: Sequence[PhotoFile], source: Path, work: Path, say: Tell) -
         raise InputError(f"{source}: {len(ready)} photos that can be read; at least {_FEWEST} are needed, 30 or more "
                          "that overlap are better")
     return ready
+
+
+def _longest_side(facts: PhotoFacts, options: ReconstructOptions) -> int:
+    """Of the photo as it is searched for features [px]."""
+    return min(max(facts.width, facts.height), options.max_size)
 
 
 def _sequential(options: ReconstructOptions, source: Path, photos: int) -> bool:

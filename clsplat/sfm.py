@@ -5,7 +5,8 @@ another reader of its SQLite database (closing one connection drops the locks of
 JSON lines on standard output, and ends when its standard input does: with its parent.
 
 The job: `database`, `photos`, `masks` (folder, or null), `groups` (lists of names that share a camera), `pairs` (file
-of names), `n_pairs`, `output`, `camera_model`, `max_size`, `seed`. The sparse models are left in `output`/0, 1, ...
+of names), `n_pairs`, `output`, `camera_model`, `max_size`, `doubled` (whether photos are searched at twice their size
+too), `seed`. Each sparse model is left in a folder of its own in `output`.
 
 Photos are imported in their order and everything is seeded: the same photos give the same model.
 """
@@ -23,6 +24,8 @@ from .lens import colmap_library, reason_of
 
 ENOUGH = 0.8  # of the photos registered; below, they are matched once more
 _PEAK = 0.003  # SIFT's contrast threshold; COLMAP's 0.0067 finds too little in small or soft photos
+# Of a photo. COLMAP takes 8192, for GPUs: matching a pair then takes 0.54 s of a CPU core instead of 0.19 s.
+_FEATURES = 4096
 
 
 def main(job_path: str) -> None:
@@ -69,6 +72,8 @@ def _find_features(colmap: Any, job: dict[str, Any], photos: list[str]) -> None:
     options.use_gpu = False
     options.max_image_size = job["max_size"]
     options.sift.peak_threshold = _PEAK
+    options.sift.max_num_features = _FEATURES
+    options.sift.first_octave = -1 if job["doubled"] else 0
     colmap.extract_features(job["database"], job["photos"], photos, colmap.CameraMode.AUTO, reader, options,
                             colmap.Device.cpu)
 

@@ -20,6 +20,7 @@ from PIL import Image
 from clsplat import reconstruct as module
 from clsplat.colmap import find_model, read_model
 from clsplat.errors import InputError, OutputError
+from clsplat.photo_folder import PhotoFile
 from clsplat.reconstruct import ReconstructOptions, made_from, reconstruct
 from clsplat.scene import Scene, load_scene
 from clsplat.sfm_process import Step
@@ -137,7 +138,7 @@ def test_training_on_photographs_uses_the_scene_again(scene: Path, walk: Path, t
     options = ("--eval", "--iterations", 10, "--cap-max", 300, "--sh-degree", 0)
     result = run("train", walk, "-m", tmp_path / "model", *options)
     assert result.exit_code == 0, result.output
-    assert f"no poses; {tmp_path / 'walk-scene'} was reconstructed of it before" in result.stderr
+    assert f"no poses: {tmp_path / 'walk-scene'} was reconstructed of it before" in result.stderr
     assert "test views (1)" in result.stdout
     assert "resumed at iteration 10" in run("train", walk, "-m", tmp_path / "model", "--resume").stderr
     clsplat("eval", tmp_path / "model", "--no-report")
@@ -191,6 +192,16 @@ def test_ctrl_c_leaves_nothing(walk: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_estimate_grows_with_photos_and_their_size(tmp_path: Path) -> None:
+    small, large = tmp_path / "small.png", tmp_path / "large.png"
+    Image.new("L", (400, 300)).save(small)
+    Image.new("L", (4000, 3000)).save(large)
+    seconds = [module.estimated_seconds([PhotoFile(file.name, file)] * count) for file in (small, large)
+               for count in (20, 140)]
+    assert seconds == sorted(seconds)
+    assert seconds[1] > 7 * seconds[0], "all pairs: quadratic"
+
+
 def test_pairs_of_a_sequence() -> None:
     assert module._pairs(4, sequential=False) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
     pairs = set(module._pairs(100, sequential=True))
@@ -201,7 +212,7 @@ def test_pairs_of_a_sequence() -> None:
 
 def test_warnings_of_photos_that_are_not_placed(tmp_path: Path) -> None:
     from clsplat.images import PhotoFacts
-    from clsplat.photo_folder import PhotoFile, Prepared
+    from clsplat.photo_folder import Prepared
 
     facts = PhotoFacts(8, 8, True, (), b"")
     ready = [Prepared(PhotoFile(f"{n}.jpg", tmp_path), facts, f"{n}.jpg") for n in range(10)]
