@@ -198,8 +198,8 @@ def test_estimate_grows_with_photos_and_their_size(tmp_path: Path) -> None:
     Image.new("L", (4000, 3000)).save(large)
     seconds = [module.estimated_seconds([PhotoFile(file.name, file)] * count) for file in (small, large)
                for count in (20, 140)]
-    assert seconds == sorted(seconds)
-    assert seconds[1] > 7 * seconds[0], "all pairs: quadratic"
+    assert seconds[0] < min(seconds[1:3])
+    assert seconds[3] > 10 * seconds[2], "all pairs: faster than the photos"
 
 
 def test_pairs_of_a_sequence() -> None:
