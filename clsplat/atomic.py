@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import BinaryIO
 
 from .errors import OutputError
 
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp(\..*)?")
 
 
@@ -49,7 +51,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or str(error)
-        raise OutputError(f"{target}: cannot be written ({reason}); choose another place") from error
+        mend = "free some space, or choose another place" if error.errno in _FULL else "choose another place"
+        raise OutputError(f"{target}: cannot be written ({reason}); {mend}") from error
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -28,6 +28,7 @@ from .model_folder import write_json
 from .render import Renderer
 from .run_log import Progress
 from .scene import Scene, View
+from .sole_writer import sole_writer
 from .splats import Splats
 from .systems import System
 from .trainer import Trainer
@@ -72,7 +73,8 @@ class RunFile:
             if self.path.exists():
                 text = self.path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise OutputError(f"{self.path}: cannot be used ({error}): choose another folder") from None
+            reason = getattr(error, "strerror", None) or error
+            raise OutputError(f"{self.path}: cannot be used ({reason}): choose another folder") from None
         self.records = parse_runs(text)
         self._separator = "" if not text or text.endswith("\n") else "\n"
 
@@ -139,8 +141,9 @@ def compare(scenes: Iterable[Scene], systems: Sequence[System], output: str | Pa
 
     Raises
     ------
-    InputError : a scene without test views, or options that do not fit a system. OutputError : cannot be written.
-    DeviceError : no device, or not enough memory. A run whose training fails is a record of its own ("failed").
+    InputError : a scene without test views, or options that do not fit a system. OutputError : cannot be written, or
+    another comparison writes there. DeviceError : no device, or not enough memory. A run whose training fails is a
+    record of its own ("failed").
     """
     folder = Path(output)
     # Systems innermost: an interrupted comparison has as many runs of each.
@@ -149,30 +152,31 @@ def compare(scenes: Iterable[Scene], systems: Sequence[System], output: str | Pa
     runs = RunFile(folder)
     device: Device | None = None
     warm: set[str] = set()
-    try:
-        for scene in scenes:
-            if not scene.test:
-                raise InputError(f"{scene.path}: no test views to measure on: load it with eval")
-            identity = scene_identity(scene)
-            for number, (label, config, again) in enumerate(configs, 1):
-                done = runs.find(identity, label, config, again)
-                if done is not None and (not curve or done.get("curve") is not None):
-                    continue
-                run = Run(scene.name, label, config, number, len(configs), again)
-                if on_run is not None:
-                    on_run(run, None)
-                device = device or open_device(config.device)
-                if label not in warm:
-                    warm_up(scene, config, device)
-                    warm.add(label)
-                ply = folder / MODELS / f"{scene.name}-{run.stem}.ply" if save_models else None
-                record = {"scene": identity, "system": label, "config": config.to_json(), "repeat": again,
-                          **train_and_measure(scene, config, device, progress, ply, curve), **(extra or {})}
-                runs.add(record)
-                if on_run is not None:
-                    on_run(run, record)
-    finally:
-        write_table(folder, runs.records)
+    with sole_writer(folder):
+        try:
+            for scene in scenes:
+                if not scene.test:
+                    raise InputError(f"{scene.path}: no test views to measure on: load it with eval")
+                identity = scene_identity(scene)
+                for number, (label, config, again) in enumerate(configs, 1):
+                    done = runs.find(identity, label, config, again)
+                    if done is not None and (not curve or done.get("curve") is not None):
+                        continue
+                    run = Run(scene.name, label, config, number, len(configs), again)
+                    if on_run is not None:
+                        on_run(run, None)
+                    device = device or open_device(config.device)
+                    if label not in warm:
+                        warm_up(scene, config, device)
+                        warm.add(label)
+                    ply = folder / MODELS / f"{scene.name}-{run.stem}.ply" if save_models else None
+                    record = {"scene": identity, "system": label, "config": config.to_json(), "repeat": again,
+                              **train_and_measure(scene, config, device, progress, ply, curve), **(extra or {})}
+                    runs.add(record)
+                    if on_run is not None:
+                        on_run(run, record)
+        finally:
+            write_table(folder, runs.records)
     return runs.records
 
 
