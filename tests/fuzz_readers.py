@@ -19,6 +19,7 @@ from clsplat.checkpoint import Checkpoint
 from clsplat.colmap import find_model, read_model
 from clsplat.colmap_files import write_binary_model
 from clsplat.config import TrainConfig
+from clsplat.errors import InputError
 from clsplat.images import image_size, read_image, write_grey16, write_png
 from clsplat.ply import read_ply
 from clsplat.point_cloud import read_point_cloud
@@ -211,8 +212,6 @@ def make_images(folder: Path) -> None:
 
 def read_images(folder: Path) -> None:
     """All that can be read; the first that cannot decides."""
-    from clsplat.errors import InputError
-
     failed: InputError | None = None
     for path in sorted(folder.iterdir()):
         try:
@@ -224,6 +223,54 @@ def read_images(folder: Path) -> None:
             failed = failed or error
     if failed is not None:
         raise failed
+
+
+def make_photographs(folder: Path) -> None:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F], exif[0x0110] = 6, "Maker", "Model"
+    exif.get_ifd(0x8769).update({0x920A: 35.0, 0xA405: 35})
+    for index in range(3):
+        picture = Image.fromarray(photo_of(index))
+        (folder / "photos").mkdir(exist_ok=True)
+        picture.save(folder / "photos" / f"shot_{index}.jpg", exif=exif)
+    Image.fromarray(np.dstack([photo_of(3), photo_of(3)[:, :, 1]])).save(folder / "photos" / "shot_3.png")
+    write_png(folder / "photos" / "masks" / "shot_0.jpg.png", photo_of(0).transpose(1, 0, 2)[:, :, 1])
+
+
+def read_photographs(folder: Path) -> None:
+    """As far as a reconstruction goes before it looks for features."""
+    import tempfile
+
+    from clsplat.photo_folder import fingerprint, find_photos, is_photographs, prepare, same_camera
+
+    is_photographs(folder / "photos")
+    found = find_photos(folder / "photos")
+    fingerprint(folder / "photos")
+    with tempfile.TemporaryDirectory() as work:
+        (Path(work) / "photos").mkdir()
+        ready = [prepare(photo, number, Path(work) / "photos", Path(work) / "masks")
+                 for number, photo in enumerate(found)]
+    same_camera([photo for photo in ready if not isinstance(photo, str)], "auto")
+    for line in ready:
+        if isinstance(line, str):  # those are left out, with this line
+            raise InputError(line)
+
+
+def make_blender(folder: Path) -> None:
+    for part, index in (("train", 0), ("train", 1), ("test", 2)):
+        write_png(folder / part / f"r_{index}.png", np.dstack([photo_of(index), photo_of(index)[:, :, 1]]))
+    for part, places in (("train", (0, 1)), ("test", (2,))):
+        frames = [{"file_path": f"./{part}/r_{i}", "rotation": 0.1,
+                   "transform_matrix": np.linalg.inv(model_views()[i].cam_from_world).tolist()} for i in places]
+        (folder / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+
+
+def read_facts(folder: Path) -> None:
+    from clsplat.scene_info import scene_info
+
+    scene_info(folder)
 
 
 READERS = {
@@ -239,6 +286,9 @@ READERS = {
     "scene": Sample(make_masked, read_scene),
     "test-list": Sample(make_listed, read_listed, "test.txt"),
     "transforms": Sample(make_transforms, read_scene),
+    "blender": Sample(make_blender, read_scene),
+    "photographs": Sample(make_photographs, read_photographs),
+    "scene-facts": Sample(make_masked, read_facts),
     "cameras-json": Sample(make_cameras, lambda f: read_cameras(f / "cameras.json")),
     "camera-path": Sample(make_path, lambda f: read_path(f / "path.json")),
     "config": Sample(make_config, read_config),
