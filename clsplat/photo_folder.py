@@ -110,9 +110,12 @@ def fingerprint(path: Path) -> str:
         file for photo in find_photos(path) for file in (photo.file, photo.mask) if file is not None]
     digest = hashlib.sha256()
     for file in files:
-        state = file.stat()
-        relative = os.fsencode(os.path.relpath(file, path))
-        digest.update(relative + f"\0{state.st_size}\0{state.st_mtime_ns}\0".encode())
+        try:
+            state = file.stat()
+            facts = f"{state.st_size}\0{state.st_mtime_ns}"
+        except OSError as error:  # a link to nowhere: such a photo is named and left out when it is read
+            facts = str(error.errno)
+        digest.update(os.fsencode(os.path.relpath(file, path)) + f"\0{facts}\0".encode())
     return digest.hexdigest()
 
 

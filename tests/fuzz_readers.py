@@ -243,7 +243,7 @@ def read_photographs(folder: Path) -> None:
     """As far as a reconstruction goes before it looks for features."""
     import tempfile
 
-    from clsplat.photo_folder import fingerprint, find_photos, is_photographs, prepare, same_camera
+    from clsplat.photo_folder import find_photos, fingerprint, is_photographs, prepare, same_camera
 
     is_photographs(folder / "photos")
     found = find_photos(folder / "photos")

@@ -109,7 +109,10 @@ def test_fingerprint_follows_every_change(tmp_path: Path) -> None:
     marks.append(fingerprint(tmp_path))
     (tmp_path / "a.png").rename(tmp_path / "c.png")
     marks.append(fingerprint(tmp_path))
-    assert len(set(marks)) == 4
+    (tmp_path / "b.png").unlink()
+    (tmp_path / "b.png").symlink_to(tmp_path / "nowhere.png")
+    marks.append(fingerprint(tmp_path))
+    assert len(set(marks)) == 5
 
 
 # --- reading -------------------------------------------------------------------------------
