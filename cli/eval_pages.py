@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from clsplat import __version__
 from clsplat.config import TrainConfig
-from clsplat.errors import InputError
+from clsplat.errors import InputError, OutputError
 from clsplat.metrics import color_corrected
 
 from .models import LoadedModel
@@ -63,12 +63,14 @@ class ViewRecorder:
 
 @dataclass(frozen=True)
 class Measurement:
-    """Of one model: the entry of its results.json, values by metric and view, and images for the page."""
+    """Of one model: the entry of its results.json, values by metric and view, images for the page, and why the files
+    could not be written, if so."""
 
     model: LoadedModel
     result: dict[str, Any]
     per_view: Mapping[str, Mapping[str, float]]
     shots: Mapping[str, Shot]
+    unwritten: OutputError | None = None
 
 
 def write_model_page(path: Path, scene: str, measured: Sequence[Measurement], labels: Sequence[str]) -> Path:

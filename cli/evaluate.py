@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from clsplat.complexity import complexity
-from clsplat.errors import InputError
+from clsplat.errors import InputError, OutputError
 from clsplat.metrics import DEFAULT_PROTOCOL, PROTOCOLS, Protocol, protocol_named
 from clsplat.model_folder import read_json, write_json
 
@@ -92,7 +92,7 @@ def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], sou
         renders = save_renders and (save_renders / path.resolve().name if len(paths) > 1 else save_renders)
         measured.append(measure_model(loaded, scene, renderer, protocol, view_set or "test", colour, renders,
                                       ViewRecorder(*metrics, not no_report, color_correct), quiet))
-        if report is None and not no_report:
+        if report is None and not no_report and measured[-1].unwritten is None:
             page = loaded.folder.path / f"{Path(REPORT).stem}{_ending(view_set or 'test')}.html"
             pages.append(write_model_page(page, scene.name, measured[-1:], [path.resolve().name]))
     if report is not None:
@@ -102,6 +102,9 @@ def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], sou
         click.echo(describe(protocol))
         for page in pages:
             click.echo(f"page: {page}")
+    for one in measured:
+        if one.unwritten is not None:
+            raise one.unwritten
 
 
 def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol: Protocol = DEFAULT_PROTOCOL,
@@ -115,7 +118,7 @@ def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol
 
     Raises
     ------
-    InputError : the scene has no such views. OutputError : cannot be written.
+    InputError : the scene has no such views. OutputError : the renders cannot be written.
     """
     from clsplat.evaluate import evaluate
 
@@ -152,9 +155,13 @@ def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol
         "shape": splats.shape, "normalisation": splats.normalisation, "set": view_set, "views": len(views),
         "background": list(colour), "device": str(renderer.device.info), "protocol": described,
     }
-    for stem, entry in (("results", result), ("per_view", per_view)):
-        _add(model.folder.path / f"{stem}{_ending(view_set)}.json", f"ours_{model.iteration}", entry)
-    return Measurement(model, result, per_view, record.shots)
+    unwritten = None
+    try:
+        for stem, entry in (("results", result), ("per_view", per_view)):
+            _add(model.folder.path / f"{stem}{_ending(view_set)}.json", f"ours_{model.iteration}", entry)
+    except OutputError as error:  # what was measured is said first
+        unwritten = error
+    return Measurement(model, result, per_view, record.shots, unwritten)
 
 
 def _say(paths: Sequence[Path], measured: Sequence[Measurement]) -> None:

@@ -138,3 +138,12 @@ def test_two_comparisons_in_one_folder(capture: Path, tmp_path: Path) -> None:
         for command in ("compare", "frontier"):
             assert "another run writes into it" in refused(command, capture, "-o", tmp_path / "c")
         holder.kill()
+
+
+def test_metrics_are_said_where_they_cannot_be_written(model: Path, tmp_path: Path) -> None:
+    shutil.copytree(model, tmp_path / "model")
+    with read_only(tmp_path / "model") as folder:
+        result = run("eval", folder)
+    assert result.exit_code == 1
+    assert "PSNR" in result.stdout
+    assert result.stderr.splitlines()[-1].startswith(f"error: {tmp_path / 'model' / 'results.json'}: cannot be written")
