@@ -268,7 +268,7 @@ def _is_a(value: Any, hint: Any) -> bool:
 
 
 def _expected(hint: Any) -> str:
-    names = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+    names = {bool: "true or false", int: "a whole number", float: "a finite number", str: "a text"}
     return names.get(hint, "a list of numbers" if get_origin(hint) is tuple else "another kind of value, or null")
 
 
