@@ -28,7 +28,7 @@ from clsplat.tuning import schedule_for
 from clsplat.video import VideoWriter
 
 # Name to the scene with poses and the reduction at which both ways are trained.
-SCENES = {"sceaux_castle": ("sceaux_castle", 1), "kitchen": ("kitchen", 1), "fox_ngp": ("fox/ngp", 1),
+SCENES = {"sceaux_castle": ("sceaux_castle", 1), "kitchen": ("kitchen", 1), "fox_ngp": ("fox/ngp", 2),
           "fox_video": ("fox", 2)}
 WAYS = ("given poses", "photos alone")
 FPS = 10

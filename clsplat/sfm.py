@@ -23,7 +23,13 @@ from typing import Any
 from .lens import colmap_library, reason_of
 
 ENOUGH = 0.8  # of the photos registered; below, they are matched once more
+_FAR_OFF, _NARROW = 4.0, 1.5  # reprojection error [px] and angle [degrees] of points to leave out, as COLMAP's mapper
 _PEAK = 0.003  # SIFT's contrast threshold; COLMAP's 0.0067 finds too little in small or soft photos
+# Lens models of many parameters run astray on the first photos: these are placed with one, and the others come last.
+_FIRST_MODEL = {"RADIAL": "SIMPLE_RADIAL", "OPENCV": "SIMPLE_RADIAL", "FULL_OPENCV": "SIMPLE_RADIAL",
+                "RADIAL_FISHEYE": "SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE": "SIMPLE_RADIAL_FISHEYE",
+                "THIN_PRISM_FISHEYE": "SIMPLE_RADIAL_FISHEYE"}
+_FISHEYE_FOCAL = 0.6  # of the longest side, where EXIF does not say; COLMAP's 1.2 is no fisheye's
 # Of a photo. COLMAP takes 8192, for GPUs: matching a pair then takes 0.54 s of a CPU core instead of 0.19 s.
 _FEATURES = 4096
 
@@ -39,6 +45,8 @@ def main(job_path: str) -> None:
 
 
 def _run(colmap: Any, job: dict[str, Any]) -> None:
+    if not hasattr(colmap, "FeatureExtractionOptions"):
+        raise RuntimeError("pycolmap is too old, version 4 is needed: pip install -U pycolmap")
     photos = [name for group in job["groups"] for name in group]
     _tell(stage="features", total=len(photos))
     _find_features(colmap, job, photos)
@@ -57,17 +65,24 @@ def _run(colmap: Any, job: dict[str, Any]) -> None:
         again = _map(colmap, job, Path(job["output"]) / "guided", len(photos))
         if max(again.values(), default=0) > most:
             models = again
+    if models and job["camera_model"] in _FIRST_MODEL:
+        _refine(colmap, max(models, key=lambda name: models[name]), job["camera_model"])
     _tell(models=models)
 
 
 def _find_features(colmap: Any, job: dict[str, Any], photos: list[str]) -> None:
     reader = colmap.ImageReaderOptions()
-    reader.camera_model = job["camera_model"]
+    reader.camera_model = _FIRST_MODEL.get(job["camera_model"], job["camera_model"])
+    fisheye = reader.camera_model == "FOV" or "FISHEYE" in reader.camera_model
+    if fisheye:
+        reader.default_focal_length_factor = _FISHEYE_FOCAL
     if job["masks"]:
         reader.mask_path = job["masks"]
     colmap.Database.open(job["database"]).close()
     for group in job["groups"]:  # in order, where the extraction's threads would number the photos by chance
         colmap.import_images(job["database"], job["photos"], colmap.CameraMode.SINGLE, group, reader)
+    if fisheye:
+        _trust_focal_lengths(colmap, job["database"])
     options = colmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.max_image_size = job["max_size"]
@@ -76,6 +91,15 @@ def _find_features(colmap: Any, job: dict[str, Any], photos: list[str]) -> None:
     options.sift.first_octave = -1 if job["doubled"] else 0
     colmap.extract_features(job["database"], job["photos"], photos, colmap.CameraMode.AUTO, reader, options,
                             colmap.Device.cpu)
+
+
+def _trust_focal_lengths(colmap: Any, path: str) -> None:
+    """Pairs of fisheye photos are verified by rays only, which takes a focal length that counts as known."""
+    database = colmap.Database.open(path)
+    for camera in database.read_all_cameras():
+        camera.has_prior_focal_length = True
+        database.update_camera(camera)
+    database.close()
 
 
 def _match(colmap: Any, job: dict[str, Any], guided: bool) -> None:
@@ -112,6 +136,24 @@ def _map(colmap: Any, job: dict[str, Any], output: Path, photos: int) -> dict[st
     models = colmap.incremental_mapping(job["database"], job["photos"], output, options,
                                         initial_image_pair_callback=first_pair, next_image_callback=one_more)
     return {str(output / str(index)): model.num_reg_images() for index, model in models.items()}
+
+
+def _refine(colmap: Any, folder: str, camera_model: str) -> None:
+    """Give a model's lenses all their parameters and adjust everything once more."""
+    model = colmap.Reconstruction(folder)
+    for camera in model.cameras.values():
+        focal, cx, cy, bend = camera.params
+        two_focals = not camera_model.startswith("RADIAL")
+        camera.model = getattr(colmap.CameraModelId, camera_model)
+        known = [focal, focal, cx, cy, bend] if two_focals else [focal, cx, cy, bend]
+        camera.params = known + [0.0] * (len(camera.params_info.split(",")) - len(known))
+    options = colmap.BundleAdjustmentOptions()
+    options.ceres.solver_options.num_threads = 1
+    options.print_summary = False
+    colmap.bundle_adjustment(model, options)
+    colmap.ObservationManager(model).filter_all_points3D(_FAR_OFF, _NARROW)
+    model.update_point_3d_errors()
+    model.write(folder)
 
 
 def _tell(**event: Any) -> None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 230.0
+FISHEYE_FOCAL = 170.0
 N_PHOTOS = 8
 
 
@@ -30,11 +31,18 @@ def cam_from_world(index: int, count: int = N_PHOTOS) -> NDArray[np.float64]:
     return pose
 
 
-def picture(index: int, count: int = N_PHOTOS, width: int = WIDTH, height: int = HEIGHT) -> NDArray[np.uint8]:
-    """(H, W, 3) photo of two walls that meet at right angles behind the origin."""
-    scale = width / WIDTH
-    y, x = np.mgrid[:height, :width] + 0.5
-    rays = np.stack([(x - width / 2) / (FOCAL * scale), (y - height / 2) / (FOCAL * scale), np.ones_like(x)], axis=2)
+def picture(index: int, count: int = N_PHOTOS, fisheye: bool = False) -> NDArray[np.uint8]:
+    """(H, W, 3) photo of two walls that meet at right angles behind the origin.
+
+    fisheye : equidistant.
+    """
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    focal = FISHEYE_FOCAL if fisheye else FOCAL
+    across, down = (x - WIDTH / 2) / focal, (y - HEIGHT / 2) / focal
+    if fisheye:
+        angle = np.hypot(across, down)
+        across, down = across * np.tan(angle) / angle, down * np.tan(angle) / angle
+    rays = np.stack([across, down, np.ones_like(x)], axis=2)
     pose = cam_from_world(index, count)
     centre, directions = -pose[:3, :3].T @ pose[:3, 3], rays @ pose[:3, :3]
     image, nearest = np.zeros(x.shape), np.full(x.shape, np.inf)
@@ -51,11 +59,11 @@ def picture(index: int, count: int = N_PHOTOS, width: int = WIDTH, height: int =
     return np.repeat(np.rint(255 * image).astype(np.uint8)[:, :, None], 3, axis=2)
 
 
-def write_walk(folder: Path, count: int = N_PHOTOS) -> Path:
+def write_walk(folder: Path, count: int = N_PHOTOS, fisheye: bool = False) -> Path:
     """All photos as PNG."""
     folder.mkdir(parents=True, exist_ok=True)
     for index, name in enumerate(names(count)):
-        Image.fromarray(picture(index, count)).save(folder / name)
+        Image.fromarray(picture(index, count, fisheye)).save(folder / name)
     return folder
 
 

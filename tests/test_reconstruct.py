@@ -238,6 +238,19 @@ def test_options(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_fisheye_photos_become_pinhole_images(tmp_path: Path) -> None:
+    """Drawn with an equidistant lens: poses, focal length and, by them, the undistorted images come out right."""
+    photo_walk.write_walk(tmp_path / "walk", fisheye=True)
+    clsplat("reconstruct", tmp_path / "walk", "-o", tmp_path / "scene", "--camera-model", "OPENCV_FISHEYE")
+    scene = load_scene(tmp_path / "scene", eval=False)
+    assert scene.names == photo_walk.names()
+    off, angle = aligned_error(scene)
+    assert off < 0.02
+    assert angle < 1
+    assert scene.views[0].camera.fx == pytest.approx(photo_walk.FISHEYE_FOCAL, rel=0.05)
+
+
+@pytest.mark.slow
 def test_same_photos_same_model_and_a_video(walk: Path, tmp_path: Path) -> None:
     """Bit for bit the same twice, from the API; and from a video of the photos."""
     steps: list[Step] = []
