@@ -41,8 +41,12 @@ class Terminal:
 
     def seen(self) -> list[str]:
         """Lines of what was written since the last look, as a terminal of today's width shows them."""
-        os.set_blocking(self.master, False)
-        text = os.read(self.master, 65536).decode()
+        self.stream.write("\0")  # the kernel hands it on when it likes: read to here
+        self.stream.flush()
+        raw = b""
+        while not raw.endswith(b"\0"):
+            raw += os.read(self.master, 65536)
+        text = raw[:-1].decode()
         lines, at_column = [""], 0
         for letter in text.replace("\r\n", "\n"):
             if letter == "\n" or at_column == self.columns:
