@@ -17,9 +17,9 @@ from .video import require_encoder
 FRAMES = 120  # wanted of a video, where it has so many
 FEWEST = 3
 _SIDE = 384  # frames are compared at this width and height [px]
-# One frame after another at a made-up steady rate, so that ffmpeg neither drops nor doubles any in either pass.
-_STEADY = "setpts=N/25/TB"
+# Frames one after another at a made-up steady rate, so that ffmpeg neither drops nor doubles any in either pass.
 _RATE = ("-r", "25")
+_STEADY = "setpts=N/25/TB"
 
 
 def extract_frames(video: Path, folder: Path, frames: int = FRAMES,
@@ -51,7 +51,7 @@ def extract_frames(video: Path, folder: Path, frames: int = FRAMES,
     chosen = sharpest(sharpness, frames)
     folder.mkdir(parents=True, exist_ok=True)
     wanted = "+".join(f"eq(n\\,{index})" for index in chosen)
-    _run([*_ffmpeg(video), "-vf", f"select={wanted},{_STEADY}", *_RATE, "-q:v", "1", "-qmin", "1", "-start_number", "0",
+    _run([*_ffmpeg(video), "-vf", f"select={wanted},{_STEADY}", "-q:v", "1", "-qmin", "1", "-start_number", "0",
           str(folder / "%06d.jpg")], video)
     files = []
     for order, index in enumerate(chosen):
@@ -78,11 +78,11 @@ def _sharpness(grey: NDArray[np.uint8]) -> float:
 def _ffmpeg(video: Path) -> list[str]:
     import imageio_ffmpeg
 
-    return [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-i", str(video)]
+    return [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", *_RATE, "-i", str(video)]
 
 
 def _grey_frames(video: Path) -> Iterator[NDArray[np.uint8]]:
-    command = [*_ffmpeg(video), "-vf", f"{_STEADY},scale={_SIDE}:{_SIDE},format=gray", *_RATE, "-f", "rawvideo", "-"]
+    command = [*_ffmpeg(video), "-vf", f"scale={_SIDE}:{_SIDE},format=gray", "-f", "rawvideo", "-"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as decoder:
         assert decoder.stdout is not None
         try:

@@ -22,11 +22,12 @@ def test_sharpest_of_each_stretch() -> None:
     assert sharpest([4.0, 4.0], 10) == [0, 1]
 
 
-def test_frames_are_the_sharp_ones_and_in_their_order(tmp_path: Path) -> None:
+@pytest.mark.parametrize("fps", [10, 30, 60])
+def test_frames_are_the_sharp_ones_and_in_their_order(tmp_path: Path, fps: int) -> None:
     """Of twelve frames, three are sharp; a patch tells which."""
     sharp = {2, 5, 10}
     noise = np.random.default_rng(0).integers(0, 256, (20, 30, 3)).astype(np.uint8).repeat(4, axis=0).repeat(4, axis=1)
-    with VideoWriter(tmp_path / "walk.mp4", 30) as writer:
+    with VideoWriter(tmp_path / "walk.mp4", fps) as writer:
         for index in range(12):
             image = Image.fromarray(noise)
             picture = np.array(image if index in sharp else image.filter(ImageFilter.GaussianBlur(4)))
