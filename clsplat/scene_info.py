@@ -146,6 +146,8 @@ def _lenses(posed: Posed) -> tuple[LensUse, ...]:
     for photo in posed.photos:
         lens = photo.lens
         focal = float(f"{lens.params[0]:.{_DIGITS}g}")  # of every model that an image can be made of
+        if not 0.0 < focal < math.inf:
+            raise InputError(f"image {photo.name!r}: its camera has a focal length of {focal:g} px; rebuild the model")
         angle = math.degrees(2.0 * math.atan(lens.width / (2.0 * focal)))
         uses[LensUse(lens.model.name, is_pinhole(lens), lens.width, lens.height, focal, round(angle, 1))] += 1
     return tuple(replace(lens, photos=n) for lens, n in uses.most_common())

@@ -85,6 +85,16 @@ def test_a_reconstructed_scene_says_how_it_went(tmp_path: Path) -> None:
     assert "photographs without poses: clsplat reconstruct" in error_of("info", garden / "images")
 
 
+def test_a_lens_without_a_focal_length_is_named(tmp_path: Path) -> None:
+    garden = write_garden(tmp_path)
+    file = garden / "sparse" / "0" / "cameras.bin"
+    data = bytearray(file.read_bytes())
+    for focal in (0.0, float("nan")):
+        data[32:40] = np.float64(focal).tobytes()  # behind the count, id, model, width and height
+        file.write_bytes(data)
+        assert "has a focal length of" in error_of("info", garden)
+
+
 def test_models_and_scenes_are_told_apart(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     model, scene = small_model(tmp_path_factory), small_capture(tmp_path_factory)
     said = clsplat("info", model, scene)
