@@ -31,6 +31,7 @@ from .photo_folder import (
 )
 from .sfm import ENOUGH
 from .sfm_process import Step, Tell, run_sfm
+from .sole_writer import sole_writer
 from .video_frames import FRAMES, extract_frames
 
 T = TypeVar("T")
@@ -201,15 +202,19 @@ def _refuse_used(scene: Path, overwrite: bool) -> None:
 
 @contextmanager
 def _unfinished(scene: Path) -> Iterator[Path]:
-    """A folder beside the scene to work in, removed in the end."""
-    work = scene.with_name(f".{scene.name}.{os.getpid()}.unfinished")
+    """An empty folder beside the scene to work in, removed in the end; what a killed run left of it goes first."""
+    work = scene.with_name(f".{scene.name}.unfinished")
     try:
-        work.mkdir(parents=True)
-        yield work
+        work.mkdir(parents=True, exist_ok=True)
+        with sole_writer(work):
+            for left in work.iterdir():
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
+            try:
+                yield work
+            finally:
+                shutil.rmtree(work, ignore_errors=True)
     except OSError as error:
         raise OutputError(f"{scene}: cannot be written ({error.strerror or error}); choose another place") from None
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def _put(finished: Path, scene: Path) -> None:

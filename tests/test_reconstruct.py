@@ -10,7 +10,7 @@ import time
 import warnings
 from pathlib import Path
 
-import clsplat_cli.reconstruct as command
+import clsplat_cli.reconstruct as cli
 import numpy as np
 import photo_walk
 import pytest
@@ -177,13 +177,34 @@ def test_a_crash_of_the_library_is_one_line(tmp_path: Path, monkeypatch: pytest.
         assert [entry.name for entry in tmp_path.iterdir()] == ["walk"]
 
 
+def test_what_a_killed_run_left_goes_and_another_run_is_kept_out(tmp_path: Path) -> None:
+    left = tmp_path / ".scene.unfinished"
+    (left / "photos").mkdir(parents=True)
+    (left / "database.db").write_bytes(b"half")
+    with module._unfinished(tmp_path / "scene") as work:
+        assert work == left
+        assert not any(work.iterdir())
+    assert not left.exists()
+    left.mkdir()
+    program = "import sys; from clsplat.sole_writer import sole_writer; from pathlib import Path\n" \
+              "with sole_writer(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", program, left]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with pytest.raises(OutputError, match="another run writes"), module._unfinished(tmp_path / "scene"):
+            pass
+        other.communicate()
+    assert left.exists()
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_ctrl_c_leaves_nothing(walk: Path, tmp_path: Path) -> None:
     program = "from clsplat_cli.main import main; main()"
     child = subprocess.Popen([sys.executable, "-c", program, "reconstruct", walk, "-o", tmp_path / "scene"],
                              stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while not list(tmp_path.glob(".scene.*/database.db")) and time.monotonic() < deadline:
+    while not list(tmp_path.glob(".scene.unfinished/database.db")) and time.monotonic() < deadline:
         time.sleep(0.05)
     child.send_signal(signal.SIGINT)
     errors = child.communicate(timeout=60)[1]
@@ -227,8 +248,8 @@ def test_warnings_of_photos_that_are_not_placed(tmp_path: Path) -> None:
 
 def test_options(tmp_path: Path) -> None:
     for name in ("CAMERA_MODELS", "CAMERA_MODES", "MATCHERS"):
-        assert getattr(command, name) == getattr(module, name)
-    defaults = {param.name: param.default for param in command.reconstruct_scene.params}
+        assert getattr(cli, name) == getattr(module, name)
+    defaults = {param.name: param.default for param in cli.reconstruct_scene.params}
     for name, value in vars(ReconstructOptions()).items():
         assert defaults[name] == value
     with pytest.raises(InputError, match="camera_model 'LENS': use one of SIMPLE_PINHOLE"):
