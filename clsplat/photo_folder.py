@@ -206,7 +206,7 @@ def _names(home: Path, suffixes: frozenset[str]) -> list[str]:
 def _foreign(home: Path) -> str:
     names = _names(home, _FOREIGN)
     kinds = sorted({Path(name).suffix.lower() for name in names})
-    return f"{len(names)} files {', '.join(kinds)}" if names else ""
+    return f"{len(names)} file{'s' if len(names) > 1 else ''} {', '.join(kinds)}" if names else ""
 
 
 def _scene_names(names: list[str]) -> list[str]:

@@ -43,7 +43,7 @@ CAMERA_MODES = ("auto", "single", "per-image", "per-folder")
 MATCHERS = ("auto", "exhaustive", "sequential")
 RECORD = "reconstruct.json"  # in the scene: what it was made of and how
 EXHAUSTIVE = 150  # photos; of more, "auto" matches neighbours by name
-SMALL = 1000  # longest side [px] of photos that are searched at twice their size too, four times as long
+SMALL = 640  # longest side [px] of photos that are searched at twice their size too, four times as long
 _OVERLAP = 10  # neighbours of a photo in a sequence
 _LOOP = 10  # every so many-th photo of a sequence is matched with all others of these, to close loops
 _FEWEST = 3
@@ -234,7 +234,7 @@ def _prepared(given: Sequence[PhotoFile], source: Path, work: Path, say: Tell) -
     ready = [result for result in found if not isinstance(result, str)]
     foreign = unread_kinds(source)
     if foreign:
-        warnings.warn(f"{source}: {foreign} are left out; convert them to JPEG to use them", stacklevel=3)
+        warnings.warn(f"left out: {foreign} in {source}; convert to JPEG to use them", stacklevel=3)
     if reasons:
         more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         warnings.warn(f"left out: {reasons[0]}{more}", stacklevel=3)

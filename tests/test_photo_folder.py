@@ -83,9 +83,9 @@ def test_folders_without_photos(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no photos in it or below; looked for \.bmp"):
         find_photos(tmp_path)
     (tmp_path / "IMG_1.HEIC").write_bytes(b"heic")
-    with pytest.raises(InputError, match=r"1 files \.heic: convert them to JPEG"):
+    with pytest.raises(InputError, match=r"1 file \.heic: convert them to JPEG"):
         find_photos(tmp_path)
-    assert unread_kinds(tmp_path) == "1 files .heic"
+    assert unread_kinds(tmp_path) == "1 file .heic"
     assert not is_photographs(tmp_path)
 
 
