@@ -82,7 +82,7 @@ static inline splat_terms splat_project(global const real *geom, const ulong cap
 #if ANTIALIASED
 // What the low-pass leaves of a splat's height if it keeps the volume: sqrt(det(M) / det(M + low-pass)), the filter on the
 // screen of Mip-Splatting (Yu et al. 2024, eq. 9, with a wider low-pass). M is B B', of the shape's own size, or with its
-// displacement m B (1 + m m') B'. Exact for kernels of a quadratic form; where a splat has sides, its peak changes besides.
+// displacement m B (1 + m m') B'. A skew-normal's peak changes besides: it is divided by the one before (skew_pixel.clh).
 typedef struct {
     vec3 b0, b1, area, m;
     vreal size, along, stretch, flat, det, factor;  // along: area'm, stretch: 1 + m'm, flat: det(M)

@@ -10,14 +10,14 @@ All of it accepts complex arrays; see reference_formulas.py for the closed forms
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from reference_formulas import inverse_2x2, jacobian, normal_cdf, rotation, sh_basis
+from reference_formulas import determinant, inverse_2x2, jacobian, normal_cdf, rotation, sh_basis
 from reference_radial import RADIAL
-from reference_shape import LOW_PASS, Array, Geometry, Kernel
+from reference_shape import Array, Geometry, Kernel
 from reference_skewed import SKEWED
 
 from clsplat.camera import Camera
@@ -63,15 +63,17 @@ def axes_of(arrays: Mapping[str, Array]) -> Array:
     return rotation(arrays["quat"]) * np.exp(arrays["log_scale"])[:, None, :]
 
 
-def lowered(kernel: Kernel) -> Kernel:
-    """The kernel times the share of its area that the low-pass does not add: the root of a ratio of determinants."""
-    def det(m: Array) -> Array:
-        return m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
+def plain_kernel(arrays: Mapping[str, Array], geometry: Geometry, shape: str, normalisation: str) -> Kernel:
+    return REFERENCES[shape].kernel(arrays, geometry, normalisation)
 
-    own = det(kernel.scale2d - LOW_PASS * np.eye(2))
-    factor = np.sqrt(np.where(own.real > 0.0, own, 0.0) / det(kernel.scale2d))
-    minus = None if kernel.amplitude_minus is None else factor * kernel.amplitude_minus
-    return kernel._replace(amplitude=factor * kernel.amplitude, amplitude_minus=minus)
+
+def antialiased_kernel(arrays: Mapping[str, Array], geometry: Geometry, shape: str, normalisation: str) -> Kernel:
+    """The kernel with the volume that it has without the low-pass: height times root of the determinant."""
+    make = REFERENCES[shape].kernel
+    kernel, own = (make(arrays, each, normalisation) for each in (geometry, replace(geometry, low_pass=0.0)))
+    factor = np.sqrt(determinant(own.scale2d) / determinant(kernel.scale2d))
+    minus = None if own.amplitude_minus is None else factor * own.amplitude_minus
+    return kernel._replace(amplitude=factor * own.amplitude, amplitude_minus=minus)
 
 
 def project(arrays: Mapping[str, Array], camera: Camera, shape: str = "gaussian", normalisation: str = "peak",
@@ -82,9 +84,8 @@ def project(arrays: Mapping[str, Array], camera: Camera, shape: str = "gaussian"
     z = point[:, 2]
     mean_px = point[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     geometry = Geometry(mean_px, jacobian(point, camera) @ camera.rotation, axes_of(arrays))
-    kernel = REFERENCES[shape].kernel(arrays, geometry, normalisation)
-    if antialiased:
-        kernel = lowered(kernel)
+    make = antialiased_kernel if antialiased else plain_kernel
+    kernel = make(arrays, geometry, shape, normalisation)
 
     stored = int(np.sqrt(arrays["sh"].shape[1])) - 1
     degree = stored if sh_degree is None else sh_degree

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from reference_shape import LOW_PASS, Array, Geometry, Kernel, ShapeReference, logistic
+from reference_shape import Array, Geometry, Kernel, ShapeReference, logistic
 
 
 def student_t(arrays: Mapping[str, Array], geometry: Geometry, normalisation: str) -> Kernel:
@@ -35,7 +35,7 @@ def generalised_exponential(arrays: Mapping[str, Array], geometry: Geometry, nor
 def ges_modulation(arrays: Mapping[str, Array], geometry: Geometry, normalisation: str) -> Kernel:
     """The Gaussian of scales times 2 sigma(0.1 (beta - 2))."""
     size = 2.0 * logistic(0.1 * (arrays["beta"] - 2.0))
-    low_pass = LOW_PASS * np.eye(2)
+    low_pass = geometry.low_pass * np.eye(2)
     scale2d = (size * size)[:, None, None] * (geometry.matrix2d() - low_pass) + low_pass
     return Kernel(geometry.point_px, scale2d, logistic(arrays["opacity_logit"]))
 

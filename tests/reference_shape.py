@@ -6,7 +6,7 @@ Every function accepts complex arrays (see reference_formulas.py: the complex st
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,18 +50,20 @@ class Kernel(NamedTuple):
 @dataclass(frozen=True)
 class Geometry:
     """The projection that all shapes share: point_px (B, 2) of the point that is projected, the affine map about it
-    (B, 2, 3) [px per world unit] and the splats' axes R S (B, 3, 3), world from unit frame.
+    (B, 2, 3) [px per world unit], the splats' axes R S (B, 3, 3), world from unit frame, and what the low-pass adds
+    [px²].
     """
 
     point_px: Array
     affine: Array
     axes: Array
+    low_pass: float = field(default_factory=lambda: LOW_PASS)
 
     def matrix2d(self, inner: Array | None = None) -> Array:
         """Screen matrix A R S inner S R' A' + low-pass of the (B, 3, 3) `inner`, the identity by default."""
         b = self.affine @ self.axes
         half = b if inner is None else b @ inner
-        return half @ np.swapaxes(b, 1, 2) + LOW_PASS * np.eye(2)
+        return half @ np.swapaxes(b, 1, 2) + self.low_pass * np.eye(2)
 
     def vector2d(self, inner: Array) -> Array:
         """A R S inner (B, 2) of the (B, 3) `inner`."""
