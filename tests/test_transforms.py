@@ -292,3 +292,19 @@ def test_what_no_file_can_be_called_is_refused(tmp_path: Path, key: str, name: s
     (tmp_path / "transforms.json").write_text(json.dumps(values))
     with pytest.raises(InputError, match=r"name|cannot be read"):
         load_scene(tmp_path)
+
+
+def test_names_lead_out_of_no_folder(tmp_path: Path) -> None:
+    """Renders are written under the names of their views."""
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    frames = []
+    for number, name in enumerate(("inside/../a.png", "../b.png")):
+        file = scene / name
+        (scene / "inside").mkdir(exist_ok=True)
+        write_png(file, np.zeros((4, 6, 3)))
+        pose = np.eye(4)
+        pose[0, 3] = number
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    (scene / "transforms.json").write_text(json.dumps({"fl_x": 5, "frames": frames}))
+    assert load_scene(scene, eval=False).names == ["a.png", "b.png"]
