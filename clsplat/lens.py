@@ -54,7 +54,7 @@ class Photo:
         """
         height, width = image.shape[:2]
         lens = _scaled(self.lens, width, height, self.name)
-        if not _is_pinhole(lens):
+        if not is_pinhole(lens):
             image, lens = _undistorted(image, lens, self.name)
             height, width = image.shape[:2]
         try:
@@ -84,7 +84,7 @@ class Photo:
             raise InputError(f"image {self.name!r}: its mask is {columns}x{rows} px, the photo {width}x{height}; "
                              "make the mask of the photo's size")
         lens = _scaled(self.lens, width, height, self.name)
-        if _is_pinhole(lens):
+        if is_pinhole(lens):
             if mask.shape == (height, width):
                 return mask.astype(bool)
             down, across = np.mgrid[:height, :width] + 0.5
@@ -125,7 +125,8 @@ def _scaled(lens: Any, width: int, height: int, name: str) -> Any:
     return scaled
 
 
-def _is_pinhole(lens: Any) -> bool:
+def is_pinhole(lens: Any) -> bool:
+    """Whether its photos are pinhole images as they are."""
     kind = lens.model.name
     if kind in _PINHOLES:
         return True
