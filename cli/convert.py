@@ -99,8 +99,6 @@ def _of_degree(splats: Splats, degree: int) -> Splats:
     """The colours cut to an SH degree, or with bands of zeros up to it."""
     import numpy as np
 
-    from clsplat.splats import Splats
-
     sh = splats.sh[:, : sh_coefficients(degree)]
     sh = np.pad(sh, ((0, 0), (0, sh_coefficients(degree) - sh.shape[1]), (0, 0)))
     return splats.with_arrays(splats.to_numpy() | {"sh": sh})

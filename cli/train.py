@@ -11,7 +11,6 @@ import click
 from clsplat.config import TrainConfig
 from clsplat.errors import InputError, OutputError
 from clsplat.model_folder import ModelFolder, read_json
-from clsplat.photo_folder import is_photographs, is_video
 from clsplat.presets import PRESETS, with_preset
 
 from .budget import budget_options, forget_search, is_search, options_of, run_search, stored_search
@@ -74,6 +73,8 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
     into the model's folder. Ctrl-C saves a checkpoint; --resume goes on from it. With --budget auto also budget.json
     and the growth curve; the small model is the last point cloud.
     """
+    from clsplat.photo_folder import is_photographs, is_video
+
     if resume and overwrite:
         raise click.UsageError("give --resume or --overwrite, not both")
     if scene and source_path and scene != source_path:
@@ -206,7 +207,7 @@ def _options_in(file: Path) -> dict[str, Any]:
 def _stored_run(folder: ModelFolder) -> tuple[dict[str, Any], dict[str, Any]]:
     """Options and scene of the run in the folder."""
     if not folder.checkpoint_path.is_file():
-        raise InputError(f"{folder.path}: no checkpoint to resume from: start without --resume")
+        raise InputError(f"{folder.path}: no checkpoint to resume from: start with --overwrite")
     stored = folder.read_config()
     try:
         config = TrainConfig.from_json(stored["config"])

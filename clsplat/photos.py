@@ -98,7 +98,7 @@ class PhotoLoss:
         if not self.learns:
             return
         if rows is None or rows.shape != self._rows.shape:
-            raise InputError(f"checkpoint: has no exposures of {len(self._rows)} photos: start without --resume")
+            raise InputError(f"checkpoint: has no exposures of {len(self._rows)} photos: start with --overwrite")
         to_device(self.device, self._exposures, rows.astype(self.kernels.dtype))
 
     def _download(self) -> NDArray[np.floating]:

@@ -71,14 +71,19 @@ def test_no_registered_image(scene: Path) -> None:
 def test_photos_missing_damaged_or_of_another_shape(scene: Path) -> None:
     photo = scene / "images" / "view_003.png"
     photo.write_bytes(photo.read_bytes()[:100])
-    assert "view_003.png" in error_of("train", scene, "-m", scene / "m")
+    left_out = run("train", scene, "-m", scene / "m", "--iterations", "1", "--cap-max", "20", "--quiet")
+    assert left_out.exit_code == 0
+    (line,) = left_out.stderr.splitlines()
+    assert line.startswith("warning: ")
+    assert "1 of 10 photos are left out" in line
+    assert "view_003.png" in line
     write_png(photo, np.zeros((50, WIDTH, 3)))
-    assert "view_003.png" in error_of("train", scene, "-m", scene / "m")
+    assert "view_003.png" in error_of("train", scene, "-m", scene / "n")
     photo.unlink()
     assert "1 of the model's 10 images are missing: view_003.png" in error_of(
-        "train", scene, "-m", scene / "m"
+        "train", scene, "-m", scene / "n"
     )
-    assert "images_4" in error_of("train", scene, "-m", scene / "m", "-i", "images_4")
+    assert "images_4" in error_of("train", scene, "-m", scene / "n", "-i", "images_4")
 
 
 def test_few_registered_photos_warn_in_one_line(scene: Path) -> None:
