@@ -56,6 +56,8 @@ class TrainConfig:
     sampling : what new and relocated splats are drawn by: "opacity" (3DGS-MCMC), or "pull", opacity times the
         gradient of the screen position (3DGS's criterion), which sends them where the image is still wrong.
     init : "sfm", "random" or a .ply path.
+    random_points : points at random beside the scene's, as a fraction of the cap; not given: 0.1 where the scene has
+        fewer than that, else none.
     sh_degree : highest degree of spherical harmonics, 0 to 3.
     sh_interval : iterations from one SH degree to the next; 0: a tenth of the run, at most 1000.
     lambda_dssim : weight of 1 - SSIM against L1.
@@ -123,6 +125,7 @@ class TrainConfig:
     relocation_limit: float = 1.0
     sampling: str = "opacity"
     init: str = "sfm"
+    random_points: float | None = None
     sh_degree: int = 3
     sh_interval: int = 0
     lambda_dssim: float = 0.2
@@ -195,6 +198,8 @@ class TrainConfig:
             _at_least(name, getattr(self, name), 0)
         if self.skew_lr is not None:
             _at_least("skew_lr", self.skew_lr, 0)
+        if self.random_points is not None and not 0 <= self.random_points <= 1:
+            raise InputError(f"random_points {self.random_points}: must be 0 to 1, a fraction of cap_max")
         if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise InputError(f"sh_degree {self.sh_degree}: must be 0 to {MAX_SH_DEGREE}")
         for name in ("lambda_dssim", "relocation_limit", "exposure_rate", "sghmc_burn_in", "alternation_warmup",

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 OPACITY = 0.5
 SCALE_FACTOR = 0.1
 RANDOM_POINTS = 100_000  # 3DGS
+FEW = 0.1  # of the cap: of fewer points, as many are added at random
 FEWEST_POINTS = 4  # a point and its three neighbours give the first scale
 _TOO_NEAR = 0.1  # of what cameras see may be nearer than the near plane
 _LOOKED_AT = 2000  # points, to find that out
@@ -37,6 +38,7 @@ def initial_splats(
     *,
     normalisation: str = "peak",
     antialiased: bool = False,
+    random_share: float | None = 0.0,
     opacity: float = OPACITY,
     scale_factor: float = SCALE_FACTOR,
 ) -> tuple[Splats, str]:
@@ -51,6 +53,8 @@ def initial_splats(
     cap : most splats; of more points those with the longest tracks are kept, of a model the most opaque.
     init : "sfm", "random", or the path of a .ply model. "sfm" without points becomes "random" and says so.
     seed : of random points and of the first skew.
+    random_share : points at random beside those of "sfm", as a fraction of the cap; None: a tenth where the scene has
+        fewer, else 0.
     opacity, scale_factor : of splats made from points; scale = factor * distance to the three nearest.
 
     Raises
@@ -65,7 +69,7 @@ def initial_splats(
     if init.lower().endswith(".ply"):
         splats, message = _from_model(init, shape, cap, sh_degree, normalisation, antialiased)
     elif init in ("sfm", "random"):
-        xyz, rgb, message = _points(scene, init, cap, rng)
+        xyz, rgb, message = _points(scene, init, cap, rng, random_share)
         order = morton_order(xyz)
         xyz, rgb = xyz[order], rgb[order]
         splats = Splats.from_points(xyz, rgb, shape=shape, sh_degree=sh_degree, normalisation=normalisation,
@@ -76,7 +80,7 @@ def initial_splats(
 
 
 def _points(
-    scene: Scene, init: str, cap: int, rng: np.random.Generator
+    scene: Scene, init: str, cap: int, rng: np.random.Generator, random_share: float | None
 ) -> tuple[Array, NDArray[np.uint8], str]:
     """Positions, colours and the message."""
     points = scene.points
@@ -84,16 +88,33 @@ def _points(
     apart = distinct(points.xyz)
     if init == "sfm" and len(apart) >= FEWEST_POINTS:
         xyz, rgb, tracks = points.xyz[apart], points.rgb[apart], points.track_length[apart]
-        if len(apart) <= cap:
-            return xyz, rgb, f"{len(apart)} splats from the scene's points"
-        keep = best_observed(xyz, tracks, cap, scene)
-        return xyz[keep], rgb[keep], f"{cap} splats from the scene's points: the best observed of {len(apart)}"
+        if random_share is None:
+            random_share = FEW if len(apart) < FEW * cap else 0.0
+        beside = min(round(random_share * cap), cap - 1)
+        if len(apart) <= cap - beside:
+            message = f"{len(apart)} splats from the scene's points"
+        else:
+            keep = best_observed(xyz, tracks, cap - beside, scene)
+            message = f"{cap - beside} splats from the scene's points: the best observed of {len(apart)}"
+            xyz, rgb = xyz[keep], rgb[keep]
+        if not beside:
+            return xyz, rgb, message
+        placed = random_points(scene, beside, rng)
+        return np.concatenate([xyz, placed]), np.concatenate([rgb, rgb[nearest_of(xyz, placed)]]), (
+            f"{message}, {beside} at random where the cameras look")
     count = min(cap, RANDOM_POINTS)
     placed = random_points(scene, count, rng)
     rgb = rng.integers(0, 256, (count, 3), dtype=np.uint8)
     there = f"{found} points" if len(apart) == found else f"{found} points, {len(apart)} of them apart"
     why = "" if init == "random" else f" (the scene has {there}): expect less than from good points"
     return placed, rgb, f"{count} splats at random where the cameras look{why}"
+
+
+def nearest_of(xyz: Array, to: Array) -> NDArray[np.int64]:
+    """Indices of the points of `xyz` (P, 3) that are nearest to each of `to`."""
+    from scipy.spatial import cKDTree  # a third of a second to import
+
+    return np.asarray(cKDTree(xyz).query(to, workers=-1)[1], np.int64)
 
 
 def distinct(xyz: Array) -> NDArray[np.int64]:

@@ -33,7 +33,7 @@ def _gaussian_splatting() -> Values:
         "position_lr_init": 1.6e-4, "position_lr_final": 1.6e-6, "feature_lr": 2.5e-3, "opacity_lr": 0.05,
         "scaling_lr": 5e-3, "rotation_lr": 1e-3, "lambda_dssim": 0.2,
         "opacity_reg": 0.0, "scale_reg": 0.0, "bisect_reg": 0.0, "noise_lr": 0.0,
-        "init_opacity": 0.1, "init_scale": 1.0,
+        "init_opacity": 0.1, "init_scale": 1.0, "random_points": 0.0,
         "densify_from": 500 / 30_000, "densify_until": 15_000 / 30_000, "densify_interval": 100,
         "grad_threshold": 2e-4, "depth_threshold": 0.0, "dense_size": 0.01, "opacity_reset": 10,
     }  # fmt: skip
@@ -112,6 +112,7 @@ def _skew_normal() -> Values:
         "sghmc_burn_in_friction": 5e5, "noise_lr": 0.0, "alternation": "cyclic",
         "opacity_reg": 0.0, "scale_reg": 0.0, "bisect_reg": 0.0, "lambda_dssim": 0.2,
         "densify_from": 500 / 30_000, "densify_until": 25_000 / 30_000, "densify_interval": 100,
+        "random_points": 0.0,
     }  # fmt: skip
 
 

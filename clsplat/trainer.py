@@ -102,8 +102,8 @@ class Trainer:
         if checkpoint is None:
             start, message = initial_splats(
                 scene, config.shape, config.cap_max, config.sh_degree, config.init, config.seed,
-                normalisation=config.normalisation, antialiased=config.antialiased, opacity=config.init_opacity,
-                scale_factor=config.init_scale)
+                normalisation=config.normalisation, antialiased=config.antialiased,
+                random_share=config.random_points, opacity=config.init_opacity, scale_factor=config.init_scale)
             first = start.to_numpy()
         else:
             first = checkpoint.splats  # not as Splats: it may hold splats that the strategy is yet to mend

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from clsplat.camera import Camera
+from clsplat.config import TrainConfig
 from clsplat.errors import InputError
 from clsplat.initialise import RANDOM_POINTS, initial_splats
 from clsplat.morton import morton_order
+from clsplat.presets import PRESETS, preset
 from clsplat.shapes import SHAPES
 from clsplat.splats import Splats
 
@@ -190,3 +192,21 @@ def test_a_scene_before_the_near_plane_is_refused() -> None:
     source.path = "yard"
     with pytest.raises(InputError, match=r"^yard: 100% of what its cameras see is nearer .* about 100 times as large"):
         initial_splats(source)
+
+
+def test_random_points_beside_few() -> None:
+    """A fraction of the cap; of itself a tenth, where the scene has fewer points. In colours of neighbours."""
+    source = scene(60)
+    for share, cap, ours, placed in ((None, 500, 60, 0), (None, 601, 60, 60), (0.5, 100, 50, 50), (0.0, 10_000, 60, 0),
+                                     (1.0, 40, 1, 39), (0.1, 30, 27, 3)):
+        splats, message = initial_splats(source, cap=cap, random_share=share)
+        assert len(splats) == ours + placed
+        assert (f"{placed} at random" in message) == (placed > 0)
+        assert message.startswith(f"{ours} splats from the scene's points")
+        known = {tuple(row) for row in np.round(source.points.xyz, 4).astype(np.float32)}
+        assert sum(tuple(row) in known for row in np.round(splats.mean, 4)) == ours
+        given = {tuple(rgb) for rgb in source.points.rgb}
+        assert {tuple(row) for row in np.rint(255 * (0.5 + 0.28209479 * splats.sh[:, 0])).astype(int)} <= given
+    with pytest.raises(InputError, match="random_points 2: must be 0 to 1"):
+        TrainConfig(random_points=2)
+    assert all(preset(name)["random_points"] == 0 for name in PRESETS)
