@@ -213,6 +213,6 @@ def _stored_run(folder: ModelFolder) -> tuple[dict[str, Any], dict[str, Any]]:
         config = TrainConfig.from_json(stored["config"])
         scene = dict(stored["scene"])
         scene["path"] = str(scene["path"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{folder.config_path}: damaged ({error}): start again with --overwrite") from None
     return {name: getattr(config, name) for name in stored["config"]}, scene
