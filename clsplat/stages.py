@@ -18,7 +18,7 @@ STAGES = {
     "binning": ("count_tiles", "total_tiles", "count_isects", "emit_isects"),
     "tile sort": ("list_isects", "find_tile_ranges"),
     "rasterize": ("rasterize",),
-    "loss": ("unpack_image", "image_loss", "image_loss_vjp"),
+    "loss": ("unpack_image", "photo_of_render", "image_loss", "image_loss_vjp", "photo_of_render_vjp", "step_exposure"),
     "rasterize_vjp": ("rasterize_vjp",),
     "gather": ("gather_isect_grads",),
     "project_vjp": ("project_splats_vjp",),

@@ -1,4 +1,7 @@
-"""Shared fixtures: every usable OpenCL device, every schedule, and renderers built once for the whole run."""
+"""Shared fixtures: every usable OpenCL device, every schedule, and renderers built once for the whole run.
+
+The default device is the first; the others are for the slow tests, as building all kernels takes minutes on each.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,17 @@ MakeRenderer = Callable[..., Renderer]
 
 # A checker that claims to be a device is too slow for these tests and has one of its own (test_oclgrind.py).
 USABLE = [info for info in list_devices() if info.ailment is None and info.platform != "Oclgrind"]
+DEFAULT = open_device().info.index if USABLE else ""
+USABLE.sort(key=lambda info: info.index != DEFAULT)
 
 NAMES = [info.platform.split()[0] for info in USABLE]
+
+
+
+def on_place(place: int, *values: object) -> object:
+    """Parameters of a test on the device in this place of USABLE."""
+    return pytest.param(*(values or (place,)), marks=[pytest.mark.slow] if place else [])
+
 
 # All schedules on the first device; on others one of lanes and one of groups, as building them takes seconds.
 DEVICE_SCHEDULES = [
@@ -38,13 +50,13 @@ def devices() -> list[Device]:
     return [open_device(info.index) for info in USABLE]
 
 
-@pytest.fixture(scope="session", params=range(len(USABLE)), ids=NAMES)
+@pytest.fixture(scope="session", params=[on_place(place) for place in range(len(USABLE))], ids=NAMES)
 def device(request: pytest.FixtureRequest, devices: list[Device]) -> Device:
     """Each usable device in turn."""
     return devices[request.param]
 
 
-@pytest.fixture(scope="session", params=DEVICE_SCHEDULES,
+@pytest.fixture(scope="session", params=[on_place(place, (place, name)) for place, name in DEVICE_SCHEDULES],
                 ids=[f"{NAMES[place]}-{name}" for place, name in DEVICE_SCHEDULES])
 def scheduled(request: pytest.FixtureRequest, devices: list[Device]) -> tuple[Device, Schedule]:
     """Each device with each of the schedules that it is tested with."""

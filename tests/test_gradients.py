@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import USABLE, MakeRenderer
+from conftest import USABLE, MakeRenderer, on_place
 from kernel_checks import BACKGROUND, KERNELS, SMOOTH, Arrays, Case
 from reference import FIELDS
 from reference_formulas import SKEW_MAX
@@ -32,7 +32,7 @@ TWO_POINTS = ((1, 0.5), (-1, -0.5))  # exact where the image is linear: in the c
 # Schedules differ in the raster only, normalisations in the projection only: not all of their products, and
 # normalisations on the first device only.
 BUILDS = [(0, *kernel, "cpu16") for kernel in KERNELS] + [(0, "skew-normal", "peak", "gpu256")]
-BUILDS += [(place, *kernel, "cpu16") for place in range(1, len(USABLE)) for kernel in KERNELS[:2]]
+BUILDS += [on_place(place, place, *kernel, "cpu16") for place in range(1, len(USABLE)) for kernel in KERNELS[:2]]
 
 
 def awkward_splats(camera: Camera) -> Arrays:

@@ -202,7 +202,9 @@ def test_what_a_killed_run_left_goes_and_another_run_is_kept_out(tmp_path: Path)
 def test_ctrl_c_leaves_nothing(walk: Path, tmp_path: Path) -> None:
     program = "from clsplat_cli.main import main; main()"
     child = subprocess.Popen([sys.executable, "-c", program, "reconstruct", walk, "-o", tmp_path / "scene"],
-                             stderr=subprocess.PIPE, text=True)
+                             stderr=subprocess.PIPE, text=True,
+                             # Shells have their background jobs ignore it, and these what they start.
+                             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     deadline = time.monotonic() + 60
     while not list(tmp_path.glob(".scene.unfinished/database.db")) and time.monotonic() < deadline:
         time.sleep(0.05)
