@@ -56,8 +56,6 @@ static inline strip own_strip(int height, int stride, ulong plane, int segment) 
     return own;
 }
 
-static inline vmask inside_image(int vec, int width) { return (vreal)(vec * LANES) + lanes_iota() < (vreal)width; }
-
 // 8-bit interleaved rows of `channels` into planes of bytes with a zero margin. Overwrites; global size: (stride, rows).
 kernel void unpack_image(
     global const uchar *restrict bytes,
@@ -149,7 +147,7 @@ kernel void image_loss(
             const vreal v_hs = by_b2 + by_a2, v_hd = by_b2 - by_a2;
             const vreal v_mean = lanes_mad(ms, by_b1 + by_a1 - v_hs, md * (by_b1 - by_a1 - v_hd));
 
-            const vmask inside = inside_image(own.first + v, width);
+            const vmask inside = lanes_before((own.first + v) * LANES, width);
             const ulong at = centre + v * LANES;
             lanes_store(lanes_if(inside, v_mean, zero), v_maps + at);
             lanes_store(lanes_if(inside, v_hs, zero), v_maps + at + 3 * plane);
@@ -225,8 +223,8 @@ kernel void image_loss_vjp(
             const vreal x = lanes_load(rendered + at), y = truth_load(truth + at);
             const vreal v_ssim = lanes_mad(x + y, v_hs, lanes_mad(x - y, v_hd, v_mean));
             const vreal sign_l1 = lanes_if(x > y, (vreal)1, lanes_if(x < y, (vreal)-1, zero));
-            lanes_store(lanes_if(inside_image(own.first + v, width), l1_scale * sign_l1 - ssim_scale * v_ssim, zero),
-                      v_color + at);
+            lanes_store(lanes_if(lanes_before((own.first + v) * LANES, width), l1_scale * sign_l1 - ssim_scale * v_ssim, zero),
+                        v_color + at);
         }
     }
 }

@@ -11,7 +11,19 @@
 #define SUMS (SQUARES + EXPOSURE)
 #define SATURATED R(0.98)      // a brighter photo says nothing of its exposure
 
-static inline vmask in_row(int vec, int width) { return (vreal)(vec * LANES) + lanes_iota() < (vreal)width; }
+// Vectors of a work-item's row.
+typedef struct { int vecs, first, past; } row_part;
+
+static inline row_part own_part(int width) {
+    const int vecs = (width + LANES - 1) / LANES, first = get_global_id(0) * PHOTO_VECS;
+    return (row_part){vecs, first, min(first + PHOTO_VECS, vecs)};
+}
+
+// Pixels of a vector inside the image that no mask hides.
+static inline vmask counted(global const uchar *truth, ulong plane, int channels, int vec, int width) {
+    const vmask inside = lanes_before(vec * LANES, width);
+    return channels > 3 ? inside & (lanes_uchar_to_real(truth + 3 * plane) > (vreal)0) : inside;
+}
 
 // photo [3 planes]: the render as the photo's camera would show it; target [3 planes of bytes], written with 5 channels:
 // the truth over the background that the render has. shift: that background less the truth's, times 255.
@@ -32,22 +44,18 @@ kernel void photo_of_render(
     real shift_g,
     real shift_b)
 {
-    const int vecs = (width + LANES - 1) / LANES, y = get_global_id(1);
-    const int first = get_global_id(0) * PHOTO_VECS, past = min(first + PHOTO_VECS, vecs);
+    const row_part own = own_part(width);
+    const int y = get_global_id(1);
     global const real *row = exposures + EXPOSURE * view;
     const real shift[3] = {shift_r, shift_g, shift_b};
     const vreal zero = (vreal)0;
     if (y >= height) return;
-    for (int vec = first; vec < past; ++vec) {
+    for (int vec = own.first; vec < own.past; ++vec) {
         const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + vec * LANES;
-        const vmask inside = in_row(vec, width);
+        const vmask inside = lanes_before(vec * LANES, width), counts = counted(truth + at, plane, channels, vec, width);
         const vreal r = lanes_load(color + at), g = lanes_load(color + at + plane), b = lanes_load(color + at + 2 * plane);
-        vmask counts = inside;
-        vreal through = zero;
-        if (channels > 3) {
-            counts &= lanes_uchar_to_real(truth + at + 3 * plane) > zero;
-            through = (vreal)1 - lanes_uchar_to_real(truth + at + 4 * plane) * (real)(1.0 / 255.0);
-        }
+        const vreal through = channels > 3
+            ? (vreal)1 - lanes_uchar_to_real(truth + at + 4 * plane) * (real)(1.0 / 255.0) : zero;
         for (int c = 0; c < 3; ++c) {
             global const real *e = row + 4 * c;
             vreal shown = lanes_mad(r, (vreal)e[0], lanes_mad(g, (vreal)e[1], lanes_mad(b, (vreal)e[2], (vreal)e[3])));
@@ -79,17 +87,16 @@ kernel void photo_of_render_vjp(
     int stride,
     ulong plane)
 {
-    const int vecs = (width + LANES - 1) / LANES, y = get_global_id(1);
-    const int first = get_global_id(0) * PHOTO_VECS, past = min(first + PHOTO_VECS, vecs);
+    const row_part own = own_part(width);
+    const int y = get_global_id(1);
     global const real *row = exposures + EXPOSURE * view;
     const vreal zero = (vreal)0;
     vreal sums[SUMS];
     for (int j = 0; j < SUMS; ++j) sums[j] = zero;
-    if (y >= height || first >= vecs) return;
-    for (int vec = first; vec < past; ++vec) {
+    if (y >= height || own.first >= own.vecs) return;
+    for (int vec = own.first; vec < own.past; ++vec) {
         const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + vec * LANES;
-        vmask counts = in_row(vec, width);
-        if (channels > 3) counts &= lanes_uchar_to_real(truth + at + 3 * plane) > zero;
+        const vmask counts = counted(truth + at, plane, channels, vec, width);
         vreal x[4], v_photo[3], wanted[3], most = zero;
         for (int c = 0; c < 3; ++c) {
             x[c] = lanes_load(color + at + c * plane);
@@ -109,7 +116,7 @@ kernel void photo_of_render_vjp(
         for (int c = 0; c < 3; ++c)
             for (int b = 0; b < 4; ++b, ++j) sums[j] = lanes_mad(wanted[c], x[b], sums[j]);
     }
-    const int items = (vecs + PHOTO_VECS - 1) / PHOTO_VECS;
+    const int items = (own.vecs + PHOTO_VECS - 1) / PHOTO_VECS;
     const ulong parts = (ulong)items * height, part = (ulong)y * items + get_global_id(0);
     for (int j = 0; j < SUMS; ++j) partial[j * parts + part] = lanes_sum(sums[j]);
 }

@@ -16,6 +16,52 @@
 #define CULLED_KEY 0xFFFFFFFFu
 #define COV2D_MAX R(1e12)  // px^2: a wider splat would overflow float32 on the way, and is no longer a splat
 
+#if ANTIALIASED
+// What the low-pass leaves of a splat's height if it keeps the volume: sqrt(det(M) / det(M + low-pass)), the filter on the
+// screen of Mip-Splatting (Yu et al. 2024, eq. 9, with a wider low-pass). M is B B', of the shape's own size, or with its
+// displacement m B (1 + m m') B'. A skew-normal's peak changes besides: it is divided by the one before (skew_pixel.clh).
+typedef struct {
+    vec3 b0, b1, area, m;
+    vreal size, along, stretch, flat, det, factor;  // along: area'm, stretch: 1 + m'm, flat: det(M)
+} lowering;
+
+static inline lowering lowered(splat_params s, vec3 b0, vec3 b1) {
+    lowering k;
+    k.size = shape_size(s);
+    k.m = shape_displacement(s);
+    k.b0 = scale3(b0, k.size);
+    k.b1 = scale3(b1, k.size);
+    k.area = cross3(k.b0, k.b1);
+    k.along = dot3(k.area, k.m);
+    k.stretch = (vreal)1 + dot3(k.m, k.m);
+    k.flat = k.stretch * dot3(k.area, k.area) - k.along * k.along;
+    const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
+    k.det = k.flat + LOW_PASS * (dot3(k.b0, k.b0) + dot3(k.b1, k.b1) + m0 * m0 + m1 * m1 + (vreal)LOW_PASS);
+    k.factor = sqrt(k.flat / k.det);
+    return k;
+}
+
+// Adds to g, whose opacities are those after lowering and become those before, and to the gradients of b0 and b1.
+static inline void lowered_vjp(lowering k, splat_params s, vec3 b0, vec3 b1, shape_grads *g, vec3 *v_b0, vec3 *v_b1) {
+    const vreal v_factor = g->s.opacity * s.opacity + g->s.opacity_minus * s.opacity_minus;
+    g->s.opacity *= k.factor;
+    g->s.opacity_minus *= k.factor;
+    // factor^2 = flat/det. A splat seen from its edge has no slope.
+    const vreal v_flat = lanes_if(k.factor > (vreal)R(1e-6), v_factor * ((vreal)1 - k.factor * k.factor)
+                                  / (max(k.factor, (vreal)R(1e-6)) * k.det), (vreal)0);
+    const vreal v_squares = -LOW_PASS * v_factor * k.factor / k.det;  // both with the 2 that the squares in flat and det bring
+    const vec3 v_area = scale3(add3(scale3(k.area, k.stretch), scale3(k.m, -k.along)), v_flat);
+    const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
+    const vec3 v_c0 = add3(cross3(k.b1, v_area), scale3(add3(k.b0, scale3(k.m, m0)), v_squares));
+    const vec3 v_c1 = add3(cross3(v_area, k.b0), scale3(add3(k.b1, scale3(k.m, m1)), v_squares));
+    *v_b0 = add3(*v_b0, scale3(v_c0, k.size));
+    *v_b1 = add3(*v_b1, scale3(v_c1, k.size));
+    shape_size_vjp(s, dot3(v_c0, b0) + dot3(v_c1, b1), g);
+    const vec3 of_flat = add3(scale3(k.m, dot3(k.area, k.area)), scale3(k.area, -k.along));
+    shape_displacement_vjp(s, add3(scale3(of_flat, v_flat), scale3(add3(scale3(k.b0, m0), scale3(k.b1, m1)), v_squares)), g);
+}
+#endif
+
 // What projection and its gradient both need.
 typedef struct {
     vec3 mean, c;          // the point that is projected: world, camera
@@ -28,7 +74,10 @@ typedef struct {
     vec3 ar0, ar1;         // rows of A R
     vec3 b0, b1;           // rows of B = A R S
     sym2 cov2d;            // B B' + low-pass [px^2]
-    splat_params s;
+    splat_params s, shown; // as stored, and as the shape is to show it
+#if ANTIALIASED
+    lowering low;          // from one to the other
+#endif
     vmask in_front;
 } splat_terms;
 
@@ -76,60 +125,14 @@ static inline splat_terms splat_project(global const real *geom, const ulong cap
     s.b0 = mul3(s.ar0, s.scale);
     s.b1 = mul3(s.ar1, s.scale);
     s.cov2d = cov2d_of(s.b0, s.b1);
-    return s;
-}
-
+    s.shown = s.s;
 #if ANTIALIASED
-// What the low-pass leaves of a splat's height if it keeps the volume: sqrt(det(M) / det(M + low-pass)), the filter on the
-// screen of Mip-Splatting (Yu et al. 2024, eq. 9, with a wider low-pass). M is B B', of the shape's own size, or with its
-// displacement m B (1 + m m') B'. A skew-normal's peak changes besides: it is divided by the one before (skew_pixel.clh).
-typedef struct {
-    vec3 b0, b1, area, m;
-    vreal size, along, stretch, flat, det, factor;  // along: area'm, stretch: 1 + m'm, flat: det(M)
-} lowering;
-
-static inline lowering lowered(splat_params s, vec3 b0, vec3 b1) {
-    lowering k;
-    k.size = shape_size(s);
-    k.m = shape_displacement(s);
-    k.b0 = scale3(b0, k.size);
-    k.b1 = scale3(b1, k.size);
-    k.area = cross3(k.b0, k.b1);
-    k.along = dot3(k.area, k.m);
-    k.stretch = (vreal)1 + dot3(k.m, k.m);
-    k.flat = k.stretch * dot3(k.area, k.area) - k.along * k.along;
-    const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
-    k.det = k.flat + LOW_PASS * (dot3(k.b0, k.b0) + dot3(k.b1, k.b1) + m0 * m0 + m1 * m1 + (vreal)LOW_PASS);
-    k.factor = sqrt(k.flat / k.det);
-    return k;
-}
-
-static inline splat_params after(lowering k, splat_params s) {
-    s.opacity *= k.factor;
-    s.opacity_minus *= k.factor;
+    s.low = lowered(s.s, s.b0, s.b1);
+    s.shown.opacity *= s.low.factor;
+    s.shown.opacity_minus *= s.low.factor;
+#endif
     return s;
 }
-
-// Adds to g, whose opacities are those after lowering and become those before, and to the gradients of b0 and b1.
-static inline void lowered_vjp(lowering k, splat_params s, vec3 b0, vec3 b1, shape_grads *g, vec3 *v_b0, vec3 *v_b1) {
-    const vreal v_factor = g->s.opacity * s.opacity + g->s.opacity_minus * s.opacity_minus;
-    g->s.opacity *= k.factor;
-    g->s.opacity_minus *= k.factor;
-    // factor^2 = flat/det. A splat seen from its edge has no slope.
-    const vreal v_flat = lanes_if(k.factor > (vreal)R(1e-6), v_factor * ((vreal)1 - k.factor * k.factor)
-                                  / (max(k.factor, (vreal)R(1e-6)) * k.det), (vreal)0);
-    const vreal v_squares = -LOW_PASS * v_factor * k.factor / k.det;  // both twice as large, and halved below
-    const vec3 v_area = scale3(add3(scale3(k.area, k.stretch), scale3(k.m, -k.along)), v_flat);
-    const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
-    const vec3 v_c0 = add3(cross3(k.b1, v_area), scale3(add3(k.b0, scale3(k.m, m0)), v_squares));
-    const vec3 v_c1 = add3(cross3(v_area, k.b0), scale3(add3(k.b1, scale3(k.m, m1)), v_squares));
-    *v_b0 = add3(*v_b0, scale3(v_c0, k.size));
-    *v_b1 = add3(*v_b1, scale3(v_c1, k.size));
-    shape_size_vjp(s, dot3(v_c0, b0) + dot3(v_c1, b1), g);
-    const vec3 of_flat = add3(scale3(k.m, dot3(k.area, k.area)), scale3(k.area, -k.along));
-    shape_displacement_vjp(s, add3(scale3(of_flat, v_flat), scale3(add3(scale3(k.b0, m0), scale3(k.b1, m1)), v_squares)), g);
-}
-#endif
 
 static inline vec3 unit_direction(constant real *cam, vec3 mean, vreal *inv_norm) {
     const vec3 from = add3(mean, scale3(CAMERA_CENTRE(cam), (vreal)-1));
@@ -161,13 +164,7 @@ kernel void project_splats(
 
     vreal out[RECORD];
     extents box;
-#if ANTIALIASED
-    const lowering low = lowered(s.s, s.b0, s.b1);
-    const splat_params shown = after(low, s.s);
-#else
-    const splat_params shown = s.s;
-#endif
-    shape_project(shown, s.b0, s.b1, s.cov2d, out + HEAD, &box);
+    shape_project(s.shown, s.b0, s.b1, s.cov2d, out + HEAD, &box);
     out[0] = s.to_px.x;
     out[1] = s.to_px.y;
     out[5] = s.c.z;
@@ -272,19 +269,13 @@ kernel void project_splats_vjp(
         v[j] = lanes_if(seen, lanes_load(moments + first + j * capacity), zero);
 
     shape_grads g;
-#if ANTIALIASED
-    const lowering low = lowered(s.s, s.b0, s.b1);
-    const splat_params shown = after(low, s.s);
-#else
-    const splat_params shown = s.s;
-#endif
-    shape_project_vjp(shown, s.b0, s.b1, s.cov2d, v, &g);
+    shape_project_vjp(s.shown, s.b0, s.b1, s.cov2d, v, &g);
 
     // cov2d = B B' + low-pass
     vec3 v_b0 = add3(g.b0, add3(scale3(s.b0, (real)2 * g.cov2d.xx), scale3(s.b1, g.cov2d.xy)));
     vec3 v_b1 = add3(g.b1, add3(scale3(s.b1, (real)2 * g.cov2d.yy), scale3(s.b0, g.cov2d.xy)));
 #if ANTIALIASED
-    lowered_vjp(low, s.s, s.b0, s.b1, &g, &v_b0, &v_b1);
+    lowered_vjp(s.low, s.s, s.b0, s.b1, &g, &v_b0, &v_b1);
 #endif
     // B = A R S
     vec3 v_scale = add3(mul3(v_b0, s.ar0), mul3(v_b1, s.ar1));

@@ -112,14 +112,13 @@ def _of_model(source: Path, iteration: int | None) -> tuple[list[Photo], Points]
 
 
 def _write_3dgs(output: Path, photos: list[Photo]) -> None:
-    from clsplat.camera import Camera
     from clsplat.cameras_json import named_cameras, write_cameras
-    from clsplat.lens import is_pinhole
+    from clsplat.lens import is_pinhole, pinhole_camera
 
     bent = [photo for photo in photos if not is_pinhole(photo.lens)]
     if bent:
         raise InputError(f"image {bent[0].name!r}: 3DGS's cameras.json has no distorted lenses: write transforms or a "
                          "COLMAP model")
-    cameras = [Camera(lens.width, lens.height, lens.focal_length_x, lens.focal_length_y, lens.principal_point_x,
-                      lens.principal_point_y, photo.cam_from_world) for photo in photos for lens in (photo.lens,)]
+    cameras = [pinhole_camera(photo.lens, photo.cam_from_world, photo.lens.width, photo.lens.height)
+               for photo in photos]
     write_cameras(output, named_cameras([photo.name for photo in photos], cameras))

@@ -10,36 +10,33 @@ import click
 
 from clsplat.errors import OutputError
 from clsplat.progress_display import PLAIN_INTERVAL, LiveLine
+from clsplat.reconstruct_options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, ReconstructOptions
 
 from .options import PATH, overwrite_option, quiet_option
 from .progress import duration
 
 if TYPE_CHECKING:
-    from clsplat.reconstruct import Reconstructed, ReconstructOptions
+    from clsplat.reconstruct import Reconstructed
     from clsplat.sfm_process import Step
 
-# As in clsplat.reconstruct, whose imports --help shall not wait for; a test compares.
-CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE",
-                 "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "FOV")
-CAMERA_MODES = ("auto", "single", "per-image", "per-folder")
-MATCHERS = ("auto", "exhaustive", "sequential")
+_DEFAULTS = ReconstructOptions()
 
 
 @click.command("reconstruct")
 @click.argument("photos", type=PATH)
 @click.option("-o", "--output", "scene", type=PATH, required=True, metavar="SCENE", help="Folder of the scene.")
-@click.option("--camera-model", type=click.Choice(CAMERA_MODELS, case_sensitive=False), default="SIMPLE_RADIAL",
+@click.option("--camera-model", type=click.Choice(CAMERA_MODELS, case_sensitive=False), default=_DEFAULTS.camera_model,
               show_default=True, metavar="NAME",
               help="COLMAP's name of the lens model: OPENCV for wide lenses, OPENCV_FISHEYE for fisheyes.")
-@click.option("--camera-mode", type=click.Choice(CAMERA_MODES), default="auto", show_default=True,
+@click.option("--camera-mode", type=click.Choice(CAMERA_MODES), default=_DEFAULTS.camera_mode, show_default=True,
               help="Which photos share a lens; auto: those of one size, camera and focal length.")
-@click.option("--matcher", type=click.Choice(MATCHERS), default="auto", show_default=True,
+@click.option("--matcher", type=click.Choice(MATCHERS), default=_DEFAULTS.matcher, show_default=True,
               help="Which photos are compared: all pairs, or neighbours by name (auto: videos, more than 150 photos).")
-@click.option("--max-size", type=click.IntRange(min=64), default=1600, show_default=True, metavar="PX",
+@click.option("--max-size", type=click.IntRange(min=64), default=_DEFAULTS.max_size, show_default=True, metavar="PX",
               help="Longest side at which features are looked for; the scene keeps the photos' size.")
-@click.option("--frames", type=click.IntRange(min=3), default=120, show_default=True, metavar="N",
+@click.option("--frames", type=click.IntRange(min=3), default=_DEFAULTS.frames, show_default=True, metavar="N",
               help="Of a video: the sharpest frame of each of N equal stretches.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=_DEFAULTS.seed, show_default=True)
 @overwrite_option
 @quiet_option
 def reconstruct_scene(photos: Path, scene: Path, overwrite: bool, quiet: bool, **values: Any) -> None:
@@ -49,8 +46,6 @@ def reconstruct_scene(photos: Path, scene: Path, overwrite: bool, quiet: bool, *
     reconstruct.json. Folders below PHOTOS belong to it. Masks, black where a photo does not count, lie in PHOTOS/masks
     as NAME.png or NAME.jpg.png.
     """
-    from clsplat.reconstruct import ReconstructOptions
-
     result = run_reconstruction(photos, scene, ReconstructOptions(**values), overwrite, quiet)
     if not quiet:
         report(result)
@@ -80,7 +75,7 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
     OutputError : the scene that is there was made of other photos. Others as `reconstruct`.
     """
     from clsplat.photo_folder import find_photos, is_video
-    from clsplat.reconstruct import ReconstructOptions, estimated_seconds, made_from
+    from clsplat.reconstruct import estimated_seconds, made_from
 
     scene = model.parent / f"{photos.resolve().stem if is_video(photos) else photos.resolve().name}-scene"
     options = ReconstructOptions()

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from .atomic import atomic_writer
-from .camera import Camera
-from .camera_path import pose_of
+from .camera_path import opengl_pose
 from .colmap import Points
 from .colmap_files import ModelView, write_binary_model
 from .errors import InputError
@@ -49,7 +48,7 @@ def write_transforms(path: Path, photos: Sequence[Photo], files: Sequence[str], 
     """
     frames = []
     for photo, file in zip(photos, files, strict=True):
-        pose = pose_of(Camera(1, 1, 1, 1, 0, 0, photo.cam_from_world))
+        pose = opengl_pose(photo.cam_from_world)
         frames.append({"file_path": file} | _lens_keys(photo) | {"transform_matrix": pose.tolist()})
     head: dict[str, Any] = {}
     if len(points):

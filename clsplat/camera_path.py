@@ -153,8 +153,14 @@ def path_of(content: Any, source: str | os.PathLike[str]) -> CameraPath:
 
 def pose_of(camera: Camera) -> NDArray[np.float64]:
     """Camera to world (4, 4) in OpenGL's axes (x right, y up, z back)."""
+    return opengl_pose(camera.cam_from_world)
+
+
+def opengl_pose(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Camera to world (4, 4) in OpenGL's axes, of a rigid (4, 4) world to camera in OpenCV's."""
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = camera.rotation.T, camera.position
+    pose[:3, :3] = cam_from_world[:3, :3].T
+    pose[:3, 3] = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
     posed: NDArray[np.float64] = pose @ _FLIP
     return posed
 

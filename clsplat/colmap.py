@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .colmap_files import check_binary_model, registered_images
-from .errors import InputError
-from .lens import Lens, Photo, colmap_library, make_lens, reason_of
-
-__all__ = ["Lens", "Model", "Photo", "Points", "find_model", "make_lens", "read_model", "read_photos", "read_points"]
+from .errors import InputError, reason_of
+from .lens import Photo, colmap_library
 
 _FILES = ("cameras", "images", "points3D")
 

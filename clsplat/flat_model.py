@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Camera
-from .colmap import Photo, Points, read_photos, read_points
+from .colmap import Points, read_photos, read_points
 from .colmap_files import ModelView, write_binary_model
-from .images import ImageU8, write_photo, write_png
-from .lens import colmap_library
+from .images import write_photo, write_png
+from .lens import Photo, colmap_library
 from .masks import FOLDER as MASK_FOLDER
 from .photo_folder import Prepared
 
@@ -72,8 +72,7 @@ def write_flat_photo(model: SparseModel, photo: Prepared, scene: Path) -> ModelV
     height, width = pixels.shape[:2]
     flat, camera = posed.fit(np.ascontiguousarray(pixels[:, :, :3]))
     if pixels.shape[2] == 4:
-        alpha: ImageU8 = np.repeat(pixels[:, :, 3:], 3, axis=2)
-        flat = np.dstack([flat, posed.fit(alpha)[0][:, :, :1]])
+        flat = np.dstack([flat, posed.fit_alpha(pixels[:, :, 3])])
     mask = photo.mask()
     write_photo(scene / "images" / photo.source.name, flat)
     if mask is not None:

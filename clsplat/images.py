@@ -169,8 +169,13 @@ def write_grey16(path: str | os.PathLike[str], array: NDArray[np.uint16]) -> Non
         Image.fromarray(np.ascontiguousarray(array, np.uint16)).save(stream, format="PNG")
 
 
+def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether an image of one (width, height) can be another at another scale, each side rounded to whole pixels."""
+    return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1]
+
+
 def resize_area(image: ImageU8, width: int, height: int) -> ImageU8:
-    """The image at another size [px], (height, width, 3 or 4); alpha weighs the colours.
+    """The image at another size [px], (height, width) or (height, width, 3 or 4); alpha weighs the colours.
 
     Whole-number reductions take the mean of each block of pixels; all other sizes use Pillow's bicubic
     filter, which widens when it reduces (3DGS's choice).

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 # Before pycolmap on purpose (see images.py), hence also pycolmap only inside functions.
 from . import images as _images
 from .camera import Camera
-from .errors import InputError
+from .errors import InputError, reason_of
+from .masks import nearest
 
 Lens = Any  # a pycolmap.Camera
 
@@ -58,10 +59,14 @@ class Photo:
             image, lens = _undistorted(image, lens, self.name)
             height, width = image.shape[:2]
         try:
-            return image, Camera(width, height, lens.focal_length_x, lens.focal_length_y,
-                                 lens.principal_point_x, lens.principal_point_y, self.cam_from_world)
+            return image, pinhole_camera(lens, self.cam_from_world, width, height)
         except InputError as error:
             raise InputError(f"image {self.name!r}: {error}; rebuild the model") from None
+
+    def fit_alpha(self, alpha: _images.ImageU8) -> _images.ImageU8:
+        """The photo's opacity, (H, W) as stored, where `fit` puts its pixels; raises what `fit` raises."""
+        fitted: _images.ImageU8 = self.fit(np.repeat(alpha[:, :, None], 3, axis=2))[0][:, :, 0]
+        return fitted
 
     def fit_mask(self, mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
         """A mask of the photo as a mask of `fit`'s image: the nearest pixel, False outside the photo.
@@ -80,16 +85,13 @@ class Photo:
         InputError : the mask has another aspect than the photo, or what `fit` raises.
         """
         rows, columns = mask.shape
-        if abs(columns * height - rows * width) >= width + height:
+        if not _images.same_aspect((columns, rows), (width, height)):
             raise InputError(f"image {self.name!r}: its mask is {columns}x{rows} px, the photo {width}x{height}; "
                              "make the mask of the photo's size")
         lens = _scaled(self.lens, width, height, self.name)
         if is_pinhole(lens):
-            if mask.shape == (height, width):
-                return mask.astype(bool)
-            down, across = np.mgrid[:height, :width] + 0.5
-        else:
-            across, down = _seen_from(_pinhole_of(lens, self.name), lens)
+            return nearest(mask, width, height)
+        across, down = _seen_from(_pinhole_of(lens, self.name), lens)
         # Outside the outermost pixel centres the image is blank (bilinear); rays that no pixel sees are NaN.
         inside = (across >= 0.5) & (across <= width - 0.5) & (down >= 0.5) & (down <= height - 0.5)
         fitted = np.zeros(inside.shape, bool)
@@ -103,6 +105,12 @@ def make_lens(model: str, width: int, height: int, params: list[float]) -> Lens:
     return colmap_library().Camera(model=model, width=width, height=height, params=params)
 
 
+def pinhole_camera(lens: Lens, cam_from_world: NDArray[np.float64], width: int, height: int) -> Camera:
+    """The camera of a lens without distortion, for images of this size [px]; raises what Camera raises."""
+    return Camera(width, height, lens.focal_length_x, lens.focal_length_y, lens.principal_point_x,
+                  lens.principal_point_y, cam_from_world)
+
+
 def colmap_library() -> ModuleType:
     """pycolmap, silent: its errors reach the user as exceptions."""
     import pycolmap
@@ -113,10 +121,10 @@ def colmap_library() -> ModuleType:
 
 
 def _scaled(lens: Any, width: int, height: int, name: str) -> Any:
-    """The lens for an image of another size; the aspect may differ by rounding each side to whole pixels."""
+    """The lens for an image of another size."""
     if not np.isfinite(lens.params).all():
         raise InputError(f"image {name!r}: its camera has a parameter that is not finite; rebuild the model")
-    if abs(width * lens.height - height * lens.width) >= lens.width + lens.height:
+    if not _images.same_aspect((width, height), (lens.width, lens.height)):
         raise InputError(f"image {name!r} is {width}x{height} px but its camera {lens.width}x{lens.height}; "
                          "use the photos that the model was made from, whole and unrotated")
     scaled = copy.copy(lens)
@@ -170,8 +178,3 @@ def _seen_from(pinhole: Any, lens: Any) -> tuple[NDArray[np.float64], NDArray[np
                      (down - pinhole.principal_point_y) / pinhole.focal_length_y, np.ones(across.shape)], axis=2)
     seen = np.asarray(lens.img_from_cam(rays.reshape(-1, 3)), np.float64).reshape(*across.shape, 2)
     return seen[..., 0], seen[..., 1]
-
-
-def reason_of(error: Exception) -> str:
-    """An error of the library in a line."""
-    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -7,13 +7,14 @@ differs there.
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError
+from .errors import InputError, reason_of
 
 Image = NDArray[np.floating[Any]] | NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -21,6 +22,7 @@ Mask = NDArray[np.bool_]
 # The trunk that torchvision fetches for the net "vgg" (its IMAGENET1K_V1); lpips brings what lies on top of it.
 VGG_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 VGG_MEGABYTES = 528
+_line = partial(reason_of, most=160)
 _LEAST = 32  # px, of VGG's five halvings
 
 
@@ -126,7 +128,3 @@ def _unit(image: Image) -> NDArray[np.float32]:
     """In 0..1 and steps of 8 bits."""
     steps = image if image.dtype == np.uint8 else np.rint(np.clip(image, 0.0, 1.0) * 255.0)
     return np.ascontiguousarray(steps, np.float32) / np.float32(255)
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:160] or type(error).__name__

@@ -13,7 +13,7 @@ import numpy as np
 
 from .cameras_json import IMAGE_SUFFIXES
 from .errors import InputError
-from .images import JPEG_SUFFIXES, ImageU8, PhotoFacts, photo_facts, read_image, write_photo, write_png
+from .images import JPEG_SUFFIXES, ImageU8, PhotoFacts, photo_facts, read_image, same_aspect, write_photo, write_png
 from .masks import FOLDER as MASK_FOLDER
 from .masks import Mask, mask_files, nearest, read_mask
 
@@ -223,7 +223,7 @@ def _upright_mask(path: Path, photo: Path, facts: PhotoFacts) -> Mask:
     """A mask of the photo as stored or of the upright photo, of its size or a reduction of it, at the upright size."""
     mask = read_mask(path)
     rows, columns = mask.shape
-    if abs(columns * facts.height - rows * facts.width) >= facts.width + facts.height:
+    if not same_aspect((columns, rows), (facts.width, facts.height)):
         raise InputError(f"{path}: is {columns}x{rows} px, the photo {photo.name} {facts.width}x{facts.height}; "
                          "make the mask of the photo's size, upright")
     return nearest(mask, facts.width, facts.height)

@@ -44,7 +44,7 @@ class PhotoLoss:
         self.loss, self.truths, self.config, self.background = loss, truths, config, background
         self.device, self.pipeline, self.kernels = loss.device, loss.pipeline, loss.kernels
         self.learns = config.exposure
-        self.in_use = self.learns or truths.channels > 3
+        self.in_use = needs_photos(config, truths.channels)
         if not self.in_use:
             return
         self.program = self.kernels.photo_program(self.device)
@@ -105,9 +105,14 @@ class PhotoLoss:
         return to_host(self.device, self._exposures, np.empty_like(self._rows))
 
 
-def photo_bytes(layout: ImageLayout, itemsize: int, in_use: bool) -> int:
+def needs_photos(config: TrainConfig, channels: int) -> bool:
+    """Whether anything stands between renders and truths of so many channels."""
+    return config.exposure or channels > 3
+
+
+def photo_bytes(layout: ImageLayout, itemsize: int, config: TrainConfig, channels: int) -> int:
     """Device memory that `PhotoLoss` takes for images of the layout."""
-    return (3 * itemsize + 3) * layout.plane if in_use else 0
+    return (3 * itemsize + 3) * layout.plane if needs_photos(config, channels) else 0
 
 
 def exposures_json(names: Sequence[str], exposures: NDArray[np.floating]) -> dict[str, list[list[float]]]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from .cameras_json import IMAGE_SUFFIXES
-from .colmap import Photo, Points, find_model, read_model
+from .colmap import Points, find_model, read_model
 from .errors import InputError
+from .lens import Photo
 
 _FEW_REGISTERED = 0.8
 

@@ -29,55 +29,23 @@ from .photo_folder import (
     same_camera,
     unread_kinds,
 )
+from .reconstruct_options import CAMERA_MODELS, CAMERA_MODES, FEWEST, MATCHERS, ReconstructOptions
 from .sfm import ENOUGH
 from .sfm_process import Step, Tell, run_sfm
 from .sole_writer import sole_writer
-from .video_frames import FRAMES, extract_frames
+from .video_frames import extract_frames
+
+__all__ = ["CAMERA_MODELS", "CAMERA_MODES", "MATCHERS", "ReconstructOptions", "Reconstructed", "estimated_seconds",
+           "made_from", "reconstruct"]
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE",
-                 "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "FOV")
-CAMERA_MODES = ("auto", "single", "per-image", "per-folder")
-MATCHERS = ("auto", "exhaustive", "sequential")
 RECORD = "reconstruct.json"  # in the scene: what it was made of and how
 EXHAUSTIVE = 150  # photos; of more, "auto" matches neighbours by name
 SMALL = 640  # longest side [px] of photos that are searched at twice their size too, four times as long
 _OVERLAP = 10  # neighbours of a photo in a sequence
 _LOOP = 10  # every so many-th photo of a sequence is matched with all others of these, to close loops
-_FEWEST = 3
-
-
-@dataclass(frozen=True)
-class ReconstructOptions:
-    """How photographs become a scene.
-
-    Parameters
-    ----------
-    camera_model : COLMAP's name of the lens model.
-    camera_mode : which photos share a camera; "auto": those of one size and, by EXIF, one camera and focal length.
-    matcher : "exhaustive" matches all pairs, "sequential" neighbours by name; "auto": sequential for videos and for
-        more than 150 photos.
-    max_size : longest side at which features are looked for [px]; the scene keeps the photos' size.
-    frames : of a video.
-    seed : of all that is random.
-    """
-
-    camera_model: str = "SIMPLE_RADIAL"
-    camera_mode: str = "auto"
-    matcher: str = "auto"
-    max_size: int = 1600
-    frames: int = FRAMES
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name, allowed in (("camera_model", CAMERA_MODELS), ("camera_mode", CAMERA_MODES), ("matcher", MATCHERS)):
-            if getattr(self, name) not in allowed:
-                raise InputError(f"{name} {getattr(self, name)!r}: use one of {', '.join(allowed)}")
-        for name, least in (("max_size", 64), ("frames", _FEWEST)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name} {getattr(self, name)}: must be at least {least}")
 
 
 @dataclass(frozen=True)
@@ -238,8 +206,8 @@ def _prepared(given: Sequence[PhotoFile], source: Path, work: Path, say: Tell) -
     if reasons:
         more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         warnings.warn(f"left out: {reasons[0]}{more}", stacklevel=3)
-    if len(ready) < _FEWEST:
-        raise InputError(f"{source}: {len(ready)} photos that can be read; at least {_FEWEST} are needed, 30 or more "
+    if len(ready) < FEWEST:
+        raise InputError(f"{source}: {len(ready)} photos that can be read; at least {FEWEST} are needed, 30 or more "
                          "that overlap are better")
     return ready
 
@@ -273,7 +241,7 @@ def _warn_of_rest(source: Path, ready: Sequence[Prepared], registered: Sequence[
         warnings.warn(f"{source}: only {len(registered)} of {len(ready)} photos could be placed; left out are "
                       f"{', '.join(rest[:3])}{', ...' if len(rest) > 3 else ''}. Take more photos in between, with "
                       "steps of a few degrees, sharp and of things at rest", stacklevel=3)
-    parts = sum(size >= _FEWEST for size in models.values())
+    parts = sum(size >= FEWEST for size in models.values())
     if rest and parts > 1:
         warnings.warn(f"{source}: the photos fall into {parts} parts that do not hang together; the largest "
                       f"({len(registered)} photos) is kept", stacklevel=3)

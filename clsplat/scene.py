@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from .camera import Camera
-from .colmap import Photo, Points
+from .colmap import Points
 from .config import ALPHA_USES
 from .errors import InputError
 from .images import ImageU8, read_image, resize_area
+from .lens import Photo
 from .masks import FOLDER, NO_MASKS, Mask, mask_files, nearest, read_mask
 from .posed import Posed, posed_by_colmap
 from .transforms import find_transforms, posed_by_transforms
@@ -51,7 +52,7 @@ class View:
             return self
         return View(self.name, self.camera.resized(width, height), resize_area(self.image, width, height),
                     None if self.mask is None else nearest(self.mask, width, height),
-                    None if self.alpha is None else resize_area(_grey(self.alpha), width, height)[:, :, 0])
+                    None if self.alpha is None else resize_area(self.alpha, width, height))
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +241,7 @@ def _view(photo: Photo, file: Path, resolution: int, background: tuple[float, fl
     image, camera = photo.fit(_opaque(stored, background))
     fitted = [photo.fit_mask(each, width, height) for each in counts]
     mask = np.logical_and.reduce(fitted) if fitted else None
-    alpha = None if alpha is None else photo.fit(_grey(alpha))[0][:, :, 0]
+    alpha = None if alpha is None else photo.fit_alpha(alpha)
     view = View(photo.name, camera, image, mask, alpha)
     view = view.resized(*_target_size(camera.width, camera.height, resolution))
     if view.mask is None:
@@ -248,10 +249,6 @@ def _view(photo: Photo, file: Path, resolution: int, background: tuple[float, fl
     if not view.mask.any():
         return f"{file}: its mask hides all of it"
     return replace(view, mask=None) if view.mask.all() else view
-
-
-def _grey(plane: ImageU8) -> ImageU8:
-    return np.repeat(plane[:, :, None], 3, axis=2)
 
 
 def _opaque(image: ImageU8, background: tuple[float, float, float]) -> ImageU8:

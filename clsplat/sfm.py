@@ -20,7 +20,8 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from .lens import colmap_library, reason_of
+from .errors import reason_of
+from .lens import colmap_library
 
 ENOUGH = 0.8  # of the photos registered; below, they are matched once more
 _FAR_OFF, _NARROW = 4.0, 1.5  # reprojection error [px] and angle [degrees] of points to leave out, as COLMAP's mapper

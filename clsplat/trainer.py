@@ -95,7 +95,7 @@ class Trainer:
         channels = truth_channels(scene.train, config.random_background)
         layout = ImageLayout(largest.width, largest.height, tile)
         self.memory = estimate(config, self.kernels, layout, truth_bytes(scene.train, budget, tile, channels)
-                               + photo_bytes(layout, self.kernels.dtype.itemsize, config.exposure or channels > 3))
+                               + photo_bytes(layout, self.kernels.dtype.itemsize, config, channels))
         check(self.memory, self.device)
         self.rng = np.random.default_rng(config.seed)
         self.iteration, self.seconds = 0, 0.0

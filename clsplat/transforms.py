@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 from .camera import is_rotation
 from .camera_path import cam_from_world_of
 from .cameras_json import IMAGE_SUFFIXES
-from .colmap import Lens, Photo, Points, make_lens, read_model
+from .colmap import Points, read_model
 from .errors import InputError
 from .images import image_size
 from .json_fields import read_json, real_of
+from .lens import Lens, Photo, make_lens
 from .point_cloud import read_point_cloud
 from .posed import Posed
 

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .photo_folder import PhotoFile
+from .reconstruct_options import FEWEST, FRAMES
 from .video import require_encoder
 
-FRAMES = 120  # wanted of a video, where it has so many
-FEWEST = 3
 _SIDE = 384  # frames are compared at this width and height [px]
 # Frames one after another at a made-up steady rate, so that ffmpeg neither drops nor doubles any in either pass.
 _RATE = ("-r", "25")

@@ -12,9 +12,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from small_scene import CX, CY, FX, FY, HEIGHT, WIDTH, cloud, model_views, write_garden
 
-from clsplat.colmap import Photo, make_lens, read_model
+from clsplat.colmap import read_model
 from clsplat.colmap_files import check_binary_model, write_binary_model
 from clsplat.errors import InputError
+from clsplat.lens import Photo, make_lens
 from clsplat.scene import load_scene
 
 

@@ -18,21 +18,20 @@ FLOORS = """
     capture_world compare_table errors eval_script flops harmonics interrupt morton runtime schema viewer_queue \
     viewer_settings
     arithmetic atomic budget_rules camera device json_fields metrics optim_reference perceptual plan ply_header \
-    presets profiles rotations schedules sfm_process signatures validity
+    presets profiles reconstruct_options rotations schedules sfm_process signatures validity
     binaries cameras_json checkpoint colmap_files frontier_data html_report images launches looked_at noise \
     optim_lazy paths_between ply_body ply_compact run_log shapes sole_writer video
-    camera_path capture chart_style frontier_tables lens masks opacities ply program progress_display sghmc \
-    skew_map viewer_start
-    adc charts colmap config densify eval_histogram frontier_charts kernels photo_folder regularisers sfm splats \
+    camera_path capture chart_style frontier_tables masks opacities ply program progress_display sghmc skew_map \
+    viewer_start
+    adc charts config densify eval_histogram frontier_charts kernels lens photo_folder regularisers splats \
     viewer_camera viewer_recording
-    blocks buffers complexity convert flat_model model_folder paths_around point_cloud posed rate_limits \
-    splat_file spz_file strategy systems video_frames
-    budget_state camera_files gradients limits nearest optim_rules optim_waiting placing reconstruct sort \
-    transforms
-    binning optim_fused optim_host scene stages
-    optim pipeline random_points scene_info synthetic validation view_sampler
-    initialise loss memory pairs truths tuning
-    photos render
+    blocks buffers colmap complexity convert model_folder paths_around rate_limits sfm splat_file spz_file \
+    strategy systems video_frames
+    budget_state flat_model gradients limits nearest optim_rules optim_waiting placing point_cloud posed sort
+    binning camera_files optim_fused optim_host reconstruct stages transforms
+    optim pipeline scene
+    loss memory pairs random_points scene_info synthetic truths tuning validation view_sampler
+    initialise photos render
     display evaluate needs
     eval_images prune trainer viewer_source
     bench compare eval_report shrink training viewer

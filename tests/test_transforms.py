@@ -94,7 +94,7 @@ def test_distortion_is_undistorted(folder: Path) -> None:
     """As the same lens of a COLMAP model is."""
     import pycolmap
 
-    from clsplat.colmap import Photo
+    from clsplat.lens import Photo
 
     scene = load_scene(write(folder, LENS | {"k1": 0.1, "p2": 0.01, "frames": frames()}))
     lens = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=[FX, FY, CX, CY, 0.1, 0, 0, 0.01])
