@@ -26,16 +26,16 @@ from typing import Any
 import common
 import numpy as np
 
-from clsplat.arithmetic import EXP_FORMS, PHI_FORMS, Arithmetic
-from clsplat.config import TrainConfig
-from clsplat.device import Device, Schedule, open_device
-from clsplat.evaluate import evaluate
-from clsplat.launches import recorded
-from clsplat.render import Renderer
-from clsplat.scene import Scene, load_scene
-from clsplat.shapes import NORMALISATIONS, shape_named
-from clsplat.splats import Splats
-from clsplat.trainer import Trainer
+from clsplat.device.device import Device, Schedule, open_device
+from clsplat.device.launches import recorded
+from clsplat.evaluation.evaluate import evaluate
+from clsplat.rendering.arithmetic import EXP_FORMS, PHI_FORMS, Arithmetic
+from clsplat.rendering.render import Renderer
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.splats.shapes import NORMALISATIONS, shape_named
+from clsplat.splats.splats import Splats
+from clsplat.training.config import TrainConfig
+from clsplat.training.trainer import Trainer
 
 RESOLUTION = {"fox": 2}
 STAGES = ("project_splats", "rasterize", "rasterize_vjp", "project_splats_vjp")

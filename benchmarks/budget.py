@@ -22,20 +22,20 @@ from typing import Any
 
 import common
 
-from clsplat.budget import train_budget
-from clsplat.budget_rules import BudgetOptions
-from clsplat.budget_state import FILE
-from clsplat.compare import RUNS, RunFile, digest, scene_identity, warm_up
-from clsplat.compare_table import MEASURED, Record
-from clsplat.config import TrainConfig
-from clsplat.device import open_device
-from clsplat.evaluate import evaluate
-from clsplat.memory import peak_bytes
-from clsplat.metrics import DEFAULT_PROTOCOL
-from clsplat.render import Renderer
-from clsplat.scene import load_scene
-from clsplat.shapes import SHAPES
-from clsplat.tuning import schedule_for
+from clsplat.comparison.compare import RUNS, RunFile, digest, scene_identity, warm_up
+from clsplat.comparison.compare_table import MEASURED, Record
+from clsplat.compression.budget import train_budget
+from clsplat.compression.budget_rules import BudgetOptions
+from clsplat.compression.budget_state import FILE
+from clsplat.device.device import open_device
+from clsplat.evaluation.evaluate import evaluate
+from clsplat.evaluation.metrics import DEFAULT_PROTOCOL
+from clsplat.rendering.render import Renderer
+from clsplat.rendering.tuning import schedule_for
+from clsplat.scenes.scene import load_scene
+from clsplat.splats.shapes import SHAPES
+from clsplat.training.config import TrainConfig
+from clsplat.training.memory import peak_bytes
 
 OUT = common.RESULTS / "budget"
 RESOLUTION = {"fox": 2}  # of load_scene; others as they are

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import common
 
-from clsplat.device import open_device
+from clsplat.device.device import open_device
 
 
 def main() -> None:

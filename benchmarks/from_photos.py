@@ -20,12 +20,12 @@ from typing import Any
 import common
 
 import clsplat
-from clsplat.config import TrainConfig
-from clsplat.device import open_device
-from clsplat.images import read_image
-from clsplat.reconstruct import ReconstructOptions, reconstruct
-from clsplat.tuning import schedule_for
-from clsplat.video import VideoWriter
+from clsplat.device.device import open_device
+from clsplat.files.images import read_image
+from clsplat.files.video import VideoWriter
+from clsplat.rendering.tuning import schedule_for
+from clsplat.scenes.reconstruct.reconstruct import ReconstructOptions, reconstruct
+from clsplat.training.config import TrainConfig
 
 # Name to the scene with poses and the reduction at which both ways are trained.
 SCENES = {"sceaux_castle": ("sceaux_castle", 1), "kitchen": ("kitchen", 1), "fox_ngp": ("fox/ngp", 2),

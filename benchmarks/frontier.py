@@ -20,15 +20,15 @@ from typing import NamedTuple
 
 import common
 
-from clsplat.compare import Run, compare
-from clsplat.compare_table import HEAD, Record, cells, notes, repeats, summarise
-from clsplat.frontier import distinct, read_runs, write_report
-from clsplat.frontier_data import auto_rows, equal_rows, point_rows, seed_rows
-from clsplat.frontier_tables import Table, auto_table, equal_table, seed_table
-from clsplat.presets import PRESETS
-from clsplat.scene import load_scene
-from clsplat.shapes import SHAPES
-from clsplat.systems import parse_systems
+from clsplat.comparison.compare import Run, compare
+from clsplat.comparison.compare_table import HEAD, Record, cells, notes, repeats, summarise
+from clsplat.comparison.frontier import distinct, read_runs, write_report
+from clsplat.comparison.frontier_data import auto_rows, equal_rows, point_rows, seed_rows
+from clsplat.comparison.frontier_tables import Table, auto_table, equal_table, seed_table
+from clsplat.comparison.systems import parse_systems
+from clsplat.scenes.scene import load_scene
+from clsplat.splats.shapes import SHAPES
+from clsplat.training.presets import PRESETS
 
 OUT = common.RESULTS / "frontier"
 RESOLUTION = {"fox": 2}  # of load_scene; others as they are

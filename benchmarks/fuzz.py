@@ -3,8 +3,8 @@
     python benchmarks/fuzz.py [--inputs 5000] [--seed 0] [--readers ply colmap-bin]
     python benchmarks/fuzz.py --table                         # print what is there, run nothing
 
-What is damaged, and what counts as a fault, stands in tests/fuzzing.py. `faults` has each one's input, so that
-`python tests/fuzzing.py fuzz_readers READER INPUT INPUT+1 SEED` repeats it.
+What is damaged, and what counts as a fault, stands in tests/support/fuzzing.py. `faults` has each one's input, so that
+`python tests/support/fuzzing.py fuzz_readers READER INPUT INPUT+1 SEED` repeats it.
 """
 
 from __future__ import annotations

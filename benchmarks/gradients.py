@@ -6,7 +6,7 @@ Two measures, both relative to the field's gradient in the Euclidean norm:
   differences  double build, thresholds 0, against central finite differences of the rendered image itself, over
                every parameter (random per-pixel weights, non-square image, off-centre principal point)
   reference    float32 build with the usual thresholds, against the exact (complex-step) gradient of the independent
-               NumPy renderer in tests/reference.py
+               NumPy renderer in tests/reference/reference.py
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ sys.path.insert(0, str(common.ROOT / "tests"))
 from reference import reference_gradients
 from reference_scenes import random_camera, random_splats
 
-from clsplat.camera import Camera
-from clsplat.render import Renderer
-from clsplat.shapes import SHAPES
-from clsplat.splats import Splats
-from clsplat.tuning import schedule_for
+from clsplat.cameras.camera import Camera
+from clsplat.rendering.render import Renderer
+from clsplat.rendering.tuning import schedule_for
+from clsplat.splats.shapes import SHAPES
+from clsplat.splats.splats import Splats
 
 SEED, N_SPLATS, WIDTH, HEIGHT, STEP = 3, 8, 41, 27, 1e-5
 BACKGROUND = (0.2, 0.5, 0.9)

@@ -26,11 +26,11 @@ from typing import Any
 import common
 import numpy as np
 
-from clsplat.capture import write_capture
-from clsplat.checkpoint import Checkpoint
-from clsplat.device import open_device
+from clsplat.device.device import open_device
 from clsplat.errors import ClsplatError
-from clsplat.splats import Splats
+from clsplat.scenes.demo.capture import write_capture
+from clsplat.splats.splats import Splats
+from clsplat.training.checkpoint import Checkpoint
 
 ITERATIONS, INTERVAL = 240, 3
 OPTIONS = ["--iterations", str(ITERATIONS), "--cap-max", "300", "--sh-degree", "1", "--densify-interval", "10",

@@ -53,11 +53,11 @@ def main() -> None:
 
 def run(place: str, shape: str, options: str, seed: int, args: argparse.Namespace) -> None:
     """One run; appends its line."""
-    from clsplat.device import open_device
-    from clsplat.scene import load_scene
-    from clsplat.systems import parse_systems
-    from clsplat.trainer import Trainer
-    from clsplat.tuning import schedule_for
+    from clsplat.comparison.systems import parse_systems
+    from clsplat.device.device import open_device
+    from clsplat.rendering.tuning import schedule_for
+    from clsplat.scenes.scene import load_scene
+    from clsplat.training.trainer import Trainer
 
     device = open_device(args.device)
     environment = common.environment(device, schedule_for(device))
@@ -79,8 +79,8 @@ def run(place: str, shape: str, options: str, seed: int, args: argparse.Namespac
 
 def measure(trainer: Any, splats: Any, background: tuple[float, ...], smallest: int = 11) -> dict[str, Any]:
     """PSNR of the test views in each size, and colour-corrected; sizes below SSIM's window are passed over."""
-    from clsplat.evaluate import evaluate
-    from clsplat.metrics import DEFAULT_PROTOCOL
+    from clsplat.evaluation.evaluate import evaluate
+    from clsplat.evaluation.metrics import DEFAULT_PROTOCOL
 
     psnr = []
     side = min(min(view.image.shape[:2]) for view in trainer.scene.test)

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.cameras_json import read_cameras
-from clsplat.images import write_png
-from clsplat.model_folder import ModelFolder
-from clsplat.render import Renderer
-from clsplat.shapes import SKEW_LIMIT
-from clsplat.splats import SH_C0, Splats
+from clsplat.cameras.cameras_json import read_cameras
+from clsplat.files.images import write_png
+from clsplat.rendering.render import Renderer
+from clsplat.splats.shapes import SKEW_LIMIT
+from clsplat.splats.splats import SH_C0, Splats
+from clsplat.training.model_folder import ModelFolder
 
 
 def main() -> None:

@@ -30,9 +30,9 @@ from hazards.static import Renderers, static_row
 from hazards.systems import OPTIMIZERS, SYSTEMS
 from hazards.training import TRAINING, Trainings, build_options
 
-from clsplat.device import Device, list_devices, open_device
-from clsplat.shapes import DEFAULT_SHAPE, SHAPES
-from clsplat.tuning import schedule_for
+from clsplat.device.device import Device, list_devices, open_device
+from clsplat.rendering.tuning import schedule_for
+from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
 Row = dict[str, Any]
 Task = tuple[Row, Callable[[], Row | None]]  # what tells a line from others, and what measures it

@@ -52,10 +52,10 @@ def main() -> None:
 
 def measure(args: argparse.Namespace, folder: Path) -> None:
     """All cases, each a line of the file."""
-    from clsplat.cameras_json import NamedCamera, write_cameras
-    from clsplat.device import open_device
-    from clsplat.synthetic import synthetic_scene
-    from clsplat.tuning import schedule_for
+    from clsplat.cameras.cameras_json import NamedCamera, write_cameras
+    from clsplat.device.device import open_device
+    from clsplat.rendering.tuning import schedule_for
+    from clsplat.scenes.synthetic import synthetic_scene
 
     device = open_device(args.device)
     schedule = schedule_for(device)

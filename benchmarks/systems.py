@@ -21,12 +21,12 @@ from typing import NamedTuple
 
 import common
 
-from clsplat.compare import RUNS, Run, compare
-from clsplat.compare_table import Record, markdown
-from clsplat.config import TrainConfig
-from clsplat.scene import Scene, load_scene
-from clsplat.shapes import SHAPES
-from clsplat.systems import System, parse_systems
+from clsplat.comparison.compare import RUNS, Run, compare
+from clsplat.comparison.compare_table import Record, markdown
+from clsplat.comparison.systems import System, parse_systems
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.splats.shapes import SHAPES
+from clsplat.training.config import TrainConfig
 
 OUT = common.RESULTS / "systems"
 RESOLUTION = {"fox": 2}  # of load_scene; others as they are

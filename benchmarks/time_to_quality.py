@@ -54,11 +54,11 @@ def main() -> None:
 
 def run(name: str, options: str, seed: int, args: argparse.Namespace) -> None:
     """One training; appends its line."""
-    from clsplat.device import open_device
-    from clsplat.scene import load_scene
-    from clsplat.systems import parse_systems
-    from clsplat.trainer import Trainer
-    from clsplat.tuning import schedule_for
+    from clsplat.comparison.systems import parse_systems
+    from clsplat.device.device import open_device
+    from clsplat.rendering.tuning import schedule_for
+    from clsplat.scenes.scene import load_scene
+    from clsplat.training.trainer import Trainer
 
     device, load = open_device(args.device), os.getloadavg()[0]
     environment = common.environment(device, schedule_for(device))

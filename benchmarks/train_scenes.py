@@ -68,9 +68,9 @@ def main() -> None:
 def run(key: dict[str, Any], options: list[str], out: Path, models: Path | None) -> None:
     """One training; appends its line."""
     import clsplat
-    from clsplat.config import TrainConfig
-    from clsplat.device import open_device
-    from clsplat.tuning import schedule_for
+    from clsplat.device.device import open_device
+    from clsplat.rendering.tuning import schedule_for
+    from clsplat.training.config import TrainConfig
 
     n = key["iterations"]
     marks = tuple(sorted({max(n * i // MARKS, 1) for i in range(1, MARKS + 1)}))

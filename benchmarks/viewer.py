@@ -33,7 +33,7 @@ sys.path.insert(0, str(common.ROOT / "tests"))
 
 KEYS, FRAMES = 4, 4000  # training cameras on the path, poses between them
 POSE_SECONDS = 0.016
-REST = 0.15  # seconds, of clsplat/viewer.py
+REST = 0.15  # seconds, of clsplat/viewer/viewer.py
 KINDS = ("unwatched", "resting", "moving")
 STRETCH = 25  # iterations
 SETTLED = 2  # rounds of stretches that do not count: the first visit builds kernels
@@ -87,8 +87,8 @@ def training_command(scene: str, model: Path, args: argparse.Namespace) -> list[
 
 def path_of(model: Path) -> list[Any]:
     """Cameras on the way through some training cameras, the same in both processes."""
-    from clsplat.cameras_json import read_cameras
-    from clsplat.paths_between import interpolate
+    from clsplat.cameras.cameras_json import read_cameras
+    from clsplat.cameras.paths_between import interpolate
 
     cameras = [item.camera for item in read_cameras(model / "cameras.json")]
     return interpolate(cameras[:: max(len(cameras) // KEYS, 1)][:KEYS], FRAMES)
@@ -99,8 +99,8 @@ def serve(model: Path, device: str | None) -> None:
     from clsplat_cli.models import load_model
     from clsplat_cli.view import Viewing, known_cameras
 
-    from clsplat.device import open_device
-    from clsplat.tuning import schedule_for
+    from clsplat.device.device import open_device
+    from clsplat.rendering.tuning import schedule_for
 
     places = np.array([camera.position for camera in path_of(model)])
     loaded = load_model(model)
@@ -166,7 +166,7 @@ class Walker:
 
     def wait_for(self, number: int, full: bool, timeout: float = 60.0) -> float:
         """When a picture of this pose came, of full size if wanted."""
-        from clsplat.viewer_settings import DEFAULT_SIZE
+        from clsplat.viewer.viewer_settings import DEFAULT_SIZE
 
         end = time.perf_counter() + timeout
         while time.perf_counter() < end:
@@ -252,14 +252,14 @@ def quantiles(seconds: list[float]) -> dict[str, float]:
 
 def watch_training(scene: str, args: argparse.Namespace) -> None:
     """One run in stretches without a viewer, with a client at rest and with one that moves; appends a line."""
-    from clsplat.config import TrainConfig
-    from clsplat.device import open_device
-    from clsplat.scene import load_scene
-    from clsplat.training import train
-    from clsplat.tuning import schedule_for
-    from clsplat.viewer_server import Server
-    from clsplat.viewer_start import start_of
-    from clsplat.viewer_training import TrainingView
+    from clsplat.device.device import open_device
+    from clsplat.rendering.tuning import schedule_for
+    from clsplat.scenes.scene import load_scene
+    from clsplat.training.config import TrainConfig
+    from clsplat.training.training import train
+    from clsplat.viewer.viewer_server import Server
+    from clsplat.viewer.viewer_start import start_of
+    from clsplat.viewer.viewer_training import TrainingView
 
     loaded = load_scene(common.data_folder() / scene, resolution=SCENES.get(scene, -1), eval=True)
     config = TrainConfig(iterations=args.iterations, cap_max=args.cap_max, device=args.device)

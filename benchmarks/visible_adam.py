@@ -66,11 +66,11 @@ def main() -> None:
 def run(task: str, name: str, n: int, shape: str, options: str, seed: int, iterations: int,
         args: argparse.Namespace) -> None:
     """One run; appends its line."""
-    from clsplat.device import open_device
-    from clsplat.scene import load_scene
-    from clsplat.systems import parse_systems
-    from clsplat.trainer import Trainer
-    from clsplat.tuning import schedule_for
+    from clsplat.comparison.systems import parse_systems
+    from clsplat.device.device import open_device
+    from clsplat.rendering.tuning import schedule_for
+    from clsplat.scenes.scene import load_scene
+    from clsplat.training.trainer import Trainer
 
     device, load = open_device(args.device), os.getloadavg()[0]
     environment = common.environment(device, schedule_for(device))
@@ -98,9 +98,9 @@ def run(task: str, name: str, n: int, shape: str, options: str, seed: int, itera
 
 def measure(trainer: Any, iterations: int) -> dict[str, Any]:
     """Train, and look closely at some of the iterations."""
-    from clsplat.buffers import to_host
-    from clsplat.launches import recorded
-    from clsplat.stages import by_stage
+    from clsplat.device.buffers import to_host
+    from clsplat.device.launches import recorded
+    from clsplat.profiling.stages import by_stage
 
     lanes, queue, seconds = trainer.kernels.lanes, trainer.device.queue, 0.0
     trainer.step()  # kernels are built
@@ -138,10 +138,10 @@ def measure(trainer: Any, iterations: int) -> dict[str, Any]:
 
 def wide_scene(n: int, shape: str, size: tuple[int, int]) -> Any:
     """A synthetic scene through long lenses, and its splats along a Morton curve."""
-    from clsplat.camera import Camera
-    from clsplat.morton import morton_order
-    from clsplat.splats import Splats
-    from clsplat.synthetic import synthetic_scene
+    from clsplat.cameras.camera import Camera
+    from clsplat.scenes.synthetic import synthetic_scene
+    from clsplat.splats.morton import morton_order
+    from clsplat.splats.splats import Splats
 
     scene, splats = synthetic_scene(n, *size, shape, n_views=8)
     order = morton_order(splats.mean)

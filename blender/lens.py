@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clsplat.camera import Camera
-from clsplat.camera_path import cam_from_world_of, pose_of
+from clsplat.cameras.camera import Camera
+from clsplat.cameras.camera_path import cam_from_world_of, pose_of
 from clsplat.errors import InputError
 
 SENSOR = 36.0  # Blender's own sensor width [mm]

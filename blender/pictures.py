@@ -10,11 +10,11 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
+from clsplat.cameras.camera import Camera
 from clsplat.errors import InputError
-from clsplat.placing import joined, placed, similarity
-from clsplat.render import Rendered, Renderer
-from clsplat.splats import Splats
+from clsplat.rendering.render import Rendered, Renderer
+from clsplat.splats.placing import joined, placed, similarity
+from clsplat.splats.splats import Splats
 
 from .lens import moved
 

@@ -26,8 +26,8 @@ def add_splats(context: Any, path: Path, upright: bool = True, points: int = 100
     """
     import numpy as np
 
-    from clsplat.shapes import shape_named
-    from clsplat.splats import SH_C0, Splats
+    from clsplat.splats.shapes import shape_named
+    from clsplat.splats.splats import SH_C0, Splats
 
     from .pictures import to_linear
 

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 import click
 
 from clsplat.errors import InputError
-from clsplat.shapes import DEFAULT_SHAPE, SHAPES
+from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
 from .options import PATH, device_option, is_given, scene_options
 from .progress import table
 
 if TYPE_CHECKING:
-    from clsplat.bench import Report, StageTime
-    from clsplat.device import Device
-    from clsplat.scene import Scene
-    from clsplat.splats import Splats
+    from clsplat.device.device import Device
+    from clsplat.profiling.bench import Report, StageTime
+    from clsplat.scenes.scene import Scene
+    from clsplat.splats.splats import Splats
 
 SPLATS, WIDTH, HEIGHT = 30_000, 640, 480
 HEAD = ("stage", "ms", "share", "MB", "of copy limit", "Mflop", "of FMA limit")
@@ -53,10 +53,10 @@ def bench(ctx: click.Context, source_path: Path | None, images: str | None, reso
     Bytes and operations are those that the work needs at least; only pairs of splat and pixel that show are counted.
     Other work on the machine makes all of it slower.
     """
-    from clsplat.atomic import atomic_writer
-    from clsplat.bench import bench_trainer, measure_render, measure_training
-    from clsplat.device import open_device
-    from clsplat.limits import measure_limits
+    from clsplat.device.device import open_device
+    from clsplat.files.atomic import atomic_writer
+    from clsplat.profiling.bench import bench_trainer, measure_render, measure_training
+    from clsplat.profiling.limits import measure_limits
 
     if source_path is None and (images or resolution is not None or model_path):
         raise click.UsageError("-i, -r and -m belong to a scene: give it with -s")
@@ -68,7 +68,7 @@ def bench(ctx: click.Context, source_path: Path | None, images: str | None, reso
     if source_path is not None:
         scene, start = _read(source_path, images, resolution, model_path, splats)
     else:
-        from clsplat.synthetic import synthetic_scene
+        from clsplat.scenes.synthetic import synthetic_scene
 
         scene, start = synthetic_scene(splats or SPLATS, width, height, shape or DEFAULT_SHAPE, sh_degree)
     kernel = shape or (DEFAULT_SHAPE if isinstance(start, int) else start.shape)
@@ -140,7 +140,7 @@ def _percent(fraction: float | None) -> str:
 def _read(path: Path, images: str | None, resolution: int | None, model: Path | None,
           splats: int | None) -> tuple[Scene, Splats | int]:
     """The scene, all of its views, and what to start from."""
-    from clsplat.scene import load_scene
+    from clsplat.scenes.scene import load_scene
 
     scene = load_scene(path, images, -1 if resolution is None else resolution, eval=False)
     if model is None:

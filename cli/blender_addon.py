@@ -13,8 +13,8 @@ from pathlib import Path
 import click
 
 from clsplat import __version__
-from clsplat.atomic import atomic_writer
 from clsplat.errors import InputError
+from clsplat.files.atomic import atomic_writer
 
 from .options import PATH
 

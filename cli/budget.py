@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from clsplat.budget_rules import TOLERANCE, BudgetOptions
-from clsplat.budget_state import FILE, BudgetState
-from clsplat.config import TrainConfig
+from clsplat.compression.budget_rules import TOLERANCE, BudgetOptions
+from clsplat.compression.budget_state import FILE, BudgetState
 from clsplat.errors import InputError, OutputError
-from clsplat.sole_writer import sole_writer
+from clsplat.files.sole_writer import sole_writer
+from clsplat.training.config import TrainConfig
 
 from .options import Decibels, F
 from .progress import TrainingDisplay
 
 if TYPE_CHECKING:
-    from clsplat.budget import Budgeted
-    from clsplat.scene import Scene
+    from clsplat.compression.budget import Budgeted
+    from clsplat.scenes.scene import Scene
 
 INTERRUPTED = 130
 KEYS = ("budget", "budget_tolerance", "target_psnr", "max_bytes")
@@ -84,7 +84,7 @@ def stored_search(folder: Path) -> tuple[dict[str, Any], BudgetOptions, dict[str
 def run_search(ctx: click.Context, scene: Scene, config: TrainConfig, options: BudgetOptions, model_path: Path,
                record: dict[str, Any], resume: bool, overwrite: bool, quiet: bool) -> None:
     """Search with a live display, and say what was found."""
-    from clsplat.budget import train_budget
+    from clsplat.compression.budget import train_budget
 
     result: Budgeted | None = None
     try:
@@ -103,8 +103,8 @@ def run_search(ctx: click.Context, scene: Scene, config: TrainConfig, options: B
     if chart is not None:
         click.echo(chart)
     if scene.test:
-        from clsplat.evaluate import evaluate
-        from clsplat.render import Renderer
+        from clsplat.evaluation.evaluate import evaluate
+        from clsplat.rendering.render import Renderer
 
         metrics = evaluate(Renderer(config.device), result.splats, scene.test, config.background)
         click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
@@ -125,7 +125,7 @@ def lines_of(result: Budgeted) -> list[str]:
 
 def draw_growth(result: Budgeted, model_path: Path) -> str | None:
     """Write growth.png and growth.svg; what to say of them, nothing where matplotlib is not installed."""
-    from clsplat.charts import growth_chart
+    from clsplat.comparison.charts import growth_chart
 
     report = result.report
     rows = [{"splats": row["splats"], "psnr": row["psnr"]} for row in report["growth"]]

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from clsplat.comparison.systems import DEFAULT, parse_systems
 from clsplat.errors import InputError
-from clsplat.presets import PRESETS
-from clsplat.systems import DEFAULT, parse_systems
+from clsplat.training.presets import PRESETS
 
 from .options import (
     PATH,
@@ -29,9 +29,9 @@ from .train import SCENE_KEYS, read_scene
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from clsplat.compare import Run
-    from clsplat.compare_table import Record
-    from clsplat.scene import Scene
+    from clsplat.comparison.compare import Run
+    from clsplat.comparison.compare_table import Record
+    from clsplat.scenes.scene import Scene
 
 
 @click.command("compare", cls=SpacedLists)
@@ -56,8 +56,8 @@ def compare_systems(ctx: click.Context, /, scenes: tuple[Path, ...], output: Pat
     Options of training hold for all systems; a system's own changes replace them. Writes a line a run into
     DIR/runs.jsonl, and table.md and results.json of all runs there. After Ctrl-C, the same command goes on.
     """
-    from clsplat.compare import compare
-    from clsplat.compare_table import HEAD, cells, notes, summarise
+    from clsplat.comparison.compare import compare
+    from clsplat.comparison.compare_table import HEAD, cells, notes, summarise
 
     common, loaded = options_and_scenes(ctx, scenes, values)
     with TrainingDisplay(quiet) as display:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import click
 
 from clsplat.errors import InputError, OutputError
-from clsplat.schema import MAX_SH_DEGREE, sh_coefficients
-from clsplat.shapes import GAUSSIAN, SHAPES
+from clsplat.splats.schema import MAX_SH_DEGREE, sh_coefficients
+from clsplat.splats.shapes import GAUSSIAN, SHAPES
 
 from .models import LoadedModel, load_model, load_splats, recorded_cameras
 from .options import PATH, device_option, iteration_option, quiet_option
 
 if TYPE_CHECKING:
-    from clsplat.splats import Splats
+    from clsplat.splats.splats import Splats
 
 _PLY = ".ply"
 _GAUSSIANS = (".splat", ".spz")  # files that hold no other shape
@@ -45,8 +45,8 @@ def convert_model(model: Path, output: Path, shape: str | None, approximate: boo
     nothing is written. With --shape gaussian a .ply has 3DGS's columns and no others. A .splat file has no SH bands
     above 0; .spz files round everything to a byte or so. What a file loses is measured on images.
     """
-    from clsplat.splat_file import write_splat
-    from clsplat.spz_file import write_spz
+    from clsplat.splats.splat_file import write_splat
+    from clsplat.splats.spz_file import write_spz
 
     suffix = output.suffix.lower()
     if suffix not in (_PLY, *_GAUSSIANS):
@@ -81,7 +81,7 @@ def _converted(splats: Splats, target: str, approximate: bool) -> tuple[Splats, 
     ------
     InputError : some have no equal, and none that is nearest is asked for, or there.
     """
-    from clsplat.convert import convert
+    from clsplat.splats.convert import convert
 
     try:
         return convert(splats, target), False
@@ -90,7 +90,7 @@ def _converted(splats: Splats, target: str, approximate: bool) -> tuple[Splats, 
             raise
         if not approximate:
             raise InputError(f"{error}; or --approximate") from None
-    from clsplat.nearest import nearest_gaussians
+    from clsplat.splats.nearest import nearest_gaussians
 
     return nearest_gaussians(splats), True
 
@@ -106,10 +106,10 @@ def _of_degree(splats: Splats, degree: int) -> Splats:
 
 def _cost(loaded: LoadedModel, converted: Splats, cameras: Path | None, device: str | None) -> str:
     """How far the images are from the model's own."""
-    from clsplat.cameras_json import read_cameras
-    from clsplat.evaluate import MAX_PSNR
-    from clsplat.metrics import psnr
-    from clsplat.render import Renderer
+    from clsplat.cameras.cameras_json import read_cameras
+    from clsplat.evaluation.evaluate import MAX_PSNR
+    from clsplat.evaluation.metrics import psnr
+    from clsplat.rendering.render import Renderer
 
     named = recorded_cameras(loaded) if cameras is None else read_cameras(cameras)
     if not named:

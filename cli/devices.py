@@ -11,7 +11,7 @@ import click
 from clsplat.errors import DeviceError
 
 if TYPE_CHECKING:
-    from clsplat.device import DeviceInfo
+    from clsplat.device.device import DeviceInfo
 
 
 @click.command()
@@ -24,7 +24,7 @@ def devices(ctx: click.Context) -> None:
     The device that the other commands take by default is marked; --device takes an index such as 0:1, "cpu",
     "gpu", or a part of a platform's or device's name. Exit code 1 when no device works.
     """
-    from clsplat.device import NO_PLATFORM, list_devices, open_device
+    from clsplat.device.device import NO_PLATFORM, list_devices, open_device
 
     try:
         found = list_devices()
@@ -89,9 +89,9 @@ def hints(platforms: set[str], has_gpu: bool, root: Path = Path("/")) -> list[st
 
 def _try(info: DeviceInfo) -> dict[str, str]:
     """Schedule and smoke test of one device; DeviceError where it does not work."""
-    from clsplat.device import SCHEDULES, open_device
-    from clsplat.program import smoke_test
-    from clsplat.tuning import schedule_for
+    from clsplat.device.device import SCHEDULES, open_device
+    from clsplat.device.program import smoke_test
+    from clsplat.rendering.tuning import schedule_for
 
     device = open_device(info.index)
     build_ms, run_ms = smoke_test(device)

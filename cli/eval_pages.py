@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat import __version__
-from clsplat.config import TrainConfig
 from clsplat.errors import InputError, OutputError
-from clsplat.metrics import color_corrected
+from clsplat.evaluation.metrics import color_corrected
+from clsplat.training.config import TrainConfig
 
 from .models import LoadedModel
 
 if TYPE_CHECKING:
-    from clsplat.eval_images import Shot
-    from clsplat.perceptual import Flip, Lpips
-    from clsplat.render import Rendered
-    from clsplat.scene import View
+    from clsplat.evaluation.perceptual import Flip, Lpips
+    from clsplat.evaluation.report.eval_images import Shot
+    from clsplat.rendering.render import Rendered
+    from clsplat.scenes.scene import View
 
 # Options whose values a page names first, whatever they are.
 _ALWAYS = ("iterations", "cap_max", "seed")
@@ -56,7 +56,7 @@ class ViewRecorder:
             flip_map = self.flip(color, view.image, view.mask)
             self.per_view.setdefault("FLIP", {})[view.name] = self.flip.mean(flip_map, view.mask)
         if self.pages:
-            from clsplat.eval_images import shot_of
+            from clsplat.evaluation.report.eval_images import shot_of
 
             self.shots[view.name] = shot_of(view.image, color, view.mask, flip_map)
 
@@ -84,7 +84,7 @@ def write_model_page(path: Path, scene: str, measured: Sequence[Measurement], la
     ------
     InputError : the models were measured on different views. OutputError : cannot be written.
     """
-    from clsplat.eval_report import Measured, write_eval_report
+    from clsplat.evaluation.report.eval_report import Measured, write_eval_report
 
     first = measured[0].result
     what = f"{first['views']} {'' if first['set'] == 'all' else first['set'] + ' '}views of {scene}"

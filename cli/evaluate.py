@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.complexity import complexity
 from clsplat.errors import InputError, OutputError
-from clsplat.metrics import DEFAULT_PROTOCOL, PROTOCOLS, Protocol, protocol_named
-from clsplat.model_folder import read_json, write_json
+from clsplat.evaluation.metrics import DEFAULT_PROTOCOL, PROTOCOLS, Protocol, protocol_named
+from clsplat.splats.complexity import complexity
+from clsplat.training.model_folder import read_json, write_json
 
 from .eval_pages import Measurement, ViewRecorder, write_model_page
 from .models import LoadedModel, load_model, scene_of
@@ -33,8 +33,8 @@ from .outputs import ImageWriter, output_stems
 from .progress import counted, table
 
 if TYPE_CHECKING:
-    from clsplat.render import Rendered, Renderer
-    from clsplat.scene import Scene, View
+    from clsplat.rendering.render import Rendered, Renderer
+    from clsplat.scenes.scene import Scene, View
 
 REPORT = "report.html"
 _DIGITS = {"PSNR": 3, "SSIM": 4, "LPIPS": 4, "FLIP": 4}
@@ -69,8 +69,8 @@ def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], sou
     Writes results.json, per_view.json and report.html, a page with the images, into each model's folder (with --set
     train or all: results_train.json and so on).
     """
-    from clsplat.perceptual import Flip, Lpips
-    from clsplat.render import Renderer
+    from clsplat.evaluation.perceptual import Flip, Lpips
+    from clsplat.rendering.render import Renderer
 
     paths = (*more_models, *models)
     if not paths:
@@ -120,7 +120,7 @@ def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol
     ------
     InputError : the scene has no such views. OutputError : the renders cannot be written.
     """
-    from clsplat.evaluate import evaluate
+    from clsplat.evaluation.evaluate import evaluate
 
     assert model.folder is not None
     views = {"test": scene.test, "train": scene.train, "all": scene.views}[view_set]

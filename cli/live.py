@@ -12,10 +12,10 @@ import click
 from .view import require_viser
 
 if TYPE_CHECKING:
-    from clsplat.config import TrainConfig
-    from clsplat.run_log import Progress
-    from clsplat.scene import Scene
-    from clsplat.trainer import Visit
+    from clsplat.scenes.scene import Scene
+    from clsplat.training.config import TrainConfig
+    from clsplat.training.run_log import Progress
+    from clsplat.training.trainer import Visit
 
 
 class LiveView:
@@ -29,10 +29,10 @@ class LiveView:
     def __init__(self, scene: Scene, config: TrainConfig, model_path: Path, host: str, port: int,
                  quiet: bool = False) -> None:
         require_viser()
-        from clsplat.cameras_json import NamedCamera
-        from clsplat.viewer_server import Server
-        from clsplat.viewer_start import Known, start_of
-        from clsplat.viewer_training import TrainingView
+        from clsplat.cameras.cameras_json import NamedCamera
+        from clsplat.viewer.viewer_server import Server
+        from clsplat.viewer.viewer_start import Known, start_of
+        from clsplat.viewer.viewer_training import TrainingView
 
         known = Known(tuple(NamedCamera(view.name, view.camera) for view in scene.train),
                       tuple(NamedCamera(view.name, view.camera) for view in scene.test))
@@ -57,7 +57,7 @@ class LiveView:
 
     def told(self, display: Callable[[Progress], None]) -> Callable[[Progress], None]:
         """A `progress` that also tells the page."""
-        from clsplat.viewer_training import run_line
+        from clsplat.viewer.viewer_training import run_line
 
         def progress(news: Progress) -> None:
             display(news)

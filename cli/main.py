@@ -106,7 +106,7 @@ def _known_failure(error: Exception) -> str | None:
     cl = sys.modules.get("pyopencl")  # without it no error can be OpenCL's
     if cl is None or not isinstance(error, cl.Error):
         return None
-    from clsplat.device import first_line, is_out_of_memory
+    from clsplat.device.device import first_line, is_out_of_memory
 
     if is_out_of_memory(error):
         return "device out of memory: lower --cap-max, use smaller images (-r 2, 4, 8), or another --device"
@@ -115,7 +115,7 @@ def _known_failure(error: Exception) -> str | None:
 
 def _show_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int,
                   file: TextIO | None = None, line: str | None = None) -> None:
-    if display := sys.modules.get("clsplat.progress_display"):  # where nothing is shown, it was never loaded
+    if display := sys.modules.get("clsplat.training.progress_display"):  # where nothing is shown, it was never loaded
         display.LiveLine.give_way()
     click.echo(f"warning: {_one_line(str(message))}", err=True)
 

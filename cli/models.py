@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.cameras_json import NamedCamera, bare_name, read_cameras
-from clsplat.config import ALPHA_USES
+from clsplat.cameras.cameras_json import NamedCamera, bare_name, read_cameras
 from clsplat.errors import InputError
-from clsplat.json_fields import real_of
-from clsplat.model_folder import ModelFolder
-from clsplat.splats import Splats
+from clsplat.files.json_fields import real_of
+from clsplat.splats.splats import Splats
+from clsplat.training.config import ALPHA_USES
+from clsplat.training.model_folder import ModelFolder
 
 if TYPE_CHECKING:
-    from clsplat.scene import Scene
+    from clsplat.scenes.scene import Scene
 
     from .options import RGB
 
@@ -73,11 +73,11 @@ def load_model(path: Path, iteration: int | None = None) -> LoadedModel:
 def load_splats(path: Path) -> Splats:
     """What a .ply, .splat or .spz file holds; raises InputError."""
     if path.suffix.lower() == ".splat":
-        from clsplat.splat_file import read_splat
+        from clsplat.splats.splat_file import read_splat
 
         return read_splat(path)
     if path.suffix.lower() == ".spz":
-        from clsplat.spz_file import read_spz
+        from clsplat.splats.spz_file import read_spz
 
         return read_spz(path)
     return Splats.load(path)
@@ -93,7 +93,7 @@ def scene_of(model: LoadedModel, source_path: Path | None = None, images: str | 
     ------
     InputError : no scene known, not where it was, or without the views that were held out.
     """
-    from clsplat.scene import load_scene
+    from clsplat.scenes.scene import load_scene
 
     record = model.scene or {}
     path = source_path or record.get("path")

@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 
 import click
 
-from clsplat.config import (
+from clsplat.splats.shapes import NORMALISATIONS, SHAPES
+from clsplat.training.config import (
     ALPHA_USES,
     ALTERNATIONS,
     OPTIMIZERS,
@@ -21,8 +22,7 @@ from clsplat.config import (
     STRATEGIES,
     TrainConfig,
 )
-from clsplat.shapes import NORMALISATIONS, SHAPES
-from clsplat.skew_map import SKEW_MAPS
+from clsplat.training.optim.skew_map import SKEW_MAPS
 
 F = TypeVar("F", bound=Callable[..., Any])
 RGB = tuple[float, float, float]

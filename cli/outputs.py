@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from clsplat.atomic import atomic_writer
-from clsplat.cameras_json import bare_name
+from clsplat.cameras.cameras_json import bare_name
 from clsplat.errors import InputError
+from clsplat.files.atomic import atomic_writer
 
 if TYPE_CHECKING:
-    from clsplat.render import Rendered
+    from clsplat.rendering.render import Rendered
 
     from .options import RGB
 
@@ -78,7 +78,7 @@ class ImageWriter:
 
     def write(self, stem: str, image: Rendered) -> str | None:
         """Write the files; the scale of a grey depth PNG to tell the user, else None."""
-        from clsplat.images import write_grey16, write_png
+        from clsplat.files.images import write_grey16, write_png
 
         planes = {"": image.color} | {f"_{name}": getattr(image, name) for name in self.extras}
         note = None
@@ -90,7 +90,7 @@ class ImageWriter:
             elif ending != "_depth":
                 write_png(path, plane)
             elif self.near_far is not None:
-                from clsplat.display import depth_picture
+                from clsplat.rendering.display import depth_picture
 
                 write_png(path, depth_picture(image, self.near_far, self.background))
             else:
@@ -115,7 +115,7 @@ class VideoFiles:
 
     def __init__(self, path: Path, fps: float, extras: Sequence[str] = (),
                  near_far: tuple[float, float] | None = None, background: RGB = (0.0, 0.0, 0.0)) -> None:
-        from clsplat.video import VideoWriter
+        from clsplat.files.video import VideoWriter
 
         self.near_far, self.background = near_far, background
         paths = {"colour": path} | {extra: beside(path, extra) for extra in extras}
@@ -135,7 +135,7 @@ class VideoFiles:
 
     def write(self, stem: str, image: Rendered) -> None:
         """Add the view to every video."""
-        from clsplat.display import picture_of
+        from clsplat.rendering.display import picture_of
 
         for mode, writer in self.writers.items():
             writer.write(picture_of(image, mode, self.background, self.near_far))

@@ -15,8 +15,8 @@ from .options import PATH, Decibels, device_option, iteration_option, quiet_opti
 from .progress import TrainingDisplay
 
 if TYPE_CHECKING:
-    from clsplat.prune import Pruned
-    from clsplat.scene import Scene
+    from clsplat.compression.prune import Pruned
+    from clsplat.scenes.scene import Scene
 
 
 @click.command("prune")
@@ -59,10 +59,10 @@ def prune_model(model: Path, source_path: Path | None, images: str | None, resol
 def pruned_model(loaded: LoadedModel, scene: Scene, tolerance: float, iterations: int, device: str | None,
                  display: TrainingDisplay) -> Pruned:
     """The smaller model, and what it cost."""
-    from clsplat.device import open_device
-    from clsplat.prune import SHARES, Judge, prune
-    from clsplat.render import Renderer
-    from clsplat.validation import hold_out
+    from clsplat.compression.prune import SHARES, Judge, prune
+    from clsplat.device.device import open_device
+    from clsplat.rendering.render import Renderer
+    from clsplat.scenes.validation import hold_out
 
     opened = open_device(device)
     renderer = Renderer(opened)
@@ -71,7 +71,7 @@ def pruned_model(loaded: LoadedModel, scene: Scene, tolerance: float, iterations
     splats = loaded.splats
     if not iterations:
         return prune(splats, scene.train, judge, tolerance)
-    from clsplat.shrink import trained_rounds
+    from clsplat.compression.shrink import trained_rounds
 
     before = judge(splats)
     splats = trained_rounds(scene, splats, judge, before - SHARES["splats"] * tolerance, iterations, opened, display)
@@ -82,7 +82,7 @@ def pruned_model(loaded: LoadedModel, scene: Scene, tolerance: float, iterations
 
 def lines_of(loaded: LoadedModel, pruned: Pruned, output: Path) -> list[str]:
     """What went, and what it cost."""
-    from clsplat.complexity import complexity
+    from clsplat.splats.complexity import complexity
 
     old, new = complexity(loaded.splats), complexity(pruned.splats)
     was, now = loaded.ply.stat().st_size, output.stat().st_size

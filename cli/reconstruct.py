@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from clsplat.errors import OutputError
-from clsplat.progress_display import PLAIN_INTERVAL, LiveLine
-from clsplat.reconstruct_options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, ReconstructOptions
+from clsplat.scenes.reconstruct.reconstruct_options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, ReconstructOptions
+from clsplat.training.progress_display import PLAIN_INTERVAL, LiveLine
 
 from .options import PATH, overwrite_option, quiet_option
 from .progress import duration
 
 if TYPE_CHECKING:
-    from clsplat.reconstruct import Reconstructed
-    from clsplat.sfm_process import Step
+    from clsplat.scenes.reconstruct.reconstruct import Reconstructed
+    from clsplat.scenes.reconstruct.sfm_process import Step
 
 _DEFAULTS = ReconstructOptions()
 
@@ -55,7 +55,7 @@ def reconstruct_scene(photos: Path, scene: Path, overwrite: bool, quiet: bool, *
 def run_reconstruction(photos: Path, scene: Path, options: ReconstructOptions, overwrite: bool,
                        quiet: bool) -> Reconstructed:
     """Reconstruct with a live display."""
-    from clsplat.reconstruct import reconstruct
+    from clsplat.scenes.reconstruct.reconstruct import reconstruct
 
     with StepDisplay(quiet) as display:
         return reconstruct(photos, scene, options, display, overwrite)
@@ -74,8 +74,8 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
     ------
     OutputError : the scene that is there was made of other photos. Others as `reconstruct`.
     """
-    from clsplat.photo_folder import find_photos, is_video
-    from clsplat.reconstruct import estimated_seconds, made_from
+    from clsplat.scenes.reconstruct.photo_folder import find_photos, is_video
+    from clsplat.scenes.reconstruct.reconstruct import estimated_seconds, made_from
 
     scene = model.parent / f"{photos.resolve().stem if is_video(photos) else photos.resolve().name}-scene"
     options = ReconstructOptions()

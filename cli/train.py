@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from clsplat.config import TrainConfig
 from clsplat.errors import InputError, OutputError
-from clsplat.model_folder import ModelFolder, read_json
-from clsplat.presets import PRESETS, with_preset
+from clsplat.training.config import TrainConfig
+from clsplat.training.model_folder import ModelFolder, read_json
+from clsplat.training.presets import PRESETS, with_preset
 
 from .budget import budget_options, forget_search, is_search, options_of, run_search, stored_search
 from .options import (
@@ -31,9 +31,9 @@ from .reconstruct import scene_of_photos
 from .view import server_options
 
 if TYPE_CHECKING:
-    from clsplat.evaluate import Evaluation
-    from clsplat.scene import Scene
-    from clsplat.training import Model
+    from clsplat.evaluation.evaluate import Evaluation
+    from clsplat.scenes.scene import Scene
+    from clsplat.training.training import Model
 
     from .live import LiveView
 
@@ -73,7 +73,7 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
     into the model's folder. Ctrl-C saves a checkpoint; --resume goes on from it. With --budget auto also budget.json
     and the growth curve; the small model is the last point cloud.
     """
-    from clsplat.photo_folder import is_photographs, is_video
+    from clsplat.scenes.reconstruct.photo_folder import is_photographs, is_video
 
     if resume and overwrite:
         raise click.UsageError("give --resume or --overwrite, not both")
@@ -133,7 +133,7 @@ def read_scene(path: Path, reading: dict[str, Any],
 
     reading : any of SCENE_KEYS; the others take load_scene's defaults, without test views.
     """
-    from clsplat.scene import load_scene
+    from clsplat.scenes.scene import load_scene
 
     arguments = {key: reading[key] for key in SCENE_KEYS if reading.get(key) is not None}
     arguments["eval"] = bool(arguments.get("eval") or "test_every" in arguments or "test_list" in arguments)
@@ -148,7 +148,7 @@ def run_training(scene: Scene, config: TrainConfig, model_path: Path, record: di
                  resume: bool = False, overwrite: bool = False, quiet: bool = False,
                  live: LiveView | None = None) -> Model:
     """Train with a live display, and a page in the browser if `live` is given."""
-    from clsplat.training import train as train_model
+    from clsplat.training.training import train as train_model
 
     with TrainingDisplay(quiet) as display:
         return train_model(scene, config, live.told(display) if live else display, output=model_path, resume=resume,
@@ -165,8 +165,8 @@ def test_metrics(model: Model, scene: Scene) -> Evaluation | None:
     """Metrics of the finished model on the views held out; None where there are none."""
     if not scene.test or model.iteration in model.evaluations:
         return model.evaluations.get(model.iteration)
-    from clsplat.evaluate import evaluate
-    from clsplat.render import Renderer
+    from clsplat.evaluation.evaluate import evaluate
+    from clsplat.rendering.render import Renderer
 
     return evaluate(Renderer(model.config.device), model.splats, scene.test, model.config.background)
 

@@ -8,26 +8,27 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from .budget import Budgeted, train_budget
-    from .budget_rules import BudgetOptions
-    from .camera import Camera
-    from .config import TrainConfig
-    from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
-    from .progress_display import TrainingDisplay
-    from .render import Rendered, Renderer
-    from .scene import Scene, load_scene
-    from .splats import Splats
-    from .training import Model, train
+from ._version import __version__ as __version__
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from .cameras.camera import Camera
+    from .compression.budget import Budgeted, train_budget
+    from .compression.budget_rules import BudgetOptions
+    from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
+    from .rendering.render import Rendered, Renderer
+    from .scenes.scene import Scene, load_scene
+    from .splats.splats import Splats
+    from .training.config import TrainConfig
+    from .training.progress_display import TrainingDisplay
+    from .training.training import Model, train
+
 
 _HOME = {
-    "Camera": "camera", "ClsplatError": "errors", "DeviceError": "errors", "InputError": "errors",
-    "OutputError": "errors", "TrainingError": "errors", "Rendered": "render", "Renderer": "render",
-    "Scene": "scene", "load_scene": "scene", "Splats": "splats", "TrainConfig": "config", "train": "training",
-    "Model": "training", "BudgetOptions": "budget_rules", "Budgeted": "budget", "train_budget": "budget",
-    "TrainingDisplay": "progress_display",
+    "Camera": "cameras.camera", "ClsplatError": "errors", "DeviceError": "errors", "InputError": "errors",
+    "OutputError": "errors", "TrainingError": "errors", "Rendered": "rendering.render", "Renderer": "rendering.render",
+    "Scene": "scenes.scene", "load_scene": "scenes.scene", "Splats": "splats.splats", "TrainConfig": "training.config", "train": "training.training",
+    "Model": "training.training", "BudgetOptions": "compression.budget_rules", "Budgeted": "compression.budget", "train_budget": "compression.budget",
+    "TrainingDisplay": "training.progress_display",
 }
 
 __all__ = [

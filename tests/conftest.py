@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from clsplat.device import SCHEDULES, Device, Schedule, default_schedule, list_devices, open_device
-from clsplat.program import OPTIONS_VARIABLE
-from clsplat.render import Renderer
+from clsplat.device.device import SCHEDULES, Device, Schedule, default_schedule, list_devices, open_device
+from clsplat.device.program import OPTIONS_VARIABLE
+from clsplat.rendering.render import Renderer
 
 MakeRenderer = Callable[..., Renderer]
 

@@ -7,13 +7,13 @@ from unittest import mock
 
 import numpy as np
 
-from clsplat import pipeline
-from clsplat.camera import Camera
-from clsplat.device import Device
-from clsplat.pipeline import isect_bytes
-from clsplat.render import Renderer
-from clsplat.shapes import SHAPES
-from clsplat.splats import Splats
+from clsplat.cameras.camera import Camera
+from clsplat.device.device import Device
+from clsplat.rendering import pipeline
+from clsplat.rendering.pipeline import isect_bytes
+from clsplat.rendering.render import Renderer
+from clsplat.splats.shapes import SHAPES
+from clsplat.splats.splats import Splats
 
 from . import crafted
 

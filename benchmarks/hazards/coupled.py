@@ -18,20 +18,21 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from clsplat.training.optim import skew_map
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import clsplat
-from clsplat import kernels, shapes, skew_map
-from clsplat.capture import RING_TARGET, ring_cameras
-from clsplat.colmap import Points
-from clsplat.config import TrainConfig
-from clsplat.device import Device
+from clsplat.device.device import Device
 from clsplat.errors import ClsplatError
-from clsplat.evaluate import evaluate
-from clsplat.render import Renderer
-from clsplat.scene import Scene, View
-from clsplat.splats import Splats
+from clsplat.evaluation.evaluate import evaluate
+from clsplat.rendering import kernels
+from clsplat.rendering.render import Renderer
+from clsplat.scenes.colmap import Points
+from clsplat.scenes.demo.capture import RING_TARGET, ring_cameras
+from clsplat.scenes.scene import Scene, View
+from clsplat.splats.splats import Splats, shapes
+from clsplat.training.config import TrainConfig
 
 from .training import finite_file
 

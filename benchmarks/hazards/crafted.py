@@ -11,10 +11,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import Camera
-from clsplat.kernels import NEAR
-from clsplat.schema import public_shape
-from clsplat.shapes import Shape
+from clsplat.cameras.camera import Camera
+from clsplat.rendering.kernels import NEAR
+from clsplat.splats.schema import public_shape
+from clsplat.splats.shapes import Shape
 
 Arrays = dict[str, NDArray[np.float64]]
 

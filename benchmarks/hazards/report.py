@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from clsplat.charts import heat_map
+from clsplat.comparison.charts import heat_map
 
 from .crafted import STATIC
 from .systems import SYSTEMS

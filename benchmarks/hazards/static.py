@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.device import Device, Schedule
+from clsplat.device.device import Device, Schedule
 from clsplat.errors import ClsplatError
-from clsplat.kernels import ALPHA_MAX, ALPHA_MIN, T_MIN
-from clsplat.render import Rendered, Renderer
-from clsplat.shapes import SHAPES
-from clsplat.splats import Splats
+from clsplat.rendering.kernels import ALPHA_MAX, ALPHA_MIN, T_MIN
+from clsplat.rendering.render import Rendered, Renderer
+from clsplat.splats.shapes import SHAPES
+from clsplat.splats.splats import Splats
 
 from . import crafted
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from clsplat.shapes import SHAPES
-from clsplat.skew_map import MAPS
+from clsplat.splats.shapes import SHAPES
+from clsplat.training.optim.skew_map import MAPS
 
 
 @dataclass(frozen=True)

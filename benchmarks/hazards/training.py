@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 
 import clsplat
-from clsplat.config import TrainConfig
-from clsplat.device import Device
+from clsplat.device.device import Device
+from clsplat.device.program import OPTIONS_VARIABLE
 from clsplat.errors import ClsplatError
-from clsplat.evaluate import evaluate
-from clsplat.initialise import initial_splats
-from clsplat.program import OPTIONS_VARIABLE
-from clsplat.render import Renderer
-from clsplat.scene import Scene
-from clsplat.shapes import SHAPES
-from clsplat.splats import Splats
+from clsplat.evaluation.evaluate import evaluate
+from clsplat.rendering.render import Renderer
+from clsplat.scenes.scene import Scene
+from clsplat.splats.shapes import SHAPES
+from clsplat.splats.splats import Splats
+from clsplat.training.config import TrainConfig
+from clsplat.training.initialise import initial_splats
 
 from . import worlds
 from .crafted import unit

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from clsplat.camera import Camera
-from clsplat.capture import write_capture
-from clsplat.colmap import Points
-from clsplat.scene import Scene, View, load_scene
+from clsplat.cameras.camera import Camera
+from clsplat.scenes.colmap import Points
+from clsplat.scenes.demo.capture import write_capture
+from clsplat.scenes.scene import Scene, View, load_scene
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 26
 

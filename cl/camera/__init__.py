@@ -1,1 +1,0 @@
-"""OpenCL C sources of clsplat, read as package data by clsplat.program."""

@@ -1,0 +1,363 @@
+// project.cl: splats to screen records, and the gradient back to the raw parameters. LANES splats a work-item.
+//
+// geom, sh: component-major parameter buffers [rows, capacity] (clsplat/splats/schema.py); rows by build constants.
+// Screen record of splat i: RECORD reals at records[i * RECORD]:
+//   mean_px x, y [px]; colour r, g, b; depth (camera z); first and last pixel row, then column, it can reach; shape's p.
+
+#ifndef SHAPE_SIZE
+#define shape_size(s) ((vreal)1)
+#define shape_size_vjp(s, v_size, g)
+#endif
+#ifndef SHAPE_DISPLACEMENT
+#define shape_displacement(s) zero3()
+#define shape_displacement_vjp(s, v_m, g)
+#endif
+
+#define CULLED_KEY 0xFFFFFFFFu
+#define COV2D_MAX R(1e12)  // px^2: a wider splat would overflow float32 on the way, and is no longer a splat
+
+#if ANTIALIASED
+// What the low-pass leaves of a splat's height if it keeps the volume: sqrt(det(M) / det(M + low-pass)), the filter on the
+// screen of Mip-Splatting (Yu et al. 2024, eq. 9, with a wider low-pass). M is B B', of the shape's own size, or with its
+// displacement m B (1 + m m') B'. A skew-normal's peak changes besides: it is divided by the one before (skew_pixel.clh).
+typedef struct {
+    vec3 b0, b1, area, m;
+    vreal size, along, stretch, flat, det, factor;  // along: area'm, stretch: 1 + m'm, flat: det(M)
+} lowering;
+
+static inline lowering lowered(splat_params s, vec3 b0, vec3 b1) {
+    lowering k;
+    k.size = shape_size(s);
+    k.m = shape_displacement(s);
+    k.b0 = scale3(b0, k.size);
+    k.b1 = scale3(b1, k.size);
+    k.area = cross3(k.b0, k.b1);
+    k.along = dot3(k.area, k.m);
+    k.stretch = (vreal)1 + dot3(k.m, k.m);
+    k.flat = k.stretch * dot3(k.area, k.area) - k.along * k.along;
+    const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
+    k.det = k.flat + LOW_PASS * (dot3(k.b0, k.b0) + dot3(k.b1, k.b1) + m0 * m0 + m1 * m1 + (vreal)LOW_PASS);
+    k.factor = sqrt(k.flat / k.det);
+    return k;
+}
+
+// Adds to g, whose opacities are those after lowering and become those before, and to the gradients of b0 and b1.
+static inline void lowered_vjp(lowering k, splat_params s, vec3 b0, vec3 b1, shape_grads *g, vec3 *v_b0, vec3 *v_b1) {
+    const vreal v_factor = g->s.opacity * s.opacity + g->s.opacity_minus * s.opacity_minus;
+    g->s.opacity *= k.factor;
+    g->s.opacity_minus *= k.factor;
+    // factor^2 = flat/det. A splat seen from its edge has no slope.
+    const vreal v_flat = lanes_if(k.factor > (vreal)R(1e-6), v_factor * ((vreal)1 - k.factor * k.factor)
+                                  / (max(k.factor, (vreal)R(1e-6)) * k.det), (vreal)0);
+    const vreal v_squares = -LOW_PASS * v_factor * k.factor / k.det;  // both with the 2 that the squares in flat and det bring
+    const vec3 v_area = scale3(add3(scale3(k.area, k.stretch), scale3(k.m, -k.along)), v_flat);
+    const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
+    const vec3 v_c0 = add3(cross3(k.b1, v_area), scale3(add3(k.b0, scale3(k.m, m0)), v_squares));
+    const vec3 v_c1 = add3(cross3(v_area, k.b0), scale3(add3(k.b1, scale3(k.m, m1)), v_squares));
+    *v_b0 = add3(*v_b0, scale3(v_c0, k.size));
+    *v_b1 = add3(*v_b1, scale3(v_c1, k.size));
+    shape_size_vjp(s, dot3(v_c0, b0) + dot3(v_c1, b1), g);
+    const vec3 of_flat = add3(scale3(k.m, dot3(k.area, k.area)), scale3(k.area, -k.along));
+    shape_displacement_vjp(s, add3(scale3(of_flat, v_flat), scale3(add3(scale3(k.b0, m0), scale3(k.b1, m1)), v_squares)), g);
+}
+#endif
+
+// What projection and its gradient both need.
+typedef struct {
+    vec3 mean, c;          // the point that is projected: world, camera
+    vec3 centre;           // that point in the splat's own unit frame, from (x, y, z)
+    unit_quat quat;
+    mat3 rotation;         // of the splat
+    vec3 scale;
+    projection to_px;
+    vec3 a0, a1;           // rows of A = J W [px per world unit]
+    vec3 ar0, ar1;         // rows of A R
+    vec3 b0, b1;           // rows of B = A R S
+    sym2 cov2d;            // B B' + low-pass [px^2]
+    splat_params s, shown; // as stored, and as the shape is to show it
+#if ANTIALIASED
+    lowering low;          // from one to the other
+#endif
+    vmask in_front;
+} splat_terms;
+
+static inline void load_params(global const real *geom, const ulong capacity, splat_params *s) {
+    no_params(s);
+    s->opacity = opacity_of(lanes_load(geom + ROW_OPACITY_LOGIT * capacity));
+#ifdef ROW_OPACITY_MINUS_LOGIT
+    s->opacity_minus = opacity_of(lanes_load(geom + ROW_OPACITY_MINUS_LOGIT * capacity));
+#endif
+#ifdef ROW_SKEW
+    s->skew = vec3_load(geom + ROW_SKEW * capacity, capacity);
+#endif
+#ifdef ROW_NORMAL
+    s->skew = vec3_load(geom + ROW_NORMAL * capacity, capacity);
+#endif
+#ifdef ROW_BETA
+    s->beta = lanes_load(geom + ROW_BETA * capacity);
+#endif
+#ifdef ROW_NU
+    s->nu = lanes_load(geom + ROW_NU * capacity);
+#endif
+}
+
+static inline splat_terms splat_project(global const real *geom, const ulong capacity, constant real *cam) {
+    splat_terms s;
+    load_params(geom, capacity, &s.s);
+    s.quat = quat_load(geom + ROW_QUAT * capacity, capacity);
+    s.rotation = quat_rotation(s.quat);
+    const vec3 log_scale = vec3_load(geom + ROW_LOG_SCALE * capacity, capacity);
+    s.scale = (vec3){exp(log_scale.x), exp(log_scale.y), exp(log_scale.z)};
+    s.mean = vec3_load(geom + ROW_MEAN * capacity, capacity);
+#ifdef SHAPE_CENTRE
+    s.centre = shape_centre(s.s);
+    s.mean = add3(s.mean, mat3_apply(s.rotation, mul3(s.scale, s.centre)));
+#endif
+    s.c = camera_from_world(cam, s.mean);
+    s.in_front = s.c.z >= (vreal)CAMERA_NEAR(cam);
+    s.c.z = lanes_if(s.in_front, s.c.z, (vreal)1);
+    s.to_px = camera_project(cam, s.c);
+    const mat3 w = camera_rotation(cam);
+    s.a0 = add3(scale3(w.r0, s.to_px.j00), scale3(w.r2, s.to_px.j02));
+    s.a1 = add3(scale3(w.r1, s.to_px.j11), scale3(w.r2, s.to_px.j12));
+    s.ar0 = mat3_apply_transposed(s.rotation, s.a0);
+    s.ar1 = mat3_apply_transposed(s.rotation, s.a1);
+    s.b0 = mul3(s.ar0, s.scale);
+    s.b1 = mul3(s.ar1, s.scale);
+    s.cov2d = cov2d_of(s.b0, s.b1);
+    s.shown = s.s;
+#if ANTIALIASED
+    s.low = lowered(s.s, s.b0, s.b1);
+    s.shown.opacity *= s.low.factor;
+    s.shown.opacity_minus *= s.low.factor;
+#endif
+    return s;
+}
+
+static inline vec3 unit_direction(constant real *cam, vec3 mean, vreal *inv_norm) {
+    const vec3 from = add3(mean, scale3(CAMERA_CENTRE(cam), (vreal)-1));
+    *inv_norm = (vreal)1 / sqrt(max(dot3(from, from), (vreal)R(1e-30)));
+    return scale3(from, *inv_norm);
+}
+
+// records [n, RECORD], depth_key [n] (monotonic in depth; CULLED_KEY when unseen), tile_rect [n] (first and
+// past-the-end tile, x then y). Overwrites, but for the records of vectors of which no splat is seen.
+// Global size: splats / LANES.
+kernel void project_splats(
+    global const real *restrict geom,
+    global const sh_real *restrict sh,
+    constant real *restrict cam,
+    global real *restrict records,
+    global uint *restrict depth_key,
+    global int4 *restrict tile_rect,
+    ulong capacity,
+    uint n_splats,
+    int sh_degree,
+    int width,
+    int height,
+    int tiles_x,
+    int tiles_y)
+{
+    const uint first = get_global_id(0) * LANES;
+    if (first >= n_splats) return;
+    const splat_terms s = splat_project(geom + first, capacity, cam);
+
+    vreal out[RECORD];
+    extents box;
+    shape_project(s.shown, s.b0, s.b1, s.cov2d, out + HEAD, &box);
+    out[0] = s.to_px.x;
+    out[1] = s.to_px.y;
+    out[5] = s.c.z;
+
+    // Pixels whose centres lie in the box; a NaN anywhere fails the comparison and culls the splat.
+    const vreal far = (vreal)R(1e6), half_px = (vreal)R(0.5);
+    const vreal x_lo = ceil(lanes_clamp(out[0] - box.left - half_px, -far, far));
+    const vreal x_hi = floor(lanes_clamp(out[0] + box.right - half_px, -far, far));
+    const vreal y_lo = ceil(lanes_clamp(out[1] - box.up - half_px, -far, far));
+    const vreal y_hi = floor(lanes_clamp(out[1] + box.down - half_px, -far, far));
+    out[6] = y_lo;
+    out[7] = y_hi;
+    out[8] = x_lo;
+    out[9] = x_hi;
+    const vmask seen = s.in_front & (box.left + box.right > (vreal)0) & (x_lo <= x_hi) & (y_lo <= y_hi)
+                     & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height)
+                     & (s.cov2d.xx < (vreal)COV2D_MAX) & (s.cov2d.yy < (vreal)COV2D_MAX);
+    if (!lanes_any(seen)) {  // neither colour is read nor a record written
+        for (int l = 0; l < LANES && first + l < n_splats; ++l) {
+            depth_key[first + l] = CULLED_KEY;
+            tile_rect[first + l] = (int4)(0, 0, 0, 0);
+        }
+        return;
+    }
+    const vreal seen_real = lanes_if(seen, (vreal)1, (vreal)0);
+
+    vreal basis[SH_COUNT], inv_norm;
+    sh_basis(unit_direction(cam, s.mean, &inv_norm), sh_degree, basis);
+    const int used = (sh_degree + 1) * (sh_degree + 1);
+    vreal rgb[3] = {(vreal)R(0.5), (vreal)R(0.5), (vreal)R(0.5)};
+    for (int k = 0; k < used; ++k)
+        for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * sh_load(sh + first + (ulong)(3 * k + c) * capacity);
+    for (int c = 0; c < 3; ++c) out[2 + c] = max(rgb[c], (vreal)0);
+
+    real lane[LANES][RECORD], edge[5][LANES];
+    real column[LANES];
+    for (int j = 0; j < RECORD; ++j) {
+        lanes_store(out[j], column);
+        for (int l = 0; l < LANES; ++l) lane[l][j] = column[l];
+    }
+    lanes_store(x_lo, edge[0]);
+    lanes_store(x_hi, edge[1]);
+    lanes_store(y_lo, edge[2]);
+    lanes_store(y_hi, edge[3]);
+    lanes_store(seen_real, edge[4]);
+    for (int l = 0; l < LANES && first + l < n_splats; ++l) {
+        const uint i = first + l;
+        const bool keep = edge[4][l] > 0;
+        for (int j = 0; j < RECORD; ++j) records[(ulong)i * RECORD + j] = lane[l][j];
+        depth_key[i] = keep ? as_uint((float)lane[l][5]) : CULLED_KEY;
+        const int4 rect = {max((int)edge[0][l], 0) / TILE, max((int)edge[2][l], 0) / TILE,
+                           min((int)edge[1][l] / TILE + 1, tiles_x), min((int)edge[3][l] / TILE + 1, tiles_y)};
+        tile_rect[i] = keep ? rect : (int4)(0, 0, 0, 0);
+    }
+}
+
+// moments [rows SHAPE_V + 3, capacity]: summed over pixels; the last three are the gradient of the colour.
+// grad_geom, grad_sh: as geom, sh; overwritten (zero for unseen splats), sh only for the bands in use. If `compact`, grad_sh
+// is [6, capacity]: the gradient of the colour, and the unit direction whose basis times it is that of sh.
+// signals [3, capacity], for strategies, of the splats seen: added to, the norm of the gradient of mean_px in units of
+// half the image (3DGS's normalised device coordinates), the absolute gradient along the viewing ray [1/world unit]
+// (3DSGS's depth gradient) and 1.
+kernel void project_splats_vjp(
+    global const real *restrict geom,
+    global const sh_real *restrict sh,
+    constant real *restrict cam,
+    global const real *restrict moments,
+    global const real *restrict records,
+    global const uint *restrict depth_key,
+    global real *restrict grad_geom,
+    global real *restrict grad_sh,
+    global real *restrict signals,
+    ulong capacity,
+    uint n_splats,
+    int sh_degree,
+    uint compact,
+    int width,
+    int height)
+{
+    const uint first = get_global_id(0) * LANES;
+    if (first >= n_splats) return;
+    const vreal zero = (vreal)0;
+
+    real flag[LANES], seen_rgb[3][LANES];
+    for (int l = 0; l < LANES; ++l)
+        flag[l] = first + l < n_splats && depth_key[min(first + l, n_splats - 1)] != CULLED_KEY ? 1 : 0;
+    const vmask seen = lanes_load(flag) > zero;
+    if (!lanes_any(seen)) {  // zeros, as below
+        for (int row = 0; row < GEOM_ROWS; ++row) lanes_store(zero, grad_geom + first + row * capacity);
+        const int rows = compact ? 6 : 3 * (sh_degree + 1) * (sh_degree + 1);
+        for (int row = 0; row < rows; ++row) lanes_store(zero, grad_sh + first + row * capacity);
+        return;
+    }
+    for (int l = 0; l < LANES; ++l) {
+        const ulong i = min(first + l, n_splats - 1);
+        for (int c = 0; c < 3; ++c) seen_rgb[c][l] = records[i * RECORD + 2 + c] > 0 ? flag[l] : 0;
+    }
+    const splat_terms s = splat_project(geom + first, capacity, cam);
+
+    vreal v[SHAPE_V + 3];
+    for (int j = 0; j < SHAPE_V + 3; ++j)
+        v[j] = lanes_if(seen, lanes_load(moments + first + j * capacity), zero);
+
+    shape_grads g;
+    shape_project_vjp(s.shown, s.b0, s.b1, s.cov2d, v, &g);
+
+    // cov2d = B B' + low-pass
+    vec3 v_b0 = add3(g.b0, add3(scale3(s.b0, (real)2 * g.cov2d.xx), scale3(s.b1, g.cov2d.xy)));
+    vec3 v_b1 = add3(g.b1, add3(scale3(s.b1, (real)2 * g.cov2d.yy), scale3(s.b0, g.cov2d.xy)));
+#if ANTIALIASED
+    lowered_vjp(s.low, s.s, s.b0, s.b1, &g, &v_b0, &v_b1);
+#endif
+    // B = A R S
+    vec3 v_scale = add3(mul3(v_b0, s.ar0), mul3(v_b1, s.ar1));
+    const vec3 v_ar0 = mul3(v_b0, s.scale), v_ar1 = mul3(v_b1, s.scale);
+    const vec3 v_a0 = mat3_apply(s.rotation, v_ar0), v_a1 = mat3_apply(s.rotation, v_ar1);
+    mat3 v_rotation = {add3(scale3(v_ar0, s.a0.x), scale3(v_ar1, s.a1.x)),
+                             add3(scale3(v_ar0, s.a0.y), scale3(v_ar1, s.a1.y)),
+                             add3(scale3(v_ar0, s.a0.z), scale3(v_ar1, s.a1.z))};
+    // A = J W
+    const mat3 w = camera_rotation(cam);
+    const projection v_px = {g.mean_x, g.mean_y, dot3(v_a0, w.r0), dot3(v_a0, w.r2), dot3(v_a1, w.r1),
+                             dot3(v_a1, w.r2)};
+    const vec3 v_c = camera_project_vjp(cam, s.c, v_px);
+    vec3 v_mean = mat3_apply_transposed(w, v_c);
+
+    const vreal half_x = g.mean_x * (vreal)(real)(0.5 * width), half_y = g.mean_y * (vreal)(real)(0.5 * height);
+    const vreal along_ray = fabs(dot3(v_c, s.c)) / sqrt(dot3(s.c, s.c));
+    global real *signal = signals + first;
+    lanes_store(lanes_load(signal) + lanes_if(seen, sqrt(half_x * half_x + half_y * half_y), zero), signal);
+    signal += capacity;
+    lanes_store(lanes_load(signal) + lanes_if(seen, along_ray, zero), signal);
+    signal += capacity;
+    lanes_store(lanes_load(signal) + lanes_if(seen, (vreal)1, zero), signal);
+
+    vreal v_rgb[3], inv_norm, v_basis[SH_COUNT];
+    for (int c = 0; c < 3; ++c) v_rgb[c] = lanes_if(lanes_load(seen_rgb[c]) > zero, v[SHAPE_V + c], zero);
+    // Of splats that are not seen the mean may be anything, and 0 times a NaN would reach the colour.
+    vec3 direction = unit_direction(cam, s.mean, &inv_norm);
+    direction = (vec3){lanes_if(seen, direction.x, zero), lanes_if(seen, direction.y, zero),
+                       lanes_if(seen, direction.z, zero)};
+    const int used = (sh_degree + 1) * (sh_degree + 1);
+    if (compact) {
+        vec3_store((vec3){v_rgb[0], v_rgb[1], v_rgb[2]}, grad_sh + first, capacity);
+        vec3_store(direction, grad_sh + first + 3 * capacity, capacity);
+    } else {
+        vreal basis[SH_COUNT];
+        sh_basis(direction, sh_degree, basis);
+        for (int k = 0; k < used; ++k)
+            for (int c = 0; c < 3; ++c) lanes_store(basis[k] * v_rgb[c], grad_sh + first + (ulong)(3 * k + c) * capacity);
+    }
+    for (int k = 0; k < used; ++k) {
+        v_basis[k] = zero;
+        for (int c = 0; c < 3; ++c)
+            v_basis[k] += v_rgb[c] * sh_load(sh + first + (ulong)(3 * k + c) * capacity);
+    }
+    vec3 v_direction = sh_basis_vjp(direction, sh_degree, v_basis);
+    v_direction = add3(v_direction, scale3(direction, -dot3(direction, v_direction)));
+    v_mean = add3(v_mean, scale3(v_direction, inv_norm));
+
+#ifdef SHAPE_CENTRE  // projected point = (x, y, z) + R S centre
+    const vec3 stretched = mul3(s.scale, s.centre), v_stretched = mat3_apply_transposed(s.rotation, v_mean);
+    v_scale = add3(v_scale, mul3(v_stretched, s.centre));
+    v_rotation.r0 = add3(v_rotation.r0, scale3(stretched, v_mean.x));
+    v_rotation.r1 = add3(v_rotation.r1, scale3(stretched, v_mean.y));
+    v_rotation.r2 = add3(v_rotation.r2, scale3(stretched, v_mean.z));
+    g.s.skew = add3(g.s.skew, shape_centre_vjp(s.s, mul3(v_stretched, s.scale)));
+#endif
+
+    global real *out = grad_geom + first;
+    const vec3 v_log_scale = mul3(v_scale, s.scale);
+    vec3_store((vec3){lanes_if(seen, v_mean.x, zero), lanes_if(seen, v_mean.y, zero),
+                      lanes_if(seen, v_mean.z, zero)}, out + ROW_MEAN * capacity, capacity);
+    vec3_store((vec3){lanes_if(seen, v_log_scale.x, zero), lanes_if(seen, v_log_scale.y, zero),
+                      lanes_if(seen, v_log_scale.z, zero)}, out + ROW_LOG_SCALE * capacity, capacity);
+    quat_rotation_vjp(s.quat, v_rotation, seen, out + ROW_QUAT * capacity, capacity);
+    lanes_store(lanes_if(seen, g.s.opacity * opacity_slope(s.s.opacity), zero), out + ROW_OPACITY_LOGIT * capacity);
+#ifdef ROW_OPACITY_MINUS_LOGIT
+    lanes_store(lanes_if(seen, g.s.opacity_minus * opacity_slope(s.s.opacity_minus), zero),
+                out + ROW_OPACITY_MINUS_LOGIT * capacity);
+#endif
+#ifdef ROW_BETA
+    lanes_store(lanes_if(seen, g.s.beta, zero), out + ROW_BETA * capacity);
+#endif
+#ifdef ROW_NU
+    lanes_store(lanes_if(seen, g.s.nu, zero), out + ROW_NU * capacity);
+#endif
+    const vec3 v_skew = {lanes_if(seen, g.s.skew.x, zero), lanes_if(seen, g.s.skew.y, zero),
+                         lanes_if(seen, g.s.skew.z, zero)};
+#ifdef ROW_SKEW
+    vec3_store(v_skew, out + ROW_SKEW * capacity, capacity);
+#endif
+#ifdef ROW_NORMAL
+    vec3_store(v_skew, out + ROW_NORMAL * capacity, capacity);
+#endif
+}

@@ -1,0 +1,90 @@
+"""A pinhole camera: OpenCV axes (x right, y down, z forward), pixel centres at half-integers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+
+
+def is_rotation(matrix: NDArray[np.float64]) -> bool:
+    """Whether (3, 3) turns and neither mirrors nor scales, to 1e-3."""
+    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(matrix) >= 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Intrinsics in pixels and a world-to-camera pose.
+
+    Parameters
+    ----------
+    width, height : image size [px].
+    fx, fy, cx, cy : focal lengths and principal point [px].
+    cam_from_world : (4, 4) or (3, 4) rigid transform, world to camera.
+
+    Raises
+    ------
+    InputError : a size below 1, a focal length not above 0, a non-finite value, or a pose that is not
+        a rotation and a translation.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    cam_from_world: NDArray[np.float64]
+
+    def __init__(self, width: int, height: int, fx: float, fy: float, cx: float, cy: float,
+                 cam_from_world: ArrayLike) -> None:
+        if int(width) < 1 or int(height) < 1:
+            raise InputError(f"camera: width x height is {width}x{height}; both must be at least 1")
+        intrinsics = np.array([fx, fy, cx, cy], dtype=np.float64)
+        if not np.all(np.isfinite(intrinsics)) or fx <= 0 or fy <= 0:
+            raise InputError(f"camera: fx={fx} fy={fy} cx={cx} cy={cy}; "
+                             "focal lengths must be above 0, all finite")
+        pose = np.array(cam_from_world, dtype=np.float64)
+        if pose.shape == (3, 4):
+            pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
+        if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
+            raise InputError("camera: cam_from_world must be a finite (4, 4) or (3, 4) matrix")
+        if not is_rotation(pose[:3, :3]):
+            raise InputError("camera: cam_from_world's left 3x3 block must be a rotation matrix")
+        pose.setflags(write=False)
+        for name, value in zip(("width", "height"), (width, height), strict=True):
+            object.__setattr__(self, name, int(value))
+        for name, real in zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True):
+            object.__setattr__(self, name, float(real))
+        object.__setattr__(self, "cam_from_world", pose)
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """World-to-camera rotation, (3, 3)."""
+        return self.cam_from_world[:3, :3]
+
+    @property
+    def translation(self) -> NDArray[np.float64]:
+        """World-to-camera translation, (3,)."""
+        return self.cam_from_world[:3, 3]
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """Camera centre in the world, (3,)."""
+        position: NDArray[np.float64] = -self.rotation.T @ self.translation
+        return position
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera for an image of another size (whole field of view kept)."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy,
+                      self.cam_from_world)
+
+    def posed(self, cam_from_world: ArrayLike) -> Camera:
+        """The same intrinsics at another pose."""
+        return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, cam_from_world)
+
+

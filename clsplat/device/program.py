@@ -1,0 +1,279 @@
+"""OpenCL programs from the package's sources, and kernels whose arguments are bound by name.
+
+Sources are joined here, with `#line`, and never `#include` one another: so every cache sees the whole text,
+and errors name the file. Signatures are read from that text (signatures.py). Between processes a program is kept by its
+driver or by binaries.py, never by pyopencl's cache.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import math
+import os
+import re
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from ..errors import DeviceError
+from .binaries import binary_path, load_binary, store_binary
+from .device import BROKEN_POCL, LESS_MEMORY, Device, first_line, is_out_of_memory
+from .signatures import Parameter, parse_signatures
+from .signatures import Real as Real  # of this module's interface
+
+Define = int | float | str
+
+OPTIONS = ("-cl-std=CL1.2", "-cl-mad-enable")  # never fast-relaxed-math: infinities and NaN have meaning
+OPTIONS_VARIABLE = "CLSPLAT_BUILD_OPTIONS"  # more, from outside: -Werror in tests, -O0 under Oclgrind
+
+SMOKE_TOLERANCE = 1e-5  # relative: OpenCL allows exp 3 ulp and erfc 16 ulp of float32 (6e-8 each)
+
+GROUP_ITEMS = 64
+
+
+def source(*names: str) -> str:
+    """Text of source files ("render/raster.cl", "shape/gaussian.clh") joined in order, each after its `#line`."""
+    return "".join(f'#line 1 "{name}"\n{_read(name)}\n' for name in names)
+
+
+def build(
+    device: Device,
+    files: tuple[str, ...],
+    defines: Mapping[str, Define] | None = None,
+    real: Real = "float",
+) -> Program:
+    """Program from source files, built once per device, files, defines and `real`.
+
+    Parameters
+    ----------
+    files : names as for `source`, lower ones first.
+    defines : become `#define` lines before the text; floats become literals of type `real`.
+    real : arithmetic; REAL_DOUBLE is defined as 0 or 1.
+
+    Raises
+    ------
+    DeviceError : the device has no doubles, or the build failed (device, first error line, defines).
+    """
+    defines = dict(defines or {})
+    key = (files, tuple(sorted(defines.items())), real, os.environ.get(OPTIONS_VARIABLE, ""))
+    if key not in device.programs:
+        device.programs[key] = build_text(device, source(*files), defines, real)
+    program: Program = device.programs[key]
+    return program
+
+
+def build_text(
+    device: Device, text: str, defines: Mapping[str, Define] | None = None, real: Real = "float"
+) -> Program:
+    """Program from OpenCL C text, not kept in `device`; otherwise as `build`."""
+    import pyopencl as cl
+
+    if real == "double" and not device.has_fp64:
+        raise DeviceError(f"device {device.info} has no double precision: use float32 or another --device")
+    lines = [f"#define REAL_DOUBLE {int(real == 'double')}"]
+    lines += [f"#define {name} {_literal(name, value, real)}" for name, value in (defines or {}).items()]
+    options = [*OPTIONS, *os.environ.get(OPTIONS_VARIABLE, "").split()]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", cl.CompilerWarning)  # some compilers report every success
+            built = _compiled(device, "\n".join([*lines, text]), options)
+    except cl.Error as error:
+        raise _build_error(device, error, defines or {}, real) from None
+    return Program(device, built, parse_signatures(text, real))
+
+
+def lane_group(device: Device) -> int:
+    """Group size for kernels whose work-items are vectors of splats.
+
+    PoCL stacks up the private arrays of all work-items of a group: groups of one where lanes do the work.
+    """
+    return 1 if device.info.type == "CPU" else GROUP_ITEMS
+
+
+class Program:
+    """A built program; `program["name"]` or `program.name` is a Kernel, made once."""
+
+    def __init__(self, device: Device, built: Any, signatures: dict[str, tuple[Parameter, ...]]) -> None:
+        self.device = device
+        self.signatures = signatures
+        self._built = built
+        self._kernels: dict[str, Kernel] = {}
+
+    def __getitem__(self, name: str) -> Kernel:
+        if name not in self._kernels:
+            if name not in self.signatures:
+                raise KeyError(f"no kernel {name!r}; this program has {', '.join(sorted(self.signatures))}")
+            self._kernels[name] = Kernel(self.device, self._built, name, self.signatures[name])
+        return self._kernels[name]
+
+    def __getattr__(self, name: str) -> Kernel:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        try:
+            return self[name]
+        except KeyError as error:
+            raise AttributeError(error.args[0]) from None
+
+
+class Kernel:
+    """One kernel, called as `kernel(global_size, local_size, name=value, ...)`; returns the pyopencl event.
+
+    Values: a pyopencl buffer for `global` pointers, a number for scalars, bytes for `local` pointers.
+    Not thread-safe, as OpenCL's kernel objects are not.
+    """
+
+    def __init__(self, device: Device, built: Any, name: str, parameters: tuple[Parameter, ...]) -> None:
+        import pyopencl as cl
+
+        self.name = name
+        self.parameters = parameters
+        self._device = device
+        self._queue = device.queue
+        self._kernel = cl.Kernel(built, name)
+        if self._kernel.num_args != len(parameters):
+            raise DeviceError(
+                f"kernel {name}: {self._kernel.num_args} parameters built, {len(parameters)} in its text"
+            )
+        self._names = tuple(p.name for p in parameters)
+        self._local = tuple(i for i, p in enumerate(parameters) if p.kind == "local")
+        self._kernel.set_scalar_arg_dtypes([p.dtype for p in parameters])
+        self._local_memory: Callable[[int], Any] = cl.LocalMemory
+        self._enqueue = cl.enqueue_nd_range_kernel
+        self._marker = cl.enqueue_marker
+        self._cl_error: type[Exception] = cl.Error
+
+    def __call__(
+        self, global_size: tuple[int, ...], local_size: tuple[int, ...] | None, /, **args: Any
+    ) -> Any:
+        """Enqueue on the device's queue. An empty global size runs nothing (OpenCL 1.2 would refuse it).
+
+        Raises
+        ------
+        TypeError : an argument is missing, unknown, or of the wrong kind.
+        DeviceError : the device refused the launch.
+        """
+        try:
+            values = [args[name] for name in self._names]
+        except KeyError:
+            values = []
+        if len(values) != len(self._names) or len(args) != len(values):
+            raise TypeError(self._mismatch(set(args)))
+        for i in self._local:
+            values[i] = self._local_memory(values[i])
+        if 0 in global_size:
+            return self._marker(self._queue)
+        try:
+            self._kernel.set_args(*values)
+        except Exception as error:  # pyopencl's and struct's own kinds, some of them bare RuntimeErrors
+            raise TypeError(f"kernel {self.name}: {first_line(error)}, parameters {self._names}") from error
+        try:
+            event = self._enqueue(self._queue, self._kernel, global_size, local_size)
+        except self._cl_error as error:
+            mend = f": {LESS_MEMORY}" if is_out_of_memory(error) else f", sizes {global_size} {local_size}"
+            raise DeviceError(
+                f"kernel {self.name} on {self._device.info}: {first_line(error)}{mend}"
+            ) from error
+        self._device.observe(self.name, global_size, event)
+        return event
+
+    def over(self, n: int, group: int = GROUP_ITEMS, /, **args: Any) -> Any:
+        """Enqueue at least `n` work-items in groups of `group`; the kernel must ignore those from n on.
+
+        A fixed group size matters: PoCL compiles a kernel anew for each size that it picks itself.
+        """
+        return self(((n + group - 1) // group * group,), (group,), **args)
+
+    def _mismatch(self, given: set[str]) -> str:
+        missing = [name for name in self._names if name not in given]
+        unknown = sorted(given - set(self._names))
+        return f"kernel {self.name}: missing arguments {missing}, unknown arguments {unknown}"
+
+
+def smoke_test(device: Device) -> tuple[float, float]:
+    """Build and run a tiny kernel and check its numbers.
+
+    Returns
+    -------
+    build_ms, run_ms : wall time of the build (drivers may have it cached), device time of the kernel.
+
+    Raises
+    ------
+    DeviceError : it does not build or run, or the numbers are wrong.
+    """
+    import pyopencl as cl
+
+    start = time.perf_counter()
+    kernel = build(device, ("measure/smoke.cl",))["smoke"]
+    build_ms = 1e3 * (time.perf_counter() - start)
+    x = np.linspace(-3, 3, 1000, dtype=np.float32)
+    given, result = device.alloc(x.nbytes), device.alloc(x.nbytes)
+    computed = np.empty_like(x)
+    try:
+        cl.enqueue_copy(device.queue, given, x)
+        event = kernel((1024,), None, x=given, y=result, n=x.size)
+        cl.enqueue_copy(device.queue, computed, result)
+        run_ms = 1e-6 * (event.profile.end - event.profile.start)
+    except cl.Error as error:
+        raise DeviceError(
+            f"device {device.info} runs no kernel: {first_line(error)}: update its driver"
+        ) from None
+    expected = np.array([math.exp(-v * v) + math.erfc(v) for v in x.tolist()])
+    worst = float(np.max(np.abs(computed - expected) / expected))
+    if not worst < SMOKE_TOLERANCE:
+        raise DeviceError(
+            f"device {device.info} computes wrong numbers (off by {worst:.1e}): update its driver"
+        )
+    return build_ms, run_ms
+
+
+def _compiled(device: Device, text: str, options: list[str]) -> Any:
+    """A built pyopencl program, from its kept binary where there is a good one; cl.Error when it does not build."""
+    import pyopencl as cl
+
+    path = binary_path(device.info, text, [*options, os.environ.get("PYOPENCL_BUILD_OPTIONS", "")])
+    binary = None if path is None else load_binary(path)
+    if binary is not None:
+        with suppress(cl.Error):  # a binary that the driver does not take after all
+            return cl.Program(device.context, [device.cl_device], [binary]).build(options)
+    # False, which its annotation lacks, turns pyopencl's cache off.
+    built = cl.Program(device.context, text).build(options, cache_dir=False)  # type: ignore[arg-type]
+    if path is not None:
+        store_binary(path, built.get_info(cl.program_info.BINARIES)[0])
+    return built
+
+
+@cache
+def _read(name: str) -> str:
+    try:
+        return importlib.resources.files("clsplat_cl").joinpath(*name.split("/")).read_text(encoding="utf-8")
+    except (OSError, ModuleNotFoundError):
+        raise DeviceError(
+            f"kernel source {name!r} is not in the installed package: reinstall clsplat"
+        ) from None
+
+
+def _literal(name: str, value: Define, real: Real) -> str:
+    """A define's value as OpenCL C text."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (int, np.integer)):
+        return f"({int(value)})" if value < 0 else str(int(value))
+    if not math.isfinite(value):
+        raise ValueError(f"define {name}={value}: must be finite")
+    text = repr(float(value)) if real == "double" else f"{np.float32(value)!s}f"
+    return f"({text})" if value < 0 else text
+
+
+def _build_error(device: Device, error: Exception, defines: Mapping[str, Define], real: Real) -> DeviceError:
+    log = str(error)
+    if "unknown target CPU" in log:
+        return DeviceError(f"device {device.info}: {BROKEN_POCL}")
+    lines = [line.strip() for line in log.splitlines()]
+    reason = next((line for line in lines if re.search(r"\berror\b\s*:", line, re.I)), first_line(error))
+    given = " ".join(f"{name}={value}" for name, value in defines.items())
+    return DeviceError(f"kernels do not build on {device.info}: {reason} (real={real} {given})")

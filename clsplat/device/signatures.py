@@ -1,0 +1,60 @@
+"""Parameters of kernels, read from OpenCL C text.
+
+Style: `kernel void name(` with parameters `global [const] T *restrict name`, `local T *name`, and scalars of the
+types in `_SCALARS`; `real` is float or double.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ..errors import DeviceError
+
+Real = Literal["float", "double"]
+
+_SCALARS = {"int": np.int32, "uint": np.uint32, "ulong": np.uint64, "float": np.float32, "double": np.float64}
+_ATTRIBUTE = r"__attribute__\s*\(\(.*?\)\)\)?\s*"  # the third brace closes reqd_work_group_size(...)
+_KERNEL = re.compile(rf"\b(?:__)?kernel\s+(?:{_ATTRIBUTE})*void\s+(\w+)\s*\(([^)]*)\)", re.S)
+_COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.S)
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One kernel parameter: `kind` is "buffer", "local" or "scalar" (then with its NumPy dtype)."""
+
+    name: str
+    kind: Literal["buffer", "local", "scalar"]
+    dtype: np.dtype[Any] | None = None
+
+
+def parse_signatures(text: str, real: Real) -> dict[str, tuple[Parameter, ...]]:
+    """Parameters of every kernel in OpenCL C text, by kernel name; DeviceError names what it cannot read."""
+    signatures: dict[str, tuple[Parameter, ...]] = {}
+    for name, inside in _KERNEL.findall(_COMMENT.sub(" ", text)):
+        parts = [part for part in inside.split(",") if part.strip() not in ("", "void")]
+        parameters = tuple(_parse_parameter(name, part, real) for part in parts)
+        if signatures.setdefault(name, parameters) != parameters:
+            raise DeviceError(f"kernel {name}: two definitions with different parameters in one program")
+    return signatures
+
+
+def _parse_parameter(kernel: str, text: str, real: Real) -> Parameter:
+    words = re.sub(r"\*", " * ", text).replace("__", "").split()
+    name, kinds = words[-1], words[:-1]
+    if "*" in kinds:
+        if "local" in kinds:
+            return Parameter(name, "local")
+        if "global" in kinds or "constant" in kinds:
+            return Parameter(name, "buffer")
+    types = [word for word in kinds if word not in ("const", "private")]
+    if len(types) == 1:
+        dtype = _SCALARS.get(real if types[0] == "real" else types[0])
+        if dtype is not None:
+            return Parameter(name, "scalar", np.dtype(dtype))
+    raise DeviceError(
+        f"kernel {kernel}: parameter {' '.join(text.split())!r} is of no type that can be bound"
+    )

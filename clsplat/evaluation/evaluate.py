@@ -1,0 +1,55 @@
+"""Rendering views and measuring them against their photographs."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..rendering.render import Rendered, Renderer
+from ..scenes.scene import View
+from ..splats.splats import Splats
+from .metrics import DEFAULT_PROTOCOL, Protocol
+
+MAX_PSNR = 100.0  # stands in for the infinity of two equal images, which JSON cannot hold
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Metrics of views: means, and per view by name; `render_ms` is the median wall time of a render."""
+
+    psnr: float
+    ssim: float
+    render_ms: float
+    per_view: dict[str, dict[str, float]] = field(default_factory=dict)
+
+
+def evaluate(renderer: Renderer, splats: Splats, views: Sequence[View],
+             background: Sequence[float] = (0, 0, 0), protocol: Protocol = DEFAULT_PROTOCOL,
+             on_view: Callable[[View, Rendered], None] | None = None) -> Evaluation:
+    """Render every view and compare it with its photograph.
+
+    Parameters
+    ----------
+    views : at least one; pixels that a mask hides are left out.
+    on_view : called with each view and its render, to save it.
+    """
+    per_view: dict[str, dict[str, float]] = {}
+    times = []
+    renderer.render(splats, views[0].camera, background)  # builds, uploads
+    for view in views:
+        start = time.perf_counter()
+        image = renderer.render(splats, view.camera, background)
+        times.append(1e3 * (time.perf_counter() - start))
+        measured = protocol.measure(np.clip(image.color, 0, 1), view.image / np.float32(255),
+                                    view.mask)
+        per_view[view.name] = {name: min(value, MAX_PSNR) if math.isinf(value) else value
+                               for name, value in measured.items()}
+        if on_view is not None:
+            on_view(view, image)
+    means = {key: statistics.fmean(v[key] for v in per_view.values()) for key in ("PSNR", "SSIM")}
+    return Evaluation(means["PSNR"], means["SSIM"], statistics.median(times), per_view)

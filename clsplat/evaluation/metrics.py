@@ -1,0 +1,185 @@
+"""Image quality: PSNR and SSIM, and the protocol that says how they were taken.
+
+"PSNR" and "SSIM" differ between tools by rounding and by padding, enough to change a ranking; every table
+therefore names its `Protocol`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+Padding = Literal["valid", "zero"]
+
+# Wang, Bovik, Sheikh, Simoncelli 2004: 11x11 Gaussian window, sigma 1.5, K1 = 0.01, K2 = 0.03, range 1.
+SSIM_RADIUS = 5
+SSIM_SIGMA = 1.5
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """How metrics are taken.
+
+    Parameters
+    ----------
+    name : as on the command line.
+    rounded : both images are rounded to 8 bits first.
+    padding : SSIM over windows inside the image only ("valid"), or zeros around it and one window per
+        pixel ("zero").
+    corrected : the first image is brought to the second one's exposure before, by `color_corrected`.
+    """
+
+    name: str
+    rounded: bool
+    padding: Padding
+    corrected: bool = False
+
+    def measure(self, a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> dict[str, float]:
+        """`{"PSNR": dB, "SSIM": -1..1}` of one image pair.
+
+        Parameters
+        ----------
+        a, b : (H, W) or (H, W, C), a render and its photo, say.
+        mask : (H, W), True where a pixel counts; None where all do.
+        """
+        if self.corrected:
+            a = color_corrected(a, b, mask)
+        return {"PSNR": psnr(a, b, self.rounded, mask), "SSIM": ssim(a, b, self.padding, self.rounded, mask)}
+
+    def describe(self) -> dict[str, str]:
+        """What to write beside the numbers."""
+        images = "rounded to 8 bits" if self.rounded else "real-valued, clipped to 0..1"
+        if self.corrected:
+            images = f"render in the photo's exposure (affine, least squares), {images}"
+        area = "windows inside the image" if self.padding == "valid" else "zero padding"
+        window = f"11x11, sigma 1.5, {area}"
+        name = f"{self.name}, colour-corrected" if self.corrected else self.name
+        return {"name": name, "PSNR": f"per image, {images}", "SSIM": f"{window}, {images}"}
+
+
+PROTOCOLS = {p.name: p for p in (Protocol("clsplat", True, "valid"), Protocol("3dgs", True, "zero"))}
+DEFAULT_PROTOCOL = PROTOCOLS["clsplat"]
+
+
+def protocol_named(name: str) -> Protocol:
+    """Protocol of `name`; raises InputError listing the known names."""
+    try:
+        return PROTOCOLS[name]
+    except KeyError:
+        raise InputError(f"unknown metrics protocol {name!r}: choose one of {', '.join(PROTOCOLS)}") from None
+
+
+def color_corrected(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    """Image `a` (H, W, 3), 0..1, through the affine map of colours that brings it nearest to `b`, in least squares.
+
+    For photos of unknown exposure, whose error would hide all others.
+
+    Parameters
+    ----------
+    mask : (H, W), True where a pixel counts.
+
+    Raises
+    ------
+    InputError : different or empty shapes, or not three channels.
+    """
+    x, y = _pair(a, b, rounded=False)
+    if x.shape[2:] != (3,):
+        raise InputError(f"colour correction: an image of shape {x.shape}; expected (H, W, 3)")
+    inputs = np.concatenate([x, np.ones((*x.shape[:2], 1))], axis=2)
+    counts = np.ones(x.shape[:2], bool) if mask is None else mask
+    found = np.linalg.lstsq(inputs[counts], y[counts], rcond=None)[0]
+    corrected: NDArray[np.float64] = np.clip(inputs @ found, 0.0, 1.0)
+    return corrected
+
+
+def psnr(a: NDArray[Any], b: NDArray[Any], rounded: bool = True, mask: NDArray[np.bool_] | None = None) -> float:
+    """Peak signal-to-noise ratio [dB] over all pixels that count and channels; infinite for equal images.
+
+    Parameters
+    ----------
+    a, b : (H, W) or (H, W, C), uint8 or real numbers that are clipped to 0..1.
+    rounded : round both to 8 bits first, as files would.
+    mask : (H, W), True where a pixel counts; None where all do.
+
+    Raises
+    ------
+    InputError : different or empty shapes.
+    """
+    x, y = _pair(a, b, rounded)
+    squares = (x - y) ** 2
+    error = float(np.mean(squares if mask is None else squares[mask]))
+    return float("inf") if error == 0.0 else -10.0 * float(np.log10(error))
+
+
+def ssim(a: NDArray[Any], b: NDArray[Any], padding: Padding = "valid", rounded: bool = True,
+         mask: NDArray[np.bool_] | None = None) -> float:
+    """Structural similarity, the mean over its map and over channels.
+
+    Parameters
+    ----------
+    a, b : (H, W) or (H, W, C), uint8 or real numbers that are clipped to 0..1.
+    padding : "valid" uses windows inside the image only; "zero" sets zeros around it (3DGS).
+    rounded : round both to 8 bits first, as files would.
+    mask : (H, W), True where a pixel counts; None where all do. Elsewhere `a` is taken to equal `b`, and windows around
+        such pixels do not count.
+
+    Raises
+    ------
+    InputError : different or empty shapes, an unknown padding, or "valid" on an image below 11 px.
+    """
+    if padding not in ("valid", "zero"):
+        raise InputError(f"unknown SSIM padding {padding!r}: choose one of valid, zero")
+    x, y = _pair(a, b, rounded)
+    if padding == "valid" and min(x.shape[:2]) < 2 * SSIM_RADIUS + 1:
+        size = f"{x.shape[1]}x{x.shape[0]} px"
+        raise InputError(f"SSIM: an image of {size} is below its 11x11 window; use zero padding (3dgs)")
+    if mask is not None:
+        x = np.where(mask.reshape(*mask.shape, *[1] * (x.ndim - 2)), x, y)
+    mean_x, mean_y = _blur(x), _blur(y)
+    var_x = _blur(x * x) - mean_x * mean_x
+    var_y = _blur(y * y) - mean_y * mean_y
+    cov = _blur(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
+    structure = (2 * cov + SSIM_C2) / (var_x + var_y + SSIM_C2)
+    similarity = luminance * structure
+    if padding == "valid":
+        inside = slice(SSIM_RADIUS, -SSIM_RADIUS)
+        similarity, mask = similarity[inside, inside], None if mask is None else mask[inside, inside]
+    # Where a mask leaves nothing inside the border, there is nothing to be unlike.
+    counted = similarity if mask is None else similarity[mask]
+    return float(np.mean(counted)) if counted.size else 1.0
+
+
+def _blur(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """SSIM's window mean along both axes, zeros outside."""
+    from scipy.ndimage import correlate1d  # half a second to import
+
+    offsets = np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1)
+    window = np.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    window /= window.sum()
+    for axis in (0, 1):
+        image = correlate1d(image, window, axis=axis, mode="constant", cval=0.0)
+    return image
+
+
+def _pair(a: NDArray[Any], b: NDArray[Any], rounded: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x, y = np.asarray(a), np.asarray(b)
+    if x.shape != y.shape or x.ndim not in (2, 3) or x.size == 0:
+        shapes = f"{x.shape} and {y.shape}"
+        raise InputError(f"metrics: images of shapes {shapes}; both must be the same (H, W) or (H, W, C)")
+    return _unit(x, rounded), _unit(y, rounded)
+
+
+def _unit(image: NDArray[Any], rounded: bool) -> NDArray[np.float64]:
+    """Image as float64 in 0..1."""
+    if image.dtype == np.uint8:
+        return image.astype(np.float64) / 255.0
+    unit = np.clip(image.astype(np.float64), 0.0, 1.0)
+    return np.rint(unit * 255.0) / 255.0 if rounded else unit

@@ -1,0 +1,1 @@
+"""The page that `clsplat eval` writes."""

@@ -1,0 +1,114 @@
+"""A report as one HTML page that needs nothing beside it: charts as inlined SVG, tables, markup of the caller's."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import InputError
+from .atomic import atomic_writer
+
+_STYLE = """
+:root { color-scheme: light dark; }
+body { margin: 2rem auto; max-width: 960px; padding: 0 1rem; line-height: 1.45;
+       font-family: system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: #262626; background: #fff; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin: 2.2rem 0 .4rem; }
+p { margin: .4rem 0; max-width: 46rem; }
+figure { margin: .8rem 0; padding: .5rem; background: #fff; border: 1px solid #e0e0e0; border-radius: 6px; }
+figure svg { display: block; width: 100%; height: auto; }
+.table { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; margin: .6rem 0; }
+th, td { padding: .25rem .5rem; text-align: right; border-bottom: 1px solid #d9d9d9; white-space: nowrap; }
+th { vertical-align: bottom; white-space: normal; } th.text, td.text { text-align: left; }
+.files { font-size: .85rem; } a { color: #0072b2; }
+@media (prefers-color-scheme: dark) {
+  body { color: #e6e6e6; background: #161616; } th, td { border-color: #404040; } a { color: #56b4e9; }
+  figure { border-color: #404040; }
+}
+"""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with what stands below it, in this order.
+
+    Parameters
+    ----------
+    text : paragraphs. chart : an SVG file. head, lines : a table. files : links, relative to the page.
+    markup : HTML of the caller's, put in as it is below the table.
+    """
+
+    title: str
+    text: Sequence[str] = ()
+    chart: Path | None = None
+    head: Sequence[str] = ()
+    lines: Sequence[Sequence[str]] = ()
+    files: Sequence[str] = ()
+    markup: str = ""
+
+
+def write_page(path: Path, title: str, sections: Sequence[Section], style: str = "", script: str = "") -> Path:
+    """Write the page; returns its path.
+
+    Parameters
+    ----------
+    style, script : CSS and JavaScript that the sections' markup needs.
+
+    Raises
+    ------
+    InputError : a chart cannot be read. OutputError : cannot be written.
+    """
+    body = "".join(_section(section, number) for number, section in enumerate(sections, 1))
+    page = (f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+            f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
+            f"<style>{_STYLE}{style}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n{body}"
+            + (f"<script>{script}</script>\n" if script else "") + "</body>\n</html>\n")
+    with atomic_writer(path) as stream:
+        stream.write(page.encode())
+    return path
+
+
+def _section(section: Section, number: int) -> str:
+    parts = [f"<h2>{escape(section.title)}</h2>\n"]
+    parts += [f"<p>{escape(paragraph)}</p>\n" for paragraph in section.text]
+    if section.chart is not None:
+        parts.append(f"<figure>{_inlined(section.chart, section.title, number)}</figure>\n")
+    if section.lines:
+        parts.append(_table(section.head, section.lines))
+    parts.append(section.markup)
+    if section.files:
+        links = ", ".join(f'<a href="{escape(name)}">{escape(name)}</a>' for name in section.files)
+        parts.append(f'<p class="files">Data: {links}</p>\n')
+    return "".join(parts)
+
+
+def _inlined(path: Path, title: str, number: int) -> str:
+    """The SVG without its prologue, named for screen readers, with ids of its own among the page's charts."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}): draw the chart again") from None
+    drawing = text[max(text.find("<svg"), 0) :].strip()
+    drawing = re.sub(r'( id="|href="#|url\(#)', rf"\g<1>c{number}-", drawing)
+    drawing = re.sub(r"<metadata>.*?</metadata>", "", drawing, flags=re.S)
+    return drawing.replace("<svg", f'<svg role="img" aria-label="{escape(title)}"', 1)
+
+
+def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    # Columns of words are aligned to the left, columns of numbers to the right.
+    words = [any(re.match(r"[^\W\d_]", line[column]) for line in lines) for column in range(len(head))]
+
+    def row(tag: str, cells: Sequence[str]) -> str:
+        return "<tr>" + "".join(f"<{tag}{' class=text' if word else ''}>{escape(cell)}</{tag}>"
+                                for cell, word in zip(cells, words, strict=True)) + "</tr>\n"
+
+    body = "".join(row("td", line) for line in lines)
+    return f'<div class="table"><table>\n{row("th", head)}{body}</table></div>\n'
+
+
+def escape(text: str) -> str:
+    """Text as it stands in HTML, in attributes too."""
+    return html.escape(text)

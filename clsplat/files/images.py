@@ -1,0 +1,211 @@
+"""Image files: reading, writing PNG, resizing. The only module that knows Pillow.
+
+Images are stored pixels: an EXIF orientation is not applied, because COLMAP and 3DGS do not apply it and
+camera poses refer to the pixels as stored. Only photos that have no poses yet are read upright.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+# At the top on purpose: Pillow must be loaded before pycolmap, or writing PNG corrupts the heap.
+from PIL import ExifTags, Image, ImageOps
+
+from ..errors import InputError, OutputError
+from .atomic import atomic_writer
+
+ImageU8 = NDArray[np.uint8]
+
+JPEG_SUFFIXES = (".jpg", ".jpeg")
+_PHOTO_QUALITY = 97  # of a JPEG that is made of another: its error stays far below the first one's
+_ALPHA_MODES = ("RGBA", "RGBa", "LA", "La", "PA")
+_SIXTEEN_BIT_MODES = ("I", "I;16", "I;16B", "I;16L", "I;16N")
+
+
+@dataclass(frozen=True)
+class PhotoFacts:
+    """What a photo's header says.
+
+    Parameters
+    ----------
+    width, height : upright [px].
+    plain : 8-bit RGB or grey in JPEG or PNG, stored upright: every program reads the same pixels.
+    camera : maker, model and focal lengths by EXIF; photos with equal sizes and cameras have one lens.
+    exif : EXIF without the orientation, for a copy.
+    """
+
+    width: int
+    height: int
+    plain: bool
+    camera: tuple[str, ...]
+    exif: bytes
+
+
+def read_image(path: str | os.PathLike[str], upright: bool = False) -> ImageU8:
+    """Pixels of an image file.
+
+    Grey, palette and CMYK images become RGB; 16-bit grey is rounded to 8 bits, 16-bit colour keeps its high byte.
+
+    Parameters
+    ----------
+    upright : turn the image as its EXIF orientation says.
+
+    Returns
+    -------
+    (H, W, 3), or (H, W, 4) with straight alpha where the file has transparency; uint8, 0..255.
+
+    Raises
+    ------
+    InputError : the file is missing, damaged, or no image of a known kind.
+    """
+    with _open(path) as stored:
+        try:
+            image = ImageOps.exif_transpose(stored) if upright else stored
+            if image.mode in _SIXTEEN_BIT_MODES:
+                grey = (np.clip(np.asarray(image), 0, 65535).astype(np.uint32) + 128) // 257
+                return np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)
+            if image.mode != "F":
+                has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
+                return np.array(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.uint8)
+        except Exception as error:  # decoders of damaged files raise nearly anything
+            raise _unreadable(path, error) from error
+    raise InputError(f"{path}: float pixels are not supported; convert it to 8-bit PNG or JPEG")
+
+
+def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """(width, height) [px] from the file's header alone.
+
+    Raises
+    ------
+    InputError : the file is missing or no image of a known kind.
+    """
+    with _open(path) as image:
+        return image.size
+
+
+def photo_facts(path: str | os.PathLike[str]) -> PhotoFacts:
+    """Size, kind and camera. The header is enough, but for PNG, where EXIF may stand at the end.
+
+    Raises
+    ------
+    InputError : the file is missing or no image of a known kind.
+    """
+    with _open(path) as image:
+        # Pillow shows 16-bit PNG in colour as RGB: the tile's raw mode tells, as long as nothing is decoded.
+        deep = any(";16" in str(tile[-1]) for tile in getattr(image, "tile", ()))
+        try:
+            exif = image.getexif()
+            orientation = exif.pop(ExifTags.Base.Orientation, 1)
+            details = exif.get_ifd(ExifTags.IFD.Exif)
+            named = [exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model),
+                     details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)]
+            kept = exif.tobytes()
+        except Exception:  # a damaged EXIF block raises nearly anything; the pixels may be sound
+            orientation, named, kept = 1, [], b""
+        width, height = image.size[::-1] if orientation in (5, 6, 7, 8) else image.size
+        plain = orientation == 1 and image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L") and not deep
+        plain = plain and "transparency" not in image.info
+        return PhotoFacts(width, height, plain, tuple(str(value) for value in named if value), kept)
+
+
+def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU8) -> None:
+    """Write an image as 8-bit PNG, atomically.
+
+    Parameters
+    ----------
+    array : (H, W), (H, W, 3) or (H, W, 4); uint8, or real numbers that are clipped to 0..1 and rounded.
+
+    Raises
+    ------
+    OutputError : not an image array, NaN in it, or the file cannot be written.
+    """
+    pixels = np.asarray(array)
+    if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,), (4,)) or pixels.size == 0:
+        raise OutputError(f"{path}: shape {pixels.shape} is no image; expected (H, W) or (H, W, 3 or 4)")
+    if pixels.dtype != np.uint8:
+        if np.isnan(pixels).any():
+            raise OutputError(f"{path}: the image holds NaN; the render that made it went wrong")
+        pixels = np.rint(np.clip(pixels, 0.0, 1.0) * 255.0).astype(np.uint8)
+    with atomic_writer(path) as stream:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="PNG")
+
+
+def write_photo(path: str | os.PathLike[str], pixels: ImageU8, exif: bytes = b"") -> None:
+    """Write (H, W, 3), or (H, W, 4) as PNG, atomically: JPEG of high quality by the name's ending, else PNG.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
+    jpeg = Path(path).suffix.lower() in JPEG_SUFFIXES
+    options = {"quality": _PHOTO_QUALITY, "subsampling": 0} if jpeg else {}
+    with atomic_writer(path) as stream:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="JPEG" if jpeg else "PNG", exif=exif,
+                                                           **options)
+
+
+def encode_jpeg(pixels: ImageU8, quality: int = 88) -> bytes:
+    """(H, W, 3) as a JPEG file with colours at full resolution, for pages that hold their images themselves."""
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="JPEG", quality=quality, subsampling=0,
+                                                       optimize=True)
+    return stream.getvalue()
+
+
+def write_grey16(path: str | os.PathLike[str], array: NDArray[np.uint16]) -> None:
+    """Write (H, W) as 16-bit grey PNG, atomically.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
+    with atomic_writer(path) as stream:
+        Image.fromarray(np.ascontiguousarray(array, np.uint16)).save(stream, format="PNG")
+
+
+def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether an image of one (width, height) can be another at another scale, each side rounded to whole pixels."""
+    return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1]
+
+
+def resize_area(image: ImageU8, width: int, height: int) -> ImageU8:
+    """The image at another size [px], (height, width) or (height, width, 3 or 4); alpha weighs the colours.
+
+    Whole-number reductions take the mean of each block of pixels; all other sizes use Pillow's bicubic
+    filter, which widens when it reduces (3DGS's choice).
+
+    Raises
+    ------
+    InputError : a size below 1.
+    """
+    if width < 1 or height < 1:
+        raise InputError(f"resize: width x height is {width}x{height}; both must be at least 1")
+    old_height, old_width = image.shape[:2]
+    if (width, height) == (old_width, old_height):
+        return image.copy()
+    pillow = Image.fromarray(image)
+    if old_width % width == 0 and old_height % height == 0:
+        return np.array(pillow.reduce((old_width // width, old_height // height)), dtype=np.uint8)
+    return np.array(pillow.resize((width, height), Image.Resampling.BICUBIC), dtype=np.uint8)
+
+
+def _open(path: str | os.PathLike[str]) -> Image.Image:
+    if not Path(path).exists():
+        raise InputError(f"{path}: no such image file; check the name and the folder")
+    try:
+        return Image.open(path)
+    except Exception as error:  # header parsers of damaged files raise nearly anything
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: str | os.PathLike[str], error: Exception) -> InputError:
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    if "cannot identify" in reason:  # Pillow's message then repeats the path
+        reason = "not an image of a known kind"
+    return InputError(f"{path}: cannot be read as an image ({reason}); replace or remove the file")

@@ -1,0 +1,193 @@
+"""Where the time of a training step and of a rendered image goes, stage by stage, beside what the device can do."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..device.device import Device
+from ..device.launches import recorded
+from ..errors import InputError
+from ..rendering.pairs import count_pairs
+from ..rendering.pipeline import Pipeline
+from ..scenes.scene import Scene
+from ..splats.splats import Splats
+from ..training.config import PUBLISHED_ITERATIONS, TrainConfig
+from ..training.trainer import Trainer
+from .limits import Limits
+from .stages import HOST, STAGES, Sizes, by_stage, work_of
+
+WARM_UP = 4  # iterations not counted: kernels are built, buffers grow, the SH degree rises to 3
+MOST_ITERATIONS = 1000  # so few that the strategy does not act: it is measured by itself
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """One stage of an iteration, medians over iterations.
+
+    Attributes
+    ----------
+    ms : on the device; of `host` the wall time that is left, of `strategy` the wall time of one action over the
+        iterations from one to the next.
+    share : of the iteration's wall time.
+    bytes, flops : at least needed (stages.Work); 0 where not counted.
+    of_copy, of_fma : the rate that this makes, as a fraction of the measured limit; None where not counted.
+    """
+
+    stage: str
+    ms: float
+    share: float
+    bytes: int = 0
+    flops: int = 0
+    of_copy: float | None = None
+    of_fma: float | None = None
+
+
+@dataclass(frozen=True)
+class Report:
+    """One task, "training step" or "render", measured.
+
+    Attributes
+    ----------
+    width, height : of the largest image. sizes : medians.
+    wall_ms : of an iteration, until the device is done; with the strategy's part.
+    """
+
+    task: str
+    shape: str
+    width: int
+    height: int
+    iterations: int
+    sizes: Sizes
+    wall_ms: float
+    stages: tuple[StageTime, ...]
+
+    @property
+    def useful(self) -> float:
+        """Useful pairs as a fraction of all pairs of an isect's splat and its tile's 256 pixels."""
+        return self.sizes.pairs / max(256 * self.sizes.isects, 1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for json.dump."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Report:
+        """The report that `to_json` gave; InputError if it is none."""
+        try:
+            sizes = Sizes(**values["sizes"])
+            stages = tuple(StageTime(**stage) for stage in values["stages"])
+            return cls(**values | {"sizes": sizes, "stages": stages})
+        except (KeyError, TypeError) as error:
+            raise InputError(f"not a report of stages: {error}") from None
+
+
+def bench_trainer(scene: Scene, device: Device, shape: str, start: Splats | int, sh_degree: int = 3) -> Trainer:
+    """A training run at full size and full SH degree, as in the middle of 30 000 iterations.
+
+    Parameters
+    ----------
+    start : the splats, whose number stays; or the most of the scene's points to start from.
+
+    Raises
+    ------
+    DeviceError : not enough memory. InputError : a scene without a training view.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        if isinstance(start, Splats):
+            init, cap = str(Path(folder) / "start.ply"), len(start)
+            start.save(init)
+        else:
+            init, cap = "sfm", start
+        config = TrainConfig(shape=shape, iterations=PUBLISHED_ITERATIONS, cap_max=cap, sh_degree=sh_degree,
+                             sh_interval=1, coarse_to_fine=False, init=init)
+        return Trainer(scene, config, device=device)
+
+
+def measure_training(trainer: Trainer, limits: Limits, iterations: int) -> Report:
+    """Time `iterations` training steps, each waited for, and one action of the strategy."""
+    measured = _measure("training step", trainer, trainer.step, limits, iterations)
+    start = time.perf_counter()
+    trainer.densify()
+    trainer.device.queue.finish()
+    action_ms = 1e3 * (time.perf_counter() - start) / trainer.config.densify_interval
+    wall_ms = measured.wall_ms + action_ms
+    stages = [dataclasses.replace(stage, share=stage.ms / wall_ms) for stage in measured.stages]
+    stages.insert(-1, StageTime("strategy", action_ms, action_ms / wall_ms))
+    return dataclasses.replace(measured, wall_ms=wall_ms, stages=tuple(stages))
+
+
+def measure_render(trainer: Trainer, limits: Limits, iterations: int) -> Report:
+    """Time `iterations` images of the run's splats, left on the device."""
+    cameras = itertools.cycle(view.camera for view in trainer.scene.train)
+
+    def render() -> None:
+        trainer.pipeline.forward(trainer.splats, next(cameras), trainer.config.background)
+
+    return _measure("render", trainer, render, limits, iterations)
+
+
+@dataclass(frozen=True)
+class _Iteration:
+    """One iteration as it was: wall time and time of each stage [ms], and its sizes."""
+
+    wall_ms: float
+    stage_ms: dict[str, float]
+    sizes: Sizes
+
+
+def _measure(task: str, trainer: Trainer, run: Callable[[], None], limits: Limits, iterations: int) -> Report:
+    if not 1 <= iterations <= MOST_ITERATIONS:
+        raise InputError(f"{iterations} iterations: must be 1 to {MOST_ITERATIONS}")
+    done = [_timed(trainer.pipeline, run) for _ in range(WARM_UP + iterations)][WARM_UP:]
+    wall_ms = statistics.median(one.wall_ms for one in done)
+    stages = [_stage_time(stage, done, trainer, limits, wall_ms) for stage in (*STAGES, HOST)
+              if any(stage in one.stage_ms for one in done)]
+    sizes = Sizes(*(int(statistics.median(dataclasses.astuple(one.sizes)[i] for one in done))
+                    for i in range(len(dataclasses.fields(Sizes)))))
+    largest = max((view.camera for view in trainer.scene.train), key=lambda c: c.width * c.height)
+    return Report(task, trainer.config.shape, largest.width, largest.height, iterations, sizes, wall_ms, tuple(stages))
+
+
+def _timed(pipeline: Pipeline, run: Callable[[], None]) -> _Iteration:
+    queue = pipeline.device.queue
+    queue.finish()
+    with recorded(pipeline.device) as launches:
+        start = time.perf_counter()
+        run()
+        queue.finish()
+        wall_ms = 1e3 * (time.perf_counter() - start)
+    stage_ms: dict[str, float] = {}
+    for stage, launch in by_stage(launches):
+        stage_ms[stage] = stage_ms.get(stage, 0.0) + launch.ms
+    stage_ms[HOST] = max(wall_ms - sum(stage_ms.values()), 0.0)
+    frame = pipeline.frame
+    assert frame is not None
+    layout = frame.layout
+    sizes = Sizes(frame.splats.n, frame.n_isects, layout.width * layout.height, count_pairs(pipeline, frame),
+                  frame.sh_degree)
+    return _Iteration(wall_ms, stage_ms, sizes)
+
+
+def _stage_time(stage: str, done: list[_Iteration], trainer: Trainer, limits: Limits, wall_ms: float) -> StageTime:
+    times = [one.stage_ms.get(stage, 0.0) for one in done]
+    ms = statistics.median(times)
+    is_cpu = trainer.device.info.type == "CPU"
+    work = [found for one in done if (found := work_of(trainer.kernels, one.sizes, is_cpu).get(stage)) is not None]
+    if not work:
+        return StageTime(stage, ms, ms / wall_ms)
+
+    def fraction(amounts: list[int], limit: float) -> float | None:
+        rates = [amount / (1e-3 * t * limit) for amount, t in zip(amounts, times, strict=True) if t > 0]
+        return statistics.median(rates) if any(amounts) and rates else None
+
+    moved, computed = [one.bytes for one in work], [one.flops for one in work]
+    return StageTime(stage, ms, ms / wall_ms, int(statistics.median(moved)), int(statistics.median(computed)),
+                     fraction(moved, limits.copy), fraction(computed, limits.fma))

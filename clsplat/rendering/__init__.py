@@ -1,0 +1,1 @@
+"""Splats to an image, and gradients back."""

@@ -1,0 +1,120 @@
+"""Which schedule a device runs best: measured once on a small scene, then remembered.
+
+`CLSPLAT_SCHEDULE` (a name of device.SCHEDULES, or GROUPxVECSxLANES) overrides; the cache is one JSON file in
+the user's cache folder, keyed by device, driver and the kernels' text.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import statistics
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from .._version import __version__
+from ..cameras.camera import Camera
+from ..device.binaries import cache_folder
+from ..device.buffers import ParameterBuffers, SplatBuffers
+from ..device.device import SCHEDULES, Device, Schedule, default_schedule
+from ..device.program import source
+from ..errors import ClsplatError, OutputError
+from ..files.atomic import atomic_writer
+from ..splats.splats import Splats
+from .kernels import KernelBuild
+from .pipeline import Pipeline
+
+SCHEDULE_VARIABLE = "CLSPLAT_SCHEDULE"
+_CANDIDATES = {"CPU": ("cpu16", "cpu8", "gpu256"), "other": ("gpu256", "gpu64")}
+_SIDE, _SPLATS, _REPEATS = 256, 3000, 5
+
+_chosen: dict[str, Schedule] = {}
+
+
+def schedule_for(device: Device) -> Schedule:
+    """The device's best schedule: from the environment, from the cache, or measured now (some seconds).
+
+    Raises
+    ------
+    DeviceError : the variable holds no schedule.
+    """
+    forced = os.environ.get(SCHEDULE_VARIABLE)
+    if forced:
+        return Schedule.parse(forced)
+    key = _key(device)
+    if key not in _chosen:
+        cached = _read_cache().get(key)
+        if cached is None:
+            times = measure(device)
+            fallback = str(default_schedule(device.cl_device))
+            cached = min(times, key=times.__getitem__) if times else fallback
+            _write_cache(key, cached)
+        _chosen[key] = Schedule.parse(cached)
+    return _chosen[key]
+
+
+def measure(device: Device) -> dict[str, float]:
+    """Milliseconds of rasterize and rasterize_vjp together, by schedule; without those that do not run."""
+    kind = device.info.type if device.info.type in _CANDIDATES else "other"
+    times: dict[str, float] = {}
+    for name in _CANDIDATES[kind]:
+        schedule = SCHEDULES[name]
+        if schedule.group <= device.info.max_group:
+            with suppress(ClsplatError):
+                times[str(schedule)] = _measure_one(device, schedule)
+    return times
+
+
+def _measure_one(device: Device, schedule: Schedule) -> float:
+    kernels = KernelBuild("gaussian", 0, schedule)
+    pipeline = Pipeline(device, kernels)
+    splats = SplatBuffers.of(device, _scene(), kernels.dtype)
+    grads = ParameterBuffers(device, splats.schema, splats.capacity, kernels.dtype)
+    pose = np.eye(4)
+    pose[2, 3] = 4.0
+    camera = Camera(_SIDE, _SIDE, 0.9 * _SIDE, 0.9 * _SIDE, _SIDE / 2, _SIDE / 2, pose)
+    times = []
+    for _ in range(_REPEATS + 1):
+        frame = pipeline.forward(splats, camera)
+        pipeline.backward(frame, pipeline.image("color", frame.layout, 3), grads)
+        events = pipeline.raster_events()
+        times.append(sum(1e-6 * float(event.profile.end - event.profile.start) for event in events))
+    return statistics.median(times[1:])
+
+
+def _scene() -> Splats:
+    rng = np.random.default_rng(0)
+    n = _SPLATS
+    return Splats("gaussian", {
+        "mean": rng.uniform(-1.5, 1.5, (n, 3)), "quat": rng.standard_normal((n, 4)),
+        "log_scale": rng.normal(-3.5, 0.5, (n, 3)), "opacity_logit": rng.normal(0, 2, n),
+        "sh": rng.normal(0, 1, (n, 1, 3)),
+    })
+
+
+def _key(device: Device) -> str:
+    info = device.info
+    text = source("render/raster.cl", "math/lanes.clh", "render/group.clh", "render/blend.clh")
+    digest = hashlib.sha256(text.encode()).hexdigest()[:12]
+    return "|".join((info.platform, info.platform_version, info.name, info.driver, __version__, digest))
+
+
+def _cache_path() -> Path:
+    return cache_folder() / "schedules.json"
+
+
+def _read_cache() -> dict[str, str]:
+    try:
+        values = json.loads(_cache_path().read_text(encoding="utf-8"))
+    except (OSError, ValueError, RuntimeError):
+        return {}
+    return {k: v for k, v in values.items() if isinstance(v, str)} if isinstance(values, dict) else {}
+
+
+def _write_cache(key: str, schedule: str) -> None:
+    """Remember; a read-only home only costs the measurement again."""
+    with suppress(OutputError, OSError), atomic_writer(_cache_path()) as stream:
+        stream.write(json.dumps(_read_cache() | {key: schedule}, indent=1).encode())

@@ -1,0 +1,59 @@
+"""A coloured point cloud in a PLY file, as nerfstudio (`ply_file_path`) and 3DGS (`points3d.ply`) keep it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..files.atomic import atomic_writer
+from ..splats.ply_body import read_body
+from ..splats.ply_header import read_header
+from .colmap import Points
+
+_GREY = 128
+
+
+def read_point_cloud(path: str | os.PathLike[str]) -> Points:
+    """Points from x, y, z and, where they are there, red, green, blue (0 to 255); grey without.
+
+    Returns
+    -------
+    Points with tracks of length 1: the file does not say who saw them.
+
+    Raises
+    ------
+    InputError : missing, damaged, no position, or a position that is not finite.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            header = read_header(path, stream)
+            columns = read_body(path, stream, header)["vertex"]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); give a PLY file of points") from None
+    missing = [name for name in "xyz" if name not in columns]
+    if missing:
+        raise InputError(f"{path}: has no property {missing[0]!r}; give a PLY file of points with x, y and z")
+    xyz: NDArray[np.float64] = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1)
+    bad = np.flatnonzero(~np.isfinite(xyz).all(axis=1))
+    if bad.size:
+        raise InputError(f"{path}: point {bad[0]} has a position that is not finite; export the points again")
+    rgb = np.full((len(xyz), 3), _GREY, np.uint8)
+    if all(name in columns for name in ("red", "green", "blue")):
+        rgb = np.stack([np.clip(columns[name], 0, 255).astype(np.uint8) for name in ("red", "green", "blue")], axis=1)
+    return Points(xyz, rgb, np.ones(len(xyz), np.int64))
+
+
+def write_point_cloud(path: str | os.PathLike[str], points: Points) -> None:
+    """Write positions (float32) and colours, binary; raises OutputError."""
+    columns = [("float", name) for name in "xyz"] + [("uchar", name) for name in ("red", "green", "blue")]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}",
+            *(f"property {kind} {name}" for kind, name in columns), "end_header"]
+    table = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    table["xyz"], table["rgb"] = points.xyz, points.rgb
+    with atomic_writer(path) as stream:
+        stream.write(("\n".join(head) + "\n").encode("ascii") + table.tobytes())

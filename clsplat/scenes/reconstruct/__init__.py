@@ -1,0 +1,1 @@
+"""Photographs or a video to a scene."""

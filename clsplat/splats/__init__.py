@@ -1,0 +1,1 @@
+"""What a splat model is, on the host."""

@@ -1,0 +1,25 @@
+"""Real spherical harmonics to degree 3 in NumPy, as cl/math/harmonics.clh has them (the basis and signs of 3DGS)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def sh_basis(direction: NDArray[Any], degree: int) -> NDArray[Any]:
+    """Values of the basis in unit directions (N, 3), to `degree`: (N, (degree + 1)^2), of the same dtype."""
+    x, y, z = direction.T
+    xx, yy, zz = x * x, y * y, z * z
+    bands = [
+        [np.full_like(x, 0.28209479177387814)],
+        [-0.48860251190291992 * y, 0.48860251190291992 * z, -0.48860251190291992 * x],
+        [1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy),
+         -1.0925484305920792 * x * z, 0.54627421529603959 * (xx - yy)],
+        [-0.59004358992664352 * y * (3 * xx - yy), 2.8906114426405540 * x * y * z,
+         -0.45704579946446577 * y * (4 * zz - xx - yy), 0.37317633259011546 * z * (2 * zz - 3 * (xx + yy)),
+         -0.45704579946446577 * x * (4 * zz - xx - yy), 1.4453057213202770 * z * (xx - yy),
+         -0.59004358992664352 * x * (xx - 3 * yy)],
+    ]  # fmt: skip
+    return np.stack([values for band in bands[: degree + 1] for values in band], axis=1)

@@ -1,0 +1,92 @@
+"""The body of a PLY file: columns of numbers, element after element, in any of the three encodings."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .ply_header import BYTE_ORDER, INTEGER_TYPES, REAL_TYPES, Element, Header
+
+Columns = Mapping[str, NDArray[Any]]
+_CODES = REAL_TYPES | INTEGER_TYPES
+
+
+def read_body(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[str, NDArray[Any]]]:
+    """Columns by name, of each element by name, in their own types and the machine's byte order.
+
+    Parameters
+    ----------
+    stream : at the first byte after the header.
+
+    Raises
+    ------
+    InputError : shorter or longer than the header says, or text that is no number; found before anything as large as
+        the header claims is allocated.
+    """
+    read = _read_ascii if header.encoding == "ascii" else _read_binary
+    return read(path, stream, header)
+
+
+def _read_binary(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[str, NDArray[Any]]]:
+    order = BYTE_ORDER[header.encoding]
+    dtypes = [np.dtype([(name, order + _CODES[kind]) for kind, name in element.properties])
+              for element in header.elements]
+    expected = sum(element.count * dtype.itemsize for element, dtype in zip(header.elements, dtypes, strict=True))
+    available = os.fstat(stream.fileno()).st_size - stream.tell()
+    if available != expected:
+        raise _wrong_size(path, header, f"{expected} bytes", f"{available}", available < expected)
+    body = {}
+    for element, dtype in zip(header.elements, dtypes, strict=True):
+        table: NDArray[Any] = np.frombuffer(stream.read(element.count * dtype.itemsize), dtype=dtype)
+        body[element.name] = {name: table[name].astype(_CODES[kind]) for kind, name in element.properties}
+    return body
+
+
+def _read_ascii(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[str, NDArray[Any]]]:
+    expected = sum(element.count * len(element.properties) for element in header.elements)
+    text = stream.read()
+    # Every value takes a digit and a separator, so the file's size bounds the count.
+    if 2 * expected > len(text) + 1:
+        raise _wrong_size(path, header, f"{expected} values", f"{len(text)} bytes", True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # how NumPy reports text that is no number
+        try:
+            values = np.fromstring(text, dtype=np.float64, sep=" ") if text.strip() else np.empty(0)
+        except (DeprecationWarning, ValueError):
+            raise InputError(f"{path}: the ascii body holds text that is no number; export again") from None
+    if values.size != expected:
+        raise _wrong_size(path, header, f"{expected} values", f"{values.size}", values.size < expected)
+    body, at = {}, 0
+    for element in header.elements:
+        width = len(element.properties)
+        table = values[at : at + element.count * width].reshape(element.count, width)
+        at += table.size
+        body[element.name] = {name: _cast(path, element, name, table[:, i], _CODES[kind])
+                              for i, (kind, name) in enumerate(element.properties)}
+    return body
+
+
+def _cast(path: object, element: Element, name: str, values: NDArray[np.float64], code: str) -> NDArray[Any]:
+    """Numbers read from text, in the type that the header gives them."""
+    dtype = np.dtype(code)
+    if dtype.kind in "iu":
+        info = np.iinfo(dtype)
+        good = (values >= info.min) & (values <= info.max) & (values == np.floor(values))
+        if not good.all():
+            row = int(np.flatnonzero(~good)[0])
+            raise InputError(f"{path}: element {element.name!r}, row {row}: {name} is {values[row]:g}, expected a "
+                             f"whole number from {info.min} to {info.max}; export again")
+    with np.errstate(over="ignore"):  # what overflows is found and named by the check of the model
+        return values.astype(dtype)
+
+
+def _wrong_size(path: object, header: Header, expected: str, found: str, short: bool) -> InputError:
+    problem = "is truncated" if short else "has extra data at its end"
+    held = "vertices need" if len(header.elements) == 1 else "vertices and what follows them need"
+    return InputError(f"{path}: {problem}: {header.count} {held} {expected}, found {found}; copy or export it again")

@@ -1,0 +1,131 @@
+"""The header of a PLY file: parsed strictly, so that a wrong file is named before anything is allocated.
+
+Format: Greg Turk, "The PLY Polygon File Format" (1994).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import BinaryIO
+
+from ..errors import InputError
+
+BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+REAL_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+INTEGER_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+}  # fmt: skip
+SIDE_PREFIX = "clsplat_"  # of the names of elements that may follow the vertices (ply_compact.py)
+_MAX_LINE = 4096
+_MAX_LINES = 4096
+
+
+@dataclass
+class Element:
+    """A table of the body: its rows, and (type, name) of its properties in file order."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def names(self) -> list[str]:
+        return [name for _, name in self.properties]
+
+
+@dataclass
+class Header:
+    """What a PLY header says: encoding, the element `vertex`, and those of clsplat's that follow it."""
+
+    encoding: str = ""
+    elements: list[Element] = field(default_factory=list)
+    comments: list[str] = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        """Vertices."""
+        return self.elements[0].count
+
+    @property
+    def properties(self) -> list[tuple[str, str]]:
+        """(type, name) of the vertices' properties."""
+        return self.elements[0].properties
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the vertices' properties."""
+        return self.elements[0].names
+
+
+def read_header(path: object, stream: BinaryIO) -> Header:
+    """Header of the PLY file `stream`, which is left at the first byte after it.
+
+    Raises
+    ------
+    InputError : not a PLY file, a line that is no PLY, or anything but one element `vertex` of scalars, which
+        others of clsplat's own may follow; it names the file (`path`) and the line.
+    """
+    if stream.readline(_MAX_LINE).rstrip(b"\r\n") != b"ply":
+        raise InputError(f"{path}: not a PLY file (its first line is not 'ply'); choose a splat .ply")
+    header = Header()
+    for number in range(2, _MAX_LINES):
+        raw = stream.readline(_MAX_LINE)
+        if not raw.endswith(b"\n"):
+            raise InputError(f"{path}: header line {number} is cut off; the file is truncated or no PLY")
+        line = raw.decode("latin-1").rstrip("\r\n")
+        words = line.split()
+        keyword = words[0] if words else ""
+        if keyword == "end_header":
+            break
+        try:
+            _take(header, keyword, words, line)
+        except InputError as error:
+            raise InputError(f"{path}: header line {number}: {error}") from None
+    else:
+        raise InputError(f"{path}: no end_header within {_MAX_LINES} lines; the header is damaged")
+    if not header.encoding:
+        raise InputError(f"{path}: header has no format line; add 'format binary_little_endian 1.0'")
+    if not header.elements:
+        raise InputError(f"{path}: header has no element 'vertex'; choose a splat .ply")
+    return header
+
+
+def _take(header: Header, keyword: str, words: list[str], line: str) -> None:
+    """Put one header line into `header`; raises InputError without the place."""
+    shown = line[:80].encode("unicode_escape").decode("ascii")
+    if keyword == "comment":
+        header.comments.append(line.strip()[len("comment") :].strip())
+    elif keyword == "format" and len(words) == 3:
+        if words[1] not in BYTE_ORDER:
+            raise InputError(f"format {words[1]!r} is unknown; expected one of {', '.join(BYTE_ORDER)}")
+        header.encoding = words[1]
+    elif keyword == "element" and len(words) == 3:
+        _take_element(header, words[1], words[2])
+    elif keyword == "property" and len(words) >= 2 and words[1] == "list":
+        raise InputError(f"property {words[-1]!r} is a list; a splat file has plain float properties")
+    elif keyword == "property" and len(words) == 3:
+        if not header.elements:
+            raise InputError(f"property {words[2]!r} comes before any element; the header is damaged")
+        if words[1] not in REAL_TYPES and words[1] not in INTEGER_TYPES:
+            raise InputError(f"property {words[2]!r} has unknown type {words[1]!r}; expected float or double")
+        if words[2] in header.elements[-1].names:
+            raise InputError(f"property {words[2]!r} occurs twice; rename or remove one")
+        header.elements[-1].properties.append((words[1], words[2]))
+    elif keyword != "obj_info":  # obj_info is a second kind of comment
+        raise InputError(f"{shown!r} is no PLY header line; the header is damaged")
+
+
+def _take_element(header: Header, name: str, count: str) -> None:
+    """Begin an element; raises InputError without the place."""
+    side = bool(header.elements) and name.startswith(SIDE_PREFIX)
+    if not side and (name != "vertex" or header.elements):
+        raise InputError(
+            f"element {name!r}: a splat file has one element, 'vertex' "
+            "(meshes and compressed PLY files are not read; export plain splats)"
+        )
+    if any(element.name == name for element in header.elements):
+        raise InputError(f"element {name!r} occurs twice; rename or remove one")
+    if not (count.isascii() and count.isdigit() and len(count) <= 15):
+        raise InputError(f"element {name!r} has count {count[:20]!r}; expected a whole number")
+    header.elements.append(Element(name, int(count)))

@@ -1,0 +1,117 @@
+"""The state of a run between two iterations, in one file written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..files.atomic import atomic_writer
+from ..splats.schema import Array
+
+VERSION = 2
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Everything that the rest of a run depends on.
+
+    Parameters
+    ----------
+    iteration : iterations done.
+    config : of the run, as JSON.
+    splats : public arrays by field.
+    optimizer : its state by key.
+    rng : state of the NumPy generator, as JSON.
+    queue : training views still to come in this epoch.
+    seconds : training time so far. schedule : of the kernels, whose rounding depends on it.
+    n_first : splats at the start, which the growth depends on.
+    signals : (3, N), see Pipeline.signals.
+    """
+
+    iteration: int
+    config: dict[str, Any]
+    splats: dict[str, Array]
+    optimizer: dict[str, NDArray[Any]]
+    rng: dict[str, Any]
+    queue: list[int]
+    seconds: float
+    schedule: str
+    n_first: int
+    signals: Array
+
+    def save(self, path: Path) -> None:
+        """Write; raises OutputError when the disk is full or the folder read-only (the old file stays)."""
+        meta = {"version": VERSION, "iteration": self.iteration, "config": self.config, "rng": self.rng,
+                "queue": self.queue, "seconds": self.seconds, "schedule": self.schedule,
+                "n_first": self.n_first}
+        arrays = {f"splats.{k}": v for k, v in self.splats.items()}
+        arrays |= {f"optimizer.{k}": v for k, v in self.optimizer.items()}
+        arrays["signals"] = self.signals
+        arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+        with atomic_writer(path) as stream:
+            np.savez(stream, **arrays)  # type: ignore[arg-type]
+
+    @classmethod
+    def load(cls, path: Path) -> Checkpoint:
+        """Read; raises InputError when the file is missing, damaged or of another version."""
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            meta = json.loads(arrays.pop("meta").tobytes())
+            version = meta["version"]
+        except FileNotFoundError:
+            raise InputError(f"{path}: no checkpoint to resume from: start with --overwrite") from None
+        except _DAMAGE as error:
+            raise _unreadable(path, str(error)) from None
+        if version != VERSION:
+            raise InputError(f"{path}: checkpoint version {str(version)[:20]!r}, this clsplat reads {VERSION}")
+
+        def part(prefix: str) -> dict[str, Any]:
+            return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+        try:
+            checkpoint = cls(meta["iteration"], meta["config"], part("splats."), part("optimizer."), meta["rng"],
+                             meta["queue"], meta["seconds"], meta["schedule"], meta["n_first"], arrays["signals"])
+            checkpoint._check()
+        except _DAMAGE as error:
+            raise _unreadable(path, str(error)) from None
+        return checkpoint
+
+    def _check(self) -> None:
+        """Raises one of _DAMAGE where a value cannot be what `save` wrote. The zip's checksums find damage to bytes;
+        this finds a file that was put together by something else."""
+        for name, kind in _KINDS.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind) or isinstance(value, bool):
+                raise ValueError(f"its {name} is of another kind")
+        if self.iteration < 0 or self.n_first < 1 or not 0 <= self.seconds < math.inf:
+            raise ValueError("its iteration, n_first or seconds are out of range")
+        if not all(type(place) is int and place >= 0 for place in self.queue):
+            raise ValueError("its queue is none of views")
+        np.random.default_rng().bit_generator.state = self.rng
+        n = len(self.splats["mean"])
+        for group in (self.splats, self.optimizer, {"signals": self.signals}):
+            if not all(values.dtype.kind in "fiu" and values.ndim for values in group.values()):
+                raise ValueError("it holds something that is no array of numbers")
+        if any(len(values) != n for values in self.splats.values()) or self.signals.shape != (3, n):
+            raise ValueError("its arrays are not of the same splats")
+
+
+_KINDS = {"iteration": int, "config": dict, "rng": dict, "queue": list, "seconds": int | float, "schedule": str,
+          "n_first": int}
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, OverflowError, EOFError, RecursionError, zipfile.BadZipFile,
+           zlib.error)
+
+
+def _unreadable(path: Path, why: str) -> InputError:
+    return InputError(f"{path}: not a readable checkpoint ({why.splitlines()[0] if why else 'damaged'}): "
+                      "start again with --overwrite")

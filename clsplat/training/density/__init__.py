@@ -1,0 +1,1 @@
+"""Which splats are added, moved and removed."""

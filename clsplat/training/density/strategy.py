@@ -1,0 +1,80 @@
+"""What a run's strategy does to the splats at one of its actions: from the options to a plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...splats.schema import Array
+from ...splats.shapes import shape_named
+from ..config import TrainConfig
+from .adc import plan_adc, with_reset
+from .densify import plan_relocation
+from .plan import Plan
+
+# Opacities are reset this many iterations apart at least, and not earlier, however short the run: their rate does not
+# grow in short runs. A reset at 500 of 1000 iterations cost 1 dB (half-Gaussians on 400 px photos).
+RESET_INTERVAL_MIN = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Where a run stands when its strategy acts.
+
+    Parameters
+    ----------
+    iteration : from 1. last : the last one at which the strategy may act.
+    growth : new count over old count of "mcmc". extent : of the scene [world units].
+    """
+
+    iteration: int
+    last: int
+    growth: float
+    extent: float
+
+
+def plan(config: TrainConfig, arrays: Mapping[str, Array], signals: Array, rng: np.random.Generator,
+         moment: Moment) -> Plan:
+    """The plan of one action.
+
+    Parameters
+    ----------
+    arrays : all public arrays of the model. signals : (3, N), collected since the last action (cl/render/project.cl).
+    rng : of the run; the plan depends on nothing else that is random.
+
+    Raises
+    ------
+    TrainingError : no splat is finite.
+    """
+    shape = shape_named(config.shape)
+    if config.strategy == "mcmc":
+        # The profile has peak 1; without that the length factor would be another one for each view.
+        scaled = config.normalisation == "peak" or not shape.normalised
+        return plan_relocation(
+            arrays, shape, rng, config.cap_max, growth=moment.growth, limit=config.relocation_limit,
+            rule=config.relocation if scaled else "opacity-only",
+            pull=signals[0] if config.sampling == "pull" else None)
+    every = reset_interval(config)
+    grown = plan_adc(
+        arrays, shape, signals, rng, config.cap_max, extent=moment.extent, grad_threshold=config.grad_threshold,
+        depth_threshold=config.depth_threshold, dense_size=config.dense_size,
+        prune_large=0 < every < moment.iteration)
+    return with_reset(grown, arrays, shape) if resets(config, moment) else grown
+
+
+def reset_interval(config: TrainConfig) -> int:
+    """Iterations from one opacity reset to the next; 0: there is none."""
+    return config.opacity_reset and max(config.iterations // config.opacity_reset, RESET_INTERVAL_MIN)
+
+
+def resets(config: TrainConfig, moment: Moment) -> bool:
+    """Whether the action resets opacities: the first at or after a multiple of the interval, but not the last.
+
+    3DGS: at 3000, 6000, 9000 and 12 000 of 30 000 iterations, of which 15 000 densify.
+    """
+    every = reset_interval(config)
+    if not every or moment.iteration >= moment.last:
+        return False
+    return moment.iteration // every > (moment.iteration - config.densify_interval) // every

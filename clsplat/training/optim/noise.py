@@ -1,0 +1,133 @@
+"""The exploration noise of 3DGS-MCMC, with random numbers that a kernel can repeat (cl/math/noise.clh).
+
+Random integers come from Philox4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): a
+pure function of (seed, iteration, splat), so order, device and thread count do not matter. The uniforms made
+of them are exact in float32; only log, sqrt and sin/cos may differ by some ulp between devices.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...splats.rotations import rotations
+from ...splats.schema import Array
+
+Words = NDArray[np.uint32]
+FourWords = tuple[Words, Words, Words, Words]
+
+_MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
+_WEYL = (0x9E3779B9, 0xBB67AE85)  # added to the key after each round: golden ratio, sqrt(3) - 1
+_ROUNDS = 10
+_MASK = 0xFFFFFFFF
+
+# 3DGS-MCMC (ubc-vision/3dgs-mcmc): sigmoid(100 ((1 - o) - 0.995)) = sigmoid(0.5 - 100 o): only splats that
+# are nearly transparent are moved.
+GATE_SHARPNESS = 100.0
+GATE_OFFSET = 0.5
+# Extent of the scenes that the constants of 3DGS-MCMC and SSS belong to [world units].
+PUBLISHED_EXTENT = 7.45176
+
+
+def philox4x32(counter: FourWords, key: tuple[int, int]) -> FourWords:
+    """Philox4x32-10: four random words for every counter.
+
+    Parameters
+    ----------
+    counter : four uint32 arrays that broadcast together, least significant word first.
+    key : two 32-bit integers.
+    """
+    c0, c1, c2, c3 = (np.asarray(word, np.uint32) for word in counter)
+    k0, k1 = key
+    for _ in range(_ROUNDS):
+        product0 = c0.astype(np.uint64) * np.uint64(_MULTIPLIERS[0])
+        product1 = c2.astype(np.uint64) * np.uint64(_MULTIPLIERS[1])
+        high0, low0 = _halves(product0)
+        high1, low1 = _halves(product1)
+        c0, c1, c2, c3 = high1 ^ c1 ^ np.uint32(k0), low1, high0 ^ c3 ^ np.uint32(k1), low0
+        k0, k1 = (k0 + _WEYL[0]) & _MASK, (k1 + _WEYL[1]) & _MASK
+    return c0, c1, c2, c3
+
+
+def normal3(seed: int, iteration: int, n: int, stream: int = 0) -> NDArray[np.float32]:
+    """Three independent standard normals for each of `n` splats, (n, 3).
+
+    Key (seed low, seed high), counter (index, iteration, stream, 0); words 0, 1 give components 0, 1 and words
+    2, 3 component 2 (the second of that pair is not used), by Box-Muller:
+    radius sqrt(-2 ln uniform(word a)), angle 2 pi uniform(word b). |normal| < 5.8.
+
+    Parameters
+    ----------
+    seed : 0 <= seed < 2^64. iteration : 0 <= iteration < 2^32.
+    stream : users of noise in one iteration have one each: 0 this module's, 1 sghmc.py's.
+    """
+    index = np.arange(n, dtype=np.uint32)
+    rest = [np.asarray(word, np.uint32) for word in (iteration, stream, 0)]
+    words = philox4x32((index, rest[0], rest[1], rest[2]), (seed & _MASK, seed >> 32))
+    u0, u1, u2, u3 = (_uniform(word) for word in words)
+    radius01, angle01 = np.sqrt(-2.0 * np.log(u0)), 2.0 * np.pi * u1
+    radius2, angle2 = np.sqrt(-2.0 * np.log(u2)), 2.0 * np.pi * u3
+    normals = (radius01 * np.cos(angle01), radius01 * np.sin(angle01), radius2 * np.cos(angle2))
+    return np.stack(normals, axis=1).astype(np.float32)
+
+
+def noise_amount(noise_lr: float, mean_lr: float, extent: float) -> float:
+    """What the noise is multiplied by, from its rate and the positions' (which has the extent in it).
+
+    As published, rate times rate, it grows with the covariance: as the extent's third power, so in large units splats
+    would leave the scene. Beyond PUBLISHED_EXTENT it grows with the extent alone.
+    """
+    return noise_lr * mean_lr * min(PUBLISHED_EXTENT / extent, 1.0) ** 2
+
+
+def noise_reach(extent: float) -> float:
+    """The farthest that noise moves a splat in one step [world units]."""
+    return 0.1 * extent
+
+
+def noise_gate(strength: Array) -> NDArray[np.float64]:
+    """How much of the noise a splat takes, (N,), by its largest |opacity|: .62 at 0, .5 at .005, .01 at .05."""
+    gate: NDArray[np.float64] = 1.0 / (1.0 + np.exp(GATE_SHARPNESS * strength.astype(np.float64) - GATE_OFFSET))
+    return gate
+
+
+def covariance_times(quat: Array, log_scale: Array, vector: Array) -> NDArray[np.float64]:
+    """Sigma v of (N, 3) vectors, Sigma = R S S R'."""
+    rotation = rotations(quat.astype(np.float64))
+    in_frame = np.einsum("nji,nj->ni", rotation, vector) * np.exp(2.0 * log_scale.astype(np.float64))
+    product: NDArray[np.float64] = np.einsum("nij,nj->ni", rotation, in_frame)
+    return product
+
+
+def add_noise(mean: Array, quat: Array, log_scale: Array, strength: Array, seed: int, iteration: int,
+              amount: float, reach: float = math.inf) -> Array:
+    """Means after the noise step: mean + Sigma (xi gate amount), but by `reach` at most.
+
+    Parameters
+    ----------
+    mean (N, 3), quat (N, 4) wxyz of any norm above 0, log_scale (N, 3) : raw values.
+    strength : (N,) the largest |opacity| of each splat (Shape.strength).
+    amount : noise learning rate (5e5 in 3DGS-MCMC) times the mean's learning rate of this iteration.
+
+    Returns
+    -------
+    (N, 3) of the mean's dtype.
+    """
+    xi = normal3(seed, iteration, len(mean)).astype(np.float64)
+    step = xi * (noise_gate(strength) * amount)[:, None]
+    shift = covariance_times(quat, log_scale, step)
+    length = np.maximum(np.linalg.norm(shift, axis=1, keepdims=True), 1e-15)
+    moved: Array = (mean + shift * np.minimum(reach / length, 1.0)).astype(mean.dtype)
+    return moved
+
+
+def _halves(product: NDArray[np.uint64]) -> tuple[Words, Words]:
+    """High and low 32 bits."""
+    return (product >> np.uint64(32)).astype(np.uint32), product.astype(np.uint32)
+
+
+def _uniform(words: Words) -> NDArray[np.float64]:
+    """The top 23 bits at the centre of their interval: in (0, 1), exact in float32."""
+    return ((words >> np.uint32(9)).astype(np.float64) + 0.5) * 2.0**-23

@@ -1,0 +1,34 @@
+"""Penalties on opacities and scales in NumPy; the fused form is in cl/train/optim.cl."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ...splats.opacities import opacity_names
+from ...splats.schema import Array
+from ...splats.shapes import Shape
+
+
+class Penalty(NamedTuple):
+    """opacity * sum(|o|) + scale * sum(scales) (3DGS-MCMC's regularisers) + bisect * sum((o_plus - o_minus)^2) (3DSGS).
+
+    Of a splat with two opacities the mean of both counts as |o|.
+    """
+
+    opacity: float
+    scale: float
+    bisect: float
+
+    def gradients(self, shape: Shape, params: Mapping[str, Array]) -> dict[str, Array]:
+        """Of the raw opacities and the log scales, by field."""
+        names = opacity_names(params)
+        sides = [shape.opacity(params[name]) for name in names]
+        gap = 2 * self.bisect * (sides[0] - sides[-1])
+        grads: dict[str, Array] = {"log_scale": self.scale * np.exp(params["log_scale"])}
+        for name, o, pull in zip(names, sides, (gap, -gap), strict=False):  # one side has no gap
+            slope = 1 - o * o if shape.signed else o * (1 - o)
+            grads[name] = (self.opacity / len(sides) * np.sign(o) + pull) * slope
+        return grads

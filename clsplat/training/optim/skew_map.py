@@ -1,0 +1,200 @@
+"""From a splat's trainable skew s to the kernel's bounded vector, and back.
+
+Kernels and files know only the vector: m in the centred form, the slant eta in the direct one (see shapes.py).
+r = |s|, n = s / r:
+
+    cube-root   m = n SKEW_MAX tanh(r)^(1/3)                  the skewness index is cubic in |m|: linear in r near 0
+    linear      m = n SKEW_MAX tanh(r)
+    radial      eta = n SLANT_MAX tanh(r / SLANT_MAX)
+    polar       eta = u/|u| SLANT_MAX tanh(rho / SLANT_MAX)   s = (rho, u): a magnitude and a free direction
+    coupled     eta = R' a, a = n SLANT_MAX tanh(r / SLANT_MAX)
+
+"polar" follows 3D Skew-Normal Splatting (2026), where the magnitude's activation is not published. "coupled" is the
+textbook form that it improves upon: a slant a in the world's frame with Omega^(1/2) = R S R', which turns and
+deforms with rotation and scale; its chain rule also adds to the rotation's gradient.
+
+At s = 0 the cube root's slope is infinite, and u = 0 has no direction, so lengths are floored at R_FLOOR inside
+the factors: below it the map is linear, and every gradient is finite. m = 0 is a stationary point of the kernel (which
+changes by the third order in m): training must start from a small m of random direction, see initialise.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...splats.rotations import rotations, rotations_vjp
+from ...splats.schema import Array
+from ...splats.shapes import SKEW_MAX, SLANT_MAX
+
+# By the form of the skew (shapes.Shape.skew_form); the first is its default.
+MAPS = {"centred": ("cube-root", "linear"), "direct": ("polar", "radial", "coupled")}
+SKEW_MAPS = tuple(name for names in MAPS.values() for name in names)
+R_FLOOR = 1e-6  # skew_map.clh has the same constant
+R_CEILING = 20.0  # cosh(r)^2 stays in float32's range; tanh is 1 long before
+TANH_CEILING = 1.0 - 1e-4  # inverse: keeps s where the map still has a slope
+
+_F = TypeVar("_F", np.float32, np.float64)
+
+
+def map_named(name: str, form: str | None) -> str:
+    """`name`, or for "auto" the default map of a form of skew; "" where there is no skew."""
+    if form is None:
+        return ""
+    return MAPS[form][0] if name == "auto" else name
+
+
+def check_map(name: str, form: str | None) -> None:
+    """Raises InputError unless `name` is "auto" or a map of the form (any map where there is no skew)."""
+    known = SKEW_MAPS if form is None else MAPS[form]
+    if name != "auto" and name not in known:
+        kind = "" if form is None else f" for the {form} form of skew"
+        raise InputError(f"skew_map {name!r}{kind}: choose auto or one of {', '.join(known)}")
+
+
+@dataclass(frozen=True, slots=True)
+class SkewMap:
+    """One parameterisation of the skew.
+
+    Arrays are s (N, width), skew and its gradient (N, 3), quat (N, 4) of any norm above 0; all float32 or all
+    float64, and the dtype is kept. Only "coupled" looks at the rotation.
+
+    Parameters
+    ----------
+    name : one of SKEW_MAPS.
+
+    Raises
+    ------
+    InputError : unknown name.
+    """
+
+    name: str = "cube-root"
+
+    def __post_init__(self) -> None:
+        if self.name not in SKEW_MAPS:
+            raise InputError(f"unknown skew map {self.name!r}: choose one of {', '.join(SKEW_MAPS)}")
+
+    @property
+    def width(self) -> int:
+        """Trainable reals per splat."""
+        return 4 if self.name == "polar" else 3
+
+    @property
+    def rotates(self) -> bool:
+        """Whether the skew depends on the splat's rotation too."""
+        return self.name == "coupled"
+
+    @property
+    def limit(self) -> float:
+        """What the length of the skew stays below."""
+        return SKEW_MAX if self.name in MAPS["centred"] else SLANT_MAX
+
+    def forward(self, s: NDArray[_F], quat: NDArray[_F]) -> NDArray[_F]:
+        """The skew of s."""
+        if self.name == "polar":
+            return self._length(s[:, :1]) * (s[:, 1:] / _radius(s[:, 1:]))
+        r = _radius(s)
+        skew: NDArray[_F] = s * (self._length(r) / r)
+        return _turned(skew, rotations(quat), back=True) if self.rotates else skew
+
+    def vjp(self, s: NDArray[_F], quat: NDArray[_F], v_skew: NDArray[_F]) -> tuple[NDArray[_F], Array]:
+        """Gradients of s, and what the rotation's gradient gains (N, 4), given the gradient of the skew.
+
+        With n = s / r, f = length / r and g = d length / dr the Jacobian is f I + (g - f) n n', symmetric.
+        """
+        if self.name == "polar":
+            return self._polar_vjp(s, v_skew), np.zeros_like(quat)
+        v_quat: Array = np.zeros_like(quat)
+        if self.rotates:
+            rotation = rotations(quat)
+            world = s * (self._length(_radius(s)) / _radius(s))
+            v_quat = rotations_vjp(quat, world[:, :, None] * v_skew[:, None, :])
+            v_skew = _turned(v_skew, rotation)
+        r = _radius(s)
+        n = s / r
+        f = self._length(r) / r
+        along = np.sum(n * v_skew, axis=-1, keepdims=True)
+        # Below the floor the factors are constants and |n| < 1: the map is f s, its Jacobian f I.
+        bend = np.where(r > R_FLOOR, self._slope(r) - f, np.zeros_like(f))
+        v_s: NDArray[_F] = f * v_skew + bend * along * n
+        return v_s, v_quat
+
+    def inverse(self, skew: NDArray[_F], quat: NDArray[_F]) -> NDArray[_F]:
+        """The s that gives `skew`; a length at or above the limit is taken as just below it."""
+        if self.rotates:
+            skew = _turned(skew, rotations(quat))
+        length = np.sqrt(np.sum(skew * skew, axis=-1, keepdims=True))
+        bent = length / length.dtype.type(self.limit)
+        tanh = bent**3 if self.name == "cube-root" else bent
+        r = np.arctanh(np.minimum(tanh, length.dtype.type(TANH_CEILING))) * length.dtype.type(self._scale)
+        tiny = np.finfo(length.dtype).tiny
+        if self.name == "polar":
+            pole = np.array([0, 0, 1], length.dtype)  # any direction will do where there is no skew
+            direction = np.where(length > tiny, skew / np.maximum(length, tiny), pole)
+            return np.concatenate([r, direction], axis=-1)
+        floor = np.full_like(r, R_FLOOR)
+        with np.errstate(invalid="ignore"):  # what is not finite stays so
+            s: NDArray[_F] = skew * np.where(r > floor, r / np.maximum(length, tiny), floor / self._length(floor))
+        return s
+
+    def follow(self, s: NDArray[_F], before: Mapping[str, Array], after: Mapping[str, Array]) -> NDArray[_F]:
+        """s where fields `skew` and `quat` were given new values: found anew in the rows that changed.
+
+        The other rows keep theirs, as near the limit an inverse loses digits.
+        """
+        names = ("skew", "quat") if self.rotates else ("skew",)
+        changed = np.zeros(len(s), bool)
+        for name in names:
+            changed |= (before[name] != after[name]).any(axis=1)
+        followed = s.copy()
+        followed[changed] = self.inverse(after["skew"][changed], after["quat"][changed])
+        return followed
+
+    def _polar_vjp(self, s: NDArray[_F], v_skew: NDArray[_F]) -> NDArray[_F]:
+        rho, u = s[:, :1], s[:, 1:]
+        norm = _radius(u)
+        n = u / norm
+        along = np.sum(n * v_skew, axis=-1, keepdims=True)
+        # Where the floor acts the norm is a constant.
+        across = v_skew - np.where(norm > R_FLOOR, along, np.zeros_like(along)) * n
+        v_s: NDArray[_F] = np.concatenate([self._slope(rho) * along, self._length(rho) / norm * across], axis=-1)
+        return v_s
+
+    @property
+    def _scale(self) -> float:
+        """The r at which the length has bent: 1 in the centred form; the slant's slope at 0 is 1."""
+        return 1.0 if self.name in MAPS["centred"] else SLANT_MAX
+
+    def _length(self, r: NDArray[_F]) -> NDArray[_F]:
+        """Length of the skew at r; odd in r."""
+        tanh = np.tanh(r / r.dtype.type(self._scale))
+        bent = np.cbrt(tanh) if self.name == "cube-root" else tanh
+        length: NDArray[_F] = r.dtype.type(self.limit) * bent
+        return length
+
+    def _slope(self, r: NDArray[_F]) -> NDArray[_F]:
+        """d length / dr."""
+        bent = np.clip(r / r.dtype.type(self._scale), r.dtype.type(-R_CEILING), r.dtype.type(R_CEILING))
+        shrink = np.cosh(bent) ** 2
+        if self.name == "cube-root":
+            root = np.cbrt(np.tanh(bent))
+            shrink = shrink * (3 * root * root)
+        slope: NDArray[_F] = (self.limit / self._scale / shrink).astype(r.dtype, copy=False)
+        return slope
+
+
+def _radius(s: NDArray[_F]) -> NDArray[_F]:
+    """|s| floored at R_FLOOR, (N, 1)."""
+    r: NDArray[_F] = np.maximum(np.sqrt(np.sum(s * s, axis=-1, keepdims=True)), s.dtype.type(R_FLOOR))
+    return r
+
+
+def _turned(vector: NDArray[_F], rotation: Array, back: bool = False) -> NDArray[_F]:
+    """R v of (N, 3) vectors, or R' v."""
+    turned: NDArray[_F] = np.einsum("nji,nj->ni" if back else "nij,nj->ni", rotation, vector)
+    return turned

@@ -1,0 +1,66 @@
+"""log.jsonl of a run, and what a progress display is told."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import OutputError
+from ..files.atomic import atomic_writer
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress display needs; `psnr` is of the last training image, `seconds` of training only."""
+
+    iteration: int
+    iterations: int
+    loss: float
+    psnr: float
+    n_splats: int
+    seconds: float
+    per_second: float
+    message: str = ""
+
+    @property
+    def seconds_left(self) -> float:
+        return (self.iterations - self.iteration) / self.per_second if self.per_second > 0 else math.inf
+
+
+class RunLog:
+    """log.jsonl: one line per report, appended; lines past the resumed iteration are dropped."""
+
+    def __init__(self, path: Path | None, iteration: int) -> None:
+        self.path = path
+        if path is None:
+            return
+        kept = []
+        if iteration and path.is_file():
+            for line in self._guard(path.read_bytes).splitlines():
+                try:
+                    if json.loads(line)["iteration"] <= iteration:
+                        kept.append(line + b"\n")
+                except (ValueError, KeyError, TypeError):
+                    continue  # a line cut short by a crash
+        with atomic_writer(path) as stream:  # a crash while it is written loses nothing
+            stream.writelines(kept)
+        self._stream = self._guard(lambda: path.open("a"))
+
+    def write(self, values: dict[str, Any]) -> None:
+        if self.path is not None:
+            self._guard(lambda: self._stream.write(json.dumps(values) + "\n"))
+            self.flush()
+
+    def flush(self) -> None:
+        if self.path is not None:
+            self._guard(self._stream.flush)
+
+    def _guard(self, action: Callable[[], Any]) -> Any:
+        try:
+            return action()
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written ({error.strerror or error})") from None

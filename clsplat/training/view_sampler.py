@@ -1,0 +1,33 @@
+"""Training views in random order without repetition, coarse to fine."""
+
+from __future__ import annotations
+
+import statistics
+
+import numpy as np
+
+from ..scenes.scene import View
+from .schedules import downscale_for, resolution_schedule
+
+
+class ViewSampler:
+    """Draws from `rng`, one permutation of the views after another.
+
+    Parameters
+    ----------
+    iterations : length of the run. coarse_to_fine : False: full size throughout.
+    queue : what is left of a permutation, of a resumed run.
+    """
+
+    def __init__(self, views: list[View], iterations: int, coarse_to_fine: bool, rng: np.random.Generator,
+                 queue: list[int]) -> None:
+        self.views, self.rng, self.queue = views, rng, list(queue)
+        side = min(min(view.camera.width, view.camera.height) for view in views)
+        self._pixels = statistics.median(view.camera.width * view.camera.height for view in views)
+        self.stages = resolution_schedule(iterations, image_side=side) if coarse_to_fine else [(0, 1)]
+
+    def next(self, iteration: int, n_splats: int) -> tuple[int, int]:
+        """Index of an iteration's view (from 1), and the downscale of its image that suits so many splats."""
+        if not self.queue:
+            self.queue = self.rng.permutation(len(self.views)).tolist()
+        return self.queue.pop(), downscale_for(self.stages, iteration - 1, n_splats, self._pixels)

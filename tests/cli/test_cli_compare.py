@@ -1,0 +1,93 @@
+"""`clsplat compare` and `clsplat train --preset`: what they write and print, and one line for each mistake."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from cli_runner import SHORT, clsplat, error_of, run, small_capture
+
+from clsplat.training.presets import PRESETS, preset
+
+TINY = ["--iterations", "12", "--sh-degree", "1", "--densify-interval", "5"]
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_capture(tmp_path_factory)
+
+
+def test_compare_prints_a_table_and_goes_on(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = ("compare", scene, "-o", out, "--systems", "gaussian,default:growth=1.5", "--cap-max", "40",
+                 *TINY)
+    first = run(*arguments, "--seeds", "0", "1")
+    assert first.exit_code == 0, first.output
+    lines = first.stdout.splitlines()
+    assert lines[0].split() == ["scene", "cap", "iterations", "system", "seeds", "PSNR", "SSIM", "seconds", "splats",
+                                "parameters", "MB"]  # fmt: skip
+    assert [line.split()[4] for line in lines[1:3]] == ["gaussian", "default:growth=1.5"]
+    assert "±" in lines[1]
+    assert "[4/4] yard default:growth=1.5 cap 40 seed 1: PSNR" in first.stderr
+    assert {path.name for path in out.iterdir()} == {"runs.jsonl", "table.md", "results.json"}
+    assert len((out / "runs.jsonl").read_text().splitlines()) == 4
+    again = run(*arguments, "--seeds", "0,1")
+    assert (again.stdout, again.stderr) == (first.stdout, "")
+    assert clsplat(*arguments, "--seeds", "2", "-q") == ""
+    rows = json.loads((out / "results.json").read_text())["rows"]
+    assert [row["seeds"] for row in rows] == [[0, 1, 2]] * 2
+    assert rows[1]["config"]["growth"] == 1.5
+    assert rows[0]["config"]["iterations"] == 12
+
+
+def test_compare_says_what_is_wrong(scene: Path, tmp_path: Path) -> None:
+    given = ("compare", scene, "-o", tmp_path / "out")
+    assert "unknown system 'cube'" in error_of(*given, "--systems", "cube")
+    assert "3dgs has strategy adc, which contradicts strategy mcmc" in error_of(
+        *given, "--systems", "3dgs", "--strategy", "mcmc")
+    assert "no list of seeds" in error_of(*given, "--seeds", "-1", code=2)
+    assert "no list of caps" in error_of(*given, "--cap-max", "0", code=2)
+    assert "--seed" in error_of(*given, "--seed", "1", code=2)
+    assert "two scenes are called yard" in error_of(*given, scene)
+    assert "output" in error_of("compare", scene, code=2)
+    assert not (tmp_path / "out").exists()
+    missing = tmp_path / "none"
+    assert str(missing) in error_of("compare", missing, "-o", tmp_path / "out", "--systems", "gaussian")
+    (tmp_path / "file").write_text("")
+    assert "choose another folder" in error_of("compare", scene, "-o", tmp_path / "file", "--systems", "gaussian")
+
+
+def test_default_systems_are_the_default_and_all_presets() -> None:
+    assert ",".join(("default", *PRESETS)) in clsplat("compare", "--help").replace("\n", "").replace(" ", "")
+
+
+# --- train --preset ----------------------------------------------------------------------------
+
+
+def test_preset_is_resolved_in_config_json(scene: Path, tmp_path: Path) -> None:
+    clsplat("train", scene, "-m", tmp_path, "--preset", "3dgs_mcmc", "--opacity-reg", "0.125", *SHORT)
+    config = json.loads((tmp_path / "config.json").read_text())["config"]
+    expected = preset("3dgs-mcmc") | {"opacity_reg": 0.125, "densify_interval": 10}
+    assert {key: config[key] for key in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "flag", "value", "said"),
+    [
+        ("3dgs", "--strategy", "mcmc", "preset 3dgs has strategy adc, which contradicts strategy mcmc"),
+        ("3dgs-mcmc", "--shape", "skew-normal", "contradicts shape skew-normal"),
+        ("sns", "--alternation", "off", "preset sns has alternation cyclic"),
+        ("sns", "--normalisation", "peak", "preset sns has normalisation none"),
+        ("sns", "--skew_map", "radial", "preset sns has skew_map polar"),
+        ("sss", "--position-optimizer", "adam", "preset sss has position_optimizer sghmc-sss"),
+    ],
+)
+def test_preset_and_a_flag_against_it(scene: Path, tmp_path: Path, name: str, flag: str, value: str, said: str) -> None:
+    message = error_of("train", scene, "-m", tmp_path / "m", "--preset", name, flag, value)
+    assert said in message
+    assert not (tmp_path / "m").exists()
+
+
+def test_unknown_preset(scene: Path) -> None:
+    assert "'vanilla'" in error_of("train", scene, "--preset", "vanilla", code=2)

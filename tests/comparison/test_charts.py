@@ -1,0 +1,222 @@
+"""Charts: what they show, in what colours, and that a missing matplotlib or a bad row is one line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from frontier_records import recorded, seeds, sweep
+
+from clsplat.comparison import charts, frontier_charts
+from clsplat.comparison.charts import VERDICTS, arithmetic_chart, growth_chart, heat_map, seeds_chart
+from clsplat.comparison.frontier_charts import equal_chart, size_chart, time_chart
+from clsplat.comparison.frontier_data import arithmetic_rows, curve_rows, equal_rows, point_rows, seed_rows
+from clsplat.comparison.frontier_tables import arithmetic_table
+from clsplat.errors import InputError, OutputError
+from clsplat.evaluation.chart_style import _STYLE, chart_paths, drawing, looks, place_labels, shape_colour, short_count
+from clsplat.splats.shapes import SHAPES
+
+CURVE: list[dict[str, Any]] = [{"splats": 4000, "psnr": 21.5}, {"splats": 1000, "psnr": 18.0},
+                               {"splats": 9000, "psnr": 21.6}, {"splats": 3000, "psnr": 21.45, "label": "pruned"}]
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The figures that are drawn; they are written as well, small."""
+    figures: list[Any] = []
+    context = charts.drawing
+
+    class Kept:
+        def __init__(self, *arguments: Any) -> None:
+            self.context = context(*arguments)
+
+        def __enter__(self) -> Any:
+            figures.append(self.context.__enter__())
+            return figures[-1]
+
+        def __exit__(self, *error: Any) -> Any:
+            return self.context.__exit__(*error)
+
+    for module in (charts, frontier_charts):
+        monkeypatch.setattr(module, "drawing", Kept)
+    monkeypatch.setitem(_STYLE, "savefig.dpi", 40)
+    return figures
+
+
+def words(axes: Any) -> list[str]:
+    return [text.get_text() for text in axes.texts]
+
+
+def legend_of(figure: Any) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].texts]
+
+
+def test_growth_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    paths = growth_chart(CURVE, 4000, tmp_path / "growth")
+    assert [path.name for path in paths] == ["growth.png", "growth.svg"]
+    assert paths[0].read_bytes().startswith(b"\x89PNG")
+    assert b"<svg" in paths[1].read_bytes()[:600]
+    (axes,) = drawn[0].axes
+    assert list(axes.lines[0].get_xdata()) == [1000, 4000, 9000], "the curve rises and has no named points"
+    legend = [text.get_text() for text in axes.get_legend().texts]
+    assert legend == ["growth", "knee: 4k splats, 21.50 dB", "pruned: 3k splats, 21.45 dB"]
+    assert "[dB]" in axes.get_ylabel()
+
+
+def test_charts_are_the_same_bytes(tmp_path: Path, drawn: list[Any]) -> None:
+    first, second = (growth_chart(CURVE, None, tmp_path / name) for name in "ab")
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+
+
+def test_a_knee_lies_on_the_curve(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="knee"):
+        growth_chart(CURVE, 3000, tmp_path / "growth")
+    with pytest.raises(InputError, match="needs a curve"):
+        growth_chart([], None, tmp_path / "growth")
+    assert not list(tmp_path.iterdir())
+
+
+def test_heat_map(tmp_path: Path, drawn: list[Any]) -> None:
+    cells = [{"row": "needles", "column": "gaussian", "verdict": "survives", "text": "+0.1"},
+             {"row": "needles", "column": "student-t", "verdict": "loses", "text": "-1.2"},
+             {"row": "one image", "column": "gaussian", "verdict": "fails", "text": "NaN"}]
+    heat_map(cells, tmp_path / "heat")
+    (axes,) = drawn[0].axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["needles", "one image", "survived"]
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["gaussian", "student-t"]
+    assert words(axes) == ["+0.1", "-1.2", "NaN", "", "1/2", "0/1"], "a place without a cell counts nowhere"
+    assert legend_of(drawn[0]) == ["survives", "loses", "fails"]
+    with pytest.raises(InputError, match="unknown verdict 'maybe'"):
+        heat_map([cells[0] | {"verdict": "maybe"}], tmp_path / "heat")
+
+
+def test_size_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    rows = point_rows(sweep())
+    size_chart(rows, tmp_path / "size")
+    render, size, splats = drawn[0].axes
+    assert [axes.get_xlabel() for axes in (render, size, splats)] == ["render time [ms]", "file [MB]", "splats"]
+    assert legend_of(drawn[0]) == ["gaussian", "default", "auto default"]
+    front, gaussian, default, star = splats.lines
+    assert list(front.get_xdata()) == [1000, 1500, 4000]
+    assert front.get_drawstyle() == "steps-post"
+    assert (list(gaussian.get_xdata()), list(gaussian.get_ydata())) == ([1000, 2000, 4000], [20, 21, 22])
+    assert (star.get_marker(), star.get_color()) == ("*", default.get_color())
+    assert gaussian.get_color() == shape_colour("gaussian") != default.get_color()
+    assert list(size.lines[1].get_xdata()) == pytest.approx([0.2, 0.4, 0.8])
+    assert set(words(splats)) == {"auto", "1k", "4k"}, "the front is labelled, all else is not"
+
+
+def test_time_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    runs = [recorded("gaussian", curve=sweep()[0]["curve"]), recorded("3dgs", curve=sweep()[1]["curve"])]
+    time_chart(curve_rows(runs), tmp_path / "time")
+    psnr, ssim = drawn[0].axes
+    assert (psnr.get_ylabel(), ssim.get_ylabel(), ssim.get_xlabel()) == (
+        "test PSNR [dB]", "test SSIM", "training time [s]")  # fmt: skip
+    assert list(psnr.lines[0].get_xdata()) == [0.1, 0.4, 2.0, 10.0]
+    assert list(ssim.lines[1].get_ydata()) == [row["ssim"] for row in runs[1]["curve"]]
+    assert psnr.lines[0].get_color() == psnr.lines[1].get_color(), "one shape"
+    assert psnr.lines[0].get_linestyle() != psnr.lines[1].get_linestyle()
+    best = max(row["psnr"] for row in runs[1]["curve"])
+    assert best - 5.2 < psnr.get_ylim()[0] < best - 1 < best < psnr.get_ylim()[1]
+
+
+def test_equal_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    equal_chart(equal_rows(point_rows(sweep()), "gaussian"), "gaussian", tmp_path / "equal")
+    (axes,) = drawn[0].axes
+    reached, bound = axes.lines[:2]
+    assert list(reached.get_xdata()) == [2000, 4000]
+    assert list(reached.get_ydata()) == pytest.approx([100 / 2**0.5] * 2)
+    assert (list(bound.get_xdata()), bound.get_markerfacecolor()) == ([1000], "white")
+    out_of_reach = [row for row in equal_rows(point_rows(sweep()), "default") if row["ratio"] is None]
+    with pytest.raises(InputError, match="needs points"):
+        equal_chart(out_of_reach, "default", tmp_path / "none")
+
+
+def test_seeds_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    rows = seed_rows(seeds())
+    rows[-1] |= {"psnr": 20.5, "digest": "another"}
+    seeds_chart(rows, tmp_path / "seeds")
+    (axes,) = drawn[0].axes
+    assert [label.get_text() for label in axes.get_xticklabels()] == [
+        "gaussian\nseeds 0.40 dB\nrepeats 0.00 dB", "3dgs\nseeds 0.40 dB\nrepeats 0.50 dB"]  # fmt: skip
+    assert words(axes) == ["=", "≠"]
+    dots, median, repeats = axes.lines[:3]
+    assert sorted(dots.get_ydata()) == pytest.approx([20.0, 20.1, 20.2, 20.3, 20.4])
+    assert list(median.get_ydata()) == [20.2, 20.2]
+    assert list(repeats.get_ydata()) == [20.0] * 3
+    with pytest.raises(InputError, match="several seeds"):
+        seeds_chart([], tmp_path / "none")
+
+
+def test_arithmetic_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    records = [{"scene": scene, "variant": variant, "kind": kind, "shape": shape, "image_error": error * worse,
+                "gradient_error": 10 * error * worse, "raster_ms": ms * slow, "raster_vjp_ms": 3 * ms * slow,
+                "psnr_change": -0.1 * worse}
+               for scene, slow, worse in (("near", 1.0, 0.5), ("far", 7.0, 2.0))
+               for shape, ms in (("gaussian", 5.0), ("skew-normal", 8.0))
+               for variant, kind, error, ms in (("erfc", "Phi", 1e-7, 2 * ms), ("default", "default", 1e-6, ms),
+                                                ("double", "exact", 0.0, 4 * ms))]
+    models = [{"scene": "near", "shape": "skew-normal", "variant": "normalisation pdf", "kind": "normalisation",
+               "image_error": None, "gradient_error": None, "psnr_change": 0.25}]
+    rows = arithmetic_rows([*records, *models])
+    arithmetic_chart(rows, tmp_path / "arithmetic")
+    assert [axes.get_title() for axes in drawn[0].axes] == ["gaussian", "gaussian", "skew-normal", "skew-normal"]
+    for axes, scale in zip(drawn[0].axes, (1, 10, 1, 10), strict=True):
+        marked = [line for line in axes.lines if line.get_marker() != "None"]
+        assert [line.get_xdata()[0] for line in marked] == pytest.approx([1, 2]), "of its own scene and shape's default"
+        assert [line.get_ydata()[0] for line in marked] == pytest.approx([1e-6 * scale, 1e-7 * scale])
+        assert sorted(words(axes)) == ["default", "erfc"], "every variant is named, what is exact has no place"
+    assert sorted(legend_of(drawn[0])) == ["Phi", "default", "exact"]
+    head, lines = arithmetic_table(rows)
+    assert {len(line) for line in lines} == {len(head)}
+    assert lines[0] == ("gaussian", "erfc", "2", "1.0e-07", "1.0e-06", "2.00", "2.00", "-0.125")
+    assert lines[-1] == ("skew-normal", "normalisation pdf", "1", "", "", "", "", "+0.250")
+
+
+def test_labels_keep_clear_of_points_and_of_each_other(tmp_path: Path) -> None:
+    with drawing(tmp_path / "labels", 2, 2) as figure:
+        axes = figure.add_subplot(xlim=(0, 1), ylim=(0, 1))
+        places = [(0.5 + 0.01 * n, 0.5 + 0.01 * n) for n in range(12)]
+        axes.plot(*zip(*places, strict=True), marker="o", linestyle="none")
+        points = [(x, y, "label", "black") for x, y in places]
+        place_labels(figure, [(axes, points)])
+        few = list(axes.texts)
+        boxes = [text.get_window_extent() for text in few]
+        assert 0 < len(few) < len(points)
+        assert not any(a.overlaps(b) for n, a in enumerate(boxes) for b in boxes[:n])
+        assert not any(box.contains(*axes.transData.transform(place)) for box in boxes for place in places)
+
+
+def test_colours_are_told_apart() -> None:
+    colours = [shape_colour(shape) for shape in SHAPES]
+    assert len(set(colours)) == len(SHAPES)
+    assert len({fill for fill, _ in VERDICTS.values()}) == len(VERDICTS)
+    shapes = list(SHAPES)
+    styles = looks({"a": shapes[0], "b": shapes[0], "c": shapes[1]})
+    assert styles["a"]["color"] == styles["b"]["color"] != styles["c"]["color"]
+    assert styles["a"]["linestyle"] != styles["b"]["linestyle"]
+    assert styles["a"]["marker"] != styles["c"]["marker"]
+
+
+def test_short_counts() -> None:
+    assert [short_count(n) for n in (7, 950, 1000, 2500, 20_000, 999_900, 3e6)] == [
+        "7", "950", "1k", "2.5k", "20k", "1M", "3M"]  # fmt: skip
+
+
+def test_suffixes_are_taken_off_once() -> None:
+    assert [path.name for path in chart_paths("a/fox.v2")] == ["fox.v2.png", "fox.v2.svg"]
+    assert [path.name for path in chart_paths("a/fox.svg")] == ["fox.png", "fox.svg"]
+
+
+def test_a_missing_matplotlib_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(OutputError, match=r"pip install 'clsplat\[charts\]'"):
+        growth_chart(CURVE, None, tmp_path / "growth")
+
+
+def test_an_unfinished_drawing_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), drawing(tmp_path / "half"):
+        _ = 1 / 0
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,132 @@
+"""Leaving parts out: as far as the judge allows, the least needed first, what stays keeps its bits; limits of bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runner import small_capture, small_model
+from conftest import MakeRenderer
+
+from clsplat.compression.prune import (
+    Judge,
+    Thresholds,
+    apply_thresholds,
+    band_slopes,
+    prune,
+    strongest,
+    within_bytes,
+    without_bands,
+    without_field,
+)
+from clsplat.device.device import Device
+from clsplat.errors import InputError
+from clsplat.rendering.render import Renderer
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.validation import hold_out
+from clsplat.splats.splats import Splats
+from clsplat.training.model_folder import ModelFolder
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return hold_out(load_scene(small_capture(tmp_path_factory)))
+
+
+@pytest.fixture(scope="module")
+def splats(tmp_path_factory: pytest.TempPathFactory) -> Splats:
+    """A trained model, to which are added 40 splats that hide behind the cameras or are transparent."""
+    arrays = Splats.load(ModelFolder(small_model(tmp_path_factory)).latest_ply()[0]).to_numpy()
+    more = {name: np.concatenate([values, values[:40]]) for name, values in arrays.items()}
+    more["mean"][-20:] += 1e4
+    more["opacity_logit"][-40:-20] = -12
+    more["mean"][-40:-20] += 1e-3
+    return Splats("skew-normal", more)
+
+
+@pytest.fixture(scope="module")
+def judge(scene: Scene, devices: list[Device], make_renderer: MakeRenderer) -> Judge:
+    return Judge(make_renderer(devices[0]), scene.test)
+
+
+@pytest.fixture(scope="module")
+def renderer(judge: Judge) -> Renderer:
+    return judge.renderer
+
+
+def test_prune_keeps_within_the_tolerance(splats: Splats, scene: Scene, judge: Judge) -> None:
+    pruned = prune(splats, scene.train, judge, 0.3)
+    assert pruned.before == judge(splats)
+    assert pruned.after == judge(pruned.splats) >= pruned.before - 0.3
+    assert set(pruned.costs) == {"splats", "skew", "bands"}
+    assert sum(pruned.costs.values()) == pytest.approx(pruned.before - pruned.after)
+    assert len(pruned.splats) <= len(splats) - 40, "what shows nowhere goes first"
+    assert 0 < np.count_nonzero(pruned.splats.skew.any(axis=1)) < len(pruned.splats)
+    kept = np.isin(splats.mean, pruned.splats.mean).all(axis=1)
+    np.testing.assert_array_equal(splats.mean[kept], pruned.splats.mean)
+    np.testing.assert_array_equal(splats.log_scale[kept], pruned.splats.log_scale)
+
+
+def test_more_tolerance_leaves_less(splats: Splats, scene: Scene, judge: Judge, tmp_path: Path) -> None:
+    sizes = []
+    for tolerance in (0.0, 0.2, 2.0):
+        prune(splats, scene.train, judge, tolerance).splats.save(tmp_path / "model.ply", compact=True)
+        sizes.append((tmp_path / "model.ply").stat().st_size)
+    assert sizes[0] > sizes[1] > sizes[2]
+
+
+def test_kinds_are_left_alone_unless_asked_for(splats: Splats, scene: Scene, judge: Judge) -> None:
+    pruned = prune(splats, scene.train, judge, 0.3, ("bands",))
+    np.testing.assert_array_equal(pruned.splats.skew, splats.skew)
+    assert set(pruned.costs) == {"bands"}
+    assert pruned.thresholds.splats == 0
+    assert not pruned.thresholds.fields
+
+
+def test_thresholds_do_the_same_again(splats: Splats, scene: Scene, judge: Judge) -> None:
+    pruned = prune(splats, scene.train, judge, 0.3, ("fields", "bands"))
+    again = apply_thresholds(splats, scene.train, judge.renderer, pruned.thresholds)
+    for name, values in pruned.splats.arrays.items():
+        np.testing.assert_array_equal(again.arrays[name], values, err_msg=name)
+    same = apply_thresholds(splats, scene.train, judge.renderer, Thresholds())
+    for name, values in splats.arrays.items():
+        np.testing.assert_array_equal(same.arrays[name], values, err_msg=name)
+
+
+def test_bytes_are_kept_within(splats: Splats, scene: Scene, renderer: Renderer, tmp_path: Path) -> None:
+    splats.save(tmp_path / "whole.ply", compact=True)
+    whole = (tmp_path / "whole.ply").stat().st_size
+    limit = 70 * len(splats) + 4096
+    assert limit < whole
+    small = within_bytes(splats, scene.train, renderer, limit)
+    assert small is not None
+    small.save(tmp_path / "small.ply", compact=True)
+    assert 0.9 * limit - 4096 < (tmp_path / "small.ply").stat().st_size <= limit
+    assert len(small) == len(splats)
+    assert within_bytes(splats, scene.train, renderer, 50 * len(splats)) is None
+    assert within_bytes(splats, scene.train, renderer, whole + 4096) is splats
+
+
+def test_rules_on_small_arrays() -> None:
+    points = Splats.from_points(np.eye(3), np.full((3, 3), 0.5), sh_degree=1)
+    arrays = points.to_numpy()
+    arrays["skew"][:], arrays["sh"][:, 1:] = 0.5, 1.0
+    splats = Splats(points.shape, arrays)
+    np.testing.assert_array_equal(strongest(splats, np.array([1.0, 3.0, 2.0]), 2).mean, splats.mean[1:])
+    fewer = without_field(splats, 2.0, "skew", np.array([1.0, 3.0, 2.0]))
+    assert fewer.skew.any(axis=1).tolist() == [False, True, False]
+    lost = np.array([[36.0, 0.0], [72.0, 0.0], [0.0, 0.0]])
+    np.testing.assert_array_equal(band_slopes(lost), [1.0, 2.0, 0.0])
+    flat = without_bands(splats, 1.5, [np.full((3, 1, 3), 7.0, np.float32)], lost)
+    np.testing.assert_array_equal(flat.sh[1], splats.sh[1])
+    assert not flat.sh[[0, 2], 1:].any()
+    assert (flat.sh[[0, 2], 0] == 7).all()
+
+
+def test_bad_input(splats: Splats, scene: Scene, judge: Judge) -> None:
+    with pytest.raises(InputError, match="tolerance -1"):
+        prune(splats, scene.train, judge, -1)
+    with pytest.raises(InputError, match="no splats"):
+        prune(splats.select([]), scene.train, judge, 0.1)
+    assert judge(splats.select([])) == 0

@@ -1,0 +1,149 @@
+"""Full disks, read-only folders and files in the way: one line, and nothing that was there is lost."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+from cli_runner import SHORT, clsplat, error_of, run, small_capture, small_model
+from files.test_sole_writer import HOLD
+
+from clsplat.splats.splats import Splats
+from clsplat.training.checkpoint import Checkpoint
+from clsplat.training.model_folder import ModelFolder
+
+
+@contextmanager
+def mounted(folder: Path, *options: str) -> Iterator[Path]:
+    """Something mounted on the folder while the block lasts; skips where that is not allowed."""
+    folder.mkdir(exist_ok=True)
+    command = ["mount", *options, str(folder)]
+    if shutil.which("mount") is None or subprocess.run(command, capture_output=True).returncode:
+        pytest.skip("may not mount here: needs root")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@contextmanager
+def read_only(folder: Path) -> Iterator[Path]:
+    with mounted(folder, "--bind", str(folder)):
+        subprocess.run(["mount", "-o", "remount,ro,bind", str(folder)], check=True, capture_output=True)
+        yield folder
+
+
+@pytest.fixture
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_capture(tmp_path_factory)
+
+
+@pytest.fixture
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_model(tmp_path_factory)
+
+
+def test_a_disk_that_fills_up_keeps_the_last_checkpoint(capture: Path, tmp_path: Path) -> None:
+    """With room for one checkpoint, not for two; more room, and the run goes on to the bits of one in peace."""
+    common = ["train", capture, "--checkpoint-interval", "20", "--quiet", *SHORT, "-m"]
+    clsplat(*common, tmp_path / "peace")
+    size = (tmp_path / "peace" / "checkpoint.npz").stat().st_size
+    with mounted(tmp_path / "disk", "-t", "tmpfs", "-o", f"size={size * 3 // 2 // 4096 * 4}k", "tmpfs") as disk:
+        folder = ModelFolder(disk / "model")
+        message = error_of(*common, folder.path)
+        assert "No space left on device" in message
+        assert "free some space" in message
+        assert 0 < Checkpoint.load(folder.checkpoint_path).iteration < 60
+        assert not list(disk.rglob(".*.tmp*"))
+        subprocess.run(["mount", "-o", "remount,size=50m", str(disk)], check=True)
+        clsplat("train", "--resume", "-m", folder.path, "--quiet")
+        assert folder.ply_path(60).read_bytes() == ModelFolder(tmp_path / "peace").ply_path(60).read_bytes()
+
+
+def test_a_full_disk_keeps_old_files(model: Path, tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "-t", "tmpfs", "-o", "size=64k", "tmpfs") as disk:
+        for name in ("a.ply", "a.spz", "a.splat", "t.json"):
+            (disk / name).write_bytes(b"old")
+        with (disk / "rest").open("wb", buffering=0) as rest, suppress(OSError):
+            while rest.write(bytes(4096)):
+                pass
+        for name in ("a.ply", "a.spz", "a.splat"):
+            assert "No space left" in error_of("convert", model, disk / name, "--approximate", "--overwrite")
+        assert "No space left" in error_of("cameras", model, disk / "t.json", "--overwrite")
+        assert "No space left" in error_of("render", model, "-o", disk / "renders", "--quiet")
+        assert "No space left" in error_of("train", small_scene(model), "-m", disk / "model", *SHORT)
+        for name in ("a.ply", "a.spz", "a.splat", "t.json"):
+            assert (disk / name).read_bytes() == b"old"
+
+
+def small_scene(model: Path) -> Path:
+    return Path(str(ModelFolder(model).read_config()["scene"]["path"]))
+
+
+@pytest.mark.parametrize("kind", ["read-only", "a file"])
+def test_places_that_take_no_files(capture: Path, model: Path, tmp_path: Path, kind: str) -> None:
+    place = tmp_path / "place"
+    commands = [
+        ["train", capture, "-m", place / "m", *SHORT],
+        ["train", capture, "-m", place / "m", "--budget", "auto", *SHORT],
+        ["convert", model, place / "o.ply"], ["cameras", model, place / "t.json"],
+        ["cameras", model, place / "sparse" / "0"], ["render", model, "-o", place / "r"],
+        ["prune", model, "-o", place / "p.ply"], ["compare", capture, "-o", place / "c"],
+        ["frontier", capture, "-o", place / "f"], ["blender-addon", "-o", place / "a.zip"],
+    ]  # fmt: skip
+    if kind == "a file":
+        place.write_bytes(b"mine")
+        for command in commands:
+            assert str(place) in refused(*command)
+        assert place.read_bytes() == b"mine"
+        return
+    place.mkdir()
+    with read_only(place):
+        for command in commands:
+            message = refused(*command)
+            assert str(place) in message
+            assert "Read-only file system" in message
+        assert not list(place.iterdir())
+
+
+def refused(*command: object) -> str:
+    """The one line that ends it; warnings may come before."""
+    result = run(*command)
+    assert result.exit_code == 1, result.output
+    assert "Traceback" not in result.output
+    return result.stderr.splitlines()[-1]
+
+
+def test_a_model_in_a_read_only_folder_is_used(model: Path, tmp_path: Path) -> None:
+    shutil.copytree(model, tmp_path / "model")
+    with read_only(tmp_path / "model") as folder:
+        assert "splats" in clsplat("info", folder)
+        clsplat("convert", folder, tmp_path / "o.ply", "--quiet")
+        clsplat("render", folder, "-o", tmp_path / "r", "--quiet")
+        assert "Read-only" in error_of("train", "--resume", "-m", folder)
+    assert len(Splats.load(tmp_path / "o.ply")) > 0
+
+
+def test_two_comparisons_in_one_folder(capture: Path, tmp_path: Path) -> None:
+    pytest.importorskip("fcntl")
+    (tmp_path / "c").mkdir()
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path / "c")], stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        for command in ("compare", "frontier"):
+            assert "another run writes into it" in refused(command, capture, "-o", tmp_path / "c")
+        holder.kill()
+
+
+def test_metrics_are_said_where_they_cannot_be_written(model: Path, tmp_path: Path) -> None:
+    shutil.copytree(model, tmp_path / "model")
+    with read_only(tmp_path / "model") as folder:
+        result = run("eval", folder)
+    assert result.exit_code == 1
+    assert "PSNR" in result.stdout
+    assert result.stderr.splitlines()[-1].startswith(f"error: {tmp_path / 'model' / 'results.json'}: cannot be written")

@@ -1,0 +1,232 @@
+"""The benchmarks run, on a capture of a few pixels: they cannot rot."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from cli_runner import small_capture
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+def test_train_scenes(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    out = tmp_path / "scenes.jsonl"
+    options = ["--scenes", scene.name, "--shapes", "skew-normal", "--caps", "100", "--iterations", "8",
+               "--out", str(out)]
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    command = [sys.executable, str(BENCHMARKS / "train_scenes.py")]
+    done = subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
+    (row,) = [json.loads(line) for line in out.read_text().splitlines()]
+    assert row["splats"] <= 100
+    assert row["along"][-1][0] == 8
+    assert {"device", "driver", "schedule", "commit"} <= set(row)
+    again = subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
+    assert len(out.read_text().splitlines()) == 1, "a run that is there is not run again"
+    assert f"{row['psnr']:.2f}" in again.stdout
+    assert f"{row['psnr']:.3f}" in done.stdout
+
+
+@pytest.mark.slow
+def test_stages(tmp_path: Path) -> None:
+    out = tmp_path / "stages.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "stages.py"), "--out", str(out)]
+    for _ in range(2):
+        done = subprocess.run([*command, "--smoke"], capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["shape"] for row in rows] == ["gaussian", "skew-normal"], "each once, also when it is called again"
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit", "load", "peak_mb"} <= set(row)
+        assert min(row["copy_bytes_per_s"], row["fma_flops_per_s"]) > 0
+        assert [report["task"] for report in row["reports"]] == ["training step", "render"]
+        assert f"| {row['shape']} |" in done.stdout
+    slower = tmp_path / "other.jsonl"
+    for report in (report for row in rows for report in row["reports"]):
+        report["wall_ms"] *= 2
+    slower.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    printed = subprocess.run([*command, "--against", str(slower)], capture_output=True, text=True, check=True).stdout
+    lines = printed.splitlines()[2:]
+    assert len(lines) == 4
+    assert all("| 0.50 | 1.00 |" in line for line in lines), printed
+
+
+@pytest.mark.slow
+def test_systems(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    command = [sys.executable, str(BENCHMARKS / "systems.py"), "--out", str(tmp_path)]
+    options = [scene.name, "--groups", "factors", "--caps", "60", "--seeds", "0", "--iterations", "4"]
+    for _ in range(2):
+        subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
+    file = tmp_path / scene.name / "runs.jsonl"
+    runs = [json.loads(line) for line in file.read_text().splitlines()]
+    assert len(runs) == len({run["system"] for run in runs}) == 12, "each once, also when it is called again"
+    assert all(run["commit"] and run["finite"] and run["cap_held"] for run in runs)
+    for run in runs:  # as if they were the real ones
+        run["config"] |= {"cap_max": 5000, "iterations": 1000}
+    file.write_text("".join(json.dumps(run) + "\n" for run in runs))
+    page = subprocess.run([*command, "--page"], env=environment, capture_output=True, text=True, check=True).stdout
+    first, second = (next(run for run in runs if run["system"] == name) for name in ("gaussian", "skew-normal"))
+    expected = f"| {second['psnr']:.2f} | {second['psnr'] - first['psnr']:+.2f} | {second['ssim']:.4f} |"
+    assert any(expected in line for line in page.splitlines() if line.startswith("| skew-normal | ")), page
+
+
+def test_budget(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    out = tmp_path / "budget"
+    command = [sys.executable, str(BENCHMARKS / "budget.py"), "--out", str(out)]
+    for _ in range(2):
+        subprocess.run([*command, "--smoke", "--scenes", scene.name, "--work", str(tmp_path / "work")], env=environment,
+                       capture_output=True, text=True, check=True)
+    (row,) = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
+    assert row["system"].startswith("auto skew-normal")
+    assert row["splats"] == row["budget"]["final"]["splats"] <= 60
+    assert {"device", "driver", "schedule", "commit", "psnr", "render_ms"} <= set(row)
+    best = row | {"system": "skew-normal", "splats": 2 * row["splats"], "bytes": 4 * row["bytes"],
+                  "psnr": row["psnr"] + 0.5, "seconds": 0.5 * row["seconds"]}
+    (tmp_path / "frontier").mkdir()
+    (tmp_path / "frontier" / "runs.jsonl").write_text(json.dumps(best) + "\n")
+    printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
+    assert "| -0.50 | 50% | 25% | 2.0 |" in printed.splitlines()[-1], printed
+
+
+@pytest.mark.slow
+def test_startup(tmp_path: Path) -> None:
+    out = tmp_path / "startup.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "startup.py"), "--smoke", "--out", str(out)]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [(row["task"], row["caches"]) for row in rows] == [("--help", ""), ("render", "warm")]
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit", "load"} <= set(row)
+        assert 0 < row["fastest"] <= row["seconds"] <= row["slowest"]
+        assert f"| {row['task']} |" in printed
+
+
+@pytest.mark.slow
+def test_scalar(tmp_path: Path) -> None:
+    out = tmp_path / "scalar.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "scalar.py"), "--smoke", "--out", str(out)]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    (row,) = [json.loads(line) for line in out.read_text().splitlines()]
+    assert set(row["ms"]) == {"1x16x16", "256x1x1"}
+    assert row["step_ratio"] == pytest.approx(row["ms"]["256x1x1"]["step"] / row["ms"]["1x16x16"]["step"])
+    assert f"| {row['raster_ratio']:.1f} |" in printed
+
+
+@pytest.mark.slow
+def test_time_to_quality(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    out = tmp_path / "times.jsonl"
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    command = [sys.executable, str(BENCHMARKS / "time_to_quality.py"), "--out", str(out)]
+    options = ["--smoke", "--scenes", scene.name, "--validate", "--options", "", "coarse_to_fine=off"]
+    for _ in range(2):
+        subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["options"] for row in rows] == ["", "coarse_to_fine=off"], "each once, also when it is called again"
+    assert all([point[0] for point in row["along"]] == [2, 4] for row in rows)
+    rows[0]["along"] = [[50, 10.0, 19.0, 100, 19.0], [100, 20.0, 38.0, 100, 23.0]]
+    out.write_text(json.dumps(rows[0]) + "\n")
+    printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
+    assert "| 12.5 | 17.5 |  |  | 100 | 20.0 | 38.0 | 100 | 23.00 |" in printed.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_frontier(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    out = tmp_path / "frontier"
+    command = [sys.executable, str(BENCHMARKS / "frontier.py"), "--out", str(out)]
+    options = ["--smoke", "--scenes", scene.name]
+    done = subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
+    runs = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
+    assert len(runs) == 2 + 2 + 4, "what two groups want is trained once"
+    assert [run["config"]["cap_max"] for run in runs if run["curve"]] == [60, 60]
+    assert "repeated: 1 of 1 runs gave the same splats each time" in done.stdout
+    assert {path.stem for path in (out / "charts").glob("*.png")} >= {"size", "time", "seeds"}
+    assert (out / "report.html").is_file()
+    automatic = runs[0] | {"system": "auto", "psnr": 90.0}
+    (tmp_path / "budget").mkdir()
+    (tmp_path / "budget" / "runs.jsonl").write_text(json.dumps(automatic) + "\n")
+    printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
+    assert "| yard 48x36 | auto | 90.00 |" in printed
+    assert "render_ms bytes splats |" in printed
+
+
+@pytest.mark.slow
+def test_photos(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    out = tmp_path / "photos.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "photos.py"), "--smoke", "--scenes", f"{scene.name}:1",
+               "--out", str(out), "--options", "", "exposure=true,antialiased=true"]
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    for _ in range(2):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["options"] for row in rows] == ["", "exposure=true,antialiased=true"], "each once"
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit"} <= set(row)
+        assert len(row["PSNR"]) > 1
+        assert row["corrected"] >= row["PSNR"][0] - 0.1
+        assert f"{row['corrected']:.2f}" in done.stdout
+
+
+def test_visible_adam(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    out = tmp_path / "visible.jsonl"
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    command = [sys.executable, str(BENCHMARKS / "visible_adam.py"), "--smoke", "--scenes", f"{scene.name}:1:60",
+               "--out", str(out)]
+    for _ in range(2):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [(row["task"], row["options"]) for row in rows] == [
+        (task, f"visible_adam={on}") for task in ("wide", "train") for on in ("false", "true")]
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit", "load"} <= set(row)
+        assert 0 < row["splats_seen"] <= row["vectors_seen"] <= 1
+        assert 0 < row["step_ms"] < row["device_ms"]
+        assert f"| {row['wall_ms']:.1f} |" in done.stdout
+    assert rows[0]["splats_seen"] < 0.8
+
+
+@pytest.mark.slow
+def test_stability(tmp_path: Path) -> None:
+    out = tmp_path / "stability.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "stability.py"), "--out", str(out)]
+    kinds = ["--kinds", "static", "training", "arithmetic", "--smoke"]
+    for _ in range(2):
+        subprocess.run([*command, *kinds], capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert len(rows) == len({(row["kind"], row["hazard"], row["system"]) for row in rows}), "each once"
+    assert {row["kind"] for row in rows} == {"static", "training", "arithmetic"}
+    assert all(row["finite"] for row in rows)
+    printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
+    assert "| all rates x10 | stops |" in printed
+    assert "0 of them with a number that is not finite" in printed
+
+
+@pytest.mark.slow
+def test_arithmetic(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    out = tmp_path / "arithmetic.jsonl"
+    environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
+    command = [sys.executable, str(BENCHMARKS / "arithmetic.py"), "--smoke", "--scenes", scene.name, "--out", str(out)]
+    for _ in range(2):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["variant"] for row in rows] == ["default", "exp builtin"], "each once, also when it is called again"
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit", "load"} <= set(row)
+        assert 0 < row["image_error"] < 1e-4
+        assert 0 < row["gradient_error"] < 1e-2
+        assert row["raster_ms"] > 0
+        assert f"| {row['variant']} | {row['image_error']:.1e} |" in done.stdout
+    assert rows[0]["relative_ms"] == 1

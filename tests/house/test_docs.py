@@ -1,0 +1,255 @@
+"""The documents keep their word: their commands and Python run, links lead somewhere, messages are in the source.
+
+Each `clsplat` command of a code block runs by itself in a folder with stand-ins for what it names (SCENE, MODEL, ...),
+with few iterations and splats (`shortened`). Other commands are checked for what they name; why they are not run stands
+in `NOT_RUN`. A command that is neither fails.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from itertools import pairwise
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from cli_runner import run, small_capture, small_model
+from clsplat_cli.main import COMMANDS, main
+
+import clsplat
+from clsplat.files.images import image_size, write_png
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
+TEXTS = {page.relative_to(ROOT).as_posix(): page.read_text() for page in PAGES}
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.M | re.S)
+INDENTED = re.compile(r"^    ((?:clsplat|python|pytest|pip) .*)$", re.M)
+
+# Commands that are not run here: pattern, why.
+NOT_RUN = (
+    (r"python3 -m venv|(\.venv/bin/)?pip install", "installs from the network; the extras it names are checked"),
+    (r"(\.venv/bin/)?pytest|\.venv/bin/(ruff|mypy)|\.ci/run", "the checks themselves; files they name are checked"),
+    (r"python benchmarks/", "hours; test_benchmarks.py runs small ones; script and options are checked"),
+    (r"python docs/api\.py", "test_docstrings_are_rendered runs it"),
+    (r"\.venv/bin/clsplat devices", "measures schedules; test_device.py and test_cli.py run it"),
+    (r"clsplat view |clsplat train .*--view", "serves until it is stopped; test_cli_view.py runs it"),
+)  # fmt: skip
+# Minutes, or one more of a kind of which another is run.
+SLOW = re.compile(r"clsplat (demo|compare|frontier|bench|reconstruct|prune)|--(budget|target-psnr|video|config|report)"
+                  r"|PHOTOS|-r 2|\.splat|gaussians\.ply|-direct")
+REAL_PHOTOS = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data") / "sceaux_castle"
+# What every training command gets that does not say otherwise, and the values that stand in for those it has.
+FEW = {"--iterations": "8", "--cap-max": "60", "--seeds": "0", "--seed": "1"}
+
+
+def blocks(text: str, language: str) -> list[str]:
+    return [body for name, body in FENCE.findall(text) if name == language]
+
+
+def commands() -> dict[str, str]:
+    """All commands of code blocks, without comments, with the page that has them."""
+    found: dict[str, str] = {}
+    for page, text in TEXTS.items():
+        lines = [line for body in blocks(text, "sh") for line in body.splitlines()]
+        lines += INDENTED.findall(FENCE.sub("", text))
+        for line in lines:
+            for command in re.sub(r"\s+#.*", "", line).split(" && "):
+                if command.strip():
+                    found.setdefault(command.strip(), page)
+    return found
+
+
+COMMANDS_SEEN = commands()
+
+
+def reason_not_run(command: str) -> str | None:
+    return next((reason for pattern, reason in NOT_RUN if re.match(pattern, command)), None)
+
+
+RUN = [command for command in COMMANDS_SEEN if reason_not_run(command) is None]
+
+
+def shortened(command: str) -> list[str]:
+    """Its arguments with few iterations, splats, seeds and images."""
+    words = shlex.split(command.removeprefix(".venv/bin/"))[1:]
+    for place, word in enumerate(words[:-1]):
+        words[place + 1] = FEW.get(word, words[place + 1])
+    name = words[0]
+    if name in ("train", "demo", "compare", "frontier") and "--resume" not in words:
+        options = {"--iterations", "--cap-max"} - set(words)
+        words += [part for option in sorted(options) for part in (option, FEW[option])]
+    if name == "demo":
+        words += ["--views", "10", "--width", "48"]
+    if name == "render" and "--path" in words and "--frames" not in words:
+        words += ["--frames", "3"]
+    if name == "bench":
+        words += [] if "-s" in words else ["--splats", "200", "--width", "64", "--height", "48"]
+    return words
+
+
+def stand_ins(folder: Path, words: list[str], factory: pytest.TempPathFactory) -> None:
+    """What the words name: a scene, photographs, models."""
+    makes = {"train": "-m", "reconstruct": "-o"}.get(words[0]) if "--resume" not in words else None
+    target = next((after for word, after in pairwise(words) if word == makes), None)
+    for name in ("SCENE", "MODEL", "OTHER", "SMALL"):
+        if any(name in word.split("/") for word in words) and name != target:
+            shutil.copytree((small_capture if name == "SCENE" else small_model)(factory), folder / name)
+    if "PHOTOS" in words:
+        photos = (REAL_PHOTOS if REAL_PHOTOS.is_dir() else small_capture(factory)) / "images"
+        shutil.copytree(photos, folder / "PHOTOS")
+    if "--masks" in words:
+        (photo, *_) = sorted((folder / "SCENE" / "images").iterdir())
+        width, height = image_size(photo)
+        mask = np.full((height, width), 255, np.uint8)
+        mask[:5] = 0
+        write_png(folder / "SCENE" / "masks" / f"{photo.name}.png", mask)
+
+
+@pytest.mark.parametrize("command", [
+    pytest.param(command, marks=[pytest.mark.slow] if SLOW.search(command) else []) for command in RUN])
+def test_commands_run(command: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory,
+                      monkeypatch: pytest.MonkeyPatch) -> None:
+    assert command.removeprefix(".venv/bin/").startswith("clsplat "), \
+        f"{COMMANDS_SEEN[command]}: {command!r} is neither run nor in NOT_RUN"
+    words = shortened(command)
+    if "--video" in words:
+        pytest.importorskip("imageio_ffmpeg", reason="imageio[ffmpeg] is not installed (pip install clsplat[video])")
+    stand_ins(tmp_path, words, tmp_path_factory)
+    monkeypatch.chdir(tmp_path)
+    before = set(tmp_path.rglob("*"))
+    result = run(*words)
+    if "PHOTOS" in words and not REAL_PHOTOS.is_dir():  # those of the capture are too small to fit together
+        assert result.exit_code == 1
+        assert "so none has a pose" in result.stderr
+        return
+    assert result.exit_code == 0, f"{COMMANDS_SEEN[command]}: {command}\n{result.output}"
+    assert result.stdout or set(tmp_path.rglob("*")) - before, "nothing was said and nothing written"
+
+
+@pytest.mark.parametrize("command", sorted(set(COMMANDS_SEEN) - set(RUN)))
+def test_what_other_commands_name_is_there(command: str) -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for named in re.findall(r"(?:clsplat|\.)\[([\w,-]+)\]", command):
+        assert set(named.split(",")) <= set(extras)
+    words = shlex.split(command)
+    for word in words:
+        if re.match(r"(tests|benchmarks|docs|\.ci)/", word):
+            assert (ROOT / word).exists(), word
+    script = next((ROOT / word for word in words if re.match(r"benchmarks/\w+\.py", word)), None)
+    if script is not None:
+        for option in re.findall(r"--[\w-]+", command):
+            assert f'"{option}"' in script.read_text(), f"{script.name} has no {option}"
+
+
+def options_of(name: str) -> set[str]:
+    """All options of a command, and those of the group."""
+    command = main.get_command(click.Context(main), name)
+    assert command is not None
+    return {option for param in (*command.params, *main.params) for option in (*param.opts, *param.secondary_opts)}
+
+
+def test_options_in_the_text_exist() -> None:
+    """Every `--option` of the guide and the README in backticks is one of some command."""
+    known = set().union(*(options_of(name) for name in COMMANDS)) | {"--help"}
+    for script in (ROOT / "benchmarks").glob("*.py"):
+        known |= set(re.findall(r'"(--[a-z-]+)"', script.read_text()))
+    for page, text in TEXTS.items():
+        if page.startswith("benchmarks") or page == "CHANGELOG.md":
+            continue
+        plain = FENCE.sub("", text)
+        for span in re.findall(r"`([^`\n]+)`", plain):
+            if re.match(r"(-\w |--|clsplat )", span):
+                unknown = {option.replace("_", "-") for option in re.findall(r"(?<!\w)--[a-z][\w-]*", span)} - known
+                assert not unknown, f"{page}: {span}: no command has {', '.join(unknown)}"
+            command = re.match(r"clsplat ([a-z-]+)", span)
+            if command:
+                assert command[1] in COMMANDS, f"{page}: {span}"
+                missing = set(re.findall(r"(?<!\w)--[a-z][\w-]*", span)) - options_of(command[1]) - {"--help"}
+                assert not missing, f"{page}: {span}: clsplat {command[1]} has no {', '.join(missing)}"
+
+
+def test_every_command_is_in_the_guide() -> None:
+    guide = "\n".join(text for page, text in TEXTS.items() if page.startswith("docs/") or page == "README.md")
+    assert [name for name in COMMANDS if f"clsplat {name}" not in guide] == []
+
+
+@pytest.mark.parametrize("page", [page for page, text in TEXTS.items() if blocks(text, "python")])
+def test_python_runs(page: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory,
+                     monkeypatch: pytest.MonkeyPatch) -> None:
+    """All Python of a page as one program, where the demo was made."""
+    shutil.copytree(small_capture(tmp_path_factory), tmp_path / "out" / "scene")
+    monkeypatch.chdir(tmp_path)
+    source = "\n".join(blocks(TEXTS[page], "python"))
+    source = re.sub(r"iterations=\d+", "iterations=8", re.sub(r"cap_max=\d+", "cap_max=60", source))
+    exec(compile(source, page, "exec"), {"__name__": "__main__"})
+
+
+def test_links_lead_somewhere() -> None:
+    for page, text in TEXTS.items():
+        for target in re.findall(r"\]\(([^)#\s]*)(?:#[^)]*)?\)", text):
+            if target and not re.match(r"https?:", target):
+                assert ((ROOT / page).parent / target).exists(), f"{page}: {target}"
+        for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)]+)\)", text):
+            other = TEXTS[((ROOT / page).parent / target).resolve().relative_to(ROOT).as_posix() if target else page]
+            heads = [re.sub(r"[^\w -]", "", head).strip().lower().replace(" ", "-")
+                     for head in re.findall(r"^#+ (.*)$", other, re.M)]
+            assert anchor in heads, f"{page}: {target}#{anchor}"
+
+
+def source_texts() -> list[str]:
+    """Text constants of the source, with a NUL where a value is filled in."""
+    found = []
+    for path in [file for folder in ("clsplat", "cli", "blender") for file in (ROOT / folder).glob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.JoinedStr):
+                found.append("".join(str(part.value) if isinstance(part, ast.Constant) else "\0"
+                                     for part in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return found
+
+
+def test_messages_are_those_of_the_source() -> None:
+    """Tables headed "message" quote what clsplat says; `...`, N, M, WxH and numbers stand for what is filled in."""
+    texts = source_texts()
+    quoted = 0
+    for page, text in TEXTS.items():
+        for table in re.findall(r"^\| message \|.*\n\|[-|]+\n((?:\|.*\n)+)", text, re.M):
+            for row in table.splitlines():
+                for message in re.findall(r"`([^`]+)`", row.split(" | ")[0]):
+                    quoted += 1
+                    message = re.sub(r"^(hint|warning|error): ", "", message)
+                    for part in re.split(r"\.\.\.|\b(?:\d+|N|M|WxH)\b", message):
+                        words = part.strip(" ',:;")
+                        assert len(words) < 3 or any(words in known for known in texts), f"{page}: {words!r}"
+    assert quoted > 50
+
+
+def test_docstrings_are_rendered(tmp_path: Path) -> None:
+    pytest.importorskip("pdoc", reason="pdoc is not installed (pip install clsplat[docs])")
+    command = [sys.executable, "-W", "error", str(ROOT / "docs" / "api.py"), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    text = (tmp_path / "clsplat.html").read_text()
+    for name in clsplat.__all__:
+        assert f'id="{name}"' in text
+    assert "<li><strong>target_psnr</strong>: on validation views, instead" in text
+    assert "-----" not in text, "a section that was not understood"
+
+
+def test_docstrings_without_pdoc(tmp_path: Path) -> None:
+    if importlib.util.find_spec("pdoc"):
+        pytest.skip("pdoc is installed")
+    done = subprocess.run([sys.executable, str(ROOT / "docs" / "api.py"), str(tmp_path)], capture_output=True,
+                          text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == 'error: pdoc is not installed: pip install "clsplat[docs]"\n'

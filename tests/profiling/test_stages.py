@@ -1,0 +1,120 @@
+"""Stages: every kernel has one, a step has all of them, and what is counted is right."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kernel_checks import Case
+from reference import alpha_maps, prepared, project, visible_order
+from reference_scenes import random_camera, random_splats
+
+from clsplat.device.buffers import SplatBuffers
+from clsplat.device.device import SCHEDULES, Device
+from clsplat.device.launches import Launch
+from clsplat.device.program import parse_signatures, source
+from clsplat.errors import InputError
+from clsplat.profiling.bench import Report, bench_trainer, measure_render, measure_training
+from clsplat.profiling.limits import Limits
+from clsplat.profiling.stages import HOST, SHARED, STAGE_OF, STAGES, Sizes, by_stage, work_of
+from clsplat.rendering.kernels import T_MIN, KernelBuild
+from clsplat.rendering.pairs import count_pairs
+from clsplat.rendering.pipeline import Pipeline
+from clsplat.scenes.synthetic import synthetic_scene
+
+OTHER_PROGRAMS = {"measure/smoke.cl", "measure/limits.cl", "measure/count.cl"}  # no part of an iteration
+
+
+def test_every_kernel_has_one_stage() -> None:
+    folder = Path(__file__).resolve().parents[2] / "cl"
+    files = {str(path.relative_to(folder)) for path in folder.rglob("*.cl")}
+    kernels = {name for file in files - OTHER_PROGRAMS for name in parse_signatures(source(file), "float")}
+    assert len(kernels) > 20
+    assert kernels <= set(STAGE_OF) | set(SHARED), "a kernel without a stage in clsplat/profiling/stages.py"
+    listed = [kernel for names in STAGES.values() for kernel in names] + list(SHARED)
+    assert len(listed) == len(set(listed))
+
+
+def test_shared_kernels_belong_to_what_came_before() -> None:
+    names = ["project_splats", "copy", "fill_iota", "radix_histogram", "scan_sums", "radix_scatter", "count_isects",
+             "scan_sums", "scan_apply", "emit_isects", "radix_scatter", "find_tile_ranges", "rasterize"]
+    stages = [stage for stage, _ in by_stage(Launch(name, (1,), None) for name in names)]
+    assert stages == ["project", "transfers", *["depth sort"] * 4, *["binning"] * 4, *["tile sort"] * 2, "rasterize"]
+    with pytest.raises(KeyError):
+        list(by_stage([Launch("unheard_of", (1,), None)]))
+
+
+# One lane, a wide vector and a narrow one; alpha of either sign.
+@pytest.mark.parametrize(("shape", "schedule"), [("gaussian", "cpu16"), ("gaussian", "cpu8"), ("gaussian", "scalar"),
+                                                 ("skew-normal", "cpu16"), ("student-t", "cpu16")])
+def test_useful_pairs_are_those_of_the_reference(shape: str, schedule: str, devices: list[Device]) -> None:
+    """Pixel by pixel, front to back: |alpha| at the cutoff or above, and no splat before has finished the pixel."""
+    arrays = random_splats(5, 40) | {"opacity_logit": np.random.default_rng(6).uniform(0, 4, 40)}
+    case = Case(arrays, random_camera(5, 37, 21), shape)
+    values = prepared(case.values, case.shape)
+    order = visible_order(values, case.camera, case.shape)
+    screen = project({name: value[order] for name, value in values.items()}, case.camera, case.shape)
+    pixels = case.camera.width * case.camera.height
+    transmittance, finished, useful = np.ones(pixels), np.zeros(pixels, bool), np.zeros(pixels, int)
+    for alpha in alpha_maps(screen, case.camera).real:
+        useful += (alpha != 0) & ~finished
+        after = transmittance * (1 - alpha)
+        finished |= (alpha != 0) & (after <= T_MIN)
+        transmittance = np.where(finished, transmittance, after)
+    assert finished.any() == (shape != "student-t"), "negative alphas take T up again"
+    kernels = KernelBuild(shape, 2, SCHEDULES[schedule]).for_rendering()
+    pipeline = Pipeline(devices[0], kernels)
+    frame = pipeline.forward(SplatBuffers.of(devices[0], case.splats, kernels.dtype), case.camera)
+    undecided = int((~case.decided).sum())  # one more or less in each
+    assert abs(count_pairs(pipeline, frame) - int(useful.sum())) <= undecided
+
+
+def test_work_is_counted_from_sizes() -> None:
+    kernels = KernelBuild("gaussian", 1, SCHEDULES["cpu16"])
+    work = work_of(kernels, Sizes(splats=10, isects=50, pixels=512, pairs=1000, sh_degree=1), is_cpu=True)
+    assert work["rasterize"].flops == 1000 * (20 + 10)  # exponent 4, exp 15, opacity 1; blending 10
+    assert work["rasterize"].bytes == 50 * (12 + 4 * 15) + 4 * 4 * 512
+    assert work["rasterize_vjp"].flops == 1000 * (20 + 12 + 20)
+    assert work["gather"].bytes == 10 * (8 + 4 * 9) + 50 * 4 * 9
+    assert work["depth sort"].bytes == 10 * 40
+    assert work["binning"].bytes == 10 * 28
+    assert work["tile sort"].bytes == 10 * 20 + 50 * 8 + 2 * 8
+    assert work["step"].bytes == 4 * 10 * (7 * 11 + 6 * 12 + 6)
+    assert set(work) < set(STAGES)
+    skewed = work_of(KernelBuild("skew-normal", 1, SCHEDULES["cpu16"]), Sizes(10, 50, 512, 1000, 1), is_cpu=False)
+    assert skewed["rasterize"].flops == 1000 * (52 + 10)
+    assert skewed["depth sort"].bytes == 10 * (4 + 8 * 20)
+    assert skewed["tile sort"].bytes == 50 * (4 + 20) + 2 * 8
+
+
+def test_a_step_and_an_image_have_their_stages(devices: list[Device]) -> None:
+    scene, splats = synthetic_scene(400, 48, 32, "skew-normal")
+    trainer = bench_trainer(scene, devices[0], "skew-normal", splats)
+    limits = Limits(1e9, 1e9)
+    training, render = measure_training(trainer, limits, 2), measure_render(trainer, limits, 2)
+    assert [stage.stage for stage in training.stages] == [
+        *(name for name in STAGES if name != "strategy"), "strategy", HOST]
+    assert [stage.stage for stage in render.stages] == [
+        "project", "depth sort", "binning", "tile sort", "rasterize", "transfers", HOST]
+    for report in (training, render):
+        sizes = report.sizes
+        assert (sizes.splats, sizes.pixels, sizes.sh_degree) == (400, 48 * 32, 3)
+        assert 0 < sizes.pairs < 256 * sizes.isects
+        assert 0 < report.useful < 1
+        assert all(stage.ms >= 0 for stage in report.stages)
+        assert all((stage.of_copy is not None) == (stage.bytes > 0) for stage in report.stages)
+        counted = {stage.stage for stage in report.stages if stage.of_fma}
+        assert counted <= {"rasterize", "loss", "rasterize_vjp", "step"}
+        rasterize = next(stage for stage in report.stages if stage.stage == "rasterize")
+        assert rasterize.flops == pytest.approx(sizes.pairs * 62, rel=0.2)  # medians of two
+        assert Report.from_json(json.loads(json.dumps(report.to_json()))) == report
+    with pytest.raises(InputError, match="1 to 1000"):
+        measure_render(trainer, limits, 0)
+
+
+@pytest.mark.parametrize("values", [{}, {"sizes": {}, "stages": []}, {"sizes": 3, "stages": 4}])
+def test_no_report(values: dict[str, object]) -> None:
+    with pytest.raises(InputError, match="not a report"):
+        Report.from_json(values)

@@ -1,0 +1,156 @@
+"""Antialiased splats: kernels against the reference, volume kept on the screen, and what carries the mode along."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runner import clsplat, error_of, small_capture
+from conftest import MakeRenderer
+from kernel_checks import BACKGROUND, KERNELS, SMOOTH, Arrays, Case
+from reference import FIELDS
+from reference_formulas import SKEW_MAX
+from reference_scenes import random_camera, random_splats
+from rendering.test_gradients import differences
+from tolerances import DIFFERENCES, GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, relative_error
+
+from clsplat.device.device import Device
+from clsplat.errors import InputError
+from clsplat.rendering.render import Renderer
+from clsplat.scenes.scene import load_scene
+from clsplat.splats.convert import convert
+from clsplat.splats.placing import joined
+from clsplat.splats.splats import Splats
+from clsplat.training.config import TrainConfig
+from clsplat.training.training import train
+
+SIZES = (0.3, 3.0)  # standard deviations on the screen, roughly [px]
+
+
+def small_splats(n: int = 24) -> Arrays:
+    """About as large as a pixel, which is where the mode counts."""
+    arrays = random_splats(5, n, 2)
+    px = 1.1 * 41 / 4
+    arrays["log_scale"] = np.log(np.random.default_rng(5).uniform(*SIZES, (n, 3)) / px)
+    arrays["mean"] *= 0.4
+    return arrays
+
+
+def case_of(shape: str, normalisation: str = "peak", dtype: type = np.float32, **options: object) -> Case:
+    return Case(small_splats(), random_camera(5, 41, 27), shape, normalisation, dtype, antialiased=True, **options)
+
+
+DEFAULT = [("gaussian", "peak"), ("skew-normal", "peak"), ("bisected-skew", "peak"), ("ges-modulation", "peak")]
+
+
+@pytest.mark.parametrize(("shape", "normalisation"), [
+    pytest.param(*kernel, marks=[] if kernel in DEFAULT else pytest.mark.slow) for kernel in KERNELS])
+def test_image_and_gradients_equal_the_reference(make_renderer: MakeRenderer, device: Device, shape: str,
+                                                 normalisation: str) -> None:
+    case = case_of(shape, normalisation)
+    plain = replace(case, antialiased=False)
+    assert np.abs(case.image.color - plain.image.color).max() > 0.05, "the mode changes nothing here"
+    case.check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
+
+
+@pytest.mark.parametrize("shape", [
+    "skew-normal", *(pytest.param(name, marks=pytest.mark.slow)
+                     for name in ("gaussian", "bisected-skew", "ges-modulation"))])
+def test_double_precision_and_differences(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
+    """One opacity, two, a displacement, and a size that is learned."""
+    case_of(shape, dtype=np.float64).check(make_renderer(device, "float64"), ROUNDING, ROUNDING)
+    few = Case(small_splats(4), random_camera(5, 23, 17), shape, dtype=np.float64, thresholds=SMOOTH, antialiased=True)
+    renderer = make_renderer(device, "float64", **SMOOTH)
+    few.render(renderer)
+    got = few.backward(renderer)
+    for field in FIELDS[shape]:
+        if field != "sh":
+            assert relative_error(got[field], differences(renderer, few, field)) < DIFFERENCES, field
+
+
+@pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])
+def test_a_small_splat_keeps_its_volume(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
+    """The sum of alpha over an image falls with the square of its size, however small the splat is on it."""
+    arrays = {"mean": [[0.0, 0.0, 0.0]], "quat": [[1.0, 0.0, 0.0, 0.0]], "log_scale": np.log([[0.05, 0.03, 0.04]]),
+              "opacity_logit": [2.0], "sh": [[[0.3, 0.2, 0.1]]]}
+    if shape != "gaussian":
+        arrays["skew"] = [[0.9 * SKEW_MAX, 0.2, -0.1]]
+    camera = random_camera(2, 320, 320)
+    camera = replace(camera, cam_from_world=np.block([[np.eye(3), np.array([[0], [0], [4.0]])], [0, 0, 0, 1]]))
+    renderer = make_renderer(device, alpha_min=0.0)
+    kept = {}
+    for antialiased in (False, True):
+        splats = Splats(shape, {name: np.asarray(value) for name, value in arrays.items()}, antialiased=antialiased)
+        sums = [renderer.render(splats, camera.resized(size, size), BACKGROUND).alpha.sum() * (320 / size) ** 2
+                for size in (320, 160, 80, 40)]
+        kept[antialiased] = np.array(sums) / sums[0]
+    np.testing.assert_allclose(kept[True], 1.0, atol=0.02)
+    assert kept[False][-1] > 2
+
+
+@pytest.mark.parametrize(("source", "target"), [("skew-normal", "skew-normal-direct"),
+                                                ("ges-modulation", "gaussian")])
+def test_exact_conversions_stay_exact(make_renderer: MakeRenderer, device: Device, source: str, target: str) -> None:
+    """Both forms have one volume on the screen."""
+    case = case_of(source)
+    renderer = make_renderer(device)
+    other = convert(case.splats, target)
+    assert other.antialiased
+    np.testing.assert_allclose(renderer.render(other, case.camera).color,
+                               renderer.render(case.splats, case.camera).color, atol=2e-5)
+
+
+@pytest.mark.parametrize("shape", ["skew-normal"])
+def test_edges_stay_finite(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
+    """Flat splats seen from the edge, needles, points and giants."""
+    arrays = random_splats(7, 32, 1)
+    arrays["log_scale"] = np.random.default_rng(7).choice([-40.0, -12.0, -3.0, 2.0], (32, 3))
+    case = Case(arrays, random_camera(5, 41, 27), shape, antialiased=True, thresholds=SMOOTH)  # no reference of these
+    renderer = make_renderer(device)
+    assert np.isfinite(case.render(renderer).color).all()
+    for name, value in case.backward(renderer).items():
+        assert np.isfinite(value).all(), name
+
+
+def test_the_mode_goes_with_the_model(tmp_path: Path) -> None:
+    """Through files, whole and compact, and all that makes splats of splats."""
+    splats = _model(True)
+    assert splats.antialiased
+    assert not _model(False).antialiased
+    for compact in (False, True):
+        splats.save(tmp_path / "a.ply", compact)
+        assert b"comment SplatRenderMode: mip\n" in (tmp_path / "a.ply").read_bytes()
+        assert Splats.load(tmp_path / "a.ply").antialiased
+    _model(False).save(tmp_path / "b.ply")
+    assert not Splats.load(tmp_path / "b.ply").antialiased
+    assert splats.select([1, 2]).antialiased
+    assert splats.as_shape("skew-normal").antialiased
+    assert splats.with_arrays(splats.to_numpy()).antialiased
+    assert joined([splats, splats]).antialiased
+    with pytest.raises(InputError, match="some of the models are antialiased"):
+        joined([splats, _model(False)])
+
+
+def _model(antialiased: bool) -> Splats:
+    arrays = {name: value for name, value in random_splats(1, 5, 1).items() if name != "skew"}
+    return Splats("gaussian", arrays, antialiased=antialiased)
+
+
+def test_training_and_the_command_line(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> None:
+    """The same gradients as the renderer's, and a file that says how it is to be shown."""
+    folder = small_capture(tmp_path_factory)
+    clsplat("train", folder, "-m", tmp_path / "model", "--iterations", 20, "--cap-max", 200, "--antialiased", "-q",
+            "--eval")
+    model = Splats.load(tmp_path / "model" / "point_cloud" / "iteration_20" / "point_cloud.ply")
+    assert model.antialiased
+    scene = load_scene(folder)
+    config = TrainConfig(iterations=20, cap_max=200, antialiased=True)
+    again = train(scene, config).splats
+    np.testing.assert_array_equal(again.mean, model.mean)
+    plain = Splats(model.shape, model.arrays, model.normalisation)
+    images = [Renderer().render(each, scene.test[0].camera).color for each in (model, plain)]
+    assert np.abs(images[0] - images[1]).max() > 1e-3
+    assert "antialiased" in error_of("train", folder, "-m", tmp_path / "other", "--init",
+                                     tmp_path / "model" / "point_cloud" / "iteration_20" / "point_cloud.ply")

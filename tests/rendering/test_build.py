@@ -1,0 +1,91 @@
+"""Every kernel builds without a warning, at every value of every option."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from importlib.resources import files
+
+import pytest
+from kernel_checks import KERNELS
+
+from clsplat.device.device import SCHEDULES, Device
+from clsplat.device.program import build
+from clsplat.profiling.limits import CHAINS, limits_program
+from clsplat.rendering.binning import BUCKET_BITS
+from clsplat.rendering.kernels import KernelBuild
+from clsplat.rendering.sort import DIGIT_BITS
+from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
+from clsplat.training.optim.skew_map import SKEW_MAPS
+
+REALS = ("float", "double")
+
+
+def all_builds() -> Iterator[KernelBuild]:
+    """The product of all that changes a program; degrees, as only projection knows them, for two shapes."""
+    for (shape, normalisation), schedule, real in itertools.product(KERNELS, SCHEDULES.values(), REALS):
+        yield KernelBuild(shape, 3, schedule, normalisation, real).for_rendering()
+    for shape, degree, schedule in itertools.product(("gaussian", DEFAULT_SHAPE), (0, 1, 2, 3), SCHEDULES.values()):
+        yield KernelBuild(shape, degree, schedule)  # as training builds it
+    for skew_map, schedule in itertools.product(SKEW_MAPS, SCHEDULES.values()):
+        yield KernelBuild("skew-normal", 3, schedule, skew_map=skew_map)
+
+
+def some_builds() -> Iterator[KernelBuild]:
+    """Shapes x precisions on a CPU's and a GPU's schedule, and each other option at each of its values."""
+    cpu = SCHEDULES["cpu16"]
+    for shape, schedule, real in itertools.product(SHAPES, (cpu, SCHEDULES["gpu256"]), REALS):
+        yield KernelBuild(shape, 3, schedule, real=real).for_rendering()
+    for schedule, real in itertools.product(SCHEDULES.values(), REALS):
+        yield KernelBuild(DEFAULT_SHAPE, 3, schedule, real=real).for_rendering()
+    for shape, normalisation in KERNELS:
+        yield KernelBuild(shape, 3, cpu, normalisation).for_rendering()
+    for i, skew_map in enumerate(SKEW_MAPS):
+        yield KernelBuild("skew-normal", i % 4, cpu, skew_map=skew_map)
+
+
+@pytest.fixture(scope="module")
+def compiler(devices: list[Device]) -> Device:
+    """One device: PoCL, whose front end is the quickest, where it is there."""
+    if not devices:
+        pytest.skip("no OpenCL device")
+    return min(devices, key=lambda device: device.info.platform != "Portable Computing Language")
+
+
+def build_all(device: Device, kernels: KernelBuild) -> None:
+    if kernels.real == "double" and not device.has_fp64:
+        return
+    kernels.raster_program(device)
+    kernels.loss_program(device)
+    kernels.photo_program(device)
+    kernels.optim_program(device)
+
+
+def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
+    """And every file in cl/ is part of some program."""
+    for kernels in some_builds():
+        build_all(compiler, kernels)
+    KernelBuild(DEFAULT_SHAPE, 3, SCHEDULES["cpu16"]).count_program(compiler)
+    limits_program(compiler, CHAINS[0])
+    build(compiler, ("measure/smoke.cl",))
+    build(compiler, ("render/sort.cl",), {"SORT_GROUP": 64, "RADIX_BITS": DIGIT_BITS})
+    build(compiler, ("render/order.cl", "render/bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
+    root = files("clsplat_cl")
+    there = {f.name for f in root.iterdir()} | {
+        f"{folder}/{f.name}" for folder in ("camera", "shape") for f in root.joinpath(folder).iterdir()
+    }
+    used = {name for names, *_ in compiler.programs for name in names}
+    assert used == {name for name in there if name.endswith((".cl", ".clh"))}
+
+
+@pytest.mark.slow
+def test_every_kernel_builds_on_every_device(device: Device) -> None:
+    for kernels in all_builds():
+        build_all(device, kernels)
+
+
+@pytest.mark.parametrize("group", [64, 256])
+def test_sort_and_binning_build(device: Device, group: int) -> None:
+    build(device, ("render/sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": DIGIT_BITS})
+    build(device, ("render/order.cl", "render/bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
+    build(device, ("render/bin.cl",))

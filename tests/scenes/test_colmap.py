@@ -1,0 +1,297 @@
+"""Lenses that are undistorted or refused, and damaged model files."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from small_scene import CX, CY, FX, FY, HEIGHT, WIDTH, cloud, model_views, write_garden
+
+from clsplat.errors import InputError
+from clsplat.scenes.colmap import read_model
+from clsplat.scenes.colmap_files import check_binary_model, write_binary_model
+from clsplat.scenes.lens import Photo, make_lens
+from clsplat.scenes.scene import load_scene
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A small scene."""
+    return write_garden(tmp_path)
+
+
+# --- lenses --------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+@pytest.mark.parametrize(("model", "params"), [
+    ("SIMPLE_RADIAL", [300, 205, 148, -0.2]),
+    ("RADIAL", [300, 205, 148, 0.15, 0.02]),
+    ("OPENCV", [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]),
+    ("OPENCV_FISHEYE", [200, 205, 202, 149, 0.02, 0.01, 0, 0]),
+])
+def test_undistorted_photo_shows_points_where_its_camera_says(model: str, params: list[float],
+                                                              scale: float) -> None:
+    """Round dots drawn where the lens puts them must lie where the pinhole camera puts them."""
+    import pycolmap
+
+    lens = pycolmap.Camera(model=model, width=400, height=300, params=params)
+    rays = np.array([(x, y) for y in np.linspace(-0.35, 0.35, 5) for x in np.linspace(-0.5, 0.5, 7)])
+    y, x = np.mgrid[: int(300 * scale), : int(400 * scale)] + 0.5
+    image = np.zeros(x.shape)
+    for ray in rays:
+        at = np.ravel(lens.img_from_cam(np.array([[*ray, 1.0]]))) * scale
+        image += 200 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 4.5)
+    picture = np.repeat(np.clip(image, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+    flat, camera = Photo("dots", np.eye(4), lens).fit(picture)
+    assert flat.shape == (camera.height, camera.width, 3)
+    checked = 0
+    for ray in rays:
+        expected = ray * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        if (expected < 9).any() or (expected > np.array([camera.width, camera.height]) - 9).any():
+            continue
+        column, row = expected.astype(int)
+        window = flat[row - 6 : row + 7, column - 6 : column + 7, 0].astype(float)
+        rows, columns = np.mgrid[row - 6 : row + 7, column - 6 : column + 7] + 0.5
+        found = np.array([(columns * window).sum(), (rows * window).sum()]) / window.sum()
+        assert np.linalg.norm(found - expected) < 0.15
+        checked += 1
+    assert checked >= 15
+    assert (flat[:4].sum(), flat[-4:].sum()) == (0, 0)      # the ground is black, so is what the border gets
+
+
+def _radial(r2: np.ndarray, *k: float) -> np.ndarray:
+    return 1 + sum(c * r2 ** (power + 1) for power, c in enumerate(k))
+
+
+def _fisheye(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Equidistant: as far from the centre as the angle from the axis."""
+    r = np.hypot(x, y)
+    factor = np.where(r > 0, np.arctan(r) / np.where(r > 0, r, 1), 1.0)
+    return factor * x, factor * y
+
+
+def _put_by_hand(model: str, p: list[float], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Pixels of rays (x, y, 1) by the formulas of https://colmap.github.io/cameras.html, in float64."""
+    if model == "FOV":                                             # fx fy cx cy omega (Devernay & Faugeras 2001)
+        r = np.hypot(x, y)
+        distorted = np.arctan(2 * r * np.tan(p[4] / 2)) / p[4]
+        factor = np.where(r > 0, distorted / np.where(r > 0, r, 1), 2 * np.tan(p[4] / 2) / p[4])
+        return np.stack([p[0] * factor * x + p[2], p[1] * factor * y + p[3]], axis=-1)
+    shared = model in ("SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")    # one focal length
+    fx, fy, cx, cy = (p[0], p[0], p[1], p[2]) if shared else p[:4]
+    k = p[3:] if shared else p[4:]
+    if "FISHEYE" in model:
+        x, y = _fisheye(x, y)
+    r2, xy = x * x + y * y, x * y
+    if model in ("SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"):
+        u, v = x * _radial(r2, *k), y * _radial(r2, *k)
+    elif model == "OPENCV":                                        # k1 k2 p1 p2
+        u = x * _radial(r2, *k[:2]) + 2 * k[2] * xy + k[3] * (r2 + 2 * x * x)
+        v = y * _radial(r2, *k[:2]) + 2 * k[3] * xy + k[2] * (r2 + 2 * y * y)
+    elif model == "FULL_OPENCV":                                   # k1 k2 p1 p2 k3 k4 k5 k6
+        ratio = _radial(r2, k[0], k[1], k[4]) / _radial(r2, *k[5:])
+        u = x * ratio + 2 * k[2] * xy + k[3] * (r2 + 2 * x * x)
+        v = y * ratio + 2 * k[3] * xy + k[2] * (r2 + 2 * y * y)
+    else:                                                          # THIN_PRISM_FISHEYE: k1 k2 p1 p2 k3 k4 s1 s2
+        radial = _radial(r2, k[0], k[1], k[4], k[5])
+        u = x * radial + 2 * k[2] * xy + k[3] * (r2 + 2 * x * x) + k[6] * r2
+        v = y * radial + 2 * k[3] * xy + k[2] * (r2 + 2 * y * y) + k[7] * r2
+    return np.stack([fx * u + cx, fy * v + cy], axis=-1)
+
+
+LENSES = {
+    "SIMPLE_RADIAL": [300, 205, 148, -0.15],
+    "RADIAL": [300, 205, 148, 0.1, 0.02],
+    "OPENCV": [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003],
+    "FULL_OPENCV": [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003, 0.01, 0.02, -0.01, 0.003],
+    "OPENCV_FISHEYE": [200, 205, 202, 149, 0.02, 0.01, -0.005, 0.001],
+    "SIMPLE_RADIAL_FISHEYE": [200, 205, 149, 0.03],
+    "RADIAL_FISHEYE": [200, 205, 149, 0.03, -0.01],
+    "THIN_PRISM_FISHEYE": [200, 205, 202, 149, 0.02, 0.01, 0.002, -0.001, 0.003, 0.001, 0.002, -0.002],
+    "FOV": [220, 225, 202, 149, 0.9],
+}
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_every_lens_is_undistorted_as_its_formula_says(model: str) -> None:
+    """A smooth pattern, drawn along rays: each pixel of the pinhole image shows its own ray's value.
+
+    Nothing of the library is in the expectation: the photo is drawn by inverting the formula here, the expected image
+    along the rays of the camera that comes back.
+    """
+    def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 127.5 + 60 * np.sin(9 * x + 2 * y) + 60 * np.cos(8 * y - 3 * x)
+
+    def invert(pixels: np.ndarray) -> np.ndarray:
+        """Rays by Newton's steps with a difference quotient, from the centre on."""
+        rays = np.zeros(pixels.shape)
+        for share in (0.25, 0.5, 0.75, *[1.0] * 6):
+            target = centre + share * (pixels - centre)
+            h = 1e-6
+            at = _put_by_hand(model, p, rays[..., 0], rays[..., 1])
+            dx = (_put_by_hand(model, p, rays[..., 0] + h, rays[..., 1]) - at) / h
+            dy = (_put_by_hand(model, p, rays[..., 0], rays[..., 1] + h) - at) / h
+            step = np.linalg.solve(np.stack([dx, dy], axis=-1), (target - at)[..., None])[..., 0]
+            rays = rays + step
+        return rays
+
+    pixel_sizes = 3 if model.startswith(("SIMPLE", "RADIAL")) else 4
+    p = [value / 2 if place < pixel_sizes else float(value) for place, value in enumerate(LENSES[model])]
+    centre = _put_by_hand(model, p, np.zeros(()), np.zeros(()))
+    pixels = np.stack(np.meshgrid(np.arange(200) + 0.5, np.arange(150) + 0.5), axis=-1)
+    rays = invert(pixels)
+    np.testing.assert_allclose(_put_by_hand(model, p, rays[..., 0], rays[..., 1]), pixels, atol=1e-6)
+    picture = np.rint(pattern(rays[..., 0], rays[..., 1])).astype(np.uint8)
+    photo = Photo("pattern", np.eye(4), make_lens(model, 200, 150, p))
+    flat, camera = photo.fit(np.repeat(picture[..., None], 3, axis=2))
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    x, y = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
+    at = _put_by_hand(model, p, x, y)
+    inside = ((at > 1) & (at < (199, 149))).all(axis=-1)
+    assert inside.mean() > 0.9
+    off = np.abs(flat[..., 0] - pattern(x, y))[inside]
+    assert off.mean() < 0.7                 # rounding twice alone is 0.35 in the mean
+    assert off.max() < 5                    # bilinear between pixels; half a pixel off would be 4 in the mean
+    mask = photo.fit_mask(picture > 127, 200, 150)
+    sure = inside & (np.abs(pattern(x, y) - 127.5) > 12)
+    np.testing.assert_array_equal(mask[sure], (pattern(x, y) > 127.5)[sure])
+
+
+@pytest.mark.parametrize(("model", "params"), [
+    ("PINHOLE", [300, 310, 190, 155]),
+    ("OPENCV", [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]),
+    ("OPENCV_FISHEYE", [200, 205, 202, 149, 0.02, 0.01, 0, 0]),
+])
+@pytest.mark.parametrize("reduced", [1, 2])
+def test_mask_follows_the_photo(model: str, params: list[float], reduced: int) -> None:
+    """A mask that is a threshold of the photo is that threshold of the fitted photo, but along edges."""
+    import pycolmap
+
+    photo = Photo("disc", np.eye(4), pycolmap.Camera(model=model, width=400, height=300, params=params))
+    y, x = np.mgrid[:300, :400] // reduced * reduced
+    mask = ((x - 120) ** 2 + (y - 100) ** 2 < 90**2) | (x > 330)
+    flat, camera = photo.fit(np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2))
+    fitted = photo.fit_mask(mask[::reduced, ::reduced], 400, 300)
+    assert fitted.dtype == bool
+    assert fitted.shape == (camera.height, camera.width)
+    assert not (fitted[flat[..., 0] == 0]).any()
+    assert fitted[flat[..., 0] == 255].all()
+    assert 0.2 < fitted.mean() < 0.6
+
+
+def test_mask_is_false_outside_the_photo() -> None:
+    import pycolmap
+
+    # This lens leaves a sliver of the fitted image blank.
+    params = [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]
+    photo = Photo("sliver", np.eye(4), pycolmap.Camera(model="OPENCV", width=400, height=300, params=params))
+    white, _ = photo.fit(np.full((300, 400, 3), 255, np.uint8))
+    fitted = photo.fit_mask(np.ones((300, 400), bool), 400, 300)
+    assert 0 < (~fitted).sum() < 100
+    np.testing.assert_array_equal(fitted, white[..., 0] == 255)
+    with pytest.raises(InputError, match=r"its mask is 300x400 px, the photo 400x300"):
+        photo.fit_mask(np.ones((400, 300), bool), 400, 300)
+
+
+def test_zero_distortion_is_a_plain_pinhole() -> None:
+    import pycolmap
+
+    lens = pycolmap.Camera(model="OPENCV", width=40, height=30, params=[30, 31, 18, 16, 0, 0, 0, 0])
+    image = np.random.default_rng(0).integers(0, 256, (30, 40, 3)).astype(np.uint8)
+    same, camera = Photo("plain", np.eye(4), lens).fit(image)
+    np.testing.assert_array_equal(same, image)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 31, 18, 16)
+
+
+def test_distorted_scene_loads(folder: Path) -> None:
+    cameras = folder / "sparse" / "0" / "cameras.bin"
+    cameras.write_bytes(struct.pack("<QIiQQ4d", 1, 1, 2, WIDTH, HEIGHT, FX, CX, CY, -0.1))
+    view = load_scene(folder).views[0]
+    assert view.camera.fx == view.camera.fy == pytest.approx(FX)
+    assert view.image.shape == (view.camera.height, view.camera.width, 3)
+    assert (view.camera.width, view.camera.height) != (WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(("model", "params", "word"), [
+    (17, [40.0, 30.0], "EQUIRECTANGULAR"), (1, [np.nan, FY, CX, CY], "not finite"),
+    (99, [1.0] * 4, "model id 99"), (1, [-FX, FY, CX, CY], "focal")])
+def test_unusable_lens_is_refused(folder: Path, model: int, params: list[float], word: str) -> None:
+    cameras = folder / "sparse" / "0" / "cameras.bin"
+    cameras.write_bytes(struct.pack(f"<QIiQQ{len(params)}d", 1, 1, model, WIDTH, HEIGHT, *params))
+    with pytest.raises(InputError, match=word) as error:
+        load_scene(folder)
+    assert "\n" not in str(error.value)
+
+
+# --- damage ----------------------------------------------------------------------
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes]]:
+    """Bytes of the same model as COLMAP writes it today (with rigs and frames), by kind of file."""
+    import pycolmap
+
+    root = tmp_path_factory.mktemp("whole")
+    write_binary_model(root / "ours", model_views()[:4], *cloud())
+    model = pycolmap.Reconstruction(str(root / "ours"))
+    files: dict[str, dict[str, bytes]] = {}
+    for suffix, write in ((".bin", model.write_binary), (".txt", model.write_text)):
+        (root / suffix).mkdir()
+        write(str(root / suffix))
+        files[suffix] = {file.name: file.read_bytes() for file in (root / suffix).iterdir()}
+    return files
+
+
+def _put(folder: Path, files: dict[str, bytes]) -> Path:
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
+def test_every_truncation_is_refused(whole: dict[str, dict[str, bytes]], tmp_path: Path, name: str) -> None:
+    files = whole[".bin"]
+    check_binary_model(_put(tmp_path / "m", files))
+    for end in range(0, len(files[name]), 7):
+        (tmp_path / "m" / name).write_bytes(files[name][:end])
+        with pytest.raises(InputError, match=name):
+            read_model(tmp_path / "m")
+    (tmp_path / "m" / name).write_bytes(files[name] + b"\0")
+    with pytest.raises(InputError, match="1 bytes follow"):
+        read_model(tmp_path / "m")
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
+def test_lying_counts_are_refused(whole: dict[str, dict[str, bytes]], tmp_path: Path, name: str) -> None:
+    content = whole[".bin"][name]
+    count = struct.unpack_from("<Q", content)[0]
+    for lie in (0, count - 1, count + 1, 1 << 40, (1 << 64) - 1):
+        if lie != count:
+            damaged = struct.pack("<Q", lie) + content[8:]
+            with pytest.raises(InputError, match=name):
+                read_model(_put(tmp_path / "m", {**whole[".bin"], name: damaged}))
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damage_gives_a_model_or_a_message(whole: dict[str, dict[str, bytes]], tmp_path: Path, suffix: str,
+                                           data: st.DataObject) -> None:
+    files = whole[suffix]
+    name = data.draw(st.sampled_from(sorted(files)))
+    content = bytearray(files[name])
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    message = ""
+    try:
+        model = read_model(_put(tmp_path / "m", {**files, name: bytes(content)}))
+    except InputError as error:
+        message = str(error)
+    assert "\n" not in message
+    assert message or np.isfinite(model.points.xyz).all()

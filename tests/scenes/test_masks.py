@@ -1,0 +1,135 @@
+"""Masks: where they are found, how they follow their photos, and that what they hide teaches nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from small_scene import HEIGHT, N_VIEWS, NAMES, WIDTH, photo_of, write_garden
+
+from clsplat.errors import InputError
+from clsplat.files.images import read_image, write_png
+from clsplat.files.masks import mask_files, nearest, read_mask
+from clsplat.scenes.scene import load_scene
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A small scene."""
+    return write_garden(tmp_path)
+
+
+def left_half(width: int = WIDTH, height: int = HEIGHT) -> NDArray[np.bool_]:
+    """Counts on the left."""
+    return np.broadcast_to(np.arange(width) < width // 2, (height, width))
+
+
+def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, np.uint8(255) * mask)
+
+
+@pytest.mark.parametrize("form", ["{name}.png", "{stem}.png", "{stem}.mask.png"])
+def test_masks_are_found_by_the_names_of_their_photos(folder: Path, form: str) -> None:
+    name = NAMES[3]
+    write_mask(folder / "masks" / form.format(name=name, stem=Path(name).stem), left_half())
+    scene = load_scene(folder)
+    for view in scene.views:
+        if view.name == name:
+            assert view.mask is not None
+            np.testing.assert_array_equal(view.mask, left_half())
+        else:
+            assert view.mask is None
+    assert all(view.mask is None for view in load_scene(folder, masks="none").views)
+
+
+def test_masks_in_folders_of_photos(tmp_path: Path) -> None:
+    for file in ("a.jpg.png", "left/b.png"):
+        write_mask(tmp_path / file, left_half())
+    assert mask_files(tmp_path, ["a.jpg", "left/b.jpg", "right/b.jpg"]) == {
+        "a.jpg": tmp_path / "a.jpg.png", "left/b.jpg": tmp_path / "left/b.png"}
+
+
+def test_masks_follow_the_size_of_the_photos(folder: Path) -> None:
+    """A mask of twice the photo's size, and a photo at half its size."""
+    write_mask(folder / "masks" / f"{NAMES[0]}.png", left_half(2 * WIDTH, 2 * HEIGHT))
+    for resolution, size in ((1, (WIDTH, HEIGHT)), (2, (WIDTH // 2, HEIGHT // 2))):
+        view = load_scene(folder, resolution=resolution).views[0]
+        assert view.mask is not None
+        np.testing.assert_array_equal(view.mask, left_half(*size))
+
+
+def test_grey_is_a_choice_of_black_or_white(tmp_path: Path) -> None:
+    write_png(tmp_path / "grey.png", np.array([[0, 127, 128, 255]], np.uint8))
+    np.testing.assert_array_equal(read_mask(tmp_path / "grey.png"), [[False, False, True, True]])
+
+
+def test_nearest_pixel() -> None:
+    mask = np.array([[True, False, False, True]])
+    np.testing.assert_array_equal(nearest(mask, 8, 2), np.tile(np.repeat(mask, 2, axis=1), (2, 1)))
+    np.testing.assert_array_equal(nearest(mask, 2, 1), [[False, True]])
+
+
+def test_a_mask_of_white_is_none_and_one_of_black_leaves_the_photo_out(folder: Path) -> None:
+    write_mask(folder / "masks" / f"{NAMES[0]}.png", np.ones((HEIGHT, WIDTH), bool))
+    write_mask(folder / "masks" / f"{NAMES[1]}.png", np.zeros((HEIGHT, WIDTH), bool))
+    with pytest.warns(UserWarning, match=rf"1 of {N_VIEWS} photos are left out: .*{NAMES[1]}: its mask hides all"):
+        scene = load_scene(folder)
+    assert NAMES[1] not in scene.names
+    assert scene.views[0].mask is None
+
+
+def test_bad_masks_are_named(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"shades: no such folder of masks; .*'none'"):
+        load_scene(folder, masks="shades")
+    (folder / "shades").mkdir()
+    with pytest.raises(InputError, match=rf"no mask of any photo in it; a mask of '{NAMES[0]}' is {NAMES[0]}.png"):
+        load_scene(folder, masks="shades")
+    write_mask(folder / "shades" / f"{NAMES[0]}.png", left_half(WIDTH, 3 * HEIGHT))
+    with pytest.raises(InputError, match=rf"{NAMES[0]}.*its mask is {WIDTH}x{3 * HEIGHT} px"):
+        load_scene(folder, masks="shades")
+    (folder / "shades" / f"{NAMES[0]}.png").write_text("no image")
+    with pytest.raises(InputError, match=rf"{NAMES[0]}.png: cannot be read as an image"):
+        load_scene(folder, masks="shades")
+
+
+def test_transparency_as_background_or_mask(folder: Path) -> None:
+    file = folder / "images" / NAMES[0]
+    rgb = photo_of(0)
+    alpha = np.where(left_half(), 255, 51).astype(np.uint8)
+    write_png(file, np.dstack([rgb, alpha]))
+    over = load_scene(folder, background=(1.0, 0.0, 0.0)).views[0]
+    assert over.mask is None
+    np.testing.assert_array_equal(over.alpha, alpha)
+    laid_over = 0.2 * rgb + 0.8 * np.array([255, 0, 0])
+    np.testing.assert_allclose(over.image, np.where(left_half()[:, :, None], rgb, laid_over), atol=0.51)
+    hidden = load_scene(folder, alpha="mask").views[0]
+    assert hidden.alpha is None
+    np.testing.assert_array_equal(hidden.mask, left_half())
+    np.testing.assert_array_equal(hidden.image, read_image(file)[:, :, :3])
+    write_mask(folder / "masks" / f"{NAMES[0]}.png", np.arange(HEIGHT)[:, None] < np.full(WIDTH, HEIGHT // 2))
+    both = load_scene(folder, alpha="mask").views[0]
+    assert both.mask is not None
+    np.testing.assert_array_equal(both.mask, left_half() & (np.arange(HEIGHT)[:, None] < HEIGHT // 2))
+    with pytest.raises(InputError, match=r"alpha 'over': choose one of background, mask"):
+        load_scene(folder, alpha="over")
+
+
+def test_mask_path_of_a_frame(tmp_path: Path) -> None:
+    """nerfstudio's key."""
+    write_png(tmp_path / "a.png", photo_of(0))
+    write_mask(tmp_path / "hidden" / "whatever.png", left_half())
+    frame = {"file_path": "a.png", "mask_path": "hidden/whatever.png", "transform_matrix": np.eye(4).tolist()}
+    document = {"fl_x": 50.0, "frames": [frame]}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    view = load_scene(tmp_path, eval=False).views[0]
+    assert view.mask is not None
+    np.testing.assert_array_equal(view.mask, left_half())
+    bad = {"nowhere.png": "nowhere.png: no such image file", 3: "mask_path 3 is no name of a file"}
+    for named, complaint in bad.items():
+        (tmp_path / "transforms.json").write_text(json.dumps(document | {"frames": [frame | {"mask_path": named}]}))
+        with pytest.raises(InputError, match=complaint):
+            load_scene(tmp_path, eval=False)

@@ -1,0 +1,294 @@
+"""Photographs become a scene: the right poses, whole scenes or none, and messages for what does not work."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import clsplat_cli.reconstruct as cli
+import numpy as np
+import photo_walk
+import pytest
+from cli_runner import clsplat, error_of, run
+from PIL import Image
+
+from clsplat.errors import InputError, OutputError
+from clsplat.scenes.colmap import find_model, read_model
+from clsplat.scenes.reconstruct import reconstruct as module
+from clsplat.scenes.reconstruct.photo_folder import PhotoFile
+from clsplat.scenes.reconstruct.reconstruct import ReconstructOptions, made_from, reconstruct
+from clsplat.scenes.reconstruct.sfm_process import Step
+from clsplat.scenes.scene import Scene, load_scene
+
+_kept: dict[str, Path] = {}
+
+
+@pytest.fixture
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photos, one hidden in part by a mask; made once, read only."""
+    if "walk" not in _kept:
+        folder = photo_walk.write_walk(tmp_path_factory.mktemp("photos") / "walk")
+        hidden = np.full((photo_walk.HEIGHT, photo_walk.WIDTH), 255, np.uint8)
+        hidden[:, :80] = 0
+        (folder / "masks").mkdir()
+        Image.fromarray(hidden).save(folder / "masks" / "walk_03.png")
+        (folder / "note.png").write_bytes(b"no photo")
+        _kept["walk"] = folder
+    return _kept["walk"]
+
+
+@pytest.fixture
+def scene(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The walk reconstructed by the command line; made once, read only."""
+    if "scene" not in _kept:
+        folder = tmp_path_factory.mktemp("scenes") / "corner"
+        result = run("reconstruct", walk, "-o", folder)
+        assert result.exit_code == 0, result.output
+        assert "warning: left out: " in result.stderr
+        assert "note.png" in result.stderr
+        assert "pairs matched 28/28" in result.stderr
+        assert "8 of 8 photos placed" in result.stdout
+        assert [left.name for left in folder.parent.iterdir()] == ["corner"], "nothing unfinished stays"
+        _kept["scene"] = folder
+    return _kept["scene"]
+
+
+def aligned_error(scene: Scene) -> tuple[float, float]:
+    """Largest error of the camera centres [share of their spread] and of the viewing directions [degrees].
+
+    After the similarity that brings the centres onto the true ones (Umeyama 1991).
+    """
+    poses = np.array([photo_walk.cam_from_world(int(name[5:7])) for name in scene.names])
+    true = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    found = np.array([view.camera.position for view in scene.views])
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    u, sizes, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    turn = u @ sign @ vt
+    scale = (sizes * np.diag(sign)).sum() / (a**2).sum()
+    spread = np.linalg.norm(b, axis=1).max()
+    off = np.linalg.norm(scale * a @ turn.T - b, axis=1).max() / spread
+    angles = [np.degrees(np.arccos(np.clip((turn @ view.camera.rotation[2]) @ pose[2, :3], -1, 1)))
+              for view, pose in zip(scene.views, poses, strict=True)]
+    return float(off), float(max(angles))
+
+
+def test_poses_are_the_true_ones(scene: Path) -> None:
+    loaded = load_scene(scene, eval=False)
+    assert loaded.names == photo_walk.names()
+    off, angle = aligned_error(loaded)
+    assert off < 0.01
+    assert angle < 0.5
+    camera = loaded.views[0].camera
+    assert camera.fx == pytest.approx(photo_walk.FOCAL, rel=0.05)
+    assert abs(camera.width - photo_walk.WIDTH) <= 8
+    assert len({view.camera.fx for view in loaded.views}) == 1, "photos of one size share a lens"
+
+
+def test_points_lie_where_their_photos_see_them(scene: Path) -> None:
+    """The written observations, projected by hand."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
+    assert model.num_points3D() > 200
+    distances = []
+    for image in model.images.values():
+        camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
+        assert camera.model.name == "PINHOLE"
+        for point in image.get_observation_points2D():
+            seen = pose[:, :3] @ model.points3D[point.point3D_id].xyz + pose[:, 3]
+            fx, fy, cx, cy = camera.params
+            distances.append(np.hypot(*(seen[:2] / seen[2] * (fx, fy) + (cx, cy) - point.xy)))
+    assert np.mean(distances) < 0.5
+    assert model.compute_mean_track_length() > 3
+    record = json.loads((scene / "reconstruct.json").read_text())
+    assert record["registered"] == record["photos"] == 8
+    assert record["points"] == model.num_points3D()
+
+
+def test_mask_goes_along(scene: Path) -> None:
+    mask = np.array(Image.open(scene / "masks" / "walk_03.png.png"))
+    assert mask[10:-10, 10:70].max() == 0
+    assert mask[10:-10, 90:-10].min() == 255
+    view = next(view for view in load_scene(scene, eval=False).views if view.name == "walk_03.png")
+    assert view.mask is not None
+    assert not view.mask[:, 10:70].any()
+    points = read_model(find_model(scene))
+    assert len(points.points) > 0
+
+
+def test_a_scene_is_not_replaced_unasked(scene: Path, walk: Path, tmp_path: Path) -> None:
+    assert "already holds a scene: use --overwrite" in error_of("reconstruct", walk, "-o", scene)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "work.txt").write_text("hours")
+    with pytest.raises(OutputError, match="no scene that was reconstructed"):
+        reconstruct(walk, tmp_path / "mine", overwrite=True)
+    assert made_from(scene, walk)
+    assert made_from(tmp_path, walk) is None
+
+
+def test_training_on_photographs_uses_the_scene_again(scene: Path, walk: Path, tmp_path: Path) -> None:
+    """The scene lies beside the model; other photos are not taken for it."""
+    (tmp_path / "walk-scene").symlink_to(scene)
+    options = ("--eval", "--iterations", 10, "--cap-max", 300, "--sh-degree", 0)
+    result = run("train", walk, "-m", tmp_path / "model", *options)
+    assert result.exit_code == 0, result.output
+    assert f"no poses: {tmp_path / 'walk-scene'} was reconstructed of it before" in result.stderr
+    assert "test views (1)" in result.stdout
+    assert "resumed at iteration 10" in run("train", walk, "-m", tmp_path / "model", "--resume").stderr
+    clsplat("eval", tmp_path / "model", "--no-report")
+    (walk / "walk_00.png").touch()
+    assert "was reconstructed of other photos" in error_of("train", walk, "-m", tmp_path / "other", *options)
+
+
+def test_too_few_photos(tmp_path: Path) -> None:
+    photo_walk.write_walk(tmp_path / "two", 2)
+    assert "2 photos that can be read; at least 3" in error_of("reconstruct", tmp_path / "two", "-o", tmp_path / "s")
+    assert "no such folder" in error_of("reconstruct", tmp_path / "none", "-o", tmp_path / "s")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["two"]
+
+
+def test_photos_that_do_not_fit_together(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    (tmp_path / "noise").mkdir()
+    for index in range(3):
+        Image.fromarray(rng.integers(0, 256, (40, 60, 3)).astype(np.uint8)).save(tmp_path / "noise" / f"{index}.png")
+    with pytest.raises(InputError, match="no two photos fit together"):
+        reconstruct(tmp_path / "noise", tmp_path / "scene")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["noise"]
+
+
+def test_a_crash_of_the_library_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A child that dies by a signal, and one that ends without a result."""
+    photo_walk.write_walk(tmp_path / "walk", 3)
+    start = subprocess.Popen
+    programs = {"signal SIGABRT": "import os; os.abort()", "exit code 3: out of luck":
+                "import sys; print('out of luck', file=sys.stderr); sys.exit(3)"}
+    for reason, program in programs.items():
+        monkeypatch.setattr("clsplat.scenes.reconstruct.sfm_process.subprocess.Popen", lambda command, program=program, **options: start(
+            [sys.executable, "-c", program], **options))
+        with pytest.raises(InputError, match=rf"structure from motion failed \({reason}"):
+            reconstruct(tmp_path / "walk", tmp_path / "scene")
+        assert [entry.name for entry in tmp_path.iterdir()] == ["walk"]
+
+
+def test_what_a_killed_run_left_goes_and_another_run_is_kept_out(tmp_path: Path) -> None:
+    left = tmp_path / ".scene.unfinished"
+    (left / "photos").mkdir(parents=True)
+    (left / "database.db").write_bytes(b"half")
+    with module._unfinished(tmp_path / "scene") as work:
+        assert work == left
+        assert not any(work.iterdir())
+    assert not left.exists()
+    left.mkdir()
+    program = "import sys; from clsplat.files.sole_writer import sole_writer; from pathlib import Path\n" \
+              "with sole_writer(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", program, left]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with pytest.raises(OutputError, match="another run writes"), module._unfinished(tmp_path / "scene"):
+            pass
+        other.communicate()
+    assert left.exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_ctrl_c_leaves_nothing(walk: Path, tmp_path: Path) -> None:
+    program = "from clsplat_cli.main import main; main()"
+    child = subprocess.Popen([sys.executable, "-c", program, "reconstruct", walk, "-o", tmp_path / "scene"],
+                             stderr=subprocess.PIPE, text=True,
+                             # Shells have their background jobs ignore it, and these what they start.
+                             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob(".scene.unfinished/database.db")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    child.send_signal(signal.SIGINT)
+    errors = child.communicate(timeout=60)[1]
+    assert child.returncode == 130
+    assert errors.splitlines()[-1] == "error: interrupted"
+    assert not list(tmp_path.iterdir())
+
+
+def test_estimate_grows_with_photos_and_their_size(tmp_path: Path) -> None:
+    small, large = tmp_path / "small.png", tmp_path / "large.png"
+    Image.new("L", (400, 300)).save(small)
+    Image.new("L", (4000, 3000)).save(large)
+    seconds = [module.estimated_seconds([PhotoFile(file.name, file)] * count) for file in (small, large)
+               for count in (20, 140)]
+    assert seconds[0] < min(seconds[1:3])
+    assert seconds[3] > 10 * seconds[2], "all pairs: faster than the photos"
+
+
+def test_pairs_of_a_sequence() -> None:
+    assert module._pairs(4, sequential=False) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    pairs = set(module._pairs(100, sequential=True))
+    assert {(0, 1), (0, 10), (5, 21), (5, 37), (0, 90), (30, 70)} <= pairs
+    assert not {(0, 11), (1, 91), (5, 5)} & pairs
+    assert len(pairs) < 0.4 * 99 * 50
+
+
+def test_warnings_of_photos_that_are_not_placed(tmp_path: Path) -> None:
+    from clsplat.files.images import PhotoFacts
+    from clsplat.scenes.reconstruct.photo_folder import Prepared
+
+    facts = PhotoFacts(8, 8, True, (), b"")
+    ready = [Prepared(PhotoFile(f"{n}.jpg", tmp_path), facts, f"{n}.jpg") for n in range(10)]
+    with pytest.warns(UserWarning, match=r"only 7 of 10 photos could be placed; left out are 7\.jpg, 8\.jpg, 9\.jpg\."):
+        module._warn_of_rest(tmp_path, ready, ready[:7], {"0": 7, "1": 2})
+    with pytest.warns(UserWarning, match=r"fall into 2 parts .* the largest \(8 photos\)"):
+        module._warn_of_rest(tmp_path, ready, ready[:8], {"0": 8, "1": 4})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        module._warn_of_rest(tmp_path, ready, ready, {"0": 10, "1": 4})
+
+
+def test_options(tmp_path: Path) -> None:
+    for name in ("CAMERA_MODELS", "CAMERA_MODES", "MATCHERS"):
+        assert getattr(cli, name) == getattr(module, name)
+    defaults = {param.name: param.default for param in cli.reconstruct_scene.params}
+    for name, value in vars(ReconstructOptions()).items():
+        assert defaults[name] == value
+    with pytest.raises(InputError, match="camera_model 'LENS': use one of SIMPLE_PINHOLE"):
+        ReconstructOptions(camera_model="LENS")
+    with pytest.raises(InputError, match="max_size 3: must be at least 64"):
+        ReconstructOptions(max_size=3)
+
+
+@pytest.mark.slow
+def test_fisheye_photos_become_pinhole_images(tmp_path: Path) -> None:
+    """Drawn with an equidistant lens: poses, focal length and, by them, the undistorted images come out right."""
+    photo_walk.write_walk(tmp_path / "walk", fisheye=True)
+    clsplat("reconstruct", tmp_path / "walk", "-o", tmp_path / "scene", "--camera-model", "OPENCV_FISHEYE")
+    scene = load_scene(tmp_path / "scene", eval=False)
+    assert scene.names == photo_walk.names()
+    off, angle = aligned_error(scene)
+    assert off < 0.02
+    assert angle < 1
+    assert scene.views[0].camera.fx == pytest.approx(photo_walk.FISHEYE_FOCAL, rel=0.05)
+
+
+@pytest.mark.slow
+def test_same_photos_same_model_and_a_video(walk: Path, tmp_path: Path) -> None:
+    """Bit for bit the same twice, from the API; and from a video of the photos."""
+    steps: list[Step] = []
+    files = []
+    for name in ("a", "b"):
+        reconstruct(walk, tmp_path / name, tell=steps.append)
+        files.append([(tmp_path / name / "sparse" / "0" / f"{stem}.bin").read_bytes()
+                      for stem in ("cameras", "images", "points3D")])
+    assert files[0] == files[1]
+    assert [step for step in steps if step.label == "photos placed"][-1] == Step("photos placed", 8, 8)
+    pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
+    from clsplat.files.video import VideoWriter
+
+    with VideoWriter(tmp_path / "walk.mp4", 10) as writer:
+        for index in range(photo_walk.N_PHOTOS):
+            writer.write(photo_walk.picture(index))
+    clsplat("train", tmp_path / "walk.mp4", "-m", tmp_path / "model", "--iterations", 5, "--cap-max", 300)
+    assert len(load_scene(tmp_path / "walk-scene").views) == 8

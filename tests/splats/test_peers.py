@@ -1,0 +1,223 @@
+"""Our files in other programs' readers: the values they find, not only that they open.
+
+Wants npm packages that are none of clsplat's:
+
+    npm install @playcanvas/splat-transform @mkkellogg/gaussian-splats-3d gsplat @sparkjsdev/spark
+    CLSPLAT_NODE_MODULES=$PWD/node_modules pytest tests/splats/test_peers.py
+
+Spark runs in Chromium (extra `test-view`); `pip install plyfile` adds that reader.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import threading
+from collections.abc import Callable
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reference_scenes import for_shape, random_splats
+
+from clsplat.splats.splat_file import read_splat, write_splat
+from clsplat.splats.splats import SH_C0, Splats
+from clsplat.splats.spz_file import read_spz, write_spz
+
+MODULES = Path(os.environ.get("CLSPLAT_NODE_MODULES", "/nonexistent"))
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+N = 40
+Found = dict[str, np.ndarray]
+
+# What a browser has and Node has not, as far as these packages ask for it when they are loaded.
+PRELUDE = """
+import fs from 'fs';
+globalThis.window = globalThis; globalThis.self = globalThis; globalThis.document = {createElement: () => ({})};
+const file = process.argv[2];
+const bytes = fs.readFileSync(file);
+const buffer = bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength);
+"""
+GS3D = PRELUDE + """
+const G = await import('@mkkellogg/gaussian-splats-3d');
+const read = file.endsWith('.ply') ? G.PlyParser.parseToUncompressedSplatArray(buffer, 3)
+                                   : G.SplatParser.parseStandardSplatToUncompressedSplatArray(buffer);
+console.log(JSON.stringify(read.splats));
+"""
+GSPLAT = PRELUDE + """
+const G = await import('gsplat');
+const loader = file.endsWith('.ply') ? G.PLYLoader : G.Loader;
+const data = loader.LoadFromArrayBuffer(buffer, new G.Scene()).data;
+console.log(JSON.stringify([data.positions, data.scales, data.rotations, data.colors].map(a => Array.from(a))));
+"""
+SPARK = """
+<script type="importmap">
+{"imports": {"three": "/three/build/three.module.js", "three/addons/": "/three/examples/jsm/"}}
+</script>
+<script type="module">
+import { PackedSplats } from "/@sparkjsdev/spark/dist/spark.module.js";
+window.read = async (file) => {
+  const bytes = new Uint8Array(await (await fetch("/files/" + file)).arrayBuffer());
+  const splats = new PackedSplats({ fileBytes: bytes, fileName: file });
+  await splats.initialized;
+  const rows = [];
+  splats.forEachSplat((i, c, s, q, o, k) =>
+    rows.push([c.x, c.y, c.z, s.x, s.y, s.z, q.w, q.x, q.y, q.z, o, k.r, k.g, k.b]));
+  return rows;
+};
+window.ready = true;
+</script>
+"""
+
+
+def package(name: str) -> None:
+    if not (MODULES / name).is_dir():
+        pytest.skip(f"CLSPLAT_NODE_MODULES names no folder with {name}")
+    if shutil.which("node") is None:
+        pytest.skip("there is no node")
+
+
+def node(tmp_path: Path, script: str, *arguments: object) -> str:
+    """Standard output of a script that finds the packages."""
+    (tmp_path / "node_modules").symlink_to(MODULES)
+    (tmp_path / "read.mjs").write_text(script)
+    command = ["node", str(tmp_path / "read.mjs"), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+
+
+def by_splat_transform(tmp_path: Path, file: Path) -> Found:
+    package("@playcanvas/splat-transform")
+    table = tmp_path / "read.csv"
+    subprocess.run(["node", MODULES / "@playcanvas/splat-transform" / "bin" / "cli.mjs", "-q", file, table], check=True,
+                   capture_output=True, timeout=60)
+    rows = np.genfromtxt(table, delimiter=",", names=True)
+
+    def columns(*names: str) -> np.ndarray:
+        return np.stack([rows[name] for name in names], axis=1)
+
+    found = {"mean": columns("x", "y", "z"), "scale": np.exp(columns("scale_0", "scale_1", "scale_2")),
+             "quat": columns("rot_0", "rot_1", "rot_2", "rot_3"), "opacity": 1 / (1 + np.exp(-rows["opacity"])),
+             "colour": 0.5 + SH_C0 * columns("f_dc_0", "f_dc_1", "f_dc_2")}
+    if "f_rest_44" in rows.dtype.names:
+        found["rest"] = columns(*(f"f_rest_{i}" for i in range(45))).reshape(-1, 3, 15).transpose(0, 2, 1)
+    return found
+
+
+def by_gaussian_splats_3d(tmp_path: Path, file: Path) -> Found:
+    package("@mkkellogg/gaussian-splats-3d")
+    rows = json.loads(node(tmp_path, GS3D, file))
+    table = np.array([[row[str(i)] if isinstance(row, dict) else row[i] for i in range(14)] for row in rows])
+    return {"mean": table[:, :3], "scale": table[:, 3:6], "quat": table[:, 6:10], "colour": table[:, 10:13] / 255,
+            "opacity": table[:, 13] / 255}
+
+
+def by_gsplat(tmp_path: Path, file: Path) -> Found:
+    package("gsplat")
+    places, scales, rotations, colours = (np.array(part) for part in json.loads(node(tmp_path, GSPLAT, file)))
+    colours = colours.reshape(-1, 4) / 255
+    return {"mean": places.reshape(-1, 3), "scale": scales.reshape(-1, 3), "quat": rotations.reshape(-1, 4),
+            "colour": colours[:, :3], "opacity": colours[:, 3]}
+
+
+def by_spark(tmp_path: Path, file: Path) -> Found:
+    package("@sparkjsdev/spark")
+    api = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium")
+    served = tmp_path / "served"
+    served.mkdir()
+    (served / "files").symlink_to(file.parent)
+    (served / "index.html").write_text(SPARK)
+    for name in ("three", "@sparkjsdev"):
+        (served / name).symlink_to(MODULES / name)
+    handler = type("Quiet", (SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=str(served)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        with api.sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+            page = browser.new_page()
+            page.goto(f"http://127.0.0.1:{server.server_port}/index.html")
+            page.wait_for_function("window.ready")
+            table = np.array(page.evaluate("file => window.read(file)", file.name))
+            browser.close()
+    finally:
+        server.shutdown()
+        server.server_close()
+    return {"mean": table[:, :3], "scale": table[:, 3:6], "quat": table[:, 6:10], "opacity": table[:, 10],
+            "colour": table[:, 11:]}
+
+
+def by_plyfile(tmp_path: Path, file: Path) -> Found:
+    plyfile = pytest.importorskip("plyfile")
+    rows = plyfile.PlyData.read(file)["vertex"].data
+    table = np.stack([rows[name] for name in rows.dtype.names[:62]], axis=1).astype(np.float64)
+    assert not table[:, 3:6].any()
+    return {"mean": table[:, :3], "colour": 0.5 + SH_C0 * table[:, 6:9],
+            "rest": table[:, 9:54].reshape(-1, 3, 15).transpose(0, 2, 1), "opacity": 1 / (1 + np.exp(-table[:, 54])),
+            "scale": np.exp(table[:, 55:58]), "quat": table[:, 58:]}
+
+
+# Relative, of scales; absolute, of the rest. Bytes are cut off or rounded; Spark packs what it reads.
+SPARK_ROUNDING = {"mean": 4e-3, "scale": 0.08, "quat": 0.03, "opacity": 3e-3, "colour": 3e-3}
+BYTES = {"mean": 1e-6, "scale": 1e-5, "quat": 0.01, "opacity": 4e-3, "colour": 4e-3, "rest": 1e-6}
+EXACT = dict.fromkeys(("mean", "scale", "quat", "opacity", "colour", "rest"), 2e-6)
+
+READERS: list[tuple[Callable[[Path, Path], Found], str, dict[str, float]]] = [
+    (by_splat_transform, "gaussian.ply", EXACT), (by_splat_transform, "skewed.ply", EXACT),
+    (by_splat_transform, "gaussian.spz", EXACT), (by_splat_transform, "gaussian.splat", EXACT | {"quat": 0.01}),
+    (by_gaussian_splats_3d, "gaussian.ply", BYTES), (by_gaussian_splats_3d, "skewed.ply", BYTES),
+    (by_gaussian_splats_3d, "gaussian.splat", BYTES),
+    (by_gsplat, "gaussian.ply", BYTES), (by_gsplat, "skewed.ply", BYTES), (by_gsplat, "gaussian.splat", BYTES),
+    (by_spark, "gaussian.ply", SPARK_ROUNDING), (by_spark, "skewed.ply", SPARK_ROUNDING),
+    (by_spark, "gaussian.spz", SPARK_ROUNDING), (by_spark, "gaussian.splat", SPARK_ROUNDING),
+    (by_plyfile, "gaussian.ply", EXACT), (by_plyfile, "skewed.ply", EXACT),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("files")
+    arrays = {name: values.astype(np.float32) for name, values in random_splats(7, N, 3).items()}
+    arrays["sh"] *= 0.3
+    Splats("skew-normal", arrays).save(folder / "skewed.ply")
+    gaussians = Splats("gaussian", for_shape(arrays, "gaussian"))
+    gaussians.save(folder / "gaussian.ply")
+    write_splat(folder / "gaussian.splat", gaussians)
+    write_spz(folder / "gaussian.spz", gaussians)
+    return folder
+
+
+@pytest.mark.parametrize(("reader", "name", "tolerances"), READERS,
+                         ids=[f"{reader.__name__[3:]}-{name}" for reader, name, _ in READERS])
+def test_others_find_our_values(files: Path, tmp_path: Path, reader: Callable[[Path, Path], Found], name: str,
+                                tolerances: dict[str, float]) -> None:
+    readers = {".ply": Splats.load, ".spz": read_spz, ".splat": read_splat}
+    ours = readers[Path(name).suffix](files / name)
+    found = reader(tmp_path, files / name)
+    unit = ours.quat / np.linalg.norm(ours.quat, axis=1, keepdims=True)
+    theirs = found["quat"] / np.linalg.norm(found["quat"], axis=1, keepdims=True)
+    wanted = {"mean": ours.mean, "scale": np.exp(ours.log_scale), "opacity": 1 / (1 + np.exp(-ours.opacity_logit)),
+              "colour": np.clip(0.5 + SH_C0 * ours.sh[:, 0], 0, 1), "rest": ours.sh[:, 1:]}
+    assert np.abs(np.abs(np.sum(unit * theirs, axis=1)) - 1).max() < tolerances["quat"]
+    for field in set(found) - {"quat"}:
+        values = np.clip(found[field], 0, 1) if field == "colour" else found[field]
+        relative = field == "scale"
+        np.testing.assert_allclose(values, wanted[field], rtol=tolerances[field] if relative else 0,
+                                   atol=1e-7 if relative else tolerances[field], err_msg=field)
+
+
+@pytest.mark.parametrize("name", ["back.ply", "back.spz"])
+def test_we_read_what_splat_transform_writes(files: Path, tmp_path: Path, name: str) -> None:
+    package("@playcanvas/splat-transform")
+    command = ["node", MODULES / "@playcanvas/splat-transform" / "bin" / "cli.mjs", "-q", "--spz-version", "3",
+               files / "gaussian.ply", tmp_path / name]
+    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    ours = Splats.load(files / "gaussian.ply")
+    back = read_spz(tmp_path / name) if name.endswith(".spz") else Splats.load(tmp_path / name)
+    np.testing.assert_allclose(back.mean, ours.mean, atol=1e-6 if name.endswith(".ply") else 2e-4)
+    np.testing.assert_allclose(back.log_scale, ours.log_scale, atol=1e-6 if name.endswith(".ply") else 0.04)
+    np.testing.assert_allclose(back.sh, ours.sh, atol=1e-6 if name.endswith(".ply") else 0.07)

@@ -1,0 +1,133 @@
+"""Kernels against the reference: cases computed once, and the comparison."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from reference import (
+    Rendered,
+    alpha_maps,
+    prepared,
+    project,
+    reference_gradients,
+    render_reference,
+    visible_order,
+)
+from reference_scenes import for_shape
+from tolerances import relative_error
+
+from clsplat.cameras.camera import Camera
+from clsplat.rendering import render
+from clsplat.rendering.kernels import ALPHA_MAX, ALPHA_MIN, T_MIN
+from clsplat.splats.shapes import NORMALISATIONS, SHAPES
+from clsplat.splats.splats import Splats
+
+Arrays = dict[str, NDArray[np.floating]]
+
+# (shape, normalisation) of every kernel there is.
+KERNELS = [
+    (shape.name, normalisation) for shape in SHAPES.values()
+    for normalisation in (NORMALISATIONS if shape.normalised else NORMALISATIONS[:1])
+]  # fmt: skip
+BACKGROUND = (0.2, 0.5, 0.9)
+SMOOTH = {"alpha_min": 0.0, "alpha_max": 1.0, "t_min": 0.0}
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One scene, one view, one loss, and what the reference says of them. `arrays` may lack the shape's own fields
+    (see `reference_scenes.for_shape`).
+
+    The values are rounded to `dtype` first, so that both sides see the same ones. A pixel is *decided* if no
+    alpha and no transmittance in it lies so close to a threshold that float32 may fall on the other side;
+    the loss is blind to the others and comparisons leave them out.
+    """
+
+    arrays: Arrays
+    camera: Camera
+    shape: str
+    normalisation: str = "peak"
+    dtype: type = np.float32
+    fields: tuple[str, ...] | None = None  # gradients wanted; None = all
+    seed: int = 0
+    thresholds: dict[str, float] = field(default_factory=dict)
+    antialiased: bool = False
+
+    @cached_property
+    def values(self) -> Arrays:
+        return {name: value.astype(self.dtype) for name, value in for_shape(self.arrays, self.shape).items()}
+
+    @cached_property
+    def splats(self) -> Splats:
+        return Splats(self.shape, self.values, self.normalisation, self.antialiased)
+
+    @cached_property
+    def image(self) -> Rendered:
+        return render_reference(self.values, self.camera, self.shape, self.normalisation, BACKGROUND,
+                                antialiased=self.antialiased, **self.thresholds)
+
+    @cached_property
+    def gradients(self) -> Arrays:
+        return reference_gradients(self.values, self.camera, *self.weights, self.shape, self.normalisation,
+                                   BACKGROUND, fields=self.fields, antialiased=self.antialiased, **self.thresholds)
+
+    @cached_property
+    def decided(self) -> NDArray[np.bool_]:
+        """(H, W)."""
+        shape = (self.camera.height, self.camera.width)
+        values = prepared(self.values, self.shape)
+        order = visible_order(values, self.camera, self.shape)
+        if self.thresholds or not len(order):
+            return np.ones(shape, bool)
+        ordered = {name: value[order] for name, value in values.items()}
+        screen = project(ordered, self.camera, self.shape, self.normalisation, antialiased=self.antialiased)
+        raw = alpha_maps(screen, self.camera, 0.0, np.inf)
+        behind = np.cumprod(1.0 - alpha_maps(screen, self.camera), axis=0)
+        size = np.abs(raw)
+        close = (np.abs(size / ALPHA_MIN - 1.0) < 3e-4) | (np.abs(size - ALPHA_MAX) < 1e-5)
+        close |= np.abs(behind / T_MIN - 1.0) < 2e-3
+        return ~close.any(axis=0).reshape(shape)
+
+    @cached_property
+    def weights(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Random v_color (H, W, 3) and v_alpha (H, W)."""
+        rng = np.random.default_rng(self.seed)
+        v_color, v_alpha = rng.normal(size=(*self.decided.shape, 3)), rng.normal(size=self.decided.shape)
+        return v_color * self.decided[..., None], v_alpha * self.decided
+
+    def render(self, renderer: render.Renderer) -> render.Rendered:
+        return renderer.render(self.splats, self.camera, BACKGROUND)
+
+    def backward(self, renderer: render.Renderer) -> Arrays:
+        return renderer.backward(*self.weights)
+
+    def check(self, renderer: render.Renderer, image_tolerance: float, gradient_tolerance: float) -> None:
+        """Render and differentiate; assert that both agree with the reference.
+
+        Images: largest absolute difference (depth: relative to the largest camera z). Gradients: largest
+        difference of a field relative to that field's largest entry, or to 1e-3 of the largest of all fields
+        where that is more: below it a field is the rounding of others (rotation of a ball, skew of m = 0).
+        """
+        got = self.render(renderer)
+        self.check_image(got, image_tolerance)
+        gradients = self.backward(renderer)
+        floor = 1e-3 * max(np.abs(value).max(initial=0.0) for value in gradients.values())
+        for name, want in self.gradients.items():
+            assert gradients[name].shape == want.shape, name
+            error = relative_error(gradients[name], want, floor)
+            assert error <= gradient_tolerance, f"gradient of {name}: off by {error:.1e}"
+
+    def check_image(self, got: render.Rendered, tolerance: float) -> None:
+        reach = float(np.abs(self.values["mean"]).sum(1).max(initial=0.0))
+        furthest = max(1.0, self.camera.translation[2] + reach)
+        assert self.decided.mean() > 0.8, "too few pixels left to compare"
+        for name, scale in (("color", 1.0), ("alpha", 1.0), ("depth", furthest)):
+            ours, reference = getattr(got, name), getattr(self.image, name)
+            assert ours.shape == reference.shape, name
+            assert np.isfinite(ours).all(), name
+            error = float(np.abs(ours - reference)[self.decided].max(initial=0.0)) / scale
+            assert error <= tolerance, f"{name}: off by {error:.1e}"

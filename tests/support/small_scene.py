@@ -1,0 +1,59 @@
+"""A small COLMAP scene to load, damage and look at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from clsplat.files.images import write_png
+from clsplat.scenes.colmap_files import ModelView, write_binary_model
+
+WIDTH, HEIGHT, N_VIEWS, N_POINTS = 40, 30, 9, 12
+FX, FY, CX, CY = 33.0, 31.0, 18.5, 16.25
+NAMES = [f"shot_{index}.png" for index in range(N_VIEWS)]
+
+
+def model_views() -> list[ModelView]:
+    """Nine views that turn and walk, each of 8 of the points."""
+    rng = np.random.default_rng(1)
+    views = []
+    for index, name in enumerate(NAMES):
+        angle = 0.1 * index
+        pose = np.eye(4)
+        pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        pose[:3, 3] = (0.3 * index, -0.2, 4.0)
+        seen = rng.permutation(N_POINTS)[:8]
+        pixels = rng.random((8, 2)) * HEIGHT
+        views.append(ModelView(name, (WIDTH, HEIGHT), (FX, FY, CX, CY), pose, pixels, seen))
+    return views
+
+
+def cloud() -> tuple[np.ndarray, np.ndarray]:
+    """Positions (P, 3) and colours of the points."""
+    rng = np.random.default_rng(2)
+    return rng.normal(size=(N_POINTS, 3)), rng.integers(0, 256, (N_POINTS, 3)).astype(np.uint8)
+
+
+def photo_of(index: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """A photo that tells its index and which side is up."""
+    image = np.zeros((height, width, 3), np.uint8)
+    image[..., 0], image[: height // 2, :, 1] = 20 * index, 200
+    return image
+
+
+def write_garden(parent: Path) -> Path:
+    """The scene's folder, written backwards so that order in the files is not the order of names."""
+    root = parent / "garden"
+    for index, name in enumerate(NAMES):
+        write_png(root / "images" / name, photo_of(index))
+    write_binary_model(root / "sparse" / "0", model_views()[::-1], *cloud())
+    return root
+
+
+def as_text(model: Path, target: Path) -> None:
+    """The model in `model`, written as text to `target`."""
+    import pycolmap
+
+    target.mkdir(parents=True, exist_ok=True)
+    pycolmap.Reconstruction(str(model)).write_text(str(target))

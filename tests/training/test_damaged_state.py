@@ -1,0 +1,87 @@
+"""Files that a run leaves for itself, changed by something else: named in one line, never a traceback."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fuzz_readers import make_checkpoint, make_model, read_checkpoint, read_model_folder
+
+from clsplat.errors import InputError
+from clsplat.training.checkpoint import Checkpoint
+from clsplat.training.config import TrainConfig
+from clsplat.training.model_folder import read_json
+
+
+def rewritten(path: Path, **changes: Any) -> None:
+    """The checkpoint with other arrays, or other values in its `meta`; None leaves one out."""
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    meta = json.loads(arrays["meta"].tobytes())
+    for name, value in changes.items():
+        place = arrays if name in arrays else meta
+        place[name] = value
+        if value is None:
+            del place[name]
+    if changes.get("meta", 1) is not None:
+        arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+    np.savez(path, **arrays)
+
+
+@pytest.mark.parametrize("changes", [
+    {"queue": None}, {"queue": [0, "one"]}, {"queue": [True]}, {"iteration": -1}, {"iteration": 2.5},
+    {"seconds": "long"}, {"seconds": float("nan")}, {"n_first": 0}, {"rng": {}}, {"rng": {"bit_generator": "MT19937"}},
+    {"version": "2\n2"}, {"meta": None}, {"signals": None}, {"signals": np.ones(3)}, {"splats.mean": np.ones((5, 3))},
+    {"splats.mean": np.array(["x"] * 6)}, {"splats.mean": None}, {"optimizer.m.mean": np.float32(1)},
+    {"config": {"iterations": "many"}}, {"config": [1]}, {"config": {"colour": 1}},
+], ids=str)
+def test_checkpoints_of_something_else(tmp_path: Path, changes: dict[str, Any]) -> None:
+    make_checkpoint(tmp_path)
+    read_checkpoint(tmp_path)
+    rewritten(tmp_path / "checkpoint.npz", **changes)
+    with pytest.raises(InputError) as caught:
+        read_checkpoint(tmp_path)
+    assert "\n" not in str(caught.value)
+    if "config" not in changes:
+        with pytest.raises(InputError, match=r"checkpoint\.npz: "):
+            Checkpoint.load(tmp_path / "checkpoint.npz")
+
+
+@pytest.mark.parametrize(("values", "said"), [
+    ({"iterations": "many"}, "iterations is the text 'many'; expected a whole number"),
+    ({"iterations": 2.5}, "expected a whole number"), ({"iterations": True}, "iterations is true"),
+    ({"lambda_dssim": float("inf")}, "expected a finite number"),
+    ({"background": [0, 0]}, "expected a list"), ({"save_iterations": 3}, "expected a list"),
+    ({"save_iterations": ["a"]}, "expected a list"), ({"visible_adam": 1}, "expected true or false"),
+    ({"device": 3}, "or null"), ({"iterations": None}, "iterations is null"), ([], "config: is a list"),
+])
+def test_options_of_another_kind_are_named(values: Any, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        TrainConfig.from_json(values)
+
+
+def test_options_come_back() -> None:
+    for config in (TrainConfig(), TrainConfig(strategy="mcmc", save_iterations=(3, 4), device="cpu", skew_lr=0.1)):
+        assert TrainConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
+    assert TrainConfig.from_json({"init_opacity": None, "skew_lr": None}) == TrainConfig()
+
+
+@pytest.mark.parametrize(("config", "said"), [
+    ("[" * 100_000, "is no JSON"), ('{"config": {"background": [0, 0, NaN]}}', "background"),
+    ('{"config": {"background": [0, 0, 2]}}', "from 0 to 1"), ('{"scene": {"test_names": [3]}}', "must be names"),
+])
+def test_model_folders(tmp_path: Path, config: str, said: str) -> None:
+    make_model(tmp_path)
+    read_model_folder(tmp_path)
+    (tmp_path / "config.json").write_text(config)
+    with pytest.raises(InputError, match=said):
+        read_model_folder(tmp_path)
+
+
+def test_json_that_is_no_object(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text("[1]")
+    with pytest.raises(InputError, match="expected a JSON object"):
+        read_json(tmp_path / "a.json")

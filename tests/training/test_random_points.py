@@ -1,0 +1,79 @@
+"""Random points: where the cameras look, denser where more of them do."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clsplat.cameras.camera import Camera
+from clsplat.training.random_points import random_points, seen
+
+
+def looking(places: np.ndarray, at: np.ndarray, field: float = 0.7) -> list[Camera]:
+    """Square cameras of an angle of view [rad] that look at a point, y down."""
+    cameras = []
+    for place in places:
+        forward = (at - place) / np.linalg.norm(at - place)
+        right = np.cross([0.0, 0.0, 1.0], forward)
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
+        focal = 16 / np.tan(field / 2)
+        cameras.append(Camera(32, 32, focal, focal, 16, 16, pose))
+    return cameras
+
+
+def scene(cameras: list[Camera], extent: float = 4.0) -> Any:
+    return SimpleNamespace(train=[SimpleNamespace(camera=camera) for camera in cameras], extent=extent)
+
+
+def ring(n: int = 12, radius: float = 4.0) -> np.ndarray:
+    turn = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(n, 1.0)], axis=1)
+
+
+def lookers(cameras: list[Camera], xyz: np.ndarray) -> np.ndarray:
+    return np.sum([seen(camera, xyz)[1] for camera in cameras], axis=0)
+
+
+@pytest.mark.parametrize("middle", [(0.0, 0.0, 0.0), (50.0, -20.0, 7.0)])
+def test_half_of_them_are_where_most_cameras_look(middle: tuple[float, float, float]) -> None:
+    at = np.array(middle)
+    cameras = looking(ring() + at, at)
+    xyz = random_points(scene(cameras), 2000, np.random.default_rng(0))
+    assert xyz.shape == (2000, 3)
+    count = lookers(cameras, xyz)
+    assert (count >= 2).all()
+    assert 0.5 <= np.mean(count >= 9) < 0.8
+    assert np.mean(np.linalg.norm(xyz - at, axis=1) < 4) > 0.5, "within the ring"
+    assert np.linalg.norm(xyz - at, axis=1).max() > 12, "and far behind it"
+
+
+def test_the_scale_of_the_world_does_not_matter() -> None:
+    small, large = (random_points(scene(looking(size * ring(), np.zeros(3)), 4.0 * size), 500, np.random.default_rng(3))
+                    for size in (1.0, 1000.0))
+    np.testing.assert_allclose(1000 * small, large, rtol=1e-6)
+
+
+def test_parallel_cameras_look_ahead() -> None:
+    """A row of them along x, looking along z."""
+    cameras = []
+    for x in (4.0, 5.0, 6.0):
+        pose = np.eye(4)
+        pose[0, 3] = -x
+        cameras.append(Camera(20, 10, 5, 5, 10, 5, pose))
+    xyz = random_points(scene(cameras, 1.1), 400, np.random.default_rng(0))
+    assert (lookers(cameras, xyz) >= 2).all()
+    assert (xyz[:, 2] > 0).all()
+
+
+def test_one_camera_and_cameras_in_one_place_do() -> None:
+    one = looking(ring(1), np.zeros(3))
+    assert (lookers(one, random_points(scene(one, 1.0), 200, np.random.default_rng(0))) == 1).all()
+    turned = looking(np.tile([0.0, 0.0, 1.0], (8, 1)), np.array([3.0, 0.0, 1.0]))
+    xyz = random_points(scene(turned, 0.0), 100, np.random.default_rng(0))
+    assert np.isfinite(xyz).all()

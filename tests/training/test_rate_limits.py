@@ -1,0 +1,28 @@
+"""rate_limits.py: what is refused, and that the defaults never are."""
+
+from __future__ import annotations
+
+import pytest
+
+from clsplat.errors import InputError
+from clsplat.training.config import TrainConfig
+from clsplat.training.presets import PRESETS, preset
+from clsplat.training.rate_limits import LIMITS, check_rates
+
+
+@pytest.mark.parametrize("iterations", [1, 10, 200, 30_000])
+def test_defaults_and_presets_pass(iterations: int) -> None:
+    check_rates(TrainConfig(iterations=iterations))
+    for name in PRESETS:
+        check_rates(TrainConfig(**(preset(name) | {"iterations": iterations})))
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_a_hundred_times_the_rate_is_refused_with_what_would_do(name: str) -> None:
+    rate = 100 * getattr(TrainConfig(), name)
+    if name == "position_lr_final":  # 100 times is the rate at the start
+        rate *= 100
+    with pytest.raises(InputError, match=rf"^{name} .* of 200 iterations .*: use at most [\d.e-]+$") as caught:
+        check_rates(TrainConfig(iterations=200, **{name: rate}))
+    most = float(str(caught.value).rsplit(" ", 1)[1])
+    check_rates(TrainConfig(iterations=200, **{name: most}))

@@ -1,0 +1,128 @@
+"""strategy.py: which plan the options ask for, and when."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from model_arrays import Arrays, random_model
+
+from clsplat.errors import InputError
+from clsplat.splats import shapes
+from clsplat.training.config import BY_STRATEGY, STRATEGIES, TrainConfig
+from clsplat.training.density import strategy
+from clsplat.training.density.densify import relocation
+from clsplat.training.density.plan import Plan
+from clsplat.training.density.strategy import Moment
+
+N = 100
+
+
+def action(config: TrainConfig, iteration: int = 100, seed: int = 0, arrays: Arrays | None = None,
+           signals: np.ndarray | None = None) -> tuple[Arrays, Plan]:
+    shape = shapes.shape_named(config.shape)
+    arrays = random_model(shape, N, 1) if arrays is None else arrays
+    signals = np.zeros((3, N)) if signals is None else signals
+    moment = Moment(iteration, int(config.densify_until * config.iterations), 1.5, 1.0)
+    return arrays, strategy.plan(config, arrays, signals, np.random.default_rng(seed), moment)
+
+
+def mcmc(**options: Any) -> TrainConfig:
+    return TrainConfig(strategy="mcmc", **options)
+
+
+def test_mcmc_relocates_and_grows_by_the_options() -> None:
+    config = mcmc(shape="gaussian", cap_max=130, iterations=3000)
+    arrays, plan = action(config)
+    assert len(plan.source) == 130
+    dead = np.sum(shapes.GAUSSIAN.strength(arrays) <= 0.005)
+    assert plan.relocated == dead > 10
+    _, few = action(mcmc(shape="gaussian", cap_max=130, relocation_limit=0.05))
+    assert few.relocated == 5
+    _, flat = action(mcmc(shape="gaussian", cap_max=130, relocation="opacity-only"))
+    assert "log_scale" not in flat.values
+
+
+def test_length_squared_is_twice_the_log_factor() -> None:
+    shifts = []
+    for rule in ("length", "length-squared"):
+        arrays, plan = action(mcmc(shape="gaussian", cap_max=130, relocation=rule))
+        shifts.append(plan.values["log_scale"] - arrays["log_scale"][plan.source])
+    assert shifts[0].min() < -0.01
+    np.testing.assert_allclose(shifts[1], 2 * shifts[0], atol=1e-5)
+    size = np.bincount(plan.source, minlength=N)
+    row = int(size.argmax())
+    _, factor = relocation(shapes.GAUSSIAN, {k: a[row : row + 1] for k, a in arrays.items()}, size[row : row + 1])
+    np.testing.assert_allclose(shifts[0][row], np.log(factor[0]), atol=1e-5)
+
+
+@pytest.mark.parametrize(("normalisation", "scaled"), [("peak", True), ("pdf", False), ("none", False)])
+def test_a_kernel_without_peak_one_keeps_its_scale(normalisation: str, scaled: bool) -> None:
+    _, plan = action(mcmc(shape="skew-normal", normalisation=normalisation, cap_max=130))
+    assert ("log_scale" in plan.values) == scaled
+
+
+def test_pull_is_read_only_when_asked_for() -> None:
+    signals = np.zeros((3, N))
+    arrays, _ = action(mcmc())
+    wanted = int(np.flatnonzero(shapes.SKEW_NORMAL.strength(arrays) > 0.005)[7])
+    signals[0, wanted] = 1.0
+    _, plan = action(mcmc(sampling="pull"), signals=signals)
+    assert (plan.source[N:] == wanted).all()
+    _, plan = action(mcmc(sampling="opacity"), signals=signals)
+    assert not (plan.source[N:] == wanted).all()
+
+
+def adc(**options: object) -> TrainConfig:
+    return TrainConfig(**({"shape": "gaussian", "strategy": "adc", "iterations": 30_000, "opacity_reset": 10,
+                           "cap_max": 1000} | options))  # type: ignore[arg-type]
+
+
+def test_adc_resets_when_3dgs_does() -> None:
+    config = adc()
+    at = [it for it in range(100, 15_001, 100) if action(config, it)[1].reset_fields]
+    assert at == [3000, 6000, 9000, 12_000]
+    assert not any(action(adc(opacity_reset=0), it)[1].reset_fields for it in at)
+    # A multiple that no action falls on is made up for at the next action, once.
+    odd = adc(iterations=7000, opacity_reset=7, densify_interval=300, densify_until=0.8)
+    assert [it for it in range(300, 5601, 300) if action(odd, it)[1].reset_fields] == [1200, 2100, 3000, 4200, 5100]
+
+
+def test_adc_looks_at_sizes_after_the_first_reset() -> None:
+    arrays = random_model(shapes.GAUSSIAN, N, 1, dead=0)
+    arrays["log_scale"][:] = -5
+    arrays["log_scale"][0] = 0  # as large as the scene
+    for iteration, config, kept in ((3000, adc(), True), (3100, adc(), False), (9000, adc(opacity_reset=0), True)):
+        assert (0 in action(config, iteration, arrays=arrays)[1].source) == kept
+
+
+def test_adc_hands_on_its_options() -> None:
+    arrays = random_model(shapes.GAUSSIAN, N, 1, dead=0)
+    signals = np.zeros((3, N))
+    signals[:3, 5] = (0.1, 1.0, 1.0)
+    assert len(action(adc(), arrays=arrays, signals=signals)[1].source) == N + 1
+    assert len(action(adc(grad_threshold=0.2), arrays=arrays, signals=signals)[1].source) == N
+    deep = adc(grad_threshold=0.2, depth_threshold=0.5)
+    assert len(action(deep, arrays=arrays, signals=signals)[1].source) == N + 1
+    assert len(action(adc(cap_max=N), arrays=arrays, signals=signals)[1].source) == N
+    size = float(np.exp(arrays["log_scale"][5].max()))
+    assert "log_scale" in action(adc(dense_size=size / 2), arrays=arrays, signals=signals)[1].values
+    cloned = action(adc(dense_size=size * 2), arrays=arrays, signals=signals)[1]
+    assert np.array_equal(cloned.apply(arrays)["log_scale"], arrays["log_scale"][cloned.source])
+
+
+def test_short_runs_leave_opacities_the_time_to_recover() -> None:
+    config = adc(iterations=4000, densify_until=0.9)
+    assert [it for it in range(100, 3601, 100) if action(config, it)[1].reset_fields] == [1000, 2000, 3000]
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_options_that_are_not_given_are_the_strategys_own(name: str) -> None:
+    config = TrainConfig(strategy=name, noise_lr=7.0)
+    assert config == TrainConfig.from_json(config.to_json())
+    own = BY_STRATEGY[name] | {"noise_lr": 7.0}
+    assert {key: getattr(config, key) for key in own} == own
+    assert TrainConfig() == TrainConfig(strategy=TrainConfig().strategy, **BY_STRATEGY[TrainConfig().strategy])
+    with pytest.raises(InputError, match="opacity_reg -1: must be at least 0"):
+        TrainConfig(strategy=name, opacity_reg=-1)
