@@ -27,10 +27,10 @@ import common
 import numpy as np
 
 from clsplat.device.device import Device, Schedule, open_device
-from clsplat.device.launches import recorded
+from clsplat.device.trace import recorded
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.arithmetic import EXP_FORMS, PHI_FORMS, Arithmetic
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.splats.shapes import NORMALISATIONS, shape_named
 from clsplat.splats.splats import Splats

@@ -23,19 +23,19 @@ from typing import Any
 import common
 
 from clsplat.comparison.compare import RUNS, RunFile, digest, scene_identity, warm_up
-from clsplat.comparison.compare_table import MEASURED, Record
-from clsplat.compression.budget import train_budget
-from clsplat.compression.budget_rules import BudgetOptions
-from clsplat.compression.budget_state import FILE
+from clsplat.comparison.table import MEASURED, Record
+from clsplat.compression.rules import BudgetOptions
+from clsplat.compression.search import train_budget
+from clsplat.compression.state import FILE
 from clsplat.device.device import open_device
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.evaluation.metrics import DEFAULT_PROTOCOL
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.rendering.tuning import schedule_for
 from clsplat.scenes.scene import load_scene
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.config import TrainConfig
-from clsplat.training.memory import peak_bytes
+from clsplat.training.memory_estimate import peak_bytes
 
 OUT = common.RESULTS / "budget"
 RESOLUTION = {"fox": 2}  # of load_scene; others as they are

@@ -21,11 +21,11 @@ from typing import NamedTuple
 import common
 
 from clsplat.comparison.compare import Run, compare
-from clsplat.comparison.compare_table import HEAD, Record, cells, notes, repeats, summarise
-from clsplat.comparison.frontier import distinct, read_runs, write_report
-from clsplat.comparison.frontier_data import auto_rows, equal_rows, point_rows, seed_rows
-from clsplat.comparison.frontier_tables import Table, auto_table, equal_table, seed_table
-from clsplat.comparison.systems import parse_systems
+from clsplat.comparison.methods import parse_systems
+from clsplat.comparison.sweep import distinct, read_runs, write_report
+from clsplat.comparison.sweep_rows import auto_rows, equal_rows, point_rows, seed_rows
+from clsplat.comparison.sweep_tables import Table, auto_table, equal_table, seed_table
+from clsplat.comparison.table import HEAD, Record, cells, notes, repeats, summarise
 from clsplat.scenes.scene import load_scene
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.presets import PRESETS

@@ -6,7 +6,7 @@ Two measures, both relative to the field's gradient in the Euclidean norm:
   differences  double build, thresholds 0, against central finite differences of the rendered image itself, over
                every parameter (random per-pixel weights, non-square image, off-centre principal point)
   reference    float32 build with the usual thresholds, against the exact (complex-step) gradient of the independent
-               NumPy renderer in tests/reference/reference.py
+               NumPy renderer in tests/reference/renderer.py
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from reference import reference_gradients
 from reference_scenes import random_camera, random_splats
 
 from clsplat.cameras.camera import Camera
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.rendering.tuning import schedule_for
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats

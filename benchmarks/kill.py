@@ -28,7 +28,7 @@ import numpy as np
 
 from clsplat.device.device import open_device
 from clsplat.errors import ClsplatError
-from clsplat.scenes.demo.capture import write_capture
+from clsplat.scenes.demo.scene import write_capture
 from clsplat.splats.splats import Splats
 from clsplat.training.checkpoint import Checkpoint
 

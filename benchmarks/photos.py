@@ -53,7 +53,7 @@ def main() -> None:
 
 def run(place: str, shape: str, options: str, seed: int, args: argparse.Namespace) -> None:
     """One run; appends its line."""
-    from clsplat.comparison.systems import parse_systems
+    from clsplat.comparison.methods import parse_systems
     from clsplat.device.device import open_device
     from clsplat.rendering.tuning import schedule_for
     from clsplat.scenes.scene import load_scene

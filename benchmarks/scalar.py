@@ -50,8 +50,8 @@ def run(name: str, shape: str, args: argparse.Namespace) -> dict[str, Any]:
     from clsplat.device.device import Schedule, open_device
     from clsplat.profiling.bench import bench_trainer
     from clsplat.rendering.tuning import SCHEDULE_VARIABLE
+    from clsplat.scenes.random_scene import synthetic_scene
     from clsplat.scenes.scene import load_scene
-    from clsplat.scenes.synthetic import synthetic_scene
 
     device, load = open_device(args.device), os.getloadavg()[0]
     schedules = [str(Schedule.parse(schedule)) for schedule in args.schedules]
@@ -79,7 +79,7 @@ def run(name: str, shape: str, args: argparse.Namespace) -> dict[str, Any]:
 
 def timed_step(trainer: Any) -> dict[str, float]:
     """Milliseconds of one training step: of the rasteriser's two stages on the device, and of the whole step."""
-    from clsplat.device.launches import recorded
+    from clsplat.device.trace import recorded
 
     trainer.device.queue.finish()
     with recorded(trainer.device) as launches:

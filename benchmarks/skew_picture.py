@@ -14,10 +14,10 @@ import numpy as np
 
 from clsplat.cameras.cameras_json import read_cameras
 from clsplat.files.images import write_png
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import SKEW_LIMIT
 from clsplat.splats.splats import SH_C0, Splats
-from clsplat.training.model_folder import ModelFolder
+from clsplat.training.folder import ModelFolder
 
 
 def main() -> None:

@@ -7,7 +7,7 @@
     python benchmarks/stages.py --smoke --out FILE            # a few seconds, for tests
 
 Real scenes are at full size (at most 1600 px wide) and start from their points; synthetic ones have about the same
-useful pairs a pixel at every count (clsplat/scenes/synthetic.py). A case that is in the file for this commit and device is
+useful pairs a pixel at every count (clsplat/scenes/random_scene.py). A case that is in the file for this commit and device is
 skipped: kill and restart at will. Times are medians, of the device's own clock but for `wall`, `host` and `strategy`.
 `load` is the machine's one-minute load at the start of a case: where others were at work the numbers are worth little.
 """
@@ -80,11 +80,11 @@ def run(case: dict[str, Any], device_name: str | None, iterations: int, out: Pat
     """One case; appends its line. limits : how they are measured, if not as usual."""
     from clsplat.device.device import open_device
     from clsplat.profiling.bench import bench_trainer, measure_render, measure_training
-    from clsplat.profiling.limits import measure_limits
+    from clsplat.profiling.roofline import measure_limits
     from clsplat.rendering.tuning import schedule_for
+    from clsplat.scenes.random_scene import synthetic_scene
     from clsplat.scenes.scene import load_scene
-    from clsplat.scenes.synthetic import synthetic_scene
-    from clsplat.training.memory import peak_bytes
+    from clsplat.training.memory_estimate import peak_bytes
 
     device, load = open_device(device_name), os.getloadavg()[0]
     environment = common.environment(device, schedule_for(device))

@@ -55,7 +55,7 @@ def measure(args: argparse.Namespace, folder: Path) -> None:
     from clsplat.cameras.cameras_json import NamedCamera, write_cameras
     from clsplat.device.device import open_device
     from clsplat.rendering.tuning import schedule_for
-    from clsplat.scenes.synthetic import synthetic_scene
+    from clsplat.scenes.random_scene import synthetic_scene
 
     device = open_device(args.device)
     schedule = schedule_for(device)

@@ -22,8 +22,8 @@ from typing import NamedTuple
 import common
 
 from clsplat.comparison.compare import RUNS, Run, compare
-from clsplat.comparison.compare_table import Record, markdown
-from clsplat.comparison.systems import System, parse_systems
+from clsplat.comparison.methods import System, parse_systems
+from clsplat.comparison.table import Record, markdown
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.config import TrainConfig

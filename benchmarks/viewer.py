@@ -88,7 +88,7 @@ def training_command(scene: str, model: Path, args: argparse.Namespace) -> list[
 def path_of(model: Path) -> list[Any]:
     """Cameras on the way through some training cameras, the same in both processes."""
     from clsplat.cameras.cameras_json import read_cameras
-    from clsplat.cameras.paths_between import interpolate
+    from clsplat.cameras.interpolate import interpolate
 
     cameras = [item.camera for item in read_cameras(model / "cameras.json")]
     return interpolate(cameras[:: max(len(cameras) // KEYS, 1)][:KEYS], FRAMES)
@@ -166,7 +166,7 @@ class Walker:
 
     def wait_for(self, number: int, full: bool, timeout: float = 60.0) -> float:
         """When a picture of this pose came, of full size if wanted."""
-        from clsplat.viewer.viewer_settings import DEFAULT_SIZE
+        from clsplat.viewer.settings import DEFAULT_SIZE
 
         end = time.perf_counter() + timeout
         while time.perf_counter() < end:
@@ -256,10 +256,10 @@ def watch_training(scene: str, args: argparse.Namespace) -> None:
     from clsplat.rendering.tuning import schedule_for
     from clsplat.scenes.scene import load_scene
     from clsplat.training.config import TrainConfig
-    from clsplat.training.training import train
-    from clsplat.viewer.viewer_server import Server
-    from clsplat.viewer.viewer_start import start_of
-    from clsplat.viewer.viewer_training import TrainingView
+    from clsplat.training.run import train
+    from clsplat.viewer.server import Server
+    from clsplat.viewer.start import start_of
+    from clsplat.viewer.training import TrainingView
 
     loaded = load_scene(common.data_folder() / scene, resolution=SCENES.get(scene, -1), eval=True)
     config = TrainConfig(iterations=args.iterations, cap_max=args.cap_max, device=args.device)

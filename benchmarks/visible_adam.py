@@ -66,7 +66,7 @@ def main() -> None:
 def run(task: str, name: str, n: int, shape: str, options: str, seed: int, iterations: int,
         args: argparse.Namespace) -> None:
     """One run; appends its line."""
-    from clsplat.comparison.systems import parse_systems
+    from clsplat.comparison.methods import parse_systems
     from clsplat.device.device import open_device
     from clsplat.rendering.tuning import schedule_for
     from clsplat.scenes.scene import load_scene
@@ -98,8 +98,8 @@ def run(task: str, name: str, n: int, shape: str, options: str, seed: int, itera
 
 def measure(trainer: Any, iterations: int) -> dict[str, Any]:
     """Train, and look closely at some of the iterations."""
-    from clsplat.device.buffers import to_host
-    from clsplat.device.launches import recorded
+    from clsplat.device.memory import to_host
+    from clsplat.device.trace import recorded
     from clsplat.profiling.stages import by_stage
 
     lanes, queue, seconds = trainer.kernels.lanes, trainer.device.queue, 0.0
@@ -139,7 +139,7 @@ def measure(trainer: Any, iterations: int) -> dict[str, Any]:
 def wide_scene(n: int, shape: str, size: tuple[int, int]) -> Any:
     """A synthetic scene through long lenses, and its splats along a Morton curve."""
     from clsplat.cameras.camera import Camera
-    from clsplat.scenes.synthetic import synthetic_scene
+    from clsplat.scenes.random_scene import synthetic_scene
     from clsplat.splats.morton import morton_order
     from clsplat.splats.splats import Splats
 

@@ -18,7 +18,7 @@ from .errors import reported
 
 if TYPE_CHECKING:
     from clsplat.cameras.camera import Camera
-    from clsplat.cameras.camera_path import CameraPath
+    from clsplat.cameras.path import CameraPath
 
 _CLIP = (0.01, 1e5)  # world units; clsplat's own near plane, and beyond any sky
 _FILTER = bpy.props.StringProperty(default="*.json", options={"HIDDEN"})
@@ -89,7 +89,7 @@ def camera_at(context: Any, item: Any, parent: Any = None) -> Camera:
     import numpy as np
 
     from clsplat.errors import InputError
-    from clsplat.splats.placing import similarity
+    from clsplat.splats.transform import similarity
 
     from .lens import camera_of, moved
 
@@ -129,9 +129,9 @@ class ImportCameras(bpy.types.Operator, ImportHelper):  # type: ignore[misc]
 
     @reported
     def execute(self, context: Any) -> set[str]:
-        from clsplat.cameras.camera_path import path_of
         from clsplat.cameras.cameras_json import cameras_of
-        from clsplat.files.json_fields import read_json
+        from clsplat.cameras.path import path_of
+        from clsplat.files.json_file import read_json
 
         file = Path(bpy.path.abspath(self.filepath))
         content, parent = read_json(file, "a camera_path.json or a cameras.json"), splats_of(context)
@@ -187,7 +187,7 @@ class ExportCameras(bpy.types.Operator, ExportHelper):  # type: ignore[misc]
 
 def write_path_of(context: Any, file: Path, parent: Any = None) -> None:
     """The scene's camera over the scene's frames as camera_path.json; the scene's frame stays what it was."""
-    from clsplat.cameras.camera_path import CameraPath, write_path
+    from clsplat.cameras.path import CameraPath, write_path
 
     scene = context.scene
     before, frames = scene.frame_current, []

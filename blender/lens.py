@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.cameras.camera import Camera
-from clsplat.cameras.camera_path import cam_from_world_of, pose_of
+from clsplat.cameras.path import cam_from_world_of, pose_of
 from clsplat.errors import InputError
 
 SENSOR = 36.0  # Blender's own sensor width [mm]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from clsplat.cameras.camera import Camera
 from clsplat.errors import InputError
-from clsplat.rendering.render import Rendered, Renderer
-from clsplat.splats.placing import joined, placed, similarity
+from clsplat.rendering.renderer import Rendered, Renderer
 from clsplat.splats.splats import Splats
+from clsplat.splats.transform import joined, placed, similarity
 
 from .lens import moved
 

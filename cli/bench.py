@@ -56,7 +56,7 @@ def bench(ctx: click.Context, source_path: Path | None, images: str | None, reso
     from clsplat.device.device import open_device
     from clsplat.files.atomic import atomic_writer
     from clsplat.profiling.bench import bench_trainer, measure_render, measure_training
-    from clsplat.profiling.limits import measure_limits
+    from clsplat.profiling.roofline import measure_limits
 
     if source_path is None and (images or resolution is not None or model_path):
         raise click.UsageError("-i, -r and -m belong to a scene: give it with -s")
@@ -68,7 +68,7 @@ def bench(ctx: click.Context, source_path: Path | None, images: str | None, reso
     if source_path is not None:
         scene, start = _read(source_path, images, resolution, model_path, splats)
     else:
-        from clsplat.scenes.synthetic import synthetic_scene
+        from clsplat.scenes.random_scene import synthetic_scene
 
         scene, start = synthetic_scene(splats or SPLATS, width, height, shape or DEFAULT_SHAPE, sh_degree)
     kernel = shape or (DEFAULT_SHAPE if isinstance(start, int) else start.shape)

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from clsplat.compression.budget_rules import TOLERANCE, BudgetOptions
-from clsplat.compression.budget_state import FILE, BudgetState
+from clsplat.compression.rules import TOLERANCE, BudgetOptions
+from clsplat.compression.state import FILE, BudgetState
 from clsplat.errors import InputError, OutputError
-from clsplat.files.sole_writer import sole_writer
+from clsplat.files.lock import sole_writer
 from clsplat.training.config import TrainConfig
 
 from .options import Decibels, F
 from .progress import TrainingDisplay
 
 if TYPE_CHECKING:
-    from clsplat.compression.budget import Budgeted
+    from clsplat.compression.search import Budgeted
     from clsplat.scenes.scene import Scene
 
 INTERRUPTED = 130
@@ -84,7 +84,7 @@ def stored_search(folder: Path) -> tuple[dict[str, Any], BudgetOptions, dict[str
 def run_search(ctx: click.Context, scene: Scene, config: TrainConfig, options: BudgetOptions, model_path: Path,
                record: dict[str, Any], resume: bool, overwrite: bool, quiet: bool) -> None:
     """Search with a live display, and say what was found."""
-    from clsplat.compression.budget import train_budget
+    from clsplat.compression.search import train_budget
 
     result: Budgeted | None = None
     try:
@@ -104,7 +104,7 @@ def run_search(ctx: click.Context, scene: Scene, config: TrainConfig, options: B
         click.echo(chart)
     if scene.test:
         from clsplat.evaluation.evaluate import evaluate
-        from clsplat.rendering.render import Renderer
+        from clsplat.rendering.renderer import Renderer
 
         metrics = evaluate(Renderer(config.device), result.splats, scene.test, config.background)
         click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")

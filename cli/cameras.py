@@ -13,7 +13,7 @@ from .options import PATH, iteration_option, overwrite_option, quiet_option
 
 if TYPE_CHECKING:
     from clsplat.scenes.colmap import Points
-    from clsplat.scenes.lens import Photo
+    from clsplat.scenes.undistort import Photo
 
 FORMATS = ("transforms", "colmap", "colmap-text", "cameras")
 OPAQUE = 0.5  # splats of this opacity and above are points of a model
@@ -38,7 +38,7 @@ def write_cameras_of(source: Path, output: Path, form: str | None, images: str |
     or camera path. Cameras of models are those of its training images: free of distortion, at the size they were
     reduced to; images/NAME.png is then the name of each, and the centres of opaque splats are the points.
     """
-    from clsplat.scenes.camera_files import relative_files, write_colmap, write_transforms
+    from clsplat.scenes.export import relative_files, write_colmap, write_transforms
 
     if form is None:
         form = "cameras" if output.name == "cameras.json" else "transforms" if output.suffix == ".json" else "colmap"
@@ -79,11 +79,11 @@ def _of_model(source: Path, iteration: int | None) -> tuple[list[Photo], Points]
     """Photos of a model's or a file's cameras, and a model's opaque splats."""
     import numpy as np
 
-    from clsplat.cameras.camera_path import read_path
     from clsplat.cameras.cameras_json import NamedCamera, read_cameras
-    from clsplat.files.json_fields import read_json
+    from clsplat.cameras.path import read_path
+    from clsplat.files.json_file import read_json
     from clsplat.scenes.colmap import Points
-    from clsplat.scenes.lens import Photo, make_lens
+    from clsplat.scenes.undistort import Photo, make_lens
     from clsplat.splats.shapes import shape_named
     from clsplat.splats.splats import SH_C0
 
@@ -113,7 +113,7 @@ def _of_model(source: Path, iteration: int | None) -> tuple[list[Photo], Points]
 
 def _write_3dgs(output: Path, photos: list[Photo]) -> None:
     from clsplat.cameras.cameras_json import named_cameras, write_cameras
-    from clsplat.scenes.lens import is_pinhole, pinhole_camera
+    from clsplat.scenes.undistort import is_pinhole, pinhole_camera
 
     bent = [photo for photo in photos if not is_pinhole(photo.lens)]
     if bent:

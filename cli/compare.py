@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.comparison.systems import DEFAULT, parse_systems
+from clsplat.comparison.methods import DEFAULT, parse_systems
 from clsplat.errors import InputError
 from clsplat.training.presets import PRESETS
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from clsplat.comparison.compare import Run
-    from clsplat.comparison.compare_table import Record
+    from clsplat.comparison.table import Record
     from clsplat.scenes.scene import Scene
 
 
@@ -57,7 +57,7 @@ def compare_systems(ctx: click.Context, /, scenes: tuple[Path, ...], output: Pat
     DIR/runs.jsonl, and table.md and results.json of all runs there. After Ctrl-C, the same command goes on.
     """
     from clsplat.comparison.compare import compare
-    from clsplat.comparison.compare_table import HEAD, cells, notes, summarise
+    from clsplat.comparison.table import HEAD, cells, notes, summarise
 
     common, loaded = options_and_scenes(ctx, scenes, values)
     with TrainingDisplay(quiet) as display:

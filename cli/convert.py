@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from clsplat.errors import InputError, OutputError
-from clsplat.splats.schema import MAX_SH_DEGREE, sh_coefficients
+from clsplat.splats.fields import MAX_SH_DEGREE, sh_coefficients
 from clsplat.splats.shapes import GAUSSIAN, SHAPES
 
 from .models import LoadedModel, load_model, load_splats, recorded_cameras
@@ -45,8 +45,8 @@ def convert_model(model: Path, output: Path, shape: str | None, approximate: boo
     nothing is written. With --shape gaussian a .ply has 3DGS's columns and no others. A .splat file has no SH bands
     above 0; .spz files round everything to a byte or so. What a file loses is measured on images.
     """
-    from clsplat.splats.splat_file import write_splat
-    from clsplat.splats.spz_file import write_spz
+    from clsplat.splats.dot_splat import write_splat
+    from clsplat.splats.spz import write_spz
 
     suffix = output.suffix.lower()
     if suffix not in (_PLY, *_GAUSSIANS):
@@ -90,7 +90,7 @@ def _converted(splats: Splats, target: str, approximate: bool) -> tuple[Splats, 
             raise
         if not approximate:
             raise InputError(f"{error}; or --approximate") from None
-    from clsplat.splats.nearest import nearest_gaussians
+    from clsplat.splats.approximate import nearest_gaussians
 
     return nearest_gaussians(splats), True
 
@@ -109,7 +109,7 @@ def _cost(loaded: LoadedModel, converted: Splats, cameras: Path | None, device: 
     from clsplat.cameras.cameras_json import read_cameras
     from clsplat.evaluation.evaluate import MAX_PSNR
     from clsplat.evaluation.metrics import psnr
-    from clsplat.rendering.render import Renderer
+    from clsplat.rendering.renderer import Renderer
 
     named = recorded_cameras(loaded) if cameras is None else read_cameras(cameras)
     if not named:

@@ -11,7 +11,7 @@ import click
 
 from clsplat.errors import OutputError
 from clsplat.training.config import TrainConfig
-from clsplat.training.model_folder import ModelFolder
+from clsplat.training.folder import ModelFolder
 
 from .eval_pages import ViewRecorder, write_model_page
 from .evaluate import REPORT, describe, measure_model
@@ -42,7 +42,7 @@ def demo(ctx: click.Context, out: Path, iterations: int, cap_max: int, width: in
     OUT/scene is kept when it is there already; OUT/model and OUT/renders are replaced with --overwrite.
     """
     from clsplat.evaluation.metrics import DEFAULT_PROTOCOL
-    from clsplat.rendering.render import Renderer
+    from clsplat.rendering.renderer import Renderer
 
     start = time.perf_counter()
     folder = ModelFolder(out / "model")
@@ -80,7 +80,7 @@ def _make_scene(scene: Path, width: int, views: int, quiet: bool) -> None:
         if not quiet:
             click.echo(f"{scene}: already there, used as it is", err=True)
         return
-    from clsplat.scenes.demo.capture import write_capture
+    from clsplat.scenes.demo.scene import write_capture
 
     if not quiet:
         click.echo(f"making {views} photos in {scene}", err=True)

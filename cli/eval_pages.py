@@ -20,8 +20,8 @@ from .models import LoadedModel
 
 if TYPE_CHECKING:
     from clsplat.evaluation.perceptual import Flip, Lpips
-    from clsplat.evaluation.report.eval_images import Shot
-    from clsplat.rendering.render import Rendered
+    from clsplat.evaluation.report.images import ComparedImage
+    from clsplat.rendering.renderer import Rendered
     from clsplat.scenes.scene import View
 
 # Options whose values a page names first, whatever they are.
@@ -43,7 +43,7 @@ class ViewRecorder:
     pages: bool = True
     corrected: bool = False
     per_view: dict[str, dict[str, float]] = field(default_factory=dict)
-    shots: dict[str, Shot] = field(default_factory=dict)
+    shots: dict[str, ComparedImage] = field(default_factory=dict)
 
     def __call__(self, view: View, image: Rendered) -> None:
         color: NDArray[Any] = image.color
@@ -56,7 +56,7 @@ class ViewRecorder:
             flip_map = self.flip(color, view.image, view.mask)
             self.per_view.setdefault("FLIP", {})[view.name] = self.flip.mean(flip_map, view.mask)
         if self.pages:
-            from clsplat.evaluation.report.eval_images import shot_of
+            from clsplat.evaluation.report.images import shot_of
 
             self.shots[view.name] = shot_of(view.image, color, view.mask, flip_map)
 
@@ -69,7 +69,7 @@ class Measurement:
     model: LoadedModel
     result: dict[str, Any]
     per_view: Mapping[str, Mapping[str, float]]
-    shots: Mapping[str, Shot]
+    shots: Mapping[str, ComparedImage]
     unwritten: OutputError | None = None
 
 
@@ -84,7 +84,7 @@ def write_model_page(path: Path, scene: str, measured: Sequence[Measurement], la
     ------
     InputError : the models were measured on different views. OutputError : cannot be written.
     """
-    from clsplat.evaluation.report.eval_report import Measured, write_eval_report
+    from clsplat.evaluation.report.page import Measured, write_eval_report
 
     first = measured[0].result
     what = f"{first['views']} {'' if first['set'] == 'all' else first['set'] + ' '}views of {scene}"

@@ -13,8 +13,8 @@ import click
 
 from clsplat.errors import InputError, OutputError
 from clsplat.evaluation.metrics import DEFAULT_PROTOCOL, PROTOCOLS, Protocol, protocol_named
-from clsplat.splats.complexity import complexity
-from clsplat.training.model_folder import read_json, write_json
+from clsplat.files.json_file import read_object, write_json
+from clsplat.splats.stats import complexity
 
 from .eval_pages import Measurement, ViewRecorder, write_model_page
 from .models import LoadedModel, load_model, scene_of
@@ -33,7 +33,7 @@ from .outputs import ImageWriter, output_stems
 from .progress import counted, table
 
 if TYPE_CHECKING:
-    from clsplat.rendering.render import Rendered, Renderer
+    from clsplat.rendering.renderer import Rendered, Renderer
     from clsplat.scenes.scene import Scene, View
 
 REPORT = "report.html"
@@ -70,7 +70,7 @@ def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], sou
     train or all: results_train.json and so on).
     """
     from clsplat.evaluation.perceptual import Flip, Lpips
-    from clsplat.rendering.render import Renderer
+    from clsplat.rendering.renderer import Renderer
 
     paths = (*more_models, *models)
     if not paths:
@@ -191,7 +191,7 @@ def describe(protocol: Protocol) -> str:
 def _add(path: Path, key: str, entry: dict[str, Any]) -> None:
     """Write the entry into a JSON object that may hold those of other iterations."""
     try:
-        known = read_json(path)
+        known = read_object(path)
     except InputError:  # absent or damaged: it is made of what we measure, so nothing is lost
         known = {}
     write_json(path, known | {key: entry})

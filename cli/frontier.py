@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.comparison.systems import parse_systems
+from clsplat.comparison.methods import parse_systems
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
 from .compare import flat, options_and_scenes, say_run
@@ -24,7 +24,7 @@ from .options import (
 from .progress import TrainingDisplay, table
 
 if TYPE_CHECKING:
-    from clsplat.comparison.compare_table import Record
+    from clsplat.comparison.table import Record
 
 CAPS = (1000, 2500, 5000, 10_000)
 SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
@@ -59,7 +59,7 @@ def draw_frontier(ctx: click.Context, /, scenes: tuple[Path, ...], output: Path,
     Writes DIR/report.html, DIR/charts (PNG, SVG, and their data as CSV and JSON) and what `clsplat compare` writes.
     Runs that are there are not done again; after Ctrl-C the charts show what is there, and the same command goes on.
     """
-    from clsplat.comparison.frontier import distinct, frontier, read_runs, write_report
+    from clsplat.comparison.sweep import distinct, frontier, read_runs, write_report
 
     if charts_only == bool(scenes):
         raise click.UsageError("give scenes, or --charts-only to draw the runs that are there")
@@ -80,9 +80,9 @@ def draw_frontier(ctx: click.Context, /, scenes: tuple[Path, ...], output: Path,
 
 def report(records: list[Record], reference: str) -> None:
     """The tables that charts do not hold: all runs, and splats at equal quality."""
-    from clsplat.comparison.compare_table import HEAD, cells, summarise
-    from clsplat.comparison.frontier_data import equal_rows, point_rows
-    from clsplat.comparison.frontier_tables import equal_table
+    from clsplat.comparison.sweep_rows import equal_rows, point_rows
+    from clsplat.comparison.sweep_tables import equal_table
+    from clsplat.comparison.table import HEAD, cells, summarise
 
     click.echo(table(HEAD, map(cells, summarise(records))))
     equal = equal_rows(point_rows(records), reference)

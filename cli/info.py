@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from clsplat.errors import InputError
-from clsplat.splats.complexity import complexity
 from clsplat.splats.splats import Splats
-from clsplat.training.model_folder import ModelFolder
+from clsplat.splats.stats import complexity
+from clsplat.training.folder import ModelFolder
 
 from .models import load_model
 from .options import PATH, iteration_option
 from .progress import table
 
 if TYPE_CHECKING:
-    from clsplat.scenes.scene_info import LensUse, SceneInfo
+    from clsplat.scenes.info import LensUse, SceneInfo
 
 _NAMED = 5  # names that are listed, of many
 
@@ -44,8 +44,8 @@ def show_info(paths: tuple[Path, ...], iteration: int | None, images: str | None
 
 
 def _is_scene(path: Path) -> bool:
-    from clsplat.scenes.reconstruct.photo_folder import is_photographs
-    from clsplat.scenes.scene_info import is_scene
+    from clsplat.scenes.info import is_scene
+    from clsplat.scenes.reconstruct.photo_files import is_photographs
 
     if path.is_file() or not path.is_dir() or ModelFolder(path).iterations():
         return path.is_file() and path.suffix == ".json"
@@ -93,7 +93,7 @@ def rows_of(found: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def _show_scene(path: Path, images: str | None, as_json: bool) -> None:
-    from clsplat.scenes.scene_info import scene_info
+    from clsplat.scenes.info import scene_info
 
     found = scene_info(path, images)
     if as_json:

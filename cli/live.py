@@ -14,7 +14,7 @@ from .view import require_viser
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
     from clsplat.training.config import TrainConfig
-    from clsplat.training.run_log import Progress
+    from clsplat.training.log import Progress
     from clsplat.training.trainer import Visit
 
 
@@ -30,9 +30,9 @@ class LiveView:
                  quiet: bool = False) -> None:
         require_viser()
         from clsplat.cameras.cameras_json import NamedCamera
-        from clsplat.viewer.viewer_server import Server
-        from clsplat.viewer.viewer_start import Known, start_of
-        from clsplat.viewer.viewer_training import TrainingView
+        from clsplat.viewer.server import Server
+        from clsplat.viewer.start import Known, start_of
+        from clsplat.viewer.training import TrainingView
 
         known = Known(tuple(NamedCamera(view.name, view.camera) for view in scene.train),
                       tuple(NamedCamera(view.name, view.camera) for view in scene.test))
@@ -57,7 +57,7 @@ class LiveView:
 
     def told(self, display: Callable[[Progress], None]) -> Callable[[Progress], None]:
         """A `progress` that also tells the page."""
-        from clsplat.viewer.viewer_training import run_line
+        from clsplat.viewer.training import run_line
 
         def progress(news: Progress) -> None:
             display(news)

@@ -115,7 +115,7 @@ def _known_failure(error: Exception) -> str | None:
 
 def _show_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int,
                   file: TextIO | None = None, line: str | None = None) -> None:
-    if display := sys.modules.get("clsplat.training.progress_display"):  # where nothing is shown, it was never loaded
+    if display := sys.modules.get("clsplat.training.progress"):  # where nothing is shown, it was never loaded
         display.LiveLine.give_way()
     click.echo(f"warning: {_one_line(str(message))}", err=True)
 

@@ -10,10 +10,10 @@ import click
 
 from clsplat.cameras.cameras_json import NamedCamera, bare_name, read_cameras
 from clsplat.errors import InputError
-from clsplat.files.json_fields import real_of
+from clsplat.files.json_file import real_of
+from clsplat.scenes.options import ALPHA_USES
 from clsplat.splats.splats import Splats
-from clsplat.training.config import ALPHA_USES
-from clsplat.training.model_folder import ModelFolder
+from clsplat.training.folder import ModelFolder
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
@@ -73,11 +73,11 @@ def load_model(path: Path, iteration: int | None = None) -> LoadedModel:
 def load_splats(path: Path) -> Splats:
     """What a .ply, .splat or .spz file holds; raises InputError."""
     if path.suffix.lower() == ".splat":
-        from clsplat.splats.splat_file import read_splat
+        from clsplat.splats.dot_splat import read_splat
 
         return read_splat(path)
     if path.suffix.lower() == ".spz":
-        from clsplat.splats.spz_file import read_spz
+        from clsplat.splats.spz import read_spz
 
         return read_spz(path)
     return Splats.load(path)

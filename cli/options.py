@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 
 import click
 
+from clsplat.scenes.options import ALPHA_USES
 from clsplat.splats.shapes import NORMALISATIONS, SHAPES
 from clsplat.training.config import (
-    ALPHA_USES,
     ALTERNATIONS,
     OPTIMIZERS,
     POSITION_OPTIMIZERS,

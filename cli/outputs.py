@@ -15,7 +15,7 @@ from clsplat.errors import InputError
 from clsplat.files.atomic import atomic_writer
 
 if TYPE_CHECKING:
-    from clsplat.rendering.render import Rendered
+    from clsplat.rendering.renderer import Rendered
 
     from .options import RGB
 
@@ -90,7 +90,7 @@ class ImageWriter:
             elif ending != "_depth":
                 write_png(path, plane)
             elif self.near_far is not None:
-                from clsplat.rendering.display import depth_picture
+                from clsplat.rendering.colormaps import depth_picture
 
                 write_png(path, depth_picture(image, self.near_far, self.background))
             else:
@@ -135,7 +135,7 @@ class VideoFiles:
 
     def write(self, stem: str, image: Rendered) -> None:
         """Add the view to every video."""
-        from clsplat.rendering.display import picture_of
+        from clsplat.rendering.colormaps import picture_of
 
         for mode, writer in self.writers.items():
             writer.write(picture_of(image, mode, self.background, self.near_far))

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from clsplat.cameras.camera_path import DEFAULT_FPS, CameraPath, read_path
 from clsplat.cameras.cameras_json import NamedCamera, bare_name
-from clsplat.cameras.paths_between import interpolate, resized_by_height
+from clsplat.cameras.interpolate import interpolate, resized_by_height
+from clsplat.cameras.path import DEFAULT_FPS, CameraPath, read_path
 from clsplat.errors import InputError
 
 from .models import LoadedModel
@@ -97,7 +97,7 @@ def path_of(model: LoadedModel, views: Sequence[NamedCamera], source: Path, path
     rate = fps or DEFAULT_FPS
     count = max(1, round(seconds * rate)) if seconds is not None else frames or FRAMES
     if path in AROUND:
-        from clsplat.cameras import paths_around  # lazy: reads no splats where a file has the path
+        from clsplat.cameras import orbits as paths_around  # lazy: reads no splats where a file has the path
 
         cameras = getattr(paths_around, path)(model.splats, [view.camera for view in views], count)
         return CameraPath(tuple(cameras), rate, closed=True)

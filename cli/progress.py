@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable, Sequence
 from typing import TypeVar
 
-from clsplat.training.progress_display import PLAIN_INTERVAL, LiveLine, TrainingDisplay, duration
+from clsplat.training.progress import PLAIN_INTERVAL, LiveLine, TrainingDisplay, duration
 
 __all__ = ["TrainingDisplay", "counted", "duration", "table"]
 

@@ -61,8 +61,8 @@ def pruned_model(loaded: LoadedModel, scene: Scene, tolerance: float, iterations
     """The smaller model, and what it cost."""
     from clsplat.compression.prune import SHARES, Judge, prune
     from clsplat.device.device import open_device
-    from clsplat.rendering.render import Renderer
-    from clsplat.scenes.validation import hold_out
+    from clsplat.rendering.renderer import Renderer
+    from clsplat.scenes.split import hold_out
 
     opened = open_device(device)
     renderer = Renderer(opened)
@@ -71,7 +71,7 @@ def pruned_model(loaded: LoadedModel, scene: Scene, tolerance: float, iterations
     splats = loaded.splats
     if not iterations:
         return prune(splats, scene.train, judge, tolerance)
-    from clsplat.compression.shrink import trained_rounds
+    from clsplat.compression.prune_and_refine import trained_rounds
 
     before = judge(splats)
     splats = trained_rounds(scene, splats, judge, before - SHARES["splats"] * tolerance, iterations, opened, display)
@@ -82,7 +82,7 @@ def pruned_model(loaded: LoadedModel, scene: Scene, tolerance: float, iterations
 
 def lines_of(loaded: LoadedModel, pruned: Pruned, output: Path) -> list[str]:
     """What went, and what it cost."""
-    from clsplat.splats.complexity import complexity
+    from clsplat.splats.stats import complexity
 
     old, new = complexity(loaded.splats), complexity(pruned.splats)
     was, now = loaded.ply.stat().st_size, output.stat().st_size

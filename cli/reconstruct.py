@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from clsplat.errors import OutputError
-from clsplat.scenes.reconstruct.reconstruct_options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, ReconstructOptions
-from clsplat.training.progress_display import PLAIN_INTERVAL, LiveLine
+from clsplat.scenes.reconstruct.options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, ReconstructOptions
+from clsplat.training.progress import PLAIN_INTERVAL, LiveLine
 
 from .options import PATH, overwrite_option, quiet_option
 from .progress import duration
@@ -74,7 +74,7 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
     ------
     OutputError : the scene that is there was made of other photos. Others as `reconstruct`.
     """
-    from clsplat.scenes.reconstruct.photo_folder import find_photos, is_video
+    from clsplat.scenes.reconstruct.photo_files import find_photos, is_video
     from clsplat.scenes.reconstruct.reconstruct import estimated_seconds, made_from
 
     scene = model.parent / f"{photos.resolve().stem if is_video(photos) else photos.resolve().name}-scene"

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
-from clsplat.cameras.camera_path import DEFAULT_FPS, write_path
 from clsplat.cameras.cameras_json import NamedCamera, named_cameras, read_cameras, write_cameras
-from clsplat.cameras.paths_between import resized_by_height
+from clsplat.cameras.interpolate import resized_by_height
+from clsplat.cameras.path import DEFAULT_FPS, write_path
 from clsplat.errors import InputError
 
 from .models import LoadedModel, both_forms, load_model, one_model, recorded_cameras, scene_of
@@ -34,7 +34,7 @@ from .path_options import Range, named, path_of, path_options, resized
 from .progress import counted
 
 if TYPE_CHECKING:
-    from clsplat.rendering.render import Renderer
+    from clsplat.rendering.renderer import Renderer
 
 _QUARTILES = (0.25, 0.75)  # of their ranges' near and far ends
 _SAMPLES = 12  # frames that the range of depths is taken from, at a quarter of the size
@@ -138,7 +138,7 @@ def render_views(model: LoadedModel, views: Sequence[NamedCamera], output: Path 
     InputError : views whose files would be the same, or lie outside `output`.
     OutputError : a file cannot be written.
     """
-    from clsplat.rendering.render import Renderer
+    from clsplat.rendering.renderer import Renderer
 
     stems = output_stems([view.name for view in views], extras, keep_suffix=format == "npy")
     renderer = Renderer(device)
@@ -169,7 +169,7 @@ def render_views(model: LoadedModel, views: Sequence[NamedCamera], output: Path 
 
 def _depths_seen(renderer: Renderer, model: LoadedModel, views: Sequence[NamedCamera]) -> tuple[float, float]:
     """One range for the whole path, so that its colours do not flicker: over a few small frames."""
-    from clsplat.rendering.display import depth_range
+    from clsplat.rendering.colormaps import depth_range
 
     step = -(-len(views) // _SAMPLES)
     ranges = []

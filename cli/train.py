@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from clsplat.errors import InputError, OutputError
+from clsplat.files.json_file import read_object
 from clsplat.training.config import TrainConfig
-from clsplat.training.model_folder import ModelFolder, read_json
+from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
 
 from .budget import budget_options, forget_search, is_search, options_of, run_search, stored_search
@@ -33,7 +34,7 @@ from .view import server_options
 if TYPE_CHECKING:
     from clsplat.evaluation.evaluate import Evaluation
     from clsplat.scenes.scene import Scene
-    from clsplat.training.training import Model
+    from clsplat.training.run import Model
 
     from .live import LiveView
 
@@ -73,7 +74,7 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
     into the model's folder. Ctrl-C saves a checkpoint; --resume goes on from it. With --budget auto also budget.json
     and the growth curve; the small model is the last point cloud.
     """
-    from clsplat.scenes.reconstruct.photo_folder import is_photographs, is_video
+    from clsplat.scenes.reconstruct.photo_files import is_photographs, is_video
 
     if resume and overwrite:
         raise click.UsageError("give --resume or --overwrite, not both")
@@ -148,7 +149,7 @@ def run_training(scene: Scene, config: TrainConfig, model_path: Path, record: di
                  resume: bool = False, overwrite: bool = False, quiet: bool = False,
                  live: LiveView | None = None) -> Model:
     """Train with a live display, and a page in the browser if `live` is given."""
-    from clsplat.training.training import train as train_model
+    from clsplat.training.run import train as train_model
 
     with TrainingDisplay(quiet) as display:
         return train_model(scene, config, live.told(display) if live else display, output=model_path, resume=resume,
@@ -166,7 +167,7 @@ def test_metrics(model: Model, scene: Scene) -> Evaluation | None:
     if not scene.test or model.iteration in model.evaluations:
         return model.evaluations.get(model.iteration)
     from clsplat.evaluation.evaluate import evaluate
-    from clsplat.rendering.render import Renderer
+    from clsplat.rendering.renderer import Renderer
 
     return evaluate(Renderer(model.config.device), model.splats, scene.test, model.config.background)
 
@@ -192,7 +193,7 @@ def report(model: Model, metrics: Evaluation | None) -> None:
 
 def _options_in(file: Path) -> dict[str, Any]:
     """TrainConfig's arguments that a JSON file has."""
-    values = read_json(file)
+    values = read_object(file)
     values = values.get("config", values)
     try:
         config = TrainConfig.from_json(values)

@@ -12,7 +12,7 @@ import click
 
 from clsplat.cameras.cameras_json import named_cameras
 from clsplat.errors import ClsplatError, InputError
-from clsplat.training.model_folder import ModelFolder
+from clsplat.training.folder import ModelFolder
 
 from .models import LoadedModel, both_forms, load_model, one_model, recorded_cameras, scene_of
 from .options import (
@@ -27,9 +27,9 @@ from .options import (
 )
 
 if TYPE_CHECKING:
-    from clsplat.viewer.viewer_server import Server
-    from clsplat.viewer.viewer_source import ModelSource, Watch
-    from clsplat.viewer.viewer_start import Known
+    from clsplat.viewer.server import Server
+    from clsplat.viewer.source import ModelSource, Watch
+    from clsplat.viewer.start import Known
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -90,7 +90,7 @@ def view(model: Path | None, model_path: Path | None, source_path: Path | None, 
 
 def known_cameras(model: LoadedModel, source_path: Path | None, images: str | None, resolution: int | None) -> Known:
     """Cameras of the scene given, else those in the model's folder; none are known of a PLY alone."""
-    from clsplat.viewer.viewer_start import Known
+    from clsplat.viewer.start import Known
 
     if source_path is not None or images is not None or resolution is not None:
         scene = scene_of(model, source_path, images, resolution)
@@ -110,11 +110,11 @@ class Viewing:
         import numpy as np
 
         from clsplat.cameras.camera import Camera
+        from clsplat.viewer.server import Server
+        from clsplat.viewer.settings import Settings
+        from clsplat.viewer.source import ModelSource, Watch
+        from clsplat.viewer.start import start_of
         from clsplat.viewer.viewer import Viewer
-        from clsplat.viewer.viewer_server import Server
-        from clsplat.viewer.viewer_settings import Settings
-        from clsplat.viewer.viewer_source import ModelSource, Watch
-        from clsplat.viewer.viewer_start import start_of
 
         cameras = [item.camera for item in (*known.train, *known.test)]
         self.source: ModelSource = ModelSource(model.splats, device)

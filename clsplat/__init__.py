@@ -12,23 +12,23 @@ from ._version import __version__ as __version__
 
 if TYPE_CHECKING:
     from .cameras.camera import Camera
-    from .compression.budget import Budgeted, train_budget
-    from .compression.budget_rules import BudgetOptions
+    from .compression.rules import BudgetOptions
+    from .compression.search import Budgeted, train_budget
     from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
-    from .rendering.render import Rendered, Renderer
+    from .rendering.renderer import Rendered, Renderer
     from .scenes.scene import Scene, load_scene
     from .splats.splats import Splats
     from .training.config import TrainConfig
-    from .training.progress_display import TrainingDisplay
-    from .training.training import Model, train
+    from .training.progress import TrainingDisplay
+    from .training.run import Model, train
 
 
 _HOME = {
     "Camera": "cameras.camera", "ClsplatError": "errors", "DeviceError": "errors", "InputError": "errors",
-    "OutputError": "errors", "TrainingError": "errors", "Rendered": "rendering.render", "Renderer": "rendering.render",
-    "Scene": "scenes.scene", "load_scene": "scenes.scene", "Splats": "splats.splats", "TrainConfig": "training.config", "train": "training.training",
-    "Model": "training.training", "BudgetOptions": "compression.budget_rules", "Budgeted": "compression.budget", "train_budget": "compression.budget",
-    "TrainingDisplay": "training.progress_display",
+    "OutputError": "errors", "TrainingError": "errors", "Rendered": "rendering.renderer", "Renderer": "rendering.renderer",
+    "Scene": "scenes.scene", "load_scene": "scenes.scene", "Splats": "splats.splats", "TrainConfig": "training.config", "train": "training.run",
+    "Model": "training.run", "BudgetOptions": "compression.rules", "Budgeted": "compression.search", "train_budget": "compression.search",
+    "TrainingDisplay": "training.progress",
 }
 
 __all__ = [

@@ -11,7 +11,7 @@ import pytest
 
 from clsplat.device.device import SCHEDULES, Device, Schedule, default_schedule, list_devices, open_device
 from clsplat.device.program import OPTIONS_VARIABLE
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 
 MakeRenderer = Callable[..., Renderer]
 

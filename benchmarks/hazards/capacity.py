@@ -11,7 +11,7 @@ from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device
 from clsplat.rendering import pipeline
 from clsplat.rendering.pipeline import isect_bytes
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 

@@ -18,7 +18,6 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from clsplat.training.optim import skew_map
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -26,13 +25,14 @@ import clsplat
 from clsplat.device.device import Device
 from clsplat.errors import ClsplatError
 from clsplat.evaluation.evaluate import evaluate
-from clsplat.rendering import kernels
-from clsplat.rendering.render import Renderer
+from clsplat.rendering import build as kernels
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.colmap import Points
-from clsplat.scenes.demo.capture import RING_TARGET, ring_cameras
+from clsplat.scenes.demo.scene import RING_TARGET, ring_cameras
 from clsplat.scenes.scene import Scene, View
 from clsplat.splats.splats import Splats, shapes
 from clsplat.training.config import TrainConfig
+from clsplat.training.optim import skew_map
 
 from .training import finite_file
 

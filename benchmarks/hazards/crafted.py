@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.cameras.camera import Camera
-from clsplat.rendering.kernels import NEAR
-from clsplat.splats.schema import public_shape
+from clsplat.rendering.build import NEAR
+from clsplat.splats.fields import public_shape
 from clsplat.splats.shapes import Shape
 
 Arrays = dict[str, NDArray[np.float64]]

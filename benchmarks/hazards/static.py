@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from clsplat.device.device import Device, Schedule
 from clsplat.errors import ClsplatError
-from clsplat.rendering.kernels import ALPHA_MAX, ALPHA_MIN, T_MIN
-from clsplat.rendering.render import Rendered, Renderer
+from clsplat.rendering.build import ALPHA_MAX, ALPHA_MIN, T_MIN
+from clsplat.rendering.renderer import Rendered, Renderer
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 

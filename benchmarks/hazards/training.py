@@ -19,7 +19,7 @@ from clsplat.device.device import Device
 from clsplat.device.program import OPTIONS_VARIABLE
 from clsplat.errors import ClsplatError
 from clsplat.evaluation.evaluate import evaluate
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats

@@ -11,7 +11,7 @@ import numpy as np
 
 from clsplat.cameras.camera import Camera
 from clsplat.scenes.colmap import Points
-from clsplat.scenes.demo.capture import write_capture
+from clsplat.scenes.demo.scene import write_capture
 from clsplat.scenes.scene import Scene, View, load_scene
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 26

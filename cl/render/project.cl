@@ -1,6 +1,6 @@
 // project.cl: splats to screen records, and the gradient back to the raw parameters. LANES splats a work-item.
 //
-// geom, sh: component-major parameter buffers [rows, capacity] (clsplat/splats/schema.py); rows by build constants.
+// geom, sh: component-major parameter buffers [rows, capacity] (clsplat/splats/fields.py); rows by build constants.
 // Screen record of splat i: RECORD reals at records[i * RECORD]:
 //   mean_px x, y [px]; colour r, g, b; depth (camera z); first and last pixel row, then column, it can reach; shape's p.
 

@@ -1,5 +1,5 @@
 // lazy.cl: which vectors of splats a lazy step is for, and the steps that the others sat out, done without another
-// (clsplat/training/optim/optim_lazy.py, clsplat/training/optim/optim_waiting.py).
+// (clsplat/training/optim/lazy.py, clsplat/training/optim/waiting.py).
 
 #define CULLED_KEY 0xFFFFFFFFu  // as in project.cl
 

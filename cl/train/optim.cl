@@ -1,6 +1,6 @@
 // optim.cl: one step of all parameters, or of those of splats that were seen: Adam with regularisers and the skew map's chain
 // rule; SGHMC for positions, MCMC noise, and the kernels that move splats about. The NumPy forms are in
-// clsplat/training/optim/optim_host.py, optim_reference.py, optim_lazy.py, regularisers.py, sghmc.py, skew_map.py and noise.py; a test
+// clsplat/training/optim/reference.py, optim_reference.py, optim_lazy.py, regularisers.py, sghmc.py, skew_map.py and noise.py; a test
 // compares them step for step.
 
 // Coefficient k of the colour. grad_sh [6, capacity]: the gradient of the colour and the direction (cl/render/project.cl), whose

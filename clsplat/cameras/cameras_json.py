@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
-from ..files.json_fields import kind, matrix, number, read_json, size, value
+from ..files.json_file import kind, matrix, number, read_json, size, value
 from .camera import Camera
 
 _MEND = "add it as 3DGS writes it"

@@ -22,16 +22,16 @@ from ..errors import InputError, OutputError, TrainingError
 from ..evaluation.evaluate import evaluate
 from ..evaluation.metrics import DEFAULT_PROTOCOL
 from ..files.atomic import atomic_writer
-from ..files.sole_writer import sole_writer
-from ..rendering.render import Renderer
+from ..files.json_file import write_json
+from ..files.lock import sole_writer
+from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene, View
 from ..splats.splats import Splats
 from ..training.config import FREE_OPTIONS, TrainConfig
-from ..training.model_folder import write_json
-from ..training.run_log import Progress
+from ..training.log import Progress
 from ..training.trainer import Trainer
-from .compare_table import MEASURED, Record, markdown, notes, summarise
-from .systems import System
+from .methods import System
+from .table import MEASURED, Record, markdown, notes, summarise
 
 RUNS, TABLE, RESULTS, MODELS = "runs.jsonl", "table.md", "results.json", "models"
 WARM_UP = 3  # iterations

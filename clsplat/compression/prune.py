@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
-from ..rendering.render import Renderer
+from ..rendering.renderer import Renderer
 from ..scenes.scene import View
+from ..splats.fields import Array, sh_coefficients
 from ..splats.ply_compact import bands_in_use, in_use, layout_bytes, plan_layout
-from ..splats.schema import Array, sh_coefficients
 from ..splats.splats import Splats
-from .needs import Needs, Reals, lower_bands, measure
+from .importance import Needs, Reals, lower_bands, measure
 
 SHARES = {"splats": 0.5, "fields": 0.75, "bands": 1.0}  # of the tolerance, spent once the kind is done
 _STEPS = 10  # of a bisection: one in a thousand of the ranks

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DeviceError
-from .runtime import register_pip_runtime
+from .pip_runtime import register_pip_runtime
 
 TILES = (16, 8, 32)  # sides of a tile [px]; the first is what schedules are measured with
 MIB = 1 << 20
@@ -44,7 +44,7 @@ class Schedule:
         if self.lanes not in (1, 8, 16):
             raise DeviceError(f"schedule {self}: LANES must be 1, 8 or 16 (cl/math/lanes.clh)")
         if self.group == 1 and self.lanes > 1 and self.vecs > 64:
-            raise DeviceError(f"schedule {self}: a work-item has at most 64 vectors (a bit each, cl/render/raster.cl)")
+            raise DeviceError(f"schedule {self}: a work-item has at most 64 vectors (a bit each, cl/render/rasterize.cl)")
         if self.group > 1 and self.group % 32:  # sums go by parts of 16; PoCL 3.1 gets groups of 16 wrong
             raise DeviceError(f"schedule {self}: GROUP must be 1 or a multiple of 32 (cl/render/group.clh)")
 

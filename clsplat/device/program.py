@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import DeviceError
-from .binaries import binary_path, load_binary, store_binary
 from .device import BROKEN_POCL, LESS_MEMORY, Device, first_line, is_out_of_memory
-from .signatures import Parameter, parse_signatures
-from .signatures import Real as Real  # of this module's interface
+from .kernel_args import Parameter, parse_signatures
+from .kernel_args import Real as Real  # of this module's interface
+from .program_cache import binary_path, load_binary, store_binary
 
 Define = int | float | str
 
@@ -37,7 +37,7 @@ GROUP_ITEMS = 64
 
 
 def source(*names: str) -> str:
-    """Text of source files ("render/raster.cl", "shape/gaussian.clh") joined in order, each after its `#line`."""
+    """Text of source files ("render/rasterize.cl", "shape/gaussian.clh") joined in order, each after its `#line`."""
     return "".join(f'#line 1 "{name}"\n{_read(name)}\n' for name in names)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..rendering.render import Rendered, Renderer
+from ..rendering.renderer import Rendered, Renderer
 from ..scenes.scene import View
 from ..splats.splats import Splats
 from .metrics import DEFAULT_PROTOCOL, Protocol

@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from ..device.device import Device
-from ..device.launches import recorded
+from ..device.trace import recorded
 from ..errors import InputError
-from ..rendering.pairs import count_pairs
+from ..rendering.overdraw import count_pairs
 from ..rendering.pipeline import Pipeline
 from ..scenes.scene import Scene
 from ..splats.splats import Splats
 from ..training.config import PUBLISHED_ITERATIONS, TrainConfig
 from ..training.trainer import Trainer
-from .limits import Limits
+from .roofline import Limits
 from .stages import HOST, STAGES, Sizes, by_stage, work_of
 
 WARM_UP = 4  # iterations not counted: kernels are built, buffers grow, the SH degree rises to 3

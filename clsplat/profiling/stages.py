@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from ..device.launches import TRANSFERS, Launch
-from ..rendering.kernels import KernelBuild
-from ..rendering.sort import radix_passes
+from ..device.trace import TRANSFERS, Launch
+from ..rendering.build import KernelBuild
+from ..rendering.radix_sort import radix_passes
+from ..splats.fields import Group, sh_coefficients
 from ..splats.flops import ADAM, BLEND, BLEND_VJP, LOSS
-from ..splats.schema import Group, sh_coefficients
 from ..splats.shapes import shape_named
 
 STAGES = {

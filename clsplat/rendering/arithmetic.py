@@ -1,4 +1,4 @@
-"""Forms of the arithmetic of pixels and colours: speed against accuracy (cl/math/forms.clh, benchmarks/arithmetic.py)."""
+"""Forms of the arithmetic of pixels and colours: speed against accuracy (cl/math/approx.clh, benchmarks/arithmetic.py)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ..errors import InputError
 
-# By their numbers in cl/math/forms.clh. Errors are absolute for Phi and relative for exp, in float32 vectors.
+# By their numbers in cl/math/approx.clh. Errors are absolute for Phi and relative for exp, in float32 vectors.
 EXP_FORMS = ("polynomial", "builtin", "cubic", "power")  # 3.2e-7; the driver's; 7.5e-5; (1 + x/256)^256
 PHI_FORMS = ("polynomial", "erfc", "logistic-cubic", "tanh", "logistic")  # 2.7e-7; the driver's; 1.4e-4; 1.8e-4; 9.5e-3
 

@@ -13,11 +13,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device.buffers import Pool, copy, to_host
 from ..device.device import Device
+from ..device.memory import Pool, copy, to_host
 from ..device.program import build
 from ..errors import DeviceError
-from .sort import Sorter
+from .radix_sort import Sorter
 
 MAX_ISECTS = 2**31 - 1  # of a band: ids are 32 bits
 BUCKET_BITS = 11  # of a depth key, that choose its bucket

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..device.buffers import ParameterBuffers, Pool, SplatBuffers, fill_zero, send_to_device, to_device, to_host
 from ..device.device import TILES, Device
+from ..device.memory import Pool, fill_zero, send_to_device, to_device, to_host
 from ..device.program import lane_group
 from .binning import MAX_ISECTS, Band, cut, make_binner
-from .gradients import CompactGradients
-from .kernels import MARGIN_X, MARGIN_Y, NEAR, KernelBuild
+from .build import MARGIN_X, MARGIN_Y, NEAR, KernelBuild
+from .splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers
 
 SIGNALS = 3  # screen gradient, depth gradient, times seen
 TIMES_SEEN = 2
@@ -29,7 +29,7 @@ TIMES_SEEN = 2
 
 @dataclass(frozen=True)
 class ImageLayout:
-    """Planes of an image on the device: whole tiles, inside a margin (cl/render/raster.cl)."""
+    """Planes of an image on the device: whole tiles, inside a margin (cl/render/rasterize.cl)."""
 
     width: int
     height: int

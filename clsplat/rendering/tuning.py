@@ -17,15 +17,15 @@ import numpy as np
 
 from .._version import __version__
 from ..cameras.camera import Camera
-from ..device.binaries import cache_folder
-from ..device.buffers import ParameterBuffers, SplatBuffers
 from ..device.device import SCHEDULES, Device, Schedule, default_schedule
 from ..device.program import source
+from ..device.program_cache import cache_folder
 from ..errors import ClsplatError, OutputError
 from ..files.atomic import atomic_writer
 from ..splats.splats import Splats
-from .kernels import KernelBuild
+from .build import KernelBuild
 from .pipeline import Pipeline
+from .splat_buffers import ParameterBuffers, SplatBuffers
 
 SCHEDULE_VARIABLE = "CLSPLAT_SCHEDULE"
 _CANDIDATES = {"CPU": ("cpu16", "cpu8", "gpu256"), "other": ("gpu256", "gpu64")}
@@ -97,7 +97,7 @@ def _scene() -> Splats:
 
 def _key(device: Device) -> str:
     info = device.info
-    text = source("render/raster.cl", "math/lanes.clh", "render/group.clh", "render/blend.clh")
+    text = source("render/rasterize.cl", "math/lanes.clh", "render/group.clh", "render/blend.clh")
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
     return "|".join((info.platform, info.platform_version, info.name, info.driver, __version__, digest))
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, reason_of
-from .colmap_files import check_binary_model, registered_images
-from .lens import Photo, colmap_library
+from .colmap_binary import check_binary_model, registered_images
+from .undistort import Photo, colmap_library
 
 _FILES = ("cameras", "images", "points3D")
 
@@ -39,7 +39,7 @@ class Points:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class SparseModel:
     """A sparse model: registered photos sorted by name, and points."""
 
     photos: list[Photo]
@@ -67,7 +67,7 @@ def find_model(scene: Path) -> Path:
     return max(models, key=registered_images)          # the first of equals
 
 
-def read_model(folder: Path) -> Model:
+def read_model(folder: Path) -> SparseModel:
     """Read a binary or text model; missing points give an empty cloud.
 
     Raises
@@ -93,7 +93,7 @@ def read_model(folder: Path) -> Model:
     if bad:
         raise InputError(f"{folder}: {bad} points have a position that is not finite; the points3D file is "
                          "damaged: rebuild it")
-    return Model(photos, points)
+    return SparseModel(photos, points)
 
 
 def _suffix(folder: Path) -> str:

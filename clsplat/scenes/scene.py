@@ -15,11 +15,11 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..files.images import ImageU8, read_image, resize_area
 from ..files.masks import FOLDER, NO_MASKS, Mask, mask_files, nearest, read_mask
-from ..training.config import ALPHA_USES
 from .colmap import Points
-from .lens import Photo
-from .posed import Posed, posed_by_colmap
-from .transforms import find_transforms, posed_by_transforms
+from .nerfstudio import find_transforms, posed_by_transforms
+from .options import ALPHA_USES
+from .posed_images import Posed, posed_by_colmap
+from .undistort import Photo
 
 MAX_WIDTH = 1600                # 3DGS: with resolution -1, wider images are reduced to this [px]
 _EXTENT_MARGIN = 1.1            # 3DGS: extent over the farthest camera's distance from their mean

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .opacities import raw_of_thickness, thickness
-from .rotations import rotations
-from .schema import Array
+from .checks import LIMIT_SLACK
+from .fields import Array
+from .optical_depth import raw_of_thickness, thickness
+from .quaternions import rotations
 from .shapes import SKEW_MAX, SLANT_MAX, Shape, shape_named
 from .splats import Splats
-from .validity import LIMIT_SLACK
 
 Reals = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -19,10 +19,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
-from .ply_body import read_body
-from .ply_compact import Table, filled_in, plan_layout, side_fields, side_tables
-from .ply_header import REAL_TYPES, Header, read_header
-from .schema import (
+from .checks import check_arrays, first_fault, sh_degree_for
+from .fields import (
     CORE,
     LOG_SCALE,
     MEAN,
@@ -36,8 +34,10 @@ from .schema import (
     sh_coefficients,
     sh_field,
 )
+from .ply_body import read_body
+from .ply_compact import Table, filled_in, plan_layout, side_fields, side_tables
+from .ply_header import REAL_TYPES, Header, read_header
 from .shapes import GAUSSIAN, NORMALISATIONS, SHAPES, Shape, check_normalisation, shape_named
-from .validity import check_arrays, first_fault, sh_degree_for
 
 _NORMALS = ("nx", "ny", "nz")
 _COMMENT = "clsplat"

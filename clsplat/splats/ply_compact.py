@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .fields import MAX_SH_DEGREE, Array, Field, Schema, sh_coefficients
 from .ply_header import SIDE_PREFIX, Header
-from .schema import MAX_SH_DEGREE, Array, Field, Schema, sh_coefficients
 
 INDEX = "index"
 _SH = SIDE_PREFIX + "sh_"

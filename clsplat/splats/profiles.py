@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .schema import Array
+from .fields import Array
 
 
 def gaussian(z: Array, fields: Mapping[str, Array]) -> Array:

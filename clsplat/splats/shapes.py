@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from . import profiles
+from .fields import Array, Field, Schema, make_schema
 from .flops import DENSITY, EXP, LOG, LOG1P, MOMENTS, PHI, QUADRATIC
-from .schema import Array, Field, Schema, make_schema
 
 SKEW_LIMIT = math.sqrt(2.0 / (math.pi - 2.0))  # 1.3236: |m| of an infinitely skewed normal
 SKEW_MAX = 0.985 * SKEW_LIMIT  # kernels and training stay below: nothing cancels in float32 then

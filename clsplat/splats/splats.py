@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from .checks import check_arrays, sh_degree_for
+from .fields import MAX_SH_DEGREE, Array, Schema, public_shape, sh_coefficients
 from .ply import read_ply, write_ply
-from .schema import MAX_SH_DEGREE, Array, Schema, public_shape, sh_coefficients
 from .shapes import DEFAULT_SHAPE, check_normalisation, shape_named
-from .validity import check_arrays, sh_degree_for
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 _MIN_SQUARED_DISTANCE = 1e-7  # 3DGS's floor, for points that coincide

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
-from ..splats.schema import Array
+from ..splats.fields import Array
 
 VERSION = 2
 

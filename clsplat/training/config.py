@@ -9,8 +9,8 @@ from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from ..errors import InputError
-from ..files.json_fields import kind, real_of
-from ..splats.schema import MAX_SH_DEGREE
+from ..files.json_file import kind, real_of
+from ..splats.fields import MAX_SH_DEGREE
 from ..splats.shapes import DEFAULT_SHAPE, check_normalisation, shape_named
 from .optim.skew_map import check_map, map_named
 
@@ -20,7 +20,6 @@ POSITION_OPTIMIZERS = ("adam", "sghmc", "sghmc-sss")
 ALTERNATIONS = ("off", "cyclic")
 RELOCATIONS = ("length", "length-squared", "opacity-only")
 SAMPLINGS = ("opacity", "pull")
-ALPHA_USES = ("background", "mask")  # of scene.load_scene, which needs an image library; the command line does not
 # Options that change nothing in the result: runs that differ in these alone are the same run.
 FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
 # What an option is where it is not given: what was best with that strategy on validation views (benchmarks/SYSTEMS.md).

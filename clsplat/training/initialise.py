@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..rendering.kernels import NEAR
+from ..rendering.build import NEAR
+from ..splats.fields import Array, sh_coefficients
 from ..splats.morton import morton_order
-from ..splats.schema import Array, sh_coefficients
 from ..splats.shapes import DEFAULT_SHAPE, shape_named
 from ..splats.splats import Splats
 from .random_points import random_points, seen

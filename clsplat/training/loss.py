@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..device.buffers import to_host
+from ..device.memory import to_host
 from ..device.program import GROUP_ITEMS, lane_group
 from ..rendering.pipeline import ImageLayout, Pipeline
+from .programs import loss_program, loss_strip
 
 _LEAST_ROWS = 32  # of a work-item, which blurs ten rows beyond them
 _ITEMS_PER_UNIT = {"CPU": 6, "GPU": 2048}  # so many that no compute unit of the device waits long for the last
@@ -42,7 +43,7 @@ class ImageLoss:
     def __init__(self, pipeline: Pipeline, weight: float) -> None:
         self.pipeline, self.weight = pipeline, weight
         self.device, self.kernels = pipeline.device, pipeline.kernels
-        self.program = self.kernels.loss_program(self.device)
+        self.program = loss_program(self.device, self.kernels)
         # One lane, an item a pixel column: groups that read whole lines of memory.
         self._group = lane_group(self.device) if self.kernels.lanes > 1 else GROUP_ITEMS
         self._sums: tuple[Any, int, int, float] | None = None
@@ -57,7 +58,7 @@ class ImageLoss:
         counted : fraction of the pixels that are not masked; the others have no error.
         """
         image, kernels = self.pipeline.image, self.kernels
-        strips = -(-layout.tiles_x * layout.tile // (kernels.lanes * kernels.strip))
+        strips = -(-layout.tiles_x * layout.tile // (kernels.lanes * loss_strip(kernels)))
         segment = self._rows(strips, layout.height)
         segments = -(-layout.height // segment)
         n_parts = 3 * segments * strips

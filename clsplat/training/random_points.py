@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.looked_at import where_axes_meet
-from ..splats.schema import Array
+from ..splats.fields import Array
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera

@@ -11,36 +11,36 @@ from pathlib import Path
 
 import numpy as np
 
-from ..device.buffers import SplatBuffers
 from ..device.device import Device, Schedule, open_device
 from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import Evaluation, evaluate
-from ..rendering.gradients import CompactGradients
-from ..rendering.kernels import KernelBuild
+from ..rendering.build import KernelBuild
 from ..rendering.pipeline import TIMES_SEEN, ImageLayout, Pipeline, most_isects
-from ..rendering.render import Renderer
+from ..rendering.renderer import Renderer
+from ..rendering.splat_buffers import CompactGradients, SplatBuffers
 from ..rendering.tuning import schedule_for
 from ..scenes.scene import Scene, View
 from ..splats.morton import morton_order
-from ..splats.opacities import finite_rows
+from ..splats.optical_depth import finite_rows
 from ..splats.splats import Splats
-from .blocks import active_blocks
+from .alternation import active_blocks
 from .checkpoint import Checkpoint
 from .config import TrainConfig
 from .density.strategy import Moment, plan
+from .exposure import PhotoLoss, exposures_json, photo_bytes
+from .folder import ModelFolder
 from .initialise import initial_splats
 from .interrupt import stoppable
+from .log import Progress, RunLog
 from .loss import ImageLoss, LossValue
-from .memory import check, estimate, peak_bytes, room_for_isects
-from .model_folder import ModelFolder
+from .memory_estimate import check, estimate, peak_bytes, room_for_isects
 from .optim.noise import noise_amount, noise_reach
-from .optim.optim import make_optimizer
+from .optim.optimizer import make_optimizer
 from .optim.skew_map import SKEW_MAPS
-from .photos import PhotoLoss, exposures_json, photo_bytes
+from .programs import optim_program
 from .rate_limits import check_rates
-from .run_log import Progress, RunLog
 from .schedules import exponential_decay, sh_degree_at
-from .truths import Truths, truth_budget, truth_bytes, truth_channels
+from .targets import Truths, truth_budget, truth_bytes, truth_channels
 from .view_sampler import ViewSampler
 
 Visit = Callable[["Trainer", threading.Event], None]
@@ -128,7 +128,7 @@ class Trainer:
             self.photos.load_state(state)
             self.optimizer.load_state(state)
             self.pipeline.write_signals(checkpoint.signals, self.splats.capacity)
-        self.optim_program = self.kernels.optim_program(self.device)
+        self.optim_program = optim_program(self.device, self.kernels)
         self.renderer = Renderer(self.device)
         self.evaluations: dict[int, Evaluation] = {}
         self.evaluation_seconds: dict[int, float] = {}

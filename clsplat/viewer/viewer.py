@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import ClsplatError
-from ..rendering.display import Picture, to_bytes
-from .viewer_camera import Pace, Pose, camera_of, window_of
-from .viewer_queue import Wishes
-from .viewer_settings import Settings
-from .viewer_source import Source
+from ..rendering.colormaps import Picture, to_bytes
+from .camera import Pace, Pose, camera_of, window_of
+from .render_queue import Wishes
+from .settings import Settings
+from .source import Source
 
 REST = 0.15  # seconds without a move after which a camera is still
 _ROUNDING = 1e-3  # seconds, so that a picture that waits for rest finds it
@@ -27,7 +27,7 @@ SECONDS = 1.0 / 16.0  # that a picture of a moving camera may take: leaves a mar
 
 
 @dataclass(frozen=True)
-class Shot:
+class Picture:
     """A picture made for a looker-on.
 
     Attributes
@@ -45,7 +45,7 @@ class Shot:
 class Looker:
     """One who looks on."""
 
-    send: Callable[[Shot], None]
+    send: Callable[[Picture], None]
     settings: Settings
     pose: Pose | None = None
     moved: float = -math.inf
@@ -70,7 +70,7 @@ class Viewer:
         self._lookers: dict[int, Looker] = {}
         self._lock = threading.Lock()
 
-    def join(self, who: int, send: Callable[[Shot], None]) -> None:
+    def join(self, who: int, send: Callable[[Picture], None]) -> None:
         """Somebody looks on from now; `send` is called by the thread that serves."""
         with self._lock:
             self._lookers[who] = Looker(send, self.settings, pace=Pace(self.seconds))
@@ -158,18 +158,18 @@ class Viewer:
         """How many cameras move: they share the time."""
         return max(sum(now - looker.moved < REST for looker in list(self._lookers.values())), 1)
 
-    def _shot(self, pose: Pose, settings: Settings, size: int, still: bool, start: float) -> Shot:
+    def _shot(self, pose: Pose, settings: Settings, size: int, still: bool, start: float) -> Picture:
         """A picture, whatever comes; blank where there is nothing to see from the pose."""
         message = ""
         try:
             camera = camera_of(pose, size)
             if camera is not None:
-                return Shot(self.source.picture(camera, settings), still, self._clock() - start)
+                return Picture(self.source.picture(camera, settings), still, self._clock() - start)
         except ClsplatError as error:
             message = str(error)
         except Exception as error:  # a driver's, for one: the server goes on
             message = f"no picture: {type(error).__name__}: {error}".split("\n")[0]
-        return Shot(blank(pose, size, settings), still, self._clock() - start, message)
+        return Picture(blank(pose, size, settings), still, self._clock() - start, message)
 
 
 def blank(pose: Pose, size: int, settings: Settings) -> Picture:

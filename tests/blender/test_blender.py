@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 import clsplat as package
 from clsplat.cameras.camera import Camera
 from clsplat.errors import InputError
-from clsplat.rendering.render import Rendered, Renderer
-from clsplat.splats.placing import joined, placed
+from clsplat.rendering.renderer import Rendered, Renderer
+from clsplat.splats.transform import joined, placed
 
 # --- lens ----------------------------------------------------------------------------------------
 

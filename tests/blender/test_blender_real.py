@@ -22,12 +22,12 @@ from clsplat_cli.blender_addon import addon_zip
 from PIL import Image
 
 from clsplat.cameras.camera import Camera
-from clsplat.cameras.camera_path import CameraPath, read_path, write_path
 from clsplat.cameras.cameras_json import NamedCamera, read_cameras, write_cameras
-from clsplat.cameras.paths_between import interpolate
-from clsplat.rendering.render import Renderer
-from clsplat.splats.placing import joined, placed
+from clsplat.cameras.interpolate import interpolate
+from clsplat.cameras.path import CameraPath, read_path, write_path
+from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
+from clsplat.splats.transform import joined, placed
 
 CHILD = Path(__file__).parents[1] / "support" / "blender_child.py"
 

@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 from frontier_records import recorded, seeds, sweep
 
-from clsplat.comparison import charts, frontier_charts
+from clsplat.comparison import charts
+from clsplat.comparison import sweep_charts as frontier_charts
 from clsplat.comparison.charts import VERDICTS, arithmetic_chart, growth_chart, heat_map, seeds_chart
-from clsplat.comparison.frontier_charts import equal_chart, size_chart, time_chart
-from clsplat.comparison.frontier_data import arithmetic_rows, curve_rows, equal_rows, point_rows, seed_rows
-from clsplat.comparison.frontier_tables import arithmetic_table
+from clsplat.comparison.sweep_charts import equal_chart, size_chart, time_chart
+from clsplat.comparison.sweep_rows import arithmetic_rows, curve_rows, equal_rows, point_rows, seed_rows
+from clsplat.comparison.sweep_tables import arithmetic_table
 from clsplat.errors import InputError, OutputError
 from clsplat.evaluation.chart_style import _STYLE, chart_paths, drawing, looks, place_labels, shape_colour, short_count
 from clsplat.splats.shapes import SHAPES

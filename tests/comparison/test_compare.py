@@ -13,16 +13,16 @@ from cli_runner import small_capture
 
 from clsplat.comparison import compare as module
 from clsplat.comparison.compare import Run, compare, curve_iterations, digest, scene_identity
-from clsplat.comparison.compare_table import HEAD, MEASURED, Record, cells, markdown, notes, repeats, summarise
-from clsplat.comparison.systems import parse_systems
+from clsplat.comparison.methods import parse_systems
+from clsplat.comparison.table import HEAD, MEASURED, Record, cells, markdown, notes, repeats, summarise
 from clsplat.errors import InputError, TrainingError
 from clsplat.evaluation.evaluate import evaluate
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
+from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
-from clsplat.training.training import train
 
 CAP = 60
 SHORT: dict[str, Any] = {"iterations": 20, "sh_degree": 1, "densify_interval": 5}

@@ -22,11 +22,11 @@ from clsplat.compression.prune import (
 )
 from clsplat.device.device import Device
 from clsplat.errors import InputError
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, load_scene
-from clsplat.scenes.validation import hold_out
+from clsplat.scenes.split import hold_out
 from clsplat.splats.splats import Splats
-from clsplat.training.model_folder import ModelFolder
+from clsplat.training.folder import ModelFolder
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from clsplat_cli import devices as devices_cli
 
 from clsplat.device import device as device_module
-from clsplat.device import runtime
+from clsplat.device import pip_runtime as runtime
 from clsplat.device.device import (
     SCHEDULES,
     Device,

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from clsplat_cli.main import COMMANDS
 
-from clsplat.device.binaries import SELF_CACHING
 from clsplat.device.device import list_devices
 from clsplat.device.program import OPTIONS_VARIABLE
+from clsplat.device.program_cache import SELF_CACHING
 
 USABLE = [info for info in list_devices() if info.ailment is None and info.platform != "Oclgrind"]
 PROCESSES = 4
@@ -24,7 +24,7 @@ import hashlib, sys
 import numpy as np
 from clsplat.cameras.camera import Camera
 from clsplat.device.device import SCHEDULES
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
 rng = np.random.default_rng(0)
 splats = Splats("gaussian", {"mean": rng.uniform(-1, 1, (50, 3)), "quat": rng.standard_normal((50, 4)),

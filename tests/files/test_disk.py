@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 from cli_runner import SHORT, clsplat, error_of, run, small_capture, small_model
-from files.test_sole_writer import HOLD
+from files.test_lock import HOLD
 
 from clsplat.splats.splats import Splats
 from clsplat.training.checkpoint import Checkpoint
-from clsplat.training.model_folder import ModelFolder
+from clsplat.training.folder import ModelFolder
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.files.atomic import atomic_path
-from clsplat.files.sole_writer import sole_writer
+from clsplat.files.lock import sole_writer
 
 pytest.importorskip("fcntl")
 KILLED = """

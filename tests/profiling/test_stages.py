@@ -8,23 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kernel_checks import Case
-from reference import alpha_maps, prepared, project, visible_order
-from reference_scenes import random_camera, random_splats
+from reference.renderer import alpha_maps, prepared, project, visible_order
+from reference.scenes import random_camera, random_splats
 
-from clsplat.device.buffers import SplatBuffers
 from clsplat.device.device import SCHEDULES, Device
-from clsplat.device.launches import Launch
 from clsplat.device.program import parse_signatures, source
+from clsplat.device.trace import Launch
 from clsplat.errors import InputError
 from clsplat.profiling.bench import Report, bench_trainer, measure_render, measure_training
-from clsplat.profiling.limits import Limits
+from clsplat.profiling.roofline import Limits
 from clsplat.profiling.stages import HOST, SHARED, STAGE_OF, STAGES, Sizes, by_stage, work_of
-from clsplat.rendering.kernels import T_MIN, KernelBuild
-from clsplat.rendering.pairs import count_pairs
+from clsplat.rendering.build import T_MIN, KernelBuild
+from clsplat.rendering.overdraw import count_pairs
 from clsplat.rendering.pipeline import Pipeline
-from clsplat.scenes.synthetic import synthetic_scene
+from clsplat.rendering.splat_buffers import SplatBuffers
+from clsplat.scenes.random_scene import synthetic_scene
 
-OTHER_PROGRAMS = {"measure/smoke.cl", "measure/limits.cl", "measure/count.cl"}  # no part of an iteration
+OTHER_PROGRAMS = {"measure/smoke.cl", "measure/roofline.cl", "measure/count.cl"}  # no part of an iteration
 
 
 def test_every_kernel_has_one_stage() -> None:

@@ -6,13 +6,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import FIELDS, NEAR_PLANE, REFERENCES, blend, projected_point, reference_gradients, render_reference
-from reference_formulas import SKEW_MAX, rotation
-from reference_scenes import for_shape, random_camera, random_splats
 from scipy.spatial.transform import Rotation
-from tolerances import DIFFERENCES, ROUNDING, relative_error
 
 from clsplat.cameras.camera import Camera
+from reference.formulas import SKEW_MAX, rotation
+from reference.renderer import (
+    FIELDS,
+    NEAR_PLANE,
+    REFERENCES,
+    blend,
+    projected_point,
+    reference_gradients,
+    render_reference,
+)
+from reference.scenes import for_shape, random_camera, random_splats
+from reference.tolerances import DIFFERENCES, ROUNDING, relative_error
 
 SEEDS = st.integers(0, 2**32 - 1)
 FEW = settings(max_examples=3, deadline=None)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from reference_loss import C1, C2, blur_matrix, reference_loss, reference_loss_gradient, ssim_map
-from tolerances import DIFFERENCES
+
+from reference.loss import C1, C2, blur_matrix, reference_loss, reference_loss_gradient, ssim_map
+from reference.tolerances import DIFFERENCES
 
 
 def random_pair(height: int, width: int):

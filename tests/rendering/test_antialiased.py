@@ -10,21 +10,21 @@ import pytest
 from cli_runner import clsplat, error_of, small_capture
 from conftest import MakeRenderer
 from kernel_checks import BACKGROUND, KERNELS, SMOOTH, Arrays, Case
-from reference import FIELDS
-from reference_formulas import SKEW_MAX
-from reference_scenes import random_camera, random_splats
+from reference.formulas import SKEW_MAX
+from reference.renderer import FIELDS
+from reference.scenes import random_camera, random_splats
+from reference.tolerances import DIFFERENCES, GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, relative_error
 from rendering.test_gradients import differences
-from tolerances import DIFFERENCES, GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, relative_error
 
 from clsplat.device.device import Device
 from clsplat.errors import InputError
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
 from clsplat.splats.convert import convert
-from clsplat.splats.placing import joined
 from clsplat.splats.splats import Splats
+from clsplat.splats.transform import joined
 from clsplat.training.config import TrainConfig
-from clsplat.training.training import train
+from clsplat.training.run import train
 
 SIZES = (0.3, 3.0)  # standard deviations on the screen, roughly [px]
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from conftest import MakeRenderer
 from kernel_checks import BACKGROUND, SMOOTH, Case
-from reference_scenes import random_camera, random_splats
+from reference.scenes import random_camera, random_splats
 
 from clsplat.device.device import SCHEDULES, Device, Schedule
 from clsplat.errors import DeviceError, InputError
 from clsplat.rendering.arithmetic import EXP_FORMS, PHI_FORMS, Arithmetic
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
 
 # Most that a pixel of a few splats may be off in double, some times the form's own error.

@@ -9,21 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reference_scenes import for_shape, random_camera, random_splats
+from reference.scenes import for_shape, random_camera, random_splats
+from reference.tolerances import relative_error
 from small_scene import write_garden
-from tolerances import relative_error
 
-from clsplat.device.buffers import ParameterBuffers, Pool, SplatBuffers, to_device, to_host
 from clsplat.device.device import SCHEDULES, Device, open_device
+from clsplat.device.memory import Pool, to_device, to_host
 from clsplat.errors import DeviceError
 from clsplat.rendering.binning import MAX_ISECTS, Band, ChunkBinner, GroupBinner, cut
-from clsplat.rendering.kernels import KernelBuild
-from clsplat.rendering.pairs import count_pairs
+from clsplat.rendering.build import KernelBuild
+from clsplat.rendering.overdraw import count_pairs
 from clsplat.rendering.pipeline import Pipeline, most_isects
+from clsplat.rendering.splat_buffers import ParameterBuffers, SplatBuffers
 from clsplat.scenes.scene import load_scene
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
-from clsplat.training.memory import Estimate, check, room_for_isects
+from clsplat.training.memory_estimate import Estimate, check, room_for_isects
 from clsplat.training.trainer import Trainer
 
 WIDTH, HEIGHT, N = 103, 71, 300  # 7 x 5 tiles

@@ -11,12 +11,13 @@ from kernel_checks import KERNELS
 
 from clsplat.device.device import SCHEDULES, Device
 from clsplat.device.program import build
-from clsplat.profiling.limits import CHAINS, limits_program
+from clsplat.profiling.roofline import CHAINS, limits_program
 from clsplat.rendering.binning import BUCKET_BITS
-from clsplat.rendering.kernels import KernelBuild
-from clsplat.rendering.sort import DIGIT_BITS
+from clsplat.rendering.build import KernelBuild
+from clsplat.rendering.radix_sort import DIGIT_BITS
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.training.optim.skew_map import SKEW_MAPS
+from clsplat.training.programs import exposure_program, loss_program, optim_program
 
 REALS = ("float", "double")
 
@@ -56,9 +57,9 @@ def build_all(device: Device, kernels: KernelBuild) -> None:
     if kernels.real == "double" and not device.has_fp64:
         return
     kernels.raster_program(device)
-    kernels.loss_program(device)
-    kernels.photo_program(device)
-    kernels.optim_program(device)
+    loss_program(device, kernels)
+    exposure_program(device, kernels)
+    optim_program(device, kernels)
 
 
 def test_every_kernel_builds_without_warnings(compiler: Device) -> None:

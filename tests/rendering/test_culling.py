@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from kernel_checks import Case
-from reference_scenes import for_shape, random_camera, random_splats
-from reference_skewed import SKEWED
+from reference.scenes import for_shape, random_camera, random_splats
+from reference.skewed import SKEWED
 from rendering.test_footprint import strongly_skewed
 
-from clsplat.device.buffers import SplatBuffers, to_host
 from clsplat.device.device import TILES, Device, Schedule
-from clsplat.rendering.kernels import KernelBuild
+from clsplat.device.memory import to_host
+from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.pipeline import Pipeline
+from clsplat.rendering.splat_buffers import SplatBuffers
 from clsplat.splats.shapes import SHAPES, shape_named
 
 WIDTH, HEIGHT = 83, 61

@@ -12,18 +12,19 @@ import pytest
 from conftest import MakeRenderer
 from kernel_checks import Arrays, Case
 from numpy.typing import NDArray
-from reference import kernel_values, prepared, project
-from reference_formulas import SKEW_MAX
-from reference_scenes import for_shape, random_camera, random_splats
-from reference_shape import Kernel
-from reference_skewed import SKEWED
-from tolerances import IMAGE_FLOAT32, ROUNDING
+from reference.formulas import SKEW_MAX
+from reference.renderer import kernel_values, prepared, project
+from reference.scenes import for_shape, random_camera, random_splats
+from reference.shape import Kernel
+from reference.skewed import SKEWED
+from reference.tolerances import IMAGE_FLOAT32, ROUNDING
 
 from clsplat.cameras.camera import Camera
-from clsplat.device.buffers import SplatBuffers, to_host
 from clsplat.device.device import TILES, Device, default_schedule
-from clsplat.rendering.kernels import ALPHA_MIN, KernelBuild
+from clsplat.device.memory import to_host
+from clsplat.rendering.build import ALPHA_MIN, KernelBuild
 from clsplat.rendering.pipeline import Pipeline
+from clsplat.rendering.splat_buffers import SplatBuffers
 from clsplat.splats.splats import Splats
 
 SHAPES = list(SKEWED)  # those of another falloff: test_shapes_radial.py

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import alpha_maps, project
-from reference_formulas import (
+from reference.formulas import (
     CLAMP_MARGIN,
     SKEW_MAX,
     bounded,
@@ -20,12 +19,13 @@ from reference_formulas import (
     sh_basis,
     slope_of,
 )
-from reference_scenes import random_camera, random_splats
-from reference_shape import LOW_PASS
+from reference.renderer import alpha_maps, project
+from reference.scenes import random_camera, random_splats
+from reference.shape import LOW_PASS
+from reference.tolerances import ROUNDING, relative_error
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.special import erfc, factorial, lpmv, ndtr
-from tolerances import ROUNDING, relative_error
 
 from clsplat.splats import shapes
 

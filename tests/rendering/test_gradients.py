@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from conftest import USABLE, MakeRenderer, on_place
 from kernel_checks import BACKGROUND, KERNELS, SMOOTH, Arrays, Case
-from reference import FIELDS
-from reference_formulas import SKEW_MAX
-from reference_scenes import random_camera, random_splats
-from tolerances import DIFFERENCES, relative_error
+from reference.formulas import SKEW_MAX
+from reference.renderer import FIELDS
+from reference.scenes import random_camera, random_splats
+from reference.tolerances import DIFFERENCES, relative_error
 
 from clsplat.cameras.camera import Camera
 from clsplat.device.device import SCHEDULES, Device
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from reference_formulas import sh_basis as reference_basis
-from reference_scenes import for_shape, random_camera, random_splats
+from reference.formulas import sh_basis as reference_basis
+from reference.scenes import for_shape, random_camera, random_splats
 
-from clsplat.device.buffers import ParameterBuffers, SplatBuffers, to_device
 from clsplat.device.device import Device, default_schedule
-from clsplat.rendering.gradients import CompactGradients
-from clsplat.rendering.kernels import KernelBuild
+from clsplat.device.memory import to_device
+from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.pipeline import Pipeline
+from clsplat.rendering.splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers
 from clsplat.splats.harmonics import sh_basis
 from clsplat.splats.splats import Splats
 

@@ -12,19 +12,19 @@ import pytest
 from conftest import MakeRenderer
 from kernel_checks import BACKGROUND, SMOOTH, Arrays, Case
 from numpy.typing import NDArray
-from reference import prepared, project
-from reference_formulas import rotation
-from reference_radial import RADIAL
-from reference_scenes import for_shape, random_camera, random_splats
+from reference.formulas import rotation
+from reference.radial import RADIAL
+from reference.renderer import prepared, project
+from reference.scenes import for_shape, random_camera, random_splats
+from reference.tolerances import DIFFERENCES, GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, SAME_FLOAT32, relative_error
 from rendering.test_footprint import kernel_boxes
-from tolerances import DIFFERENCES, GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, SAME_FLOAT32, relative_error
 
 from clsplat.cameras.camera import Camera
-from clsplat.device.buffers import to_device, to_host
 from clsplat.device.device import Device
+from clsplat.device.memory import to_device, to_host
 from clsplat.device.program import build_text, source
-from clsplat.rendering.kernels import ALPHA_MAX, ALPHA_MIN, LOW_PASS
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.build import ALPHA_MAX, ALPHA_MIN, LOW_PASS
+from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import BETA_BOUNDS, NU_BOUNDS, SHAPES
 from clsplat.splats.splats import Splats
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import reference_shape
-import reference_skewed
 from conftest import MakeRenderer
 from kernel_checks import BACKGROUND, Arrays, Case
 from numpy.typing import NDArray
-from reference import axes_of, kernel_values, project, projected_point, render_reference
-from reference_formulas import jacobian
-from reference_scenes import for_shape, random_camera, random_splats
+from reference import shape as reference_shape
+from reference import skewed as reference_skewed
+from reference.formulas import jacobian
+from reference.renderer import axes_of, kernel_values, project, projected_point, render_reference
+from reference.scenes import for_shape, random_camera, random_splats
+from reference.tolerances import GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, relative_error
 from scipy.special import ndtr
-from tolerances import GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, relative_error
 
 from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device

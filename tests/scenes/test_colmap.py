@@ -14,9 +14,9 @@ from small_scene import CX, CY, FX, FY, HEIGHT, WIDTH, cloud, model_views, write
 
 from clsplat.errors import InputError
 from clsplat.scenes.colmap import read_model
-from clsplat.scenes.colmap_files import check_binary_model, write_binary_model
-from clsplat.scenes.lens import Photo, make_lens
+from clsplat.scenes.colmap_binary import check_binary_model, write_binary_model
 from clsplat.scenes.scene import load_scene
+from clsplat.scenes.undistort import Photo, make_lens
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from PIL import Image
 from clsplat.errors import InputError, OutputError
 from clsplat.scenes.colmap import find_model, read_model
 from clsplat.scenes.reconstruct import reconstruct as module
-from clsplat.scenes.reconstruct.photo_folder import PhotoFile
+from clsplat.scenes.reconstruct.photo_files import PhotoFile
 from clsplat.scenes.reconstruct.reconstruct import ReconstructOptions, made_from, reconstruct
 from clsplat.scenes.reconstruct.sfm_process import Step
 from clsplat.scenes.scene import Scene, load_scene
@@ -186,7 +186,7 @@ def test_what_a_killed_run_left_goes_and_another_run_is_kept_out(tmp_path: Path)
         assert not any(work.iterdir())
     assert not left.exists()
     left.mkdir()
-    program = "import sys; from clsplat.files.sole_writer import sole_writer; from pathlib import Path\n" \
+    program = "import sys; from clsplat.files.lock import sole_writer; from pathlib import Path\n" \
               "with sole_writer(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     command = [sys.executable, "-c", program, left]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
@@ -235,7 +235,7 @@ def test_pairs_of_a_sequence() -> None:
 
 def test_warnings_of_photos_that_are_not_placed(tmp_path: Path) -> None:
     from clsplat.files.images import PhotoFacts
-    from clsplat.scenes.reconstruct.photo_folder import Prepared
+    from clsplat.scenes.reconstruct.photo_files import Prepared
 
     facts = PhotoFacts(8, 8, True, (), b"")
     ready = [Prepared(PhotoFile(f"{n}.jpg", tmp_path), facts, f"{n}.jpg") for n in range(10)]

@@ -31,7 +31,7 @@ from small_scene import (
 from clsplat.errors import InputError
 from clsplat.files.images import write_png
 from clsplat.scenes.colmap import find_model, read_model
-from clsplat.scenes.colmap_files import write_binary_model
+from clsplat.scenes.colmap_binary import write_binary_model
 from clsplat.scenes.scene import load_scene
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from kernel_checks import BACKGROUND, Case
-from reference import render_reference
-from reference_scenes import Arrays, for_shape, random_camera, random_splats
-from tolerances import IMAGE_FLOAT32, ROUNDING
+from reference.renderer import render_reference
+from reference.scenes import Arrays, for_shape, random_camera, random_splats
+from reference.tolerances import IMAGE_FLOAT32, ROUNDING
 
 from clsplat.errors import InputError
 from clsplat.splats.convert import convert

@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reference_scenes import for_shape, random_splats
+from reference.scenes import for_shape, random_splats
 
-from clsplat.splats.splat_file import read_splat, write_splat
+from clsplat.splats.dot_splat import read_splat, write_splat
 from clsplat.splats.splats import SH_C0, Splats
-from clsplat.splats.spz_file import read_spz, write_spz
+from clsplat.splats.spz import read_spz, write_spz
 
 MODULES = Path(os.environ.get("CLSPLAT_NODE_MODULES", "/nonexistent"))
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

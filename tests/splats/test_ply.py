@@ -14,8 +14,8 @@ from model_strategies import Arrays, models, random_arrays
 from scenes_data import scene_folder
 
 from clsplat.errors import InputError
+from clsplat.splats.fields import Field
 from clsplat.splats.ply import read_ply, write_ply
-from clsplat.splats.schema import Field
 from clsplat.splats.shapes import SHAPES
 
 IN_FOLDER = settings(

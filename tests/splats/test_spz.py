@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reference_scenes import random_splats
+from reference.scenes import random_splats
 
 from clsplat.errors import InputError
-from clsplat.splats.splat_file import read_splat, write_splat
+from clsplat.splats.dot_splat import read_splat, write_splat
 from clsplat.splats.splats import Splats
-from clsplat.splats.spz_file import read_spz, write_spz
+from clsplat.splats.spz import read_spz, write_spz
 
 HEADER = struct.Struct("<IIIBBBB")
 SMALL = [(1.0, 0.0, 0.0, 0.0), (0.5, -0.5, 0.5, -0.5), (-0.1, 0.7, -0.7, 0.1), (0.0, 0.0, 0.0, -3.0)]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from clsplat.cameras.camera import Camera
-from clsplat.cameras.paths_around import look_at
+from clsplat.cameras.orbits import look_at
 from clsplat.splats.splats import Splats
 
 WIDTH, HEIGHT = 96, 64

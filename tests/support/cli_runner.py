@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner, Result
 from clsplat_cli.main import main
 
-from clsplat.scenes.demo.capture import write_capture
+from clsplat.scenes.demo.scene import write_capture
 
 WIDTH, HEIGHT, N_VIEWS = 48, 36, 10
 TEST_NAMES = ["view_000.png", "view_008.png"]  # every 8th of ten

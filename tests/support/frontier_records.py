@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from clsplat.comparison.compare_table import MEASURED, Record
+from clsplat.comparison.table import MEASURED, Record
 from clsplat.training.config import TrainConfig
 
 

@@ -13,19 +13,19 @@ from model_arrays import random_model
 from small_scene import FX, FY, NAMES, as_text, cloud, model_views, photo_of
 
 from clsplat.cameras.camera import Camera
-from clsplat.cameras.camera_path import CameraPath, read_path, write_path
 from clsplat.cameras.cameras_json import named_cameras, read_cameras, write_cameras
+from clsplat.cameras.path import CameraPath, read_path, write_path
 from clsplat.errors import InputError
 from clsplat.files.images import image_size, read_image, write_grey16, write_png
 from clsplat.scenes.colmap import find_model, read_model
-from clsplat.scenes.colmap_files import write_binary_model
+from clsplat.scenes.colmap_binary import write_binary_model
 from clsplat.scenes.point_cloud import read_point_cloud
 from clsplat.scenes.scene import load_scene
+from clsplat.splats.dot_splat import read_splat, write_splat
 from clsplat.splats.ply import read_ply
 from clsplat.splats.shapes import SHAPES
-from clsplat.splats.splat_file import read_splat, write_splat
 from clsplat.splats.splats import Splats
-from clsplat.splats.spz_file import read_spz, write_spz
+from clsplat.splats.spz import read_spz, write_spz
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 
@@ -151,8 +151,8 @@ def make_checkpoint(folder: Path) -> None:
 def read_checkpoint(folder: Path) -> None:
     """As far as resuming goes before it asks for a device."""
     from clsplat.device.device import Schedule
-    from clsplat.training.model_folder import ModelFolder
-    from clsplat.training.training import _fitting_checkpoint
+    from clsplat.training.folder import ModelFolder
+    from clsplat.training.run import _fitting_checkpoint
 
     found = _fitting_checkpoint(ModelFolder(folder), TrainConfig(iterations=100))
     Schedule.parse(found.schedule)
@@ -181,7 +181,7 @@ def read_model_folder(folder: Path) -> None:
 def make_search(folder: Path) -> None:
     from dataclasses import asdict
 
-    from clsplat.compression.budget_rules import BudgetOptions
+    from clsplat.compression.rules import BudgetOptions
 
     values = {"config": TrainConfig(iterations=100).to_json(), "options": asdict(BudgetOptions()),
               "scene": {"path": "/data", "resolution": 2}}
@@ -243,7 +243,7 @@ def read_photographs(folder: Path) -> None:
     """As far as a reconstruction goes before it looks for features."""
     import tempfile
 
-    from clsplat.scenes.reconstruct.photo_folder import find_photos, fingerprint, is_photographs, prepare, same_camera
+    from clsplat.scenes.reconstruct.photo_files import find_photos, fingerprint, is_photographs, prepare, same_camera
 
     is_photographs(folder / "photos")
     found = find_photos(folder / "photos")
@@ -268,7 +268,7 @@ def make_blender(folder: Path) -> None:
 
 
 def read_facts(folder: Path) -> None:
-    from clsplat.scenes.scene_info import scene_info
+    from clsplat.scenes.info import scene_info
 
     scene_info(folder)
 

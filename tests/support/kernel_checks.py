@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from reference import (
+from reference.renderer import (
     Rendered,
     alpha_maps,
     prepared,
@@ -17,12 +17,12 @@ from reference import (
     render_reference,
     visible_order,
 )
-from reference_scenes import for_shape
-from tolerances import relative_error
+from reference.scenes import for_shape
+from reference.tolerances import relative_error
 
 from clsplat.cameras.camera import Camera
-from clsplat.rendering import render
-from clsplat.rendering.kernels import ALPHA_MAX, ALPHA_MIN, T_MIN
+from clsplat.rendering import renderer as render
+from clsplat.rendering.build import ALPHA_MAX, ALPHA_MIN, T_MIN
 from clsplat.splats.shapes import NORMALISATIONS, SHAPES
 from clsplat.splats.splats import Splats
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from clsplat.splats import shapes
-from clsplat.splats.schema import public_shape
+from clsplat.splats.fields import public_shape
 from clsplat.splats.shapes import Shape
 
 Arrays = dict[str, np.ndarray]

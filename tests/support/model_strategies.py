@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from clsplat.splats.schema import public_shape
+from clsplat.splats.fields import public_shape
 from clsplat.splats.shapes import SHAPES
 
 Arrays = dict[str, np.ndarray]

@@ -14,10 +14,12 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from reference_scenes import for_shape, random_camera, random_splats
+from reference.scenes import for_shape, random_camera, random_splats
 
 from clsplat.device.device import Device, Schedule, buffers, open_device, program
-from clsplat.rendering import binning, pipeline, render, sort
+from clsplat.rendering import binning, pipeline
+from clsplat.rendering import radix_sort as sort
+from clsplat.rendering import renderer as render
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.splats.splats import Splats
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.files.images import write_png
-from clsplat.scenes.colmap_files import ModelView, write_binary_model
+from clsplat.scenes.colmap_binary import ModelView, write_binary_model
 
 WIDTH, HEIGHT, N_VIEWS, N_POINTS = 40, 30, 9, 12
 FX, FY, CX, CY = 33.0, 31.0, 18.5, 16.25

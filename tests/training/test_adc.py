@@ -12,11 +12,11 @@ from model_arrays import ALL_SHAPES, Arrays, random_model
 
 from clsplat.errors import TrainingError
 from clsplat.splats import shapes
-from clsplat.splats.opacities import opacity_names
-from clsplat.splats.rotations import rotations
+from clsplat.splats.optical_depth import opacity_names
+from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import Shape
 from clsplat.training.density.adc import MIN_OPACITY, RESET_OPACITY, SPLIT_SHRINK, WORLD_SIZE, plan_adc, with_reset
-from clsplat.training.density.plan import Plan
+from clsplat.training.density.edit import Plan
 
 EXTENT = 2.0
 THRESHOLD = 2e-4

@@ -11,9 +11,9 @@ import pytest
 from fuzz_readers import make_checkpoint, make_model, read_checkpoint, read_model_folder
 
 from clsplat.errors import InputError
+from clsplat.files.json_file import read_object
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
-from clsplat.training.model_folder import read_json
 
 
 def rewritten(path: Path, **changes: Any) -> None:
@@ -84,4 +84,4 @@ def test_model_folders(tmp_path: Path, config: str, said: str) -> None:
 def test_json_that_is_no_object(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("[1]")
     with pytest.raises(InputError, match="expected a JSON object"):
-        read_json(tmp_path / "a.json")
+        read_object(tmp_path / "a.json")

@@ -7,13 +7,13 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reference_loss import reference_loss, reference_loss_gradient
-from tolerances import ROUNDING, relative_error
+from reference.loss import reference_loss, reference_loss_gradient
+from reference.tolerances import ROUNDING, relative_error
 
-from clsplat.device.buffers import to_device, to_host
 from clsplat.device.device import SCHEDULES, Device, Schedule
+from clsplat.device.memory import to_device, to_host
 from clsplat.device.program import Real
-from clsplat.rendering.kernels import KernelBuild
+from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.pipeline import ImageLayout, Pipeline
 from clsplat.training.loss import ImageLoss, LossValue
 

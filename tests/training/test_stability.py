@@ -18,7 +18,7 @@ from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
 from clsplat.training.optim.noise import PUBLISHED_EXTENT
-from clsplat.training.optim.optim_rules import Rules
+from clsplat.training.optim.rules import Rules
 from clsplat.training.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))

@@ -12,8 +12,8 @@ from clsplat.errors import InputError
 from clsplat.splats import shapes
 from clsplat.training.config import BY_STRATEGY, STRATEGIES, TrainConfig
 from clsplat.training.density import strategy
-from clsplat.training.density.densify import relocation
-from clsplat.training.density.plan import Plan
+from clsplat.training.density.edit import Plan
+from clsplat.training.density.relocation import relocation
 from clsplat.training.density.strategy import Moment
 
 N = 100

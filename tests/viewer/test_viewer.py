@@ -9,21 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reference_scenes import for_shape, random_camera, random_splats
+from reference.scenes import for_shape, random_camera, random_splats
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
 from clsplat.errors import DeviceError, InputError
-from clsplat.rendering.display import MODES, Picture, to_bytes
-from clsplat.rendering.render import Renderer
+from clsplat.rendering.colormaps import MODES, Picture, to_bytes
+from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
-from clsplat.viewer.viewer import REST, Shot, Viewer
-from clsplat.viewer.viewer_camera import WIDEST, Pace, Pose, camera_of, window_of
-from clsplat.viewer.viewer_queue import Wishes
-from clsplat.viewer.viewer_recording import MOST_KEYS, Recording
-from clsplat.viewer.viewer_settings import LARGEST, SMALLEST, Settings
-from clsplat.viewer.viewer_source import ModelSource, Watch, coverage
-from clsplat.viewer.viewer_start import Known, fov_of, start_of
+from clsplat.viewer.camera import WIDEST, Pace, Pose, camera_of, window_of
+from clsplat.viewer.recording import MOST_KEYS, Recording
+from clsplat.viewer.render_queue import Wishes
+from clsplat.viewer.settings import LARGEST, SMALLEST, Settings
+from clsplat.viewer.source import ModelSource, Watch, coverage
+from clsplat.viewer.start import Known, fov_of, start_of
+from clsplat.viewer.viewer import REST, Picture, Viewer
 
 AHEAD = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 1.0, 96, 64)
 BACKGROUND = (0.2, 0.4, 0.6)
@@ -194,7 +194,7 @@ def test_unusable_values_change_nothing(name: str, value: object) -> None:
 def test_small_while_moving_and_full_when_still() -> None:
     clock = Clock()
     source = Plain(clock, seconds=0.2)
-    viewer, shots = Viewer(source, clock=clock), list[Shot]()
+    viewer, shots = Viewer(source, clock=clock), list[Picture]()
     viewer.join(1, shots.append)
     for _ in range(20):
         viewer.move(1, AHEAD)
@@ -240,7 +240,7 @@ def test_everybody_has_settings_of_their_own() -> None:
 
 @pytest.mark.parametrize("error", [DeviceError("out of memory"), ValueError("a bug\nof a driver"), MemoryError()])
 def test_a_picture_that_cannot_be_made_is_blank_and_says_why(error: Exception) -> None:
-    clock, shots = Clock(), list[Shot]()
+    clock, shots = Clock(), list[Picture]()
     viewer = Viewer(Plain(clock, error=error), Settings(background=BACKGROUND), clock=clock)
     viewer.join(1, shots.append)
     viewer.move(1, AHEAD)
@@ -253,7 +253,7 @@ def test_a_picture_that_cannot_be_made_is_blank_and_says_why(error: Exception) -
 
 @pytest.mark.parametrize("pose", NONE, ids=range(len(NONE)))
 def test_absurd_cameras_see_a_blank_picture(pose: Pose) -> None:
-    clock, shots = Clock(), list[Shot]()
+    clock, shots = Clock(), list[Picture]()
     viewer = Viewer(Plain(clock), Settings(background=BACKGROUND), clock=clock)
     viewer.join(1, shots.append)
     viewer.move(1, pose)
@@ -263,9 +263,9 @@ def test_absurd_cameras_see_a_blank_picture(pose: Pose) -> None:
 
 def test_a_line_that_breaks_ends_with_itself() -> None:
     clock = Clock()
-    viewer, shots = Viewer(Plain(clock), clock=clock), list[Shot]()
+    viewer, shots = Viewer(Plain(clock), clock=clock), list[Picture]()
 
-    def broken(shot: Shot) -> None:
+    def broken(shot: Picture) -> None:
         raise ConnectionError("reset by peer")
 
     viewer.join(1, broken)

@@ -15,11 +15,10 @@ from typing import TypeVar
 
 from ...errors import InputError, OutputError
 from ...files.images import PhotoFacts, photo_facts
-from ...files.json_fields import read_json
-from ...files.sole_writer import sole_writer
-from ...training.model_folder import write_json
-from .flat_model import SparseModel, write_flat_model, write_flat_photo
-from .photo_folder import (
+from ...files.json_file import read_json, write_json
+from ...files.lock import sole_writer
+from .options import CAMERA_MODELS, CAMERA_MODES, FEWEST, MATCHERS, ReconstructOptions
+from .photo_files import (
     PhotoFile,
     Prepared,
     complete_masks,
@@ -30,9 +29,9 @@ from .photo_folder import (
     same_camera,
     unread_kinds,
 )
-from .reconstruct_options import CAMERA_MODELS, CAMERA_MODES, FEWEST, MATCHERS, ReconstructOptions
-from .sfm import ENOUGH
 from .sfm_process import Step, Tell, run_sfm
+from .sfm_worker import ENOUGH
+from .undistorted_scene import SparseModel, write_flat_model, write_flat_photo
 from .video_frames import extract_frames
 
 __all__ = ["CAMERA_MODELS", "CAMERA_MODES", "MATCHERS", "ReconstructOptions", "Reconstructed", "estimated_seconds",

@@ -58,7 +58,7 @@ def run_sfm(work: Path, job: dict[str, Any], tell: Tell, source: str) -> dict[st
     (work / "job.json").write_text(json.dumps(whole), encoding="utf-8")
     log = work / "log.txt"
     with log.open("wb") as errors:
-        child = subprocess.Popen([sys.executable, "-m", f"{__package__}.sfm", str(work / "job.json")], stderr=errors,
+        child = subprocess.Popen([sys.executable, "-m", f"{__package__}.sfm_worker", str(work / "job.json")], stderr=errors,
                                  stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=_environment(),
                                  start_new_session=True)
     try:

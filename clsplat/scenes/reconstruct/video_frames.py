@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files.video import require_encoder
-from .photo_folder import PhotoFile
-from .reconstruct_options import FEWEST, FRAMES
+from .options import FEWEST, FRAMES
+from .photo_files import PhotoFile
 
 _SIDE = 384  # frames are compared at this width and height [px]
 # Frames one after another at a made-up steady rate, so that ffmpeg neither drops nor doubles any in either pass.

@@ -29,11 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import TrainingError
-from ...splats.opacities import Reals, finite_rows, opacity_names, raw_of_thickness, thickness
-from ...splats.rotations import rotations
-from ...splats.schema import Array
+from ...splats.fields import Array
+from ...splats.optical_depth import Reals, finite_rows, opacity_names, raw_of_thickness, thickness
+from ...splats.quaternions import rotations
 from ...splats.shapes import Shape
-from .plan import Plan
+from .edit import Plan
 
 # 3DGS's constants.
 MIN_OPACITY = 0.005  # below: pruned

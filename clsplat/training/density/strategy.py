@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...splats.schema import Array
+from ...splats.fields import Array
 from ...splats.shapes import shape_named
 from ..config import TrainConfig
 from .adc import plan_adc, with_reset
-from .densify import plan_relocation
-from .plan import Plan
+from .edit import Plan
+from .relocation import plan_relocation
 
 # Opacities are reset this many iterations apart at least, and not earlier, however short the run: their rate does not
 # grow in short runs. A reset at 500 of 1000 iterations cost 1 dB (half-Gaussians on 400 px photos).

@@ -12,8 +12,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ...splats.rotations import rotations
-from ...splats.schema import Array
+from ...splats.fields import Array
+from ...splats.quaternions import rotations
 
 Words = NDArray[np.uint32]
 FourWords = tuple[Words, Words, Words, Words]

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...splats.opacities import opacity_names
-from ...splats.schema import Array
+from ...splats.fields import Array
+from ...splats.optical_depth import opacity_names
 from ...splats.shapes import Shape
 
 

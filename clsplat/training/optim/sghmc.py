@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...splats.schema import Array
+from ...splats.fields import Array
 from .noise import PUBLISHED_EXTENT as SSS_EXTENT
 from .noise import covariance_times, noise_gate
 

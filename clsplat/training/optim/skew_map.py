@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...splats.rotations import rotations, rotations_vjp
-from ...splats.schema import Array
+from ...splats.fields import Array
+from ...splats.quaternions import rotations, rotations_vjp
 from ...splats.shapes import SKEW_MAX, SLANT_MAX
 
 # By the form of the skew (shapes.Shape.skew_form); the first is its default.

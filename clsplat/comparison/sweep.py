@@ -1,0 +1,167 @@
+"""A sweep of systems, caps and seeds, and its charts: quality against time, render time, bytes and splats."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..evaluation import chart_style
+from ..files.html_page import Section, write_page
+from ..scenes.scene import Scene
+from ..training.log import Progress
+from .charts import arithmetic_chart, seeds_chart
+from .compare import RUNS, Run, compare, parse_runs, run_key
+from .methods import System
+from .sweep_charts import equal_chart, size_chart, time_chart
+from .sweep_rows import (
+    Row,
+    arithmetic_rows,
+    auto_rows,
+    curve_rows,
+    equal_rows,
+    point_rows,
+    seed_rows,
+    write_rows,
+)
+from .sweep_tables import NONE, Table, arithmetic_table, auto_table, equal_table, seed_table
+from .table import HEAD, Record, cells, notes, summarise
+
+CHARTS, REPORT = "charts", "report.html"
+CURVE = 12  # points along a run
+
+_TEXT = {
+    "time": ("Quality along the training",
+             "Test PSNR and SSIM against seconds of training, which leave out these measurements. Each point was "
+             "measured. The axes begin 5 dB and 0.3 below the best."),
+    "size": ("Quality against render time, bytes and splats",
+             "Each point is a training run, or the mean over its seeds. Grey: the Pareto front, which no other point "
+             "beats in both; its points are labelled by the cap on splats. A star chose its own number of splats. "
+             "Render time is the median over the test views of the fastest of five renders, on the host's clock."),
+    "equal": ("Splats needed at equal quality",
+              "How many splats a system needs for the PSNR that the reference has at each of its caps, linear in log "
+              "splats between runs. Hollow, or ≤: its smallest model is better already. Dashed: 70 %."),
+    "seeds": ("What chance does",
+              "Test PSNR of runs that differ in the seed alone, their median, and beside them (diamonds) one seed "
+              "trained again; = : the same splats, bit by bit. Spread: maximum less minimum."),
+    "arithmetic": ("Arithmetic",
+                   "What forms of exp and Φ, half-precision colour, cutoffs, tiles and lanes cost and gain on trained "
+                   "scenes: errors against the double build with the same rule, of cutoffs against one without, beside "
+                   "the time relative to the default's; geometric means over the scenes. Where there is no room for a "
+                   "name, see the table. Normalisations are other models: their line is the PSNR that training with "
+                   "them ends at, against the default's."),
+}
+
+
+def frontier(scenes: Iterable[Scene], systems: Sequence[System], output: str | Path, caps: Sequence[int],
+             seeds: Sequence[int], common: Mapping[str, Any] | None = None, *, curve: int = CURVE, repeat: int = 1,
+             more: Sequence[Record] = (), extra: Mapping[str, Any] | None = None,
+             progress: Callable[[Progress], None] | None = None,
+             on_run: Callable[[Run, Record | None], None] | None = None) -> list[Record]:
+    """Train what is not in `output` yet, as `compare` does, and draw the charts of all that is there.
+
+    Parameters
+    ----------
+    scenes, systems, output, caps, seeds, common, curve, repeat, extra, progress, on_run : as of `compare`.
+    more : records of elsewhere, drawn as well; see `read_runs`.
+
+    Returns
+    -------
+    All runs in `output`. Its charts and report.html are written after Ctrl-C too. Without matplotlib a warning says so
+    before the first run, and the charts' data are written alone.
+
+    Raises
+    ------
+    As `compare`.
+    """
+    if not chart_style.available():
+        warnings.warn(f"{chart_style.MISSING}; the charts' data are written all the same", stacklevel=2)
+    try:
+        return compare(scenes, systems, output, caps, seeds, common, curve=curve, repeat=repeat, extra=extra,
+                       progress=progress, on_run=on_run)
+    finally:
+        if (Path(output) / RUNS).exists():
+            write_report(output, [*read_runs(output), *more], reference=systems[0].label)
+
+
+def read_runs(path: str | Path) -> list[Record]:
+    """The records of a runs.jsonl, or of the one in a folder.
+
+    Raises
+    ------
+    InputError : there is none, or it cannot be read.
+    """
+    file = Path(path)
+    file = file / RUNS if file.is_dir() else file
+    try:
+        return parse_runs(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{file}: cannot be read ({reason}): give the folder of a comparison, or its {RUNS}") from None
+
+
+def distinct(records: Sequence[Record]) -> list[Record]:
+    """The records without those of runs that stand there already."""
+    kept: dict[str, Record] = {}
+    for record in records:
+        kept.setdefault(run_key(record), record)
+    return list(kept.values())
+
+
+def write_report(folder: str | Path, records: Sequence[Record], *, reference: str | None = None,
+                 arithmetic: Sequence[Row] = ()) -> list[Path]:
+    """Charts of records, with their data as CSV and JSON, and the page that shows them all.
+
+    Parameters
+    ----------
+    records : of `compare` or `read_runs`; the first of equal runs counts.
+    reference : system that the others' splats are counted against; None: the first that was swept.
+    arithmetic : records of `frontier_data.arithmetic_rows`.
+
+    Returns
+    -------
+    The charts' files and the page. Without matplotlib the charts are left out, and the page says so.
+
+    Raises
+    ------
+    InputError : no records. OutputError : cannot be written.
+    """
+    if not records:
+        raise InputError(f"{folder}: no runs to draw")
+    folder, kept = Path(folder), distinct(records)
+    points, seeds = point_rows(kept), seed_rows(kept)
+    first = reference or next((point["system"] for point in points if not point["auto"]), "")
+    equal, auto, forms = equal_rows(points, first), auto_rows(points), arithmetic_rows(arithmetic)
+    parts: list[tuple[str, Sequence[Row], Callable[[Any, Path], list[Path]], Table]] = [
+        ("size", points, size_chart, auto_table(auto)),
+        ("equal", equal, lambda rows, out: equal_chart(rows, first, out), equal_table(equal, first)),
+        ("time", curve_rows(kept), time_chart, NONE),
+        ("seeds", seeds, seeds_chart, seed_table(seeds)),
+        ("arithmetic", forms, arithmetic_chart, arithmetic_table(forms))]
+    written: list[Path] = []
+    sections = [_protocol(kept)]
+    for name, rows, draw, (head, lines) in parts:
+        if rows:
+            files = write_rows(folder / CHARTS, name, rows)
+            title, *text = _TEXT[name]
+            drawn = []
+            if chart_style.available():
+                drawn = draw(rows, folder / CHARTS / name)
+            else:
+                text.append(f"No chart: {chart_style.MISSING}.")
+            names = [f"{CHARTS}/{path.name}" for path in (*files, *drawn)]
+            sections.append(Section(title, text, drawn[-1] if drawn else None, head, lines, names))
+            written += [*files, *drawn]
+    sections.append(Section("All runs", head=HEAD, lines=[cells(row) for row in summarise(kept)], files=[RUNS]))
+    scenes = dict.fromkeys(record["scene"]["name"] for record in kept)
+    return [*written, write_page(folder / REPORT, f"Quality and cost: {', '.join(scenes)}", sections)]
+
+
+def _protocol(records: Sequence[Record]) -> Section:
+    """What was run, on what, and how it was measured."""
+    iterations = sorted({record["config"]["iterations"] for record in records})
+    said = [f"{len(records)} training runs of {', '.join(map(str, iterations))} iterations, measured on test views, "
+            "from which nothing is chosen", *notes(records, summarise(records))]
+    return Section("Protocol", [f"{line[:1].upper()}{line[1:]}." for line in said])

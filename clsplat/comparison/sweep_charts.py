@@ -1,0 +1,156 @@
+"""Charts of a sweep: quality along the time, quality against cost with its front, splats at equal quality."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..evaluation.chart_style import (
+    FRONT,
+    INK,
+    WIDTH,
+    Label,
+    chart_paths,
+    drawing,
+    legend_rows,
+    log_axis,
+    looks,
+    place_labels,
+    shape_colour,
+    short_count,
+    star,
+    system_legend,
+)
+from .sweep_rows import Row
+
+# Below these the curves' first moments would press all else together.
+_DB_SHOWN, _SSIM_SHOWN = 5.0, 0.3
+_COSTS = {"render_ms": ("render time [ms]", 1.0), "bytes": ("file [MB]", 1e-6), "splats": ("splats", 1.0)}
+EQUAL_AIM = 0.7  # share of the reference's splats that is looked for
+
+
+def time_chart(rows: Sequence[Row], out: str | Path) -> list[Path]:
+    """Test PSNR above, SSIM below, against seconds of training; a column a scene, a line a run.
+
+    The axes begin 5 dB (0.3) below the best. rows : of `frontier_data.curve_rows`. out : path without a suffix.
+
+    Raises
+    ------
+    InputError : no rows. OutputError : no matplotlib, or not writable.
+    """
+    scenes, styles = _scenes(rows, out), looks({row["system"]: row["shape"] for row in rows})
+    with drawing(out, WIDTH, 5.6 + 0.2 * legend_rows(len(styles))) as figure:
+        panels = figure.subplots(2, len(scenes), squeeze=False, sharex="col")
+        for column, scene in enumerate(scenes):
+            own = [row for row in rows if row["scene"] == scene]
+            runs: dict[tuple[str, int], list[Row]] = {}
+            for row in own:
+                runs.setdefault((row["system"], row["seed"]), []).append(row)
+            for axes, key, name, shown in ((panels[0][column], "psnr", "test PSNR [dB]", _DB_SHOWN),
+                                           (panels[1][column], "ssim", "test SSIM", _SSIM_SHOWN)):
+                for (system, _), run in runs.items():
+                    axes.plot([row["seconds"] for row in run], [row[key] for row in run],
+                              **styles[system] | {"markersize": 3, "linewidth": 1.3})
+                best = max(row[key] for row in own)
+                visible = [row for row in own if row[key] >= best - shown]
+                low, high = min(row["seconds"] for row in visible) / 1.1, max(row["seconds"] for row in visible) * 1.1
+                bottom = min(row[key] for row in visible)
+                axes.set(xscale="log", xlim=(low, high), ylim=(bottom - 0.03 * (best - bottom) - 1e-3,
+                                                              best + 0.04 * (best - bottom) + 1e-3))
+                log_axis(axes.xaxis, low, high)
+                if column == 0:
+                    axes.set_ylabel(name)
+            panels[0][column].set_title(f"{scene}, cap {short_count(own[0]['cap'])}")
+            panels[1][column].set_xlabel("training time [s]")
+        system_legend(figure, styles)
+    return chart_paths(out)
+
+
+def size_chart(rows: Sequence[Row], out: str | Path) -> list[Path]:
+    """Test PSNR against render time, file size and splats; a row a scene.
+
+    The Pareto front is grey, its points labelled by cap. Points of a system at several caps are joined; stars
+    chose their own number of splats.
+
+    rows : of `frontier_data.point_rows`. out : path without a suffix. Raises as `time_chart`.
+    """
+    scenes = _scenes(rows, out)
+    swept = [row for row in rows if not row["auto"]]
+    stars = {row["system"]: row["shape"] for row in rows if row["auto"]}
+    styles = looks({row["system"]: row["shape"] for row in swept})
+    with drawing(out, WIDTH, 2.9 * len(scenes) + 0.3 + 0.2 * legend_rows(len(styles) + len(stars))) as figure:
+        panels = figure.subplots(len(scenes), len(_COSTS), squeeze=False, sharey="row")
+        labels: list[tuple[Any, list[Label]]] = []
+        for line, scene in enumerate(scenes):
+            own = [row for row in rows if row["scene"] == scene]
+            for axes, (cost, (name, unit)) in zip(panels[line], _COSTS.items(), strict=True):
+                _cost_panel(axes, own, cost, unit, styles)
+                front = sorted((row for row in own if row[f"front_{cost}"]), key=lambda row: not row["auto"])
+                names = ["auto" if row["auto"] else short_count(row["cap"]) for row in front]
+                labels.append((axes, [(unit * row[cost], row["psnr"], name, shape_colour(row["shape"]))
+                                      for name, row in zip(names, front, strict=True)]))
+                if line == len(scenes) - 1:
+                    axes.set_xlabel(name)
+            panels[line][0].set_ylabel(f"{scene}\ntest PSNR [dB]")
+        system_legend(figure, styles, stars)
+        place_labels(figure, labels)
+    return chart_paths(out)
+
+
+def equal_chart(rows: Sequence[Row], reference: str, out: str | Path) -> list[Path]:
+    """Splats needed for the PSNR of the reference, as a share of the reference's; a column a scene.
+
+    A hollow point is a bound: the smallest model is better already. What is out of reach has no point.
+
+    rows : of `frontier_data.equal_rows`. out : path without a suffix. Raises as `time_chart`.
+    """
+    rows = [row for row in rows if row["ratio"] is not None]
+    scenes, styles = _scenes(rows, out), looks({row["system"]: row["shape"] for row in rows})
+    with drawing(out, WIDTH, 3.1 + 0.2 * legend_rows(len(styles))) as figure:
+        (panels,) = figure.subplots(1, len(scenes), squeeze=False, sharey=True)
+        for axes, scene in zip(panels, scenes, strict=True):
+            for system, style in styles.items():
+                own = sorted((row for row in rows if row["scene"] == scene and row["system"] == system),
+                             key=lambda row: float(row["reference_splats"]))
+                for bound in (False, True):
+                    part = [row for row in own if bool(row["bound"]) == bound]
+                    how = {"linestyle": "none", "markerfacecolor": "white"} if bound else {}
+                    axes.plot([row["reference_splats"] for row in part], [100 * row["ratio"] for row in part],
+                              **style | how)
+            axes.axhline(100, color=INK, linewidth=1)
+            axes.axhline(100 * EQUAL_AIM, color=INK, linewidth=1, linestyle=(0, (4, 3)))
+            sizes = [row["reference_splats"] for row in rows if row["scene"] == scene]
+            low, high = min(sizes) / 1.3, max(sizes) * 1.3
+            axes.set(xscale="log", xlim=(low, high), title=scene, xlabel=f"splats of {reference}")
+            log_axis(axes.xaxis, low, high)
+        panels[0].set_ylim(0, max(110, 105 * max(row["ratio"] for row in rows)))
+        panels[0].set_ylabel(f"splats for the same PSNR\n[% of {reference}'s]")
+        system_legend(figure, styles)
+    return chart_paths(out)
+
+
+def _cost_panel(axes: Any, own: Sequence[Row], cost: str, unit: float, styles: dict[str, dict[str, Any]]) -> None:
+    """One panel of the size chart, without labels."""
+    front = sorted((unit * row[cost], row["psnr"]) for row in own if row[f"front_{cost}"])
+    axes.plot(*zip(*front, strict=True), color=FRONT, linewidth=3.5, drawstyle="steps-post", zorder=1)
+    for system, style in styles.items():
+        line = sorted((row["cap"], unit * row[cost], row["psnr"]) for row in own
+                      if row["system"] == system and not row["auto"])
+        if line:
+            axes.plot([point[1] for point in line], [point[2] for point in line], **style)
+    for row in own:
+        if row["auto"]:
+            axes.plot([unit * row[cost]], [row["psnr"]], **star(row["shape"]))
+    costs = [unit * row[cost] for row in own]
+    low, high = min(costs) / 1.2, max(costs) * 1.2
+    axes.set(xscale="log", xlim=(low, high))
+    axes.margins(y=0.12)
+    log_axis(axes.xaxis, low, high)
+
+
+def _scenes(rows: Sequence[Row], out: str | Path) -> list[str]:
+    if not rows:
+        raise InputError(f"{out}: a chart needs points")
+    return list(dict.fromkeys(row["scene"] for row in rows))

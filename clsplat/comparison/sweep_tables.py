@@ -1,0 +1,80 @@
+"""The rows of a sweep as tables of text: a head and lines of cells, for pages and terminals."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+
+from .sweep_rows import Row
+
+Table = tuple[tuple[str, ...], list[tuple[str, ...]]]
+NONE: Table = (), []
+
+
+def equal_table(rows: Sequence[Row], reference: str) -> Table:
+    """Splats needed at equal PSNR, as a share of the reference's; a column for each of its caps.
+
+    rows : of `frontier_data.equal_rows`.
+    """
+    caps = sorted({row["reference_cap"] for row in rows})
+    lines: list[tuple[str, ...]] = []
+    for scene, system in dict.fromkeys((row["scene"], row["system"]) for row in rows):
+        own = {row["reference_cap"]: row for row in rows if (row["scene"], row["system"]) == (scene, system)}
+        lines.append((scene, system, *(_share(own[cap]) if cap in own else "" for cap in caps)))
+    return ("scene", "system", *(f"{reference}, cap {cap}" for cap in caps)), lines
+
+
+def auto_table(rows: Sequence[Row]) -> Table:
+    """Automatic runs beside the best of the sweep. rows : of `frontier_data.auto_rows`."""
+    head = ("scene", "system", "PSNR", "splats", "MB", "best cap", "its PSNR", "lost dB", "% of its splats",
+            "% of its MB", "on the front of")
+    lines: list[tuple[str, ...]] = []
+    for row in rows:
+        best = ("",) * 5 if row["best_cap"] is None else (
+            str(row["best_cap"]), f"{row['best_psnr']:.2f}", f"{row['lost']:.2f}", f"{100 * row['splats_ratio']:.0f}",
+            f"{100 * row['bytes_ratio']:.0f}")
+        lines.append((row["scene"], row["system"], f"{row['psnr']:.2f}", f"{row['splats']:.0f}",
+                      f"{1e-6 * row['bytes']:.2f}", *best, row["front"] or "none"))
+    return head, lines
+
+
+def seed_table(rows: Sequence[Row]) -> Table:
+    """PSNR over seeds, and over repeats of one. rows : of `frontier_data.seed_rows`."""
+    head = ("scene", "cap", "system", "seeds", "median PSNR", "least", "most", "spread", "runs of one seed",
+            "their spread", "same bits")
+    lines: list[tuple[str, ...]] = []
+    for scene, system in dict.fromkeys((row["scene"], row["system"]) for row in rows):
+        own = [row for row in rows if (row["scene"], row["system"]) == (scene, system)]
+        psnr = [row["psnr"] for row in own if not row["repeat"]]
+        same = repeated(own)
+        values = [row["psnr"] for row in same]
+        again = ("", "", "") if not same else (
+            str(len(same)), f"{max(values) - min(values):.4f}",
+            "yes" if len({row["digest"] for row in same}) == 1 else "no")
+        lines.append((scene, str(own[0]["cap"]), system, str(len(psnr)), f"{statistics.median(psnr):.2f}",
+                      f"{min(psnr):.2f}", f"{max(psnr):.2f}", f"{max(psnr) - min(psnr):.2f}", *again))
+    return head, lines
+
+
+def arithmetic_table(rows: Sequence[Row]) -> Table:
+    """Variants of the arithmetic. rows : of `frontier_data.arithmetic_rows`."""
+    head = ("shape", "variant", "scenes", "image error", "gradient error", "render time of default",
+            "gradient time of default", "PSNR change [dB]")
+    lines: list[tuple[str, ...]] = []
+    for row in rows:
+        errors = ("" if row[name] is None else f"{row[name]:.1e}" for name in ("image_error", "gradient_error"))
+        times = ("" if row[name] is None else f"{row[name]:.2f}" for name in ("raster", "raster_vjp"))
+        lines.append((row["shape"], row["variant"], str(row["scenes"]), *errors, *times, f"{row['psnr_change']:+.3f}"))
+    return head, lines
+
+
+def repeated(rows: Sequence[Row]) -> list[Row]:
+    """Of one system's rows those of the seed that was trained more than once."""
+    seeds = {row["seed"] for row in rows if row["repeat"]}
+    return [row for row in rows if row["seed"] in seeds]
+
+
+def _share(row: Row) -> str:
+    if row["ratio"] is None:
+        return "not reached"
+    return f"{'≤ ' if row['bound'] else ''}{100 * row['ratio']:.0f} %"

@@ -1,0 +1,159 @@
+"""What each part of a splat is worth: how far the training images would change without it.
+
+An image is an affine function of each splat's opacity, and a linear one of each of its colours (where neither is
+clamped). Without splat i it is I - o_i dI/do_i; the squared change, summed over pixels and channels, is
+o_i^2 |dI/do_i|^2 = E[(o_i e.dI/do_i)^2] for signs e drawn at random for each pixel and channel (Hutchinson 1989): one
+backward pass with such signs in place of the loss' gradient tells an unbiased estimate for all splats at once. The
+same goes for colours, and to first order for a field that is set to its neutral value.
+
+For colours the passes add up, for each splat, A = sum over views of w b b', with b the SH basis in the view's direction
+and w the sum of the squared weights of the splat's pixels. Coefficients that change by x change the images by x'A x. So
+the best lower degree is known in closed form: with l the coefficients that stay and h those that go, l takes over
+(A_ll)^-1 A_lh h, and what is lost is h'(A_hh - A_hl (A_ll)^-1 A_lh) h.
+
+Changes of many splats add up only as far as they do not overlap; how much may go is therefore decided on images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..rendering.renderer import Renderer
+from ..scenes.scene import View
+from ..splats.fields import Array, Field, sh_coefficients, sh_degree_of
+from ..splats.harmonics import sh_basis
+from ..splats.optical_depth import opacity_names
+from ..splats.ply_compact import movable
+from ..splats.shapes import Shape, shape_named
+from ..splats.splats import SH_C0, Splats
+
+Reals = NDArray[np.float64]
+
+_RIDGE = 1e-3  # of A_ll's mean diagonal: coefficients that no view determines stay as they are
+_CHUNK = 8192  # splats whose systems are solved at once
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Squared changes of the images, summed over pixels, channels and views (0..1 is black to white).
+
+    Parameters
+    ----------
+    removal : (N,) without the splat.
+    fields : (N,) with the neutral value, by own field of the shape; see `droppable`.
+    colour : (N, K (K + 1) / 2) the upper triangle of A, row by row; None where it was not asked for.
+    """
+
+    removal: Reals
+    fields: dict[str, Reals]
+    colour: NDArray[np.float32] | None
+
+
+def measure(renderer: Renderer, splats: Splats, views: Sequence[View],
+            background: Sequence[float] = (0.0, 0.0, 0.0), seed: int = 0, parts: bool = True) -> Needs:
+    """Needs of all splats on some views; one render and one backward pass each.
+
+    Parameters
+    ----------
+    views : the training views. seed : of the signs. parts : False: of whole splats only.
+    """
+    rng = np.random.default_rng(seed)
+    shape, arrays, n = shape_named(splats.shape), splats.arrays, len(splats)
+    opacities = {name: _per_opacity(shape, arrays[name]) for name in opacity_names(arrays)}
+    fields = droppable(splats) if parts else []
+    coefficients = sh_coefficients(splats.sh_degree)
+    rows, columns = np.triu_indices(coefficients)
+    removal, dropped = np.zeros(n), {field.name: np.zeros(n) for field in fields}
+    colour = np.zeros((n, len(rows)), np.float32) if parts else None
+    for view in views:
+        image = renderer.render(splats, view.camera, background)
+        signs = rng.choice(np.array([-1.0, 1.0]), size=image.color.shape)
+        grads = renderer.backward(signs)
+        removal += np.sum([factor * grads[name] for name, factor in opacities.items()], axis=0) ** 2
+        for field in fields:
+            dropped[field.name] += _first_order(field, arrays[field.name], grads[field.name]) ** 2
+        if colour is not None:
+            weight = np.mean((grads["sh"][:, 0].astype(np.float64) / SH_C0) ** 2, axis=1)
+            basis = sh_basis(_directions(splats, view), splats.sh_degree).astype(np.float32)
+            # Most splats show in some views only.
+            seen = np.flatnonzero(weight)
+            basis = basis[seen]
+            colour[seen] += weight[seen, None].astype(np.float32) * (basis[:, rows] * basis[:, columns])
+    return Needs(removal, dropped, colour)
+
+
+def droppable(splats: Splats) -> list[Field]:
+    """Own fields of the shape that may be set to their neutral value, and the splat is then the best one without.
+
+    The skew of the direct form is none: there it moves and shrinks the splat too (convert such a model first).
+    """
+    form = shape_named(splats.shape).skew_form
+    return [field for field in movable(splats.schema) if field.name != "skew" or form == "centred"]
+
+
+def lower_bands(sh: Array, colour: NDArray[np.float32]) -> tuple[list[Array], Reals]:
+    """Colours of each lower degree, as good as they can be on the views of `colour`, and what is lost by them.
+
+    Parameters
+    ----------
+    sh : (N, K, 3). colour : see `Needs`.
+
+    Returns
+    -------
+    For degrees 0, 1, ... below that of `sh` (N, (degree + 1)^2, 3) coefficients; and (N, degree of `sh` + 1) losses.
+    """
+    degree = sh_degree_of(sh.shape[1])
+    lower = [np.empty((len(sh), sh_coefficients(d), 3), sh.dtype) for d in range(degree)]
+    lost = np.zeros((len(sh), degree + 1))
+    for first in range(0, len(sh), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        a, own = _square(colour[part], sh.shape[1]), sh[part].astype(np.float64)
+        for d, out in enumerate(lower):
+            kept = sh_coefficients(d)
+            change = -own
+            low = a[:, :kept, :kept]
+            ridge = _RIDGE * np.trace(low, axis1=1, axis2=2) / kept + np.finfo(np.float32).tiny
+            low = low + ridge[:, None, None] * np.eye(kept)
+            change[:, :kept] = np.linalg.solve(low, a[:, :kept, kept:] @ own[:, kept:])
+            out[part] = own[:, :kept] + change[:, :kept]
+            lost[part, d] = np.sum(change * (a @ change), axis=(1, 2))
+    # A lower degree never loses less; rounding may say so.
+    return lower, np.maximum.accumulate(np.maximum(lost, 0.0)[:, ::-1], axis=1)[:, ::-1]
+
+
+def _per_opacity(shape: Shape, raw: Array) -> Reals:
+    """o over do/draw, by which a gradient of the raw opacity becomes the image's change without the splat."""
+    wide = raw.astype(np.float64)
+    if shape.signed:  # tanh: o / (1 - o^2)
+        factor: Reals = 0.5 * np.sinh(np.clip(2.0 * wide, -60.0, 60.0))
+    else:  # logistic: 1 / (1 - o)
+        factor = 1.0 + np.exp(np.minimum(wide, 60.0))
+    return factor
+
+
+def _first_order(field: Field, values: Array, grads: Array) -> Reals:
+    """The image's change by a field's way to its neutral value; of a bounded field, in its logarithm."""
+    wide, neutral = values.astype(np.float64), np.asarray(field.neutral)
+    way = wide * np.log(wide / neutral) if field.bounds is not None else wide - neutral
+    product: Reals = (way * grads).reshape(len(values), field.width).sum(axis=1)
+    return product
+
+
+def _directions(splats: Splats, view: View) -> Reals:
+    """(N, 3) unit vectors from the camera to the splats."""
+    away = splats.mean.astype(np.float64) - view.camera.position
+    unit: Reals = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    return unit
+
+
+def _square(triangle: NDArray[np.float32], coefficients: int) -> Reals:
+    """(N, K, K) symmetric matrices of their upper triangles."""
+    rows, columns = np.triu_indices(coefficients)
+    full = np.zeros((len(triangle), coefficients, coefficients))
+    full[:, rows, columns] = triangle
+    full[:, columns, rows] = triangle
+    return full

@@ -1,0 +1,77 @@
+"""What a search for the smallest model has found so far: budget.json and the models of its stages, for `--resume`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..files.json_file import read_object, write_json
+from ..splats.splats import Splats
+from ..training.config import FREE_OPTIONS, TrainConfig
+from .rules import BudgetOptions
+
+FILE, FOLDER = "budget.json", "budget"
+
+
+class BudgetState:
+    """budget.json in a model's folder, written after every stage, and the PLY files of stages beside it.
+
+    Attributes
+    ----------
+    values : "config", "options", "scene" (how it was read), and a key for each stage that is done.
+    """
+
+    def __init__(self, output: Path) -> None:
+        self.path, self.folder = output / FILE, output / FOLDER
+        self.values: dict[str, Any] = {}
+
+    def begin(self, config: TrainConfig, options: BudgetOptions, scene: dict[str, Any]) -> None:
+        """Forget what a former search found."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        values = {"config": config.to_json(), "options": asdict(options), "scene": scene}
+        self.values = json.loads(json.dumps(values))  # as a search that is resumed reads them
+        write_json(self.path, self.values)
+
+    def load(self) -> None:
+        """What a search left there; InputError where there is none, or it is damaged."""
+        if not self.path.is_file():
+            raise InputError(f"{self.path}: no search to resume from: start without --resume")
+        values = read_object(self.path)
+        for key in ("config", "options", "scene"):
+            if not isinstance(values.get(key), dict):
+                raise InputError(f"{self.path}: damaged (no {key!r}): start again with --overwrite")
+        self.values = values
+
+    def check(self, config: TrainConfig, options: BudgetOptions) -> None:
+        """Raises InputError unless the search was started with these options."""
+        stored = TrainConfig.from_json(self.values["config"]).to_json() | self.values["options"]
+        for key, value in (config.to_json() | asdict(options)).items():
+            if key not in FREE_OPTIONS and stored.get(key) != value:
+                raise InputError(f"{self.path}: --resume with {key}={value}, but the search was started with "
+                                 f"{key}={stored.get(key)}: use the same options, or --overwrite to start again")
+
+    def put(self, stage: str, value: Any) -> None:
+        """A stage is done."""
+        self.values[stage] = value
+        write_json(self.path, self.values)
+
+    def save(self, name: str, splats: Splats) -> None:
+        """Keep a stage's model."""
+        splats.save(self.folder / f"{name}.ply")
+
+    def model(self, name: str) -> Splats:
+        """The model of a stage that is done."""
+        return Splats.load(self.folder / f"{name}.ply")
+
+    def remove(self) -> None:
+        """Delete budget.json and the stages' models."""
+        self.end()
+        self.path.unlink(missing_ok=True)
+
+    def end(self) -> None:
+        """The stages' models are no longer needed."""
+        shutil.rmtree(self.folder, ignore_errors=True)

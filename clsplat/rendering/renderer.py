@@ -1,0 +1,174 @@
+"""The public renderer: splats and a camera in, NumPy images and gradients out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..cameras.camera import Camera
+from ..device.device import Device, Schedule, open_device
+from ..device.memory import to_device
+from ..device.program import Real
+from ..errors import DeviceError, InputError
+from ..splats.fields import Array
+from ..splats.splats import Splats
+from .arithmetic import DEFAULT_ARITHMETIC, Arithmetic
+from .build import ALPHA_MAX, ALPHA_MIN, T_MIN, KernelBuild
+from .overdraw import pairs_per_pixel
+from .pipeline import Frame, Pipeline
+from .splat_buffers import ParameterBuffers, SplatBuffers
+from .tuning import schedule_for
+
+PRECISIONS: dict[str, Real] = {"float32": "float", "float64": "double"}
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """One image.
+
+    Attributes
+    ----------
+    color : (H, W, 3), 0 = black, 1 = white; may exceed 1.
+    alpha : (H, W), 1 - final transmittance.
+    depth : (H, W), sum of weight * camera z [world units]; divide by alpha for a mean depth.
+    """
+
+    color: Array
+    alpha: Array
+    depth: Array
+
+
+class Renderer:
+    """Renders splats of any shape on one device.
+
+    Parameters
+    ----------
+    device : None (the best one), a `--device` string ("cpu", "gpu", "0:1", part of a name), or an opened
+        Device.
+    precision : "float32" or "float64".
+    schedule : how a tile's pixels are shared out; None lets the device choose.
+    alpha_min, alpha_max, t_min : blending thresholds; (0, 1, 0) makes the image smooth, for gradient checks.
+    arithmetic : forms of exp and Phi, and how colour is kept: speed against accuracy.
+    keep : models that stay on the device, those last rendered.
+
+    Raises
+    ------
+    DeviceError : no such device, or no doubles on it. InputError : unknown precision.
+    """
+
+    def __init__(self, device: str | Device | None = None, precision: str = "float32", *,
+                 schedule: Schedule | None = None, alpha_min: float = ALPHA_MIN, alpha_max: float = ALPHA_MAX,
+                 t_min: float = T_MIN, arithmetic: Arithmetic = DEFAULT_ARITHMETIC, keep: int = 1) -> None:
+        if precision not in PRECISIONS:
+            raise InputError(f"precision {precision!r}: choose float32 or float64")
+        self.device = device if isinstance(device, Device) else open_device(device)
+        self.precision = precision
+        if precision == "float64" and not self.device.has_fp64:
+            raise DeviceError(f"device {self.device.info} has no double precision: "
+                              "use float32 or another --device")
+        self.schedule, self.arithmetic = schedule, arithmetic
+        self._thresholds = (alpha_min, alpha_max, t_min)
+        self._pipelines: dict[KernelBuild, Pipeline] = {}
+        self._keep = keep
+        self._uploaded: list[tuple[Splats, SplatBuffers]] = []  # the last rendered last
+        self._last: tuple[Pipeline, Frame] | None = None
+
+    def render(self, splats: Splats, camera: Camera, background: ArrayLike = (0.0, 0.0, 0.0),
+               sh_degree: int | None = None) -> Rendered:
+        """Image of the splats (semantics: those of gsplat, see ARCHITECTURE.md).
+
+        Parameters
+        ----------
+        background : three reals shown where transmittance is left.
+        sh_degree : highest band of colour shown; None: all.
+        """
+        rgb = np.asarray(background, np.float64)
+        if rgb.shape != (3,) or not np.all(np.isfinite(rgb)):
+            raise InputError(f"background {background!r}: expected three finite numbers R, G, B")
+        pipeline = self._pipeline(splats)
+        buffers = self._upload(splats, pipeline)
+        frame = pipeline.forward(buffers, camera, (float(rgb[0]), float(rgb[1]), float(rgb[2])), sh_degree)
+        self._last = (pipeline, frame)
+        return read_frame(pipeline, frame)
+
+    def count_splats(self) -> NDArray[np.float32]:
+        """(H, W) splats that each pixel of the last render takes in (see `pairs.pairs_per_pixel`).
+
+        Raises
+        ------
+        InputError : nothing rendered yet.
+        """
+        if self._last is None:
+            raise InputError("count_splats: render an image first")
+        return pairs_per_pixel(*self._last)
+
+    def backward(self, v_color: ArrayLike, v_alpha: ArrayLike | None = None) -> dict[str, Array]:
+        """Gradients of the last render's loss with respect to the raw values.
+
+        Parameters
+        ----------
+        v_color : (H, W, 3), gradient of the loss with respect to `color`.
+        v_alpha : (H, W), likewise for `alpha`, or None.
+
+        Returns
+        -------
+        mean (N, 3), quat (N, 4), log_scale (N, 3), opacity_logit (N,), sh (N, K, 3) and the shape's own.
+
+        Raises
+        ------
+        InputError : nothing rendered yet, or arrays of another size than the image.
+        """
+        if self._last is None:
+            raise InputError("backward: render an image first")
+        pipeline, frame = self._last
+        size = (frame.layout.height, frame.layout.width)
+        given_color = _image("v_color", v_color, (*size, 3))
+        given_alpha = np.zeros(size) if v_alpha is None else _image("v_alpha", v_alpha, size)
+        buffers = {}
+        for name, array in (("v_color", given_color), ("v_alpha", given_alpha)):
+            planes = frame.layout.pack(array, pipeline.kernels.dtype)
+            buffers[name] = pipeline.image(name, frame.layout, len(planes))
+            to_device(self.device, buffers[name], planes)
+        splats = frame.splats
+        grads = ParameterBuffers(self.device, splats.schema, splats.capacity, splats.dtype)
+        pipeline.backward(frame, buffers["v_color"], grads, buffers["v_alpha"])
+        return grads.download(splats.n)
+
+    def _pipeline(self, splats: Splats) -> Pipeline:
+        real = PRECISIONS[self.precision]
+        schedule = self.schedule or schedule_for(self.device)
+        alpha_min, alpha_max, t_min = self._thresholds
+        kernels = KernelBuild(splats.shape, splats.sh_degree, schedule, splats.normalisation, real,
+                              alpha_min=alpha_min, alpha_max=alpha_max, t_min=t_min,
+                              arithmetic=self.arithmetic, antialiased=splats.antialiased).for_rendering()
+        if kernels not in self._pipelines:
+            self._pipelines[kernels] = Pipeline(self.device, kernels)
+        return self._pipelines[kernels]
+
+    def _upload(self, splats: Splats, pipeline: Pipeline) -> SplatBuffers:
+        """Splats are immutable: the same object need not travel twice."""
+        known = next((item for item in self._uploaded if item[0] is splats), None)
+        if known is None:
+            del self._uploaded[: max(len(self._uploaded) + 1 - self._keep, 0)]  # first: memory may be short
+            kernels = pipeline.kernels
+            known = (splats, SplatBuffers.of(self.device, splats, kernels.dtype, sh_dtype=kernels.sh_dtype))
+        else:
+            self._uploaded.remove(known)
+        self._uploaded.append(known)
+        return known[1]
+
+
+def read_frame(pipeline: Pipeline, frame: Frame) -> Rendered:
+    """The images of a pipeline's last frame, on the host."""
+    alpha = 1 - pipeline.read_image("transmittance", frame.layout)[..., 0]
+    depth = pipeline.read_image("depth", frame.layout)[..., 0]
+    return Rendered(pipeline.read_image("color", frame.layout), alpha, depth)
+
+
+def _image(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    array = np.asarray(values, np.float64)
+    if array.shape != shape:
+        raise InputError(f"{name}: shape {array.shape}, expected {shape}, that of the rendered image")
+    return array

@@ -1,0 +1,116 @@
+"""Splats and their gradients on the device: one row of a buffer for each component, one column for each splat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..device.device import Device
+from ..device.memory import fill_zero, to_device, to_host
+from ..splats.fields import Array, Group, Schema, public_shape
+from ..splats.harmonics import sh_basis
+from ..splats.splats import Splats
+
+CAPACITY_STEP = 1024  # columns are padded: whole groups of 64 items of 16 lanes stay inside
+HALF_MAX = 65504.0  # largest half-precision number
+COMPACT_ROWS = 6  # of colour: its gradient, and a direction
+
+
+def capacity_for(n: int) -> int:
+    """Columns to allocate for n splats."""
+    return max(CAPACITY_STEP, -(-n // CAPACITY_STEP) * CAPACITY_STEP)
+
+
+class ParameterBuffers:
+    """One value per parameter of every splat: `geom` and `sh`, each [rows, capacity]. Starts at zero."""
+
+    def __init__(self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating],
+                 sh_dtype: np.dtype[np.floating] | None = None) -> None:
+        self.device, self.schema, self.capacity, self.dtype = device, schema, capacity_for(capacity), dtype
+        self.dtypes = {Group.GEOM: dtype, Group.SH: sh_dtype or dtype}
+        self.buffers = {group: device.alloc(self.group_bytes(group)) for group in Group}
+        for group, buffer in self.buffers.items():
+            fill_zero(device, buffer, self.group_bytes(group))
+
+    def group_bytes(self, group: Group) -> int:
+        """Size of one of the two buffers."""
+        return self.schema.rows(group) * self.capacity * self.dtypes[group].itemsize
+
+    @property
+    def geom(self) -> Any:
+        return self.buffers[Group.GEOM]
+
+    @property
+    def sh(self) -> Any:
+        return self.buffers[Group.SH]
+
+    def upload(self, arrays: Mapping[str, Array]) -> None:
+        """Public arrays (schema.public_shape) of n <= capacity splats, by field, into the first n columns."""
+        for name in arrays:
+            field = self.schema[name]
+            dtype = self.dtypes[field.group]
+            array = np.asarray(arrays[name], self.dtype)
+            if dtype == np.float16:
+                array = array.clip(-HALF_MAX, HALF_MAX)
+            rows = array.reshape(len(array), field.width).T
+            padded = np.zeros((field.width, self.capacity), dtype)
+            padded[:, : rows.shape[1]] = rows
+            to_device(self.device, self.buffers[field.group], padded, self._offset_bytes(field.name))
+
+    def download(self, n: int, names: tuple[str, ...] | None = None) -> dict[str, Array]:
+        """Public arrays of the first n splats."""
+        arrays: dict[str, Array] = {}
+        for name in names or self.schema.names:
+            field = self.schema[name]
+            rows: Array = np.empty((field.width, self.capacity), self.dtypes[field.group])
+            to_host(self.device, self.buffers[field.group], rows, self._offset_bytes(name))
+            arrays[name] = np.ascontiguousarray(rows[:, :n].T).reshape(public_shape(field, n))
+        return arrays
+
+    def _offset_bytes(self, name: str) -> int:
+        return self.schema.offset(name) * self.capacity * self.dtypes[self.schema[name].group].itemsize
+
+
+class SplatBuffers(ParameterBuffers):
+    """Splats on the device; `n` of `capacity` columns are in use."""
+
+    def __init__(self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating],
+                 sh_dtype: np.dtype[np.floating] | None = None) -> None:
+        super().__init__(device, schema, capacity, dtype, sh_dtype)
+        self.n = 0
+
+    @classmethod
+    def of(cls, device: Device, splats: Splats, dtype: np.dtype[np.floating],
+           capacity: int = 0, sh_dtype: np.dtype[np.floating] | None = None) -> SplatBuffers:
+        """Upload of host splats, with room for `capacity`; colour as `sh_dtype`, if given."""
+        self = cls(device, splats.schema, max(capacity, len(splats)), dtype, sh_dtype)
+        self.set(splats.to_numpy())
+        return self
+
+    def set(self, arrays: Mapping[str, Array]) -> None:
+        """Replace all splats."""
+        self.upload(arrays)
+        self.n = len(arrays["mean"])
+
+
+class CompactGradients(ParameterBuffers):
+    """Gradients of all parameters, those of SH coefficients by the two things that they are the product of.
+
+    `sh` is [6, capacity], (N, 2, 3) on the host: the gradient of the colour, and the unit direction from the camera,
+    in which the basis is taken. Written out, the gradients would be 3 K reals a splat, and most of what the backward
+    writes.
+    """
+
+    def __init__(self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating]) -> None:
+        self.sh_degree = schema.sh_degree
+        fields = (replace(field, width=COMPACT_ROWS) if field.name == "sh" else field for field in schema)
+        super().__init__(device, Schema(tuple(fields)), capacity, dtype)
+
+    def written_out(self, n: int) -> dict[str, Array]:
+        """Public arrays of the gradients of the first n splats' parameters, `sh` as (N, K, 3)."""
+        arrays = self.download(n)
+        v_rgb, direction = arrays["sh"][:, :1], arrays["sh"][:, 1]
+        return arrays | {"sh": sh_basis(direction, self.sh_degree)[:, :, None] * v_rgb}

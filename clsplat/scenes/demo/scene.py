@@ -1,0 +1,162 @@
+"""A procedural capture with ground truth: photos, exact poses and a point cloud, for trials without data.
+
+The world (capture_world.py) has what is hard for splats: hard edges, thin poles, a panel whose sides differ,
+cast shadows, and a glossy ball.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...cameras.camera import Camera
+from ...errors import InputError, OutputError
+from ...files.images import write_png
+from ..colmap_binary import ModelView, write_binary_model
+from .world import SURFACES, Hits, World
+
+RING_RADIUS = 3.6                              # of the ring of cameras, world units
+_HEIGHTS = (0.75, 1.9)                     # first half of the views low, second half high
+RING_TARGET = np.array([0.0, 0.0, 0.5])
+_FOCAL = 0.9                               # of the image width: 58 degrees across
+_SUBPIXELS = (0.25, 0.75)                  # 2x2 supersampling
+
+_POINTS = 3000
+_FEWEST_OBSERVATIONS = 3
+# Parts of the point cloud by surface: thin and small things get more than their area.
+_SHARES = {"ground": 0.36, "dome": 0.16, "box": 0.16, "ball": 0.08, "panel": 0.12, "poles": 0.12}
+_DEPTH_TOLERANCE = 2e-3                    # world units: float32 casting is good to some 1e-5
+
+
+def write_capture(folder: str | os.PathLike[str], width: int = 200, height: int = 150, n_views: int = 40,
+                  seed: int = 0) -> Path:
+    """Render the little world from two rings of cameras and write it as a COLMAP scene.
+
+    Parameters
+    ----------
+    folder : made; must be empty or absent. Gets images/*.png and sparse/0/*.bin.
+    width, height : image size [px].
+    n_views : number of photos, half of them on the lower ring.
+    seed : of the world's details and of the choice of points; equal arguments give equal files.
+
+    Returns
+    -------
+    The folder, for `load_scene`.
+
+    Raises
+    ------
+    InputError : images below 16 px or fewer than 4 views.
+    OutputError : the folder holds something, or cannot be written.
+    """
+    if width < 16 or height < 16 or n_views < 4:
+        raise InputError(f"capture: {width}x{height} px, {n_views} views; "
+                         "needs at least 16x16 px and 4 views")
+    root = Path(folder)
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise OutputError(f"{root}: already there and not an empty folder; name another one")
+    world, cameras = World(seed), ring_cameras(width, height, n_views)
+    for index, camera in enumerate(cameras):
+        write_png(root / "images" / _name(index), photograph(world, camera))
+    points = _surface_points(world, cameras, np.random.default_rng(seed))
+    seen = np.stack([visible(world, camera, points.position, points.normal) for camera in cameras])
+    kept = seen.sum(axis=0) >= _FEWEST_OBSERVATIONS
+    xyz, seen = points.position[kept].astype(np.float64), seen[:, kept]
+    rgb = np.rint(255 * points.color[kept]).astype(np.uint8)
+    views = [
+        ModelView(_name(index), (width, height), (camera.fx, camera.fy, camera.cx, camera.cy),
+                  camera.cam_from_world, _project(camera, xyz[of_view])[0], np.flatnonzero(of_view))
+        for index, (camera, of_view) in enumerate(zip(cameras, seen, strict=True))]
+    write_binary_model(root / "sparse" / "0", views, xyz, rgb)
+    return root
+
+
+def ring_cameras(width: int, height: int, n_views: int) -> list[Camera]:
+    """Cameras around the world's middle that look at it: a low ring, then a high one between its gaps."""
+    low = n_views // 2
+    cameras = []
+    for index in range(n_views):
+        ring, place, count = (0, index, low) if index < low else (1, index - low + 0.5, n_views - low)
+        angle = 2 * np.pi * place / count
+        position = np.array([RING_RADIUS * np.cos(angle), RING_RADIUS * np.sin(angle), _HEIGHTS[ring]])
+        forward = (RING_TARGET - position) / np.linalg.norm(RING_TARGET - position)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+        pose[:3, 3] = -pose[:3, :3] @ position
+        cameras.append(Camera(width, height, _FOCAL * width, _FOCAL * width, width / 2, height / 2, pose))
+    return cameras
+
+
+def photograph(world: World, camera: Camera) -> NDArray[np.float32]:
+    """(H, W, 3) colours 0..1: the mean of 2x2 rays a pixel."""
+    rays = [_cast(world, camera, _pixels(camera) + np.array([dx, dy])).color
+            for dy in _SUBPIXELS for dx in _SUBPIXELS]
+    photo: NDArray[np.float32] = np.mean(rays, axis=0).reshape(camera.height, camera.width, 3)
+    return photo
+
+
+def visible(world: World, camera: Camera, xyz: NDArray[np.floating],
+            normal: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which surface points the camera sees.
+
+    That is: inside the image, on the side of the surface that faces the camera, and with nothing nearer on
+    the ray to them. xyz, normal : (P, 3).
+    """
+    pixels, depth = _project(camera, xyz)
+    inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    facing = ((xyz - camera.position) * normal).sum(axis=1) < 0
+    seen = np.zeros(len(xyz), np.bool_)
+    of = np.flatnonzero(inside & facing)
+    distance = np.linalg.norm(xyz[of] - camera.position, axis=1)
+    nearest = world.distances(*_rays(camera, pixels[of])).min(axis=0)
+    seen[of] = np.abs(nearest - distance) < _DEPTH_TOLERANCE
+    return seen
+
+
+def _name(index: int) -> str:
+    return f"view_{index:03d}.png"
+
+
+def _surface_points(world: World, cameras: list[Camera], rng: np.random.Generator) -> Hits:
+    """Surface points at random places of every view, by each surface's share."""
+    chosen: list[Hits] = []
+    for camera in cameras:
+        pixels = _pixels(camera) + rng.random((camera.width * camera.height, 2))
+        surface = world.distances(*_rays(camera, pixels)).argmin(axis=0)
+        counts = [max(1, round(_POINTS * _SHARES[name] / len(cameras))) for name in SURFACES]
+        picks = [rng.permutation(np.flatnonzero(surface == index))[:count]
+                 for index, count in enumerate(counts)]
+        chosen.append(_cast(world, camera, pixels[np.concatenate(picks)]))
+    return Hits(*(np.concatenate([getattr(hits, part.name) for hits in chosen]) for part in fields(Hits)))
+
+
+def _pixels(camera: Camera) -> NDArray[np.float64]:
+    """(H * W, 2) corners x, y of all pixels, row by row."""
+    y, x = np.mgrid[:camera.height, :camera.width]
+    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+
+
+def _rays(camera: Camera, pixels: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Origins and unit directions (R, 3) of the rays through pixel positions (R, 2)."""
+    local = np.concatenate([(pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy),
+                            np.ones((len(pixels), 1))], axis=1)
+    direction = local @ camera.rotation / np.linalg.norm(local, axis=1, keepdims=True)
+    origin = np.broadcast_to(camera.position.astype(np.float32), direction.shape)
+    return origin, direction.astype(np.float32)
+
+
+def _cast(world: World, camera: Camera, pixels: NDArray[np.float64]) -> Hits:
+    return world.cast(*_rays(camera, pixels))
+
+
+def _project(camera: Camera, xyz: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixel positions (P, 2) and depths (P,) of world points."""
+    local = xyz @ camera.rotation.T + camera.translation
+    depth = local[:, 2]
+    safe = np.where(depth > 0, depth, 1.0)[:, None]
+    return local[:, :2] / safe * (camera.fx, camera.fy) + (camera.cx, camera.cy), depth

@@ -1,0 +1,145 @@
+"""Cameras and points for other programs: a COLMAP model, or nerfstudio's and instant-ngp's transforms.json.
+
+COLMAP's text files as its documentation has them (https://colmap.github.io/format.html); the binary ones are written by
+colmap_files.py. Points get no tracks: only the reconstruction itself knows who saw them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..cameras.path import opengl_pose
+from ..errors import InputError
+from ..files.atomic import atomic_writer
+from .colmap import Points
+from .colmap_binary import ModelView, write_binary_model
+from .point_cloud import write_point_cloud
+from .undistort import Lens, Photo, make_lens
+
+POINTS_FILE = "sparse_pc.ply"  # nerfstudio's name
+# Parameters of COLMAP's models by their keys in transforms.json; "f" is both focal lengths.
+_KEYS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"), "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"), "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
+}  # fmt: skip
+_FISHEYE = "OPENCV_FISHEYE"
+_DENOMINATOR = ("k4", "k5", "k6")  # of FULL_OPENCV, which readers of transforms.json do not know
+
+
+def write_transforms(path: Path, photos: Sequence[Photo], files: Sequence[str], points: Points) -> None:
+    """Write cameras, each with its lens, and the points beside them.
+
+    Parameters
+    ----------
+    files : where each photo is, as `file_path` shall say, relative to the file's folder.
+
+    Raises
+    ------
+    InputError : a lens that the format has no keys for. OutputError : cannot be written.
+    """
+    frames = []
+    for photo, file in zip(photos, files, strict=True):
+        pose = opengl_pose(photo.cam_from_world)
+        frames.append({"file_path": file} | _lens_keys(photo) | {"transform_matrix": pose.tolist()})
+    head: dict[str, Any] = {}
+    if len(points):
+        write_point_cloud(path.parent / POINTS_FILE, points)
+        head["ply_file_path"] = POINTS_FILE
+    # What all frames say is said once, above them.
+    shared = {key: value for key, value in (frames[0] if frames else {}).items()
+              if key != "file_path" and all(frame.get(key) == value for frame in frames[1:])}
+    if len(frames) > 1:
+        shared.pop("transform_matrix", None)
+        head |= shared
+        frames = [{key: value for key, value in frame.items() if key not in shared} for frame in frames]
+    lines = [f"{json.dumps(key)}: {json.dumps(value)}" for key, value in head.items()]
+    lines.append('"frames": [\n  ' + ",\n  ".join(map(json.dumps, frames)) + "\n]")
+    with atomic_writer(path) as stream:
+        stream.write(("{\n" + ",\n".join(lines) + "\n}\n").encode("utf-8"))
+
+
+def write_colmap(folder: Path, photos: Sequence[Photo], points: Points, text: bool = False) -> None:
+    """Write cameras, images and points3D, .bin or .txt, into a folder, which is made when absent.
+
+    Raises
+    ------
+    OutputError : cannot be written.
+    """
+    views, names = [], {}
+    for photo in photos:
+        lens = _plainest(photo.lens)
+        names[int(lens.model)] = str(lens.model.name)
+        views.append(ModelView(photo.name, (lens.width, lens.height), tuple(map(float, lens.params)),
+                               photo.cam_from_world, np.empty((0, 2)), np.empty(0, np.int64), int(lens.model)))
+    if text:
+        _write_text(folder, views, names, points)
+    else:
+        write_binary_model(folder, views, points.xyz, points.rgb)
+
+
+def relative_files(files: Sequence[Path], folder: Path) -> list[str]:
+    """Paths of files as seen from a folder, `/` between names; of those on another drive, the whole path."""
+    def seen(file: Path) -> str:
+        try:
+            return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+        except ValueError:
+            return file.resolve().as_posix()
+
+    return [seen(file) for file in files]
+
+
+def _plainest(lens: Lens) -> Lens:
+    """The same lens in the model of fewest parameters: many programs know PINHOLE and OPENCV only."""
+    for longer, model, kept in (("FULL_OPENCV", "OPENCV", 8), ("OPENCV", "PINHOLE", 4)):
+        if lens.model.name == longer and not np.any(lens.params[kept:]):
+            lens = make_lens(model, lens.width, lens.height, list(lens.params[:kept]))
+    return lens
+
+
+def _lens_keys(photo: Photo) -> dict[str, Any]:
+    """A lens as transforms.json has it; raises InputError."""
+    lens = _plainest(photo.lens)
+    model = str(lens.model.name)
+    if model not in _KEYS:
+        raise InputError(f"image {photo.name!r}: transforms.json has no lens of COLMAP's model {model}: undistort the "
+                         "photos first, or write a COLMAP model")
+    values = dict(zip(_KEYS[model], map(float, lens.params), strict=True))
+    if any(values.pop(key, 0.0) for key in _DENOMINATOR if model != _FISHEYE):
+        raise InputError(f"image {photo.name!r}: transforms.json has no k4, k5 and k6 of a perspective lens: undistort "
+                         "the photos first, or write a COLMAP model")
+    if "f" in values:
+        values = {"fl_x": values["f"], "fl_y": values.pop("f")} | values
+    kind = _FISHEYE if model == _FISHEYE else "OPENCV" if len(values) > 4 else "PINHOLE"
+    return {"camera_model": kind, "w": int(lens.width), "h": int(lens.height)} | values
+
+
+def _write_text(folder: Path, views: Sequence[ModelView], names: dict[int, str], points: Points) -> None:
+    from scipy.spatial.transform import Rotation  # lazy: a third of a second to import
+
+    cameras: dict[tuple[Any, ...], int] = {}
+    images = []
+    for number, view in enumerate(views, 1):
+        lens = (names[view.model], *view.size, *view.intrinsics)
+        camera = cameras.setdefault(lens, len(cameras) + 1)
+        x, y, z, w = Rotation.from_matrix(view.cam_from_world[:3, :3]).as_quat().tolist()
+        images += [_line(number, w, x, y, z, *view.cam_from_world[:3, 3].tolist(), camera, view.name), ""]
+    rows = [_line(number, *xyz, *rgb, 0.0) for number, (xyz, rgb)
+            in enumerate(zip(points.xyz.tolist(), points.rgb.tolist(), strict=True), 1)]
+    tables = {"cameras": [_line(number, *lens) for lens, number in cameras.items()], "images": images, "points3D": rows}
+    for name, lines in tables.items():
+        with atomic_writer(folder / f"{name}.txt") as stream:
+            stream.write("".join(f"{line}\n" for line in lines).encode("utf-8"))
+
+
+def _line(*values: object) -> str:
+    """Values in a line; `str` gives a float's shortest form that reads back as the same."""
+    return " ".join(map(str, values))

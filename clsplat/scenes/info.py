@@ -1,0 +1,153 @@
+"""What a scene holds, from its files' headers alone: no photo is decoded."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..cameras.cameras_json import IMAGE_SUFFIXES
+from ..errors import InputError
+from ..files.images import image_size
+from ..files.json_file import read_json, real_of
+from .nerfstudio import find_transforms
+from .posed_images import Posed
+from .reconstruct.reconstruct import RECORD
+from .scene import chosen_tests, masks_of, read_posed
+from .undistort import is_pinhole
+
+_DIGITS = 6  # significant ones of a focal length, by which lenses are told apart
+
+
+@dataclass(frozen=True)
+class LensUse:
+    """Photos taken through one lens.
+
+    Parameters
+    ----------
+    model : COLMAP's name. pinhole : whether its photos need no undistortion. width, height : of its images [px].
+    focal : horizontal focal length [px].
+    field_of_view : horizontal [degrees], as of a pinhole. photos : how many.
+    """
+
+    model: str
+    pinhole: bool
+    width: int
+    height: int
+    focal: float
+    field_of_view: float
+    photos: int = 0
+
+
+@dataclass(frozen=True)
+class SceneInfo:
+    """A scene's contents.
+
+    Parameters
+    ----------
+    kind : "COLMAP" or the name of the transforms file.
+    photos : with poses. unregistered : photos in the same folder that the scene knows no pose of.
+    unreadable : photos that are no images. sizes : photos by (width, height) as stored [px], most frequent first.
+    photo_bytes : of the posed photos' files. lenses : most used first.
+    points : in the cloud. track_mean, track_median : photos that see a point; 0 where the files do not say.
+    test : names of the test views. masked : photos with a mask.
+    placed : of a scene that `reconstruct` made: photos placed, photos given, mean reprojection error [px]; else None.
+    """
+
+    kind: str
+    photos: int
+    unregistered: tuple[str, ...]
+    unreadable: tuple[str, ...]
+    sizes: tuple[tuple[tuple[int, int], int], ...]
+    photo_bytes: int
+    lenses: tuple[LensUse, ...]
+    points: int
+    track_mean: float
+    track_median: float
+    test: tuple[str, ...]
+    masked: int
+    placed: tuple[int, int, float] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, as `clsplat info --json` prints them."""
+        return {
+            "kind": self.kind, "photos": self.photos, "unregistered": list(self.unregistered),
+            "unreadable": list(self.unreadable), "photo_bytes": self.photo_bytes,
+            "sizes": [{"width": size[0], "height": size[1], "photos": n} for size, n in self.sizes],
+            "lenses": [asdict(lens) for lens in self.lenses], "points": self.points, "track_mean": self.track_mean,
+            "track_median": self.track_median, "test": list(self.test), "masked": self.masked,
+            "placed": self.placed and dict(zip(("photos", "of", "error"), self.placed, strict=True)),
+        }
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a path looks like a scene: a folder with a COLMAP model or transforms, or a transforms file."""
+    return path.suffix == ".json" if path.is_file() else (path / "sparse").is_dir() or bool(find_transforms(path))
+
+
+def scene_info(path: str | os.PathLike[str], images: str | None = None, test_every: int = 8) -> SceneInfo:
+    """Look into a scene; parameters as of `load_scene`.
+
+    Raises
+    ------
+    InputError : a missing folder or photo, or a damaged model.
+    """
+    root = Path(path)
+    posed = read_posed(root, images)
+    sizes: Counter[tuple[int, int]] = Counter()
+    unreadable = []
+    for name, file in posed.files.items():
+        try:
+            sizes[image_size(file)] += 1
+        except InputError:
+            unreadable.append(name)
+    tracks = posed.points.track_length
+    masks = masks_of(root, posed, None)
+    transforms = [] if (root / "sparse").is_dir() else find_transforms(root)
+    return SceneInfo(
+        " and ".join(file.name for file in transforms) or "COLMAP", len(posed.photos),
+        _unregistered(posed, masks.values()),
+        tuple(unreadable), tuple(sizes.most_common()), sum(file.stat().st_size for file in posed.files.values()),
+        _lenses(posed), len(posed.points), float(tracks.mean()) if len(tracks) else 0.0,
+        float(np.median(tracks)) if len(tracks) else 0.0,
+        tuple(sorted(chosen_tests(posed, test_every, None))) if len(posed.photos) > 1 else (),
+        len(masks), _placed(root))
+
+
+def _unregistered(posed: Posed, masks: Iterable[Path]) -> tuple[str, ...]:
+    """Photos beside the posed ones, by their paths below the folder that holds them all."""
+    files = {file.resolve() for file in posed.files.values()}
+    known = files | {file.resolve() for file in masks}
+    folder = Path(os.path.commonpath([file.parent for file in files]))
+    others = (file for file in sorted(folder.rglob("*")) if file.suffix.lower() in IMAGE_SUFFIXES)
+    return tuple(file.relative_to(folder).as_posix() for file in others if file not in known)
+
+
+def _placed(root: Path) -> tuple[int, int, float] | None:
+    if not (root / RECORD).is_file():
+        return None
+    record = read_json(root / RECORD, "a scene of clsplat reconstruct")
+    values = record if isinstance(record, dict) else {}
+    found = [real_of(values.get(key)) for key in ("registered", "photos", "error")]
+    registered, photos, error = (value if value is not None and math.isfinite(value) else -1.0 for value in found)
+    if min(registered, photos, error) < 0:
+        raise InputError(f"{root / RECORD}: registered, photos and error must be numbers; remove the file")
+    return int(registered), int(photos), error
+
+
+def _lenses(posed: Posed) -> tuple[LensUse, ...]:
+    uses: Counter[LensUse] = Counter()
+    for photo in posed.photos:
+        lens = photo.lens
+        focal = float(f"{lens.params[0]:.{_DIGITS}g}")  # of every model that an image can be made of
+        if not 0.0 < focal < math.inf:
+            raise InputError(f"image {photo.name!r}: its camera has a focal length of {focal:g} px; rebuild the model")
+        angle = math.degrees(2.0 * math.atan(lens.width / (2.0 * focal)))
+        uses[LensUse(lens.model.name, is_pinhole(lens), lens.width, lens.height, focal, round(angle, 1))] += 1
+    return tuple(replace(lens, photos=n) for lens, n in uses.most_common())

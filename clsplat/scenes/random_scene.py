@@ -1,0 +1,99 @@
+"""Splats and views of any number and size, for timing: no photos needed, and nothing to learn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..files.images import ImageU8
+from ..splats.fields import Array, Field, public_shape, sh_coefficients
+from ..splats.shapes import DEFAULT_SHAPE, Shape, shape_named
+from ..splats.splats import Splats
+from .colmap import Points
+from .demo.scene import RING_RADIUS, RING_TARGET, ring_cameras
+from .scene import Scene, View
+
+OVERDRAW = 24.0  # ellipses of the median size that would cover a pixel; the near and the large ones double it
+_BALL = 0.6 * RING_RADIUS  # radius of the ball they fill [world units]: more than the views see at their sides
+_CUTOFF = 2.6  # standard deviations from the middle of a typical splat to where alpha falls to 1/255
+_SPREAD = 0.4  # of log scales
+_MOST_SKEWED = 0.97  # part of a bounded vector's limit; the median is 0.82 of it, as after short trainings
+
+
+def synthetic_scene(n: int, width: int = 640, height: int = 480, shape: str = DEFAULT_SHAPE, sh_degree: int = 3,
+                    n_views: int = 6, seed: int = 0) -> tuple[Scene, Splats]:
+    """A ball of `n` random splats in a ring of cameras, and smooth images to compare with.
+
+    Sizes fall as 1/sqrt(n), so that the splats over a pixel, and with them the useful pairs of an image, stay nearly
+    the same: some 40 a pixel, and up to 60 where there are three splats a pixel and the low-pass widens them. Opacities
+    are of every height, most of them low or high as in trained models; skew and the like are as different. Equal
+    arguments give equal bits.
+
+    Parameters
+    ----------
+    width, height : of the images [px], at least 16.
+    n_views : cameras, at least 2; half of them on the upper ring.
+
+    Raises
+    ------
+    InputError : no splat, smaller images, fewer views, or an unknown shape.
+    """
+    if n < 1 or min(width, height) < 16 or n_views < 2:
+        raise InputError(f"synthetic scene: {n} splats, {width}x{height} px, {n_views} views; "
+                         "needs at least 1 splat, 16x16 px and 2 views")
+    rng = np.random.default_rng(seed)
+    splats = _splats(n, shape_named(shape), sh_degree, rng)
+    views = [View(f"view_{index:03d}.png", camera, _smooth_image(width, height, rng))
+             for index, camera in enumerate(ring_cameras(width, height, n_views))]
+    points = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
+    return Scene("synthetic", Path("synthetic"), views, points), splats
+
+
+def _splats(n: int, shape: Shape, sh_degree: int, rng: np.random.Generator) -> Splats:
+    direction = _directions(n, 3, rng)
+    radius = _BALL * np.cbrt(rng.random((n, 1)))
+    # n ellipses of this size cover the ball's disk OVERDRAW times.
+    scale = _BALL / _CUTOFF * np.sqrt(OVERDRAW / n)
+    sh = rng.standard_normal((n, sh_coefficients(sh_degree), 3), np.float32)
+    sh[:, 1:] *= 0.1
+    opacity = 0.02 + 0.96 * rng.beta(0.7, 0.7, n)
+    arrays: dict[str, Array] = {
+        "mean": RING_TARGET + radius * direction,
+        "quat": rng.standard_normal((n, 4)),
+        "log_scale": rng.normal(np.log(scale), _SPREAD, (n, 3)),
+        "opacity_logit": shape.raw_opacity(opacity),
+        "sh": sh,
+    }
+    for field in shape.fields:
+        arrays[field.name] = _own(field, n, arrays, rng)
+    return Splats(shape.name, {name: values.astype(np.float32, copy=False) for name, values in arrays.items()})
+
+
+def _own(field: Field, n: int, arrays: dict[str, Array], rng: np.random.Generator) -> Array:
+    """Values of one of the shape's own fields, away from where it is a Gaussian."""
+    if field.neutral_from is not None:
+        other: Array = rng.permutation(arrays[field.neutral_from])
+        return other
+    if field.limit is not None or field.nonzero:
+        length = 1.0 if field.limit is None else _MOST_SKEWED * field.limit * rng.random((n, 1)) ** 0.25
+        return length * _directions(n, field.width, rng)
+    start = field.neutral[0] if field.start is None else field.start
+    return start * np.exp(rng.normal(0, 0.2, public_shape(field, n)))
+
+
+def _directions(n: int, width: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    vectors = rng.standard_normal((n, width))
+    unit: NDArray[np.float64] = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return unit
+
+
+def _smooth_image(width: int, height: int, rng: np.random.Generator) -> ImageU8:
+    """Waves of a few periods in each channel."""
+    x, y = np.arange(width)[None, :, None] / width, np.arange(height)[:, None, None] / height
+    periods, phase = rng.uniform(-4, 4, (2, 3)), rng.uniform(0, 2 * np.pi, 3)
+    wave = 0.5 + 0.4 * np.sin(2 * np.pi * (periods[0] * x + periods[1] * y) + phase)
+    image: ImageU8 = np.rint(255 * wave).astype(np.uint8)
+    return image

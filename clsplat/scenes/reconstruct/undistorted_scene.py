@@ -1,0 +1,87 @@
+"""A sparse model of distorted photos as a scene of pinhole images: photos undistorted, observations moved with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...cameras.camera import Camera
+from ...files.images import write_photo, write_png
+from ...files.masks import FOLDER as MASK_FOLDER
+from ..colmap import Points, read_photos, read_points
+from ..colmap_binary import ModelView, write_binary_model
+from ..undistort import Photo, colmap_library
+from .photo_files import Prepared
+
+
+class SparseModel:
+    """A model that COLMAP's mapper wrote.
+
+    Parameters
+    ----------
+    folder : of the model.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._model = colmap_library().Reconstruction(str(folder))
+        self._photos = {photo.name: photo for photo in read_photos(self._model)}
+        self._images = {image.name: image for image in self._model.images.values()}
+        self._rows = {number: row for row, number in enumerate(sorted(self._model.points3D))}
+
+    @property
+    def names(self) -> set[str]:
+        """Of the photos that it registers."""
+        return set(self._photos)
+
+    @property
+    def points(self) -> Points:
+        """Positions, colours and track lengths."""
+        return read_points(self._model)
+
+    @property
+    def errors(self) -> NDArray[np.float64]:
+        """(P,) mean reprojection error of each point [px]."""
+        return np.array([self._model.points3D[number].error for number in self._rows])
+
+    def photo(self, name: str) -> Photo:
+        """A registered photo with its lens."""
+        return self._photos[name]
+
+    def view(self, name: str, camera: Camera, scene_name: str) -> ModelView:
+        """The photo's observations [px] of points, where a pinhole camera sees them."""
+        seen = [(point.xy, self._rows[point.point3D_id]) for point in self._images[name].get_observation_points2D()]
+        lens = self._photos[name].lens
+        rays = np.asarray(lens.cam_from_img(np.array([xy for xy, _ in seen]).reshape(-1, 2))).reshape(-1, 2)
+        kept = np.isfinite(rays).all(axis=1)
+        pixels = rays[kept] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        return ModelView(scene_name, (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy),
+                         camera.cam_from_world, pixels, np.array([row for _, row in seen], np.int64)[kept])
+
+
+def write_flat_photo(model: SparseModel, photo: Prepared, scene: Path) -> ModelView:
+    """Undistort a registered photo, and its mask, into the scene's folders.
+
+    Raises
+    ------
+    InputError : the file is not what it was, or the lens has no pinhole image. OutputError : cannot be written.
+    """
+    posed, pixels = model.photo(photo.staged), photo.pixels()
+    height, width = pixels.shape[:2]
+    flat, camera = posed.fit(np.ascontiguousarray(pixels[:, :, :3]))
+    if pixels.shape[2] == 4:
+        flat = np.dstack([flat, posed.fit_alpha(pixels[:, :, 3])])
+    mask = photo.mask()
+    write_photo(scene / "images" / photo.source.name, flat)
+    if mask is not None:
+        write_png(scene / MASK_FOLDER / f"{photo.source.name}.png",
+                  np.where(posed.fit_mask(mask, width, height), 255, 0).astype(np.uint8))
+    return model.view(photo.staged, camera, photo.source.name)
+
+
+def write_flat_model(model: SparseModel, views: Sequence[ModelView], scene: Path) -> None:
+    """Write `sparse`/0 of the scene, with cameras, poses, points and tracks."""
+    points = model.points
+    write_binary_model(scene / "sparse" / "0", views, points.xyz, points.rgb, model.errors)

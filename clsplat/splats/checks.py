@@ -1,0 +1,99 @@
+"""What the arrays of a model must be: the one check that files and `Splats` share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import InputError
+from .fields import MAX_SH_DEGREE, Array, Field, Schema, public_shape, sh_coefficients
+
+# A quaternion's (or direction's) squared norm must neither vanish nor overflow in float32 (1.2e-38 to 3.4e38).
+QUAT_NORM_MIN, QUAT_NORM_MAX = 1e-15, 1e15
+# A vector stored at its limit may round up in float32.
+LIMIT_SLACK = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """The first unusable value of a field.
+
+    Parameters
+    ----------
+    index : which splat.
+    component : position within the splat, () where the whole vector is at fault.
+    what : the value and the rule it breaks.
+    """
+
+    index: int
+    component: tuple[int, ...]
+    what: str
+
+
+def first_fault(field: Field, values: Array) -> Fault | None:
+    """First value of `field` that no model may hold, or None.
+
+    Parameters
+    ----------
+    values : the field's public array (see `schema.public_shape`).
+    """
+    finite = np.isfinite(values)
+    if not finite.all():
+        index, *component = (int(i) for i in np.argwhere(~finite)[0])
+        value = float(values[(index, *component)])
+        return Fault(index, tuple(component), f"value is {value}, must be finite")
+    if field.bounds is not None:
+        low, high = field.bounds
+        bad = np.flatnonzero((values < low * (1 - LIMIT_SLACK)) | (values > high * (1 + LIMIT_SLACK)))
+        if bad.size == 0:
+            return None
+        index = int(bad[0])
+        return Fault(index, (), f"value is {float(values[index]):.6g}, must be {low:g} to {high:g}")
+    if not field.nonzero and field.limit is None:
+        return None
+    norms = np.linalg.norm(values.astype(np.float64), axis=1)
+    if field.nonzero:
+        bad = np.flatnonzero((norms < QUAT_NORM_MIN) | (norms > QUAT_NORM_MAX))
+        rule = "above 0" if bad.size and norms[bad[0]] < 1 else f"at most {QUAT_NORM_MAX:g}"
+    else:
+        assert field.limit is not None
+        bad = np.flatnonzero(norms > field.limit * (1 + LIMIT_SLACK))
+        rule = f"at most {field.limit:.6g}"
+    if bad.size == 0:
+        return None
+    index = int(bad[0])
+    return Fault(index, (), f"norm is {norms[index]:.6g}, must be {rule}")
+
+
+def sh_degree_for(arrays: Mapping[str, Array]) -> int:
+    """The SH degree that `arrays["sh"]` has, or the one nearest below, which `check_arrays` then names."""
+    sh = arrays.get("sh")
+    coefficients = sh.shape[1] if sh is not None and sh.ndim == 3 else 1
+    return max((d for d in range(MAX_SH_DEGREE + 1) if sh_coefficients(d) <= coefficients), default=0)
+
+
+def check_arrays(schema: Schema, arrays: Mapping[str, Array]) -> None:
+    """Check that `arrays` is a whole and usable model of `schema`.
+
+    Raises
+    ------
+    InputError : a field missing or unknown, a shape that does not fit, or an unusable value; it names
+        field, splat and value.
+    """
+    unknown = [name for name in arrays if name not in schema]
+    if unknown:
+        raise InputError(f"splats: unknown field {unknown[0]!r}; this shape has {', '.join(schema.names)}")
+    n = len(arrays["mean"]) if "mean" in arrays and arrays["mean"].ndim else 0
+    for field in schema:
+        if field.name not in arrays:
+            raise InputError(f"splats: field {field.name!r} is missing; give {', '.join(schema.names)}")
+        values, expected = arrays[field.name], public_shape(field, n)
+        if values.shape != expected:
+            raise InputError(f"splats: field {field.name!r} has shape {values.shape}; expected {expected}")
+    for field in schema:
+        fault = first_fault(field, arrays[field.name])
+        if fault is not None:
+            place = ", ".join(str(i) for i in (fault.index, *fault.component))
+            raise InputError(f"splats: {field.name}[{place}]: {fault.what}")

@@ -1,0 +1,44 @@
+"""Rotation matrices of quaternions w, x, y, z of any norm above 0, and their gradient."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .fields import Array
+
+NORM_FLOOR = 1e-15  # of |q|; the kernels' too (algebra.clh)
+
+
+def rotations(quat: Array) -> Array:
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4), of the same dtype."""
+    w, x, y, z = _unit(quat)[0].T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+
+
+def rotations_vjp(quat: Array, v: Array) -> Array:
+    """Gradient (N, 4) of the raw quaternions, through the normalisation, given v (N, 3, 3) of the matrices."""
+    unit, norm = _unit(quat)
+    w, x, y, z = unit.T
+    sums, gaps = v + v.transpose(0, 2, 1), v - v.transpose(0, 2, 1)
+    xy, xz, yz = sums[:, 0, 1], sums[:, 0, 2], sums[:, 1, 2]
+    zy, xz_gap, yx = gaps[:, 2, 1], gaps[:, 0, 2], gaps[:, 1, 0]
+    v_unit = 2 * np.stack([
+        x * zy + y * xz_gap + z * yx,
+        w * zy + y * xy + z * xz - 2 * x * (v[:, 1, 1] + v[:, 2, 2]),
+        w * xz_gap + x * xy + z * yz - 2 * y * (v[:, 0, 0] + v[:, 2, 2]),
+        w * yx + x * xz + y * yz - 2 * z * (v[:, 0, 0] + v[:, 1, 1]),
+    ], axis=1)
+    along = np.sum(unit * v_unit, axis=1, keepdims=True)
+    gradient: Array = (v_unit - along * unit) / norm
+    return gradient
+
+
+def _unit(quat: Array) -> tuple[Array, Array]:
+    """Normalised quaternions (N, 4) and their norms (N, 1)."""
+    norm = np.maximum(np.linalg.norm(quat, axis=1, keepdims=True), quat.dtype.type(NORM_FLOOR))
+    return quat / norm, norm

@@ -1,0 +1,65 @@
+"""What becomes of each splat when a strategy acts: made on the host, applied by the optimizers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...splats.fields import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The splats after an action, as a gather of the old ones and new values of some fields.
+
+    Attributes
+    ----------
+    source : (N_new,) int64, the old row whose parameters each new row copies.
+    values : by field, what replaces the copies: public arrays of N_new splats.
+    fresh : (N_new,) bool, rows whose optimizer state (moments, momentum) becomes zero.
+    state_source : (N_new,) int64, the old row whose optimizer state each new row takes over before that; None:
+        the state stays in its row, and rows beyond the old count start at zero.
+    reset_fields : fields whose state becomes zero in all rows.
+    relocated, added, removed : counts, for the log.
+    """
+
+    source: NDArray[np.int64]
+    values: dict[str, Array]
+    fresh: NDArray[np.bool_]
+    state_source: NDArray[np.int64] | None = None
+    reset_fields: tuple[str, ...] = ()
+    relocated: int = 0
+    added: int = 0
+    removed: int = 0
+
+    def permuted(self, order: NDArray[np.int64], n_old: int) -> Plan:
+        """The same splats in another order: `order` holds the plan's rows. n_old : splats before the plan."""
+        states, fresh = self.state_source, self.fresh
+        if states is None:
+            rows = np.arange(len(self.source))
+            states, fresh = np.minimum(rows, n_old - 1), fresh | (rows >= n_old)
+        values = {name: array[order] for name, array in self.values.items()}
+        return replace(self, source=self.source[order], values=values, fresh=fresh[order], state_source=states[order])
+
+    def apply(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
+        """The parameters after the plan (copies); the device's gather must do the same."""
+        moved = {name: array[self.source] for name, array in arrays.items()}
+        for name, values in self.values.items():
+            moved[name] = values.astype(arrays[name].dtype)
+        return moved
+
+    def apply_state(self, state: Array, name: str) -> Array:
+        """Optimizer state (N, ...) of one field after the plan (a copy)."""
+        n, n_new = len(state), len(self.source)
+        if self.state_source is not None:
+            moved = state[self.state_source]
+        else:
+            moved = np.zeros((n_new, *state.shape[1:]), state.dtype)
+            moved[: min(n, n_new)] = state[:n_new]
+        moved[self.fresh] = 0
+        if name in self.reset_fields:
+            moved[:] = 0
+        return moved

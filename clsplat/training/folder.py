@@ -1,0 +1,114 @@
+"""A trained model's folder: config, cameras, log, checkpoint and point clouds, in 3DGS's layout."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from ..cameras.cameras_json import NamedCamera, write_cameras
+from ..errors import InputError, OutputError
+from ..files.json_file import read_object, write_json
+from ..splats.splats import Splats
+
+_ITERATION = re.compile(r"iteration_(\d+)")
+
+
+class ModelFolder:
+    """Paths and small files of one model."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+
+    @property
+    def config_path(self) -> Path:
+        return self.path / "config.json"
+
+    @property
+    def cameras_path(self) -> Path:
+        return self.path / "cameras.json"
+
+    @property
+    def exposures_path(self) -> Path:
+        return self.path / "exposure.json"
+
+    @property
+    def log_path(self) -> Path:
+        return self.path / "log.jsonl"
+
+    @property
+    def checkpoint_path(self) -> Path:
+        return self.path / "checkpoint.npz"
+
+    def ply_path(self, iteration: int) -> Path:
+        """Point cloud of one iteration."""
+        return self.path / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+    @property
+    def is_used(self) -> bool:
+        """Whether a run has written here."""
+        return any(p.exists() for p in (self.config_path, self.checkpoint_path, self.path / "point_cloud"))
+
+    def iterations(self) -> list[int]:
+        """Iterations with a point cloud, rising."""
+        found = []
+        for folder in (self.path / "point_cloud").glob("iteration_*"):
+            match = _ITERATION.fullmatch(folder.name)
+            if match and (folder / "point_cloud.ply").is_file():
+                found.append(int(match[1]))
+        return sorted(found)
+
+    def latest_ply(self, iteration: int | None = None) -> tuple[Path, int]:
+        """Point cloud of `iteration`, or the last; raises InputError when there is none."""
+        found = self.iterations()
+        if not found:
+            raise InputError(f"{self.path}: no point_cloud/iteration_N/point_cloud.ply in it: "
+                             "train a model first")
+        if iteration is not None and iteration not in found:
+            raise InputError(f"{self.path}: no iteration {iteration}: it has {', '.join(map(str, found))}")
+        chosen = found[-1] if iteration is None else iteration
+        return self.ply_path(chosen), chosen
+
+    def prepare(self) -> None:
+        """Make the folder; raises OutputError when nothing can be written there."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            probe = self.path / ".clsplat-write-test"
+            probe.write_bytes(b"")
+            probe.unlink()
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(f"{self.path}: cannot be written ({reason}): choose another folder") from None
+
+    def clear(self) -> None:
+        """Remove what a former run wrote, and nothing else."""
+        for path in (self.checkpoint_path, self.log_path, self.config_path, self.cameras_path, self.exposures_path,
+                     *(self.path / name for name in ("results.json", "per_view.json", "report.html"))):
+            path.unlink(missing_ok=True)
+        for iteration in self.iterations():
+            ply = self.ply_path(iteration)
+            ply.unlink()
+            if not any(ply.parent.iterdir()):
+                ply.parent.rmdir()
+
+    def write_config(self, values: dict[str, Any]) -> None:
+        """The run's options and scene."""
+        write_json(self.config_path, values)
+
+    def read_config(self) -> dict[str, Any]:
+        """What `write_config` wrote; raises InputError when it is missing or damaged."""
+        return read_object(self.config_path)
+
+    def write_cameras(self, named: list[NamedCamera]) -> None:
+        """3DGS's cameras.json."""
+        write_cameras(self.cameras_path, named)
+
+    def write_exposures(self, by_photo: dict[str, list[list[float]]]) -> None:
+        """3DGS's exposure.json."""
+        write_json(self.exposures_path, by_photo)
+
+    def save(self, splats: Splats, iteration: int) -> Path:
+        """Write the point cloud of an iteration."""
+        path = self.ply_path(iteration)
+        splats.save(path)
+        return path

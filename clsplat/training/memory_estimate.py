@@ -1,0 +1,84 @@
+"""How much device memory a run will take, before it starts."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+from ..device.device import Device
+from ..errors import DeviceError
+from ..rendering.build import KernelBuild
+from ..rendering.pipeline import ImageLayout, isect_bytes
+from ..rendering.splat_buffers import COMPACT_ROWS
+from ..splats.fields import Group
+from .config import TrainConfig
+from .optim.skew_map import SkewMap
+
+_ROLES = 5  # value, gradient, two moments, and the copy that relocation swaps with; of colour the gradient is compact
+_IMAGE_PLANES = 3 + 1 + 9 + 3  # colour, T, gradients of SSIM's maps, v_color
+# Splat-tile pairs of an image: about 100 a tile, however few the splats, and 4 more a splat. At the end of runs on
+# three real scenes of 400-px photos with 5 000 and 20 000 splats there were 0.5 to 0.8 times as many.
+_ISECTS_PER_TILE, _ISECTS_PER_SPLAT = 100, 4
+_LEAST_ISECTS = 1 << 20  # that there must be room for: images with more are cut into bands
+_SCREEN_WORDS = 16  # keys, orders, rectangles, counts and offsets of a splat
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Bytes by purpose, of an isect, and of the largest single buffer other than those of isects."""
+
+    splats: int
+    isects: int
+    images: int
+    isect: int
+    largest_buffer: int
+
+    @property
+    def total(self) -> int:
+        return self.splats + self.isects + self.images
+
+    def __str__(self) -> str:
+        return (f"{self.total / 1e6:.0f} MB of device memory (splats {self.splats / 1e6:.0f}, "
+                f"splat-tile pairs {self.isects / 1e6:.0f}, images {self.images / 1e6:.0f})")
+
+
+def peak_bytes() -> int:
+    """Most host memory this process has held; 0 where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # bytes there, KiB elsewhere
+
+
+def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, truth_bytes: int) -> Estimate:
+    """Memory at the cap, for the largest image, with `truth_bytes` of images to learn. Splat-tile pairs are a guess."""
+    real, n = kernels.dtype.itemsize, config.cap_max
+    rows = {group: kernels.schema.rows(group) for group in Group}
+    screen = (kernels.record + kernels.v_record) * real + 4 * _SCREEN_WORDS
+    isect = isect_bytes(kernels)
+    n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
+    extra = 6 * SkewMap(config.map).width if config.map else 0  # s, moments, and a spare of each
+    extra += 0 if config.position_optimizer == "adam" else 6  # momentum
+    buffers = [rows[Group.SH] * n * real, 9 * layout.plane * real]
+    splat = _ROLES * rows[Group.GEOM] + (_ROLES - 1) * rows[Group.SH] + COMPACT_ROWS + extra
+    return Estimate(n * (splat * real + screen), n_isects * isect,
+                    _IMAGE_PLANES * layout.plane * real + truth_bytes, isect, max(buffers))
+
+
+def room_for_isects(needed: Estimate, device: Device) -> int:
+    """Isects that fit beside splats and images; buffers that grow take half as much again."""
+    return max(device.info.global_mem_bytes - needed.splats - needed.images, 0) * 2 // (3 * needed.isect)
+
+
+def check(needed: Estimate, device: Device) -> None:
+    """Raises DeviceError when splats and images do not fit the device, with some isects beside them."""
+    info = device.info
+    mend = "lower --cap-max, use smaller images (-r 2, 4, 8), a lower --sh-degree, or another --device"
+    if needed.total > info.global_mem_bytes and room_for_isects(needed, device) < _LEAST_ISECTS:
+        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, "
+                          f"the run needs about {needed}: {mend}")
+    if needed.largest_buffer > info.max_alloc_bytes:
+        raise DeviceError(f"{info} allows {info.max_alloc_bytes / 1e6:.0f} MB in one buffer, "
+                          f"the run needs about {needed.largest_buffer / 1e6:.0f} MB: {mend}")

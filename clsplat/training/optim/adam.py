@@ -1,0 +1,82 @@
+"""Adam in NumPy: the reference that the fused device step is compared with, and the one to read.
+
+Kingma & Ba 2015 with 3DGS's constants. The step count is one for all splats, as in 3DGS: relocated splats get
+zero moments but no fresh bias correction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...splats.fields import Array
+
+BETA1, BETA2, EPS = 0.9, 0.999, 1e-15  # 3DGS
+WAITS = 256  # one more than the steps that a splat may sit out (optim_lazy.py)
+
+
+class NumpyAdam:
+    """Adam over named arrays whose first axis is the splat.
+
+    Parameters
+    ----------
+    params : the arrays to come, for the shapes and dtypes of their moments.
+
+    Attributes
+    ----------
+    step_count : steps taken.
+    first, second : name to first and second moments.
+    """
+
+    def __init__(self, params: Mapping[str, Array], beta1: float = BETA1, beta2: float = BETA2,
+                 eps: float = EPS) -> None:
+        self.beta1, self.beta2, self.eps = beta1, beta2, eps
+        self.step_count = 0
+        self.first = {name: np.zeros_like(param) for name, param in params.items()}
+        self.second = {name: np.zeros_like(param) for name, param in params.items()}
+
+    def advance(self) -> None:
+        """Begin a step: the bias corrections follow the count."""
+        self.step_count += 1
+
+    def direction(self, name: str, grad: Array, rows: slice | NDArray[np.int64] = slice(None)) -> Array:
+        """Take a gradient of some splats, `rows`, into the moments of `name`.
+
+        Returns
+        -------
+        Their bias-corrected direction, to be scaled by a rate.
+
+        Raises
+        ------
+        KeyError : no such name. ValueError : the gradient has another shape than the parameter.
+        """
+        m, v = self.first[name][rows], self.second[name][rows]
+        if grad.shape != m.shape:
+            raise ValueError(f"{name}: gradient {grad.shape}, parameter {m.shape}")
+        m *= self.beta1
+        m += (1.0 - self.beta1) * grad
+        v *= self.beta2
+        v += (1.0 - self.beta2) * (grad * grad)
+        self.first[name][rows], self.second[name][rows] = m, v
+        correction1 = 1.0 - self.beta1**self.step_count
+        correction2 = math.sqrt(1.0 - self.beta2**self.step_count)
+        ascent: Array = (m / correction1) / (np.sqrt(v) / correction2 + self.eps)
+        return ascent
+
+    def step(
+        self, params: Mapping[str, Array], grads: Mapping[str, Array], lrs: Mapping[str, ArrayLike]
+    ) -> None:
+        """Update every array of `params` in place.
+
+        Parameters
+        ----------
+        params, grads : name to array; every parameter needs a gradient of its shape.
+        lrs : name to rate, a number or anything that broadcasts over the parameter.
+        """
+        self.advance()
+        for name, param in params.items():
+            rate = np.asarray(lrs[name], dtype=param.dtype)
+            param -= rate * self.direction(name, grads[name])

@@ -1,0 +1,106 @@
+"""What both optimizers go by: rates, regularisers, the skew map, how positions move, and which blocks learn when."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from ...splats.fields import Array, Field, Schema
+from ...splats.shapes import Shape, shape_named
+from ..alternation import Blocks, active_blocks
+from ..config import TrainConfig
+from .noise import PUBLISHED_EXTENT
+from .regularisers import Penalty
+from .sghmc import Coefficients, Sghmc
+from .skew_map import SkewMap
+
+SH_REST_FACTOR = 1.0 / 20.0  # 3DGS: bands above the constant learn 20 times slower
+
+
+@dataclass(frozen=True)
+class Rules:
+    """The config as the optimizers read it; `extent` of the scene [world units]."""
+
+    config: TrainConfig
+    extent: float
+
+    @property
+    def shape(self) -> Shape:
+        return shape_named(self.config.shape)
+
+    @cached_property
+    def rates(self) -> dict[str, float]:
+        """Adam's rate per field; the mean's changes with the iteration and is given at each step."""
+        config = self.config
+        rates = {"quat": config.rotation_lr, "log_scale": config.scaling_lr, "opacity_logit": config.opacity_lr,
+                 "opacity_minus_logit": config.opacity_lr, "sh": config.feature_lr,
+                 "normal": config.normal_lr, "beta": config.beta_lr, "nu": config.nu_lr}
+        for field in self.shape.fields:
+            if field.name == "skew":
+                rates["skew"] = field.lr if config.skew_lr is None else config.skew_lr
+        return {name: rate * config.rate_factor(name) for name, rate in rates.items()}
+
+    def sh_rates(self, rows: int, dtype: np.dtype[np.floating]) -> Array:
+        """Rate per row of colour, of which the first three are the constant band."""
+        rates = np.full(rows, self.rates["sh"], dtype)
+        rates[3:] *= SH_REST_FACTOR
+        return rates
+
+    def penalty(self, n: int) -> Penalty:
+        """The regularisers of n splats: the config's weights are those of means over splats.
+
+        Scales are taken in world units, as published, and in larger scenes than that in units of the extent: else
+        they would outweigh the images.
+        """
+        config = self.config
+        scale = config.scale_reg * min(PUBLISHED_EXTENT / self.extent, 1.0)
+        return Penalty(config.opacity_reg / n, scale / (3 * n), config.bisect_reg / n)
+
+    @cached_property
+    def map(self) -> SkewMap | None:
+        """The map of the trainable skew, where the shape has one."""
+        return SkewMap(self.config.map) if self.config.map else None
+
+    @cached_property
+    def sghmc(self) -> Sghmc | None:
+        """How positions move, unless by Adam."""
+        config = self.config
+        if config.position_optimizer == "adam":
+            return None
+        return Sghmc(config.position_optimizer == "sghmc-sss", self.extent, config.sghmc_friction,
+                     config.sghmc_burn_in_friction, int(config.sghmc_burn_in * config.iterations))
+
+    def coefficients(self, sghmc: Sghmc, iteration: int, mean_lr: float) -> Coefficients:
+        """Of SGHMC's step, from the rate that Adam would take."""
+        factor = self.config.rate_factor("mean")
+        return sghmc.coefficients(iteration, mean_lr / factor, factor)
+
+    def blocks(self, iteration: int) -> Blocks:
+        """The blocks that learn at `iteration`; of shapes without a skew that is no block."""
+        base, skew = active_blocks(iteration, self.config)
+        return Blocks(base, skew and self.map is not None)
+
+    def base_fields(self, schema: Schema) -> tuple[Field, ...]:
+        """All fields but the skew: the base block."""
+        return tuple(field for field in schema if field.name != "skew")
+
+    @property
+    def geometry_waits(self) -> bool:
+        """Whether with `visible_adam` geometry waits as colour does: nothing else moves splats, or looks at them."""
+        config = self.config
+        pulled = config.opacity_reg or config.scale_reg or config.bisect_reg
+        return not (pulled or config.noise_lr or self.sghmc)
+
+    def check_state(self, state: Mapping[str, NDArray[Any]], schema: Schema) -> None:
+        """Raises InputError naming an entry that an optimizer's state lacks, or has and should not."""
+        wanted = {"steps"} | {f"{role}.{name}" for role in ("first", "second") for name in schema.names}
+        wanted |= ({"skew_s"} if self.map else set()) | ({"momentum"} if self.sghmc else set())
+        wanted |= {"waiting.last", "waiting.drifts"} if self.config.visible_adam else set()
+        if odd := sorted(wanted ^ set(state)):
+            raise InputError(f"optimizer state: missing or unknown entry {odd[0]!r}: start without --resume")

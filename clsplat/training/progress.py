@@ -1,0 +1,163 @@
+"""What a long run shows: one line that is rewritten on a terminal or in a notebook, elsewhere a line now and then."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import ClassVar, TextIO
+
+from .log import Progress
+
+PLAIN_INTERVAL = 10.0  # seconds between lines where nothing can be rewritten
+_BAR = (4, 20)  # characters, least and most
+_NOTEBOOK_COLUMNS, _USUAL_COLUMNS = 100, 80
+
+
+class LiveLine:
+    """A line of text that changes.
+
+    It uses no colours and no escape sequences but the carriage return; where that cannot be trusted (a file, a pipe,
+    TERM=dumb) it writes whole lines, `PLAIN_INTERVAL` apart.
+
+    Parameters
+    ----------
+    stream : standard error by default, in a notebook standard output. clock : seconds.
+    """
+
+    _open: ClassVar[LiveLine | None] = None  # the one whose cursor stands at the end of a line
+
+    def __init__(self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+        notebook = stream is None and _in_notebook()
+        self.stream = stream or (sys.stdout if notebook else sys.stderr)
+        self.clock = clock
+        self.live = notebook or (self.stream.isatty() and os.environ.get("TERM") != "dumb")
+        self._columns = _NOTEBOOK_COLUMNS if notebook else 0
+        self._shown = -math.inf
+        self._length = 0
+
+    def show(self, text: str | Callable[[int], str], last: bool = False) -> None:
+        """Replace the line.
+
+        Parameters
+        ----------
+        text : or what makes one that fits some columns; 0 stands for any number. last : it is to stay.
+        """
+        make = text if callable(text) else lambda _: text
+        if self.live:
+            columns = (self._columns or _columns(self.stream)) - 1
+            line = make(columns)[:columns]
+            self._write("\r" + line.ljust(min(max(self._length, len(line)), columns)))
+            self._length, LiveLine._open = len(line), self
+            if last:
+                self.close()
+        elif last or self.clock() - self._shown >= PLAIN_INTERVAL:
+            self._shown = self.clock()
+            self._write(make(0) + "\n")
+
+    def say(self, text: str) -> None:
+        """A line of its own, above the one that changes."""
+        self.clear()
+        self._write(text + "\n")
+
+    def clear(self) -> None:
+        """Take the line away, for others to write; it comes back when it is next shown."""
+        if LiveLine._open is self:
+            self._write("\r" + " " * self._length + "\r")
+            self._length, LiveLine._open = 0, None
+
+    def close(self) -> None:
+        """Leave the line as it stands and go to the next."""
+        if LiveLine._open is self:
+            self._write("\n")
+            self._length, LiveLine._open = 0, None
+
+    @classmethod
+    def give_way(cls) -> None:
+        """Clear whichever line is open."""
+        if cls._open is not None:
+            cls._open.clear()
+
+    def _write(self, text: str) -> None:
+        self.stream.write(text)
+        self.stream.flush()
+
+
+class TrainingDisplay:
+    """A `progress` callback for `train`, `train_budget` and others; a context manager too, which ends the line.
+
+    Parameters
+    ----------
+    quiet : show nothing. stream, clock : as of `LiveLine`.
+    """
+
+    def __init__(self, quiet: bool = False, stream: TextIO | None = None,
+                 clock: Callable[[], float] = time.monotonic) -> None:
+        self.quiet, self._line = quiet, LiveLine(stream, clock)
+
+    def __enter__(self) -> TrainingDisplay:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self._line.close()
+
+    def __call__(self, progress: Progress) -> None:
+        if self.quiet:
+            return
+        if progress.message:
+            self._line.say(progress.message)
+        else:
+            self._line.show(lambda columns: progress_line(progress, columns), progress.iteration == progress.iterations)
+
+
+def progress_line(progress: Progress, columns: int = 0) -> str:
+    """Iteration, loss, PSNR, splats, speed and time left, with a bar.
+
+    Parameters
+    ----------
+    columns : that it may take: the loss, the speed and the number of splats are left out, in this order, where it is
+        narrow, the bar too; 0: as long as it is, without a bar.
+    """
+    share = progress.iteration / progress.iterations
+    count = f"{progress.iteration}/{progress.iterations}"
+    speed = f"{progress.per_second:.{0 if progress.per_second >= 10 else 1}f} it/s"
+    fields = {"loss": f"loss {progress.loss:.4f}", "PSNR": f"PSNR {progress.psnr:.2f}",
+              "splats": f"{progress.n_splats} splats", "speed": speed,
+              "left": f"{duration(progress.seconds_left)} left"}
+    percents = f"{share:4.0%}"
+    for dropped in ("loss", "speed", "splats", "PSNR"):
+        if not columns or len("  ".join([f"{count} {percents}", *fields.values()])) <= columns:
+            break
+        del fields[dropped]
+    text = "  ".join(fields.values())
+    least, most = _BAR
+    bar = min(columns - len(count) - len(text) - 5, most)
+    return f"{count} [{'#' * round(bar * share):-<{bar}}]  {text}" if bar >= least else f"{count} {percents}  {text}"
+
+
+def duration(seconds: float) -> str:
+    """7 s, 2:31 or 1:02:31."""
+    if not math.isfinite(seconds):
+        return "?"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    return f"{minutes}:{rest:02}" if minutes < 60 else f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
+
+
+def _columns(stream: TextIO) -> int:
+    try:
+        return os.get_terminal_size(stream.fileno()).columns or _USUAL_COLUMNS
+    except (OSError, ValueError):
+        return _USUAL_COLUMNS
+
+
+def _in_notebook() -> bool:
+    """Whether this runs in the kernel of a notebook, whose output takes carriage returns though it is no terminal."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return getattr(shell, "kernel", None) is not None

@@ -1,0 +1,178 @@
+"""What is looked at: a model file that is read again when it changes, as splats on the device."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras.camera import Camera
+from ..errors import ClsplatError, InputError
+from ..rendering.colormaps import MODES, Picture, model_for, picture
+from ..rendering.renderer import Renderer
+from ..splats.shapes import shape_named
+from ..splats.splats import Splats
+from .settings import Settings
+
+KEPT = 4  # models on the device at once: looker-ons with other caps, or at the skew
+
+
+class Source(Protocol):
+    """Something that pictures can be made of.
+
+    Attributes
+    ----------
+    modes : of `display.MODES`. partial : whether fewer splats than all can be shown.
+    """
+
+    @property
+    def n_splats(self) -> int: ...
+
+    @property
+    def sh_degree(self) -> int: ...
+
+    @property
+    def modes(self) -> tuple[str, ...]: ...
+
+    @property
+    def partial(self) -> bool: ...
+
+    def picture(self, camera: Camera, settings: Settings) -> Picture:
+        """What the camera sees, as large as it says."""
+
+
+class ModelSource:
+    """A model on the device.
+
+    Parameters
+    ----------
+    splats : shown first. keep : models on the device at once.
+    """
+
+    modes = MODES
+    partial = True
+
+    def __init__(self, splats: Splats, device: str | None = None, keep: int = KEPT) -> None:
+        self.renderer = Renderer(device, keep=keep)
+        self._rendering = threading.Lock()  # a renderer is of one thread at a time
+        self._keep = keep
+        self.show(splats)
+
+    def show(self, splats: Splats) -> None:
+        """Show another model from the next picture on; any thread may call this."""
+        # One assignment: a picture in the making sees the old model or the new one.
+        self._shown = _Shown(splats, self._keep)
+
+    @property
+    def splats(self) -> Splats:
+        return self._shown.splats
+
+    @property
+    def n_splats(self) -> int:
+        return len(self.splats)
+
+    @property
+    def sh_degree(self) -> int:
+        return self.splats.sh_degree
+
+    def picture(self, camera: Camera, settings: Settings) -> Picture:
+        """What the camera sees; at full settings the bytes of `clsplat render`."""
+        with self._rendering:
+            splats = self._shown.part(settings.cap, settings.mode)
+            return picture(self.renderer, splats, camera, settings.mode, settings.background,
+                           sh_degree=settings.sh_degree)
+
+
+class _Shown:
+    """A model and the parts of it that were asked for last."""
+
+    def __init__(self, splats: Splats, keep: int) -> None:
+        self.splats, self._keep = splats, keep
+        self._order: NDArray[np.intp] | None = None
+        self._parts: dict[tuple[int, bool], Splats] = {}
+
+    def part(self, cap: int | None, mode: str) -> Splats:
+        """At most `cap` splats, those first that cover most, in the order of the file; coloured for the mode."""
+        n = len(self.splats) if cap is None else min(cap, len(self.splats))
+        skew = mode == "skew"
+        if n == len(self.splats) and not skew:
+            return self.splats
+        part = self._parts.pop((n, skew), None)
+        if part is None:
+            if self._order is None:
+                self._order = np.argsort(-coverage(self.splats), kind="stable")
+            part = self.splats if n == len(self.splats) else self.splats.select(np.sort(self._order[:n]))
+            part = model_for(part, mode)
+            while len(self._parts) >= self._keep - 1:
+                del self._parts[next(iter(self._parts))]
+        self._parts[n, skew] = part
+        return part
+
+
+def coverage(splats: Splats) -> NDArray[np.float64]:
+    """(N,) opacity times the area of the two longest axes: how much a splat covers, from the average side."""
+    strength = shape_named(splats.shape).strength(splats.arrays)
+    longest = np.sort(splats.log_scale.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
+    covered: NDArray[np.float64] = strength * np.exp(np.clip(longest, -200.0, 200.0))
+    return covered
+
+
+class Watch:
+    """A model's file, looked at now and then: read again once it has changed and is whole.
+
+    Parameters
+    ----------
+    find : the file to show now (of a model folder: the last iteration's); raises InputError where there is none.
+    """
+
+    def __init__(self, find: Callable[[], Path]) -> None:
+        self._find = find
+        self.path = find()
+        self._read = self._seen = _stamp(self.path)
+
+    def poll(self) -> Splats | None:
+        """The new model, or None: nothing new, or the file is still being written.
+
+        Raises
+        ------
+        InputError : the new file cannot be used; said once for each state of the file.
+        """
+        path = self._find()
+        stamp = _stamp(path)
+        # A file is read once it has stayed the same from one look to the next.
+        settled, self._seen = stamp == self._seen, stamp
+        if not settled or stamp == self._read:
+            return None
+        return self._load(path, stamp)
+
+    def reload(self) -> Splats:
+        """The model as it is in the file now. Raises InputError."""
+        path = self._find()
+        return self._load(path, _stamp(path))
+
+    def _load(self, path: Path, stamp: tuple[object, ...]) -> Splats:
+        self._read = self._seen = stamp
+        if len(stamp) == 1:
+            raise InputError(f"{path}: is not there any more")
+        try:
+            splats = Splats.load(path)
+        except ClsplatError:
+            raise
+        except (OSError, MemoryError) as error:
+            raise InputError(f"{path}: cannot be read ({error})") from None
+        self.path = path
+        return splats
+
+
+def _stamp(path: Path) -> tuple[object, ...]:
+    """What changes when a file does; (path,) where there is none."""
+    try:
+        status = os.stat(path)
+    except OSError:
+        return (path,)
+    return path, status.st_mtime_ns, status.st_size, status.st_ino

@@ -1,0 +1,144 @@
+"""Path files: nerfstudio's camera_path.json and our cameras.json, in and out, and their faults by name."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from clsplat.cameras.camera import Camera
+from clsplat.cameras.cameras_json import NamedCamera, write_cameras
+from clsplat.cameras.path import CameraPath, parse_path, path_text, read_path, write_path
+from clsplat.errors import InputError
+
+WIDTH, HEIGHT = 640, 360
+
+
+def some_cameras(n: int, off_centre: bool = False) -> tuple[Camera, ...]:
+    rng = np.random.default_rng(n)
+    made = []
+    for _ in range(n):
+        pose = np.hstack([Rotation.random(rng=rng).as_matrix(), rng.normal(size=(3, 1))])
+        fx, fy = rng.uniform(200, 900, 2)
+        lens = (fx, fy, 300.0, 200.0) if off_centre else (fx, fx, WIDTH / 2, HEIGHT / 2)
+        made.append(Camera(WIDTH, HEIGHT, *lens, pose))
+    return tuple(made)
+
+
+def same(left: Camera, right: Camera) -> None:
+    for key in ("width", "height", "fx", "fy", "cx", "cy"):
+        assert getattr(left, key) == pytest.approx(getattr(right, key), rel=1e-12)
+    np.testing.assert_allclose(left.cam_from_world, right.cam_from_world, atol=1e-12)
+
+
+def nerfstudio(**changes: Any) -> dict[str, Any]:
+    """One frame at (1, 2, 3) with OpenGL's axes along the world's: it looks along -z, y up."""
+    pose = [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]
+    base = {
+        "camera_type": "perspective", "render_height": 100, "render_width": 200, "fps": 24, "seconds": 2,
+        "camera_path": [{"camera_to_world": pose, "fov": 90, "aspect": 2.0}] * 2,
+    }  # fmt: skip
+    return {key: value for key, value in (base | changes).items() if value != "absent"}
+
+
+@pytest.mark.parametrize("off_centre", [False, True])
+def test_round_trip(tmp_path: Path, off_centre: bool) -> None:
+    given = CameraPath(some_cameras(5, off_centre), 24.0, some_cameras(2, off_centre), closed=True)
+    write_path(tmp_path / "deep" / "path.json", given)
+    for read in (read_path(tmp_path / "deep" / "path.json"), parse_path(path_text(given))):
+        assert (read.fps, read.closed) == (24.0, True)
+        for left, right in zip(read.cameras + read.keys, given.cameras + given.keys, strict=True):
+            same(left, right)
+
+
+def test_nerfstudios_axes_and_vertical_field_of_view() -> None:
+    path = parse_path(json.dumps(nerfstudio()))
+    camera = path.cameras[0]
+    assert (len(path.cameras), path.fps) == (2, 24)
+    assert camera.fx == camera.fy == pytest.approx(50)  # 90 degrees over 100 px
+    np.testing.assert_allclose(camera.position, [1, 2, 3])
+    ahead_and_up = camera.rotation @ ([1, 2.5, 1] - camera.position)
+    np.testing.assert_allclose(ahead_and_up, [0, -0.5, 2])
+    written = json.loads(path_text(path))
+    assert written["camera_path"][0] == {"camera_to_world": nerfstudio()["camera_path"][0]["camera_to_world"],
+                                         "fov": pytest.approx(90), "aspect": 2.0}
+
+
+def test_keyframes_of_both_of_nerfstudios_viewers() -> None:
+    pose = np.array(nerfstudio()["camera_path"][0]["camera_to_world"], float).reshape(4, 4)
+    new = {"matrix": pose.ravel().tolist(), "fov": 90, "aspect": 2}
+    old = {"matrix": json.dumps(pose.T.ravel().tolist()), "fov": 90, "aspect": 2}
+    path = parse_path(json.dumps(nerfstudio(keyframes=[new, old])))
+    for key in path.keys:
+        same(key, path.cameras[0])
+
+
+def test_rate_from_seconds() -> None:
+    assert parse_path(json.dumps(nerfstudio(fps="absent"))).fps == 1
+    assert parse_path(json.dumps(nerfstudio(fps="absent", seconds="absent"))).fps == 30
+
+
+def test_a_cameras_json_is_a_path(tmp_path: Path) -> None:
+    cameras = some_cameras(3, off_centre=True)
+    write_cameras(tmp_path / "cameras.json", [NamedCamera(str(n), camera) for n, camera in enumerate(cameras)])
+    path = read_path(tmp_path / "cameras.json")
+    assert path.seconds == pytest.approx(0.1)
+    for left, right in zip(path.cameras, cameras, strict=True):
+        same(left, right)
+
+
+def frame(**changes: Any) -> dict[str, Any]:
+    entry = nerfstudio()["camera_path"][0] | changes
+    return nerfstudio(camera_path=[nerfstudio()["camera_path"][0],
+                                   {key: value for key, value in entry.items() if value != "absent"}])
+
+
+@pytest.mark.parametrize(("content", "words"), [
+    (nerfstudio(camera_path="absent"), ["'camera_path' is missing"]),
+    (nerfstudio(render_width="absent"), ["'render_width' is missing"]),
+    (nerfstudio(render_height=10.5), ["'render_height'", "10.5"]),
+    (nerfstudio(camera_path=[]), ["'camera_path' is empty"]),
+    (nerfstudio(camera_path=[3]), ["'camera_path'", "list of objects"]),
+    (nerfstudio(camera_type="fisheye"), ["'camera_type'", "fisheye"]),
+    (nerfstudio(fps=0), ["fps"]),
+    (nerfstudio(fps="absent", seconds=0), ["'seconds' is 0"]),
+    (frame(camera_to_world="absent"), ["camera_path[1]", "'camera_to_world' is missing"]),
+    (frame(camera_to_world=[1] * 15), ["camera_path[1]", "16 numbers"]),
+    (frame(camera_to_world=[2, *nerfstudio()["camera_path"][0]["camera_to_world"][1:]]), ["camera_path[1]", "rigid"]),
+    (frame(fov="absent"), ["camera_path[1]", "'fov' is missing"]),
+    (frame(fov=180), ["camera_path[1]", "'fov' is 180"]),
+    (frame(fov=math.inf), ["camera_path[1]", "'fov' is not finite"]),
+    (nerfstudio(keyframes=[{"matrix": "[1,", "fov": 50}]), ["keyframes[0]", "16 numbers"]),
+    ([], ["no cameras"]),
+    (7, ["a number"]),
+])  # fmt: skip
+def test_faults_name_file_and_field(tmp_path: Path, content: Any, words: list[str]) -> None:
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(InputError) as caught:
+        read_path(file)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in (*words, str(file)):
+        assert word in message
+
+
+def test_no_json_and_no_file(tmp_path: Path) -> None:
+    (tmp_path / "bad").write_text("{")
+    with pytest.raises(InputError, match="is no JSON"):
+        read_path(tmp_path / "bad")
+    with pytest.raises(InputError, match="upload: is no JSON"):
+        parse_path(b"\xff", "upload")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_path(tmp_path / "none")
+
+
+def test_frames_of_two_sizes_are_no_camera_path() -> None:
+    first = some_cameras(1)[0]
+    with pytest.raises(InputError, match="frame 1 is 64x36"):
+        path_text(CameraPath((first, first.resized(64, 36))))

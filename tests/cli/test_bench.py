@@ -1,0 +1,70 @@
+"""`clsplat bench`: the table names every stage, the file holds the numbers, errors are one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from cli_runner import HEIGHT, N_VIEWS, WIDTH, clsplat, error_of, small_capture, small_model
+from clsplat_cli.bench import sentence
+
+from clsplat.profiling.bench import Report, StageTime
+from clsplat.profiling.roofline import Limits
+from clsplat.profiling.stages import HOST, STAGES
+
+
+@pytest.fixture(autouse=True)
+def limits_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clsplat.profiling.roofline.measure_limits", lambda device: Limits(1e10, 1e11))
+
+
+def test_made_up_scene(tmp_path: Path) -> None:
+    file = tmp_path / "deep" / "bench.json"
+    said = clsplat("bench", "--splats", 200, "--width", 48, "--height", 32, "--shape", "gaussian", "--iterations", 1,
+                   "--json", file)
+    assert "copy 10.0 GB/s, FMA 100 Gflop/s" in said
+    training, render = said.split("render: ")
+    for stage in (*STAGES, HOST):
+        assert any(line.startswith(f"{stage}  ") for line in training.splitlines()), stage
+    assert "200 gaussian splats" in training
+    assert "rasterize_vjp" not in render
+    assert " takes " in render, "a sentence on what takes the time"
+    stored = json.loads(file.read_text())
+    assert {"device", "driver", "schedule", "scene", "copy_bytes_per_s", "fma_flops_per_s"} <= set(stored)
+    reports = [Report.from_json(values) for values in stored["reports"]]
+    assert [(report.task, report.width, report.height) for report in reports] == [
+        ("training step", 48, 32), ("render", 48, 32)]
+
+
+def test_scene_from_its_points_and_from_a_model(tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene, model = small_capture(tmp_path_factory), small_model(tmp_path_factory)
+    said = clsplat("bench", "-s", scene, "--splats", 90, "--shape", "gaussian", "--iterations", 1)
+    assert f"yard, up to {WIDTH}x{HEIGHT} px: 90 gaussian splats" in said
+    assert N_VIEWS > 1
+    assert " skew-normal splats" in clsplat("bench", "-s", scene, "-m", model, "--sh-degree", 1, "--iterations", 1)
+
+
+def test_errors(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scene = small_capture(tmp_path_factory)
+    assert "with -s" in error_of("bench", "-r", 2, code=2)
+    assert "use -r" in error_of("bench", "-s", scene, "--width", 64, code=2)
+    assert "not both" in error_of("bench", "-s", scene, "-m", tmp_path, "--splats", 5, code=2)
+    assert "--iterations" in error_of("bench", "--iterations", 0, code=2)
+    assert "--width" in error_of("bench", "--width", 4, code=2)
+    assert str(tmp_path / "none") in error_of("bench", "-s", tmp_path / "none")
+    assert str(tmp_path / "none.ply") in error_of("bench", "-s", scene, "-m", tmp_path / "none.ply")
+    assert "nowhere" in error_of("bench", "--device", "nowhere")
+
+
+@pytest.mark.parametrize(("stage", "said"), [
+    (StageTime("rasterize", 2, 0.4, 1, 1, 0.1, 0.61), "61 % of the FMA limit and 10 % of the copy limit: arithmetic"),
+    (StageTime("loss", 2, 0.4, 1, 1, 0.7, 0.1), ": memory limits it."),
+    (StageTime("step", 2, 0.4, 1, 0, 1.3), "130 % of the copy limit: the caches help it"),
+    (StageTime("gather", 2, 0.4, 1, 0, 0.2), "neither limits it"),
+    (StageTime("host", 2, 0.4), "waits for Python"),
+    (StageTime("transfers", 2, 0.4), "not compared"),
+])
+def test_sentences(stage: StageTime, said: str) -> None:
+    assert said in sentence(stage)
+    assert sentence(stage).startswith(f"{stage.stage} takes 40 % of the time")

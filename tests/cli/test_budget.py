@@ -1,0 +1,143 @@
+"""`clsplat info`, `clsplat prune` and `clsplat train --budget`: files, what they say, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runner import clsplat, error_of, small_capture, small_model
+
+from clsplat.splats.convert import convert
+from clsplat.splats.splats import Splats
+from clsplat.training.folder import ModelFolder
+
+SEARCH = ("--eval", "--iterations", 20, "--cap-max", 150, "--sh-degree", 0, "--densify-interval", 5)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_model(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_capture(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def found(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A searched model's folder, and what the command said."""
+    folder = tmp_path_factory.mktemp("search") / "model"
+    return folder, clsplat("train", scene, "-m", folder, "--budget", "auto", "--budget-tolerance", "1dB", *SEARCH)
+
+
+def test_info_counts(model: Path, tmp_path: Path) -> None:
+    ply = ModelFolder(model).latest_ply()[0]
+    n = len(Splats.load(ply))
+    text = clsplat("info", model)
+    assert f"{ply}: {n} splats, shape skew-normal, SH degree 1, " in text
+    assert "splats with skew" in text
+    arrays = Splats.load(ply).to_numpy()
+    arrays["skew"][5:] = 0
+    Splats("skew-normal", arrays).save(tmp_path / "few.ply", compact=True)
+    (first, second) = map(json.loads, clsplat("info", model, tmp_path / "few.ply", "--json").splitlines())
+    assert (first["splats"], first["skewed"], second["skewed"]) == (n, n, 5)
+    assert second["bytes"] == (tmp_path / "few.ply").stat().st_size < first["bytes"] == ply.stat().st_size
+    assert second["sh_coefficients"] == [3 * n, 9 * n]
+
+
+def test_eval_writes_the_complexity(model: Path) -> None:
+    clsplat("eval", model, "-q")
+    (entry,) = json.loads((model / "results.json").read_text()).values()
+    assert entry["skewed_fraction"] == 1.0
+    assert entry["parameters_in_use"] == entry["parameters"]
+    assert entry["sh_coefficients"] == [3 * entry["splats"], 9 * entry["splats"]]
+
+
+def test_prune_leaves_out_what_is_not_missed(model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "small.ply"
+    said = clsplat("prune", model, "-o", out, "--tolerance", "0.5dB")
+    ply = ModelFolder(model).latest_ply()[0]
+    small, whole = Splats.load(out), Splats.load(ply)
+    assert len(small) <= len(whole)
+    assert out.stat().st_size < 0.8 * ply.stat().st_size
+    assert f"splats: {len(small)} of {len(whole)}, " in said
+    assert "validation views: PSNR " in said
+    clsplat("prune", out, "-s", json.loads((model / "config.json").read_text())["scene"]["path"], "-o", out,
+            "--tolerance", ".2", "--overwrite", "--whole", "-q")
+    assert b"clsplat_" not in out.read_bytes().split(b"end_header")[0]
+
+
+def test_prune_trains_on_if_asked(model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "small.ply"
+    clsplat("prune", model, "-o", out, "--tolerance", "0.5", "--iterations", 5, "-q")
+    assert len(Splats.load(out)) <= len(Splats.load(ModelFolder(model).latest_ply()[0]))
+
+
+def test_prune_takes_a_plain_3dgs_file(model: Path, scene: Path, tmp_path: Path) -> None:
+    arrays = Splats.load(ModelFolder(model).latest_ply()[0]).to_numpy()
+    arrays["skew"][:] = 0
+    plain = tmp_path / "plain.ply"
+    convert(Splats("skew-normal", arrays), "gaussian").save(plain)
+    plain.write_bytes(plain.read_bytes().replace(b"comment clsplat shape=gaussian normalisation=peak\n", b""))
+    said = clsplat("prune", plain, "-s", scene, "-o", tmp_path / "out.ply", "--tolerance", 0.5)
+    assert "skew" not in said
+    assert Splats.load(tmp_path / "out.ply").shape == "gaussian"
+    assert "give the scene's folder with -s" in error_of("prune", plain, "-o", tmp_path / "other.ply")
+
+
+def test_prune_refuses(model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.ply"
+    out.write_text("precious")
+    assert "exists already" in error_of("prune", model, "-o", out)
+    assert out.read_text() == "precious"
+    assert "is a folder" in error_of("prune", model, "-o", tmp_path)
+    assert "no number of decibels" in error_of("prune", model, "-o", tmp_path / "a.ply", "--tolerance", "much", code=2)
+    assert "no such model folder" in error_of("prune", tmp_path / "none", "-o", tmp_path / "a.ply")
+    assert "no such model folder" in error_of("info", tmp_path / "none")
+
+
+def test_a_search_writes_a_smaller_model(found: tuple[Path, str]) -> None:
+    folder, said = found
+    report = json.loads((folder / "budget.json").read_text())
+    assert report["options"]["tolerance"] == 1
+    last = ModelFolder(folder).latest_ply()[0]
+    splats = Splats.load(last)
+    assert len(splats) == report["final"]["splats"] < 150
+    assert f"{last}: {len(splats)} splats, " in said
+    assert "growth: pays up to 150 splats" in said
+    assert "test views (2): PSNR " in said
+    entry = json.loads(clsplat("info", folder, "--json"))
+    assert entry["splats"] == len(splats)
+    assert entry["bytes"] == report["final"]["bytes"]
+
+
+def test_a_search_that_is_done_or_is_another(found: tuple[Path, str], scene: Path) -> None:
+    folder, _ = found
+    assert "the search is finished: nothing to resume" in error_of("train", "--resume", "-m", folder)
+    assert "already holds a model" in error_of("train", scene, "-m", folder, "--max-bytes", 1000)
+    assert "no number of decibels" in error_of("train", scene, "--target-psnr", "x", code=2)
+
+
+def test_an_interrupted_search_says_how_to_go_on(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from cli_runner import run
+
+    import clsplat.compression.search as budget
+
+    def stop(*args: object, **kinds: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(budget, "prune", stop)
+        result = run("train", scene, "-m", tmp_path / "model", "--target-psnr", 10, *SEARCH)
+    assert result.exit_code == 130
+    assert result.stderr.splitlines()[-1] == (
+        f"stopped; what is done is kept; to go on: clsplat train --resume -m {tmp_path / 'model'}")
+    assert "already holds a model" in error_of("train", scene, "-m", tmp_path / "model", *SEARCH)
+    said = clsplat("train", "--resume", "-m", tmp_path / "model")
+    assert "validation views: PSNR" in said
+    assert np.isfinite(Splats.load(ModelFolder(tmp_path / "model").latest_ply()[0]).mean).all()
+    clsplat("train", scene, "-m", tmp_path / "model", "--overwrite", "-q", *SEARCH)
+    assert not (tmp_path / "model" / "budget.json").exists(), "another run's folder now"

@@ -1,0 +1,173 @@
+"""`clsplat view` and `clsplat train --view`: what they show, and what they say of bad input."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runner import ITERATIONS, N_VIEWS, SHORT, TEST_NAMES, clsplat, error_of, small_capture, small_model
+from clsplat_cli.models import load_model
+from clsplat_cli.view import known_cameras
+from PIL import Image
+
+from clsplat.cameras.camera import Camera
+from clsplat.cameras.cameras_json import NamedCamera, write_cameras
+from clsplat.viewer.camera import Pose, camera_of
+from clsplat.viewer.settings import Settings
+from clsplat.viewer.source import ModelSource
+
+
+def test_a_still_picture_has_the_bytes_of_render(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    model = small_model(tmp_path_factory)
+    position = tuple(known_cameras(load_model(model), None, None, None).test[0].camera.position)
+    camera = camera_of(Pose((0.9, 0.1, -0.3, 0.2), position, 0.9, 130, 70), 1280)
+    assert isinstance(camera, Camera)
+    write_cameras(tmp_path / "cameras.json", [NamedCamera("browser", camera)])
+    clsplat("render", model, "--cameras", tmp_path / "cameras.json", "-o", tmp_path / "out", "--background", "0.2,0,1")
+    shown = ModelSource(load_model(model).splats).picture(camera, Settings(background=(0.2, 0.0, 1.0)))
+    assert np.array_equal(shown, np.asarray(Image.open(tmp_path / "out" / "browser.png")))
+    assert len(np.unique(shown)) > 50
+
+
+def test_cameras_are_split_as_the_run_did(tmp_path_factory: pytest.TempPathFactory) -> None:
+    model = load_model(small_model(tmp_path_factory))
+    scene = small_capture(tmp_path_factory)
+    for known in (known_cameras(model, None, None, None), known_cameras(model, scene, None, 2)):
+        assert [item.name for item in known.test] == [name.removesuffix(".png") for name in TEST_NAMES]
+        assert len(known.train) == N_VIEWS - len(TEST_NAMES)
+    ply = load_model(model.ply)
+    assert not known_cameras(ply, None, None, None).by_label
+
+
+def test_bad_input_is_one_line(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
+    model, scene = small_model(tmp_path_factory), small_capture(tmp_path_factory)
+    assert "no such model folder or PLY file" in error_of("view", tmp_path / "none")
+    assert "give one model folder" in error_of("view", code=2)
+    assert "no iteration 7" in error_of("view", model, "--iteration", "7")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        assert f"127.0.0.1:{port}: cannot be listened at" in error_of("view", model, "--port", port)
+        refused = error_of("train", scene, "-m", tmp_path / "run", "--view", "--port", port, *SHORT)
+        assert f"127.0.0.1:{port}: cannot be listened at" in refused
+        assert not (tmp_path / "run").exists()
+    assert "--view shows one run" in error_of("train", scene, "--view", "--budget", "auto", code=2)
+
+
+def test_without_viser_both_say_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+                                                tmp_path_factory: pytest.TempPathFactory) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert "pip install clsplat[view]" in error_of("view", small_model(tmp_path_factory))
+    assert "pip install clsplat[view]" in error_of(
+        "train", small_capture(tmp_path_factory), "-m", tmp_path / "run", "--view", *SHORT)
+    assert not (tmp_path / "run").exists()
+
+
+class Command:
+    """A `clsplat ...` of its own process that serves a page."""
+
+    def __init__(self, *args: object) -> None:
+        command = [sys.executable, "-u", "-c", "from clsplat_cli.main import main; main()", *(str(arg) for arg in args)]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                                        env=os.environ | {"COLUMNS": "200"})
+        self.said = ""
+        assert self.process.stdout is not None
+        while not (found := re.search(r"http://localhost:(\d+)|http://127\.0\.0\.1:(\d+)", self.said)):
+            line = self.process.stdout.readline()
+            assert line, self.said
+            self.said += line
+        self.port = int(found[1] or found[2])
+
+    def end(self) -> int:
+        """Ctrl-C."""
+        self.process.send_signal(signal.SIGINT)
+        assert self.process.stdout is not None
+        self.said += self.process.stdout.read()
+        return self.process.wait(20)
+
+
+@pytest.fixture
+def viewing(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Command, Path]]:
+    pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
+    ply = tmp_path / "model.ply"
+    ply.write_bytes(load_model(small_model(tmp_path_factory)).ply.read_bytes())
+    command = Command("view", ply, "--port", 0)
+    yield command, ply
+    if command.process.poll() is None:
+        command.process.kill()
+
+
+@pytest.mark.slow
+def test_view_shows_a_file_that_changes_and_ends_with_ctrl_c(viewing: tuple[Command, Path]) -> None:
+    from viewer_client import Client
+
+    from clsplat.viewer.page import plain
+
+    command, ply = viewing
+    whole, some = ply.read_bytes(), load_model(ply).splats.select(range(50))
+    with Client(command.port) as client:
+        client.look((0, 0, -3))
+        first = client.still()
+        ply.write_bytes(whole[:-100])
+        client.until("of before is shown")
+        client.look((0, 0, -3))
+        assert np.abs(client.still().astype(int) - first).mean() < 2.0
+        some.save(ply)
+        client.until(plain("50 splats"))
+    assert command.end() == 0
+    assert "Traceback" not in command.said
+    assert len(command.said.splitlines()) == 1, command.said
+
+
+@pytest.mark.slow
+def test_train_view_shows_the_run(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
+    from viewer_client import Client
+
+    options = [*SHORT[2:], "--iterations", 100000]
+    command = Command("train", small_capture(tmp_path_factory), "-m", tmp_path / "run", "--view", "--port", 0, *options)
+    try:
+        client = Client(command.port)
+        client.look((0, 0, -3))
+        client.until("iteration ", 30.0)
+        shown = client.picture(30.0)
+        assert shown.ndim == 3
+        client.set("Pause", True)
+        client.drain(0.5)
+        log = tmp_path / "run" / "log.jsonl"
+        time.sleep(0.3)
+        before = log.read_text()
+        client.look((0, 0.5, -3))
+        client.still()
+        assert log.read_text() == before
+        client.set("Resume", True)
+        client.vanish()
+        while log.read_text() == before:
+            time.sleep(0.05)
+        assert command.end() == 130
+        assert "to go on: clsplat train --resume" in command.said
+        assert "Traceback" not in command.said
+    finally:
+        if command.process.poll() is None:
+            command.process.kill()
+
+
+@pytest.mark.slow
+def test_a_watched_model_has_the_same_bits(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
+    model = small_model(tmp_path_factory)
+    clsplat("train", small_capture(tmp_path_factory), "-m", tmp_path / "run", "--eval", "--save-iterations", "20,40",
+            "--view", "--port", 0, *SHORT)
+    name = Path("point_cloud") / f"iteration_{ITERATIONS}" / "point_cloud.ply"
+    assert (tmp_path / "run" / name).read_bytes() == (model / name).read_bytes()

@@ -1,0 +1,221 @@
+"""Sweeps: what the charts show is what the runs measured, and every run is made once."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cli_runner import small_capture
+from frontier_records import curve, recorded, seeds, sweep
+
+from clsplat.comparison import compare as compare_module
+from clsplat.comparison import sweep as frontier
+from clsplat.comparison.methods import parse_systems
+from clsplat.comparison.sweep_rows import (
+    auto_rows,
+    curve_rows,
+    equal_rows,
+    is_auto,
+    pareto,
+    point_rows,
+    seed_rows,
+    splats_needed,
+    write_rows,
+)
+from clsplat.comparison.sweep_tables import auto_table, equal_table, seed_table
+from clsplat.comparison.table import Record
+from clsplat.errors import InputError
+from clsplat.evaluation import chart_style
+from clsplat.files.html_page import Section, write_page
+from clsplat.scenes.scene import load_scene
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No matplotlib: quicker, where only the data count."""
+    monkeypatch.setattr(chart_style, "available", lambda: False)
+
+
+# --- what is drawn -----------------------------------------------------------------------------
+
+
+def test_pareto_keeps_what_nothing_beats() -> None:
+    assert pareto([(1, 20), (2, 21), (2, 22), (3, 21.5), (4, 22), (5, 23)]) == {0, 2, 5}
+    assert pareto([(2, 20), (1, 20), (1, 20)]) == {1}, "of equal points the first"
+    assert pareto([]) == set()
+
+
+def test_splats_needed_is_linear_in_log_splats() -> None:
+    line = [(4000, 22.0), (1000, 20.0), (2000, 21.0)]
+    assert splats_needed(line, 20.5) == pytest.approx(1000 * 2**0.5)
+    assert splats_needed(line, 21.0) == pytest.approx(2000)
+    assert splats_needed(line, 19.0) == 1000, "a bound: the smallest is better already"
+    assert splats_needed(line, 22.1) is None
+    dip = [(1000, 20.0), (2000, 22.0), (4000, 21.0), (8000, 24.0)]
+    assert splats_needed(dip, 21.5) == pytest.approx(1000 * 2**0.75), "where it first is good enough"
+
+
+def test_points_and_fronts() -> None:
+    points = point_rows(sweep())
+    assert [(p["system"], p["cap"], p["front_splats"]) for p in points] == [
+        ("gaussian", 1000, False), ("default", 1000, True), ("auto default", 1500, True), ("gaussian", 2000, False),
+        ("default", 2000, False), ("gaussian", 4000, False), ("default", 4000, True)]  # fmt: skip
+    assert [p["auto"] for p in points].count(True) == 1
+    assert points[0]["render_ms"] == 10
+    assert points[0]["shape"] == "gaussian"
+
+
+def test_points_are_means_of_runs_that_did_not_fail() -> None:
+    runs = [recorded("a", cap, 20.0 + seed, seed) for cap in (10, 20) for seed in (0, 1)]
+    runs += [recorded("a", 10, 30.0, 0, repeat=1), recorded("b", 10, failed="lost")]
+    points = point_rows(runs)
+    assert [(p["system"], p["seeds"], p["psnr"]) for p in points] == [("a", 2, 20.5), ("a", 2, 20.5)]
+
+
+def test_a_scene_of_one_cap_is_no_sweep_and_other_lengths_are_left_out() -> None:
+    assert point_rows(seeds()) == []
+    longer = recorded("gaussian", 4000, 30.0, iterations=900)
+    assert max(p["psnr"] for p in point_rows([*sweep(), longer])) == 22.5
+
+
+def test_equal_quality() -> None:
+    rows = equal_rows(point_rows(sweep()), "gaussian")
+    assert [(row["system"], row["reference_cap"], row["bound"]) for row in rows] == [
+        ("default", 1000, "at most"), ("default", 2000, ""), ("default", 4000, "")]  # fmt: skip
+    assert [row["ratio"] for row in rows] == pytest.approx([1.0, 2**-0.5, 2**-0.5])
+    head, lines = equal_table(rows, "gaussian")
+    assert head == ("scene", "system", "gaussian, cap 1000", "gaussian, cap 2000", "gaussian, cap 4000")
+    assert lines == [("yard 8x6", "default", "≤ 100 %", "71 %", "71 %")]
+    other = equal_rows(point_rows(sweep()), "default")
+    assert [row["splats"] for row in other][-1] is None
+    assert equal_table(other, "default")[1][0][-1] == "not reached"
+    assert equal_rows(point_rows(sweep()), "none") == []
+
+
+def test_automatic_runs_are_set_beside_the_best_of_their_shape() -> None:
+    (row,) = auto_rows(point_rows(sweep()))
+    assert (row["best_cap"], row["front"]) == (4000, "render_ms bytes splats")
+    assert row["lost"] == pytest.approx(0.05)
+    assert row["splats_ratio"] == row["bytes_ratio"] == pytest.approx(0.375)
+    assert auto_table([row])[1][0][3:] == (
+        "1500", "0.30", "4000", "22.50", "0.05", "38", "38", "render_ms bytes splats")  # fmt: skip
+    (alone,) = auto_rows(point_rows([record for record in sweep() if record["system"] != "default"]))
+    assert alone["lost"] is None
+    assert auto_table([alone])[1][0][5] == ""
+    assert [is_auto(label) for label in ("auto", "auto 20 dB", "auto:x=1", "automatic", "default")] == [
+        True, True, True, False, False]  # fmt: skip
+
+
+def test_curves_are_of_the_cap_that_most_were_followed_at() -> None:
+    runs = [recorded("a", 10, curve=curve(20)), recorded("b", 10, curve=curve(21)), recorded("b", 99, curve=curve(22)),
+            recorded("c", 99), recorded("a", 10, curve=curve(20), repeat=1), recorded("d", 10, failed="x", curve=[])]
+    rows = curve_rows(runs)
+    assert {(row["system"], row["cap"]) for row in rows} == {("a", 10), ("b", 10)}
+    assert [row["iteration"] for row in rows] == [1, 4, 20, 100] * 2
+    assert rows[0]["seconds"] == 0.1
+
+
+def test_seeds_and_repeats() -> None:
+    rows = seed_rows([*seeds(), *sweep()])
+    assert len(rows) == 14
+    _, lines = seed_table(rows)
+    assert lines[0] == ("attic 8x6", "500", "gaussian", "5", "20.20", "20.00", "20.40", "0.40", "3", "0.0000", "yes")
+    rows[-1]["digest"] = "another"
+    assert seed_table(rows)[1][1][-1] == "no"
+    assert seed_rows(seeds()[:2]) == []
+
+
+def test_rows_are_written_as_csv_and_json(tmp_path: Path) -> None:
+    rows = point_rows(sweep())
+    paths = write_rows(tmp_path / "deep", "size", rows)
+    assert [path.name for path in paths] == ["size.csv", "size.json"]
+    assert json.loads(paths[1].read_text()) == rows
+    with paths[0].open(newline="") as stream:
+        read = list(csv.DictReader(stream))
+    assert [float(row["psnr"]) for row in read] == [row["psnr"] for row in rows]
+
+
+# --- the page ----------------------------------------------------------------------------------
+
+
+def test_a_page_needs_nothing_beside_it(tmp_path: Path) -> None:
+    svg = tmp_path / "a.svg"
+    svg.write_text('<?xml version="1.0"?>\n<!DOCTYPE svg>\n<svg width="9"><metadata>x</metadata><path id="m1"/>'
+                   '<use xlink:href="#m1" clip-path="url(#p)"/></svg>')
+    path = write_page(tmp_path / "r.html", "a & b", [
+        Section("one", ["<b>"], svg, ("name", "n"), [("x", "1"), ("y", "2")], ["a.csv"]), Section("two", chart=svg)])
+    text = path.read_text()
+    assert "<title>a &amp; b</title>" in text
+    assert "&lt;b&gt;" in text
+    assert '<svg role="img" aria-label="one" width="9">' in text
+    assert text.count('id="c1-m1"') == text.count('href="#c1-m1"') == text.count("url(#c1-p)") == 1
+    assert text.count('id="c2-m1"') == 1, "charts of one page have ids of their own"
+    assert "metadata" not in text
+    assert text.count("<?xml") == text.count("<script") == text.count("http") == 0
+    assert '<th class=text>name</th><th>n</th>' in text
+    assert '<a href="a.csv">' in text
+    with pytest.raises(InputError, match="draw the chart again"):
+        write_page(path, "t", [Section("one", chart=tmp_path / "none.svg")])
+
+
+def test_report_without_matplotlib(tmp_path: Path, undrawn: None) -> None:
+    paths = frontier.write_report(tmp_path, [*sweep(), *seeds()], reference="gaussian")
+    assert {path.name for path in paths} == {f"{name}.{kind}" for name in ("size", "equal", "time", "seeds")
+                                             for kind in ("csv", "json")} | {"report.html"}
+    text = (tmp_path / "report.html").read_text()
+    assert text.count("pip install") == 4
+    assert "<svg" not in text
+    assert "71 %" in text
+    with pytest.raises(InputError, match="no runs to draw"):
+        frontier.write_report(tmp_path, [])
+
+
+def test_equal_runs_of_two_folders_count_once(tmp_path: Path, undrawn: None) -> None:
+    again = [record | {"psnr": 1.0} for record in sweep()]
+    frontier.write_report(tmp_path, [*sweep(), *again])
+    rows = json.loads((tmp_path / "charts" / "size.json").read_text())
+    assert [row["seeds"] for row in rows] == [1] * 7
+    assert min(row["psnr"] for row in rows) == 20.0
+
+
+# --- the sweep ---------------------------------------------------------------------------------
+
+
+def test_an_interrupted_sweep_leaves_charts_and_goes_on(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory,
+                                                        monkeypatch: pytest.MonkeyPatch, undrawn: None) -> None:
+    made = []
+
+    def train_and_measure(_: Any, config: Any, *more: Any) -> Record:
+        made.append(config.cap_max)
+        if len(made) == 4:
+            raise KeyboardInterrupt
+        psnr = 20 + config.cap_max / 100
+        values = recorded("", config.cap_max, psnr, curve=curve(psnr))
+        return {key: value for key, value in values.items() if key not in ("scene", "system", "config", "repeat")}
+
+    monkeypatch.setattr(compare_module, "warm_up", lambda *arguments: None)
+    monkeypatch.setattr(compare_module, "train_and_measure", train_and_measure)
+    scene, systems = load_scene(small_capture(tmp_path_factory)), parse_systems("gaussian,default")
+    arguments = ([scene], systems, tmp_path, [20, 40], [0], {"iterations": 9})
+    with pytest.warns(UserWarning, match=r"clsplat\[charts\]"), pytest.raises(KeyboardInterrupt):
+        frontier.frontier(*arguments)
+    shown = json.loads((tmp_path / "charts" / "size.json").read_text())
+    assert [(row["system"], row["cap"]) for row in shown] == [("gaussian", 20), ("default", 20), ("gaussian", 40)]
+    assert (tmp_path / "report.html").exists()
+    with pytest.warns(UserWarning, match=r"clsplat\[charts\]"):
+        records = frontier.frontier(*arguments, more=[recorded("auto", 30, 25.0)])
+    assert made == [20, 20, 40, 40, 40]
+    assert len(records) == 4
+    shown = json.loads((tmp_path / "charts" / "size.json").read_text())
+    assert len(shown) == 4, "another scene's run is not of this front"
+
+
+def test_runs_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"runs.jsonl: cannot be read .*give the folder of a comparison"):
+        frontier.read_runs(tmp_path)
+    (tmp_path / "runs.jsonl").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match="cannot be read"):
+        frontier.read_runs(tmp_path / "runs.jsonl")

@@ -1,0 +1,38 @@
+"""Recording: each command once, in order, under its name, and nothing outside the block."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clsplat.device.device import Device
+from clsplat.device.memory import fill_zero, to_device, to_host
+from clsplat.device.program import build
+from clsplat.device.trace import TRANSFERS, recorded
+
+
+def test_every_command_is_recorded_once(device: Device) -> None:
+    smoke = build(device, ("measure/smoke.cl",)).smoke
+    x = np.linspace(-1, 1, 100, dtype=np.float32)
+    given, result = device.alloc(x.nbytes), device.alloc(x.nbytes)
+    with recorded(device) as launches:
+        to_device(device, given, x)
+        fill_zero(device, result, x.nbytes)
+        with recorded(device) as inner:
+            smoke.over(x.size, x=given, y=result, n=x.size)
+        smoke((0,), None, x=given, y=result, n=0)  # launches nothing
+        to_host(device, result, np.empty_like(x))
+    to_device(device, given, x)
+    device.queue.finish()
+    assert [launch.name for launch in inner] == ["smoke"]
+    assert [(launch.name, launch.size) for launch in launches] == [
+        ("upload", (400,)), ("fill", (400,)), ("smoke", (128,)), ("download", (400,))]
+    assert all(launch.ms >= 0 for launch in launches)
+    assert inner[0].ms > 0
+    assert {"upload", "fill", "download"} <= set(TRANSFERS)
+
+
+def test_recording_ends_with_an_error(device: Device) -> None:
+    with pytest.raises(ZeroDivisionError), recorded(device):
+        raise ZeroDivisionError
+    assert device.observer is None

@@ -1,0 +1,78 @@
+"""Two runs into one folder: the second is refused, until the first has ended in whatever way."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from clsplat_cli.budget import forget_search
+
+from clsplat.compression.state import FILE
+from clsplat.errors import OutputError
+from clsplat.files.lock import sole_writer
+
+pytest.importorskip("fcntl")
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from clsplat.files.lock import sole_writer
+with sole_writer(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def holder(folder: Path) -> subprocess.Popen[str]:
+    process = subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "held\n"
+    return process
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+def test_another_process_keeps_out_until_it_ends(tmp_path: Path, end: signal.Signals) -> None:
+    process = holder(tmp_path)
+    try:
+        with pytest.raises(OutputError, match="another run writes into it"), sole_writer(tmp_path):
+            pytest.fail("came in")
+    finally:
+        process.send_signal(end)
+        process.wait(10)
+    time.sleep(0.05)
+    with sole_writer(tmp_path):
+        pass
+
+
+def test_blocks_within_a_block_are_one_writer(tmp_path: Path) -> None:
+    with sole_writer(tmp_path):
+        with sole_writer(tmp_path / "."):
+            pass
+        assert refused(tmp_path), "the inner end has not let go"
+    assert not refused(tmp_path)
+    with sole_writer(None):
+        pass
+
+
+def refused(folder: Path) -> bool:
+    done = subprocess.run([sys.executable, "-c", HOLD.replace("60", "0"), str(folder)], capture_output=True, text=True)
+    return "another run writes into it" in done.stderr
+
+
+def test_a_search_that_goes_on_keeps_its_findings(tmp_path: Path) -> None:
+    """Whoever takes its folder with --overwrite meanwhile is refused before anything is removed."""
+    (tmp_path / FILE).write_text("{}")
+    process = holder(tmp_path)
+    try:
+        with pytest.raises(OutputError, match="another run writes into it"):
+            forget_search(tmp_path)
+        assert (tmp_path / FILE).exists()
+    finally:
+        process.kill()
+        process.wait(10)
+    forget_search(tmp_path)
+    assert not (tmp_path / FILE).exists()

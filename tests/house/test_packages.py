@@ -1,0 +1,193 @@
+"""The order of packages, and what only certain files may name: libraries, shapes, LANES, GROUP."""
+
+from __future__ import annotations
+
+import ast
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from clsplat.splats.shapes import SHAPES
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# The rule: a package imports only packages to its left, and inside a package no import runs in a circle.
+PACKAGES = (
+    "errors", "_version", "files", "splats", "cameras", "scenes", "device", "rendering", "evaluation", "training",
+    "compression", "comparison", "profiling", "viewer",
+)  # fmt: skip
+# These three stand side by side: none imports another.
+LAST = ("comparison", "profiling", "viewer")
+
+# Libraries that only these modules import.
+OWNERS = {
+    "pyopencl": {"device.device", "device.memory", "device.program", "training.targets"},
+    "pycolmap": {"scenes.undistort"},
+    "PIL": {"files.images"},
+    "matplotlib": {"evaluation.chart_style"},
+    "viser": {"viewer.page", "viewer.server"},
+    "imageio": {"files.video"},
+    "imageio_ffmpeg": {"files.video", "scenes.reconstruct.video_frames"},
+    "lpips": {"evaluation.perceptual"},
+    "torch": {"evaluation.perceptual"},
+    "flip_evaluator": {"evaluation.perceptual"},
+    "click": set(),  # the command line's
+}
+
+# Files beside shapes.py and cl/shape/ that may name a shape, and why.
+SHAPE_NAMES_IN = {
+    "splats/convert.py": "which shape's splats are Gaussians of other scales",
+    "training/presets.py": "a published system has its kernel",
+    "rendering/tuning.py": "the cheapest kernel is the one that schedules are measured on",
+}
+
+COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.S)
+
+
+def modules() -> dict[str, Path]:
+    """Each module of the library by its dotted name below `clsplat`."""
+    folder = ROOT / "clsplat"
+    paths = sorted(folder.rglob("*.py"))
+    return {".".join(path.relative_to(folder).with_suffix("").parts): path for path in paths}
+
+
+def kernel_sources() -> dict[str, str]:
+    """Sources below cl/ by name, without comments."""
+    folder = ROOT / "cl"
+    return {
+        str(path.relative_to(folder)): COMMENT.sub(" ", path.read_text())
+        for path in sorted(folder.rglob("*.cl*")) if path.suffix in (".cl", ".clh")
+    }  # fmt: skip
+
+
+def imports_of(name: str, path: Path) -> set[str]:
+    """Modules of the library that a module imports, lazily or not."""
+    known, found = modules(), set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = name.split(".")[: -node.level]
+            target = ".".join([*base, *(node.module or "").split(".")]).strip(".")
+            found |= {target} if target in known else {f"{target}.{a.name}".strip(".") for a in node.names}
+        elif isinstance(node, ast.ImportFrom | ast.Import):
+            named = [node.module or ""] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names]
+            assert not any(n.split(".")[0].startswith("clsplat") for n in named), f"{name}: import relatively"
+    return found
+
+
+def foreign_imports(tree: ast.AST) -> set[str]:
+    """Top-level packages from elsewhere that a module imports."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+def code_strings(tree: ast.AST) -> Iterator[str]:
+    """String constants that are not docstrings."""
+    documents = {
+        id(node.body[0].value) for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and node.body
+        and isinstance(node.body[0], ast.Expr)
+    }  # fmt: skip
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documents:
+            yield node.value
+
+
+def package_of(name: str) -> str:
+    return name.split(".")[0]
+
+
+def test_every_package_has_its_place_in_the_line() -> None:
+    assert {package_of(name) for name in modules()} == {*PACKAGES, "__init__"}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_import_only_packages_to_their_left(package: str) -> None:
+    allowed = set(PACKAGES[: PACKAGES.index(package) + 1]) - (set(LAST) - {package} if package in LAST else set())
+    for name, path in modules().items():
+        if package_of(name) == package:
+            for imported in imports_of(name, path):
+                assert package_of(imported) in allowed, f"{name} imports {imported}"
+
+
+def test_no_import_runs_in_a_circle() -> None:
+    arrows = {name: imports_of(name, path) for name, path in modules().items()}
+    finished: set[str] = set()
+
+    def visit(name: str, way: tuple[str, ...]) -> None:
+        assert name not in way, f"a circle: {' -> '.join((*way, name))}"
+        if name not in finished:
+            for imported in arrows.get(name, ()):
+                visit(imported, (*way, name))
+            finished.add(name)
+
+    for name in arrows:
+        visit(name, ())
+
+
+def test_no_two_classes_have_one_name() -> None:
+    homes: dict[str, list[str]] = {}
+    for name, path in modules().items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name, []).append(name)
+    assert {name: places for name, places in homes.items() if len(places) > 1} == {}
+
+
+def test_the_packages_are_installed() -> None:
+    """Each folder with modules is in pyproject.toml."""
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {path.parent.relative_to(ROOT) for path in (ROOT / "clsplat").rglob("*.py")}
+    assert {".".join(folder.parts) for folder in folders} == {name for name in listed if name.startswith("clsplat.")
+                                                              or name == "clsplat"}
+
+
+@pytest.mark.parametrize("library", OWNERS)
+def test_libraries_have_owners(library: str) -> None:
+    users = {n for n, path in modules().items() if library in foreign_imports(ast.parse(path.read_text()))}
+    assert users == OWNERS[library]
+
+
+def test_only_shape_files_name_shapes() -> None:
+    naming = {
+        path.relative_to(ROOT).as_posix().removeprefix("clsplat/")
+        for path in (*(ROOT / "clsplat").rglob("*.py"), *(ROOT / "cli").glob("*.py"))
+        if path.name != "shapes.py" and set(SHAPES) & set(code_strings(ast.parse(path.read_text())))
+    }  # fmt: skip
+    assert naming == set(SHAPE_NAMES_IN)
+    words = re.compile("|".join(name.replace("-", "[-_ ]?") for name in SHAPES), re.I)
+    for name, text in kernel_sources().items():
+        if not name.startswith("shape/"):
+            assert not words.search(text), f"{name} names the shape {words.search(text)}"
+
+
+def test_only_their_own_files_branch_on_lanes_and_group() -> None:
+    homes = {"math/lanes.clh": r"\bLANES\b|\bREAL_DOUBLE\b", "render/group.clh": r"\bGROUP\b"}
+    for name, text in kernel_sources().items():
+        conditions = [line for line in text.splitlines() if re.match(r"\s*#\s*(if|elif)", line)]
+        for home, words in homes.items():
+            asking = [line for line in conditions if re.search(words, line)]
+            assert bool(asking) == (name == home), f"{name}: {asking}"
+
+
+def test_blending_constants_live_in_one_file() -> None:
+    words = re.compile(r"\b(ALPHA_MIN|ALPHA_MAX|T_MIN)\b")
+    assert {name for name, text in kernel_sources().items() if words.search(text)} == {"render/blend.clh"}
+
+
+def test_kernels_use_no_atomics_and_no_includes() -> None:
+    for name, text in kernel_sources().items():
+        assert not re.search(r"\batom(ic)?_\w+|#\s*include|cl_khr_(global|local)_\w*atomics", text), name
+
+
+def test_files_stay_small() -> None:
+    """About 300 lines a file, 400 at most."""
+    for path in [*modules().values(), *(ROOT / "cl").rglob("*.cl*"), *(ROOT / "cli").glob("*.py")]:
+        assert len(path.read_text().splitlines()) <= 400, path.name

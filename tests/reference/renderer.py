@@ -1,0 +1,232 @@
+"""An independent float64 renderer, slow and obvious, that the OpenCL kernels are held against.
+
+It goes another way than the kernels wherever there is one: skewed splats are in the direct (location, scale matrix,
+slope) form, every pixel meets every splat, the peak is found by bisection, and gradients come by complex step instead
+of hand-written adjoints. The shapes' own parts are in reference_skewed.py and reference_radial.py.
+
+All of it accepts complex arrays; see reference_formulas.py for the closed forms and the complex step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.cameras.camera import Camera
+from reference.formulas import determinant, inverse_2x2, jacobian, normal_cdf, rotation, sh_basis
+from reference.radial import RADIAL
+from reference.shape import Array, Geometry, Kernel
+from reference.skewed import SKEWED
+
+NEAR_PLANE = 0.01  # splats with a camera z below this are skipped
+REFERENCES = SKEWED | RADIAL
+FIELDS = {
+    name: ("mean", "quat", "log_scale", "opacity_logit", *own.fields, "sh") for name, own in REFERENCES.items()
+}
+STEP = 1e-20  # of the complex step; its square must vanish beside 1
+
+
+class Rendered(NamedTuple):
+    """Images of one view: color (H, W, 3), alpha (H, W), depth (H, W) = sum of weight * camera z."""
+
+    color: Array
+    alpha: Array
+    depth: Array
+
+
+@dataclass(frozen=True)
+class Screen:
+    """B projected splats: their kernels, where the projected point falls (B, 2) [px], color (B, 3) >= 0 and
+    depth (B,), its camera z.
+    """
+
+    kernel: Kernel
+    mean_px: Array
+    color: Array
+    depth: Array
+
+
+def projected_point(arrays: Mapping[str, Array], shape: str) -> Array:
+    """(B, 3) world positions of the points that are projected."""
+    centre = REFERENCES[shape].centre
+    if centre is None:
+        return arrays["mean"]
+    return arrays["mean"] + np.einsum("bij,bj->bi", axes_of(arrays), centre(arrays))
+
+
+def axes_of(arrays: Mapping[str, Array]) -> Array:
+    """R S (B, 3, 3), world from splat frame."""
+    return rotation(arrays["quat"]) * np.exp(arrays["log_scale"])[:, None, :]
+
+
+def plain_kernel(arrays: Mapping[str, Array], geometry: Geometry, shape: str, normalisation: str) -> Kernel:
+    return REFERENCES[shape].kernel(arrays, geometry, normalisation)
+
+
+def antialiased_kernel(arrays: Mapping[str, Array], geometry: Geometry, shape: str, normalisation: str) -> Kernel:
+    """The kernel with the volume that it has without the low-pass: height times root of the determinant."""
+    make = REFERENCES[shape].kernel
+    kernel, own = (make(arrays, each, normalisation) for each in (geometry, replace(geometry, low_pass=0.0)))
+    factor = np.sqrt(determinant(own.scale2d) / determinant(kernel.scale2d))
+    minus = None if own.amplitude_minus is None else factor * own.amplitude_minus
+    return kernel._replace(amplitude=factor * own.amplitude, amplitude_minus=minus)
+
+
+def project(arrays: Mapping[str, Array], camera: Camera, shape: str = "gaussian", normalisation: str = "peak",
+            sh_degree: int | None = None, antialiased: bool = False) -> Screen:
+    """Raw splats (fields as stored, real or complex) to the screen; `sh_degree` None means all stored."""
+    world = projected_point(arrays, shape)
+    point = world @ camera.rotation.T + camera.translation
+    z = point[:, 2]
+    mean_px = point[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    geometry = Geometry(mean_px, jacobian(point, camera) @ camera.rotation, axes_of(arrays))
+    make = antialiased_kernel if antialiased else plain_kernel
+    kernel = make(arrays, geometry, shape, normalisation)
+
+    stored = int(np.sqrt(arrays["sh"].shape[1])) - 1
+    degree = stored if sh_degree is None else sh_degree
+    ray = world - camera.position
+    basis = sh_basis(ray / np.sqrt((ray * ray).sum(-1, keepdims=True)), degree)
+    color = np.einsum("bk,bkc->bc", basis, arrays["sh"][:, : (degree + 1) ** 2]) + 0.5
+    color = np.where(color.real > 0.0, color, 0.0)
+    return Screen(kernel, mean_px, color, z)
+
+
+def kernel_values(kernel: Kernel, pixels: Array) -> Array:
+    """(B, P) alphas before clamp and cutoff at the points `pixels` (2, P) or (B, 2, P) [px]."""
+    d = pixels - kernel.location[:, :, None]
+    conic = inverse_2x2(kernel.scale2d)
+    q = conic[:, 0, 0, None] * d[:, 0] ** 2 + conic[:, 1, 1, None] * d[:, 1] ** 2
+    q = q + 2.0 * conic[:, 0, 1, None] * d[:, 0] * d[:, 1]
+    opacity = kernel.amplitude[:, None]
+    if kernel.slope is not None:
+        above = normal_cdf((kernel.slope[:, :, None] * d).sum(1))
+        minus = 0.0 if kernel.amplitude_minus is None else kernel.amplitude_minus[:, None]
+        opacity = minus + (opacity - minus) * above
+    return kernel.falloff(q) * opacity
+
+
+def alpha_maps(screen: Screen, camera: Camera, alpha_min: float = 1 / 255, alpha_max: float = 0.99) -> Array:
+    """(B, H W) alphas at the pixel centres, |alpha| clamped to alpha_max and 0 where it is below alpha_min."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    alpha = kernel_values(screen.kernel, np.stack([x.ravel(), y.ravel()]))
+    alpha = np.where(np.abs(alpha.real) > alpha_max, np.copysign(alpha_max, alpha.real), alpha)
+    return np.where(np.abs(alpha.real) < alpha_min, 0.0, alpha)
+
+
+def blend(alphas: Sequence[Array], colors: Sequence[Array], depths: Sequence[Array], background: ArrayLike,
+          t_min: float) -> Rendered:
+    """Front-to-back blending of B variants at once: per splat alphas (B, P), colors (B, 3), depths (B,).
+
+    A pixel is finished for good by the splat that would take its transmittance to <= t_min; that splat
+    is not blended. B may be 1 for splats that are alike in all variants. Returns (B, P, ...) images.
+    """
+    pixels = alphas[0].shape[-1]
+    transmittance: Array = np.ones((1, pixels))
+    finished = np.zeros((1, pixels), dtype=bool)
+    color: Array = np.zeros((1, pixels, 3))
+    depth: Array = np.zeros((1, pixels))
+    for alpha, rgb, z in zip(alphas, colors, depths, strict=True):
+        after = transmittance * (1.0 - alpha)
+        finished = finished | (after.real <= t_min)
+        weight = np.where(finished, 0.0, transmittance * alpha)
+        color = color + weight[..., None] * rgb[:, None, :]
+        depth = depth + weight * z[:, None]
+        transmittance = np.where(finished, transmittance, after)
+    color = color + transmittance[..., None] * np.asarray(background, dtype=np.float64)
+    return Rendered(color, 1.0 - transmittance, depth)
+
+
+def prepared(arrays: Mapping[str, ArrayLike], shape: str) -> dict[str, Array]:
+    """The shape's fields as float64 arrays."""
+    return {name: np.asarray(arrays[name], dtype=np.float64) for name in FIELDS[shape]}
+
+
+def visible_order(values: Mapping[str, Array], camera: Camera, shape: str) -> NDArray[np.intp]:
+    """Indices of the splats not in front of the near plane, nearest first; equal depths keep their order."""
+    z = projected_point(values, shape) @ camera.rotation[2] + camera.translation[2]
+    order = np.argsort(z, kind="stable")
+    return order[z[order] >= NEAR_PLANE]
+
+
+def render_reference(arrays: Mapping[str, ArrayLike], camera: Camera, shape: str = "gaussian",
+                     normalisation: str = "peak", background: ArrayLike = (0.0, 0.0, 0.0),
+                     alpha_min: float = 1 / 255, alpha_max: float = 0.99, t_min: float = 1e-4,
+                     sh_degree: int | None = None, antialiased: bool = False) -> Rendered:
+    """Render raw splats: `arrays` holds mean (N, 3), quat (N, 4), log_scale (N, 3), opacity_logit (N,),
+    sh (N, K, 3) and the shape's own.
+    """
+    values = prepared(arrays, shape)
+    order = visible_order(values, camera, shape)
+    size = (camera.height, camera.width)
+    if len(order) == 0:
+        color = np.broadcast_to(np.asarray(background, dtype=np.float64), (*size, 3)).copy()
+        return Rendered(color, np.zeros(size), np.zeros(size))
+    screen = project({k: v[order] for k, v in values.items()}, camera, shape, normalisation, sh_degree, antialiased)
+    alphas = alpha_maps(screen, camera, alpha_min, alpha_max)
+    image = blend(alphas[:, None], screen.color[:, None], screen.depth[:, None], background, t_min)
+    return Rendered(image.color.reshape(*size, 3), image.alpha.reshape(size), image.depth.reshape(size))
+
+
+def reference_gradients(arrays: Mapping[str, ArrayLike], camera: Camera, v_color: ArrayLike,
+                        v_alpha: ArrayLike | None = None, shape: str = "gaussian",
+                        normalisation: str = "peak", background: ArrayLike = (0.0, 0.0, 0.0),
+                        alpha_min: float = 1 / 255, alpha_max: float = 0.99, t_min: float = 1e-4,
+                        sh_degree: int | None = None, fields: Sequence[str] | None = None,
+                        antialiased: bool = False) -> dict[str, Array]:
+    """Gradient of sum(v_color * color) + sum(v_alpha * alpha) with respect to the raw values.
+
+    Clamps and thresholds count as constant where they act. `v_color` is (H, W, 3), `v_alpha` (H, W) or
+    None; `fields` None means all of the shape's. Returns arrays shaped like the inputs. One splat at a
+    time: only its own alpha map is computed anew, in one batch with one complex step per parameter.
+    """
+    values = prepared(arrays, shape)
+    names = FIELDS[shape] if fields is None else tuple(fields)
+    gradients = {name: np.zeros_like(values[name]) for name in names}
+    order = visible_order(values, camera, shape)
+    if len(order) == 0:
+        return gradients
+    weights = np.asarray(v_color, dtype=np.float64).reshape(-1, 3)
+    weights_alpha = np.zeros(len(weights))
+    if v_alpha is not None:
+        weights_alpha = np.asarray(v_alpha, dtype=np.float64).ravel()
+    screen = project({k: v[order] for k, v in values.items()}, camera, shape, normalisation, sh_degree, antialiased)
+    alphas = list(alpha_maps(screen, camera, alpha_min, alpha_max)[:, None])
+    colors, depths = list(screen.color[:, None]), list(screen.depth[:, None])
+
+    for place, splat in enumerate(order):
+        bumped = project(one_step_each(values, splat, names), camera, shape, normalisation, sh_degree, antialiased)
+        replaced = [
+            [*values_of[:place], new, *values_of[place + 1 :]]
+            for values_of, new in (
+                (alphas, alpha_maps(bumped, camera, alpha_min, alpha_max)), (colors, bumped.color),
+                (depths, bumped.depth),
+            )
+        ]  # fmt: skip
+        image = blend(*replaced, background=background, t_min=t_min)
+        loss = np.einsum("bpc,pc->b", image.color, weights) + np.einsum("bp,p->b", image.alpha, weights_alpha)
+        start = 0
+        for name in names:
+            entry = gradients[name][splat]
+            part = loss.imag[start : start + entry.size] / STEP
+            gradients[name][splat] = part.reshape(entry.shape)
+            start += entry.size
+    return gradients
+
+
+def one_step_each(values: Mapping[str, Array], splat: int, names: Sequence[str]) -> dict[str, Array]:
+    """As many copies of one splat as `names` have parameters, each with the imaginary step on another one."""
+    count = sum(values[name][splat].size for name in names)
+    one = [splat] * count
+    copies = {name: array[one].astype(np.complex128) for name, array in values.items()}
+    start = 0
+    for name in names:
+        flat = copies[name].reshape(count, -1)
+        width = flat.shape[1]
+        flat[start + np.arange(width), np.arange(width)] += 1j * STEP
+        start += width
+    return copies

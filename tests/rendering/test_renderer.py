@@ -1,0 +1,334 @@
+"""The renderer against the reference: images, depths and gradients, on every device and schedule."""
+
+from __future__ import annotations
+
+import itertools
+from functools import cache
+
+import numpy as np
+import pytest
+from conftest import DEVICE_SCHEDULES, MakeRenderer
+from kernel_checks import BACKGROUND, KERNELS, Case
+from reference.formulas import SKEW_MAX
+from reference.renderer import prepared, reference_gradients, render_reference, visible_order
+from reference.scenes import Arrays, random_camera, random_splats
+from reference.tolerances import GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, SAME_FLOAT32, relative_error
+
+from clsplat.cameras.camera import Camera
+from clsplat.device.device import SCHEDULES, TILES, Device, Schedule, default_schedule
+from clsplat.device.memory import to_device
+from clsplat.errors import InputError
+from clsplat.rendering.build import BATCH, NEAR, KernelBuild
+from clsplat.rendering.pipeline import Pipeline
+from clsplat.rendering.renderer import Renderer
+from clsplat.rendering.splat_buffers import ParameterBuffers, SplatBuffers
+from clsplat.splats.shapes import SHAPES
+from clsplat.splats.splats import Splats
+
+SKEWED = "skew-normal"
+# What hangs on the raster and not on the formulas is tested with two shapes, with every other one among the slow tests.
+BOTH = pytest.mark.parametrize("shape", [
+    pytest.param(name, marks=[] if name in ("gaussian", SKEWED) else pytest.mark.slow) for name in SHAPES
+])  # fmt: skip
+EVERY = pytest.mark.parametrize("shape", SHAPES)
+
+
+@cache
+def cloud(shape: str, normalisation: str = "peak", dtype: type = np.float32) -> Case:
+    """24 splats of every kind in 3 x 2 tiles, the last ones cut."""
+    return Case(random_splats(1, 24, 3), random_camera(1, 41, 27), shape, normalisation, dtype)
+
+
+@BOTH
+def test_every_schedule_agrees_with_the_reference(make_renderer: MakeRenderer,
+                                                  scheduled: tuple[Device, Schedule], shape: str) -> None:
+    renderer = make_renderer(scheduled[0], schedule=scheduled[1])
+    cloud(shape).check(renderer, IMAGE_FLOAT32, GRADIENT_FLOAT32)
+    for case in thin_cases(shape).values():
+        case.check_image(case.render(renderer), IMAGE_FLOAT32)
+
+
+@BOTH
+def test_one_lane_agrees_with_the_reference(make_renderer: MakeRenderer, devices: list[Device], shape: str) -> None:
+    """The other form of every formula; the default schedules of CPUs have lanes."""
+    if not devices:
+        pytest.skip("no OpenCL device")
+    renderer = make_renderer(devices[0], schedule=SCHEDULES["gpu256"])
+    cloud(shape).check(renderer, IMAGE_FLOAT32, GRADIENT_FLOAT32)
+
+
+@pytest.mark.parametrize(("shape", "normalisation"), KERNELS)
+def test_every_normalisation_agrees_with_the_reference(make_renderer: MakeRenderer, device: Device,
+                                                       shape: str, normalisation: str) -> None:
+    cloud(shape, normalisation).check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
+
+
+@EVERY
+def test_double_precision_agrees_to_rounding(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
+    cloud(shape, dtype=np.float64).check(make_renderer(device, "float64"), ROUNDING, ROUNDING)
+
+
+@BOTH
+def test_schedules_and_devices_agree(make_renderer: MakeRenderer, devices: list[Device], shape: str) -> None:
+    """Each against each, on decided pixels: only the order of sums and exp's and Phi's last bits differ."""
+    case, images, gradients = cloud(shape), {}, {}
+    for place, name in DEVICE_SCHEDULES:
+        device, schedule = devices[place], SCHEDULES[name]
+        if schedule.group <= device.info.max_group:
+            renderer = make_renderer(device, schedule=schedule)
+            images[place, name] = case.render(renderer).color[case.decided]
+            gradients[place, name] = case.backward(renderer)
+    assert len(images) > len(devices)
+    for a, b in itertools.combinations(images, 2):
+        assert np.abs(images[a] - images[b]).max() < SAME_FLOAT32, (a, b)
+        for field, value in gradients[a].items():
+            assert relative_error(value, gradients[b][field]) < GRADIENT_FLOAT32, (a, b, field)
+
+
+@BOTH
+def test_the_same_again_gives_the_same_bits(make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule],
+                                            shape: str) -> None:
+    case, renderer = cloud(shape), make_renderer(scheduled[0], schedule=scheduled[1])
+    first, again = [(case.render(renderer), case.backward(renderer)) for _ in range(2)]
+    for name in ("color", "alpha", "depth"):
+        assert np.array_equal(getattr(first[0], name), getattr(again[0], name)), name
+    for name, value in first[1].items():
+        assert np.array_equal(value, again[1][name]), name
+
+
+# ---- scenes at the edges -----------------------------------------------------------------------------------
+
+
+@cache
+def thin_cases(shape: str) -> dict[str, Case]:
+    """Images of odd sizes and counts of splats about the batch and the lanes; gradients of two fields."""
+    fields = ("mean", "log_scale")
+    cases = {}
+    for width, height in ((1, 1), (TILES[0], TILES[0]), (TILES[0] + 1, TILES[0] - 1), (200, 5), (5, 130), (33, 64)):
+        camera = random_camera(5, width, height)
+        cases[f"{width} x {height}"] = Case(random_splats(5, 12, 3), camera, shape, fields=fields)
+    for n in (1, 7, 8, 9, 15, 16, 17, BATCH - 1, BATCH, BATCH + 1, 2 * BATCH + 1):
+        arrays = random_splats(n, n, 3)
+        arrays["opacity_logit"] -= 2.0  # so that many shine through
+        cases[f"{n} splats"] = Case(arrays, random_camera(3, 13, 11), shape, fields=fields)
+    return cases
+
+
+@BOTH
+@pytest.mark.parametrize("name", thin_cases(SKEWED))
+def test_sizes_and_counts(make_renderer: MakeRenderer, device: Device, shape: str, name: str) -> None:
+    thin_cases(shape)[name].check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
+
+
+def changed(**fields: object) -> Arrays:
+    """12 splats, with some fields replaced (a number, an array, or a function of the old value)."""
+    arrays = random_splats(7, 12, 3)
+    for name, value in fields.items():
+        new = value(arrays[name]) if callable(value) else value
+        arrays[name] = np.broadcast_to(np.asarray(new, np.float64), arrays[name].shape).copy()
+    return arrays
+
+
+def skewed_to(length: float) -> Arrays:
+    return changed(skew=lambda m: m * (length / np.linalg.norm(m, axis=1, keepdims=True)))
+
+
+EDGES = {
+    "short quaternions": lambda: changed(quat=lambda q: 1e-4 * q),
+    "long quaternions": lambda: changed(quat=lambda q: 1e4 * q),
+    "colours clamped at black": lambda: changed(sh=lambda sh: sh - 0.4 * (np.arange(16) == 0)[:, None]),
+    "no skew": lambda: changed(skew=0.0),
+    "skew just within the bound": lambda: skewed_to(0.9999 * SKEW_MAX),
+    "skew beyond the bound": lambda: skewed_to(1.01 * SKEW_MAX),
+    "discs": lambda: changed(log_scale=[-5.0, 1.0, 1.0]),
+    "dim": lambda: changed(opacity_logit=-5.0),
+    "far apart, most out of sight": lambda: changed(mean=lambda mean: 6.0 * mean),
+    "partly behind the camera": lambda: changed(mean=lambda mean: mean * 5.0 + [0, 0, 1]),
+}
+
+
+@EVERY
+@pytest.mark.parametrize("name", EDGES)
+def test_edges(make_renderer: MakeRenderer, device: Device, shape: str, name: str) -> None:
+    case = Case(EDGES[name](), random_camera(7, 41, 27), shape)
+    assert np.ptp(case.image.alpha) > 1e-3, "nothing to see"
+    case.check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
+
+
+@EVERY
+def test_points_and_giants(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
+    """Splats of no size are the low-pass; others far larger than the image are a haze. Their rotation and
+    scale matter next to nothing: only gradients of mean, opacity and colour have a scale to be compared on.
+    """
+    fields = ("mean", "opacity_logit", "sh")
+    for log_scale in (-12.0, 3.0):
+        case = Case(changed(log_scale=log_scale), random_camera(7, 41, 27), shape, fields=fields)
+        case.check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
+
+
+@EVERY
+def test_needles(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
+    """Condition 3e3 costs float32 accuracy: 3e3 * 6e-8 in q, ten times that in gradients. Doubles: formulas hold."""
+    arrays, camera = changed(log_scale=[-6.0, -6.0, 1.0]), random_camera(7, 41, 27)
+    single, double = (Case(arrays, camera, shape, dtype=dtype) for dtype in (np.float32, np.float64))
+    single.check(make_renderer(device), 3e3 * 6e-8, 10 * 3e3 * 6e-8)
+    double.check(make_renderer(device, "float64"), ROUNDING, 100 * ROUNDING)
+
+
+@BOTH
+def test_opaque_stack_ends_for_good(make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule],
+                                    shape: str) -> None:
+    """Pixels finish in the first batch, others later; splats behind, thin ones too, take no part then."""
+    case = stack(shape)
+    order = visible_order(prepared(case.values, shape), case.camera, shape)
+    assert not case.gradients["mean"][order[-20:]].any(), "the last ones should be hidden"
+    assert case.gradients["mean"][order[:3]].any()
+    renderer = make_renderer(scheduled[0], schedule=scheduled[1])
+    case.check(renderer, IMAGE_FLOAT32, GRADIENT_FLOAT32)
+    assert not case.backward(renderer)["mean"][order[-20:]].any()
+
+
+@cache
+def stack(shape: str) -> Case:
+    """192 wide splats, a few opaque ones among thin ones: pixels finish after some 40 to 140 of them."""
+    arrays = random_splats(7, 3 * BATCH, 3)
+    arrays["mean"] *= 0.5
+    arrays["log_scale"] = np.minimum(arrays["log_scale"] + 3.0, 0.8)
+    opaque = np.arange(3 * BATCH) % 21 == 1  # never one of a sign that may flip
+    arrays["opacity_logit"][:] = np.where(opaque, 7.0, -3.0)
+    fields = ("mean", "skew") if shape == SKEWED else ("mean",)
+    return Case(arrays, random_camera(7, 18, 8), shape, fields=fields)
+
+
+@BOTH
+def test_nothing_to_see(make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule], shape: str) -> None:
+    """No splats, or all behind the camera, too dim, or beside the image: background, gradients of zero."""
+    camera = random_camera(2, 19, 17)
+    to_world = camera.rotation.T
+    scenes = {
+        "none": {name: array[:0] for name, array in changed().items()},
+        "behind": changed(mean=lambda mean: 0.1 * mean + camera.position - to_world @ [0.0, 0.0, 2.0]),
+        "dim": changed(opacity_logit=-6.0),
+        "beside": changed(mean=lambda mean: 0.1 * mean + camera.position + to_world @ [50.0, 0.0, 5.0]),
+    }
+    renderer = make_renderer(scheduled[0], schedule=scheduled[1])
+    for name, arrays in scenes.items():
+        case = Case(arrays, camera, shape)
+        image = case.render(renderer)
+        assert (image.color == np.float32(BACKGROUND)).all(), name
+        assert not image.alpha.any(), name
+        assert not image.depth.any(), name
+        for field, gradient in case.backward(renderer).items():
+            assert gradient.shape == case.values[field].shape, (name, field)
+            assert not gradient.any(), (name, field)
+
+
+@EVERY
+def test_near_plane(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
+    """A splat at the near plane is drawn, the next number below is not."""
+    camera = Camera(9, 7, 8.0, 8.0, 4.3, 3.6, np.eye(4))
+    for z, seen in ((NEAR, True), (np.nextafter(NEAR, 0.0), False), (-1.0, False)):
+        arrays = random_splats(3, 1, 3)
+        arrays["mean"], arrays["log_scale"] = np.array([[0.0, 0.0, z]]), np.full((1, 3), -6.0)
+        arrays["skew"][:] = 0.0  # all shapes project (x, y, z) then
+        case = Case(arrays, camera, shape, dtype=np.float64)
+        assert case.image.alpha.any() == seen
+        case.check(make_renderer(device, "float64"), ROUNDING, ROUNDING)
+
+
+@EVERY
+def test_extreme_values_stay_finite(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
+    """Whatever finite values Splats takes, image and gradients are finite."""
+    rng = np.random.default_rng(0)
+    n = 400
+    arrays = random_splats(0, n, 3)
+    arrays["mean"] *= 10.0 ** rng.uniform(-6, 6, (n, 1))
+    arrays["log_scale"] = rng.uniform(-60, 60, (n, 3))
+    arrays["opacity_logit"] = rng.uniform(-100, 100, n)
+    arrays["sh"] *= 10.0 ** rng.uniform(-6, 3, (n, 1, 1))
+    arrays["quat"] *= 10.0 ** rng.uniform(-12, 12, (n, 1))
+    renderer, seen = make_renderer(device), 0
+    for start in range(0, n, 8):
+        eight = {name: value[start : start + 8] for name, value in arrays.items()}
+        case = Case(eight, random_camera(0), shape)
+        image = case.render(renderer)
+        assert all(np.isfinite(getattr(image, name)).all() for name in ("color", "alpha", "depth"))
+        seen += image.alpha.any()
+        for name, value in renderer.backward(rng.normal(size=(17, 23, 3)), rng.normal(size=(17, 23))).items():
+            assert np.isfinite(value).all(), name
+    assert seen > 10
+
+
+def test_not_a_number_is_refused_before_it_reaches_a_device() -> None:
+    for name in ("mean", "quat", "log_scale", "opacity_logit", "sh", "skew"):
+        arrays = random_splats(0, 3, 0)
+        arrays[name].reshape(-1)[1] = np.nan
+        with pytest.raises(InputError, match=name):
+            Splats(SKEWED, arrays)
+
+
+# ---- the public face ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_fewer_sh_bands_in_use(device: Device, degree: int) -> None:
+    """Kernels built for degree 3 that use the lower bands only, as training does; other rows stay zero."""
+    case = cloud(SKEWED)
+    pipeline = Pipeline(device, KernelBuild(SKEWED, 3, default_schedule(device.cl_device)).for_rendering())
+    splats = SplatBuffers.of(device, case.splats, pipeline.kernels.dtype)
+    frame = pipeline.forward(splats, case.camera, BACKGROUND, degree)
+    options = {"shape": SKEWED, "background": BACKGROUND, "sh_degree": degree}
+    image = render_reference(case.values, case.camera, **options)
+    color = pipeline.read_image("color", frame.layout)
+    assert np.abs(color - image.color)[case.decided].max() < IMAGE_FLOAT32
+
+    planes = frame.layout.pack(case.weights[0], pipeline.kernels.dtype)
+    v_color, v_alpha = (pipeline.image(name, frame.layout, 3) for name in ("v_color", "v_alpha"))
+    to_device(device, v_color, planes)
+    grads = ParameterBuffers(device, splats.schema, splats.n, pipeline.kernels.dtype)
+    pipeline.backward(frame, v_color, grads, v_alpha)
+    got, bands = grads.download(splats.n), (degree + 1) ** 2
+    want = reference_gradients(case.values, case.camera, case.weights[0], fields=("mean", "sh"), **options)
+    assert relative_error(got["mean"], want["mean"]) < GRADIENT_FLOAT32
+    assert relative_error(got["sh"][:, :bands], want["sh"][:, :bands]) < GRADIENT_FLOAT32
+    assert not got["sh"][:, bands:].any()
+
+
+def test_splats_of_no_sh_bands(make_renderer: MakeRenderer, device: Device) -> None:
+    case = Case(random_splats(4, 9, 0), random_camera(4), "gaussian")
+    case.check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
+
+
+def test_one_renderer_serves_changing_scenes_and_sizes(make_renderer: MakeRenderer, device: Device) -> None:
+    """Buffers are kept and grow; nothing of an earlier frame may show in a later one."""
+    renderer = make_renderer(device)
+    cases = [cloud("gaussian"), *thin_cases(SKEWED).values(), cloud(SKEWED), *thin_cases("gaussian").values()]
+    for case in (*cases, *reversed(cases)):
+        case.check_image(case.render(renderer), IMAGE_FLOAT32)
+
+
+def test_gradients_without_alpha_are_those_of_zero_alpha_weights(make_renderer: MakeRenderer,
+                                                                 device: Device) -> None:
+    case, renderer = cloud(SKEWED), make_renderer(device)
+    v_color, v_alpha = case.weights
+    case.render(renderer)
+    without = renderer.backward(v_color)
+    zero = renderer.backward(v_color, np.zeros_like(v_alpha))
+    assert all(np.array_equal(without[name], zero[name]) for name in zero)
+    assert not np.array_equal(without["mean"], renderer.backward(v_color, v_alpha)["mean"])
+
+
+def test_wrong_calls_are_named(make_renderer: MakeRenderer, device: Device) -> None:
+    case, renderer = cloud("gaussian"), Renderer(device)
+    with pytest.raises(InputError, match="render an image first"):
+        renderer.backward(np.zeros((27, 41, 3)))
+    with pytest.raises(InputError, match="float16"):
+        Renderer(device, "float16")
+    for background in ((0, 0), (0, 0, np.nan), 1.0):
+        with pytest.raises(InputError, match="background"):
+            renderer.render(case.splats, case.camera, background)
+    case.render(renderer)
+    with pytest.raises(InputError, match=r"v_color: shape \(41, 27, 3\), expected \(27, 41, 3\)"):
+        renderer.backward(np.zeros((41, 27, 3)))
+    with pytest.raises(InputError, match=r"v_alpha: shape \(27, 41, 1\)"):
+        renderer.backward(np.zeros((27, 41, 3)), np.zeros((27, 41, 1)))

@@ -1,0 +1,146 @@
+"""Cameras for other programs: written, read back by our readers and by COLMAP's, the same."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runner import clsplat, error_of, small_model
+from small_scene import NAMES, write_garden
+
+from clsplat.cameras.cameras_json import read_cameras
+from clsplat.cameras.path import CameraPath, write_path
+from clsplat.scenes.colmap import read_model
+from clsplat.scenes.export import relative_files, write_colmap, write_transforms
+from clsplat.scenes.posed_images import Posed
+from clsplat.scenes.scene import load_scene, read_posed
+from clsplat.scenes.undistort import Photo, make_lens
+from clsplat.splats.splats import Splats
+
+# Lenses, and what they are written as: transforms.json knows a few forms only.
+LENSES = {
+    "SIMPLE_PINHOLE": [33.0, 18.5, 16.25], "PINHOLE": [33.0, 31.0, 18.5, 16.25],
+    "SIMPLE_RADIAL": [33.0, 18.5, 16.25, -0.1], "RADIAL": [33.0, 18.5, 16.25, -0.1, 0.02],
+    "OPENCV": [33.0, 31.0, 18.5, 16.25, -0.1, 0.02, 1e-3, -2e-3],
+    "FULL_OPENCV": [33.0, 31.0, 18.5, 16.25, -0.1, 0.02, 1e-3, -2e-3, 0.01, 0.0, 0.0, 0.0],
+    "OPENCV_FISHEYE": [33.0, 31.0, 18.5, 16.25, 0.01, 0.002, 0.0, 1e-4],
+}  # fmt: skip
+
+
+@pytest.fixture
+def garden(tmp_path: Path) -> Path:
+    return write_garden(tmp_path)
+
+
+def with_lens(garden: Path, model: str) -> Posed:
+    posed = read_posed(garden, None)
+    photos = [Photo(photo.name, photo.cam_from_world, make_lens(model, 40, 30, LENSES[model]))
+              for photo in posed.photos]
+    return Posed(photos, posed.files, posed.points)
+
+
+def assert_same(ours: list[Photo], theirs: list[Photo]) -> None:
+    """Poses to 1e-9, and lenses by where they see points."""
+    rng = np.random.default_rng(0)
+    rays = np.column_stack([rng.uniform(-0.4, 0.4, (30, 2)), np.ones(30)])
+    assert [photo.name for photo in ours] == [photo.name for photo in theirs]
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(one.cam_from_world, other.cam_from_world, atol=1e-9)
+        assert (one.lens.width, one.lens.height) == (other.lens.width, other.lens.height)
+        np.testing.assert_allclose(one.lens.img_from_cam(rays), other.lens.img_from_cam(rays), atol=1e-9)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("model", [*LENSES, "FOV"])
+def test_colmap_models_come_back(garden: Path, tmp_path: Path, model: str, text: bool) -> None:
+    LENSES.setdefault("FOV", [33.0, 31.0, 18.5, 16.25, 0.9])
+    posed = with_lens(garden, model)
+    write_colmap(tmp_path / "out", posed.photos, posed.points, text)
+    assert {path.suffix for path in (tmp_path / "out").iterdir()} == {".txt" if text else ".bin"}
+    back = read_model(tmp_path / "out")
+    assert_same(posed.photos, back.photos)
+    np.testing.assert_array_equal(back.points.xyz, posed.points.xyz)
+    np.testing.assert_array_equal(back.points.rgb, posed.points.rgb)
+
+
+@pytest.mark.parametrize("model", [name for name in LENSES if name != "FOV"])
+def test_transforms_come_back(garden: Path, model: str) -> None:
+    posed = with_lens(garden, model)
+    write_transforms(garden / "transforms.json", posed.photos, [f"images/{name}" for name in NAMES], posed.points)
+    shutil.rmtree(garden / "sparse")
+    back = read_posed(garden, None)
+    named = [Photo(f"images/{photo.name}", photo.cam_from_world, photo.lens) for photo in posed.photos]
+    assert_same(named, back.photos)
+    np.testing.assert_allclose(back.points.xyz, posed.points.xyz, rtol=1e-6)
+    np.testing.assert_array_equal(back.points.rgb, posed.points.rgb)
+
+
+def test_plain_lenses_are_written_as_such(garden: Path, tmp_path: Path) -> None:
+    """3DGS reads PINHOLE only, and transforms.json is read as FULL_OPENCV."""
+    posed = read_posed(garden, None)
+    photos = [Photo(p.name, p.cam_from_world, make_lens("FULL_OPENCV", 40, 30, [33, 31, 18.5, 16.25, *[0] * 8]))
+              for p in posed.photos]
+    write_colmap(tmp_path / "out", photos, posed.points)
+    assert {photo.lens.model.name for photo in read_model(tmp_path / "out").photos} == {"PINHOLE"}
+
+
+def test_a_scene_is_written_and_trains_as_before(garden: Path, tmp_path: Path) -> None:
+    before = load_scene(garden)
+    assert "9 cameras, 12 points" in clsplat("cameras", garden, garden / "transforms.json")
+    assert "exists already" in error_of("cameras", garden, garden / "transforms.json")
+    other = tmp_path / "elsewhere" / "deep"
+    clsplat("cameras", garden, other / "transforms.json", "-q")
+    frames = json.loads((other / "transforms.json").read_text())["frames"]
+    assert [(other / frame["file_path"]).resolve() for frame in frames] == [garden / "images" / name for name in NAMES]
+    assert [view.name for view in load_scene(other).views] == NAMES
+    moved = garden.parent / "moved"
+    shutil.copytree(garden, moved)
+    shutil.rmtree(moved / "sparse")
+    clsplat("cameras", moved, moved / "sparse" / "0", "--format", "colmap-text")  # from transforms.json, and back
+    after = load_scene(moved)
+    assert after.names == before.names
+    for one, two in zip(before.views, after.views, strict=True):
+        np.testing.assert_allclose(one.camera.cam_from_world, two.camera.cam_from_world, atol=1e-9)
+        np.testing.assert_array_equal(one.image, two.image)
+
+
+def test_a_model_s_cameras_and_centres(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    model = small_model(tmp_path_factory)
+    said = clsplat("cameras", model, tmp_path / "sparse" / "0")
+    named, found = read_cameras(model / "cameras.json"), read_model(tmp_path / "sparse" / "0")
+    assert sorted(f"{entry.name}.png" for entry in named) == [photo.name for photo in found.photos]
+    poses = {f"{entry.name}.png": entry.camera for entry in named}
+    for photo in found.photos:
+        np.testing.assert_allclose(photo.cam_from_world, poses[photo.name].cam_from_world, atol=1e-9)
+        assert list(photo.lens.params) == [getattr(poses[photo.name], name) for name in ("fx", "fy", "cx", "cy")]
+    splats = Splats.load(sorted(model.glob("point_cloud/*_60/point_cloud.ply"))[-1])
+    opaque = splats.mean[splats.opacity_logit >= 0]
+    np.testing.assert_array_equal(found.points.xyz, opaque)
+    assert f"{len(opaque)} points" in said
+    clsplat("cameras", model, tmp_path / "cameras.json")
+    for one, two in zip(read_cameras(tmp_path / "cameras.json"), named, strict=True):
+        assert (one.name, one.camera.fx, one.camera.cy) == (two.name, two.camera.fx, two.camera.cy)
+        np.testing.assert_allclose(one.camera.cam_from_world, two.camera.cam_from_world, atol=1e-12)
+    path = CameraPath(tuple(entry.camera for entry in named[:3]))
+    write_path(tmp_path / "path.json", path)
+    assert "3 cameras" in clsplat("cameras", tmp_path / "path.json", tmp_path / "t" / "transforms.json")
+
+
+def test_what_has_no_cameras_or_no_form_is_refused(garden: Path, tmp_path: Path,
+                                                   tmp_path_factory: pytest.TempPathFactory) -> None:
+    ply = sorted(small_model(tmp_path_factory).glob("point_cloud/*/point_cloud.ply"))[0]
+    assert "has no cameras" in error_of("cameras", ply, tmp_path / "out.json")
+    posed = with_lens(garden, "RADIAL")
+    write_colmap(garden / "sparse" / "0", posed.photos, posed.points)
+    assert "no distorted lenses" in error_of("cameras", garden, tmp_path / "cameras.json")
+    photo = Photo("a.png", np.eye(4), make_lens("FOV", 40, 30, [33.0, 31.0, 18.5, 16.25, 0.9]))
+    with pytest.raises(Exception, match="no lens of COLMAP's model FOV"):
+        write_transforms(tmp_path / "t.json", [photo], ["a.png"], posed.points)
+    six = make_lens("FULL_OPENCV", 40, 30, [33.0, 31.0, 18.5, 16.25, 0, 0, 0, 0, 0, 0.1, 0, 0])
+    with pytest.raises(Exception, match="no k4, k5 and k6"):
+        write_transforms(tmp_path / "t.json", [Photo("a.png", np.eye(4), six)], ["a.png"], posed.points)
+    assert not (tmp_path / "t.json").exists()
+    assert relative_files([garden / "images" / "a.png"], garden / "out") == ["../images/a.png"]

@@ -1,0 +1,108 @@
+"""`clsplat info` of scenes: what is there, what is not, and nothing decoded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runner import clsplat, error_of, small_capture, small_model
+from small_scene import HEIGHT, N_POINTS, NAMES, WIDTH, write_garden
+
+from clsplat.cameras.camera import Camera
+from clsplat.files import images
+from clsplat.files.images import write_png
+from clsplat.scenes.info import scene_info
+from clsplat.scenes.scene import load_scene
+
+
+def test_a_scene_is_counted_without_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    garden = write_garden(tmp_path)
+    scene = load_scene(garden)
+    monkeypatch.setattr(images, "read_image", None)
+    found = scene_info(garden)
+    assert (found.kind, found.photos, found.points, found.masked) == ("COLMAP", 9, N_POINTS, 0)
+    assert found.sizes == (((WIDTH, HEIGHT), 9),)
+    assert found.track_mean == pytest.approx(9 * 8 / N_POINTS)
+    assert found.track_median == np.median(scene.points.track_length)
+    assert set(found.test) == scene.test_names
+    (lens,) = found.lenses
+    camera: Camera = scene.cameras[0]
+    assert (lens.focal, lens.pinhole, lens.photos) == (camera.fx, True, 9)
+    assert lens.field_of_view == pytest.approx(62.4, abs=0.05), "2 atan(20 / 33)"
+    assert found.photo_bytes == sum(file.stat().st_size for file in (garden / "images").iterdir())
+    assert (found.unregistered, found.unreadable) == ((), ())
+
+
+def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+    garden = write_garden(tmp_path)
+    write_png(garden / "images" / "more" / "late.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    (garden / "images" / NAMES[2]).write_bytes(b"no image")
+    write_png(garden / "images" / NAMES[4], np.zeros((2 * HEIGHT, 2 * WIDTH, 3), np.uint8))
+    write_png(garden / "masks" / f"{NAMES[5]}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    found = scene_info(garden)
+    assert found.unregistered == ("more/late.png",)
+    assert found.unreadable == (NAMES[2],)
+    assert found.sizes == (((WIDTH, HEIGHT), 7), ((2 * WIDTH, 2 * HEIGHT), 1))
+    assert found.masked == 1
+    said = clsplat("info", garden)
+    for text in (f"unreadable      1 ({NAMES[2]})", "without a pose  1 (more/late.png)", "masks           of 1 photos"):
+        assert text in said
+    entry = json.loads(clsplat("info", "--json", garden))
+    assert entry["scene"] == str(garden)
+    assert entry["sizes"][1] == {"width": 2 * WIDTH, "height": 2 * HEIGHT, "photos": 1}
+    assert entry["lenses"][0]["model"] == "PINHOLE"
+    assert len(entry["test"]) == 2
+
+
+def test_transforms_with_distortion(tmp_path: Path) -> None:
+    frames = []
+    for index, name in enumerate(("a.png", "b.png", "c.png")):
+        write_png(tmp_path / name, np.zeros((30, 40, 3), np.uint8))
+        frames.append({"file_path": name, "transform_matrix": np.eye(4).tolist(), "k1": 0.1 if index else 0.0})
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({"w": 40, "h": 30, "fl_x": 40.0, "fl_y": 40.0, "frames": frames}))
+    found = scene_info(tmp_path)
+    assert [(lens.pinhole, lens.photos) for lens in found.lenses] == [(False, 2), (True, 1)]
+    assert found.kind == "transforms.json"
+    assert found.track_mean == 0
+    for path in (tmp_path, file):
+        said = clsplat("info", path)
+        assert "FULL_OPENCV, 40x30 px, focal length 40.0 px (53 degrees across): 2 photos, undistorted" in said
+        assert "points          0\n" in said
+
+
+def test_a_reconstructed_scene_says_how_it_went(tmp_path: Path) -> None:
+    garden = write_garden(tmp_path)
+    record = garden / "reconstruct.json"
+    record.write_text('{"photos": 12, "registered": 9, "error": 0.254}')
+    assert "reconstructed   9 of 12 photos, 0.25 px off" in clsplat("info", garden)
+    assert json.loads(clsplat("info", "--json", garden))["placed"] == {"photos": 9, "of": 12, "error": 0.254}
+    for bad in ('{"photos": 12}', "[]", '{"photos": "x", "registered": 9, "error": 1e999}'):
+        record.write_text(bad)
+        assert "reconstruct.json: registered, photos and error must be numbers" in error_of("info", garden)
+    assert "photographs without poses: clsplat reconstruct" in error_of("info", garden / "images")
+
+
+def test_a_lens_without_a_focal_length_is_named(tmp_path: Path) -> None:
+    garden = write_garden(tmp_path)
+    file = garden / "sparse" / "0" / "cameras.bin"
+    data = bytearray(file.read_bytes())
+    for focal in (0.0, float("nan")):
+        data[32:40] = np.float64(focal).tobytes()  # behind the count, id, model, width and height
+        file.write_bytes(data)
+        assert "has a focal length of" in error_of("info", garden)
+
+
+def test_models_and_scenes_are_told_apart(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    model, scene = small_model(tmp_path_factory), small_capture(tmp_path_factory)
+    said = clsplat("info", model, scene)
+    assert "400 splats" in said
+    assert "10 photos with poses" in said
+    kinds = [next(iter(json.loads(line))) for line in clsplat("info", "--json", model, scene).splitlines()]
+    assert kinds == ["model", "scene"]
+    assert "neither a model (point_cloud/) nor a scene" in error_of("info", tmp_path)
+    (tmp_path / "config.json").write_text("{}")
+    assert "train a model first" in error_of("info", tmp_path)
+    assert "no such model folder or PLY file" in error_of("info", tmp_path / "none")

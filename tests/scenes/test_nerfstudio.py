@@ -1,0 +1,310 @@
+"""transforms.json of NeRF, instant-ngp and nerfstudio: poses, lenses, splits, points, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scenes_data import scene_folder
+from small_scene import CX, CY, FX, FY, HEIGHT, NAMES, WIDTH, cloud, model_views, photo_of, write_garden
+
+from clsplat.errors import InputError
+from clsplat.files.images import write_png
+from clsplat.scenes.nerfstudio import posed_by_transforms
+from clsplat.scenes.scene import load_scene
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+Values = dict[str, Any]
+
+
+def opengl(pose: np.ndarray) -> list[list[float]]:
+    """Camera-to-world with y up and z backwards, of a world-to-camera pose."""
+    return (np.linalg.inv(pose) @ FLIP).tolist()
+
+
+def frames(folder: str = "images/") -> list[Values]:
+    return [{"file_path": folder + view.name, "transform_matrix": opengl(view.cam_from_world)}
+            for view in model_views()]
+
+
+LENS = {"w": WIDTH, "h": HEIGHT, "fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The small scene without its COLMAP model."""
+    root = write_garden(tmp_path)
+    shutil.rmtree(root / "sparse")
+    return root
+
+
+def write(folder: Path, values: Values, name: str = "transforms.json") -> Path:
+    file = folder / name
+    file.write_text(json.dumps(values))
+    return file
+
+
+def test_poses_and_lens_are_those_of_colmap(folder: Path, tmp_path: Path) -> None:
+    write(folder, LENS | {"frames": frames()[::-1]})
+    scene, other = load_scene(folder), load_scene(write_garden(tmp_path / "other"))
+    assert scene.names == [f"images/{name}" for name in other.names]
+    assert scene.name == "garden"
+    for ours, theirs in zip(scene.views, other.views, strict=True):
+        np.testing.assert_allclose(ours.camera.cam_from_world, theirs.camera.cam_from_world, atol=1e-12)
+        assert vars(ours.camera).keys() == vars(theirs.camera).keys()
+        assert (ours.camera.fx, ours.camera.fy, ours.camera.cx, ours.camera.cy) == (FX, FY, CX, CY)
+        np.testing.assert_array_equal(ours.image, theirs.image)
+    assert scene.test_names == {f"images/{NAMES[0]}", f"images/{NAMES[8]}"}, "every 8th"
+    assert len(scene.points) == 0
+
+
+def test_file_may_be_named_and_comes_after_colmap(folder: Path, tmp_path: Path) -> None:
+    both = write_garden(tmp_path / "other")
+    file = write(both, LENS | {"frames": frames()[:4]})
+    assert len(load_scene(both).views) == len(NAMES), "COLMAP's"
+    named = load_scene(file)
+    assert (named.name, len(named.views), named.path) == ("garden", 4, file)
+
+
+def test_own_lens_of_a_frame_comes_first(folder: Path) -> None:
+    own = frames()
+    own[2] |= {"fl_x": 50.0, "fl_y": 60.0, "cx": 10.0, "cy": 11.0}
+    views = load_scene(write(folder, LENS | {"frames": own})).views
+    assert (views[2].camera.fx, views[2].camera.fy, views[2].camera.cx, views[2].camera.cy) == (50, 60, 10, 11)
+    assert views[3].camera.fx == FX
+
+
+def test_lens_is_scaled_to_reduced_photos(folder: Path) -> None:
+    for index, name in enumerate(NAMES):
+        write_png(folder / "images_2" / name, photo_of(index, WIDTH // 2, HEIGHT // 2))
+    write(folder, LENS | {"frames": frames()})
+    camera = load_scene(folder, images="images_2").views[0].camera
+    assert (camera.width, camera.height, camera.fx, camera.cx) == (WIDTH // 2, HEIGHT // 2, FX / 2, CX / 2)
+
+
+def test_distortion_is_undistorted(folder: Path) -> None:
+    """As the same lens of a COLMAP model is."""
+    import pycolmap
+
+    from clsplat.scenes.undistort import Photo
+
+    scene = load_scene(write(folder, LENS | {"k1": 0.1, "p2": 0.01, "frames": frames()}))
+    lens = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=[FX, FY, CX, CY, 0.1, 0, 0, 0.01])
+    image, camera = Photo("a", np.eye(4), lens).fit(photo_of(0))
+    assert scene.views[0].camera.fx == pytest.approx(camera.fx)
+    np.testing.assert_array_equal(scene.views[0].image, image)
+    fisheye = load_scene(write(folder, LENS | {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "frames": frames()}))
+    assert fisheye.views[0].image.shape != (HEIGHT, WIDTH, 3) or (fisheye.views[0].image != photo_of(0)).any()
+
+
+def blender_set(folder: Path) -> Path:
+    """Transparent photos in train/ and test/, one angle of view, no suffixes and no sizes."""
+    photo = np.zeros((8, 12, 4), np.uint8)
+    photo[:, :6] = (200, 100, 0, 128)
+    for name, every in (("train", 1), ("test", 3)):
+        chosen = model_views()[::every]
+        for view in chosen:
+            write_png(folder / name / f"{view.name[:-4]}.png", photo)
+        own = [{"file_path": f"./{name}/{view.name[:-4]}", "rotation": 0.1,
+                "transform_matrix": opengl(view.cam_from_world)} for view in chosen]
+        write(folder, {"camera_angle_x": 0.7, "frames": own}, f"transforms_{name}.json")
+    return folder
+
+
+def test_blender_set(tmp_path: Path) -> None:
+    folder = blender_set(tmp_path)
+    scene = load_scene(folder, background=(1.0, 1.0, 1.0))
+    assert len(scene.train) == 9
+    assert sorted(view.name for view in scene.test) == ["test/shot_0.png", "test/shot_3.png", "test/shot_6.png"]
+    camera = scene.views[0].camera
+    assert camera.fx == camera.fy == pytest.approx(6 / np.tan(0.35))
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (12, 8, 6, 4)
+    np.testing.assert_array_equal(scene.views[0].image[0, 0], [227, 177, 127])
+    np.testing.assert_array_equal(scene.views[0].image[0, 11], [255, 255, 255])
+    assert len(load_scene(folder, eval=False).train) == 12
+    assert load_scene(folder / "transforms_train.json").test_names == scene.test_names
+
+
+def test_lists_of_nerfstudio_split(folder: Path) -> None:
+    names = [f"images/{name}" for name in NAMES]
+    lists = {"train_filenames": names[:5], "val_filenames": names[5:6], "test_filenames": names[6:8]}
+    scene = load_scene(write(folder, LENS | lists | {"frames": frames()}))
+    assert scene.test_names == set(names[6:8])
+    assert scene.names == names[:8], "the last is in no list"
+    del lists["test_filenames"]
+    assert load_scene(write(folder, LENS | lists | {"frames": frames()})).test_names == set(names[5:6])
+
+
+def test_points_of_a_ply(folder: Path) -> None:
+    xyz, rgb = cloud()
+    header = "\n".join(["ply", "format ascii 1.0", f"element vertex {len(xyz)}",
+                        *(f"property float {name}" for name in "xyz"),
+                        *(f"property uchar {name}" for name in ("red", "green", "blue")), "end_header\n"])
+    rows = [" ".join(map(str, (*map(float, at), *map(int, colour)))) for at, colour in zip(xyz, rgb, strict=True)]
+    (folder / "cloud.ply").write_text(header + "\n".join(rows) + "\n")
+    points = load_scene(write(folder, LENS | {"ply_file_path": "cloud.ply", "frames": frames()})).points
+    np.testing.assert_allclose(points.xyz, xyz, rtol=1e-6)
+    np.testing.assert_array_equal(points.rgb, rgb)
+
+
+def test_points_of_the_model_behind_the_poses_move_along(folder: Path, tmp_path: Path) -> None:
+    shutil.move(write_garden(tmp_path / "other") / "sparse", folder / "colmap" / "sparse")
+    moved = [[0, 1, 0, 1], [-1, 0, 0, 2], [0, 0, 1, 3]]
+    write(folder, LENS | {"applied_transform": moved, "applied_scale": 0.5, "frames": frames()})
+    xyz, matrix = cloud()[0], np.array(moved, float)
+    np.testing.assert_allclose(load_scene(folder).points.xyz, 0.5 * (xyz @ matrix[:, :3].T + matrix[:, 3]), atol=1e-12)
+
+
+def test_absent_photos_are_named_and_left_out(folder: Path) -> None:
+    (folder / "images" / NAMES[3]).unlink()
+    write(folder, LENS | {"frames": frames()})
+    with pytest.warns(UserWarning, match=rf"1 of 9 frames name photos that are not there, such as 'images/{NAMES[3]}'"):
+        assert len(load_scene(folder).views) == 8
+    with pytest.raises(InputError, match="none of its 9 photos is there"):
+        load_scene(write(folder, LENS | {"frames": frames("nowhere/")}))
+
+
+def changed(**values: Any) -> Callable[[Values], Values]:
+    return lambda whole: whole | values
+
+
+def in_frame(**values: Any) -> Callable[[Values], Values]:
+    return lambda whole: whole | {"frames": [whole["frames"][0], whole["frames"][1] | values, *whole["frames"][2:]]}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (changed(frames=[]), "has no list 'frames'"),
+        (changed(frames=[3]), "frame 0: has no file_path"),
+        (changed(fl_x=None, fl_y=None), "has neither fl_x nor camera_angle_x"),
+        (changed(fl_x=-3), "fl_x is -3; it must be above 0"),
+        (changed(fl_x=10**400), "it must be a number"),
+        (changed(w=1e9), "w x h is 1000000000 x 30"),
+        (changed(test_filenames=True), "is no list of photos"),
+        (changed(fl_x="wide"), "fl_x is 'wide'; it must be a number"),
+        (changed(fl_x=None, fl_y=None, camera_angle_x=4.0), "camera_angle_x is 4; an angle of view is below pi"),
+        (changed(w=0), "w x h is 0 x 30"),
+        (changed(k4=0.1), "k4 of a perspective lens"),
+        (changed(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR' has no pinhole image"),
+        (changed(ply_file_path="gone.ply"), r"gone\.ply: cannot be read"),
+        (changed(ply_file_path="images"), "images: cannot be read"),
+        (changed(test_filenames=[1]), "is no list of photos"),
+        (in_frame(transform_matrix=[[1, 2], [3, 4]]), "frame 1: transform_matrix must be 4 x 4"),
+        (in_frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "frame 1: transform_matrix has no rotation"),
+        (in_frame(transform_matrix=None), "frame 1: transform_matrix must be"),
+        (in_frame(file_path=f"./images/{NAMES[0]}"), "has a frame already"),
+        (in_frame(cx=float("nan")), "frame 1: cx is 'nan'"),
+    ],
+)
+def test_faults_are_named(folder: Path, change: Callable[[Values], Values], said: str) -> None:
+    file = write(folder, change(LENS | {"frames": frames()}))
+    with pytest.raises(InputError, match=said) as caught:
+        load_scene(folder)
+    assert str(caught.value).startswith(str(file.parent))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "[" * 100_000, '{"frames": 3}'])
+def test_damaged_files_are_named(folder: Path, text: str) -> None:
+    file = folder / "transforms.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"transforms\.json: (is no JSON|has no list)"):
+        posed_by_transforms([file])
+
+
+@pytest.mark.data
+def test_fox_has_the_cameras_of_its_colmap_model() -> None:
+    folder = scene_folder("fox")
+    ours, theirs = load_scene(folder / "transforms.json", resolution=4), load_scene(folder, resolution=4)
+    assert [Path(name).name for name in ours.names] == theirs.names
+    for own, other in zip(ours.views, theirs.views, strict=True):
+        np.testing.assert_allclose(own.camera.cam_from_world, other.camera.cam_from_world, atol=1e-9)
+        assert own.camera.fx == pytest.approx(other.camera.fx)
+        np.testing.assert_array_equal(own.image, other.image)
+    order = [np.lexsort(points.xyz.astype(np.float32).T) for points in (ours.points, theirs.points)]
+    np.testing.assert_allclose(ours.points.xyz[order[0]], theirs.points.xyz[order[1]], atol=1e-4)
+
+
+@pytest.mark.data
+def test_instant_ngp_fox_skips_absent_photos() -> None:
+    with pytest.warns(UserWarning, match="17 of 67 frames"):
+        scene = load_scene(scene_folder("fox") / "ngp", resolution=4)
+    assert len(scene.views) == 50
+    assert scene.views[0].camera.cx != pytest.approx(138.6395 / 4, rel=1e-4), "undistorted"
+
+
+@pytest.mark.data
+def test_lego_has_its_own_split() -> None:
+    scene = load_scene(scene_folder("lego"), resolution=4, background=(1.0, 1.0, 1.0))
+    assert (len(scene.train), len(scene.test)) == (100, 25)
+    assert scene.views[0].image[0, 0].tolist() == [255, 255, 255]
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=3), max_leaves=6)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_fuzz_succeeds_or_says_why(folder: Path, data: st.DataObject) -> None:
+    """Any value of the file, at any depth, replaced by anything: a scene, or one line that names the file."""
+    whole = LENS | {"k1": 0.0, "camera_model": "OPENCV", "test_filenames": [f"images/{NAMES[1]}"],
+                    "ply_file_path": "", "applied_transform": np.eye(4).tolist(), "frames": frames()[:3]}
+    for _ in range(data.draw(st.integers(1, 3))):
+        inner: Any = whole
+        while True:
+            keys = list(inner) if isinstance(inner, dict) else list(range(len(inner)))
+            if not keys:
+                break
+            key = data.draw(st.sampled_from(keys))
+            if not isinstance(inner[key], (dict, list)) or not inner[key] or data.draw(st.booleans()):
+                inner[key] = data.draw(ANYTHING)
+                break
+            inner = inner[key]
+    file = write(folder, whole)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            said = f"{len(posed_by_transforms([file]).photos)} photos"
+        except InputError as error:
+            said = str(error).removeprefix(str(folder))
+    assert said.endswith(" photos") or said.startswith("/"), "the file is named"
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("name", ["/", "..", "é" * 200, "é" * 200 + "/a.png", "a/" * 1500 + "b", "a\0b", "\ud800"])
+@pytest.mark.parametrize("key", ["file_path", "ply_file_path"])
+def test_what_no_file_can_be_called_is_refused(tmp_path: Path, key: str, name: str) -> None:
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    write_png(tmp_path / "a.png", np.zeros((4, 6, 3)))
+    values = {"fl_x": 5, "frames": [frame]}
+    (frame if key == "file_path" else values)[key] = name
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match=r"name|cannot be read"):
+        load_scene(tmp_path)
+
+
+def test_names_lead_out_of_no_folder(tmp_path: Path) -> None:
+    """Renders are written under the names of their views."""
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    frames = []
+    for number, name in enumerate(("inside/../a.png", "../b.png")):
+        file = scene / name
+        (scene / "inside").mkdir(exist_ok=True)
+        write_png(file, np.zeros((4, 6, 3)))
+        pose = np.eye(4)
+        pose[0, 3] = number
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    (scene / "transforms.json").write_text(json.dumps({"fl_x": 5, "frames": frames}))
+    assert load_scene(scene, eval=False).names == ["a.png", "b.png"]

@@ -1,0 +1,40 @@
+"""Views held out of the training set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from cli_runner import small_capture
+
+from clsplat.errors import InputError
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.split import hold_out
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(small_capture(tmp_path_factory))
+
+
+def test_test_views_are_gone_and_training_views_held_out(scene: Scene) -> None:
+    split = hold_out(scene)
+    assert scene.test_names.isdisjoint(split.names)
+    assert {view.name for view in scene.train} == set(split.names)
+    assert [view.name for view in split.test] == [scene.train[i].name for i in (1, 3, 5, 7)]
+    assert len(split.train) == 4
+
+
+@pytest.mark.parametrize(("n", "places"), [(3, [1]), (4, [1, 3]), (9, [1, 4, 7]), (21, [3, 10, 17]),
+                                           (43, [3, 10, 17, 24, 31, 38])])
+def test_how_many_are_held_out(scene: Scene, n: int, places: list[int]) -> None:
+    views = [replace(scene.views[0], name=f"{i:03}") for i in range(n)]
+    split = hold_out(Scene("many", Path("many"), views, scene.points))
+    assert [view.name for view in split.test] == [f"{i:03}" for i in places]
+    assert split.train[0] is views[0]
+
+
+def test_two_views_cannot_be_split(scene: Scene) -> None:
+    with pytest.raises(InputError, match="has 2 training views; at least 3"):
+        hold_out(replace(scene, views=scene.views[:2], test_names=frozenset()))

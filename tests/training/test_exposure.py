@@ -1,0 +1,269 @@
+"""Exposure, masks and transparency in training: the kernels against a float64 form of them, and what is learned."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runner import clsplat, small_capture
+from numpy.typing import NDArray
+from reference.loss import reference_loss, reference_loss_gradient
+from reference.tolerances import ROUNDING, relative_error
+
+from clsplat.cameras.camera import Camera
+from clsplat.device.device import SCHEDULES, Device, Schedule
+from clsplat.device.memory import to_device, to_host
+from clsplat.device.program import Real
+from clsplat.rendering.build import KernelBuild
+from clsplat.rendering.pipeline import Pipeline
+from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.training.checkpoint import Checkpoint
+from clsplat.training.config import TrainConfig
+from clsplat.training.exposure import PhotoLoss, exposures_json
+from clsplat.training.loss import ImageLoss
+from clsplat.training.run import train
+from clsplat.training.targets import Truths, truth_channels
+from clsplat.training.trainer import Trainer
+
+SIZES = [(3, 2), (40, 5), (13, 14), (150, 3)]  # width, height: less than a vector, several items a row
+# Backgrounds of photos and of a render.
+BEHIND, NEW = (0.2137, 0.4071, 0.6113), (0.9059, 0.1011, 0.5023)
+
+
+def laid_over(image: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """A photo over the render's background in the place of its own, 0..255."""
+    through = 1 - alpha[:, :, None] / 255
+    return np.clip(image + 255 * through * (np.array(NEW) - np.array(BEHIND)), 0, 255)
+
+
+def views_of(masks: bool, alphas: bool) -> list[View]:
+    rng = np.random.default_rng(3)
+    views = []
+    for i, (width, height) in enumerate(SIZES):
+        image = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
+        mask = rng.random((height, width)) < 0.7 if masks and i != 1 else None
+        alpha = rng.integers(0, 256, (height, width)).astype(np.uint8) if alphas and i != 2 else None
+        if alpha is not None:  # no colour shall lie halfway between two bytes
+            halfway = np.abs(laid_over(image, alpha) % 1 - 0.5) < 1e-3
+            alpha[halfway.any(axis=2)] = 255
+        views.append(View(f"{i}.png", Camera(width, height, 25.0, 26.0, width / 2, height / 2, np.eye(4)), image, mask,
+                          alpha))
+    return views
+
+
+def photo_loss(device: Device, schedule: Schedule, real: Real, views: list[View], exposure: bool) -> PhotoLoss:
+    if real == "double" and not device.has_fp64:
+        pytest.skip("no double precision")
+    kernels = KernelBuild("gaussian", 0, schedule, real=real)
+    config = TrainConfig(exposure=exposure, random_background=True, iterations=100)
+    truths = Truths(device, kernels, views, 10**9, truth_channels(views, with_alpha=True))
+    return PhotoLoss(ImageLoss(Pipeline(device, kernels), 0.2), truths, config, BEHIND)
+
+
+def wanted_of(color: NDArray[np.float64], exposure: NDArray[np.float64],
+              view: View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The render as the photo, and the photo over the render's background; both (H, W, 3)."""
+    shown = color @ exposure[:, :3].T + exposure[:, 3]
+    opaque = np.full(view.image.shape[:2], 255, np.uint8)
+    target = np.rint(laid_over(view.image, opaque if view.alpha is None else view.alpha)) / 255
+    return shown if view.mask is None else np.where(view.mask[:, :, None], shown, target), target
+
+
+def gradient_of(color: NDArray[np.float64], exposure: NDArray[np.float64], view: View) -> NDArray[np.float64]:
+    """Of the render (H, W, 3)."""
+    v = reference_loss_gradient(*wanted_of(color, exposure, view))
+    return (v if view.mask is None else v * view.mask[:, :, None]) @ exposure[:, :3]
+
+
+def best_exposure(color: NDArray[np.float64], view: View, pull: float) -> NDArray[np.float64]:
+    """(3, 4) of least squares, with rows for the pull to the identity."""
+    target = wanted_of(color, np.eye(3, 4), view)[1]
+    counts = target.max(axis=2) < 0.98
+    if view.mask is not None:
+        counts &= view.mask
+    n = counts.sum()
+    if not n:
+        return np.eye(3, 4)
+    weight = np.sqrt(pull * n)
+    inputs = np.vstack([np.column_stack([color[counts], np.ones(n)]), weight * np.eye(4)])
+    outputs = np.vstack([target[counts], weight * np.eye(3, 4).T])
+    return np.linalg.lstsq(inputs, outputs, rcond=None)[0].T
+
+
+def some_exposures(n: int) -> NDArray[np.float64]:
+    return np.tile(np.eye(3, 4), (n, 1, 1)) + 0.1 * np.random.default_rng(5).normal(size=(n, 3, 4))
+
+
+def test_the_reference_gradient_is_that_of_differences() -> None:
+    """Through exposure, mask and background, at a pixel that counts and at one that does not."""
+    view = views_of(True, True)[0]
+    assert view.mask is not None
+    color, exposure = np.random.default_rng(0).random((*view.image.shape[:2], 3)), some_exposures(1)[0]
+    v = gradient_of(color, exposure, view)
+    assert 0 < view.mask.sum() < view.mask.size
+    step = 1e-6
+    for place in np.ndindex(*color.shape):
+        ends = []
+        for sign in (1, -1):
+            moved = color.copy()
+            moved[place] += sign * step
+            ends.append(reference_loss(*wanted_of(moved, exposure, view)))
+        assert v[place] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5, abs=1e-9)
+
+
+@pytest.mark.parametrize(("masks", "alphas", "real", "tolerance"), [
+    (False, False, "float", 5e-5), (True, True, "float", 5e-5), (True, True, "double", ROUNDING)])
+def test_gradients_and_step_equal_the_reference(scheduled: tuple[Device, Schedule], real: Real, tolerance: float,
+                                                masks: bool, alphas: bool) -> None:
+    """A truth without mask or opacity lies among those with them."""
+    views = views_of(masks, alphas)
+    device, schedule = scheduled
+    photos = photo_loss(device, schedule, real, views, exposure=True)
+    dtype = photos.kernels.dtype
+    exposures = some_exposures(len(views))
+    photos.load_state({"exposure": exposures.reshape(-1, 12)})
+    rate, pull = photos.config.exposure_rate, photos.config.exposure_pull
+    for iteration, i in enumerate((0, 1, 2, 3, 0), 1):
+        view = views[i]
+        truth = photos.truths.get(i, 1)
+        layout = truth.layout
+        color = np.random.default_rng(iteration).random((*view.image.shape[:2], 3)).astype(np.float32)
+        to_device(device, photos.pipeline.image("color", layout, 3), layout.pack(color, dtype))
+        planes = to_host(device, photos.gradient(truth, NEW),
+                         np.empty((3, layout.rows, layout.stride), dtype))
+        v = gradient_of(color.astype(np.float64), exposures[i], view)
+        found = layout.unpack(planes)
+        assert relative_error(found, v) < tolerance
+        np.testing.assert_array_equal(planes, layout.pack(found, dtype))  # a margin of zeros
+        if view.mask is not None:
+            assert not found[~view.mask].any()
+            assert found[view.mask].any()
+        shown, target = wanted_of(color.astype(np.float64), exposures[i], view)
+        value = photos.loss.value()
+        assert value.total == pytest.approx(reference_loss(shown, target), rel=1e-4)
+        counts = np.ones(shown.shape[:2], bool) if view.mask is None else view.mask
+        assert value.mse == pytest.approx(((shown - target)[counts] ** 2).mean(), rel=1e-4)
+        moved = rate * (best_exposure(color.astype(np.float64), view, pull) - exposures[i])
+        exposures[i] += moved
+        exposures -= moved / len(views)
+        np.testing.assert_allclose(photos.exposures(), exposures, atol=1e-9 if real == "double" else 2e-5)
+    np.testing.assert_allclose(photos.exposures().mean(axis=0), some_exposures(len(views)).mean(axis=0), atol=1e-6)
+
+
+def test_without_any_of_it_no_kernel_runs(device: Device) -> None:
+    photos = photo_loss(device, SCHEDULES["cpu16"], "float", views_of(False, False), exposure=False)
+    assert not photos.in_use
+    assert photos.truths.channels == 3
+    np.testing.assert_array_equal(photos.exposures(), np.tile(np.eye(3, 4), (4, 1, 1)))
+    assert photos.state() == {}
+
+
+# --- what is learned -----------------------------------------------------------------------
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(small_capture(tmp_path_factory))
+
+
+CONFIG = TrainConfig(iterations=200, cap_max=2500, sh_degree=0, coarse_to_fine=False, seed=1)
+
+
+def exposed(scene: Scene, gains: NDArray[np.float64]) -> Scene:
+    """Training photos with gains around 0.75, the test photos' own."""
+    of = dict(zip([view.name for view in scene.train], 0.75 * gains, strict=True))
+    views = [replace(view, image=np.rint(of.get(view.name, 0.75) * view.image).astype(np.uint8))
+             for view in scene.views]
+    return replace(scene, views=views)
+
+
+def test_exposures_of_photos_are_found(capture: Scene) -> None:
+    """Photos of known gains, of mean 1: the gains are learned, and views of gain 1 are better for it."""
+    n = len(capture.train)
+    gains = np.random.default_rng(2).permutation(np.linspace(0.7, 1.3, n))
+    scene = exposed(capture, gains)
+    trainers = [Trainer(scene, replace(CONFIG, exposure=exposure)) for exposure in (False, True)]
+    for trainer in trainers:
+        trainer.run()
+    learned = trainers[1].photos.exposures()
+    np.testing.assert_allclose(learned.mean(axis=0), np.eye(3, 4), atol=1e-5)
+    grey = 0.4
+    of_grey = (grey * learned[:, :, :3].sum(axis=2) + learned[:, :, 3]).mean(axis=1) / grey
+    assert np.corrcoef(of_grey, gains)[0, 1] > 0.95
+    plain, compensated = (trainer.evaluate(scene.test).psnr for trainer in trainers)
+    assert compensated > plain + 0.5
+
+
+def test_what_a_mask_hides_is_not_learned(capture: Scene) -> None:
+    """A magenta block at the left or the right of each photo, masked and not."""
+    def blotted(view: View, side: int, masked: bool) -> View:
+        height, width = view.image.shape[:2]
+        hidden = np.zeros((height, width), bool)
+        hidden[:, :: 2 * side - 1][height // 4 : 3 * height // 4, width // 8 : width // 2] = True
+        image = np.where(hidden[:, :, None], np.array([255, 0, 255], np.uint8), view.image)
+        return replace(view, image=image, mask=~hidden if masked else None)
+
+    def magenta(image: NDArray[np.floating]) -> float:
+        return float((image * [0.5, -1.0, 0.5]).sum(axis=2).mean())
+
+    excess = {}
+    for masked in (False, True):
+        scene = replace(capture, views=[view if view.name in capture.test_names else blotted(view, i % 2, masked)
+                                        for i, view in enumerate(capture.views)])
+        model = Trainer(scene, CONFIG).run().splats
+        excess[masked] = np.mean([magenta(np.clip(Renderer().render(model, view.camera).color, 0, 1))
+                                  - magenta(view.image / 255) for view in scene.test])
+    assert excess[False] > 0.02
+    assert excess[True] < 0.2 * excess[False]
+
+
+def test_random_backgrounds_show_through_nothing_opaque(capture: Scene) -> None:
+    """Photos of a black object on transparent ground: black splats and none look the same over black only."""
+    def on_nothing(view: View) -> View:
+        height, width = view.image.shape[:2]
+        alpha = np.zeros((height, width), np.uint8)
+        alpha[height // 3: 2 * height // 3, width // 3: 2 * width // 3] = 255
+        return replace(view, image=np.zeros_like(view.image), alpha=alpha)
+
+    views = [on_nothing(view) for view in capture.views]
+    coverage = {}
+    for random in (False, True):
+        trainer = Trainer(replace(capture, views=views), replace(CONFIG, random_background=random))
+        model = trainer.run().splats
+        alpha = Renderer().render(model, views[1].camera).alpha
+        inside = views[1].alpha > 0
+        coverage[random] = alpha[inside].mean() - alpha[~inside].mean()
+    assert coverage[True] > 0.5
+    assert coverage[True] > coverage[False] + 0.3
+
+
+def test_a_resumed_run_has_the_same_exposures(capture: Scene, tmp_path: Path) -> None:
+    config = replace(CONFIG, iterations=40, exposure=True, random_background=True)
+    whole = train(capture, config, output=tmp_path / "whole")
+    trainer = Trainer(capture, config)
+    for _ in range(23):
+        trainer.step()
+    trainer.checkpoint().save(tmp_path / "half.npz")
+    resumed = Trainer(capture, config, Checkpoint.load(tmp_path / "half.npz"))
+    splats = resumed.run().splats
+    for name, array in whole.splats.arrays.items():
+        np.testing.assert_array_equal(array, splats.arrays[name])
+    stored = json.loads((tmp_path / "whole" / "exposure.json").read_text())
+    assert stored == exposures_json([view.name for view in capture.train], resumed.photos.exposures())
+
+
+def test_exposure_json_multiplies_from_the_left() -> None:
+    """As 3DGS uses it: colour (3,) times the first three columns, plus the last."""
+    exposure, colour = some_exposures(1), np.array([0.2, 0.5, 0.7])
+    stored = np.array(exposures_json(["a"], exposure)["a"])
+    np.testing.assert_allclose(colour @ stored[:, :3] + stored[:, 3], exposure[0, :, :3] @ colour + exposure[0, :, 3])
+
+
+def test_on_the_command_line(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> None:
+    folder = small_capture(tmp_path_factory)
+    clsplat("train", folder, "-m", tmp_path / "model", "--iterations", 10, "--cap-max", 200, "--exposure",
+            "--random-background", "-q")
+    assert len(json.loads((tmp_path / "model" / "exposure.json").read_text())) == len(load_scene(folder).views)

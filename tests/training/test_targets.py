@@ -1,0 +1,105 @@
+"""The training images on the device: what is there, what stays, what is uploaded again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cli_runner import small_capture
+from numpy.typing import NDArray
+
+import clsplat
+from clsplat.device.device import SCHEDULES, Device
+from clsplat.device.memory import to_host
+from clsplat.device.trace import recorded
+from clsplat.files.images import resize_area
+from clsplat.rendering.build import KernelBuild
+from clsplat.scenes.scene import View, load_scene
+from clsplat.training.config import TrainConfig
+from clsplat.training.targets import Truth, Truths, truth_budget, truth_bytes
+from clsplat.training.trainer import Trainer
+
+SIZES = [(40, 30), (17, 65), (64, 48), (40, 30)]  # width and height
+
+
+def some_views() -> list[View]:
+    rng = np.random.default_rng(0)
+    return [View(f"{i}.png", clsplat.Camera(width, height, 25.0, 26.0, width / 2, height / 2, np.eye(4)),
+                 rng.integers(0, 256, (height, width, 3)).astype(np.uint8))
+            for i, (width, height) in enumerate(SIZES)]
+
+
+def truths_of(device: Device, budget: int) -> Truths:
+    return Truths(device, KernelBuild("gaussian", 0, SCHEDULES["cpu16"]), some_views(), budget)
+
+
+def image_of(truths: Truths, truth: Truth) -> NDArray[np.uint8]:
+    """(H, W, 3), read back; the margin must be zero."""
+    layout = truth.layout
+    planes = to_host(truths.device, truths.planes(truth), np.empty((3, layout.rows, layout.stride), np.uint8))
+    image = layout.unpack(planes)
+    np.testing.assert_array_equal(planes, layout.pack(image, np.dtype(np.uint8)))
+    return image
+
+
+@pytest.mark.parametrize("budget", [10**9, 20_000, 0])
+def test_images_arrive_whatever_stays(device: Device, budget: int) -> None:
+    """Twice through all views at each of three sizes; what stays is uploaded once."""
+    truths = truths_of(device, budget)
+    for downscale in (4, 2, 1):
+        for again in range(2):
+            for i, view in enumerate(truths.views):
+                with recorded(device) as launches:
+                    truth = truths.get(i, downscale)
+                    image = image_of(truths, truth)
+                size = (view.camera.width // downscale, view.camera.height // downscale)
+                assert (truth.camera.width, truth.camera.height) == size
+                np.testing.assert_array_equal(image, resize_area(view.image, *size))
+                uploads = sum(launch.name == "upload" for launch in launches)
+                if budget != 20_000:
+                    assert uploads == int(not (again and budget))
+        assert truths._kept_bytes <= budget
+
+
+def test_part_of_the_images_stays(device: Device) -> None:
+    """The first ones drawn, within the budget."""
+    truths = truths_of(device, 20_000)
+    for i in range(4):
+        image_of(truths, truths.get(i, 1))
+    with recorded(device) as launches:
+        for i in range(4):
+            image_of(truths, truths.get(i, 1))
+    assert 0 < sum(launch.name == "upload" for launch in launches) < 4
+
+
+def test_images_of_the_last_size_are_given_back(device: Device) -> None:
+    truths = truths_of(device, 10**9)
+    held = []
+    for downscale in (1, 4):
+        for i in range(4):
+            image_of(truths, truths.get(i, downscale))
+        held.append(truths.nbytes)
+    assert held[1] < 0.7 * held[0]
+
+
+@pytest.mark.parametrize("budget", [10**9, 20_000, 0])
+def test_what_is_promised_is_enough(device: Device, budget: int) -> None:
+    truths = truths_of(device, budget)
+    for i in (2, 0, 1, 3):  # the largest first: buffers then need no room to grow
+        image_of(truths, truths.get(i, 1))
+    assert truths.nbytes <= truth_bytes(truths.views, budget, truths.tile)
+    assert truth_budget(device) == device.info.global_mem_bytes // 4
+
+
+def test_training_does_not_depend_on_what_stays(tmp_path_factory: pytest.TempPathFactory,
+                                                devices: list[Device]) -> None:
+    """The same bits with all images on the device and with none."""
+    scene = load_scene(small_capture(tmp_path_factory))
+    config = TrainConfig(iterations=10, cap_max=300, sh_degree=1)
+    models = []
+    for kept in (True, False):
+        trainer = Trainer(scene, config, device=devices[0])
+        if not kept:
+            trainer.truths.budget = 0
+        models.append(trainer.run().splats)
+    for name, array in models[0].arrays.items():
+        np.testing.assert_array_equal(array, models[1].arrays[name])

@@ -1,0 +1,284 @@
+"""The viewer's server with real connections: its address, several browsers, lines that break, senseless messages."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from reference.scenes import for_shape, random_camera, random_splats
+
+pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
+
+from cli_runner import small_model
+from viewer_client import Client
+from websockets.exceptions import ConnectionClosed
+
+from clsplat.cameras.cameras_json import NamedCamera
+from clsplat.cameras.path import parse_path
+from clsplat.errors import OutputError
+from clsplat.splats.splats import Splats
+from clsplat.viewer.camera import Pose, camera_of
+from clsplat.viewer.page import plain
+from clsplat.viewer.server import Server
+from clsplat.viewer.settings import Settings
+from clsplat.viewer.source import ModelSource
+from clsplat.viewer.start import Known, start_of
+from clsplat.viewer.viewer import Viewer
+
+# The server silences these warnings of viser's, but pytest has its own filters.
+pytestmark = [pytest.mark.filterwarnings("ignore:Queued a"), pytest.mark.filterwarnings(r"ignore:\[viser\]")]
+
+LABELS = ("Show", "Background", "Jump to", "Seconds a key")
+BACKGROUND = (0.0, 0.0, 1.0)
+
+
+def model(n: int = 40) -> Splats:
+    return Splats("skew-normal", for_shape(random_splats(3, n, 3, np.float32), "skew-normal"))
+
+
+class Running:
+    """A server with its thread."""
+
+    def __init__(self, folder: Path) -> None:
+        self.source = ModelSource(model())
+        self.viewer = Viewer(self.source, Settings(background=BACKGROUND))
+        cameras = [NamedCamera(f"view_{seed}", random_camera(seed)) for seed in range(3)]
+        self.reloads = 0
+        self.server = Server(self.viewer, start_of(model().mean, [item.camera for item in cameras]),
+                             Known(tuple(cameras[:2]), tuple(cameras[2:])), port=0, reload=self.reload, folder=folder)
+        self.worker = threading.Thread(target=self.viewer.run)
+        self.worker.start()
+
+    def reload(self) -> str:
+        self.reloads += 1
+        return f"read again *{self.reloads}*"
+
+    def close(self) -> None:
+        self.viewer.close()
+        self.server.close()
+        self.worker.join()
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    started = Running(tmp_path_factory.mktemp("paths"))
+    yield started
+    started.close()
+
+
+def expected(settings: Settings, position: tuple[float, float, float] = (0, 0, -3)) -> np.ndarray:
+    camera = camera_of(Pose((1, 0, 0, 0), position, 1.0, 96, 64), 1000)
+    assert camera is not None
+    return ModelSource(model()).picture(camera, settings)
+
+
+def close_to(shown: np.ndarray, picture: np.ndarray) -> bool:
+    """Equal but for JPEG's losses."""
+    return shown.shape == picture.shape and bool(np.abs(shown.astype(int) - picture).mean() < 4.0)
+
+
+def shows(client: Client, picture: np.ndarray) -> bool:
+    """Whether a browser gets this picture before long."""
+    end = time.monotonic() + 10.0
+    while not (client.pictures and close_to(client.last(), picture)):
+        if time.monotonic() > end:
+            return False
+        client.receive(0.1)
+    return True
+
+
+def test_a_busy_port_is_one_line(running: Running) -> None:
+    refused = r"127\.0\.0\.1:\d+: cannot be listened at \(.*in use\); choose another --port"
+    with pytest.raises(OutputError, match=refused):
+        Server(Viewer(running.source), start_of(model().mean, []), port=running.server.port)
+    with socket.socket() as other:  # of another program, which listens elsewhere too
+        other.bind(("0.0.0.0", 0))
+        other.listen()
+        with pytest.raises(OutputError, match="cannot be listened at"):
+            Server(Viewer(running.source), start_of(model().mean, []), port=other.getsockname()[1])
+
+
+@pytest.mark.parametrize("host", ["256.1.1.1", "192.0.2.1", "no.such.host.invalid"])
+def test_an_address_that_is_not_ours_is_one_line(running: Running, host: str) -> None:
+    with pytest.raises(OutputError, match="cannot be listened at"):
+        Server(Viewer(running.source), start_of(model().mean, []), host=host, port=0)
+
+
+def test_a_browser_sees_the_render(running: Running) -> None:
+    with Client(running.server.port) as client:
+        client.look()
+        assert shows(client, expected(Settings(background=BACKGROUND)))
+        client.look((0, 0, -5))
+        assert shows(client, expected(Settings(background=BACKGROUND), (0, 0, -5)))
+        assert not close_to(client.last(), expected(Settings(background=BACKGROUND)))
+
+
+def test_two_browsers_see_what_each_has_chosen(running: Running) -> None:
+    with Client(running.server.port) as one, Client(running.server.port) as two:
+        one.look()
+        two.look()
+        one.set("Show", "Depth")
+        two.set("Background", [255, 0, 0])
+        assert shows(one, expected(Settings(mode="depth", background=BACKGROUND)))
+        assert shows(two, expected(Settings(background=(1.0, 0.0, 0.0))))
+        two.set("Splats", 5)
+        two.set("SH degree", 0)
+        assert shows(two, expected(Settings(background=(1.0, 0.0, 0.0), cap=5, sh_degree=0)))
+        one.set("Resolution", 64)
+        one.still((43, 64))
+
+
+def test_lines_that_break_in_mid_frame_harm_nobody(running: Running) -> None:
+    with Client(running.server.port) as steady:
+        steady.look()
+        steady.still()
+        for number in range(6):
+            client = Client(running.server.port)
+            client.look((0, 0, -3 - number))
+            client.receive(1.0)
+            client.look((0, 0, -4 - number))
+            client.vanish() if number % 2 else client.close()
+        steady.look((0, 0, -4))
+        assert shows(steady, expected(Settings(background=BACKGROUND), (0, 0, -4)))
+        for _ in range(50):
+            if running.viewer.count == 1:
+                break
+            steady.drain(0.1)
+        assert running.viewer.count == 1, "those who have gone are forgotten"
+
+
+SENSELESS = [
+    {"type": "ViewerCameraMessage", "wxyz": "x", "position": None},
+    {"type": "GuiUpdateMessage", "uuid": "Show", "updates": {"value": "../../etc/passwd"}},
+    {"type": "GuiUpdateMessage", "uuid": "Show", "updates": {"no such": 1}},
+    {"type": "GuiUpdateMessage", "uuid": "nobody", "updates": {"value": 1}},
+    {"type": "GuiUpdateMessage", "uuid": "Background", "updates": {"value": [1e9, "a", 2]}},
+    {"type": "GuiUpdateMessage", "uuid": "Jump to", "updates": {"value": "/etc/passwd"}},
+    {"type": "GuiUpdateMessage", "uuid": "Seconds a key", "updates": {"value": float("nan")}},
+    {"type": "ShareUrlRequest"},
+    {"type": "NoMessage"},
+    b"\xff\x00 no message",
+]
+
+
+def test_senseless_messages_change_nothing(running: Running, capfd: pytest.CaptureFixture[str]) -> None:
+    """At worst the connection that sent one ends."""
+    for message in SENSELESS:
+        with Client(running.server.port) as client:
+            client.look()
+            client.picture()
+            if isinstance(message, bytes):
+                client.send_raw(message)
+            else:
+                client.send(message | ({"uuid": client.uuid(message["uuid"])} if message.get("uuid") in LABELS else {}))
+            with contextlib.suppress(ConnectionClosed):
+                client.drain(0.05)
+    with Client(running.server.port) as client:
+        client.look()
+        assert shows(client, expected(Settings(background=BACKGROUND)))
+        assert running.viewer.settings == Settings(background=BACKGROUND)
+    assert "Traceback" not in "".join(capfd.readouterr())
+
+
+ABSURD: list[dict[str, Any]] = [
+    {"position": (float("nan"), 0, 0)}, {"position": (1e300, 0, 0)}, {"fov": float("nan")}, {"fov": 1e9}, {"fov": -1.0},
+    {"width": 10**12, "height": -4}, {"width": 0, "height": 0}, {"wxyz": (0, 0, 0, 0)}, {"wxyz": (float("inf"),) * 4},
+]  # fmt: skip
+
+
+def test_absurd_cameras_harm_nobody(running: Running) -> None:
+    with Client(running.server.port) as client:
+        for camera in ABSURD:
+            client.look(**camera)
+            client.picture()
+        client.look()
+        assert shows(client, expected(Settings(background=BACKGROUND)))
+
+
+def test_an_absurd_camera_sees_the_background(running: Running) -> None:
+    with Client(running.server.port) as client:
+        client.look(fov=3.1)
+        assert shows(client, np.broadcast_to((0, 0, 255), (64, 96, 3)))
+
+
+def test_the_panel_jumps_to_cameras(running: Running) -> None:
+    with Client(running.server.port) as client:
+        client.look()
+        client.still()
+        client.set("Jump to", "test 0: view_2")
+        client.drain(0.3)
+        moved = [m for m in client.received if m["type"] == "SetCameraPositionMessage" and not m.get("initial")]
+        assert np.allclose(moved[-1]["position"], random_camera(2).position)
+        client.set("Show cameras", True)
+        client.drain(0.3)
+        assert sum(m["type"] == "CameraFrustumMessage" for m in client.received) == 3
+
+
+def test_a_path_is_recorded_and_saved(running: Running, tmp_path: Path) -> None:
+    folder = running.server._folder
+    assert folder is not None
+    with Client(running.server.port) as client:
+        client.look()
+        client.still()
+        client.set("Download", True)
+        client.until("add two or more")
+        for step in range(3):
+            client.look((step, 0, -3))
+            client.still()
+            client.set("Add a key", True)
+            client.until(f"{step + 1} key")
+        client.set("Save", True)
+        client.until(plain("camera_path_001.json"))
+        client.set("Play", True)
+        walked: list[float] = []
+        while len(walked) < 5:
+            assert client.receive(5.0)
+            walked = [message["position"][0] for message in client.received
+                      if message["type"] == "SetCameraPositionMessage" and not message["initial"]]
+        client.set("Stop", True)
+        assert walked == sorted(walked)
+        assert 0.0 < walked[-1] < 2.0
+        client.set("Download", True)
+        client.drain(0.3)
+        started = [m for m in client.received if m["type"] == "FileTransferStartDownload"]
+        content = b"".join(bytes(m["content"]) for m in client.received if m["type"] == "FileTransferPart")
+    assert started[0]["filename"] == "camera_path.json"
+    path = parse_path(content)
+    assert content == (folder / "camera_path_001.json").read_bytes()
+    assert len(path.keys) == 3
+    assert np.allclose(path.cameras[-1].position, (2, 0, -3), atol=1e-6)
+    assert [file.name for file in folder.iterdir()] == ["camera_path_001.json"]
+
+
+def test_reading_again_is_said_plainly(running: Running) -> None:
+    with Client(running.server.port) as client:
+        client.look()
+        client.still()
+        client.set("Read the file again", True)
+        client.until(plain("read again *1*"))
+
+
+def test_nothing_of_a_message_is_markup() -> None:
+    assert plain("a*b_c <i>\n[x](y)") == r"a\*b\_c \<i\> \[x\]\(y\)"
+
+
+@pytest.mark.slow
+def test_the_benchmark_runs(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    model, out = small_model(tmp_path_factory), tmp_path / "viewer.jsonl"
+    command = [sys.executable, str(Path(__file__).parents[2] / "benchmarks" / "viewer.py"), "--scenes", model.name,
+               "--models", str(model.parent), "--windows", "320x240", "--seconds", "0.5", "--out", str(out)]
+    subprocess.run(command, check=True, capture_output=True)
+    (row,) = [json.loads(line) for line in out.read_text().splitlines()]
+    assert row["fps_moving"] > 1
+    assert 0 < row["latency_ms"]["median"] <= row["latency_ms"]["p95"]
+    assert {"device", "driver", "schedule", "commit", "splats"} <= set(row)
