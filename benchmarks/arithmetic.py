@@ -96,8 +96,13 @@ def main() -> None:
 
 def run(scene: Scene, shape: str, device: Device, args: argparse.Namespace) -> None:
     """The lines of a scene and shape that are not there yet."""
-    identity = {"scene": scene.name, "shape": shape, "platform": device.info.platform, "cap": args.cap,
-                "iterations": args.iterations}
+    identity = {
+        "scene": scene.name,
+        "shape": shape,
+        "platform": device.info.platform,
+        "cap": args.cap,
+        "iterations": args.iterations,
+    }
     there = {row["variant"] for row in common.read(args.out) if identity.items() <= row.items()}
     wanted = [v for v in variants(shape)[: args.variants] if v.name not in there]
     trained = {}
@@ -114,15 +119,28 @@ def run(scene: Scene, shape: str, device: Device, args: argparse.Namespace) -> N
         psnr[name] = [evaluate(Renderer(device), model, scene.test).psnr for model in models]
     for name in others:
         change = statistics.fmean(psnr[name]) - statistics.fmean(psnr["peak"])
-        common.append(args.out, common.environment(device, "") | identity | {
-            "variant": f"normalisation {name}", "kind": "normalisation", "image_error": None, "gradient_error": None,
-            "psnr_change": change, "psnr": psnr[name], "load": os.getloadavg()[0]})
+        common.append(
+            args.out,
+            common.environment(device, "")
+            | identity
+            | {
+                "variant": f"normalisation {name}",
+                "kind": "normalisation",
+                "image_error": None,
+                "gradient_error": None,
+                "psnr_change": change,
+                "psnr": psnr[name],
+                "load": os.getloadavg()[0],
+            },
+        )
 
 
-def train(scene: Scene, shape: str, device: Device, args: argparse.Namespace, normalisation: str = "peak",
-          seed: int = 0) -> Splats:
-    config = TrainConfig(shape=shape, iterations=args.iterations, cap_max=args.cap, seed=seed,
-                         normalisation=normalisation)
+def train(
+    scene: Scene, shape: str, device: Device, args: argparse.Namespace, normalisation: str = "peak", seed: int = 0
+) -> Splats:
+    config = TrainConfig(
+        shape=shape, iterations=args.iterations, cap_max=args.cap, seed=seed, normalisation=normalisation
+    )
     return Trainer(scene, config, device=device).run().splats
 
 
@@ -151,11 +169,22 @@ def measure(scene: Scene, splats: Splats, device: Device, wanted: list[Variant],
         got = outputs(renderers[v.name], scene, splats, losses)
         image_error, gradient_error = errors(got, truths[key])
         ms = medians[v.name]
-        rows.append(common.environment(device, renderers[v.name].schedule or "") | {
-            "variant": v.name, "kind": v.kind, "splats": len(splats), "image_error": image_error,
-            "gradient_error": gradient_error, "psnr_change": got["psnr"] - truths[key]["psnr"],
-            "raster_ms": ms["rasterize"], "raster_vjp_ms": ms["rasterize_vjp"], "ms": sum(ms.values()),
-            "relative_ms": sum(ms.values()) / sum(medians["default"].values()), "load": os.getloadavg()[0]})
+        rows.append(
+            common.environment(device, renderers[v.name].schedule or "")
+            | {
+                "variant": v.name,
+                "kind": v.kind,
+                "splats": len(splats),
+                "image_error": image_error,
+                "gradient_error": gradient_error,
+                "psnr_change": got["psnr"] - truths[key]["psnr"],
+                "raster_ms": ms["rasterize"],
+                "raster_vjp_ms": ms["rasterize_vjp"],
+                "ms": sum(ms.values()),
+                "relative_ms": sum(ms.values()) / sum(medians["default"].values()),
+                "load": os.getloadavg()[0],
+            }
+        )
     return rows
 
 
@@ -179,8 +208,18 @@ def errors(got: dict[str, Any], truth: dict[str, Any]) -> tuple[float, float]:
 
 
 def print_table(rows: list[dict[str, Any]]) -> None:
-    titles = ["scene", "shape", "platform", "variant", "image error", "gradient error", "PSNR change [dB]",
-              "forward [ms]", "gradient [ms]", "time of default"]
+    titles = [
+        "scene",
+        "shape",
+        "platform",
+        "variant",
+        "image error",
+        "gradient error",
+        "PSNR change [dB]",
+        "forward [ms]",
+        "gradient [ms]",
+        "time of default",
+    ]
     print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
     for row in rows:
         cells = [row["scene"], row["shape"], row["platform"].split()[0], row["variant"]]

@@ -39,8 +39,21 @@ from clsplat.training.memory_estimate import peak_bytes
 
 OUT = common.RESULTS / "budget"
 RESOLUTION = {"fox": 2}  # of load_scene; others as they are
-HEAD = ("scene", "shape", "system", "PSNR [dB]", "SSIM", "splats", "MB", "render ms", "seconds", "PSNR less best",
-        "splats of best", "bytes of best", "time of best")
+HEAD = (
+    "scene",
+    "shape",
+    "system",
+    "PSNR [dB]",
+    "SSIM",
+    "splats",
+    "MB",
+    "render ms",
+    "seconds",
+    "PSNR less best",
+    "splats of best",
+    "bytes of best",
+    "time of best",
+)
 
 
 def main() -> None:
@@ -78,22 +91,46 @@ def run(name: str, shape: str, args: argparse.Namespace) -> None:
     work = args.work / f"{name}-{shape}-{args.iterations}-{args.cap}-{args.tolerance:g}"
     resume = (work / FILE).is_file()
     started = time.process_time()
-    found = train_budget(scene, config, options, lambda progress: say(name, progress.message), output=work,
-                         resume=resume, overwrite=not resume)
+    found = train_budget(
+        scene,
+        config,
+        options,
+        lambda progress: say(name, progress.message),
+        output=work,
+        resume=resume,
+        overwrite=not resume,
+    )
     cpu_seconds = time.process_time() - started
     measured = evaluate(Renderer(device), found.splats, scene.test, config.background)
     report, arrays = found.report, found.splats.arrays
     kept = {key: value for key, value in report.items() if key not in ("config", "options", "scene")}
     record: Record = dict.fromkeys(MEASURED) | {
-        "scene": identity, "system": label, "config": config.to_json(), "failed": report["final"]["missed"],
-        "finite": True, "cap_held": len(found.splats) <= args.cap, "device": str(device.info),
-        "driver": f"{device.info.driver} ({device.info.version})", "schedule": str(schedule_for(device)),
-        "protocol": DEFAULT_PROTOCOL.describe(), "psnr": measured.psnr, "ssim": measured.ssim,
-        "render_ms": measured.render_ms, "seconds": found.seconds, "cpu_seconds": None if resume else cpu_seconds,
-        "splats": len(found.splats), "bytes": found.path.stat().st_size,
-        "parameters": report["final"]["parameters_in_use"], "device_bytes": 0, "peak_bytes": peak_bytes(),
-        "digest": digest(arrays), "curve": None, "commit": common.commit(), "version": version(),
-        "budget": {"options": asdict(options), **kept}}
+        "scene": identity,
+        "system": label,
+        "config": config.to_json(),
+        "failed": report["final"]["missed"],
+        "finite": True,
+        "cap_held": len(found.splats) <= args.cap,
+        "device": str(device.info),
+        "driver": f"{device.info.driver} ({device.info.version})",
+        "schedule": str(schedule_for(device)),
+        "protocol": DEFAULT_PROTOCOL.describe(),
+        "psnr": measured.psnr,
+        "ssim": measured.ssim,
+        "render_ms": measured.render_ms,
+        "seconds": found.seconds,
+        "cpu_seconds": None if resume else cpu_seconds,
+        "splats": len(found.splats),
+        "bytes": found.path.stat().st_size,
+        "parameters": report["final"]["parameters_in_use"],
+        "device_bytes": 0,
+        "peak_bytes": peak_bytes(),
+        "digest": digest(arrays),
+        "curve": None,
+        "commit": common.commit(),
+        "version": version(),
+        "budget": {"options": asdict(options), **kept},
+    }
     runs.add(record)
 
 
@@ -110,9 +147,14 @@ def say(scene: str, message: str) -> None:
 
 def best_of(record: Record, sweep: list[Record]) -> Record | None:
     """The run of the sweep with the highest PSNR for the same scene, shape and iterations."""
-    same = [run for run in sweep if run["scene"] == record["scene"] and not run["failed"]
-            and run["system"] == record["config"]["shape"]
-            and run["config"]["iterations"] == record["config"]["iterations"]]
+    same = [
+        run
+        for run in sweep
+        if run["scene"] == record["scene"]
+        and not run["failed"]
+        and run["system"] == record["config"]["shape"]
+        and run["config"]["iterations"] == record["config"]["iterations"]
+    ]
     return max(same, key=lambda run: float(run["psnr"]), default=None)
 
 
@@ -126,15 +168,27 @@ def print_table(records: list[Record], sweep: list[Record]) -> None:
             line(scene, shape, f"best cap: {best['config']['cap_max']}", best, ("", "", "", ""))
         against: tuple[Any, ...] = ("", "", "", "")
         if best is not None:
-            against = (f"{record['psnr'] - best['psnr']:+.2f}", *(f"{record[key] / best[key]:.0%}"
-                                                                  for key in ("splats", "bytes")),
-                       f"{record['seconds'] / best['seconds']:.1f}")
+            against = (
+                f"{record['psnr'] - best['psnr']:+.2f}",
+                *(f"{record[key] / best[key]:.0%}" for key in ("splats", "bytes")),
+                f"{record['seconds'] / best['seconds']:.1f}",
+            )
         line(scene, shape, record["system"], record, against)
 
 
 def line(scene: str, shape: str, system: str, record: Record, against: tuple[Any, ...]) -> None:
-    cells = (scene, shape, system, f"{record['psnr']:.2f}", f"{record['ssim']:.4f}", record["splats"],
-             f"{record['bytes'] / 1e6:.2f}", f"{record['render_ms']:.1f}", f"{record['seconds']:.1f}", *against)
+    cells = (
+        scene,
+        shape,
+        system,
+        f"{record['psnr']:.2f}",
+        f"{record['ssim']:.4f}",
+        record["splats"],
+        f"{record['bytes'] / 1e6:.2f}",
+        f"{record['render_ms']:.1f}",
+        f"{record['seconds']:.1f}",
+        *against,
+    )
     print("| " + " | ".join(map(str, cells)) + " |")
 
 

@@ -22,6 +22,7 @@ def data_folder() -> Path:
 
 def commit() -> str:
     """Short hash of the code measured, with "+" when the kernels or the library differ from it."""
+
     def git(*args: str) -> str:
         return subprocess.run(["git", *args], cwd=ROOT, capture_output=True, text=True).stdout.strip()
 
@@ -31,8 +32,15 @@ def commit() -> str:
 def environment(device: Device, schedule: object) -> dict[str, Any]:
     """Device, driver, schedule, commit and cores."""
     info = device.info
-    return {"device": info.name, "platform": info.platform, "driver": info.driver, "schedule": str(schedule),
-            "commit": commit(), "cores": os.cpu_count(), "machine": platform.machine()}
+    return {
+        "device": info.name,
+        "platform": info.platform,
+        "driver": info.driver,
+        "schedule": str(schedule),
+        "commit": commit(),
+        "cores": os.cpu_count(),
+        "machine": platform.machine(),
+    }
 
 
 def append(path: Path, row: dict[str, Any]) -> None:

@@ -1,6 +1,6 @@
 """Time `clsplat demo` as a new user meets it: no compiled kernel, no measured schedule in any cache.
 
-    python benchmarks/demo.py [--device 0:0] [--out benchmarks/results/demo.jsonl]
+python benchmarks/demo.py [--device 0:0] [--out benchmarks/results/demo.jsonl]
 """
 
 from __future__ import annotations
@@ -39,11 +39,16 @@ def main() -> None:
         schedules = json.loads((root / "cache" / "clsplat" / "schedules.json").read_text())
     measured = next(iter(results.values()))
     device = open_device(args.device)
-    row = {"seconds": seconds, "load": os.getloadavg()[0],
-           **{key: measured[key] for key in ("PSNR", "SSIM", "render_ms", "splats", "bytes")}}
+    row = {
+        "seconds": seconds,
+        "load": os.getloadavg()[0],
+        **{key: measured[key] for key in ("PSNR", "SSIM", "render_ms", "splats", "bytes")},
+    }
     common.append(args.out, row | common.environment(device, next(iter(schedules.values()))))
-    print(f"{device.info}: demo from empty caches {seconds:.0f} s, test PSNR {row['PSNR']:.2f} dB, "
-          f"SSIM {row['SSIM']:.4f}, {row['splats']} splats")
+    print(
+        f"{device.info}: demo from empty caches {seconds:.0f} s, test PSNR {row['PSNR']:.2f} dB, "
+        f"SSIM {row['SSIM']:.4f}, {row['splats']} splats"
+    )
 
 
 if __name__ == "__main__":

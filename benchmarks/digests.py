@@ -26,9 +26,15 @@ import numpy as np
 
 FILE = Path(__file__).resolve().parent / "results" / "digests.json"
 SHAPES = (
-    "gaussian", "skew-normal", "skew-normal-direct", "half-gaussian", "bisected-skew", "generalised-exponential",
-    "ges-modulation", "student-t",
-)  # fmt: skip
+    "gaussian",
+    "skew-normal",
+    "skew-normal-direct",
+    "half-gaussian",
+    "bisected-skew",
+    "generalised-exponential",
+    "ges-modulation",
+    "student-t",
+)
 # Options that reach code which a plain run does not reach; on the first schedule only.
 OPTIONS: dict[str, dict[str, Any]] = {
     "mcmc": {"strategy": "mcmc"},
@@ -54,8 +60,15 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "coarse": {"coarse_to_fine": True},
 }
 SCHEDULES = ("cpu16", "cpu8", "scalar")
-COMMON = {"iterations": 50, "cap_max": 400, "densify_interval": 5, "sh_interval": 8, "init": "random", "seed": 3,
-          "coarse_to_fine": False}  # fmt: skip
+COMMON = {
+    "iterations": 50,
+    "cap_max": 400,
+    "densify_interval": 5,
+    "sh_interval": 8,
+    "init": "random",
+    "seed": 3,
+    "coarse_to_fine": False,
+}
 WIDTH, HEIGHT, VIEWS = 72, 56, 6
 
 
@@ -130,8 +143,18 @@ def digests(cases: list[str], device_name: str | None, folder: Path) -> dict[str
         gradients = renderer.backward(weights, weights[..., 0])
         parts = {"model": splats.to_numpy(), "render": images, "gradients": gradients}
         found[case] = {part: digest(arrays) for part, arrays in parts.items()}
-    processor = next((line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
-                      if line.startswith("model name")), "") if info.type == "CPU" else ""  # fmt: skip
+    processor = (
+        next(
+            (
+                line.split(":")[1].strip()
+                for line in Path("/proc/cpuinfo").read_text().splitlines()
+                if line.startswith("model name")
+            ),
+            "",
+        )
+        if info.type == "CPU"
+        else ""
+    )
     return {"device": f"{info.platform} {info.driver} {processor or info.name}", "digests": found}
 
 

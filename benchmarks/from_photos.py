@@ -28,8 +28,12 @@ from clsplat.scenes.reconstruct.reconstruct import ReconstructOptions, reconstru
 from clsplat.training.config import TrainConfig
 
 # Name to the scene with poses and the reduction at which both ways are trained.
-SCENES = {"sceaux_castle": ("sceaux_castle", 1), "kitchen": ("kitchen", 1), "fox_ngp": ("fox/ngp", 2),
-          "fox_video": ("fox", 2)}
+SCENES = {
+    "sceaux_castle": ("sceaux_castle", 1),
+    "kitchen": ("kitchen", 1),
+    "fox_ngp": ("fox/ngp", 2),
+    "fox_video": ("fox", 2),
+}
 WAYS = ("given poses", "photos alone")
 FPS = 10
 
@@ -77,13 +81,20 @@ def measure(scene: str, args: argparse.Namespace) -> None:
         if job["way"] != WAYS[0]:
             held_out = _same_photos(posed, made, args.work)
             posed = clsplat.load_scene(made, resolution=resolution, test_list=held_out)
-        config = TrainConfig(iterations=args.iterations, cap_max=args.cap, seed=job["seed"],
-                             test_iterations=(args.iterations,))
+        config = TrainConfig(
+            iterations=args.iterations, cap_max=args.cap, seed=job["seed"], test_iterations=(args.iterations,)
+        )
         model = clsplat.train(posed, config)
         last = model.evaluations[args.iterations]
-        row = job | {"psnr": last.psnr, "ssim": last.ssim, "splats": len(model.splats), "seconds": model.seconds,
-                     "per_view": {Path(name).name: values["PSNR"] for name, values in last.per_view.items()},
-                     "points": len(posed.points), "views": len(posed.views)}
+        row = job | {
+            "psnr": last.psnr,
+            "ssim": last.ssim,
+            "splats": len(model.splats),
+            "seconds": model.seconds,
+            "per_view": {Path(name).name: values["PSNR"] for name, values in last.per_view.items()},
+            "points": len(posed.points),
+            "views": len(posed.views),
+        }
         if job["way"] != WAYS[0]:
             row["reconstruction"] = common.read(figures)[-1]
         common.append(args.out, row | common.environment(device, schedule))
@@ -121,8 +132,7 @@ def _same_photos(given: Any, made: Path, work: Path) -> Path:
     order = {name: number for number, name in enumerate(names)}
     views = clsplat.load_scene(made, resolution=32, eval=False).names
     held_out = {order[Path(name).name] for name in given.test_names}
-    chosen = [name for name in views
-              if (int(name[6:11]) if name.startswith("frame_") else order[name]) in held_out]
+    chosen = [name for name in views if (int(name[6:11]) if name.startswith("frame_") else order[name]) in held_out]
     file = work / f"{made.name}-test.txt"
     file.write_text("\n".join(chosen))
     return file
@@ -130,8 +140,10 @@ def _same_photos(given: Any, made: Path, work: Path) -> Path:
 
 def print_table(rows: list[dict[str, Any]]) -> None:
     """A line for each scene and lens model: means over the seeds that both ways have."""
-    print("| photographs | lens model | placed | seconds | off px | track | points | given poses | photos alone | "
-          "difference | seeds |")
+    print(
+        "| photographs | lens model | placed | seconds | off px | track | points | given poses | photos alone | "
+        "difference | seeds |"
+    )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     kinds = sorted({(row["scene"], row["camera_model"], row["iterations"], row["cap"]) for row in rows})
     for kind in kinds:
@@ -142,9 +154,11 @@ def print_table(rows: list[dict[str, Any]]) -> None:
             continue
         given, alone = (statistics.mean(by[way][seed]["psnr"] for seed in seeds) for way in WAYS)
         r = by[WAYS[1]][seeds[0]]["reconstruction"]
-        print(f"| {kind[0]} | {kind[1]} | {r['registered']}/{r['photos']} | {r['seconds']:.0f} | {r['error']:.2f} | "
-              f"{r['track_length']:.1f} | {r['points']} | {given:.2f} dB | {alone:.2f} dB | {alone - given:+.2f} dB | "
-              f"{len(seeds)} |")
+        print(
+            f"| {kind[0]} | {kind[1]} | {r['registered']}/{r['photos']} | {r['seconds']:.0f} | {r['error']:.2f} | "
+            f"{r['track_length']:.1f} | {r['points']} | {given:.2f} dB | {alone:.2f} dB | {alone - given:+.2f} dB | "
+            f"{len(seeds)} |"
+        )
 
 
 if __name__ == "__main__":

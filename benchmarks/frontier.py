@@ -78,8 +78,12 @@ def main() -> None:
     # Automatic runs belong to the sweep that they were made beside.
     more = [record for path in sorted((args.out.parent / "budget").rglob("*.jsonl")) for record in read_runs(path)]
     if not args.table:
-        write_report(args.out, [*records, *more], reference=REFERENCE,
-                     arithmetic=common.read(args.out.parent / "arithmetic.jsonl"))
+        write_report(
+            args.out,
+            [*records, *more],
+            reference=REFERENCE,
+            arithmetic=common.read(args.out.parent / "arithmetic.jsonl"),
+        )
     print_tables(distinct([*records, *more]))
 
 
@@ -87,9 +91,18 @@ def run(group: Group, args: argparse.Namespace) -> None:
     """The runs of one group that are not there yet."""
     sizes = group.scenes or {name: RESOLUTION.get(name, -1) for name in args.scenes}
     scenes = (load_scene(common.data_folder() / name, resolution=size, eval=True) for name, size in sizes.items())
-    compare(scenes, parse_systems(",".join(group.systems)), args.out, group.caps, range(group.seeds),
-            {"iterations": group.iterations, "device": args.device}, curve=group.curve, repeat=group.repeat,
-            extra={"commit": common.commit()}, on_run=say)
+    compare(
+        scenes,
+        parse_systems(",".join(group.systems)),
+        args.out,
+        group.caps,
+        range(group.seeds),
+        {"iterations": group.iterations, "device": args.device},
+        curve=group.curve,
+        repeat=group.repeat,
+        extra={"commit": common.commit()},
+        on_run=say,
+    )
 
 
 def print_tables(records: Sequence[Record]) -> None:
@@ -98,7 +111,9 @@ def print_tables(records: Sequence[Record]) -> None:
     tables: list[tuple[str, Table]] = [
         ("", (HEAD, [cells(row) for row in rows])),
         (f"splats for the PSNR of {REFERENCE}", equal_table(equal_rows(points, REFERENCE), REFERENCE)),
-        ("automatic runs", auto_table(auto_rows(points))), ("seeds", seed_table(seed_rows(records)))]
+        ("automatic runs", auto_table(auto_rows(points))),
+        ("seeds", seed_table(seed_rows(records))),
+    ]
     for title, (head, lines) in tables:
         if lines:
             print(f"\n{title}\n" if title else "")

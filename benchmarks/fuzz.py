@@ -36,16 +36,27 @@ def main() -> None:
     for reader in () if args.table else args.readers:
         start = time.perf_counter()
         (result,) = campaign([reader], args.inputs, args.seed)
-        common.append(args.out, {
-            "reader": reader, "seed": args.seed, "inputs": result.inputs, "refused": result.refused,
-            "faults": len(result.faults), "first_faults": result.faults[:KEPT],
-            "seconds": round(time.perf_counter() - start, 1), "commit": common.commit()})
+        common.append(
+            args.out,
+            {
+                "reader": reader,
+                "seed": args.seed,
+                "inputs": result.inputs,
+                "refused": result.refused,
+                "faults": len(result.faults),
+                "first_faults": result.faults[:KEPT],
+                "seconds": round(time.perf_counter() - start, 1),
+                "commit": common.commit(),
+            },
+        )
         for fault, times in Counter(fault["fault"] for fault in result.faults).most_common(5):
             print(f"{reader}: {times} x {fault}")
     print(f"{'reader':14} {'seed':>6} {'inputs':>8} {'refused':>8} {'faults':>7}  commit")
     for row in common.read(args.out):
-        print(f"{row['reader']:14} {row['seed']:6d} {row['inputs']:8d} {row['refused']:8d} {row['faults']:7d}  "
-              f"{row['commit']}")
+        print(
+            f"{row['reader']:14} {row['seed']:6d} {row['inputs']:8d} {row['refused']:8d} {row['faults']:7d}  "
+            f"{row['commit']}"
+        )
 
 
 if __name__ == "__main__":

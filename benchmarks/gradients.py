@@ -45,8 +45,9 @@ def main() -> None:
     print("| shape | field | double against differences | float32 against reference |")
     print("|---|---|---|---|")
     for shape in SHAPES:
-        arrays = {k: v for k, v in random_splats(SEED, N_SPLATS, 3, np.float64).items()
-                  if k in SHAPES[shape].schema(3).names}
+        arrays = {
+            k: v for k, v in random_splats(SEED, N_SPLATS, 3, np.float64).items() if k in SHAPES[shape].schema(3).names
+        }
         smooth = Renderer(args.device, "float64", alpha_min=0.0, alpha_max=1.0, t_min=0.0)
         usual = Renderer(args.device)
         by_differences = differences(smooth, shape, arrays, camera, *weights)
@@ -54,23 +55,39 @@ def main() -> None:
         smooth_grads = gradients(smooth, shape, arrays, camera, *weights)
         usual_grads = gradients(usual, shape, arrays, camera, *weights)
         for field in arrays:
-            row = {"shape": shape, "field": field,
-                   "double_differences": relative(smooth_grads[field], by_differences[field]),
-                   "float32_reference": relative(usual_grads[field], exact[field])}
+            row = {
+                "shape": shape,
+                "field": field,
+                "double_differences": relative(smooth_grads[field], by_differences[field]),
+                "float32_reference": relative(usual_grads[field], exact[field]),
+            }
             common.append(args.out, row | common.environment(usual.device, schedule_for(usual.device)))
             print(f"| {shape} | {field} | {row['double_differences']:.1e} | {row['float32_reference']:.1e} |")
 
 
-def gradients(renderer: Renderer, shape: str, arrays: dict[str, NDArray[np.float64]], camera: Camera,
-              v_color: NDArray[np.float64], v_alpha: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:
+def gradients(
+    renderer: Renderer,
+    shape: str,
+    arrays: dict[str, NDArray[np.float64]],
+    camera: Camera,
+    v_color: NDArray[np.float64],
+    v_alpha: NDArray[np.float64],
+) -> dict[str, NDArray[np.floating]]:
     """The kernels' own gradient."""
     renderer.render(Splats(shape, arrays), camera, BACKGROUND)
     return renderer.backward(v_color, v_alpha)
 
 
-def differences(renderer: Renderer, shape: str, arrays: dict[str, NDArray[np.float64]], camera: Camera,
-                v_color: NDArray[np.float64], v_alpha: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+def differences(
+    renderer: Renderer,
+    shape: str,
+    arrays: dict[str, NDArray[np.float64]],
+    camera: Camera,
+    v_color: NDArray[np.float64],
+    v_alpha: NDArray[np.float64],
+) -> dict[str, NDArray[np.float64]]:
     """Central differences of the weighted image, one parameter at a time."""
+
     def loss(changed: dict[str, NDArray[np.float64]]) -> float:
         image = renderer.render(Splats(shape, changed), camera, BACKGROUND)
         return float((v_color * image.color).sum() + (v_alpha * image.alpha).sum())

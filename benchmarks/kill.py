@@ -33,9 +33,24 @@ from clsplat.splats.splats import Splats
 from clsplat.training.checkpoint import Checkpoint
 
 ITERATIONS, INTERVAL = 240, 3
-OPTIONS = ["--iterations", str(ITERATIONS), "--cap-max", "300", "--sh-degree", "1", "--densify-interval", "10",
-           "--checkpoint-interval", str(INTERVAL), "--save-iterations", ",".join(map(str, range(20, ITERATIONS, 20))),
-           "--test-iterations", "100,200", "--eval", "--quiet"]
+OPTIONS = [
+    "--iterations",
+    str(ITERATIONS),
+    "--cap-max",
+    "300",
+    "--sh-degree",
+    "1",
+    "--densify-interval",
+    "10",
+    "--checkpoint-interval",
+    str(INTERVAL),
+    "--save-iterations",
+    ",".join(map(str, range(20, ITERATIONS, 20))),
+    "--test-iterations",
+    "100,200",
+    "--eval",
+    "--quiet",
+]
 CLSPLAT = [sys.executable, "-c", "from clsplat_cli.main import main; main()"]
 MOMENTS = ("any time", "after a checkpoint", "while writing")
 LONGEST = 120  # seconds that a process may take
@@ -85,9 +100,16 @@ class Killer:
             self.process(model, "")
             self.look(model)
             self.compare(model, reference)
-        return {"kills": self.kills.total(), "moments": dict(self.kills), "iterations killed at": sorted(self.at),
-                "runs": self.runs, "processes": self.processes, "cold starts": len(self.cold),
-                "faults": self.faults, "seconds": round(time.perf_counter() - start, 1)}
+        return {
+            "kills": self.kills.total(),
+            "moments": dict(self.kills),
+            "iterations killed at": sorted(self.at),
+            "runs": self.runs,
+            "processes": self.processes,
+            "cold starts": len(self.cold),
+            "faults": self.faults,
+            "seconds": round(time.perf_counter() - start, 1),
+        }
 
     def command(self, model: Path) -> list[str]:
         """Go on where there is a checkpoint; else begin, over what a killed beginning has left."""
@@ -123,8 +145,9 @@ class Killer:
                 self.at.append(Checkpoint.load(checkpoint).iteration)
             return False
         if code:
-            self.faults.append(f"run {self.runs}: ended with {code} after {self.kills.total()} kills: "
-                               f"{errors.read_text()[-300:]}")
+            self.faults.append(
+                f"run {self.runs}: ended with {code} after {self.kills.total()} kills: {errors.read_text()[-300:]}"
+            )
         return True
 
     def wait(self, child: subprocess.Popen[bytes], moment: str, checkpoint: Path, before: int) -> bool:
@@ -160,8 +183,10 @@ class Killer:
     def compare(self, model: Path, reference: Path) -> None:
         """Of a run that has come to its end."""
         place = f"run {self.runs}"
-        names = [sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file())
-                 for root in (model, reference)]
+        names = [
+            sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file())
+            for root in (model, reference)
+        ]
         if names[0] != names[1]:
             self.faults.append(f"{place}: other files: {sorted(set(names[0]) ^ set(names[1]))}")
         for path in reference.glob("point_cloud/*/point_cloud.ply"):

@@ -29,8 +29,9 @@ WHITE = {"lego"}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=["fox:2", "kitchen:-1", "sceaux_castle:-1", "lego:2"])
-    parser.add_argument("--options", nargs="+",
-                        default=["", "exposure=true", "antialiased=true", "exposure=true,antialiased=true"])
+    parser.add_argument(
+        "--options", nargs="+", default=["", "exposure=true", "antialiased=true", "exposure=true,antialiased=true"]
+    )
     parser.add_argument("--shapes", nargs="+", default=["gaussian", "skew-normal"])
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--cap", type=int, default=20_000)
@@ -62,16 +63,23 @@ def run(place: str, shape: str, options: str, seed: int, args: argparse.Namespac
     device = open_device(args.device)
     environment = common.environment(device, schedule_for(device))
     name, _, reduction = place.rpartition(":")
-    key = {"scene": place, "shape": shape, "options": options, "seed": seed, "iterations": args.iterations,
-           "cap": args.cap} | {k: environment[k] for k in KEY if k in environment}
+    key = {
+        "scene": place,
+        "shape": shape,
+        "options": options,
+        "seed": seed,
+        "iterations": args.iterations,
+        "cap": args.cap,
+    } | {k: environment[k] for k in KEY if k in environment}
     if any(all(row[k] == value for k, value in key.items()) for row in common.read(args.out)):
         return
     white = name in WHITE
     background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
     scene = load_scene(common.data_folder() / name, resolution=int(reduction), background=background)
     (system,) = parse_systems(f"{shape}:{options}" if options else shape)
-    trainer = Trainer(scene, system.config(args.cap, seed, {"iterations": args.iterations, "background": background}),
-                      device=device)
+    trainer = Trainer(
+        scene, system.config(args.cap, seed, {"iterations": args.iterations, "background": background}), device=device
+    )
     model = trainer.run()
     measured = measure(trainer, model.splats, background)
     common.append(args.out, key | environment | {"splats": len(model.splats), "seconds": model.seconds} | measured)
@@ -87,8 +95,9 @@ def measure(trainer: Any, splats: Any, background: tuple[float, ...], smallest: 
     for part in [part for part in SHOWN if side // part >= smallest]:
         views = [view.resized(view.camera.width // part, view.camera.height // part) for view in trainer.scene.test]
         psnr.append(round(evaluate(trainer.renderer, splats, views, background).psnr, 3))
-    corrected = evaluate(trainer.renderer, splats, trainer.scene.test, background,
-                         replace(DEFAULT_PROTOCOL, corrected=True))
+    corrected = evaluate(
+        trainer.renderer, splats, trainer.scene.test, background, replace(DEFAULT_PROTOCOL, corrected=True)
+    )
     return {"PSNR": psnr, "corrected": round(corrected.psnr, 3)}
 
 

@@ -67,14 +67,23 @@ def run(name: str, shape: str, args: argparse.Namespace) -> dict[str, Any]:
     for _ in range(WARM_UP + args.iterations):
         for schedule, trainer in trainers.items():
             done[schedule].append(timed_step(trainer))
-    times = {schedule: {stage: statistics.median(one[stage] for one in each[WARM_UP:]) for stage in (*RASTER, "step")}
-             for schedule, each in done.items()}
+    times = {
+        schedule: {stage: statistics.median(one[stage] for one in each[WARM_UP:]) for stage in (*RASTER, "step")}
+        for schedule, each in done.items()
+    }
     camera = scene.cameras[0]
     return common.environment(device, schedules[0]) | {
-        "scene": name, "shape": shape, "splats": trainers[schedules[0]].splats.n, "width": camera.width,
-        "height": camera.height, "load": load, "other": schedules[1], "ms": times,
+        "scene": name,
+        "shape": shape,
+        "splats": trainers[schedules[0]].splats.n,
+        "width": camera.width,
+        "height": camera.height,
+        "load": load,
+        "other": schedules[1],
+        "ms": times,
         "raster_ratio": raster(times[schedules[1]]) / raster(times[schedules[0]]),
-        "step_ratio": times[schedules[1]]["step"] / times[schedules[0]]["step"]}
+        "step_ratio": times[schedules[1]]["step"] / times[schedules[0]]["step"],
+    }
 
 
 def timed_step(trainer: Any) -> dict[str, float]:
@@ -96,16 +105,38 @@ def raster(times: dict[str, float]) -> float:
 
 def print_table(rows: list[dict[str, Any]]) -> None:
     """A line a case: both schedules' times, and how many times longer the other takes."""
-    titles = ["scene", "splats", "shape", "platform", "schedules", "load", "rasterize [ms]", "rasterize_vjp [ms]",
-              "both: ratio", "step [ms]", "step: ratio"]
+    titles = [
+        "scene",
+        "splats",
+        "shape",
+        "platform",
+        "schedules",
+        "load",
+        "rasterize [ms]",
+        "rasterize_vjp [ms]",
+        "both: ratio",
+        "step [ms]",
+        "step: ratio",
+    ]
     print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
     for row in rows:
         pair = (row["schedule"], row["other"])
-        forward, backward, step = (" / ".join(f"{row['ms'][schedule][stage]:.1f}" for schedule in pair)
-                                   for stage in (*RASTER, "step"))
-        cells = [f"{row['scene']} {row['width']}x{row['height']}", row["splats"], row["shape"],
-                 row["platform"].split()[0], " / ".join(pair), f"{row['load']:.1f}", forward, backward,
-                 f"{row['raster_ratio']:.1f}", step, f"{row['step_ratio']:.1f}"]
+        forward, backward, step = (
+            " / ".join(f"{row['ms'][schedule][stage]:.1f}" for schedule in pair) for stage in (*RASTER, "step")
+        )
+        cells = [
+            f"{row['scene']} {row['width']}x{row['height']}",
+            row["splats"],
+            row["shape"],
+            row["platform"].split()[0],
+            " / ".join(pair),
+            f"{row['load']:.1f}",
+            forward,
+            backward,
+            f"{row['raster_ratio']:.1f}",
+            step,
+            f"{row['step_ratio']:.1f}",
+        ]
         print("| " + " | ".join(map(str, cells)) + " |")
 
 

@@ -37,9 +37,11 @@ def main() -> None:
     pictures = [renderer.render(s, camera).color for s in (splats, Splats(splats.shape, arrays, splats.normalisation))]
     write_png(args.out, np.clip(np.concatenate(pictures, axis=1), 0, 1))
     opacity = 1 / (1 + np.exp(-splats.opacity_logit))
-    print(f"{len(splats)} splats; |skew|/limit quantiles 10 25 50 75 90 %: "
-          + " ".join(f"{q:.2f}" for q in np.quantile(size, (0.1, 0.25, 0.5, 0.75, 0.9)))
-          + f"; share above 0.4: {np.mean(size > 0.4):.0%}, by opacity {np.average(size > 0.4, weights=opacity):.0%}")
+    print(
+        f"{len(splats)} splats; |skew|/limit quantiles 10 25 50 75 90 %: "
+        + " ".join(f"{q:.2f}" for q in np.quantile(size, (0.1, 0.25, 0.5, 0.75, 0.9)))
+        + f"; share above 0.4: {np.mean(size > 0.4):.0%}, by opacity {np.average(size > 0.4, weights=opacity):.0%}"
+    )
 
 
 if __name__ == "__main__":

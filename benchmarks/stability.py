@@ -60,8 +60,11 @@ def main() -> None:
                 print(path)
         return
     first = open_device(args.device)
-    devices = [first] + [open_device(info.index) for info in list_devices()
-                         if info.ailment is None and info.platform != "Oclgrind" and info.index != first.info.index]
+    devices = [first] + [
+        open_device(info.index)
+        for info in list_devices()
+        if info.ailment is None and info.platform != "Oclgrind" and info.index != first.info.index
+    ]
     done = {tuple(row[key] for key in KEY) for row in common.read(args.out)}
     for kind in args.kinds:
         for key, measure in KINDS[kind](devices[:1] if args.smoke else devices, args.smoke):
@@ -72,8 +75,11 @@ def main() -> None:
                 continue
             device = next(device for device in devices if device.info.index == key["device"])
             common.append(args.out, key | measured | {"environment": common.environment(device, schedule_for(device))})
-            print(f"{kind}: {key['hazard']}, {key['system']} {key['optimizer']} {key['build']}: "
-                  f"{measured['verdict']} {measured['message']}", flush=True)
+            print(
+                f"{kind}: {key['hazard']}, {key['system']} {key['optimizer']} {key['build']}: "
+                f"{measured['verdict']} {measured['message']}",
+                flush=True,
+            )
     print_tables(common.read(args.out))
 
 
@@ -88,8 +94,13 @@ def static_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
         for shape in some(SHAPES, smoke, ("gaussian",)):
             renderers: list[Renderers] = []
 
-            def measure(hazard: str, shape: str = shape, device: Device = device, build: str = build,
-                        kept: list[Renderers] = renderers) -> Row | None:
+            def measure(
+                hazard: str,
+                shape: str = shape,
+                device: Device = device,
+                build: str = build,
+                kept: list[Renderers] = renderers,
+            ) -> Row | None:
                 with build_options(build):
                     if not kept:
                         kept.append(Renderers(device, schedule_for(device)))
@@ -104,15 +115,19 @@ def training_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
     for system in SYSTEMS[:1] if smoke else SYSTEMS:
         for optimizer in some(OPTIMIZERS, smoke, ("adam",)):
             for hazard in some(TRAINING, smoke, SMOKE["training"]):
-                yield (key_of("training", hazard, system.label, devices[0], optimizer),
-                       lambda h=hazard, s=system, o=optimizer: runs.row(h, s, o))
+                yield (
+                    key_of("training", hazard, system.label, devices[0], optimizer),
+                    lambda h=hazard, s=system, o=optimizer: runs.row(h, s, o),
+                )
 
 
 def capacity_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
     for hazard in CAPACITY:
         for shape in ("gaussian", DEFAULT_SHAPE):
-            yield (key_of("capacity", hazard, shape, devices[0]),
-                   lambda h=hazard, s=shape: capacity_row(h, s, devices[0], smoke))
+            yield (
+                key_of("capacity", hazard, shape, devices[0]),
+                lambda h=hazard, s=shape: capacity_row(h, s, devices[0], smoke),
+            )
 
 
 def recovery_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
@@ -122,8 +137,11 @@ def recovery_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
 
             def measure(form: str = form, case: dict[str, float] = case) -> Row:
                 found = coupled.recovered(devices[0], form, case, **({"iterations": 10} if smoke else {}))
-                return case | found | {"verdict": "stops" if found["message"] else
-                                       "survives" if found["finite"] else "fails"}
+                return (
+                    case
+                    | found
+                    | {"verdict": "stops" if found["message"] else "survives" if found["finite"] else "fails"}
+                )
 
             yield key_of("recovery", name, form, devices[0]), measure
 
@@ -132,6 +150,7 @@ def arithmetic_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
     for length in slant_arithmetic.LENGTHS:
         for aspect in slant_arithmetic.ASPECTS[-1 if smoke else 0 :]:
             for slant in slant_arithmetic.SLANTS:
+
                 def measure(slant: float = slant, aspect: float = aspect, length: float = length) -> Row:
                     found = slant_arithmetic.arithmetic_row(slant, aspect, length)
                     lost = found["squares_not_positive"] > 0
@@ -145,9 +164,12 @@ def some(all_of: Iterable[str], smoke: bool, few: Iterable[str]) -> list[str]:
 
 
 KINDS: dict[str, Callable[[list[Device], bool], Iterator[Task]]] = {
-    "static": static_tasks, "training": training_tasks, "capacity": capacity_tasks, "recovery": recovery_tasks,
+    "static": static_tasks,
+    "training": training_tasks,
+    "capacity": capacity_tasks,
+    "recovery": recovery_tasks,
     "arithmetic": arithmetic_tasks,
-}  # fmt: skip
+}
 
 if __name__ == "__main__":
     main()

@@ -7,7 +7,7 @@
     python benchmarks/stages.py --smoke --out FILE            # a few seconds, for tests
 
 Real scenes are at full size (at most 1600 px wide) and start from their points; synthetic ones have about the same
-useful pairs a pixel at every count (clsplat/scenes/random_scene.py). A case that is in the file for this commit and device is
+useful pairs a pixel at every count (clsplat/scenes/random_scene.py). A case in the file for this commit and device is
 skipped: kill and restart at will. Times are medians, of the device's own clock but for `wall`, `host` and `strategy`.
 `load` is the machine's one-minute load at the start of a case: where others were at work the numbers are worth little.
 """
@@ -75,8 +75,9 @@ def cases(args: argparse.Namespace) -> list[dict[str, Any]]:
     return [dict(zip(CASE, values, strict=True)) for values in (*made_up, *real)]
 
 
-def run(case: dict[str, Any], device_name: str | None, iterations: int, out: Path,
-        limits: dict[str, int] | None = None) -> None:
+def run(
+    case: dict[str, Any], device_name: str | None, iterations: int, out: Path, limits: dict[str, int] | None = None
+) -> None:
     """One case; appends its line. limits : how they are measured, if not as usual."""
     from clsplat.device.device import open_device
     from clsplat.profiling.bench import bench_trainer, measure_render, measure_training
@@ -101,9 +102,17 @@ def run(case: dict[str, Any], device_name: str | None, iterations: int, out: Pat
     trainer = bench_trainer(scene, device, case["shape"], start)
     measured = measure_limits(device, **limits or {})
     reports = [measure(trainer, measured, iterations) for measure in (measure_training, measure_render)]
-    row = case | environment | {"load": load, "copy_bytes_per_s": measured.copy,
-                                "fma_flops_per_s": measured.fma, "peak_mb": peak_bytes() / 1e6,
-                                "reports": [report.to_json() for report in reports]}
+    row = (
+        case
+        | environment
+        | {
+            "load": load,
+            "copy_bytes_per_s": measured.copy,
+            "fma_flops_per_s": measured.fma,
+            "peak_mb": peak_bytes() / 1e6,
+            "reports": [report.to_json() for report in reports],
+        }
+    )
     common.append(out, row)
     print(" ".join(str(case[name]) for name in CASE), *(f"{r.task} {r.wall_ms:.1f} ms" for r in reports), flush=True)
 
@@ -111,14 +120,24 @@ def run(case: dict[str, Any], device_name: str | None, iterations: int, out: Pat
 def print_table(rows: list[dict[str, Any]]) -> None:
     """A line a case and task: size, wall time, and each stage's time with its larger fraction of a limit."""
     stages = _stage_names(rows)
-    _print_head(["scene", "size", "splats", "shape", "device", "load", "task", "useful pairs", "isects", "wall [ms]",
-                 *stages])
+    _print_head(
+        ["scene", "size", "splats", "shape", "device", "load", "task", "useful pairs", "isects", "wall [ms]", *stages]
+    )
     for row in rows:
         for report in row["reports"]:
             sizes, found = report["sizes"], {stage["stage"]: stage for stage in report["stages"]}
-            cells = [row["scene"], f"{row['width']}x{row['height']}", row["splats"], row["shape"],
-                     f"{row['platform'].split()[0]} {row['schedule']}", f"{row['load']:.1f}", report["task"],
-                     f"{1e-6 * sizes['pairs']:.2f} M", sizes["isects"], f"{report['wall_ms']:.2f}"]
+            cells = [
+                row["scene"],
+                f"{row['width']}x{row['height']}",
+                row["splats"],
+                row["shape"],
+                f"{row['platform'].split()[0]} {row['schedule']}",
+                f"{row['load']:.1f}",
+                report["task"],
+                f"{1e-6 * sizes['pairs']:.2f} M",
+                sizes["isects"],
+                f"{report['wall_ms']:.2f}",
+            ]
             print("| " + " | ".join(map(str, [*cells, *(_cell(found.get(name)) for name in stages)])) + " |")
 
 
@@ -131,8 +150,15 @@ def print_ratios(rows: list[dict[str, Any]], others: list[dict[str, Any]]) -> No
         for report, other in zip(row["reports"], there.get(place, {"reports": []})["reports"], strict=False):
             ours, theirs = ({stage["stage"]: stage["ms"] for stage in r["stages"]} for r in (report, other))
             ratios = [f"{ours[s] / theirs[s]:.2f}" if s in ours and theirs.get(s) else "" for s in stages]
-            cells = [row["scene"], row["splats"], row["shape"], row["platform"].split()[0], report["task"],
-                     f"{report['wall_ms'] / other['wall_ms']:.2f}", *ratios]
+            cells = [
+                row["scene"],
+                row["splats"],
+                row["shape"],
+                row["platform"].split()[0],
+                report["task"],
+                f"{report['wall_ms'] / other['wall_ms']:.2f}",
+                *ratios,
+            ]
             print("| " + " | ".join(map(str, cells)) + " |")
 
 

@@ -67,14 +67,31 @@ def measure(args: argparse.Namespace, folder: Path) -> None:
         model, cameras = folder / f"{shape}.ply", folder / "cameras.json"
         splats.save(model)
         write_cameras(cameras, [NamedCamera("view", scene.cameras[0])])
-        render = [*command, "render", str(model), "--cameras", str(cameras), "-o", str(folder / "images"), "--quiet",
-                  "--device", device.info.index]
-        case = row | {"task": "render", "shape": shape, "splats": args.splats, "width": args.width,
-                      "height": args.height}
+        render = [
+            *command,
+            "render",
+            str(model),
+            "--cameras",
+            str(cameras),
+            "-o",
+            str(folder / "images"),
+            "--quiet",
+            "--device",
+            device.info.index,
+        ]
+        case = row | {
+            "task": "render",
+            "shape": shape,
+            "splats": args.splats,
+            "width": args.width,
+            "height": args.height,
+        }
         for state in args.states:
-            times = [seconds(render, caches(folder / "caches", state, str(schedule), index))
-                     for index in range(args.runs + (state == "warm"))]
-            append(args.out, case | {"caches": state}, times[-args.runs:])  # the first warm one made them warm
+            times = [
+                seconds(render, caches(folder / "caches", state, str(schedule), index))
+                for index in range(args.runs + (state == "warm"))
+            ]
+            append(args.out, case | {"caches": state}, times[-args.runs :])  # the first warm one made them warm
 
 
 def caches(folder: Path, state: str, schedule: str, index: int) -> dict[str, str]:
@@ -107,8 +124,16 @@ def print_table(rows: list[dict[str, Any]]) -> None:
     print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
     for row in rows:
         model = f"{row['splats']} {row['shape']}, {row['width']}x{row['height']}" if "shape" in row else ""
-        cells = [row["task"], model, row["caches"], row["platform"].split()[0] if model else "", row["commit"],
-                 f"{row['load']:.1f}", row["runs"], *(f"{row[name]:.2f}" for name in ("seconds", "fastest", "slowest"))]
+        cells = [
+            row["task"],
+            model,
+            row["caches"],
+            row["platform"].split()[0] if model else "",
+            row["commit"],
+            f"{row['load']:.1f}",
+            row["runs"],
+            *(f"{row[name]:.2f}" for name in ("seconds", "fastest", "slowest")),
+        ]
         print("| " + " | ".join(map(str, cells)) + " |")
 
 

@@ -34,10 +34,22 @@ RESOLUTION = {"fox": 2}  # of load_scene; others as they are
 
 # What shapes are trained with: the defaults of the day on which these tables were begun, written out so that they stay
 # one experiment when defaults change. Presets bring their own.
-BASE = {"strategy": "mcmc", "sampling": "opacity", "relocation": "length", "growth": 1.05, "noise_lr": 5e5,
-        "init_opacity": 0.5, "init_scale": 0.5, "opacity_reg": 0.001, "scale_reg": 0.001,
-        "densify_from": 0.05, "densify_until": 0.8, "densify_interval": 100, "grad_threshold": 2e-4,
-        "opacity_reset": 10}
+BASE = {
+    "strategy": "mcmc",
+    "sampling": "opacity",
+    "relocation": "length",
+    "growth": 1.05,
+    "noise_lr": 5e5,
+    "init_opacity": 0.5,
+    "init_scale": 0.5,
+    "opacity_reg": 0.001,
+    "scale_reg": 0.001,
+    "densify_from": 0.05,
+    "densify_until": 0.8,
+    "densify_interval": 100,
+    "grad_threshold": 2e-4,
+    "opacity_reset": 10,
+}
 
 
 class Group(NamedTuple):
@@ -50,8 +62,10 @@ class Group(NamedTuple):
 
     def contestants(self) -> list[System]:
         """The systems, shapes with the options of BASE."""
-        return [replace(system, changes=BASE | dict(system.changes)) if system.base in SHAPES else system
-                for system in parse_systems(",".join(self.systems))]
+        return [
+            replace(system, changes=BASE | dict(system.changes)) if system.base in SHAPES else system
+            for system in parse_systems(",".join(self.systems))
+        ]
 
 
 # Growth by gradient instead of BASE's by opacity.
@@ -73,46 +87,124 @@ GROUPS = {
     "presets": Group(("default", "3dgs", "3dgs-mcmc", "ges", "3d-hgs", "sss", "sns", "3dsgs"), (5000, 20000)),
     # one optimizer; the skew's form and its training: SNS's four ablation rows (vanilla, decomposition, alternation,
     # both) and the centred form with and without alternation
-    "forms": Group(("skew-normal", "skew-normal:alternation=cyclic", "skew-normal-direct:skew_map=coupled",
-                    "skew-normal-direct:skew_map=polar", "skew-normal-direct:skew_map=coupled,alternation=cyclic",
-                    "skew-normal-direct:skew_map=polar,alternation=cyclic", "gaussian"), (1000, 5000, 20000)),
+    "forms": Group(
+        (
+            "skew-normal",
+            "skew-normal:alternation=cyclic",
+            "skew-normal-direct:skew_map=coupled",
+            "skew-normal-direct:skew_map=polar",
+            "skew-normal-direct:skew_map=coupled,alternation=cyclic",
+            "skew-normal-direct:skew_map=polar,alternation=cyclic",
+            "gaussian",
+        ),
+        (1000, 5000, 20000),
+    ),
     # one optimizer, every kernel
-    "shapes": Group(("gaussian", "skew-normal", "skew-normal-direct:skew_map=polar", "half-gaussian", "bisected-skew",
-                     "generalised-exponential", "ges-modulation", "student-t:opacity_lr=0.005"), (5000,)),
+    "shapes": Group(
+        (
+            "gaussian",
+            "skew-normal",
+            "skew-normal-direct:skew_map=polar",
+            "half-gaussian",
+            "bisected-skew",
+            "generalised-exponential",
+            "ges-modulation",
+            "student-t:opacity_lr=0.005",
+        ),
+        (5000,),
+    ),
     # one kernel, other options
-    "factors": Group(("gaussian", "gaussian:noise_lr=0", "gaussian:position_optimizer=sghmc,noise_lr=0",
-                      "gaussian:position_optimizer=sghmc-sss,noise_lr=0", "gaussian:strategy=adc,noise_lr=0",
-                      "skew-normal", "skew-normal:strategy=adc,noise_lr=0",
-                      "skew-normal:position_optimizer=sghmc,noise_lr=0", "skew-normal:normalisation=pdf",
-                      "skew-normal:normalisation=none", "skew-normal:skew_map=linear",
-                      "skew-normal-direct:skew_map=radial"), (5000,)),
+    "factors": Group(
+        (
+            "gaussian",
+            "gaussian:noise_lr=0",
+            "gaussian:position_optimizer=sghmc,noise_lr=0",
+            "gaussian:position_optimizer=sghmc-sss,noise_lr=0",
+            "gaussian:strategy=adc,noise_lr=0",
+            "skew-normal",
+            "skew-normal:strategy=adc,noise_lr=0",
+            "skew-normal:position_optimizer=sghmc,noise_lr=0",
+            "skew-normal:normalisation=pdf",
+            "skew-normal:normalisation=none",
+            "skew-normal:skew_map=linear",
+            "skew-normal-direct:skew_map=radial",
+        ),
+        (5000,),
+    ),
     # which start and which strategy
-    "strategies": Group(("skew-normal", "skew-normal:init_opacity=0.1,init_scale=1",
-                         "skew-normal:init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0",
-                         "3dgs:shape=skew-normal", "3dgs", "3dgs:shape=generalised-exponential",
-                         "generalised-exponential", "gaussian"), (5000, 20000), validate=True),
+    "strategies": Group(
+        (
+            "skew-normal",
+            "skew-normal:init_opacity=0.1,init_scale=1",
+            "skew-normal:init_opacity=0.1,init_scale=1,opacity_reg=0,scale_reg=0",
+            "3dgs:shape=skew-normal",
+            "3dgs",
+            "3dgs:shape=generalised-exponential",
+            "generalised-exponential",
+            "gaussian",
+        ),
+        (5000, 20000),
+        validate=True,
+    ),
     # what makes the difference between the two strategies, with and without room to grow
-    "growth": Group(("skew-normal", "skew-normal:sampling=pull", PULL, f"{PULL},init_opacity=0.1,init_scale=1",
-                     "skew-normal:strategy=adc,noise_lr=0,densify_until=0.5", adc("skew-normal"),
-                     "3dgs:shape=skew-normal", "generalised-exponential:sampling=pull",
-                     "skew-normal:densify_until=0.5", "skew-normal:noise_lr=0"), (5000, 20000), validate=True),
+    "growth": Group(
+        (
+            "skew-normal",
+            "skew-normal:sampling=pull",
+            PULL,
+            f"{PULL},init_opacity=0.1,init_scale=1",
+            "skew-normal:strategy=adc,noise_lr=0,densify_until=0.5",
+            adc("skew-normal"),
+            "3dgs:shape=skew-normal",
+            "generalised-exponential:sampling=pull",
+            "skew-normal:densify_until=0.5",
+            "skew-normal:noise_lr=0",
+        ),
+        (5000, 20000),
+        validate=True,
+    ),
     # which start goes with which strategy
-    "starts": Group((adc("skew-normal"), adc("skew-normal", "init_opacity=0.1,init_scale=0.5"),
-                     adc("skew-normal", "init_opacity=0.5,init_scale=1"), adc("skew-normal", START),
-                     adc("skew-normal", "init_opacity=0.1,init_scale=1"), f"{PULL},{START}",
-                     f"{PULL},init_opacity=0.1,init_scale=0.5"), (5000, 20000), validate=True),
+    "starts": Group(
+        (
+            adc("skew-normal"),
+            adc("skew-normal", "init_opacity=0.1,init_scale=0.5"),
+            adc("skew-normal", "init_opacity=0.5,init_scale=1"),
+            adc("skew-normal", START),
+            adc("skew-normal", "init_opacity=0.1,init_scale=1"),
+            f"{PULL},{START}",
+            f"{PULL},init_opacity=0.1,init_scale=0.5",
+        ),
+        (5000, 20000),
+        validate=True,
+    ),
     # the candidates for a default, then the kernel with the best of them
-    "candidates": Group(("skew-normal", adc("skew-normal", START), f"{PULL},{START}",
-                         adc("skew-normal", "init_opacity=0.1,init_scale=0.5"),
-                         f"skew-normal:strategy=adc,noise_lr=0,densify_until=0.5,{START}"), (5000, 20000),
-                        validate=True),
+    "candidates": Group(
+        (
+            "skew-normal",
+            adc("skew-normal", START),
+            f"{PULL},{START}",
+            adc("skew-normal", "init_opacity=0.1,init_scale=0.5"),
+            f"skew-normal:strategy=adc,noise_lr=0,densify_until=0.5,{START}",
+        ),
+        (5000, 20000),
+        validate=True,
+    ),
     "kernels": Group(("skew-normal", *KERNELS), (5000, 20000), validate=True),
-    "kernels-long": Group(("skew-normal", *KERNELS, *(f"{kernel},opacity_reset=0" for kernel in KERNELS)),
-                          (20000,), 3000, validate=True),
+    "kernels-long": Group(
+        ("skew-normal", *KERNELS, *(f"{kernel},opacity_reset=0" for kernel in KERNELS)), (20000,), 3000, validate=True
+    ),
     # whether three times the iterations say the same
-    "long": Group(("skew-normal", "skew-normal:alternation=cyclic",
-                   "skew-normal:alternation=cyclic,alternation_split=0.8", "gaussian", "generalised-exponential"),
-                  (5000,), 3000),
+    "long": Group(
+        (
+            "skew-normal",
+            "skew-normal:alternation=cyclic",
+            "skew-normal:alternation=cyclic,alternation_split=0.8",
+            "gaussian",
+            "generalised-exponential",
+        ),
+        (5000,),
+        3000,
+    ),
 }
 
 
@@ -142,8 +234,16 @@ def main() -> None:
         for group in (GROUPS[group] for group in asked):
             caps = [cap for cap in group.caps if args.caps is None or cap in args.caps] or args.caps or []
             common_options = {"iterations": args.iterations or group.iterations, "device": args.device}
-            compare([scene], group.contestants(), args.out / name, caps, args.seeds,
-                    common_options, extra={"commit": common.commit()}, on_run=say)
+            compare(
+                [scene],
+                group.contestants(),
+                args.out / name,
+                caps,
+                args.seeds,
+                common_options,
+                extra={"commit": common.commit()},
+                on_run=say,
+            )
     for path in sorted(args.out.glob(f"*/{RUNS}")):
         print(markdown(common.read(path)))
 
@@ -162,13 +262,21 @@ def page(folder: Path, validate: bool) -> str:
     lines = []
     for name, group in GROUPS.items():
         for cap in group.caps if group.validate == validate else ():
-            by = {(scene, system.label): own_runs(records, system, cap, group.iterations)
-                  for scene, records in scenes.items() for system in group.contestants()}
+            by = {
+                (scene, system.label): own_runs(records, system, cap, group.iterations)
+                for scene, records in scenes.items()
+                for system in group.contestants()
+            }
             if not any(len(seeds) for (_, system), seeds in by.items() if system != group.systems[0]):
                 continue
-            lines += [f"**{name}, {cap} splats, {group.iterations} iterations**", "", "| system | " + " | ".join(
-                f"{scene}: PSNR | to {short(group.systems[0])} | SSIM | CPU s | seeds" for scene in scenes) + " |",
-                "|---|" + "---:|" * 5 * len(scenes)]
+            lines += [
+                f"**{name}, {cap} splats, {group.iterations} iterations**",
+                "",
+                "| system | "
+                + " | ".join(f"{scene}: PSNR | to {short(group.systems[0])} | SSIM | CPU s | seeds" for scene in scenes)
+                + " |",
+                "|---|" + "---:|" * 5 * len(scenes),
+            ]
             for system in group.systems:
                 cells = [cell for scene in scenes for cell in row(by[scene, system], by[scene, group.systems[0]])]
                 lines.append(f"| {short(system)} | " + " | ".join(cells) + " |")
@@ -185,12 +293,16 @@ def short(label: str) -> str:
 
 def own_runs(records: list[Record], system: System, cap: int, iterations: int) -> dict[int, Record]:
     """A system's runs by seed: those made with the options it has now."""
+
     def same(record: Record) -> bool:
         options = replace(TrainConfig.from_json(record["config"]), device=None)
         return options == system.config(cap, options.seed, {"iterations": iterations})
 
-    return {record["config"]["seed"]: record for record in records if record["system"] == system.label
-            and record["config"]["cap_max"] == cap and same(record)}
+    return {
+        record["config"]["seed"]: record
+        for record in records
+        if record["system"] == system.label and record["config"]["cap_max"] == cap and same(record)
+    }
 
 
 def row(own: dict[int, Record], base: dict[int, Record]) -> list[str]:
@@ -199,12 +311,19 @@ def row(own: dict[int, Record], base: dict[int, Record]) -> list[str]:
     if not done:
         return ["failed" if own else "", "", "", "", str(len(own) or "")]
     psnr = [record["psnr"] for record in done]
-    pairs = [own[seed]["psnr"] - base[seed]["psnr"] for seed in own
-             if seed in base and own is not base and not own[seed]["failed"] and not base[seed]["failed"]]
+    pairs = [
+        own[seed]["psnr"] - base[seed]["psnr"]
+        for seed in own
+        if seed in base and own is not base and not own[seed]["failed"] and not base[seed]["failed"]
+    ]
     to_base = f"{min(pairs):+.2f} to {max(pairs):+.2f}" if len(pairs) > 1 else "".join(f"{d:+.2f}" for d in pairs)
-    return [f"{statistics.fmean(psnr):.2f} ± {(max(psnr) - min(psnr)) / 2:.2f}" if len(psnr) > 1 else f"{psnr[0]:.2f}",
-            to_base, f"{statistics.fmean(record['ssim'] for record in done):.4f}",
-            f"{statistics.fmean(record['cpu_seconds'] for record in done):.0f}", str(len(done))]
+    return [
+        f"{statistics.fmean(psnr):.2f} ± {(max(psnr) - min(psnr)) / 2:.2f}" if len(psnr) > 1 else f"{psnr[0]:.2f}",
+        to_base,
+        f"{statistics.fmean(record['ssim'] for record in done):.4f}",
+        f"{statistics.fmean(record['cpu_seconds'] for record in done):.0f}",
+        str(len(done)),
+    ]
 
 
 def say(run: Run, record: Record | None) -> None:

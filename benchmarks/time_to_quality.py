@@ -62,8 +62,14 @@ def run(name: str, options: str, seed: int, args: argparse.Namespace) -> None:
 
     device, load = open_device(args.device), os.getloadavg()[0]
     environment = common.environment(device, schedule_for(device))
-    key = {"scene": name, "views": "validation" if args.validate else "test", "options": options, "cap": args.cap,
-           "iterations": args.iterations, "seed": seed} | {k: environment[k] for k in KEY if k in environment}
+    key = {
+        "scene": name,
+        "views": "validation" if args.validate else "test",
+        "options": options,
+        "cap": args.cap,
+        "iterations": args.iterations,
+        "seed": seed,
+    } | {k: environment[k] for k in KEY if k in environment}
     if any(all(row[k] == value for k, value in key.items()) for row in common.read(args.out)):
         return
     (system,) = parse_systems(f"default:{options}" if options else "default")
@@ -81,8 +87,15 @@ def run(name: str, options: str, seed: int, args: argparse.Namespace) -> None:
             trainer.step()
         device.queue.finish()
         seconds, cpu = seconds + time.perf_counter() - start, cpu + time.process_time() - cpu_start
-        along.append([trainer.iteration, round(seconds, 3), round(cpu, 3), trainer.splats.n,
-                      round(trainer.evaluate(scene.test).psnr, 3)])
+        along.append(
+            [
+                trainer.iteration,
+                round(seconds, 3),
+                round(cpu, 3),
+                trainer.splats.n,
+                round(trainer.evaluate(scene.test).psnr, 3),
+            ]
+        )
     common.append(args.out, key | environment | {"load": load, "along": along})
     print(f"{name} {options} seed {seed}: {along[-1][-1]:.2f} dB after {seconds:.1f} s", flush=True)
 
@@ -105,15 +118,40 @@ def reached(along: list[list[float]], level: float, column: int) -> float | None
 
 def print_table(rows: list[dict[str, Any]]) -> None:
     """A line a run."""
-    titles = ["scene", "views", "options", "seed", "platform", "commit", "load", *(f"s to {db} dB" for db in LEVELS_DB),
-              "iterations", "seconds", "CPU s", "splats", "PSNR [dB]"]
+    titles = [
+        "scene",
+        "views",
+        "options",
+        "seed",
+        "platform",
+        "commit",
+        "load",
+        *(f"s to {db} dB" for db in LEVELS_DB),
+        "iterations",
+        "seconds",
+        "CPU s",
+        "splats",
+        "PSNR [dB]",
+    ]
     print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
     for row in rows:
         iterations, seconds, cpu, splats, psnr = row["along"][-1]
         times = [reached(row["along"], level, 1) for level in LEVELS_DB]
-        cells = [row["scene"], row["views"], row["options"] or "default", row["seed"], row["platform"].split()[0],
-                 row["commit"], f"{row['load']:.1f}", *("" if at is None else f"{at:.1f}" for at in times), iterations,
-                 f"{seconds:.1f}", f"{cpu:.1f}", splats, f"{psnr:.2f}"]
+        cells = [
+            row["scene"],
+            row["views"],
+            row["options"] or "default",
+            row["seed"],
+            row["platform"].split()[0],
+            row["commit"],
+            f"{row['load']:.1f}",
+            *("" if at is None else f"{at:.1f}" for at in times),
+            iterations,
+            f"{seconds:.1f}",
+            f"{cpu:.1f}",
+            splats,
+            f"{psnr:.2f}",
+        ]
         print("| " + " | ".join(map(str, cells)) + " |")
 
 

@@ -49,15 +49,31 @@ def main() -> None:
         return
     label = " ".join(args.option)
     for scene, cap, iterations, seed, shape in itertools.product(
-            args.scenes, args.caps, args.iterations, args.seeds, args.shapes):
+        args.scenes, args.caps, args.iterations, args.seeds, args.shapes
+    ):
         key = dict(zip(KEY, (scene, shape, cap, iterations, seed, label), strict=True))
         if any(all(row[k] == v for k, v in key.items()) for row in common.read(args.out)):
             continue
         if args.one:
             run(key, args.option, args.out, args.models)
         else:  # a process of its own: peak memory is then the run's
-            command = [sys.executable, __file__, "--one", "--scenes", scene, "--shapes", shape, "--caps", str(cap),
-                       "--iterations", str(iterations), "--seeds", str(seed), "--out", str(args.out)]
+            command = [
+                sys.executable,
+                __file__,
+                "--one",
+                "--scenes",
+                scene,
+                "--shapes",
+                shape,
+                "--caps",
+                str(cap),
+                "--iterations",
+                str(iterations),
+                "--seeds",
+                str(seed),
+                "--out",
+                str(args.out),
+            ]
             for option in args.option:
                 command += ["--option", option]
             subprocess.run(command + (["--models", str(args.models)] if args.models else []), check=True)
@@ -74,8 +90,13 @@ def run(key: dict[str, Any], options: list[str], out: Path, models: Path | None)
 
     n = key["iterations"]
     marks = tuple(sorted({max(n * i // MARKS, 1) for i in range(1, MARKS + 1)}))
-    defaults = {"shape": key["shape"], "cap_max": key["cap"], "iterations": n, "seed": key["seed"],
-                "test_iterations": marks}
+    defaults = {
+        "shape": key["shape"],
+        "cap_max": key["cap"],
+        "iterations": n,
+        "seed": key["seed"],
+        "test_iterations": marks,
+    }
     config = TrainConfig(**(defaults | {k: _value(v) for k, v in (o.split("=", 1) for o in options)}))
     scene = clsplat.load_scene(common.data_folder() / key["scene"])
     device = open_device(config.device)
@@ -87,11 +108,19 @@ def run(key: dict[str, Any], options: list[str], out: Path, models: Path | None)
     last = model.evaluations[n]
     skew = np.linalg.norm(model.splats.skew, axis=1)
     row = key | {
-        "psnr": last.psnr, "ssim": last.ssim, "per_view": last.per_view, "seconds": model.seconds,
-        "cpu_seconds": cpu, "load": os.getloadavg()[1],
-        "splats": len(model.splats), "peak_mb": model.peak_bytes / 1e6, "render_ms": last.render_ms,
-        "along": [[it, round(model.evaluation_seconds[it], 2), round(e.psnr, 3)]
-                  for it, e in sorted(model.evaluations.items())],
+        "psnr": last.psnr,
+        "ssim": last.ssim,
+        "per_view": last.per_view,
+        "seconds": model.seconds,
+        "cpu_seconds": cpu,
+        "load": os.getloadavg()[1],
+        "splats": len(model.splats),
+        "peak_mb": model.peak_bytes / 1e6,
+        "render_ms": last.render_ms,
+        "along": [
+            [it, round(model.evaluation_seconds[it], 2), round(e.psnr, 3)]
+            for it, e in sorted(model.evaluations.items())
+        ],
         "skew_quantiles": [round(float(q), 3) for q in np.quantile(skew, (0.1, 0.25, 0.5, 0.75, 0.9))],
         "skewed_share": float(np.mean(skew > 0.5)),
     }
@@ -101,27 +130,62 @@ def run(key: dict[str, Any], options: list[str], out: Path, models: Path | None)
 
 def print_table(rows: list[dict[str, Any]]) -> None:
     """Mean over seeds of each configuration, and its spread (max - min)."""
-    titles = ["scene", "shape", "cap", "iterations", "options", "seeds", "PSNR [dB]", "spread", "SSIM", "seconds",
-              "CPU s", "peak MB", "render ms", "skewed", *(f"s to {db} dB" for db in LEVELS_DB)]
+    titles = [
+        "scene",
+        "shape",
+        "cap",
+        "iterations",
+        "options",
+        "seeds",
+        "PSNR [dB]",
+        "spread",
+        "SSIM",
+        "seconds",
+        "CPU s",
+        "peak MB",
+        "render ms",
+        "skewed",
+        *(f"s to {db} dB" for db in LEVELS_DB),
+    ]
     print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in rows:
         groups.setdefault(tuple(row[k] for k in KEY if k != "seed"), []).append(row)
     for (scene, shape, cap, iterations, label), runs in sorted(groups.items()):
         psnr = [r["psnr"] for r in runs]
-        cells = [scene, shape, cap, iterations, label, len(runs), f"{statistics.fmean(psnr):.2f}",
-                 f"{max(psnr) - min(psnr):.2f}", f"{_mean(runs, 'ssim'):.4f}", f"{_mean(runs, 'seconds'):.0f}",
-                 f"{_mean(runs, 'cpu_seconds'):.0f}", f"{_mean(runs, 'peak_mb'):.0f}",
-                 f"{_mean(runs, 'render_ms'):.0f}",
-                 f"{100 * _mean(runs, 'skewed_share'):.0f} %" if shape != "gaussian" else ""]
+        cells = [
+            scene,
+            shape,
+            cap,
+            iterations,
+            label,
+            len(runs),
+            f"{statistics.fmean(psnr):.2f}",
+            f"{max(psnr) - min(psnr):.2f}",
+            f"{_mean(runs, 'ssim'):.4f}",
+            f"{_mean(runs, 'seconds'):.0f}",
+            f"{_mean(runs, 'cpu_seconds'):.0f}",
+            f"{_mean(runs, 'peak_mb'):.0f}",
+            f"{_mean(runs, 'render_ms'):.0f}",
+            f"{100 * _mean(runs, 'skewed_share'):.0f} %" if shape != "gaussian" else "",
+        ]
         cells += [_seconds_to(runs, db) for db in LEVELS_DB]
         print("| " + " | ".join(str(c) for c in cells) + " |")
 
 
 def print_pairs(rows: list[dict[str, Any]]) -> None:
     """Gaussian beside skew-normal at equal splats, iterations and seeds; difference: mean of the paired runs."""
-    titles = ["scene", "splats", "iterations", "seeds", "gaussian PSNR / SSIM", "skew-normal PSNR / SSIM",
-              "difference [dB]", "CPU s", "render ms"]
+    titles = [
+        "scene",
+        "splats",
+        "iterations",
+        "seeds",
+        "gaussian PSNR / SSIM",
+        "skew-normal PSNR / SSIM",
+        "difference [dB]",
+        "CPU s",
+        "render ms",
+    ]
     print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
     by_key = {tuple(row[k] for k in KEY): row for row in rows}
     groups: dict[tuple[Any, ...], list[tuple[dict[str, Any], dict[str, Any]]]] = {}
@@ -133,11 +197,16 @@ def print_pairs(rows: list[dict[str, Any]]) -> None:
         sides = [[pair[side] for pair in pairs] for side in (0, 1)]
         gain = [b["psnr"] - a["psnr"] for a, b in pairs]
         spread = f" ({min(gain):+.2f} to {max(gain):+.2f})" if len(gain) > 1 else ""
-        cells = [scene, cap, f"{iterations} {label}".strip(), len(pairs),
-                 *(f"{_mean(runs, 'psnr'):.2f} / {_mean(runs, 'ssim'):.4f}" for runs in sides),
-                 f"{statistics.fmean(gain):+.2f}{spread}",
-                 " / ".join(f"{_mean(runs, 'cpu_seconds'):.0f}" for runs in sides),
-                 " / ".join(f"{_mean(runs, 'render_ms'):.0f}" for runs in sides)]
+        cells = [
+            scene,
+            cap,
+            f"{iterations} {label}".strip(),
+            len(pairs),
+            *(f"{_mean(runs, 'psnr'):.2f} / {_mean(runs, 'ssim'):.4f}" for runs in sides),
+            f"{statistics.fmean(gain):+.2f}{spread}",
+            " / ".join(f"{_mean(runs, 'cpu_seconds'):.0f}" for runs in sides),
+            " / ".join(f"{_mean(runs, 'render_ms'):.0f}" for runs in sides),
+        ]
         print("| " + " | ".join(str(c) for c in cells) + " |")
 
 

@@ -77,9 +77,22 @@ def training_command(scene: str, model: Path, args: argparse.Namespace) -> list[
     """`clsplat train` of a scene."""
     device = ["--device", args.device] if args.device else []
     resolution = ["-r", str(SCENES[scene])] if scene in SCENES else []
-    return [sys.executable, "-c", "from clsplat_cli.main import main; main()", "train",
-            str(common.data_folder() / scene), *resolution, "-m", str(model), "--eval",
-            "--iterations", str(args.iterations), "--cap-max", str(args.cap_max), *device]
+    return [
+        sys.executable,
+        "-c",
+        "from clsplat_cli.main import main; main()",
+        "train",
+        str(common.data_folder() / scene),
+        *resolution,
+        "-m",
+        str(model),
+        "--eval",
+        "--iterations",
+        str(args.iterations),
+        "--cap-max",
+        str(args.cap_max),
+        *device,
+    ]
 
 
 # --- pictures --------------------------------------------------------------------------------
@@ -104,8 +117,9 @@ def serve(model: Path, device: str | None) -> None:
 
     places = np.array([camera.position for camera in path_of(model)])
     loaded = load_model(model)
-    viewing = Viewing(loaded, None, known_cameras(loaded, None, None, None), (0.0, 0.0, 0.0), "127.0.0.1", 0, None,
-                      device)
+    viewing = Viewing(
+        loaded, None, known_cameras(loaded, None, None, None), (0.0, 0.0, 0.0), "127.0.0.1", 0, None, device
+    )
     make = viewing.source.picture
 
     def stamped(camera: Any, settings: Any) -> Any:
@@ -118,8 +132,16 @@ def serve(model: Path, device: str | None) -> None:
     viewing.source.picture = stamped  # type: ignore[method-assign]
     threading.Thread(target=viewing.run, daemon=True).start()
     opened = open_device(device)
-    print(json.dumps({"port": viewing.server.port, "splats": viewing.source.n_splats,
-                      **common.environment(opened, schedule_for(opened))}), flush=True)
+    print(
+        json.dumps(
+            {
+                "port": viewing.server.port,
+                "splats": viewing.source.n_splats,
+                **common.environment(opened, schedule_for(opened)),
+            }
+        ),
+        flush=True,
+    )
     sys.stdin.read()
 
 
@@ -193,8 +215,12 @@ def walk(scene: str, model: Path, window: str, args: argparse.Namespace) -> None
     """One model in one window; appends its line."""
     width, height = (int(side) for side in window.split("x"))
     device = ["--device", args.device] if args.device else []
-    server = subprocess.Popen([sys.executable, __file__, "--serve", str(model), *device], stdin=subprocess.PIPE,
-                              stdout=subprocess.PIPE, text=True)
+    server = subprocess.Popen(
+        [sys.executable, __file__, "--serve", str(model), *device],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     assert server.stdin is not None
     assert server.stdout is not None
     told = json.loads(server.stdout.readline())
@@ -230,13 +256,21 @@ def walk(scene: str, model: Path, window: str, args: argparse.Namespace) -> None
         server.stdin.close()
         server.wait(20)
     sides = [item[2] for item in moving]
-    row = {"task": "view", "scene": scene, "window": window, **told,
-           "fps_moving": len(moving) / (end - start),
-           "moving_width_px": [min(sides), statistics.median(sides), max(sides)], "latency_ms": quantiles(latencies),
-           "first_after_rest_ms": quantiles(first), "full_after_rest_ms": quantiles(full),
-           "fps_still": 1.0 / (statistics.median(full) - REST),
-           "bytes_moving": statistics.median(item[4] for item in moving), "bytes_full": walker.seen[-1][4],
-           "seconds": end - start}
+    row = {
+        "task": "view",
+        "scene": scene,
+        "window": window,
+        **told,
+        "fps_moving": len(moving) / (end - start),
+        "moving_width_px": [min(sides), statistics.median(sides), max(sides)],
+        "latency_ms": quantiles(latencies),
+        "first_after_rest_ms": quantiles(first),
+        "full_after_rest_ms": quantiles(full),
+        "fps_still": 1.0 / (statistics.median(full) - REST),
+        "bytes_moving": statistics.median(item[4] for item in moving),
+        "bytes_full": walker.seen[-1][4],
+        "seconds": end - start,
+    }
     common.append(args.out, row)
     print(json.dumps(row), flush=True)
 
@@ -265,8 +299,12 @@ def watch_training(scene: str, args: argparse.Namespace) -> None:
     config = TrainConfig(iterations=args.iterations, cap_max=args.cap_max, device=args.device)
     view = TrainingView(config)
     server = Server(view.viewer, start_of(loaded.points.xyz, [item.camera for item in loaded.train]), port=0)
-    watcher = subprocess.Popen([sys.executable, __file__, "--watch", str(server.port)], stdin=subprocess.PIPE,
-                               stdout=subprocess.PIPE, text=True)
+    watcher = subprocess.Popen(
+        [sys.executable, __file__, "--watch", str(server.port)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     assert watcher.stdin is not None
     assert watcher.stdout is not None
     watcher.stdout.readline()  # it is connected
@@ -297,10 +335,18 @@ def watch_training(scene: str, args: argparse.Namespace) -> None:
     plain = 0.5 * (times[0, :-1] + times[0, 1:])
     more = {kind: quartiles(times[place, :-1] / plain - 1.0) for place, kind in enumerate(KINDS) if place}
     device = open_device(args.device)
-    row = {"task": "train --view", "scene": scene, "iterations": args.iterations, "cap_max": args.cap_max,
-           **common.environment(device, schedule_for(device)), "stretch": STRETCH, "stretches": times.shape[1],
-           "more_time": more, "seconds": {kind: float(times[place].sum()) for place, kind in enumerate(KINDS)},
-           "pictures_a_second": {kind: count / sum(seconds[kind]) for kind, count in pictures.items()}}
+    row = {
+        "task": "train --view",
+        "scene": scene,
+        "iterations": args.iterations,
+        "cap_max": args.cap_max,
+        **common.environment(device, schedule_for(device)),
+        "stretch": STRETCH,
+        "stretches": times.shape[1],
+        "more_time": more,
+        "seconds": {kind: float(times[place].sum()) for place, kind in enumerate(KINDS)},
+        "pictures_a_second": {kind: count / sum(seconds[kind]) for kind, count in pictures.items()},
+    }
     common.append(args.out, row)
     print(json.dumps(row), flush=True)
 

@@ -38,8 +38,9 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=["wide", "train"], choices=["wide", "train"])
     parser.add_argument("--options", nargs="+", default=["visible_adam=false", "visible_adam=true"])
     parser.add_argument("--splats", nargs="+", type=int, default=[100_000, 1_000_000], help="of the wide scene")
-    parser.add_argument("--scenes", nargs="+", default=["fox:2:20000", "fox:4:5000", "kitchen:-1:20000",
-                                                        "sceaux_castle:-1:18000"])
+    parser.add_argument(
+        "--scenes", nargs="+", default=["fox:2:20000", "fox:4:5000", "kitchen:-1:20000", "sceaux_castle:-1:18000"]
+    )
     parser.add_argument("--shapes", nargs="+", default=["skew-normal"])
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
@@ -63,8 +64,9 @@ def main() -> None:
     print_table(common.read(args.out))
 
 
-def run(task: str, name: str, n: int, shape: str, options: str, seed: int, iterations: int,
-        args: argparse.Namespace) -> None:
+def run(
+    task: str, name: str, n: int, shape: str, options: str, seed: int, iterations: int, args: argparse.Namespace
+) -> None:
     """One run; appends its line."""
     from clsplat.comparison.methods import parse_systems
     from clsplat.device.device import open_device
@@ -76,8 +78,15 @@ def run(task: str, name: str, n: int, shape: str, options: str, seed: int, itera
     environment = common.environment(device, schedule_for(device))
     (system,) = parse_systems(f"{shape}:{options}" if options else shape)
     name, reduction, cap = [*name.split(":"), "-1", str(n)][:3]
-    key = {"task": task, "scene": name, "splats": int(cap), "shape": shape, "options": options, "seed": seed,
-           "iterations": iterations} | {k: environment[k] for k in KEY if k in environment}
+    key = {
+        "task": task,
+        "scene": name,
+        "splats": int(cap),
+        "shape": shape,
+        "options": options,
+        "seed": seed,
+        "iterations": iterations,
+    } | {k: environment[k] for k in KEY if k in environment}
     if any(all(row[k] == value for k, value in key.items()) for row in common.read(args.out)):
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -132,8 +141,13 @@ def measure(trainer: Any, iterations: int) -> dict[str, Any]:
             splats_seen.append(visible.sum() / n)
             seen.append(visible.reshape(-1, lanes).any(axis=1).mean())
     late = {name: statistics.median(kept[len(kept) // 2 :]) for name, kept in stages.items()}  # at full size
-    return {"splats_seen": float(np.mean(splats_seen)), "vectors_seen": float(np.mean(seen)), "step_ms": late["step"],
-            "device_ms": late["device"], "wall_ms": 1e3 * seconds / (iterations - 1)}
+    return {
+        "splats_seen": float(np.mean(splats_seen)),
+        "vectors_seen": float(np.mean(seen)),
+        "step_ms": late["step"],
+        "device_ms": late["device"],
+        "wall_ms": 1e3 * seconds / (iterations - 1),
+    }
 
 
 def wide_scene(n: int, shape: str, size: tuple[int, int]) -> Any:
@@ -157,8 +171,20 @@ def wide_scene(n: int, shape: str, size: tuple[int, int]) -> Any:
 
 def print_table(rows: list[dict[str, Any]]) -> None:
     """A line for all seeds of a case, means of them."""
-    titles = ["scene", "splats", "shape", "options", "platform", "seeds", "splats seen", "vectors seen", "step [ms]",
-              "device [ms]", "wall [ms]", "PSNR [dB]"]
+    titles = [
+        "scene",
+        "splats",
+        "shape",
+        "options",
+        "platform",
+        "seeds",
+        "splats seen",
+        "vectors seen",
+        "step [ms]",
+        "device [ms]",
+        "wall [ms]",
+        "PSNR [dB]",
+    ]
     print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
     cases: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in rows:
@@ -170,10 +196,20 @@ def print_table(rows: list[dict[str, Any]]) -> None:
         def mean(name: str, found: list[dict[str, Any]] = found) -> float:
             return statistics.mean(one[name] for one in found)
 
-        cells = [row["scene"], row.get("end", row["splats"]), row["shape"], row["options"], row["platform"].split()[0],
-                 len(found), f"{mean('splats_seen'):.0%}", f"{mean('vectors_seen'):.0%}", f"{mean('step_ms'):.2f}",
-                 f"{mean('device_ms'):.1f}", f"{mean('wall_ms'):.1f}",
-                 ", ".join(f"{one['psnr']:.3f}" for one in found if "psnr" in one)]
+        cells = [
+            row["scene"],
+            row.get("end", row["splats"]),
+            row["shape"],
+            row["options"],
+            row["platform"].split()[0],
+            len(found),
+            f"{mean('splats_seen'):.0%}",
+            f"{mean('vectors_seen'):.0%}",
+            f"{mean('step_ms'):.2f}",
+            f"{mean('device_ms'):.1f}",
+            f"{mean('wall_ms'):.1f}",
+            ", ".join(f"{one['psnr']:.3f}" for one in found if "psnr" in one),
+        ]
         print("| " + " | ".join(map(str, cells)) + " |")
 
 

@@ -96,8 +96,12 @@ def camera_at(context: Any, item: Any, parent: Any = None) -> Camera:
     depsgraph = context.evaluated_depsgraph_get()
     seen = item.evaluated_get(depsgraph)
     raster = raster_of(context.scene.render)
-    camera = camera_of(lens_values(seen.data), type(raster)(raster.width, raster.height, raster.pixel_aspect_x,
-                                                            raster.pixel_aspect_y), seen.matrix_world, item.name)
+    camera = camera_of(
+        lens_values(seen.data),
+        type(raster)(raster.width, raster.height, raster.pixel_aspect_x, raster.pixel_aspect_y),
+        seen.matrix_world,
+        item.name,
+    )
     if parent is None:
         return camera
     try:
@@ -125,7 +129,8 @@ class ImportCameras(bpy.types.Operator, ImportHelper):  # type: ignore[misc]
     filename_ext = ".json"
     filter_glob: _FILTER  # type: ignore[valid-type]
     animated: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="As Animation", default=False, description="Make one animated camera of a cameras.json, a frame each")
+        name="As Animation", default=False, description="Make one animated camera of a cameras.json, a frame each"
+    )
 
     @reported
     def execute(self, context: Any) -> set[str]:
@@ -161,9 +166,13 @@ class ExportCameras(bpy.types.Operator, ExportHelper):  # type: ignore[misc]
 
     filename_ext = ".json"
     filter_glob: _FILTER  # type: ignore[valid-type]
-    content: bpy.props.EnumProperty(name="Content", items=[  # type: ignore[valid-type]
-        ("PATH", "Animation (camera_path.json)", "The scene's camera, frame by frame, as nerfstudio has it"),
-        ("CAMERAS", "Cameras (cameras.json)", "The selected cameras, or all, at this frame, as 3DGS has them")])
+    content: bpy.props.EnumProperty(
+        name="Content",
+        items=[  # type: ignore[valid-type]
+            ("PATH", "Animation (camera_path.json)", "The scene's camera, frame by frame, as nerfstudio has it"),
+            ("CAMERAS", "Cameras (cameras.json)", "The selected cameras, or all, at this frame, as 3DGS has them"),
+        ],
+    )
 
     @reported
     def execute(self, context: Any) -> set[str]:
@@ -178,7 +187,8 @@ class ExportCameras(bpy.types.Operator, ExportHelper):  # type: ignore[misc]
             write_path_of(context, file, parent)
             return {"FINISHED"}
         cameras = [item for item in context.selected_objects if item.type == "CAMERA"] or [
-            item for item in scene.objects if item.type == "CAMERA"]
+            item for item in scene.objects if item.type == "CAMERA"
+        ]
         if not cameras:
             raise InputError("the scene has no cameras: add one")
         write_cameras(file, [NamedCamera(item.name, camera_at(context, item, parent)) for item in cameras])

@@ -54,8 +54,12 @@ def composite(scene: Any, engine: str) -> Any:
         result = next(socket for socket in mix.outputs if socket.type == "RGBA")
     else:
         factor, first, second, result = mix.inputs[0], mix.inputs[1], mix.inputs[2], mix.outputs[0]
-    for source, target in ((nearer.outputs[0], factor), (behind.outputs[0], first), (before.outputs[0], second),
-                           (result, sink)):
+    for source, target in (
+        (nearer.outputs[0], factor),
+        (behind.outputs[0], first),
+        (before.outputs[0], second),
+        (result, sink),
+    ):
         tree.links.new(source, target)
     return splats
 
@@ -112,9 +116,14 @@ class Composite(bpy.types.Operator):  # type: ignore[misc]
     bl_label = "Composite With Meshes"
     bl_options = {"REGISTER", "UNDO"}
 
-    engine: bpy.props.EnumProperty(name="Engine", items=[  # type: ignore[valid-type]
-        ("CYCLES", "Cycles", "Path tracing"), ("BLENDER_EEVEE", "EEVEE", "Needs a graphics card"),
-        ("BLENDER_WORKBENCH", "Workbench", "Needs a graphics card")])
+    engine: bpy.props.EnumProperty(
+        name="Engine",
+        items=[  # type: ignore[valid-type]
+            ("CYCLES", "Cycles", "Path tracing"),
+            ("BLENDER_EEVEE", "EEVEE", "Needs a graphics card"),
+            ("BLENDER_WORKBENCH", "Workbench", "Needs a graphics card"),
+        ],
+    )
 
     @reported
     def execute(self, context: Any) -> set[str]:

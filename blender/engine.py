@@ -50,8 +50,13 @@ def objects_of(depsgraph: Any) -> list[Placed]:
     for instance in depsgraph.object_instances:
         original = instance.object.original
         if original.clsplat_ply and instance.show_self:
-            found.append(Placed(original.name, Path(bpy.path.abspath(original.clsplat_ply, library=original.library)),
-                                np.array(instance.matrix_world, np.float64)))
+            found.append(
+                Placed(
+                    original.name,
+                    Path(bpy.path.abspath(original.clsplat_ply, library=original.library)),
+                    np.array(instance.matrix_world, np.float64),
+                )
+            )
     return found
 
 
@@ -172,8 +177,9 @@ def lens_values(data: Any) -> Any:
     """The `Lens` of a Blender camera's data."""
     from .lens import Lens
 
-    return Lens(data.lens, data.sensor_width, data.sensor_height, data.sensor_fit, data.shift_x, data.shift_y,
-                data.type)
+    return Lens(
+        data.lens, data.sensor_width, data.sensor_height, data.sensor_fit, data.shift_x, data.shift_y, data.type
+    )
 
 
 def raster_of(settings: Any, width: int = 0, height: int = 0) -> Any:
@@ -185,5 +191,11 @@ def raster_of(settings: Any, width: int = 0, height: int = 0) -> Any:
         border = (settings.border_min_x, settings.border_min_y, settings.border_max_x, settings.border_max_y)
     if width and height:
         return Raster(width, height, settings.pixel_aspect_x, settings.pixel_aspect_y, border)
-    return Raster.of_settings(settings.resolution_x, settings.resolution_y, settings.resolution_percentage,
-                              settings.pixel_aspect_x, settings.pixel_aspect_y, border)
+    return Raster.of_settings(
+        settings.resolution_x,
+        settings.resolution_y,
+        settings.resolution_percentage,
+        settings.pixel_aspect_x,
+        settings.pixel_aspect_y,
+        border,
+    )

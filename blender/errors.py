@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-MISSING = ("clsplat is not installed in Blender's Python: see the preferences of the add-on clsplat for the command")
+MISSING = "clsplat is not installed in Blender's Python: see the preferences of the add-on clsplat for the command"
 
 
 def message_of(error: Exception) -> str | None:

@@ -61,11 +61,22 @@ class Raster:
     border: tuple[float, float, float, float] | None = None
 
     @staticmethod
-    def of_settings(resolution_x: int, resolution_y: int, percentage: int, pixel_aspect_x: float = 1.0,
-                    pixel_aspect_y: float = 1.0, border: tuple[float, float, float, float] | None = None) -> Raster:
+    def of_settings(
+        resolution_x: int,
+        resolution_y: int,
+        percentage: int,
+        pixel_aspect_x: float = 1.0,
+        pixel_aspect_y: float = 1.0,
+        border: tuple[float, float, float, float] | None = None,
+    ) -> Raster:
         """From Blender's settings; sizes are cut off to whole pixels, as Blender does."""
-        return Raster(max(1, resolution_x * percentage // 100), max(1, resolution_y * percentage // 100),
-                      pixel_aspect_x, pixel_aspect_y, border)
+        return Raster(
+            max(1, resolution_x * percentage // 100),
+            max(1, resolution_y * percentage // 100),
+            pixel_aspect_x,
+            pixel_aspect_y,
+            border,
+        )
 
     @property
     def pixels(self) -> tuple[int, int, int, int]:
@@ -119,8 +130,15 @@ def camera_of_matrices(view: ArrayLike, projection: ArrayLike, width: int, heigh
     world = np.asarray(np.linalg.inv(pose), np.float64)
     world[:3, :3] /= np.linalg.norm(world[:3, :3], axis=0)
     # Clip x = (P00 x + P02 z) / -z runs from -1 to 1 over the width, y likewise, upwards.
-    return Camera(width, height, lens[0, 0] * width / 2, lens[1, 1] * height / 2, (1 - lens[0, 2]) * width / 2,
-                  (1 + lens[1, 2]) * height / 2, cam_from_world_of(world))
+    return Camera(
+        width,
+        height,
+        lens[0, 0] * width / 2,
+        lens[1, 1] * height / 2,
+        (1 - lens[0, 2]) * width / 2,
+        (1 + lens[1, 2]) * height / 2,
+        cam_from_world_of(world),
+    )
 
 
 def lens_of(camera: Camera) -> tuple[Lens, tuple[float, float]]:
@@ -128,8 +146,14 @@ def lens_of(camera: Camera) -> tuple[Lens, tuple[float, float]]:
     aspect = camera.fx / camera.fy
     if math.isclose(aspect, 1.0, rel_tol=1e-6):
         aspect = 1.0
-    lens = Lens(camera.fx * SENSOR / camera.width, SENSOR, SENSOR * camera.height / camera.width, "HORIZONTAL",
-                0.5 - camera.cx / camera.width, (camera.cy - camera.height / 2) * aspect / camera.width)
+    lens = Lens(
+        camera.fx * SENSOR / camera.width,
+        SENSOR,
+        SENSOR * camera.height / camera.width,
+        "HORIZONTAL",
+        0.5 - camera.cx / camera.width,
+        (camera.cy - camera.height / 2) * aspect / camera.width,
+    )
     return lens, (max(1.0, 1.0 / aspect), max(1.0, aspect))
 
 

@@ -17,7 +17,8 @@ class Preferences(bpy.types.AddonPreferences):  # type: ignore[misc]
 
     device: bpy.props.StringProperty(  # type: ignore[valid-type]
         name="Device",
-        description='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name; empty: the best')
+        description='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name; empty: the best',
+    )
 
     def draw(self, context: Any) -> None:
         self.layout.prop(self, "device")

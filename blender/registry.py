@@ -11,8 +11,15 @@ from . import cameras, composite, engine, panels, splat_object
 CLASSES = (*splat_object.CLASSES, *cameras.CLASSES, *composite.CLASSES, *panels.CLASSES, engine.ClsplatRenderEngine)
 
 # Blender's panels for engines of its own that mean nothing here.
-_FOREIGN = ("VIEWLAYER_PT_filter", "VIEWLAYER_PT_layer_passes", "RENDER_PT_gpencil", "RENDER_PT_simplify",
-            "RENDER_PT_freestyle", "DATA_PT_camera_dof", "DATA_PT_camera_dof_aperture")
+_FOREIGN = (
+    "VIEWLAYER_PT_filter",
+    "VIEWLAYER_PT_layer_passes",
+    "RENDER_PT_gpencil",
+    "RENDER_PT_simplify",
+    "RENDER_PT_freestyle",
+    "DATA_PT_camera_dof",
+    "DATA_PT_camera_dof_aperture",
+)
 
 
 def register() -> None:
@@ -20,10 +27,17 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Object.clsplat_ply = bpy.props.StringProperty(
-        name="Splats", description="PLY of the splats that are rendered at this object's place", subtype="FILE_PATH")
+        name="Splats", description="PLY of the splats that are rendered at this object's place", subtype="FILE_PATH"
+    )
     bpy.types.Scene.clsplat_background = bpy.props.FloatVectorProperty(
-        name="Background", description="Display colour behind the splats where the film is not transparent",
-        subtype="COLOR_GAMMA", size=3, min=0.0, max=1.0, default=(0.0, 0.0, 0.0))
+        name="Background",
+        description="Display colour behind the splats where the film is not transparent",
+        subtype="COLOR_GAMMA",
+        size=3,
+        min=0.0,
+        max=1.0,
+        default=(0.0, 0.0, 0.0),
+    )
     for panel in _suiting_panels():
         panel.COMPAT_ENGINES.add(engine.IDNAME)
     bpy.types.TOPBAR_MT_file_import.append(splat_object.draw_import)
@@ -47,5 +61,8 @@ def unregister() -> None:
 
 def _suiting_panels() -> list[Any]:
     """Panels of output, camera and film that Blender shows for its simple engines."""
-    return [panel for panel in bpy.types.Panel.__subclasses__()
-            if "BLENDER_RENDER" in getattr(panel, "COMPAT_ENGINES", ()) and panel.__name__ not in _FOREIGN]
+    return [
+        panel
+        for panel in bpy.types.Panel.__subclasses__()
+        if "BLENDER_RENDER" in getattr(panel, "COMPAT_ENGINES", ()) and panel.__name__ not in _FOREIGN
+    ]

@@ -72,14 +72,20 @@ class ImportSplats(bpy.types.Operator, ImportHelper):  # type: ignore[misc]
     filename_ext = ".ply"
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})  # type: ignore[valid-type]
     upright: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Upright", default=True, description="Turn the file's downward y axis to Blender's downward z axis")
+        name="Upright", default=True, description="Turn the file's downward y axis to Blender's downward z axis"
+    )
     points: bpy.props.IntProperty(  # type: ignore[valid-type]
-        name="Points", default=100_000, min=1,
-        description="At most so many points stand for the splats in the viewport; all splats are rendered")
+        name="Points",
+        default=100_000,
+        min=1,
+        description="At most so many points stand for the splats in the viewport; all splats are rendered",
+    )
     use_engine: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Render with clsplat", default=True,
+        name="Render with clsplat",
+        default=True,
         description="Make clsplat the scene's render engine, with the view transform Standard, which shows the "
-                    "splats' own colours")
+        "splats' own colours",
+    )
 
     @reported
     def execute(self, context: Any) -> set[str]:

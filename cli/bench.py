@@ -28,25 +28,55 @@ _NEAR = 0.5  # of a limit: closer than that it is what limits
 
 @click.command()
 @scene_options
-@click.option("-m", "--model-path", "model_path", type=PATH, metavar="MODEL_OR_PLY",
-              help="With -s: the splats of a trained model.  [default: the scene's points]")
-@click.option("--splats", type=click.IntRange(min=1), metavar="N",
-              help=f"How many made-up splats, or with -s how many of the scene's points at most.  [default: {SPLATS}; "
-                   "with -s all]")
+@click.option(
+    "-m",
+    "--model-path",
+    "model_path",
+    type=PATH,
+    metavar="MODEL_OR_PLY",
+    help="With -s: the splats of a trained model.  [default: the scene's points]",
+)
+@click.option(
+    "--splats",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help=f"How many made-up splats, or with -s how many of the scene's points at most.  [default: {SPLATS}; "
+    "with -s all]",
+)
 @click.option("--width", type=click.IntRange(min=16), default=WIDTH, show_default=True, help="Without -s [px].")
 @click.option("--height", type=click.IntRange(min=16), default=HEIGHT, show_default=True, help="Without -s [px].")
-@click.option("--shape", type=click.Choice(tuple(SHAPES)),
-              help=f"The splat kernel.  [default: {DEFAULT_SHAPE}, or the model's]")
-@click.option("--sh-degree", type=click.IntRange(0, 3), default=3, show_default=True,
-              help="Degree of spherical harmonics.")
-@click.option("--iterations", "--steps", type=click.IntRange(1, 1000), default=10, show_default=True,
-              help="How many are timed, after a few that are not.")
+@click.option(
+    "--shape", type=click.Choice(tuple(SHAPES)), help=f"The splat kernel.  [default: {DEFAULT_SHAPE}, or the model's]"
+)
+@click.option(
+    "--sh-degree", type=click.IntRange(0, 3), default=3, show_default=True, help="Degree of spherical harmonics."
+)
+@click.option(
+    "--iterations",
+    "--steps",
+    type=click.IntRange(1, 1000),
+    default=10,
+    show_default=True,
+    help="How many are timed, after a few that are not.",
+)
 @click.option("--json", "json_path", type=PATH, metavar="FILE", help="Write all numbers there, too.")
 @device_option
 @click.pass_context
-def bench(ctx: click.Context, source_path: Path | None, images: str | None, resolution: int | None,
-          model_path: Path | None, splats: int | None, width: int, height: int, shape: str | None, sh_degree: int,
-          iterations: int, json_path: Path | None, device: str | None) -> None:
+def bench(
+    ctx: click.Context,
+    source_path: Path | None,
+    images: str | None,
+    resolution: int | None,
+    model_path: Path | None,
+    splats: int | None,
+    width: int,
+    height: int,
+    shape: str | None,
+    sh_degree: int,
+    iterations: int,
+    json_path: Path | None,
+    device: str | None,
+) -> None:
     """Time each stage of a training step and of an image, and compare with what the device can do at best.
 
     The limits are measured on the same device: bytes a second of a copy, operations a second of fused multiply-adds.
@@ -82,8 +112,11 @@ def bench(ctx: click.Context, source_path: Path | None, images: str | None, reso
         click.echo("\n" + "\n".join(describe(reports[-1], scene.name)))
     if json_path is not None:
         values = device_record(opened, schedule) | {
-            "scene": scene.name, "copy_bytes_per_s": limits.copy, "fma_flops_per_s": limits.fma,
-            "reports": [report.to_json() for report in reports]}
+            "scene": scene.name,
+            "copy_bytes_per_s": limits.copy,
+            "fma_flops_per_s": limits.fma,
+            "reports": [report.to_json() for report in reports],
+        }
         with atomic_writer(json_path) as stream:
             stream.write(json.dumps(values, indent=1).encode())
 
@@ -110,16 +143,25 @@ def describe(report: Report, scene: str) -> list[str]:
 
 def cells(stage: StageTime) -> tuple[str, ...]:
     """One row of the table; nothing where nothing is counted."""
-    return (stage.stage, f"{stage.ms:.3f}", _percent(stage.share),
-            f"{1e-6 * stage.bytes:.1f}" if stage.bytes else "", _percent(stage.of_copy),
-            f"{1e-6 * stage.flops:.0f}" if stage.flops else "", _percent(stage.of_fma))
+    return (
+        stage.stage,
+        f"{stage.ms:.3f}",
+        _percent(stage.share),
+        f"{1e-6 * stage.bytes:.1f}" if stage.bytes else "",
+        _percent(stage.of_copy),
+        f"{1e-6 * stage.flops:.0f}" if stage.flops else "",
+        _percent(stage.of_fma),
+    )
 
 
 def sentence(stage: StageTime) -> str:
     """What limits a stage, as far as the two fractions tell."""
     start = f"{stage.stage} takes {_percent(stage.share)} of the time"
-    fractions = [f"{_percent(fraction)} of the {name} limit"
-                 for name, fraction in (("FMA", stage.of_fma), ("copy", stage.of_copy)) if fraction is not None]
+    fractions = [
+        f"{_percent(fraction)} of the {name} limit"
+        for name, fraction in (("FMA", stage.of_fma), ("copy", stage.of_copy))
+        if fraction is not None
+    ]
     if stage.stage == "host":
         return f"{start}: the device waits for Python and its driver; more splats or pixels would hide it."
     if not fractions:
@@ -137,8 +179,9 @@ def _percent(fraction: float | None) -> str:
     return "" if fraction is None else f"{100 * fraction:.0f} %"
 
 
-def _read(path: Path, images: str | None, resolution: int | None, model: Path | None,
-          splats: int | None) -> tuple[Scene, Splats | int]:
+def _read(
+    path: Path, images: str | None, resolution: int | None, model: Path | None, splats: int | None
+) -> tuple[Scene, Splats | int]:
     """The scene, all of its views, and what to start from."""
     from clsplat.scenes.scene import load_scene
 

@@ -21,15 +21,24 @@ from .options import PATH
 _MANIFEST = "blender_manifest.toml"
 _WHEN = (1980, 1, 1, 0, 0, 0)  # the same files make the same zip
 # Blender's names of the platforms that wheels are built for.
-_PLATFORMS = {r"linux.*x86_64": "linux-x64", r"win_amd64": "windows-x64", r"win_arm64": "windows-arm64",
-              r"macosx.*(arm64|universal2)": "macos-arm64", r"macosx.*(x86_64|universal2)": "macos-x64"}
+_PLATFORMS = {
+    r"linux.*x86_64": "linux-x64",
+    r"win_amd64": "windows-x64",
+    r"win_arm64": "windows-arm64",
+    r"macosx.*(arm64|universal2)": "macos-arm64",
+    r"macosx.*(x86_64|universal2)": "macos-x64",
+}
 
 
 @click.command()
 @click.option("-o", "--output", type=PATH, default=Path("clsplat-addon.zip"), show_default=True, metavar="FILE")
-@click.option("--wheels", type=PATH, metavar="DIR",
-              help="Put the wheels of this folder inside, which Blender then installs with the add-on; all but "
-                   "NumPy's, which Blender brings along.")
+@click.option(
+    "--wheels",
+    type=PATH,
+    metavar="DIR",
+    help="Put the wheels of this folder inside, which Blender then installs with the add-on; all but "
+    "NumPy's, which Blender brings along.",
+)
 def build_addon(output: Path, wheels: Path | None) -> None:
     """Build the Blender add-on as a zip: in Blender, Edit > Preferences > Get Extensions > Install from Disk.
 
@@ -41,14 +50,17 @@ def build_addon(output: Path, wheels: Path | None) -> None:
     with atomic_writer(output) as stream:
         stream.write(addon_zip(bundled))
     with_wheels = f" with {len(bundled)} wheels" if bundled else ""
-    click.echo(f"{output}: add-on {__version__}{with_wheels}; in Blender, Edit > Preferences > Get Extensions > "
-               "Install from Disk")
+    click.echo(
+        f"{output}: add-on {__version__}{with_wheels}; in Blender, Edit > Preferences > Get Extensions > "
+        "Install from Disk"
+    )
 
 
 def addon_zip(wheels: list[Path]) -> bytes:
     """The zip's bytes; the same for the same sources and wheels."""
-    contents = {entry.name: entry.read_bytes() for entry in files("clsplat_blender").iterdir()
-                if entry.name.endswith(".py")}
+    contents = {
+        entry.name: entry.read_bytes() for entry in files("clsplat_blender").iterdir() if entry.name.endswith(".py")
+    }
     contents[_MANIFEST] = manifest(wheels).encode("utf-8")
     licence = importlib.metadata.distribution("clsplat").read_text("licenses/LICENSE")
     if licence:
@@ -72,8 +84,14 @@ def manifest(wheels: list[Path]) -> str:
     if wheels:
         named = json.dumps([f"./wheels/{wheel.name}" for wheel in wheels], indent=2)
         lines = f"wheels = {named}\n"
-        platforms = sorted({place for wheel in wheels for pattern, place in _PLATFORMS.items()
-                            if re.search(pattern, wheel.stem.rsplit("-", 1)[-1])})
+        platforms = sorted(
+            {
+                place
+                for wheel in wheels
+                for pattern, place in _PLATFORMS.items()
+                if re.search(pattern, wheel.stem.rsplit("-", 1)[-1])
+            }
+        )
         if platforms:
             lines = f"platforms = {json.dumps(platforms)}\n{lines}"
     head, section, rest = text.partition("[permissions]")

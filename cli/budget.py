@@ -27,16 +27,31 @@ KEYS = ("budget", "budget_tolerance", "target_psnr", "max_bytes")
 def budget_options(function: F) -> F:
     """`--budget`, `--budget-tolerance`, `--target-psnr` and `--max-bytes`."""
     for option in (
-        click.option("--max-bytes", type=click.IntRange(min=1), metavar="N",
-                     help="The best model whose file has at most N bytes; implies --budget auto."),
-        click.option("--target-psnr", type=Decibels(), metavar="DB",
-                     help="The smallest model with that PSNR on validation views; implies --budget auto."),
-        click.option("--budget-tolerance", type=Decibels(), metavar="DB",
-                     help="PSNR on validation views that fewer splats and parameters may cost; implies --budget "
-                          f"auto.  [default: {TOLERANCE:g}]"),
-        click.option("--budget", type=click.Choice(["auto"]),
-                     help="Find the smallest model that the scene needs, on views held out of the training set. "
-                          "--cap-max is the most splats that are tried. Takes the time of five to nine runs."),
+        click.option(
+            "--max-bytes",
+            type=click.IntRange(min=1),
+            metavar="N",
+            help="The best model whose file has at most N bytes; implies --budget auto.",
+        ),
+        click.option(
+            "--target-psnr",
+            type=Decibels(),
+            metavar="DB",
+            help="The smallest model with that PSNR on validation views; implies --budget auto.",
+        ),
+        click.option(
+            "--budget-tolerance",
+            type=Decibels(),
+            metavar="DB",
+            help="PSNR on validation views that fewer splats and parameters may cost; implies --budget "
+            f"auto.  [default: {TOLERANCE:g}]",
+        ),
+        click.option(
+            "--budget",
+            type=click.Choice(["auto"]),
+            help="Find the smallest model that the scene needs, on views held out of the training set. "
+            "--cap-max is the most splats that are tried. Takes the time of five to nine runs.",
+        ),
     ):
         function = option(function)
     return function
@@ -81,16 +96,26 @@ def stored_search(folder: Path) -> tuple[dict[str, Any], BudgetOptions, dict[str
     return {name: getattr(config, name) for name in state.values["config"]}, options, scene
 
 
-def run_search(ctx: click.Context, scene: Scene, config: TrainConfig, options: BudgetOptions, model_path: Path,
-               record: dict[str, Any], resume: bool, overwrite: bool, quiet: bool) -> None:
+def run_search(
+    ctx: click.Context,
+    scene: Scene,
+    config: TrainConfig,
+    options: BudgetOptions,
+    model_path: Path,
+    record: dict[str, Any],
+    resume: bool,
+    overwrite: bool,
+    quiet: bool,
+) -> None:
     """Search with a live display, and say what was found."""
     from clsplat.compression.search import train_budget
 
     result: Budgeted | None = None
     try:
         with TrainingDisplay(quiet) as display:
-            result = train_budget(scene, config, options, display, output=model_path, resume=resume,
-                                  overwrite=overwrite, extra=record)
+            result = train_budget(
+                scene, config, options, display, output=model_path, resume=resume, overwrite=overwrite, extra=record
+            )
     except KeyboardInterrupt:
         _say_stopped(ctx, model_path)
     if not result.finished:
@@ -114,12 +139,14 @@ def lines_of(result: Budgeted) -> list[str]:
     """What the search found."""
     report, final = result.report, result.report["final"]
     held_out = report["held_out"]
-    lines = [f"growth: pays up to {report['knee']} splats",
-             f"rounds: {report['rounds'][report['chosen']]['splats']} of {report['rounds'][0]['splats']} splats stay",
-             f"validation views: PSNR {held_out['psnr_pruned']:.2f} dB, with all splats and parameters "
-             f"{report['rounds'][0]['psnr']:.2f} dB",
-             f"{result.path}: {final['splats']} splats, {final['skewed_fraction']:.0%} skewed, "
-             f"{final['parameters_in_use']} parameters, {final['bytes'] / 1e6:.2f} MB; {result.seconds:.0f} s in all"]
+    lines = [
+        f"growth: pays up to {report['knee']} splats",
+        f"rounds: {report['rounds'][report['chosen']]['splats']} of {report['rounds'][0]['splats']} splats stay",
+        f"validation views: PSNR {held_out['psnr_pruned']:.2f} dB, with all splats and parameters "
+        f"{report['rounds'][0]['psnr']:.2f} dB",
+        f"{result.path}: {final['splats']} splats, {final['skewed_fraction']:.0%} skewed, "
+        f"{final['parameters_in_use']} parameters, {final['bytes'] / 1e6:.2f} MB; {result.seconds:.0f} s in all",
+    ]
     return lines + [f"warning: {final['missed']}"] * (final["missed"] is not None)
 
 

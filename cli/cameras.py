@@ -23,15 +23,26 @@ _COLMAP_FILES = ("cameras", "images", "points3D")
 @click.command("cameras")
 @click.argument("source", type=PATH)
 @click.argument("output", type=PATH)
-@click.option("--format", "form", type=click.Choice(FORMATS),
-              help="nerfstudio's and instant-ngp's transforms.json, a COLMAP model (.bin or .txt), or 3DGS's "
-                   "cameras.json.  [default: by OUTPUT: cameras.json, other .json files transforms, else colmap]")
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(FORMATS),
+    help="nerfstudio's and instant-ngp's transforms.json, a COLMAP model (.bin or .txt), or 3DGS's "
+    "cameras.json.  [default: by OUTPUT: cameras.json, other .json files transforms, else colmap]",
+)
 @click.option("-i", "--images", help="Folder of the photos inside a scene.")
 @iteration_option
 @overwrite_option
 @quiet_option
-def write_cameras_of(source: Path, output: Path, form: str | None, images: str | None, iteration: int | None,
-                     overwrite: bool, quiet: bool) -> None:
+def write_cameras_of(
+    source: Path,
+    output: Path,
+    form: str | None,
+    images: str | None,
+    iteration: int | None,
+    overwrite: bool,
+    quiet: bool,
+) -> None:
     """Write the cameras of SOURCE into OUTPUT, a .json file or a COLMAP model's folder, with points beside them.
 
     SOURCE is a scene (its cameras keep their lenses, and the files name its photos), a model folder, or a cameras.json
@@ -71,8 +82,11 @@ def _of_scene(scene: Path, images: str | None) -> tuple[list[Photo], list[Path],
     posed = read_posed(scene, images)
     first = {photo.name.partition("/")[0] if "/" in photo.name else None for photo in posed.photos}
     cut = len(first.pop() or "") + 1 if len(first) == 1 and None not in first else 0
-    return [replace(photo, name=photo.name[cut:]) for photo in posed.photos], \
-        [posed.files[photo.name] for photo in posed.photos], posed.points
+    return (
+        [replace(photo, name=photo.name[cut:]) for photo in posed.photos],
+        [posed.files[photo.name] for photo in posed.photos],
+        posed.points,
+    )
 
 
 def _of_model(source: Path, iteration: int | None) -> tuple[list[Photo], Points]:
@@ -117,8 +131,10 @@ def _write_3dgs(output: Path, photos: list[Photo]) -> None:
 
     bent = [photo for photo in photos if not is_pinhole(photo.lens)]
     if bent:
-        raise InputError(f"image {bent[0].name!r}: 3DGS's cameras.json has no distorted lenses: write transforms or a "
-                         "COLMAP model")
-    cameras = [pinhole_camera(photo.lens, photo.cam_from_world, photo.lens.width, photo.lens.height)
-               for photo in photos]
+        raise InputError(
+            f"image {bent[0].name!r}: 3DGS's cameras.json has no distorted lenses: write transforms or a COLMAP model"
+        )
+    cameras = [
+        pinhole_camera(photo.lens, photo.cam_from_world, photo.lens.width, photo.lens.height) for photo in photos
+    ]
     write_cameras(output, named_cameras([photo.name for photo in photos], cameras))

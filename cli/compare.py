@@ -37,8 +37,13 @@ if TYPE_CHECKING:
 @click.command("compare", cls=SpacedLists)
 @click.argument("scenes", nargs=-1, required=True, type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, metavar="DIR", help="Folder of the runs and the table.")
-@click.option("--systems", default=",".join((DEFAULT, *PRESETS)), show_default=True, metavar="NAME,NAME,...",
-              help='Presets, shapes, or "default"; any with changes: sns:alternation=off,skew_map=coupled.')
+@click.option(
+    "--systems",
+    default=",".join((DEFAULT, *PRESETS)),
+    show_default=True,
+    metavar="NAME,NAME,...",
+    help='Presets, shapes, or "default"; any with changes: sns:alternation=off,skew_map=coupled.',
+)
 @click.option("--cap-max", "caps", type=Numbers("caps"), multiple=True, help="Most splats.  [default: 5000]")
 @click.option("--seeds", type=Numbers("seeds", 0), multiple=True, help="A run for each.  [default: 0]")
 @photo_options
@@ -48,9 +53,18 @@ if TYPE_CHECKING:
 @quiet_option
 @config_options("shape", "cap_max", "seed", "save_iterations", "test_iterations", "checkpoint_interval")
 @click.pass_context
-def compare_systems(ctx: click.Context, /, scenes: tuple[Path, ...], output: Path, systems: str,
-                    caps: tuple[tuple[int, ...], ...], seeds: tuple[tuple[int, ...], ...], save_models: bool,
-                    quiet: bool, **values: Any) -> None:
+def compare_systems(
+    ctx: click.Context,
+    /,
+    scenes: tuple[Path, ...],
+    output: Path,
+    systems: str,
+    caps: tuple[tuple[int, ...], ...],
+    seeds: tuple[tuple[int, ...], ...],
+    save_models: bool,
+    quiet: bool,
+    **values: Any,
+) -> None:
     """Train each of the systems on SCENES with equal caps, iterations and seeds, and measure the test views.
 
     Options of training hold for all systems; a system's own changes replace them. Writes a line a run into
@@ -61,8 +75,17 @@ def compare_systems(ctx: click.Context, /, scenes: tuple[Path, ...], output: Pat
 
     common, loaded = options_and_scenes(ctx, scenes, values)
     with TrainingDisplay(quiet) as display:
-        records = compare(loaded, parse_systems(systems), output, flat(caps) or [5000], flat(seeds) or [0], common,
-                          save_models=save_models, progress=display, on_run=None if quiet else say_run)
+        records = compare(
+            loaded,
+            parse_systems(systems),
+            output,
+            flat(caps) or [5000],
+            flat(seeds) or [0],
+            common,
+            save_models=save_models,
+            progress=display,
+            on_run=None if quiet else say_run,
+        )
     if not quiet:
         rows = summarise(records)
         click.echo(table(HEAD, map(cells, rows)))
@@ -70,8 +93,9 @@ def compare_systems(ctx: click.Context, /, scenes: tuple[Path, ...], output: Pat
             click.echo(note)
 
 
-def options_and_scenes(ctx: click.Context, paths: Sequence[Path],
-                       values: dict[str, Any]) -> tuple[dict[str, Any], Iterator[Scene]]:
+def options_and_scenes(
+    ctx: click.Context, paths: Sequence[Path], values: dict[str, Any]
+) -> tuple[dict[str, Any], Iterator[Scene]]:
     """Options of training that stand on the command line, and the scenes, each read when it is asked for."""
     common = config_values(ctx, values)
     reading = {key: values[key] for key in SCENE_KEYS if key in values and is_given(ctx, key)} | {"eval": True}
@@ -95,5 +119,8 @@ def say_run(run: Run, record: Record | None) -> None:
     elif record["failed"]:
         click.echo(f"{run}: failed: {record['failed']}", err=True)
     else:
-        click.echo(f"{run}: PSNR {record['psnr']:.2f} dB, SSIM {record['ssim']:.4f}, {record['splats']} splats, "
-                   f"{duration(record['seconds'])}", err=True)
+        click.echo(
+            f"{run}: PSNR {record['psnr']:.2f} dB, SSIM {record['ssim']:.4f}, {record['splats']} splats, "
+            f"{duration(record['seconds'])}",
+            err=True,
+        )

@@ -24,21 +24,43 @@ _GAUSSIANS = (".splat", ".spz")  # files that hold no other shape
 @click.command("convert")
 @click.argument("model", type=PATH)
 @click.argument("output", type=PATH)
-@click.option("--shape", type=click.Choice(list(SHAPES)),
-              help="The splat kernel to convert to.  [default: the model's; of .splat and .spz files gaussian]")
-@click.option("--approximate", is_flag=True,
-              help="Where splats have no equal Gaussian, take the nearest, and measure what it costs.")
-@click.option("--sh-degree", type=click.IntRange(0, MAX_SH_DEGREE),
-              help="Leave out the SH bands above, or add bands of zeros: some programs read degree 3 only.")
-@click.option("--cameras", type=PATH, metavar="FILE",
-              help="A cameras.json to measure from.  [default: that of the model's folder]")
+@click.option(
+    "--shape",
+    type=click.Choice(list(SHAPES)),
+    help="The splat kernel to convert to.  [default: the model's; of .splat and .spz files gaussian]",
+)
+@click.option(
+    "--approximate",
+    is_flag=True,
+    help="Where splats have no equal Gaussian, take the nearest, and measure what it costs.",
+)
+@click.option(
+    "--sh-degree",
+    type=click.IntRange(0, MAX_SH_DEGREE),
+    help="Leave out the SH bands above, or add bands of zeros: some programs read degree 3 only.",
+)
+@click.option(
+    "--cameras",
+    type=PATH,
+    metavar="FILE",
+    help="A cameras.json to measure from.  [default: that of the model's folder]",
+)
 @iteration_option
 @click.option("--overwrite", is_flag=True, help="Replace OUTPUT.")
 @device_option
 @quiet_option
-def convert_model(model: Path, output: Path, shape: str | None, approximate: bool, sh_degree: int | None,
-                  cameras: Path | None, iteration: int | None, overwrite: bool, device: str | None,
-                  quiet: bool) -> None:
+def convert_model(
+    model: Path,
+    output: Path,
+    shape: str | None,
+    approximate: bool,
+    sh_degree: int | None,
+    cameras: Path | None,
+    iteration: int | None,
+    overwrite: bool,
+    device: str | None,
+    quiet: bool,
+) -> None:
     """Write MODEL, a folder or a file of splats, into OUTPUT: a .ply of all columns, or a .splat or .spz file.
 
     Without --approximate only exact conversions of the shape are made: where a splat has no equal in the other shape,
@@ -116,9 +138,11 @@ def _cost(loaded: LoadedModel, converted: Splats, cameras: Path | None, device: 
         return "what that costs was not measured: name cameras with --cameras FILE"
     renderer, worst, total = Renderer(device), float("inf"), 0.0
     for entry in named:
-        own, new = (renderer.render(splats, entry.camera, loaded.background).color
-                    for splats in (loaded.splats, converted))
+        own, new = (
+            renderer.render(splats, entry.camera, loaded.background).color for splats in (loaded.splats, converted)
+        )
         value = min(psnr(own, new), MAX_PSNR)
         worst, total = min(worst, value), total + value
-    return (f"PSNR against the model's own images, {len(named)} cameras: {total / len(named):.2f} dB, "
-            f"worst {worst:.2f} dB")
+    return (
+        f"PSNR against the model's own images, {len(named)} cameras: {total / len(named):.2f} dB, worst {worst:.2f} dB"
+    )

@@ -35,8 +35,17 @@ ITERATIONS, CAP = 1500, 6000
 @device_option
 @quiet_option
 @click.pass_context
-def demo(ctx: click.Context, out: Path, iterations: int, cap_max: int, width: int, views: int,
-         overwrite: bool, device: str | None, quiet: bool) -> None:
+def demo(
+    ctx: click.Context,
+    out: Path,
+    iterations: int,
+    cap_max: int,
+    width: int,
+    views: int,
+    overwrite: bool,
+    device: str | None,
+    quiet: bool,
+) -> None:
     """Make a small scene in OUT/scene, train on it, render its test views and measure them.
 
     OUT/scene is kept when it is there already; OUT/model and OUT/renders are replaced with --overwrite.
@@ -61,16 +70,20 @@ def demo(ctx: click.Context, out: Path, iterations: int, cap_max: int, width: in
     result = measured.result
     if quiet:
         return
-    click.echo(f"\ntest views ({len(scene.test)}): PSNR {result['PSNR']:.2f} dB, SSIM {result['SSIM']:.4f}, "
-               f"{result['render_ms']:.1f} ms each; {result['splats']} splats")
+    click.echo(
+        f"\ntest views ({len(scene.test)}): PSNR {result['PSNR']:.2f} dB, SSIM {result['SSIM']:.4f}, "
+        f"{result['render_ms']:.1f} ms each; {result['splats']} splats"
+    )
     click.echo(describe(DEFAULT_PROTOCOL))
     click.echo(f"all done in {duration(time.perf_counter() - start)}. Look at:")
     first = output_stems([scene.test[0].name])[0]
-    for path, what in ((page, "the test views beside their photos, in a browser"),
-                       (renders / f"{first}.png", "a rendered test view"),
-                       (out / "scene" / "images" / scene.test[0].name, "the photo of it"),
-                       (trained.ply, "the splats, for any viewer"),
-                       (folder.path / "results.json", "the numbers")):
+    for path, what in (
+        (page, "the test views beside their photos, in a browser"),
+        (renders / f"{first}.png", "a rendered test view"),
+        (out / "scene" / "images" / scene.test[0].name, "the photo of it"),
+        (trained.ply, "the splats, for any viewer"),
+        (folder.path / "results.json", "the numbers"),
+    ):
         click.echo(f"  {path}  {what}")
 
 

@@ -82,8 +82,7 @@ def hints(platforms: set[str], has_gpu: bool, root: Path = Path("/")) -> list[st
     if not any(os.access(node, os.R_OK | os.W_OK) for node in nodes):
         return [f"a GPU is here, but this user may not use {nodes[0]}: add the user to the group `render`"]
     return [
-        "a GPU is here, but no OpenCL driver for it: install intel-opencl-icd (Intel) "
-        "or ROCm's OpenCL runtime (AMD)"
+        "a GPU is here, but no OpenCL driver for it: install intel-opencl-icd (Intel) or ROCm's OpenCL runtime (AMD)"
     ]
 
 

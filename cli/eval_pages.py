@@ -88,31 +88,41 @@ def write_model_page(path: Path, scene: str, measured: Sequence[Measurement], la
 
     first = measured[0].result
     what = f"{first['views']} {'' if first['set'] == 'all' else first['set'] + ' '}views of {scene}"
-    models = [Measured(label, _costs(one), _facts(one), one.per_view, one.shots)
-              for label, one in zip(labels, measured, strict=True)]
+    models = [
+        Measured(label, _costs(one), _facts(one), one.per_view, one.shots)
+        for label, one in zip(labels, measured, strict=True)
+    ]
     return write_eval_report(path, models, what, _protocol_lines(first))
 
 
 def _protocol_lines(result: dict[str, Any]) -> list[str]:
     said = {key: text for key, text in result["protocol"].items() if key != "name"}
-    lines = [f"Protocol {result['protocol']['name']}. " + ". ".join(f"{key}: {text}" for key, text in said.items())
-             + ". Numbers of different protocols must not be compared. Render times are the median over the views."]
+    lines = [
+        f"Protocol {result['protocol']['name']}. "
+        + ". ".join(f"{key}: {text}" for key, text in said.items())
+        + ". Numbers of different protocols must not be compared. Render times are the median over the views."
+    ]
     lines.append(f"On {result['device']}, by clsplat {__version__}, {date.today().isoformat()}.")
     return lines
 
 
 def _costs(measured: Measurement) -> dict[str, str]:
     result = measured.result
-    return {"splats": str(result["splats"]), "render [ms]": f"{result['render_ms']:.1f}",
-            "MB": f"{result['bytes'] / 1e6:.2f}"}
+    return {
+        "splats": str(result["splats"]),
+        "render [ms]": f"{result['render_ms']:.1f}",
+        "MB": f"{result['bytes'] / 1e6:.2f}",
+    }
 
 
 def _facts(measured: Measurement) -> list[tuple[str, str]]:
     result, model = measured.result, measured.model
     facts = [
         ("file", str(model.ply)),
-        ("shape", f"{result['shape']} ({result['normalisation']})"
-                  + (", antialiased" if model.splats.antialiased else "")),
+        (
+            "shape",
+            f"{result['shape']} ({result['normalisation']})" + (", antialiased" if model.splats.antialiased else ""),
+        ),
         ("splats", f"{result['splats']}" + (f", {result['skewed']} of them skewed" if result["skewed"] else "")),
         ("SH degree", str(model.splats.sh_degree)),
         ("bytes", f"{result['bytes']} ({result['compact_bytes']} written compactly)"),

@@ -45,25 +45,52 @@ _DIGITS = {"PSNR": 3, "SSIM": 4, "LPIPS": 4, "FLIP": 4}
 @click.option("-m", "--model-path", "more_models", type=PATH, multiple=True, help="The same as an argument.")
 @scene_options
 @set_option
-@click.option("--compat", type=click.Choice(list(PROTOCOLS)), default=DEFAULT_PROTOCOL.name,
-              show_default=True, help="How PSNR and SSIM are taken; 3dgs pads SSIM with zeros.")
-@click.option("--color-correct", is_flag=True,
-              help="Measure and show renders after the affine map of colours that brings each nearest to its photo.")
+@click.option(
+    "--compat",
+    type=click.Choice(list(PROTOCOLS)),
+    default=DEFAULT_PROTOCOL.name,
+    show_default=True,
+    help="How PSNR and SSIM are taken; 3dgs pads SSIM with zeros.",
+)
+@click.option(
+    "--color-correct",
+    is_flag=True,
+    help="Measure and show renders after the affine map of colours that brings each nearest to its photo.",
+)
 @click.option("--lpips", is_flag=True, help="Also LPIPS, by VGG16 (pip install 'clsplat[lpips]').")
 @click.option("--flip", is_flag=True, help="Also FLIP, and its maps on the page (pip install 'clsplat[flip]').")
-@click.option("--report", type=PATH, metavar="FILE",
-              help="Where the page goes; of several models it compares them.  [default: report.html in each model]")
+@click.option(
+    "--report",
+    type=PATH,
+    metavar="FILE",
+    help="Where the page goes; of several models it compares them.  [default: report.html in each model]",
+)
 @click.option("--no-report", is_flag=True, help="Write no page.")
 @click.option("--save-renders", type=PATH, metavar="DIR", help="Also write the images as PNG.")
 @background_options
 @iteration_option
 @device_option
 @quiet_option
-def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], source_path: Path | None,
-                    images: str | None, resolution: int | None, view_set: str | None, compat: str,
-                    color_correct: bool, lpips: bool, flip: bool, report: Path | None, no_report: bool,
-                    save_renders: Path | None, background: RGB | None, white_background: bool,
-                    iteration: int | None, device: str | None, quiet: bool) -> None:
+def evaluate_models(
+    models: tuple[Path, ...],
+    more_models: tuple[Path, ...],
+    source_path: Path | None,
+    images: str | None,
+    resolution: int | None,
+    view_set: str | None,
+    compat: str,
+    color_correct: bool,
+    lpips: bool,
+    flip: bool,
+    report: Path | None,
+    no_report: bool,
+    save_renders: Path | None,
+    background: RGB | None,
+    white_background: bool,
+    iteration: int | None,
+    device: str | None,
+    quiet: bool,
+) -> None:
     """Measure MODELS on their scenes' test views.
 
     Writes results.json, per_view.json and report.html, a page with the images, into each model's folder (with --set
@@ -90,8 +117,19 @@ def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], sou
             raise InputError(f"{path}: is a file; eval takes model folders (render takes any PLY)")
         scene = scene_of(loaded, source_path, images, resolution)
         renders = save_renders and (save_renders / path.resolve().name if len(paths) > 1 else save_renders)
-        measured.append(measure_model(loaded, scene, renderer, protocol, view_set or "test", colour, renders,
-                                      ViewRecorder(*metrics, not no_report, color_correct), quiet))
+        measured.append(
+            measure_model(
+                loaded,
+                scene,
+                renderer,
+                protocol,
+                view_set or "test",
+                colour,
+                renders,
+                ViewRecorder(*metrics, not no_report, color_correct),
+                quiet,
+            )
+        )
         if report is None and not no_report and measured[-1].unwritten is None:
             page = loaded.folder.path / f"{Path(REPORT).stem}{_ending(view_set or 'test')}.html"
             pages.append(write_model_page(page, scene.name, measured[-1:], [path.resolve().name]))
@@ -107,9 +145,17 @@ def evaluate_models(models: tuple[Path, ...], more_models: tuple[Path, ...], sou
             raise one.unwritten
 
 
-def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol: Protocol = DEFAULT_PROTOCOL,
-                  view_set: str = "test", background: RGB | None = None, renders: Path | None = None,
-                  recorder: ViewRecorder | None = None, quiet: bool = False) -> Measurement:
+def measure_model(
+    model: LoadedModel,
+    scene: Scene,
+    renderer: Renderer,
+    protocol: Protocol = DEFAULT_PROTOCOL,
+    view_set: str = "test",
+    background: RGB | None = None,
+    renders: Path | None = None,
+    recorder: ViewRecorder | None = None,
+    quiet: bool = False,
+) -> Measurement:
     """Render and measure one model's views, and write its results.json and per_view.json.
 
     Parameters
@@ -125,8 +171,10 @@ def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol
     assert model.folder is not None
     views = {"test": scene.test, "train": scene.train, "all": scene.views}[view_set]
     if not views:
-        raise InputError(f"{model.path}: was trained on all views, none is left to test it on: "
-                         "train with --eval, or measure training views with --set train")
+        raise InputError(
+            f"{model.path}: was trained on all views, none is left to test it on: "
+            "train with --eval, or measure training views with --set train"
+        )
     record = recorder or ViewRecorder(pages=False)
     writer = None if renders is None else ImageWriter(renders, "png")
     names = [view.name for view in views]
@@ -144,16 +192,28 @@ def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol
     with closing(done):
         measured = evaluate(renderer, model.splats, list(views), colour, protocol, on_view)
     splats = model.splats
-    per_view = {metric: {name: values[metric] for name, values in measured.per_view.items()}
-                for metric in ("SSIM", "PSNR")} | record.per_view
-    described = protocol.describe() | {name: metric.describe() for name, metric in
-                                       (("LPIPS", record.lpips), ("FLIP", record.flip)) if metric is not None}
+    per_view = {
+        metric: {name: values[metric] for name, values in measured.per_view.items()} for metric in ("SSIM", "PSNR")
+    } | record.per_view
+    described = protocol.describe() | {
+        name: metric.describe()
+        for name, metric in (("LPIPS", record.lpips), ("FLIP", record.flip))
+        if metric is not None
+    }
     result = {
-        "SSIM": measured.ssim, "PSNR": measured.psnr,
+        "SSIM": measured.ssim,
+        "PSNR": measured.psnr,
         **{metric: statistics.fmean(values.values()) for metric, values in record.per_view.items()},
-        "render_ms": measured.render_ms, "bytes": model.ply.stat().st_size, **complexity(splats).to_json(),
-        "shape": splats.shape, "normalisation": splats.normalisation, "set": view_set, "views": len(views),
-        "background": list(colour), "device": str(renderer.device.info), "protocol": described,
+        "render_ms": measured.render_ms,
+        "bytes": model.ply.stat().st_size,
+        **complexity(splats).to_json(),
+        "shape": splats.shape,
+        "normalisation": splats.normalisation,
+        "set": view_set,
+        "views": len(views),
+        "background": list(colour),
+        "device": str(renderer.device.info),
+        "protocol": described,
     }
     unwritten = None
     try:
@@ -166,9 +226,16 @@ def measure_model(model: LoadedModel, scene: Scene, renderer: Renderer, protocol
 
 def _say(paths: Sequence[Path], measured: Sequence[Measurement]) -> None:
     metrics = [metric for metric in _DIGITS if metric in measured[0].result]
-    rows = [(str(path), str(one.result["splats"]), *(f"{one.result[name]:.{_DIGITS[name]}f}" for name in metrics),
-             f"{one.result['render_ms']:.1f}", f"{one.result['bytes'] / 1e6:.2f}")
-            for path, one in zip(paths, measured, strict=True)]
+    rows = [
+        (
+            str(path),
+            str(one.result["splats"]),
+            *(f"{one.result[name]:.{_DIGITS[name]}f}" for name in metrics),
+            f"{one.result['render_ms']:.1f}",
+            f"{one.result['bytes'] / 1e6:.2f}",
+        )
+        for path, one in zip(paths, measured, strict=True)
+    ]
     click.echo(table(("model", "splats", *metrics, "render ms", "MB"), rows))
 
 

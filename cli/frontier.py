@@ -33,17 +33,44 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 @click.command("frontier", cls=SpacedLists)
 @click.argument("scenes", nargs=-1, type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, metavar="DIR", help="Folder of the runs, charts and page.")
-@click.option("--systems", default=",".join(SYSTEMS), show_default=True, metavar="NAME,NAME,...",
-              help="As of `clsplat compare`; the splats of the others are counted against the first.")
-@click.option("--cap-max", "caps", type=Numbers("caps"), multiple=True,
-              help=f"Most splats.  [default: {','.join(map(str, CAPS))}]")
+@click.option(
+    "--systems",
+    default=",".join(SYSTEMS),
+    show_default=True,
+    metavar="NAME,NAME,...",
+    help="As of `clsplat compare`; the splats of the others are counted against the first.",
+)
+@click.option(
+    "--cap-max",
+    "caps",
+    type=Numbers("caps"),
+    multiple=True,
+    help=f"Most splats.  [default: {','.join(map(str, CAPS))}]",
+)
 @click.option("--seeds", type=Numbers("seeds", 0), multiple=True, help="A run for each; 3 make a chart.  [default: 0]")
-@click.option("--repeat", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
-              help="Train the first seed N times: are the splats the same, bit by bit?")
-@click.option("--curve", type=click.IntRange(min=0), default=12, show_default=True, metavar="N",
-              help="Measure the test views at N iterations along each run; 0: at its end only.")
-@click.option("--add", type=PATH, multiple=True, metavar="DIR",
-              help="Draw the runs of this folder as well, such as another comparison's.")
+@click.option(
+    "--repeat",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Train the first seed N times: are the splats the same, bit by bit?",
+)
+@click.option(
+    "--curve",
+    type=click.IntRange(min=0),
+    default=12,
+    show_default=True,
+    metavar="N",
+    help="Measure the test views at N iterations along each run; 0: at its end only.",
+)
+@click.option(
+    "--add",
+    type=PATH,
+    multiple=True,
+    metavar="DIR",
+    help="Draw the runs of this folder as well, such as another comparison's.",
+)
 @click.option("--charts-only", is_flag=True, help="Train nothing: draw what is there.")
 @photo_options
 @hiding_options
@@ -51,9 +78,21 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 @quiet_option
 @config_options("shape", "cap_max", "seed", "save_iterations", "test_iterations", "checkpoint_interval")
 @click.pass_context
-def draw_frontier(ctx: click.Context, /, scenes: tuple[Path, ...], output: Path, systems: str,
-                  caps: tuple[tuple[int, ...], ...], seeds: tuple[tuple[int, ...], ...], repeat: int, curve: int,
-                  add: tuple[Path, ...], charts_only: bool, quiet: bool, **values: Any) -> None:
+def draw_frontier(
+    ctx: click.Context,
+    /,
+    scenes: tuple[Path, ...],
+    output: Path,
+    systems: str,
+    caps: tuple[tuple[int, ...], ...],
+    seeds: tuple[tuple[int, ...], ...],
+    repeat: int,
+    curve: int,
+    add: tuple[Path, ...],
+    charts_only: bool,
+    quiet: bool,
+    **values: Any,
+) -> None:
     """Train the systems on SCENES at several caps and chart quality against time, render time, bytes and splats.
 
     Writes DIR/report.html, DIR/charts (PNG, SVG, and their data as CSV and JSON) and what `clsplat compare` writes.
@@ -71,8 +110,19 @@ def draw_frontier(ctx: click.Context, /, scenes: tuple[Path, ...], output: Path,
     else:
         common, loaded = options_and_scenes(ctx, scenes, values)
         with TrainingDisplay(quiet) as display:
-            records = frontier(loaded, contestants, output, flat(caps) or CAPS, flat(seeds) or [0], common, curve=curve,
-                               repeat=repeat, more=more, progress=display, on_run=None if quiet else say_run)
+            records = frontier(
+                loaded,
+                contestants,
+                output,
+                flat(caps) or CAPS,
+                flat(seeds) or [0],
+                common,
+                curve=curve,
+                repeat=repeat,
+                more=more,
+                progress=display,
+                on_run=None if quiet else say_run,
+            )
     if not quiet:
         report(distinct([*records, *more]), contestants[0].label)
         click.echo(f"{output / 'report.html'}: charts and tables")

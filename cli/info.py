@@ -67,23 +67,33 @@ def _show_model(path: Path, iteration: int | None, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"model": str(path), **found}))
         return
-    click.echo(f"{loaded.ply}: {found['splats']} splats, shape {found['shape']}, SH degree {found['sh_degree']}, "
-               f"{'antialiased, ' if found['antialiased'] else ''}{found['bytes'] / 1e6:.2f} MB")
+    click.echo(
+        f"{loaded.ply}: {found['splats']} splats, shape {found['shape']}, SH degree {found['sh_degree']}, "
+        f"{'antialiased, ' if found['antialiased'] else ''}{found['bytes'] / 1e6:.2f} MB"
+    )
     click.echo(table(("", "in use", "of"), rows_of(found)))
 
 
 def described(splats: Splats, ply: Path) -> dict[str, Any]:
     """The model's complexity, and the bytes of its file."""
-    return {"shape": splats.shape, "normalisation": splats.normalisation, "sh_degree": splats.sh_degree,
-            "antialiased": splats.antialiased, "bytes": ply.stat().st_size, **complexity(splats).to_json()}
+    return {
+        "shape": splats.shape,
+        "normalisation": splats.normalisation,
+        "sh_degree": splats.sh_degree,
+        "antialiased": splats.antialiased,
+        "bytes": ply.stat().st_size,
+        **complexity(splats).to_json(),
+    }
 
 
 def rows_of(found: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Lines of the table: what, how much of it is in use, and out of how much."""
     n = found["splats"]
     rows = [(f"splats with {name}", str(count), str(n)) for name, count in found["fields_in_use"].items()]
-    rows += [(f"SH coefficients, band {band}", str(count), str(3 * (2 * band + 1) * n))
-             for band, count in enumerate(found["sh_coefficients"])]
+    rows += [
+        (f"SH coefficients, band {band}", str(count), str(3 * (2 * band + 1) * n))
+        for band, count in enumerate(found["sh_coefficients"])
+    ]
     rows.append(("parameters", str(found["parameters_in_use"]), str(found["parameters"])))
     rows.append(("bytes, written compactly", str(found["compact_bytes"]), str(found["bytes"])))
     return rows
@@ -108,8 +118,13 @@ def _show_scene(path: Path, images: str | None, as_json: bool) -> None:
 
 def scene_rows(found: SceneInfo) -> list[tuple[str, str]]:
     """What, and how much of it."""
-    rows = [("photos", f"{', '.join(f'{n} of {w}x{h} px' for (w, h), n in found.sizes) or 'none readable'}, "
-                       f"{found.photo_bytes / 1e6:.1f} MB")]
+    rows = [
+        (
+            "photos",
+            f"{', '.join(f'{n} of {w}x{h} px' for (w, h), n in found.sizes) or 'none readable'}, "
+            f"{found.photo_bytes / 1e6:.1f} MB",
+        )
+    ]
     if found.placed:
         placed, given, error = found.placed
         rows.append(("reconstructed", f"{placed} of {given} photos, {error:.2f} px off"))
@@ -127,8 +142,10 @@ def scene_rows(found: SceneInfo) -> list[tuple[str, str]]:
 
 
 def _lens(lens: LensUse) -> str:
-    text = (f"{'pinhole' if lens.pinhole else lens.model}, {lens.width}x{lens.height} px, focal length "
-            f"{lens.focal:.1f} px ({lens.field_of_view:.0f} degrees across): {lens.photos} photos")
+    text = (
+        f"{'pinhole' if lens.pinhole else lens.model}, {lens.width}x{lens.height} px, focal length "
+        f"{lens.focal:.1f} px ({lens.field_of_view:.0f} degrees across): {lens.photos} photos"
+    )
     return text if lens.pinhole else f"{text}, undistorted when they are read"
 
 

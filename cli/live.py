@@ -26,21 +26,30 @@ class LiveView:
     InputError : viser is not installed. OutputError : the address cannot be listened at.
     """
 
-    def __init__(self, scene: Scene, config: TrainConfig, model_path: Path, host: str, port: int,
-                 quiet: bool = False) -> None:
+    def __init__(
+        self, scene: Scene, config: TrainConfig, model_path: Path, host: str, port: int, quiet: bool = False
+    ) -> None:
         require_viser()
         from clsplat.cameras.cameras_json import NamedCamera
         from clsplat.viewer.server import Server
         from clsplat.viewer.start import Known, start_of
         from clsplat.viewer.training import TrainingView
 
-        known = Known(tuple(NamedCamera(view.name, view.camera) for view in scene.train),
-                      tuple(NamedCamera(view.name, view.camera) for view in scene.test))
+        known = Known(
+            tuple(NamedCamera(view.name, view.camera) for view in scene.train),
+            tuple(NamedCamera(view.name, view.camera) for view in scene.test),
+        )
         cameras = [item.camera for item in (*known.train, *known.test)]
         self._training = TrainingView(config)
         self.visit: Visit = self._training.visit
-        self._server = Server(self._training.viewer, start_of(scene.points.xyz, cameras), known, host=host, port=port,
-                              title=f"clsplat: {model_path.resolve().name}")
+        self._server = Server(
+            self._training.viewer,
+            start_of(scene.points.xyz, cameras),
+            known,
+            host=host,
+            port=port,
+            title=f"clsplat: {model_path.resolve().name}",
+        )
         self._server.add_training(self._training.toggle)
         self.url = self._server.url
         if not quiet:
@@ -49,8 +58,9 @@ class LiveView:
     def __enter__(self) -> LiveView:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._server.say("the run has ended: clsplat view shows its model")
         self._training.viewer.close()
         self._server.close()

@@ -82,11 +82,14 @@ class Commands(click.Group):
         sys.exit(code if isinstance(code, int) else 0)
 
 
-@click.group(cls=Commands, context_settings={
-    "help_option_names": ["-h", "--help"],
-    "token_normalize_func": lambda token: token.replace("_", "-"),  # 3DGS writes --sh_degree
-    "max_content_width": 110,
-})
+@click.group(
+    cls=Commands,
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "token_normalize_func": lambda token: token.replace("_", "-"),  # 3DGS writes --sh_degree
+        "max_content_width": 110,
+    },
+)
 @click.version_option(__version__, prog_name="clsplat", message="%(prog)s %(version)s")
 def main() -> None:
     """Gaussian and skew-normal splatting on any OpenCL device."""
@@ -113,8 +116,14 @@ def _known_failure(error: Exception) -> str | None:
     return f"the OpenCL device failed: {first_line(error)}: try `clsplat devices`, or another --device"
 
 
-def _show_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int,
-                  file: TextIO | None = None, line: str | None = None) -> None:
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
     if display := sys.modules.get("clsplat.training.progress"):  # where nothing is shown, it was never loaded
         display.LiveLine.give_way()
     click.echo(f"warning: {_one_line(str(message))}", err=True)

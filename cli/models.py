@@ -83,8 +83,9 @@ def load_splats(path: Path) -> Splats:
     return Splats.load(path)
 
 
-def scene_of(model: LoadedModel, source_path: Path | None = None, images: str | None = None,
-             resolution: int | None = None) -> Scene:
+def scene_of(
+    model: LoadedModel, source_path: Path | None = None, images: str | None = None, resolution: int | None = None
+) -> Scene:
     """The scene that the model was trained on, read and split as then; every argument replaces its record.
 
     A model without a record needs `source_path`; every 8th view is then a test view, as in 3DGS.
@@ -102,15 +103,21 @@ def scene_of(model: LoadedModel, source_path: Path | None = None, images: str | 
     if source_path is None and not Path(path).exists():
         raise InputError(f"{model.path}: its scene {path} is not there: give the scene's folder with -s")
     held_out = model.test_names
-    scene = load_scene(path, images or record.get("images"),
-                       record.get("resolution", -1) if resolution is None else resolution,
-                       eval=held_out is None, background=model.background, masks=record.get("masks"),
-                       alpha=record.get("alpha", ALPHA_USES[0]))
+    scene = load_scene(
+        path,
+        images or record.get("images"),
+        record.get("resolution", -1) if resolution is None else resolution,
+        eval=held_out is None,
+        background=model.background,
+        masks=record.get("masks"),
+        alpha=record.get("alpha", ALPHA_USES[0]),
+    )
     if held_out is None:
         return scene
     if missing := sorted(held_out - set(scene.names)):
-        raise InputError(f"{path}: lacks view {missing[0]!r}, a test view of {model.path}: "
-                         "give the scene it was trained on with -s")
+        raise InputError(
+            f"{path}: lacks view {missing[0]!r}, a test view of {model.path}: give the scene it was trained on with -s"
+        )
     return replace(scene, test_names=held_out)
 
 
@@ -145,8 +152,7 @@ def _recorded(folder: ModelFolder) -> tuple[RGB, dict[str, Any]]:
     parts = [real_of(part) for part in rgb] if isinstance(rgb, list) else []
     if len(parts) != 3 or not all(part is not None and 0 <= part <= 1 for part in parts):
         raise InputError(f"{file}: config.background is {rgb!r}: expected three numbers from 0 to 1")
-    kinds = {"path": str, "images": str, "resolution": int, "masks": str, "alpha": str,
-             "test_names": list}
+    kinds = {"path": str, "images": str, "resolution": int, "masks": str, "alpha": str, "test_names": list}
     for key, kind in kinds.items():
         if scene.get(key) is not None and not isinstance(scene[key], kind):
             raise InputError(f"{file}: scene.{key} is {scene[key]!r}: restore the file as it was written")

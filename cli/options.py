@@ -30,9 +30,17 @@ RGB = tuple[float, float, float]
 PATH = click.Path(path_type=Path)
 SETS = ("test", "train", "all")
 
-_CHOICES = {"shape": tuple(SHAPES), "normalisation": NORMALISATIONS, "skew_map": ("auto", *SKEW_MAPS),
-            "strategy": STRATEGIES, "optimizer": OPTIMIZERS, "sampling": SAMPLINGS, "relocation": RELOCATIONS,
-            "position_optimizer": POSITION_OPTIMIZERS, "alternation": ALTERNATIONS}
+_CHOICES = {
+    "shape": tuple(SHAPES),
+    "normalisation": NORMALISATIONS,
+    "skew_map": ("auto", *SKEW_MAPS),
+    "strategy": STRATEGIES,
+    "optimizer": OPTIMIZERS,
+    "sampling": SAMPLINGS,
+    "relocation": RELOCATIONS,
+    "position_optimizer": POSITION_OPTIMIZERS,
+    "alternation": ALTERNATIONS,
+}
 _ALIASES = {"iterations": ("--steps",)}
 _METAVARS = {"init": "sfm|random|FILE.ply"}
 # Shared with other commands, or with a form of their own.
@@ -69,8 +77,7 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
     def __init__(self, what: str = "iterations", least: int = 1) -> None:
         self.what, self.least = what, least
 
-    def convert(self, value: Any, param: click.Parameter | None,
-                ctx: click.Context | None) -> tuple[int, ...]:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
         if isinstance(value, tuple):
             return value
         parts = [part for part in re.split(r"[,\s]+", value) if part]
@@ -110,21 +117,24 @@ class SpacedLists(click.Command):
 
 
 device_option = click.option(
-    "--device", metavar="SPEC", help='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name.')
+    "--device", metavar="SPEC", help='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name.'
+)
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print warnings and errors only.")
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace the model that is there.")
-iteration_option = click.option("--iteration", type=click.IntRange(min=0), metavar="N",
-                                help="Point cloud of this iteration.  [default: the last]")
-set_option = click.option("--set", "--views", "view_set", type=click.Choice(SETS),
-                          help="Which of the scene's views.  [default: test]")
+iteration_option = click.option(
+    "--iteration", type=click.IntRange(min=0), metavar="N", help="Point cloud of this iteration.  [default: the last]"
+)
+set_option = click.option(
+    "--set", "--views", "view_set", type=click.Choice(SETS), help="Which of the scene's views.  [default: test]"
+)
 
 
 def background_options(function: F) -> F:
     """`--background R,G,B` and `-w`; read them with `background_of`."""
-    function = click.option("--background", type=Color(), metavar="R,G,B",
-                            help="Colour behind the splats, each 0 to 1.")(function)
-    return click.option("-w", "--white-background", is_flag=True,
-                        help="The same as --background 1,1,1.")(function)
+    function = click.option(
+        "--background", type=Color(), metavar="R,G,B", help="Colour behind the splats, each 0 to 1."
+    )(function)
+    return click.option("-w", "--white-background", is_flag=True, help="The same as --background 1,1,1.")(function)
 
 
 def background_of(background: RGB | None, white: bool) -> RGB | None:
@@ -137,36 +147,51 @@ def background_of(background: RGB | None, white: bool) -> RGB | None:
 def photo_options(function: F) -> F:
     """`-i` and `-r`: which photos of the scene, and how large."""
     function = click.option(
-        "-r", "--resolution", type=int, metavar="N",
+        "-r",
+        "--resolution",
+        type=int,
+        metavar="N",
         help="1, 2, 4, 8: divide the size of the photos; another number: their width in pixels; "
-             "-1: as they are, but at most 1600 wide.")(function)
-    return click.option("-i", "--images", metavar="NAME",
-                        help="Folder of photos inside the scene, such as images_4.")(function)
+        "-1: as they are, but at most 1600 wide.",
+    )(function)
+    return click.option("-i", "--images", metavar="NAME", help="Folder of photos inside the scene, such as images_4.")(
+        function
+    )
 
 
 def scene_options(function: F) -> F:
     """`-s`, `-i` and `-r`: where the photos are, and how large."""
-    return click.option("-s", "--source-path", type=PATH,
-                        help="Scene: a folder with photos and a COLMAP model or transforms.json.")(
-                            photo_options(function))
+    return click.option(
+        "-s", "--source-path", type=PATH, help="Scene: a folder with photos and a COLMAP model or transforms.json."
+    )(photo_options(function))
 
 
 def hiding_options(function: F) -> F:
     """`--masks` and `--alpha`: which pixels of the photos count."""
-    function = click.option("--alpha", type=click.Choice(ALPHA_USES),
-                            help="Transparent photos: lay them over the background, or hide the transparent pixels.  "
-                                 "[default: background]")(function)
-    return click.option("--masks", metavar="NAME",
-                        help='Folder of masks inside the scene, black where a pixel is not to count; "none" for no '
-                             "masks.  [default: masks, where it is there]")(function)
+    function = click.option(
+        "--alpha",
+        type=click.Choice(ALPHA_USES),
+        help="Transparent photos: lay them over the background, or hide the transparent pixels.  [default: background]",
+    )(function)
+    return click.option(
+        "--masks",
+        metavar="NAME",
+        help='Folder of masks inside the scene, black where a pixel is not to count; "none" for no '
+        "masks.  [default: masks, where it is there]",
+    )(function)
 
 
 def split_options(function: F) -> F:
     """`--test-every` and `--test-list`: which views are held out."""
-    function = click.option("--test-list", type=PATH, metavar="FILE",
-                            help="Names of the test views, one a line; implies --eval.")(function)
-    return click.option("--test-every", type=int, metavar="N",
-                        help="Of the sorted views, every Nth is a test view; implies --eval.  [default: 8]")(function)
+    function = click.option(
+        "--test-list", type=PATH, metavar="FILE", help="Names of the test views, one a line; implies --eval."
+    )(function)
+    return click.option(
+        "--test-every",
+        type=int,
+        metavar="N",
+        help="Of the sorted views, every Nth is a test view; implies --eval.  [default: 8]",
+    )(function)
 
 
 def config_options(*without: str) -> Callable[[F], F]:
@@ -176,8 +201,9 @@ def config_options(*without: str) -> Callable[[F], F]:
     def decorate(function: F) -> F:
         for name in ("test_iterations", "save_iterations"):
             if name not in without:
-                function = click.option(_flag(name), name, type=Numbers(), multiple=True,
-                                        help=help_of.get(name))(function)
+                function = click.option(_flag(name), name, type=Numbers(), multiple=True, help=help_of.get(name))(
+                    function
+                )
         function = background_options(device_option(function))
         for field in reversed(dataclasses.fields(TrainConfig)):
             if field.name not in (*_OWN, *without):
@@ -191,10 +217,15 @@ def config_values(ctx: click.Context, values: dict[str, Any]) -> dict[str, Any]:
     """TrainConfig's arguments that the user gave on the command line; takes them out of `values`."""
     background = background_of(values.pop("background"), values.pop("white_background"))
     device = values.pop("device")
-    lists = {name: sorted({n for group in values.pop(name, ()) for n in group})
-             for name in ("save_iterations", "test_iterations")}
-    given = {field.name: values.pop(field.name) for field in dataclasses.fields(TrainConfig)
-             if field.name in values and is_given(ctx, field.name)}
+    lists = {
+        name: sorted({n for group in values.pop(name, ()) for n in group})
+        for name in ("save_iterations", "test_iterations")
+    }
+    given = {
+        field.name: values.pop(field.name)
+        for field in dataclasses.fields(TrainConfig)
+        if field.name in values and is_given(ctx, field.name)
+    }
     given |= {name: tuple(numbers) for name, numbers in lists.items() if numbers}
     own = {"background": background, "device": device}
     return given | {name: value for name, value in own.items() if value is not None}
@@ -208,11 +239,18 @@ def is_given(ctx: click.Context, name: str) -> bool:
 def _field_option(field: dataclasses.Field[Any], kind: Any, text: str | None) -> Callable[[F], F]:
     flag, default = _flag(field.name), field.default
     if kind is bool:
-        return click.option(f"{flag}/--no-{flag[2:]}", field.name, default=default, show_default=True,
-                            help=text)
+        return click.option(f"{flag}/--no-{flag[2:]}", field.name, default=default, show_default=True, help=text)
     type_: Any = click.Choice(_CHOICES[field.name]) if field.name in _CHOICES else kind
-    return click.option(flag, *_ALIASES.get(field.name, ()), field.name, type=type_, default=default,
-                        show_default=default is not None, metavar=_METAVARS.get(field.name), help=text)
+    return click.option(
+        flag,
+        *_ALIASES.get(field.name, ()),
+        field.name,
+        type=type_,
+        default=default,
+        show_default=default is not None,
+        metavar=_METAVARS.get(field.name),
+        help=text,
+    )
 
 
 def _flag(name: str) -> str:

@@ -40,8 +40,9 @@ def output_stems(names: Sequence[str], extras: Sequence[str] = (), keep_suffix: 
         stem = _safe(name) if keep_suffix else bare_name(_safe(name))
         for file in (stem, *(f"{stem}_{extra}" for extra in extras)):
             if file in taken:
-                raise InputError(f"views {taken[file]!r} and {name!r} would both be written to {file}: "
-                                 "rename one of them")
+                raise InputError(
+                    f"views {taken[file]!r} and {name!r} would both be written to {file}: rename one of them"
+                )
             taken[file] = name
         stems.append(stem)
     return stems
@@ -71,8 +72,14 @@ class ImageWriter:
     background : behind coloured depth.
     """
 
-    def __init__(self, folder: Path, format: str, extras: Sequence[str] = (),
-                 near_far: tuple[float, float] | None = None, background: RGB = (0.0, 0.0, 0.0)) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        format: str,
+        extras: Sequence[str] = (),
+        near_far: tuple[float, float] | None = None,
+        background: RGB = (0.0, 0.0, 0.0),
+    ) -> None:
         self.folder, self.format, self.extras = folder, format, extras
         self.near_far, self.background = near_far, background
 
@@ -113,8 +120,14 @@ class VideoFiles:
     InputError : no known kind of video, or the encoder is not installed.
     """
 
-    def __init__(self, path: Path, fps: float, extras: Sequence[str] = (),
-                 near_far: tuple[float, float] | None = None, background: RGB = (0.0, 0.0, 0.0)) -> None:
+    def __init__(
+        self,
+        path: Path,
+        fps: float,
+        extras: Sequence[str] = (),
+        near_far: tuple[float, float] | None = None,
+        background: RGB = (0.0, 0.0, 0.0),
+    ) -> None:
         from clsplat.files.video import VideoWriter
 
         self.near_far, self.background = near_far, background
@@ -129,8 +142,9 @@ class VideoFiles:
             self._open = opening.pop_all()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._open.__exit__(kind, error, trace)
 
     def write(self, stem: str, image: Rendered) -> None:

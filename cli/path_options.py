@@ -61,28 +61,57 @@ class Range(click.ParamType):  # type: ignore[type-arg]
 
 def path_options(function: F) -> F:
     """`--path` and the flags that shape it; `path_of` reads them."""
-    for option in reversed((
-        click.option("--path", metavar="|".join((*AROUND, BETWEEN, "FILE")),
-                     help="Render a path: around the scene, between cameras, or of a file (nerfstudio's "
-                          "camera_path.json, or a cameras.json)."),
-        click.option("--keys", metavar="NAME,NAME,...", help="The cameras to interpolate between, in this order.  "
-                                                              "[default: all, by name]"),
-        click.option("--closed", is_flag=True, help="Interpolate back to the first camera."),
-        click.option("--frames", type=click.IntRange(min=1), metavar="N",
-                     help=f"Images of the path.  [default: {FRAMES}; a file's own]"),
-        click.option("--seconds", type=click.FloatRange(min=0, min_open=True), metavar="S",
-                     help="The path's time, instead of --frames."),
-        click.option("--fps", type=click.FloatRange(min=0, min_open=True, max=1000), metavar="N",
-                     help="Frames a second.  [default: 30; a file's own]"),
-        click.option("--size", type=Size(), help="Of the images in pixels; the vertical field of view is kept."),
-        click.option("--save-path", type=PATH, metavar="FILE", help="Also write the path as camera_path.json."),
-    )):
+    for option in reversed(
+        (
+            click.option(
+                "--path",
+                metavar="|".join((*AROUND, BETWEEN, "FILE")),
+                help="Render a path: around the scene, between cameras, or of a file (nerfstudio's "
+                "camera_path.json, or a cameras.json).",
+            ),
+            click.option(
+                "--keys",
+                metavar="NAME,NAME,...",
+                help="The cameras to interpolate between, in this order.  [default: all, by name]",
+            ),
+            click.option("--closed", is_flag=True, help="Interpolate back to the first camera."),
+            click.option(
+                "--frames",
+                type=click.IntRange(min=1),
+                metavar="N",
+                help=f"Images of the path.  [default: {FRAMES}; a file's own]",
+            ),
+            click.option(
+                "--seconds",
+                type=click.FloatRange(min=0, min_open=True),
+                metavar="S",
+                help="The path's time, instead of --frames.",
+            ),
+            click.option(
+                "--fps",
+                type=click.FloatRange(min=0, min_open=True, max=1000),
+                metavar="N",
+                help="Frames a second.  [default: 30; a file's own]",
+            ),
+            click.option("--size", type=Size(), help="Of the images in pixels; the vertical field of view is kept."),
+            click.option("--save-path", type=PATH, metavar="FILE", help="Also write the path as camera_path.json."),
+        )
+    ):
         function = option(function)
     return function
 
 
-def path_of(model: LoadedModel, views: Sequence[NamedCamera], source: Path, path: str, keys: str | None, closed: bool,
-            frames: int | None, seconds: float | None, fps: float | None) -> CameraPath:
+def path_of(
+    model: LoadedModel,
+    views: Sequence[NamedCamera],
+    source: Path,
+    path: str,
+    keys: str | None,
+    closed: bool,
+    frames: int | None,
+    seconds: float | None,
+    fps: float | None,
+) -> CameraPath:
     """The path that the flags ask for; `views` of `source` are the cameras it goes around or between.
 
     Raises
@@ -133,8 +162,9 @@ def named(path: CameraPath, name: str) -> list[NamedCamera]:
 def _keys(views: Sequence[NamedCamera], source: Path, keys: str | None) -> list[Camera]:
     """The cameras of those names."""
     if not views:
-        raise InputError(f"{source}: no cameras to interpolate between: give --cameras cameras.json, or a "
-                         "scene with -s")
+        raise InputError(
+            f"{source}: no cameras to interpolate between: give --cameras cameras.json, or a scene with -s"
+        )
     if keys is None:
         return [view.camera for view in sorted(views, key=lambda view: view.name)]
     known = {bare_name(view.name): view.camera for view in views} | {view.name: view.camera for view in views}

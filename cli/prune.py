@@ -23,18 +23,35 @@ if TYPE_CHECKING:
 @click.argument("model", type=PATH)
 @scene_options
 @click.option("-o", "--output", required=True, type=PATH, metavar="FILE", help="The PLY file to write.")
-@click.option("--tolerance", type=Decibels(), default=0.1, show_default=True,
-              help="PSNR that the validation views may lose.")
-@click.option("--iterations", type=click.IntRange(min=0), default=0, show_default=True,
-              help="Train on after each quarter of the splats that goes; 0: only leave out.")
+@click.option(
+    "--tolerance", type=Decibels(), default=0.1, show_default=True, help="PSNR that the validation views may lose."
+)
+@click.option(
+    "--iterations",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Train on after each quarter of the splats that goes; 0: only leave out.",
+)
 @click.option("--whole", is_flag=True, help="Write all columns of 3DGS, for programs that know no other files.")
 @iteration_option
 @click.option("--overwrite", is_flag=True, help="Replace the file that is there.")
 @device_option
 @quiet_option
-def prune_model(model: Path, source_path: Path | None, images: str | None, resolution: int | None, output: Path,
-                tolerance: float, iterations: int, whole: bool, iteration: int | None, overwrite: bool,
-                device: str | None, quiet: bool) -> None:
+def prune_model(
+    model: Path,
+    source_path: Path | None,
+    images: str | None,
+    resolution: int | None,
+    output: Path,
+    tolerance: float,
+    iterations: int,
+    whole: bool,
+    iteration: int | None,
+    overwrite: bool,
+    device: str | None,
+    quiet: bool,
+) -> None:
     """Write MODEL, a folder or any splat PLY, without splats, skew and SH bands that its images do not miss.
 
     Some of the training views judge: their PSNR falls by no more than the tolerance. Test views are never looked at.
@@ -56,8 +73,9 @@ def prune_model(model: Path, source_path: Path | None, images: str | None, resol
             click.echo(line)
 
 
-def pruned_model(loaded: LoadedModel, scene: Scene, tolerance: float, iterations: int, device: str | None,
-                 display: TrainingDisplay) -> Pruned:
+def pruned_model(
+    loaded: LoadedModel, scene: Scene, tolerance: float, iterations: int, device: str | None, display: TrainingDisplay
+) -> Pruned:
     """The smaller model, and what it cost."""
     from clsplat.compression.prune import SHARES, Judge, prune
     from clsplat.device.device import open_device

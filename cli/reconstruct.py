@@ -25,17 +25,44 @@ _DEFAULTS = ReconstructOptions()
 @click.command("reconstruct")
 @click.argument("photos", type=PATH)
 @click.option("-o", "--output", "scene", type=PATH, required=True, metavar="SCENE", help="Folder of the scene.")
-@click.option("--camera-model", type=click.Choice(CAMERA_MODELS, case_sensitive=False), default=_DEFAULTS.camera_model,
-              show_default=True, metavar="NAME",
-              help="COLMAP's name of the lens model: OPENCV for wide lenses, OPENCV_FISHEYE for fisheyes.")
-@click.option("--camera-mode", type=click.Choice(CAMERA_MODES), default=_DEFAULTS.camera_mode, show_default=True,
-              help="Which photos share a lens; auto: those of one size, camera and focal length.")
-@click.option("--matcher", type=click.Choice(MATCHERS), default=_DEFAULTS.matcher, show_default=True,
-              help="Which photos are compared: all pairs, or neighbours by name (auto: videos, more than 150 photos).")
-@click.option("--max-size", type=click.IntRange(min=64), default=_DEFAULTS.max_size, show_default=True, metavar="PX",
-              help="Longest side at which features are looked for; the scene keeps the photos' size.")
-@click.option("--frames", type=click.IntRange(min=3), default=_DEFAULTS.frames, show_default=True, metavar="N",
-              help="Of a video: the sharpest frame of each of N equal stretches.")
+@click.option(
+    "--camera-model",
+    type=click.Choice(CAMERA_MODELS, case_sensitive=False),
+    default=_DEFAULTS.camera_model,
+    show_default=True,
+    metavar="NAME",
+    help="COLMAP's name of the lens model: OPENCV for wide lenses, OPENCV_FISHEYE for fisheyes.",
+)
+@click.option(
+    "--camera-mode",
+    type=click.Choice(CAMERA_MODES),
+    default=_DEFAULTS.camera_mode,
+    show_default=True,
+    help="Which photos share a lens; auto: those of one size, camera and focal length.",
+)
+@click.option(
+    "--matcher",
+    type=click.Choice(MATCHERS),
+    default=_DEFAULTS.matcher,
+    show_default=True,
+    help="Which photos are compared: all pairs, or neighbours by name (auto: videos, more than 150 photos).",
+)
+@click.option(
+    "--max-size",
+    type=click.IntRange(min=64),
+    default=_DEFAULTS.max_size,
+    show_default=True,
+    metavar="PX",
+    help="Longest side at which features are looked for; the scene keeps the photos' size.",
+)
+@click.option(
+    "--frames",
+    type=click.IntRange(min=3),
+    default=_DEFAULTS.frames,
+    show_default=True,
+    metavar="N",
+    help="Of a video: the sharpest frame of each of N equal stretches.",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=_DEFAULTS.seed, show_default=True)
 @overwrite_option
 @quiet_option
@@ -52,8 +79,9 @@ def reconstruct_scene(photos: Path, scene: Path, overwrite: bool, quiet: bool, *
         click.echo(f"next: clsplat train {result.scene}")
 
 
-def run_reconstruction(photos: Path, scene: Path, options: ReconstructOptions, overwrite: bool,
-                       quiet: bool) -> Reconstructed:
+def run_reconstruction(
+    photos: Path, scene: Path, options: ReconstructOptions, overwrite: bool, quiet: bool
+) -> Reconstructed:
     """Reconstruct with a live display."""
     from clsplat.scenes.reconstruct.reconstruct import reconstruct
 
@@ -63,8 +91,10 @@ def run_reconstruction(photos: Path, scene: Path, options: ReconstructOptions, o
 
 def report(result: Reconstructed) -> None:
     """Say what came of it."""
-    click.echo(f"{result.scene}: {result.registered} of {result.photos} photos placed, {result.points} points seen by "
-               f"{result.track_length:.1f} photos each, {result.error:.2f} px off, in {duration(result.seconds)}")
+    click.echo(
+        f"{result.scene}: {result.registered} of {result.photos} photos placed, {result.points} points seen by "
+        f"{result.track_length:.1f} photos each, {result.error:.2f} px off, in {duration(result.seconds)}"
+    )
 
 
 def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> Path:
@@ -85,8 +115,10 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
             click.echo(f"{photos}: no poses: {scene} was reconstructed of it before and is used", err=True)
         return scene
     if made is False and not overwrite:
-        raise OutputError(f"{scene}: was reconstructed of other photos than {photos} now has: use --overwrite to make "
-                          f"it anew, or clsplat reconstruct {photos} -o OTHER and train on that")
+        raise OutputError(
+            f"{scene}: was reconstructed of other photos than {photos} now has: use --overwrite to make "
+            f"it anew, or clsplat reconstruct {photos} -o OTHER and train on that"
+        )
     if not quiet:
         what = f"{options.frames} frames"
         if not is_video(photos):
@@ -120,8 +152,9 @@ class StepDisplay:
     def __enter__(self) -> StepDisplay:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._line.close()
 
     def __call__(self, step: Step) -> None:

@@ -49,24 +49,57 @@ _SAMPLES = 12  # frames that the range of depths is taken from, at a quarter of 
 @scene_options
 @set_option
 @path_options
-@click.option("--format", "format", type=click.Choice(["png", "npy"]), default="png", show_default=True,
-              help="png: 8 bits, rounded; npy: float32 as rendered.")
+@click.option(
+    "--format",
+    "format",
+    type=click.Choice(["png", "npy"]),
+    default="png",
+    show_default=True,
+    help="png: 8 bits, rounded; npy: float32 as rendered.",
+)
 @click.option("--alpha", is_flag=True, help="Also write alpha.")
-@click.option("--depth", is_flag=True, help="Also write depth, the alpha-weighted sum of camera z "
-                                            "(png: 16 bits, full scale is printed; video: colours).")
-@click.option("--depth-colours", "--depth-colors", is_flag=True,
-              help="Write mean depth in colours, not in 16 bits of grey.")
+@click.option(
+    "--depth",
+    is_flag=True,
+    help="Also write depth, the alpha-weighted sum of camera z (png: 16 bits, full scale is printed; video: colours).",
+)
+@click.option(
+    "--depth-colours", "--depth-colors", is_flag=True, help="Write mean depth in colours, not in 16 bits of grey."
+)
 @click.option("--depth-range", type=Range(), help="Depths at the ends of the colours.  [default: those seen]")
 @background_options
 @iteration_option
 @device_option
 @quiet_option
-def render(model: Path | None, model_path: Path | None, output: Path | None, video: Path | None, cameras: Path | None,
-           source_path: Path | None, images: str | None, resolution: int | None, view_set: str | None,
-           path: str | None, keys: str | None, closed: bool, frames: int | None, seconds: float | None,
-           fps: float | None, size: tuple[int, int] | None, save_path: Path | None, format: str, alpha: bool,
-           depth: bool, depth_colours: bool, depth_range: tuple[float, float] | None, background: RGB | None,
-           white_background: bool, iteration: int | None, device: str | None, quiet: bool) -> None:
+def render(
+    model: Path | None,
+    model_path: Path | None,
+    output: Path | None,
+    video: Path | None,
+    cameras: Path | None,
+    source_path: Path | None,
+    images: str | None,
+    resolution: int | None,
+    view_set: str | None,
+    path: str | None,
+    keys: str | None,
+    closed: bool,
+    frames: int | None,
+    seconds: float | None,
+    fps: float | None,
+    size: tuple[int, int] | None,
+    save_path: Path | None,
+    format: str,
+    alpha: bool,
+    depth: bool,
+    depth_colours: bool,
+    depth_range: tuple[float, float] | None,
+    background: RGB | None,
+    white_background: bool,
+    iteration: int | None,
+    device: str | None,
+    quiet: bool,
+) -> None:
     """Render MODEL_OR_PLY: a model's folder, or any splat PLY.
 
     The views: all of --cameras, or the test views of the scene given with -s; with a model's folder alone its
@@ -108,8 +141,9 @@ def render(model: Path | None, model_path: Path | None, output: Path | None, vid
             write_path(save_path, along)
     colour = loaded.background if colour is None else colour
     extras = [name for name, wanted in (("alpha", alpha), ("depth", depth or depth_colours)) if wanted]
-    milliseconds = render_views(loaded, views, output, colour, device, format, extras, quiet, video, rate,
-                                depth_range, depth_colours)
+    milliseconds = render_views(
+        loaded, views, output, colour, device, format, extras, quiet, video, rate, depth_range, depth_colours
+    )
     if path is not None and output is not None:
         write_cameras(output / "cameras.json", views)
     if not quiet:
@@ -118,14 +152,26 @@ def render(model: Path | None, model_path: Path | None, output: Path | None, vid
             click.echo(f"{output}: {len(views)} images, the first {shown} px, {milliseconds:.1f} ms each")
         if video is not None:
             files = ", ".join([str(video), *(beside(video, extra).name for extra in extras)])
-            click.echo(f"{files}: {len(views)} frames of {shown} px, {len(views) / rate:.4g} s at {rate:g} a second, "
-                       f"{milliseconds:.1f} ms each")
+            click.echo(
+                f"{files}: {len(views)} frames of {shown} px, {len(views) / rate:.4g} s at {rate:g} a second, "
+                f"{milliseconds:.1f} ms each"
+            )
 
 
-def render_views(model: LoadedModel, views: Sequence[NamedCamera], output: Path | None, background: RGB,
-                 device: str | None = None, format: str = "png", extras: Sequence[str] = (), quiet: bool = False,
-                 video: Path | None = None, fps: float = 30.0, depth_range: tuple[float, float] | None = None,
-                 depth_colours: bool = False) -> float:
+def render_views(
+    model: LoadedModel,
+    views: Sequence[NamedCamera],
+    output: Path | None,
+    background: RGB,
+    device: str | None = None,
+    format: str = "png",
+    extras: Sequence[str] = (),
+    quiet: bool = False,
+    video: Path | None = None,
+    fps: float = 30.0,
+    depth_range: tuple[float, float] | None = None,
+    depth_colours: bool = False,
+) -> float:
     """Render and write all views, one at a time; the median wall time of a render after the first [ms].
 
     Parameters
@@ -187,12 +233,14 @@ def _resized(views: list[NamedCamera], size: tuple[int, int] | None) -> list[Nam
     return [NamedCamera(view.name, resized_by_height(view.camera, *size)) for view in views]
 
 
-def _chosen(views: list[NamedCamera], test_names: frozenset[str] | None, view_set: str | None,
-            source: Path) -> list[NamedCamera]:
+def _chosen(
+    views: list[NamedCamera], test_names: frozenset[str] | None, view_set: str | None, source: Path
+) -> list[NamedCamera]:
     """The test, train or all views; by default the test views, where there are any among them."""
     if not views:
-        raise InputError(f"{source}: no cameras to render: give --cameras cameras.json, a scene with -s, "
-                         "or --path orbit")
+        raise InputError(
+            f"{source}: no cameras to render: give --cameras cameras.json, a scene with -s, or --path orbit"
+        )
     names = both_forms(test_names or frozenset())
     test = [view for view in views if view.name in names]
     if view_set in (None, "all"):

@@ -44,28 +44,54 @@ INTERRUPTED = 130
 
 @click.command(cls=SpacedLists)
 @click.argument("scene", required=False, type=PATH)
-@click.option("-m", "--model-path", "-o", "model_path", type=PATH,
-              help="Folder of the model.  [default: output/<name of the scene>]")
+@click.option(
+    "-m",
+    "--model-path",
+    "-o",
+    "model_path",
+    type=PATH,
+    help="Folder of the model.  [default: output/<name of the scene>]",
+)
 @scene_options
 @hiding_options
 @click.option("--eval", is_flag=True, help="Hold test views out of training, and measure them at the end.")
 @split_options
-@click.option("--resume", is_flag=True,
-              help="Go on from the model's checkpoint, with the options of its run.")
+@click.option("--resume", is_flag=True, help="Go on from the model's checkpoint, with the options of its run.")
 @overwrite_option
 @quiet_option
-@click.option("--preset", type=click.Choice(list(PRESETS)),
-              help="A published system: kernel, optimizer, strategy and constants; other options replace constants.")
-@click.option("--config", "config_file", type=PATH, metavar="FILE",
-              help="Options from a former run's config.json, or a JSON object of some; those given replace them.")
+@click.option(
+    "--preset",
+    type=click.Choice(list(PRESETS)),
+    help="A published system: kernel, optimizer, strategy and constants; other options replace constants.",
+)
+@click.option(
+    "--config",
+    "config_file",
+    type=PATH,
+    metavar="FILE",
+    help="Options from a former run's config.json, or a JSON object of some; those given replace them.",
+)
 @click.option("--view", is_flag=True, help="Show the run in the browser while it trains.")
 @server_options
 @budget_options
 @config_options()
 @click.pass_context
-def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, model_path: Path | None,
-          resume: bool, overwrite: bool, quiet: bool, preset: str | None, config_file: Path | None, view: bool,
-          port: int, host: str, **values: Any) -> None:
+def train(
+    ctx: click.Context,
+    /,
+    scene: Path | None,
+    source_path: Path | None,
+    model_path: Path | None,
+    resume: bool,
+    overwrite: bool,
+    quiet: bool,
+    preset: str | None,
+    config_file: Path | None,
+    view: bool,
+    port: int,
+    host: str,
+    **values: Any,
+) -> None:
     """Learn a splat model of SCENE, a folder with photos in images/ and a COLMAP model in sparse/, or with
     transforms.json or transforms_train.json (NeRF's Blender sets, instant-ngp, nerfstudio). A folder of photographs
     alone, or a video, is reconstructed first, into NAME-scene beside the model's folder (see clsplat reconstruct).
@@ -128,8 +154,9 @@ def train(ctx: click.Context, /, scene: Path | None, source_path: Path | None, m
         report(model, test_metrics(model, loaded))
 
 
-def read_scene(path: Path, reading: dict[str, Any],
-               background: tuple[float, float, float]) -> tuple[Scene, dict[str, Any]]:
+def read_scene(
+    path: Path, reading: dict[str, Any], background: tuple[float, float, float]
+) -> tuple[Scene, dict[str, Any]]:
     """The scene, and what config.json shall say of how it was read.
 
     reading : any of SCENE_KEYS; the others take load_scene's defaults, without test views.
@@ -145,15 +172,30 @@ def read_scene(path: Path, reading: dict[str, Any],
     return scene, record
 
 
-def run_training(scene: Scene, config: TrainConfig, model_path: Path, record: dict[str, Any],
-                 resume: bool = False, overwrite: bool = False, quiet: bool = False,
-                 live: LiveView | None = None) -> Model:
+def run_training(
+    scene: Scene,
+    config: TrainConfig,
+    model_path: Path,
+    record: dict[str, Any],
+    resume: bool = False,
+    overwrite: bool = False,
+    quiet: bool = False,
+    live: LiveView | None = None,
+) -> Model:
     """Train with a live display, and a page in the browser if `live` is given."""
     from clsplat.training.run import train as train_model
 
     with TrainingDisplay(quiet) as display:
-        return train_model(scene, config, live.told(display) if live else display, output=model_path, resume=resume,
-                           overwrite=overwrite, extra=record, visit=live.visit if live else None)
+        return train_model(
+            scene,
+            config,
+            live.told(display) if live else display,
+            output=model_path,
+            resume=resume,
+            overwrite=overwrite,
+            extra=record,
+            visit=live.visit if live else None,
+        )
 
 
 def _viewer(scene: Scene, config: TrainConfig, model_path: Path, host: str, port: int, quiet: bool) -> LiveView:
@@ -174,8 +216,10 @@ def test_metrics(model: Model, scene: Scene) -> Evaluation | None:
 
 def say_stopped(ctx: click.Context, model: Model) -> NoReturn:
     """After Ctrl-C: how to go on."""
-    click.echo(f"stopped at iteration {model.iteration}, checkpoint saved; to go on: "
-               f"clsplat train --resume -m {model.path}", err=True)
+    click.echo(
+        f"stopped at iteration {model.iteration}, checkpoint saved; to go on: clsplat train --resume -m {model.path}",
+        err=True,
+    )
     ctx.exit(INTERRUPTED)
 
 
@@ -184,11 +228,12 @@ def report(model: Model, metrics: Evaluation | None) -> None:
     assert model.path is not None
     ply = ModelFolder(model.path).ply_path(model.iteration)
     click.echo(f"{ply}: {len(model.splats)} splats, {ply.stat().st_size / 1e6:.2f} MB")
-    click.echo(f"trained {model.iteration} iterations in {duration(model.seconds)}, "
-               f"peak memory {model.peak_bytes / 1e6:.0f} MB")
+    click.echo(
+        f"trained {model.iteration} iterations in {duration(model.seconds)}, "
+        f"peak memory {model.peak_bytes / 1e6:.0f} MB"
+    )
     if metrics is not None:
-        click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, "
-                   f"SSIM {metrics.ssim:.4f}")
+        click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
 
 
 def _options_in(file: Path) -> dict[str, Any]:
@@ -199,8 +244,9 @@ def _options_in(file: Path) -> dict[str, Any]:
         config = TrainConfig.from_json(values)
         return {name: getattr(config, name) for name in values}
     except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"{file}: not options of a run ({error}): give a config.json, or an object such as "
-                         '{"iterations": 2000}') from None
+        raise InputError(
+            f'{file}: not options of a run ({error}): give a config.json, or an object such as {{"iterations": 2000}}'
+        ) from None
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 

@@ -38,10 +38,19 @@ POLL = 1.0  # seconds between looks at the file
 
 def server_options(function: F) -> F:
     """`--port` and `--host` of a viewer."""
-    function = click.option("--host", default="127.0.0.1", show_default=True,
-                            help="Address of the viewer; at 0.0.0.0 all who reach this machine may look.")(function)
-    return click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True,
-                        help="Port of the viewer; 0: any free one.")(function)
+    function = click.option(
+        "--host",
+        default="127.0.0.1",
+        show_default=True,
+        help="Address of the viewer; at 0.0.0.0 all who reach this machine may look.",
+    )(function)
+    return click.option(
+        "--port",
+        type=click.IntRange(0, 65535),
+        default=8080,
+        show_default=True,
+        help="Port of the viewer; 0: any free one.",
+    )(function)
 
 
 def require_viser() -> None:
@@ -57,15 +66,32 @@ def require_viser() -> None:
 @click.option("-m", "--model-path", type=PATH, help="The same as MODEL_OR_PLY.")
 @scene_options
 @server_options
-@click.option("--paths", "folder", type=PATH, metavar="DIR",
-              help="Folder where recorded camera paths may be saved. Without it they can be downloaded.")
+@click.option(
+    "--paths",
+    "folder",
+    type=PATH,
+    metavar="DIR",
+    help="Folder where recorded camera paths may be saved. Without it they can be downloaded.",
+)
 @background_options
 @iteration_option
 @device_option
 @quiet_option
-def view(model: Path | None, model_path: Path | None, source_path: Path | None, images: str | None,
-         resolution: int | None, port: int, host: str, folder: Path | None, background: RGB | None,
-         white_background: bool, iteration: int | None, device: str | None, quiet: bool) -> None:
+def view(
+    model: Path | None,
+    model_path: Path | None,
+    source_path: Path | None,
+    images: str | None,
+    resolution: int | None,
+    port: int,
+    host: str,
+    folder: Path | None,
+    background: RGB | None,
+    white_background: bool,
+    iteration: int | None,
+    device: str | None,
+    quiet: bool,
+) -> None:
     """Walk through MODEL_OR_PLY in the browser: a model's folder, or any splat PLY.
 
     Ctrl-C ends it. From another machine: ssh -L 8080:localhost:8080 HOST, then open http://localhost:8080 here. A file
@@ -76,8 +102,9 @@ def view(model: Path | None, model_path: Path | None, source_path: Path | None, 
     require_viser()
     loaded = load_model(given, iteration)
     known = known_cameras(loaded, source_path, images, resolution)
-    viewing = Viewing(loaded, iteration, known, loaded.background if colour is None else colour, host, port, folder,
-                      device)
+    viewing = Viewing(
+        loaded, iteration, known, loaded.background if colour is None else colour, host, port, folder, device
+    )
     if not quiet:
         click.echo(f"{given}: {len(loaded.splats)} splats at {viewing.server.url} (Ctrl-C ends)")
     try:
@@ -98,15 +125,25 @@ def known_cameras(model: LoadedModel, source_path: Path | None, images: str | No
     else:
         cameras, held_out = recorded_cameras(model), model.test_names or frozenset()
     test = both_forms(held_out)
-    return Known(tuple(item for item in cameras if item.name not in test),
-                 tuple(item for item in cameras if item.name in test))
+    return Known(
+        tuple(item for item in cameras if item.name not in test), tuple(item for item in cameras if item.name in test)
+    )
 
 
 class Viewing:
     """A model, those who look at it, and the file behind it."""
 
-    def __init__(self, model: LoadedModel, iteration: int | None, known: Known, background: RGB, host: str, port: int,
-                 folder: Path | None, device: str | None) -> None:
+    def __init__(
+        self,
+        model: LoadedModel,
+        iteration: int | None,
+        known: Known,
+        background: RGB,
+        host: str,
+        port: int,
+        folder: Path | None,
+        device: str | None,
+    ) -> None:
         import numpy as np
 
         from clsplat.cameras.camera import Camera
@@ -123,8 +160,16 @@ class Viewing:
         self.viewer = Viewer(self.source, settings)
         # Kernels are built before anybody waits for them, and a device's errors are said here.
         self.source.picture(Camera(64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4)), settings)
-        self.server: Server = Server(self.viewer, start_of(model.splats.mean, cameras), known, host=host, port=port,
-                                     title=f"clsplat: {model.path.resolve().name}", reload=self.reload, folder=folder)
+        self.server: Server = Server(
+            self.viewer,
+            start_of(model.splats.mean, cameras),
+            known,
+            host=host,
+            port=port,
+            title=f"clsplat: {model.path.resolve().name}",
+            reload=self.reload,
+            folder=folder,
+        )
         self._worker = threading.Thread(target=self.viewer.run, daemon=True)
         self._lock = threading.Lock()
 

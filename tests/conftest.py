@@ -23,7 +23,6 @@ USABLE.sort(key=lambda info: info.index != DEFAULT)
 NAMES = [info.platform.split()[0] for info in USABLE]
 
 
-
 def on_place(place: int, *values: object) -> object:
     """Parameters of a test on the device in this place of USABLE."""
     return pytest.param(*(values or (place,)), marks=[pytest.mark.slow] if place else [])
@@ -31,9 +30,8 @@ def on_place(place: int, *values: object) -> object:
 
 # All schedules on the first device; on others one of lanes and one of groups, as building them takes seconds.
 DEVICE_SCHEDULES = [
-    (place, name) for place in range(len(USABLE)) for name in SCHEDULES
-    if place == 0 or name in ("cpu16", "gpu256")
-]  # fmt: skip
+    (place, name) for place in range(len(USABLE)) for name in SCHEDULES if place == 0 or name in ("cpu16", "gpu256")
+]
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -56,8 +54,11 @@ def device(request: pytest.FixtureRequest, devices: list[Device]) -> Device:
     return devices[request.param]
 
 
-@pytest.fixture(scope="session", params=[on_place(place, (place, name)) for place, name in DEVICE_SCHEDULES],
-                ids=[f"{NAMES[place]}-{name}" for place, name in DEVICE_SCHEDULES])
+@pytest.fixture(
+    scope="session",
+    params=[on_place(place, (place, name)) for place, name in DEVICE_SCHEDULES],
+    ids=[f"{NAMES[place]}-{name}" for place, name in DEVICE_SCHEDULES],
+)
 def scheduled(request: pytest.FixtureRequest, devices: list[Device]) -> tuple[Device, Schedule]:
     """Each device with each of the schedules that it is tested with."""
     place, name = request.param
@@ -75,8 +76,9 @@ def make_renderer() -> MakeRenderer:
     """
     kept: dict[object, Renderer] = {}
 
-    def make(device: Device, precision: str = "float32", schedule: Schedule | None = None,
-             **thresholds: float) -> Renderer:
+    def make(
+        device: Device, precision: str = "float32", schedule: Schedule | None = None, **thresholds: float
+    ) -> Renderer:
         if precision == "float64" and not device.has_fp64:
             pytest.skip(f"{device.info} has no double precision")
         schedule = schedule or default_schedule(device.cl_device)

@@ -40,9 +40,14 @@ def capacity_row(hazard: str, shape: str, device: Device, smoke: bool = False) -
     assert line.frame is not None
     n_isects = line.frame.n_isects
     nbytes = n_isects * line.kernels.v_record * line.kernels.dtype.itemsize
-    found: dict[str, Any] = {"isects": n_isects, "record_bytes": nbytes, "bytes": n_isects * isect_bytes(line.kernels),
-             "bands": len(line.frame.bands), "message": "",
-             "finite": all(bool(np.isfinite(grad).all()) for grad in got.values())}
+    found: dict[str, Any] = {
+        "isects": n_isects,
+        "record_bytes": nbytes,
+        "bytes": n_isects * isect_bytes(line.kernels),
+        "bands": len(line.frame.bands),
+        "message": "",
+        "finite": all(bool(np.isfinite(grad).all()) for grad in got.values()),
+    }
     del line, renderer
     if band:
         with mock.patch.object(pipeline, "most_isects", return_value=band):
@@ -51,8 +56,10 @@ def capacity_row(hazard: str, shape: str, device: Device, smoke: bool = False) -
         return found | {"gradient_error": error, "verdict": "survives" if error == 0 and found["finite"] else "fails"}
     wide = Splats(shape, {name: values.astype(np.float64) for name, values in splats.arrays.items()})
     want = gradients(Renderer(device, "float64"), wide, camera, v_color)
-    error = max(float(np.linalg.norm(got[name] - want[name]) / max(np.linalg.norm(want[name]), 1e-30)) for name in
-                ("opacity_logit", "sh"))
+    error = max(
+        float(np.linalg.norm(got[name] - want[name]) / max(np.linalg.norm(want[name]), 1e-30))
+        for name in ("opacity_logit", "sh")
+    )
     return found | {"gradient_error": error, "verdict": "survives" if error < 1e-2 and found["finite"] else "fails"}
 
 

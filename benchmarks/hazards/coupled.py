@@ -60,8 +60,9 @@ def cases() -> list[dict[str, float]]:
     return usual + [{"slant": SLANTS[-1], "aspect": ASPECTS[1], "skew_lr": factor * SKEW_LR} for factor in (10, 100)]
 
 
-def recovered(device: Device, form: str, case: dict[str, float], seed: int = 0,
-              iterations: int = ITERATIONS) -> dict[str, Any]:
+def recovered(
+    device: Device, form: str, case: dict[str, float], seed: int = 0, iterations: int = ITERATIONS
+) -> dict[str, Any]:
     """One run: PSNR over all photos, and whether its file is finite."""
     rng = np.random.default_rng(seed)
     truth = true_splats(case["slant"], case["aspect"], rng)
@@ -79,9 +80,21 @@ def recovered(device: Device, form: str, case: dict[str, float], seed: int = 0,
         if options["shape"] != DIRECT:
             del start["skew"]
         Splats(options["shape"], start, options.get("normalisation", "peak")).save(file)
-        config = TrainConfig(**(options | {
-            "iterations": iterations, "cap_max": COUNT, "sh_degree": 0, "init": str(file), "densify_until": 0.0,
-            "coarse_to_fine": False, "seed": seed, "device": device.info.index}))
+        config = TrainConfig(
+            **(
+                options
+                | {
+                    "iterations": iterations,
+                    "cap_max": COUNT,
+                    "sh_degree": 0,
+                    "init": str(file),
+                    "densify_until": 0.0,
+                    "coarse_to_fine": False,
+                    "seed": seed,
+                    "device": device.info.index,
+                }
+            )
+        )
         try:
             model = clsplat.train(scene, config, output=Path(folder) / "model")
         except ClsplatError as error:
@@ -97,9 +110,11 @@ def true_splats(slant: float, aspect: float, rng: np.random.Generator) -> Splats
     direction = rng.normal(size=(COUNT, 3))
     short = 0.22 / np.sqrt(aspect)
     arrays = {
-        "mean": RING_TARGET + rng.uniform(-0.8, 0.8, (COUNT, 3)), "quat": rng.normal(size=(COUNT, 4)),
+        "mean": RING_TARGET + rng.uniform(-0.8, 0.8, (COUNT, 3)),
+        "quat": rng.normal(size=(COUNT, 4)),
         "log_scale": np.log(np.column_stack([np.full(COUNT, short * aspect), np.full((COUNT, 2), short)])),
-        "opacity_logit": rng.uniform(0, 3, COUNT), "sh": rng.normal(0, 1.0, (COUNT, 1, 3)),
+        "opacity_logit": rng.uniform(0, 3, COUNT),
+        "sh": rng.normal(0, 1.0, (COUNT, 1, 3)),
         "skew": 0.999 * slant * direction / np.linalg.norm(direction, axis=1, keepdims=True),
     }
     return Splats(DIRECT, {name: values.astype(np.float32) for name, values in arrays.items()})
@@ -126,6 +141,9 @@ def unbounded(lift: bool) -> Iterator[None]:
         return
     shape = shapes.SHAPES[DIRECT]
     free = replace(shape, fields=tuple(replace(field, limit=UNBOUNDED) for field in shape.fields))
-    with (mock.patch.dict(shapes.SHAPES, {DIRECT: free}), mock.patch.object(kernels, "SLANT_MAX", UNBOUNDED),
-          mock.patch.object(skew_map, "SLANT_MAX", UNBOUNDED)):
+    with (
+        mock.patch.dict(shapes.SHAPES, {DIRECT: free}),
+        mock.patch.object(kernels, "SLANT_MAX", UNBOUNDED),
+        mock.patch.object(skew_map, "SLANT_MAX", UNBOUNDED),
+    ):
         yield

@@ -124,8 +124,10 @@ def across_near_plane(shape: Shape) -> Arrays:
     name = "skew" if shape.skew_form else "normal"
     field = shape.schema(1)[name]
     length = 1.0 if field.limit is None else _MOST * field.limit
-    arrays[name] = length * unit(np.random.default_rng(6).normal(0, 0.1, (COUNT, 3)) + np.where(
-        np.arange(COUNT)[:, None] % 2, 1.0, -1.0) * np.array([0.0, 0.0, 1.0]))
+    arrays[name] = length * unit(
+        np.random.default_rng(6).normal(0, 0.1, (COUNT, 3))
+        + np.where(np.arange(COUNT)[:, None] % 2, 1.0, -1.0) * np.array([0.0, 0.0, 1.0])
+    )
     # Deviation 0.5 along the view; the middle of the splat within one of them of the plane.
     arrays["log_scale"] = np.log(np.array([[0.02, 0.02, 0.5]])) + np.zeros((COUNT, 3))
     arrays["mean"] *= ((NEAR + np.linspace(-0.45, 0.45, COUNT)) / arrays["mean"][:, 2])[:, None]

@@ -26,8 +26,10 @@ def print_tables(rows: Sequence[Row]) -> None:
             grid(cells(chosen))
     counts(rows)
     for row in (row for row in rows if row["kind"] == "capacity"):
-        print(f"\n{row['hazard']}, {row['system']}: {row['verdict']}; {row['isects'] / 1e6:.2f} M isects, "
-              f"{row['record_bytes'] / 2**31:.3f} x 2^31 bytes of records, gradient off by {row['gradient_error']:.1e}")
+        print(
+            f"\n{row['hazard']}, {row['system']}: {row['verdict']}; {row['isects'] / 1e6:.2f} M isects, "
+            f"{row['record_bytes'] / 2**31:.3f} x 2^31 bytes of records, gradient off by {row['gradient_error']:.1e}"
+        )
     recovery([row for row in rows if row["kind"] == "recovery"])
     arithmetic([row for row in rows if row["kind"] == "arithmetic"])
 
@@ -41,8 +43,9 @@ def cells(rows: Iterable[Row]) -> list[dict[str, str]]:
     known = [name for system in SYSTEMS for name in (system.shape, system.label)]
     systems.sort(key=known.index)
     order = [*STATIC, *TRAINING]
-    hazards = sorted(dict.fromkeys(hazard for hazard, _ in by),
-                     key=lambda name: order.index(name) if name in order else len(order))
+    hazards = sorted(
+        dict.fromkeys(hazard for hazard, _ in by), key=lambda name: order.index(name) if name in order else len(order)
+    )
     table = []
     for hazard in hazards:
         for system in systems:
@@ -50,8 +53,9 @@ def cells(rows: Iterable[Row]) -> list[dict[str, str]]:
             if own is None:
                 table.append({"row": hazard, "column": system, "verdict": "not run", "text": ""})
                 continue
-            worst = max(own, key=lambda row: (ORDER.index(row["verdict"]),
-                                              row.get("lost_db") or row.get("gradient_error") or 0))
+            worst = max(
+                own, key=lambda row: (ORDER.index(row["verdict"]), row.get("lost_db") or row.get("gradient_error") or 0)
+            )
             table.append({"row": hazard, "column": system, "verdict": worst["verdict"], "text": text(worst)})
     return table
 
@@ -72,8 +76,10 @@ def grid(table: Sequence[dict[str, str]]) -> None:
     print("| hazard | " + " | ".join(columns) + " |\n" + "|---" * (len(columns) + 1) + "|")
     for hazard in dict.fromkeys(cell["row"] for cell in table):
         own = {cell["column"]: cell for cell in table if cell["row"] == hazard}
-        texts = [f"**{own[column]['text']}**" if own[column]["verdict"] in ("loses", "fails") else own[column]["text"]
-                 for column in columns]
+        texts = [
+            f"**{own[column]['text']}**" if own[column]["verdict"] in ("loses", "fails") else own[column]["text"]
+            for column in columns
+        ]
         print(f"| {hazard} | " + " | ".join(texts) + " |")
 
 
@@ -97,22 +103,33 @@ def recovery(rows: Sequence[Row]) -> None:
     print("\n| PSNR of recovered splats [dB] | " + " | ".join(forms) + " |\n|---|" + "---|" * len(forms))
     for hazard in dict.fromkeys(row["hazard"] for row in rows):
         own = {row["system"]: row for row in rows if row["hazard"] == hazard}
-        print(f"| {hazard} | " + " | ".join(
-            "" if form not in own else f"{own[form]['psnr']:.2f}" if own[form]["psnr"] is not None else "stops"
-            for form in forms) + " |")
-    means = [statistics.fmean(row["psnr"] for row in rows if row["system"] == form and row["psnr"] is not None)
-             for form in forms]
+        print(
+            f"| {hazard} | "
+            + " | ".join(
+                "" if form not in own else f"{own[form]['psnr']:.2f}" if own[form]["psnr"] is not None else "stops"
+                for form in forms
+            )
+            + " |"
+        )
+    means = [
+        statistics.fmean(row["psnr"] for row in rows if row["system"] == form and row["psnr"] is not None)
+        for form in forms
+    ]
     print("| mean | " + " | ".join(f"{mean:.2f}" for mean in means) + " |")
 
 
 def arithmetic(rows: Sequence[Row]) -> None:
     if not rows:
         return
-    print("\n| 1 - k in float32 | textbook: not positive | textbook: error (99 %) | squares: not positive | "
-          "squares: error (99 %) |\n|---|---|---|---|---|")
+    print(
+        "\n| 1 - k in float32 | textbook: not positive | textbook: error (99 %) | squares: not positive | "
+        "squares: error (99 %) |\n|---|---|---|---|---|"
+    )
     for row in rows:
-        print(f"| {row['hazard']} | {row['textbook_not_positive']:.1%} | {error(row['textbook_error'])} | "
-              f"{row['squares_not_positive']:.1%} | {error(row['squares_error'])} |")
+        print(
+            f"| {row['hazard']} | {row['textbook_not_positive']:.1%} | {error(row['textbook_error'])} | "
+            f"{row['squares_not_positive']:.1%} | {error(row['squares_error'])} |"
+        )
 
 
 def error(value: float) -> str:

@@ -29,8 +29,7 @@ def arithmetic_row(slant: float, aspect: float, length: float) -> dict[str, Any]
         with np.errstate(all="ignore"):
             got = textbook(b, eta, np.float32, by_squares)
         error = np.where(np.isfinite(got), np.abs(got - exact) / exact, 1e9)  # not finite: beyond any quantile
-        found |= {f"{name}_not_positive": float(np.mean(~(got > 0))),
-                  f"{name}_error": float(np.quantile(error, 0.99))}
+        found |= {f"{name}_not_positive": float(np.mean(~(got > 0))), f"{name}_error": float(np.quantile(error, 0.99))}
     return found
 
 
@@ -54,6 +53,9 @@ def textbook(b: np.ndarray, eta: np.ndarray, dtype: type, by_squares: bool) -> n
     through = np.sum(delta * area, axis=1)
     low = dtype(LOW_PASS)
     whole = squared(area) + low * (squared(b0) + squared(b1) + low)
-    part = through * through + rest * squared(area) + low * (
-        squared(np.cross(b0, delta)) + squared(np.cross(b1, delta)) + rest * (squared(b0) + squared(b1)) + low)
+    part = (
+        through * through
+        + rest * squared(area)
+        + low * (squared(np.cross(b0, delta)) + squared(np.cross(b1, delta)) + rest * (squared(b0) + squared(b1)) + low)
+    )
     return part / whole

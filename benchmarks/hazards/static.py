@@ -18,8 +18,8 @@ from clsplat.splats.splats import Splats
 from . import crafted
 
 IMAGE_TOLERANCE = 0.5 / 255  # half an 8-bit step
-GRADIENT_TOLERANCE = 1e-2    # of a field's gradient, relative in the Euclidean norm: far below the spread of views
-NEGLIGIBLE = 1e-3            # of the largest field's: below it a field is the rounding of others
+GRADIENT_TOLERANCE = 1e-2  # of a field's gradient, relative in the Euclidean norm: far below the spread of views
+NEGLIGIBLE = 1e-3  # of the largest field's: below it a field is the rounding of others
 BACKGROUND = (0.2, 0.5, 0.9)
 
 
@@ -32,8 +32,14 @@ class Renderers:
 
     def __post_init__(self) -> None:
         def make(precision: str, shift: float = 0.0) -> Renderer:
-            return Renderer(self.device, precision, schedule=self.schedule, alpha_min=ALPHA_MIN * (1 + 3 * shift),
-                            alpha_max=ALPHA_MAX * (1 - 0.1 * shift), t_min=T_MIN * (1 + 20 * shift))
+            return Renderer(
+                self.device,
+                precision,
+                schedule=self.schedule,
+                alpha_min=ALPHA_MIN * (1 + 3 * shift),
+                alpha_max=ALPHA_MAX * (1 - 0.1 * shift),
+                t_min=T_MIN * (1 + 20 * shift),
+            )
 
         self.single, self.double, self.other = make("float32"), make("float64", -1e-4), make("float64", 1e-4)
 
@@ -66,14 +72,23 @@ def judged(shape: str, arrays: crafted.Arrays, single: Renderer, double: Rendere
     want = double.backward(v_color, v_alpha)
     got = render(single, splats)
     grads = single.backward(v_color, v_alpha)
-    finite = bool(np.isfinite(got.color).all() and np.isfinite(got.alpha).all()
-                  and all(np.isfinite(grad).all() for grad in grads.values()))
+    finite = bool(
+        np.isfinite(got.color).all()
+        and np.isfinite(got.alpha).all()
+        and all(np.isfinite(grad).all() for grad in grads.values())
+    )
     image_error = float(np.abs(got.color - exact.color)[decided].max(initial=0.0)) / brightest
     worst, error = worst_field(grads, want)
     good = image_error <= IMAGE_TOLERANCE and error <= GRADIENT_TOLERANCE
-    return {"finite": finite, "image_error": number(image_error), "gradient_error": number(error), "field": worst,
-            "decided": float(decided.mean()), "message": "",
-            "verdict": "fails" if not finite else "survives" if good else "loses"}
+    return {
+        "finite": finite,
+        "image_error": number(image_error),
+        "gradient_error": number(error),
+        "field": worst,
+        "decided": float(decided.mean()),
+        "message": "",
+        "verdict": "fails" if not finite else "survives" if good else "loses",
+    }
 
 
 def worst_field(got: dict[str, NDArray[Any]], want: dict[str, NDArray[Any]]) -> tuple[str, float]:
@@ -81,8 +96,10 @@ def worst_field(got: dict[str, NDArray[Any]], want: dict[str, NDArray[Any]]) -> 
     with np.errstate(over="ignore", invalid="ignore"):
         norms = {name: float(np.linalg.norm(value.astype(np.float64))) for name, value in want.items()}
         floor = max(NEGLIGIBLE * max(norms.values()), 1e-30)
-        errors = {name: float(np.linalg.norm(got[name].astype(np.float64) - value)) / max(norms[name], floor)
-                  for name, value in want.items()}
+        errors = {
+            name: float(np.linalg.norm(got[name].astype(np.float64) - value)) / max(norms[name], floor)
+            for name, value in want.items()
+        }
     name = max(errors, key=lambda field: errors[field] if np.isfinite(errors[field]) else np.inf)
     return name, errors[name]
 

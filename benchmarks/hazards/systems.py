@@ -26,8 +26,11 @@ class System:
         return {"shape": self.shape} | ({"skew_map": self.skew_map} if self.skew_map else {})
 
 
-SYSTEMS = tuple(System(shape.name, skew_map) for shape in SHAPES.values()
-                for skew_map in (MAPS[shape.skew_form] if shape.skew_form else ("",)))
+SYSTEMS = tuple(
+    System(shape.name, skew_map)
+    for shape in SHAPES.values()
+    for skew_map in (MAPS[shape.skew_form] if shape.skew_form else ("",))
+)
 
 # Positions by Adam under adaptive density control (the default), with relocation and noise, and by SGHMC.
 OPTIMIZERS: dict[str, dict[str, Any]] = {

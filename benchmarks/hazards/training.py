@@ -32,8 +32,17 @@ from .systems import OPTIMIZERS, System
 
 ITERATIONS, CAP, SH_DEGREE = 200, 400, 1
 TOLERANCE_DB = 0.5
-RATES = ("position_lr_init", "position_lr_final", "opacity_lr", "scaling_lr", "rotation_lr", "feature_lr", "normal_lr",
-         "beta_lr", "nu_lr")
+RATES = (
+    "position_lr_init",
+    "position_lr_final",
+    "opacity_lr",
+    "scaling_lr",
+    "rotation_lr",
+    "feature_lr",
+    "normal_lr",
+    "beta_lr",
+    "nu_lr",
+)
 
 Start = Callable[[Splats], Splats]  # what the first splats are turned into
 
@@ -113,10 +122,14 @@ TRAINING: dict[str, Hazard] = {
     "rate of skew x100": Hazard(options={"skew_lr": 0.25}, of=is_skewed),
     "rate of rotation x100": Hazard(options={"rotation_lr": 0.1}),
     "SGHMC, C x100": Hazard(options={"sghmc_friction": 1.2e4}, only=("sghmc",)),
-    "SGHMC as SSS, C x100": Hazard(options={"sghmc_friction": 1.2e4, "position_optimizer": "sghmc-sss",
-                                            "sghmc_burn_in": 0.0}, only=("sghmc",)),
-    "SGHMC as SSS, scene x100": Hazard(lambda s: worlds.in_units(s, 100), only=("sghmc",),
-                                       options={"position_optimizer": "sghmc-sss", "sghmc_burn_in": 0.0}),
+    "SGHMC as SSS, C x100": Hazard(
+        options={"sghmc_friction": 1.2e4, "position_optimizer": "sghmc-sss", "sghmc_burn_in": 0.0}, only=("sghmc",)
+    ),
+    "SGHMC as SSS, scene x100": Hazard(
+        lambda s: worlds.in_units(s, 100),
+        only=("sghmc",),
+        options={"position_optimizer": "sghmc-sss", "sghmc_burn_in": 0.0},
+    ),
     "scene x1e-3": Hazard(lambda s: worlds.in_units(s, 1e-3)),
     "scene x1e-2": Hazard(lambda s: worlds.in_units(s, 1e-2)),
     "scene x1e2": Hazard(lambda s: worlds.in_units(s, 1e2)),
@@ -136,8 +149,9 @@ TRAINING: dict[str, Hazard] = {
     "a tenth of opacity 0.9999": Hazard(start=lambda s: opacity_of(s, 0.9999), only=TWO),
     "a tenth of opacity 1/255": Hazard(start=lambda s: opacity_of(s, 1 / 255), only=TWO),
     "all transparent": Hazard(start=lambda s: opacity_of(s, 1e-3, every=1), only=TWO),
-    "relocation every 5 iterations": Hazard(start=own_at_bound, only=("mcmc",),
-                                            options={"densify_interval": 5, "densify_until": 1.0, "opacity_reg": 0.05}),
+    "relocation every 5 iterations": Hazard(
+        start=own_at_bound, only=("mcmc",), options={"densify_interval": 5, "densify_until": 1.0, "opacity_reg": 0.05}
+    ),
     "NumPy optimizer": Hazard(options={"optimizer": "numpy"}, only=("adam",)),
     "fast-math build": Hazard(build="-cl-fast-relaxed-math", only=("adam",)),
     "another OpenCL runtime": Hazard(other_device=True, only=("adam",)),
@@ -190,9 +204,21 @@ class Trainings:
 
     def run(self, world: Scene, system: System, optimizer: str, hazard: Hazard) -> dict[str, Any]:
         """Train into a folder, and look into every file of it."""
-        config = TrainConfig(**(system.options | {"iterations": self.iterations, "cap_max": CAP, "sh_degree": SH_DEGREE,
-                                                  "densify_interval": 20, "checkpoint_interval": 50}
-                                | OPTIMIZERS[optimizer] | rates_of(hazard, system) | hazard.options))
+        config = TrainConfig(
+            **(
+                system.options
+                | {
+                    "iterations": self.iterations,
+                    "cap_max": CAP,
+                    "sh_degree": SH_DEGREE,
+                    "densify_interval": 20,
+                    "checkpoint_interval": 50,
+                }
+                | OPTIMIZERS[optimizer]
+                | rates_of(hazard, system)
+                | hazard.options
+            )
+        )
         device = self.other if hazard.other_device and self.other is not None else self.device
         config = replace(config, device=device.info.index)
         found: dict[str, Any] = {"message": "", "psnr": {}, "diverged_at": None}
@@ -200,15 +226,23 @@ class Trainings:
         with tempfile.TemporaryDirectory() as folder, build_options(hazard.build):
             out = Path(folder) / "model"
             if hazard.start is not None:
-                first, _ = initial_splats(world, config.shape, config.cap_max, SH_DEGREE, opacity=config.init_opacity,
-                                          scale_factor=config.init_scale)
+                first, _ = initial_splats(
+                    world,
+                    config.shape,
+                    config.cap_max,
+                    SH_DEGREE,
+                    opacity=config.init_opacity,
+                    scale_factor=config.init_scale,
+                )
                 file = Path(folder) / "start.ply"
                 hazard.start(first).save(file)
                 config = TrainConfig.from_json(config.to_json() | {"init": str(file)})
             try:
                 model = clsplat.train(world, config, output=out)
-                found["psnr"] = {name: view["PSNR"] for name, view in evaluate(
-                    self.renderer, model.splats, world.views).per_view.items()}
+                found["psnr"] = {
+                    name: view["PSNR"]
+                    for name, view in evaluate(self.renderer, model.splats, world.views).per_view.items()
+                }
             except ClsplatError as error:
                 found["message"] = str(error).replace(str(world.path), world.name)
             found["seconds"] = time.perf_counter() - start

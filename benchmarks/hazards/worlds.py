@@ -26,6 +26,7 @@ def capture(views: int = VIEWS) -> Scene:
 
 def in_units(scene: Scene, scale: float) -> Scene:
     """The same world with all lengths times `scale`."""
+
     def camera(of: Camera) -> Camera:
         pose = of.cam_from_world.copy()
         pose[:3, 3] *= scale

@@ -16,12 +16,13 @@ kernel void count_pairs(
     uint n_counts,
     int width,
     int height,
-    int tiles_x)
-{
+    int tiles_x
+) {
     const uint id = get_global_id(0);
     if (id >= n_counts) return;
     const int tile = id / BLOCKS_PER_TILE, block = id % BLOCKS_PER_TILE;
-    const int x = tile % tiles_x * TILE + block % BLOCKS_X * BLOCK_W, y = tile / tiles_x * TILE + block / BLOCKS_X * BLOCK_H;
+    const int x = tile % tiles_x * TILE + block % BLOCKS_X * BLOCK_W,
+              y = tile / tiles_x * TILE + block / BLOCKS_X * BLOCK_H;
     const uint2 range = tile_ranges[tile];
     const vreal px = (vreal)(x + R(0.5)) + lanes_block_x(), py = (vreal)(y + R(0.5)) + lanes_block_y();
     const vmask inside = (px < (vreal)width) & (py < (vreal)height);

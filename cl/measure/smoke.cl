@@ -3,8 +3,8 @@
 kernel void smoke(
     global const float *restrict x,  // [n]
     global float *restrict y,        // [n], overwritten
-    int n)
-{
+    int n
+) {
     int i = get_global_id(0);
     if (i < n) y[i] = exp(-x[i] * x[i]) + erfc(x[i]);
 }

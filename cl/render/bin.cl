@@ -18,8 +18,8 @@ kernel void count_isects(
     uint n_splats,
     int first_tile,
     int past_tile,
-    int tiles_x)
-{
+    int tiles_x
+) {
     const uint rank = get_global_id(0);
     if (rank >= n_splats) return;
     const int4 rect = tile_rect[order[rank]];
@@ -45,8 +45,8 @@ kernel void emit_isects(
     uint n_splats,
     int first_tile,
     int past_tile,
-    int tiles_x)
-{
+    int tiles_x
+) {
     const uint rank = get_global_id(0);
     if (rank >= n_splats) return;
     const uint i = order[rank];
@@ -66,11 +66,8 @@ kernel void emit_isects(
 }
 
 // tile_ranges [n_tiles]: first and past-the-end position of each tile in the sorted isects. Must be zero before.
-kernel void find_tile_ranges(
-    global const uint *restrict sorted_tile,
-    global uint *restrict tile_ranges,
-    uint n_isects)
-{
+kernel void
+find_tile_ranges(global const uint *restrict sorted_tile, global uint *restrict tile_ranges, uint n_isects) {
     const uint at = get_global_id(0);
     if (at >= n_isects) return;
     const uint tile = sorted_tile[at];
@@ -90,8 +87,8 @@ kernel void count_tiles(
     global ushort4 *restrict ranked_rect,
     global int *restrict counts,
     int tiles_x,
-    int tiles_y)
-{
+    int tiles_y
+) {
     const ulong chunk = get_global_id(0), chunks = get_global_size(0), n = n_visible[0];
     const uint start = (uint)(chunk * n / chunks), end = (uint)((chunk + 1) * n / chunks);
     const int stride = tiles_x + 1, cells = stride * (tiles_y + 1);
@@ -125,8 +122,8 @@ kernel void total_tiles(
     uint n_chunks,
     uint cells,
     uint n_tiles,
-    uint run)
-{
+    uint run
+) {
     const uint start = get_global_id(0) * run, end = min(start + run, n_tiles);
     for (uint tile = start; tile < end; ++tile) totals[tile] = 0;
     for (uint chunk = 0; chunk < n_chunks; ++chunk) {
@@ -154,8 +151,8 @@ kernel void list_isects(
     uint cells,
     int first_tile,
     int past_tile,
-    int tiles_x)
-{
+    int tiles_x
+) {
     const ulong chunk = get_global_id(0), chunks = get_global_size(0), n = n_visible[0];
     const uint start = (uint)(chunk * n / chunks), end = (uint)((chunk + 1) * n / chunks);
     global uint *place = counts + chunk * cells;

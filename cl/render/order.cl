@@ -17,8 +17,8 @@ kernel void depth_span(
     global uint2 *restrict span,
     global uint2 *restrict splat_isects,
     uint n_splats,
-    uint run)
-{
+    uint run
+) {
     const uint chunk = get_global_id(0), start = chunk * run, end = min(start + run, n_splats);
     uint least = CULLED_KEY, most = 0;
     for (uint i = start; i < end; ++i) {
@@ -51,8 +51,8 @@ kernel void depth_histogram(
     global uint *restrict counts,
     uint n_splats,
     uint run,
-    uint n_chunks)
-{
+    uint n_chunks
+) {
     const uint chunk = get_global_id(0), start = chunk * run, end = min(start + run, n_splats);
     const uint2 scale = bucket_scale(span, n_chunks);
     global uint *own = counts + (ulong)chunk * BUCKETS;
@@ -71,8 +71,8 @@ kernel void depth_scatter(
     global uint *restrict n_visible,
     uint n_splats,
     uint run,
-    uint n_chunks)
-{
+    uint n_chunks
+) {
     const uint chunk = get_global_id(0), start = chunk * run, end = min(start + run, n_splats);
     const uint2 scale = bucket_scale(span, n_chunks);
     uint all[BUCKETS], to[BUCKETS];  // all: of every chunk; to: of the chunks before this one, then the place to write
@@ -147,8 +147,8 @@ kernel void depth_buckets(
     global uint2 *restrict pairs,
     global uint2 *restrict spare,
     global uint *restrict depth_order,
-    uint n_chunks)
-{
+    uint n_chunks
+) {
     const uint2 scale = bucket_scale(span, n_chunks);
     const ulong part = get_global_id(0), n = bucket_starts[BUCKETS];
     const uint last = bucket_from(bucket_starts, (uint)((part + 1) * n / get_global_size(0)));

@@ -47,9 +47,12 @@ static inline void lowered_vjp(lowering k, splat_params s, vec3 b0, vec3 b1, sha
     g->s.opacity *= k.factor;
     g->s.opacity_minus *= k.factor;
     // factor^2 = flat/det. A splat seen from its edge has no slope.
-    const vreal v_flat = lanes_if(k.factor > (vreal)R(1e-6), v_factor * ((vreal)1 - k.factor * k.factor)
-                                  / (max(k.factor, (vreal)R(1e-6)) * k.det), (vreal)0);
-    const vreal v_squares = -LOW_PASS * v_factor * k.factor / k.det;  // both with the 2 that the squares in flat and det bring
+    const vreal v_flat = lanes_if(
+        k.factor > (vreal)R(1e-6),
+        v_factor * ((vreal)1 - k.factor * k.factor) / (max(k.factor, (vreal)R(1e-6)) * k.det), (vreal)0
+    );
+    const vreal v_squares =
+        -LOW_PASS * v_factor * k.factor / k.det;  // both with the 2 that the squares in flat and det bring
     const vec3 v_area = scale3(add3(scale3(k.area, k.stretch), scale3(k.m, -k.along)), v_flat);
     const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
     const vec3 v_c0 = add3(cross3(k.b1, v_area), scale3(add3(k.b0, scale3(k.m, m0)), v_squares));
@@ -58,25 +61,27 @@ static inline void lowered_vjp(lowering k, splat_params s, vec3 b0, vec3 b1, sha
     *v_b1 = add3(*v_b1, scale3(v_c1, k.size));
     shape_size_vjp(s, dot3(v_c0, b0) + dot3(v_c1, b1), g);
     const vec3 of_flat = add3(scale3(k.m, dot3(k.area, k.area)), scale3(k.area, -k.along));
-    shape_displacement_vjp(s, add3(scale3(of_flat, v_flat), scale3(add3(scale3(k.b0, m0), scale3(k.b1, m1)), v_squares)), g);
+    shape_displacement_vjp(
+        s, add3(scale3(of_flat, v_flat), scale3(add3(scale3(k.b0, m0), scale3(k.b1, m1)), v_squares)), g
+    );
 }
 #endif
 
 // What projection and its gradient both need.
 typedef struct {
-    vec3 mean, c;          // the point that is projected: world, camera
-    vec3 centre;           // that point in the splat's own unit frame, from (x, y, z)
+    vec3 mean, c;  // the point that is projected: world, camera
+    vec3 centre;   // that point in the splat's own unit frame, from (x, y, z)
     unit_quat quat;
-    mat3 rotation;         // of the splat
+    mat3 rotation;  // of the splat
     vec3 scale;
     projection to_px;
-    vec3 a0, a1;           // rows of A = J W [px per world unit]
-    vec3 ar0, ar1;         // rows of A R
-    vec3 b0, b1;           // rows of B = A R S
-    sym2 cov2d;            // B B' + low-pass [px^2]
-    splat_params s, shown; // as stored, and as the shape is to show it
+    vec3 a0, a1;            // rows of A = J W [px per world unit]
+    vec3 ar0, ar1;          // rows of A R
+    vec3 b0, b1;            // rows of B = A R S
+    sym2 cov2d;             // B B' + low-pass [px^2]
+    splat_params s, shown;  // as stored, and as the shape is to show it
 #if ANTIALIASED
-    lowering low;          // from one to the other
+    lowering low;  // from one to the other
 #endif
     vmask in_front;
 } splat_terms;
@@ -156,8 +161,8 @@ kernel void project_splats(
     int width,
     int height,
     int tiles_x,
-    int tiles_y)
-{
+    int tiles_y
+) {
     const uint first = get_global_id(0) * LANES;
     if (first >= n_splats) return;
     const splat_terms s = splat_project(geom + first, capacity, cam);
@@ -180,8 +185,8 @@ kernel void project_splats(
     out[8] = x_lo;
     out[9] = x_hi;
     const vmask seen = s.in_front & (box.left + box.right > (vreal)0) & (x_lo <= x_hi) & (y_lo <= y_hi)
-                     & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height)
-                     & (s.cov2d.xx < (vreal)COV2D_MAX) & (s.cov2d.yy < (vreal)COV2D_MAX);
+                       & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height)
+                       & (s.cov2d.xx < (vreal)COV2D_MAX) & (s.cov2d.yy < (vreal)COV2D_MAX);
     if (!lanes_any(seen)) {  // neither colour is read nor a record written
         for (int l = 0; l < LANES && first + l < n_splats; ++l) {
             depth_key[first + l] = CULLED_KEY;
@@ -215,8 +220,10 @@ kernel void project_splats(
         const bool keep = edge[4][l] > 0;
         for (int j = 0; j < RECORD; ++j) records[(ulong)i * RECORD + j] = lane[l][j];
         depth_key[i] = keep ? as_uint((float)lane[l][5]) : CULLED_KEY;
-        const int4 rect = {max((int)edge[0][l], 0) / TILE, max((int)edge[2][l], 0) / TILE,
-                           min((int)edge[1][l] / TILE + 1, tiles_x), min((int)edge[3][l] / TILE + 1, tiles_y)};
+        const int4 rect = {
+            max((int)edge[0][l], 0) / TILE, max((int)edge[2][l], 0) / TILE, min((int)edge[1][l] / TILE + 1, tiles_x),
+            min((int)edge[3][l] / TILE + 1, tiles_y)
+        };
         tile_rect[i] = keep ? rect : (int4)(0, 0, 0, 0);
     }
 }
@@ -242,8 +249,8 @@ kernel void project_splats_vjp(
     int sh_degree,
     uint compact,
     int width,
-    int height)
-{
+    int height
+) {
     const uint first = get_global_id(0) * LANES;
     if (first >= n_splats) return;
     const vreal zero = (vreal)0;
@@ -265,8 +272,7 @@ kernel void project_splats_vjp(
     const splat_terms s = splat_project(geom + first, capacity, cam);
 
     vreal v[SHAPE_V + 3];
-    for (int j = 0; j < SHAPE_V + 3; ++j)
-        v[j] = lanes_if(seen, lanes_load(moments + first + j * capacity), zero);
+    for (int j = 0; j < SHAPE_V + 3; ++j) v[j] = lanes_if(seen, lanes_load(moments + first + j * capacity), zero);
 
     shape_grads g;
     shape_project_vjp(s.shown, s.b0, s.b1, s.cov2d, v, &g);
@@ -281,13 +287,14 @@ kernel void project_splats_vjp(
     vec3 v_scale = add3(mul3(v_b0, s.ar0), mul3(v_b1, s.ar1));
     const vec3 v_ar0 = mul3(v_b0, s.scale), v_ar1 = mul3(v_b1, s.scale);
     const vec3 v_a0 = mat3_apply(s.rotation, v_ar0), v_a1 = mat3_apply(s.rotation, v_ar1);
-    mat3 v_rotation = {add3(scale3(v_ar0, s.a0.x), scale3(v_ar1, s.a1.x)),
-                             add3(scale3(v_ar0, s.a0.y), scale3(v_ar1, s.a1.y)),
-                             add3(scale3(v_ar0, s.a0.z), scale3(v_ar1, s.a1.z))};
+    mat3 v_rotation = {
+        add3(scale3(v_ar0, s.a0.x), scale3(v_ar1, s.a1.x)), add3(scale3(v_ar0, s.a0.y), scale3(v_ar1, s.a1.y)),
+        add3(scale3(v_ar0, s.a0.z), scale3(v_ar1, s.a1.z))
+    };
     // A = J W
     const mat3 w = camera_rotation(cam);
-    const projection v_px = {g.mean_x, g.mean_y, dot3(v_a0, w.r0), dot3(v_a0, w.r2), dot3(v_a1, w.r1),
-                             dot3(v_a1, w.r2)};
+    const projection v_px = {g.mean_x,         g.mean_y,         dot3(v_a0, w.r0),
+                             dot3(v_a0, w.r2), dot3(v_a1, w.r1), dot3(v_a1, w.r2)};
     const vec3 v_c = camera_project_vjp(cam, s.c, v_px);
     vec3 v_mean = mat3_apply_transposed(w, v_c);
 
@@ -304,8 +311,8 @@ kernel void project_splats_vjp(
     for (int c = 0; c < 3; ++c) v_rgb[c] = lanes_if(lanes_load(seen_rgb[c]) > zero, v[SHAPE_V + c], zero);
     // Of splats that are not seen the mean may be anything, and 0 times a NaN would reach the colour.
     vec3 direction = unit_direction(cam, s.mean, &inv_norm);
-    direction = (vec3){lanes_if(seen, direction.x, zero), lanes_if(seen, direction.y, zero),
-                       lanes_if(seen, direction.z, zero)};
+    direction =
+        (vec3){lanes_if(seen, direction.x, zero), lanes_if(seen, direction.y, zero), lanes_if(seen, direction.z, zero)};
     const int used = (sh_degree + 1) * (sh_degree + 1);
     if (compact) {
         vec3_store((vec3){v_rgb[0], v_rgb[1], v_rgb[2]}, grad_sh + first, capacity);
@@ -314,12 +321,12 @@ kernel void project_splats_vjp(
         vreal basis[SH_COUNT];
         sh_basis(direction, sh_degree, basis);
         for (int k = 0; k < used; ++k)
-            for (int c = 0; c < 3; ++c) lanes_store(basis[k] * v_rgb[c], grad_sh + first + (ulong)(3 * k + c) * capacity);
+            for (int c = 0; c < 3; ++c)
+                lanes_store(basis[k] * v_rgb[c], grad_sh + first + (ulong)(3 * k + c) * capacity);
     }
     for (int k = 0; k < used; ++k) {
         v_basis[k] = zero;
-        for (int c = 0; c < 3; ++c)
-            v_basis[k] += v_rgb[c] * sh_load(sh + first + (ulong)(3 * k + c) * capacity);
+        for (int c = 0; c < 3; ++c) v_basis[k] += v_rgb[c] * sh_load(sh + first + (ulong)(3 * k + c) * capacity);
     }
     vec3 v_direction = sh_basis_vjp(direction, sh_degree, v_basis);
     v_direction = add3(v_direction, scale3(direction, -dot3(direction, v_direction)));
@@ -336,15 +343,24 @@ kernel void project_splats_vjp(
 
     global real *out = grad_geom + first;
     const vec3 v_log_scale = mul3(v_scale, s.scale);
-    vec3_store((vec3){lanes_if(seen, v_mean.x, zero), lanes_if(seen, v_mean.y, zero),
-                      lanes_if(seen, v_mean.z, zero)}, out + ROW_MEAN * capacity, capacity);
-    vec3_store((vec3){lanes_if(seen, v_log_scale.x, zero), lanes_if(seen, v_log_scale.y, zero),
-                      lanes_if(seen, v_log_scale.z, zero)}, out + ROW_LOG_SCALE * capacity, capacity);
+    vec3_store(
+        (vec3){lanes_if(seen, v_mean.x, zero), lanes_if(seen, v_mean.y, zero), lanes_if(seen, v_mean.z, zero)},
+        out + ROW_MEAN * capacity, capacity
+    );
+    vec3_store(
+        (vec3){
+            lanes_if(seen, v_log_scale.x, zero), lanes_if(seen, v_log_scale.y, zero),
+            lanes_if(seen, v_log_scale.z, zero)
+        },
+        out + ROW_LOG_SCALE * capacity, capacity
+    );
     quat_rotation_vjp(s.quat, v_rotation, seen, out + ROW_QUAT * capacity, capacity);
     lanes_store(lanes_if(seen, g.s.opacity * opacity_slope(s.s.opacity), zero), out + ROW_OPACITY_LOGIT * capacity);
 #ifdef ROW_OPACITY_MINUS_LOGIT
-    lanes_store(lanes_if(seen, g.s.opacity_minus * opacity_slope(s.s.opacity_minus), zero),
-                out + ROW_OPACITY_MINUS_LOGIT * capacity);
+    lanes_store(
+        lanes_if(seen, g.s.opacity_minus * opacity_slope(s.s.opacity_minus), zero),
+        out + ROW_OPACITY_MINUS_LOGIT * capacity
+    );
 #endif
 #ifdef ROW_BETA
     lanes_store(lanes_if(seen, g.s.beta, zero), out + ROW_BETA * capacity);
@@ -352,8 +368,9 @@ kernel void project_splats_vjp(
 #ifdef ROW_NU
     lanes_store(lanes_if(seen, g.s.nu, zero), out + ROW_NU * capacity);
 #endif
-    const vec3 v_skew = {lanes_if(seen, g.s.skew.x, zero), lanes_if(seen, g.s.skew.y, zero),
-                         lanes_if(seen, g.s.skew.z, zero)};
+    const vec3 v_skew = {
+        lanes_if(seen, g.s.skew.x, zero), lanes_if(seen, g.s.skew.y, zero), lanes_if(seen, g.s.skew.z, zero)
+    };
 #ifdef ROW_SKEW
     vec3_store(v_skew, out + ROW_SKEW * capacity, capacity);
 #endif

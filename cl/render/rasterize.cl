@@ -29,8 +29,14 @@ typedef uint block_bits;
 #if ALONE
 typedef global const real *staged_record;
 #define BATCH_MEMORY uint batch[BATCH]
-static inline void stage_batch(global const uint *lists, global const uint *isect_splat, global const real *records,
-                               uint start, int n, uint *batch) {
+static inline void stage_batch(
+    global const uint *lists,
+    global const uint *isect_splat,
+    global const real *records,
+    uint start,
+    int n,
+    uint *batch
+) {
     for (int k = 0; k < n; ++k) {
         batch[k] = isect_splat[lists[start + k]];
         prefetch_reals(records + (ulong)batch[k] * RECORD, RECORD);
@@ -40,8 +46,14 @@ static inline void stage_batch(global const uint *lists, global const uint *isec
 #else
 typedef local const real *staged_record;
 #define BATCH_MEMORY local real batch[BATCH * RECORD]
-static inline void stage_batch(global const uint *lists, global const uint *isect_splat, global const real *records,
-                               uint start, int n, local real *batch) {
+static inline void stage_batch(
+    global const uint *lists,
+    global const uint *isect_splat,
+    global const real *records,
+    uint start,
+    int n,
+    local real *batch
+) {
     for (int k = LID; k < n; k += GROUP) {
         global const real *from = records + (ulong)isect_splat[lists[start + k]] * RECORD;
         for (int j = 0; j < RECORD; ++j) batch[k * RECORD + j] = from[j];
@@ -97,7 +109,7 @@ static inline block_set blocks_reached(const real *rec, int tile_x, int tile_y) 
         if (PARTS == 1 || (rec[7] >= (real)top && rec[6] < (real)(top + LANES / BLOCKS_X * BLOCK_H))) {
             const vreal x = corners_x(first) + (vreal)tile_x, y = corners_y(first) + (vreal)tile_y;
             const vmask in_box = (x <= (vreal)rec[9]) & (x + (real)(BLOCK_W - 1) >= (vreal)rec[8])
-                               & (y <= (vreal)rec[7]) & (y + (real)(BLOCK_H - 1) >= (vreal)rec[6]);
+                                 & (y <= (vreal)rec[7]) & (y + (real)(BLOCK_H - 1) >= (vreal)rec[6]);
             const vreal dx = x + R(0.5) * BLOCK_W - rec[0], dy = y + R(0.5) * BLOCK_H - rec[1];
             bits[first / 32] |= in_box & shape_reaches(dx, dy, rec + HEAD) & lanes_bits(first % 32);
         }
@@ -154,8 +166,8 @@ kernel void rasterize(
     ulong plane,
     real background_r,
     real background_g,
-    real background_b)
-{
+    real background_b
+) {
     BATCH_MEMORY;
     local real scratch[GROUP_SCRATCH(1)];
     const int tile = get_group_id(0);
@@ -235,8 +247,12 @@ kernel void rasterize(
         const vreal zero = (vreal)0;
         T[v] = fabs(T[v]);
         lanes_store_block(lanes_if(inside, lanes_mad(T[v], (vreal)background_r, red[v]), zero), color + at, stride);
-        lanes_store_block(lanes_if(inside, lanes_mad(T[v], (vreal)background_g, green[v]), zero), color + at + plane, stride);
-        lanes_store_block(lanes_if(inside, lanes_mad(T[v], (vreal)background_b, blue[v]), zero), color + at + 2 * plane, stride);
+        lanes_store_block(
+            lanes_if(inside, lanes_mad(T[v], (vreal)background_g, green[v]), zero), color + at + plane, stride
+        );
+        lanes_store_block(
+            lanes_if(inside, lanes_mad(T[v], (vreal)background_b, blue[v]), zero), color + at + 2 * plane, stride
+        );
         lanes_store_block(lanes_if(inside, T[v], zero), transmittance + at, stride);
 #if WITH_DEPTH
         lanes_store_block(lanes_if(inside, z[v], zero), depth + at, stride);
@@ -264,8 +280,8 @@ kernel void rasterize_vjp(
     int height,
     int tiles_x,
     int stride,
-    ulong plane)
-{
+    ulong plane
+) {
     BATCH_MEMORY;
     local real scratch[GROUP_SCRATCH(V_RECORD)];
     const int tile = get_group_id(0);
@@ -279,8 +295,9 @@ kernel void rasterize_vjp(
         v_red[v] = lanes_load_block(v_color + at, stride);
         v_green[v] = lanes_load_block(v_color + at + plane, stride);
         v_blue[v] = lanes_load_block(v_color + at + 2 * plane, stride);
-        rest[v] = v_red[v] * lanes_load_block(color + at, stride) + v_green[v] * lanes_load_block(color + at + plane, stride)
-                + v_blue[v] * lanes_load_block(color + at + 2 * plane, stride);
+        rest[v] = v_red[v] * lanes_load_block(color + at, stride)
+                  + v_green[v] * lanes_load_block(color + at + plane, stride)
+                  + v_blue[v] * lanes_load_block(color + at + 2 * plane, stride);
 #if WITH_V_ALPHA
         rest[v] -= lanes_load_block(transmittance + at, stride) * lanes_load_block(v_alpha + at, stride);
 #endif
@@ -331,10 +348,8 @@ kernel void rasterize_vjp(
                 rest[v] = lanes_mad(-weight, g, rest[v]);
                 const vreal v_a = lanes_mad(T_before, g, -rest[v] / ((vreal)1 - alpha));
                 const vreal v_raw = lanes_if(hit, blend_clamp_vjp(raw_alpha, v_a), (vreal)0);
-                if (plain)
-                    shape_alpha_plain_vjp(dx, dy, raw_alpha, v_raw, sums);
-                else
-                    shape_alpha_vjp(dx, dy, rec + HEAD, pixels[v], v_raw, sums);
+                if (plain) shape_alpha_plain_vjp(dx, dy, raw_alpha, v_raw, sums);
+                else shape_alpha_vjp(dx, dy, rec + HEAD, pixels[v], v_raw, sums);
                 sums[SHAPE_V] = lanes_mad(weight, v_red[v], sums[SHAPE_V]);
                 sums[SHAPE_V + 1] = lanes_mad(weight, v_green[v], sums[SHAPE_V + 1]);
                 sums[SHAPE_V + 2] = lanes_mad(weight, v_blue[v], sums[SHAPE_V + 2]);
@@ -355,8 +370,8 @@ kernel void gather_isect_grads(
     global real *restrict moments,
     ulong capacity,
     uint n_splats,
-    int go_on)
-{
+    int go_on
+) {
     const uint first = get_global_id(0) * LANES;
     if (first >= n_splats) return;
     real sums[V_RECORD][LANES];

@@ -11,20 +11,14 @@ static inline void count_digits(global const uint *keys, uint n, uint run, uint 
     const uint lid = get_local_id(0);
     for (uint d = 0; d < RADIX; ++d) hist[d * SORT_GROUP + lid] = 0;
     const ulong start = (ulong)get_global_id(0) * run;
-    for (ulong k = start; k < start + run && k < n; ++k)
-        ++hist[((keys[k] >> shift) & (RADIX - 1)) * SORT_GROUP + lid];
+    for (ulong k = start; k < start + run && k < n; ++k) ++hist[((keys[k] >> shift) & (RADIX - 1)) * SORT_GROUP + lid];
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
 // counts [RADIX, n_blocks], digit-major: its exclusive scan is where each block's digit starts.
 SORT_ATTRIBUTE
-kernel void radix_histogram(
-    global const uint *restrict keys,
-    global uint *restrict counts,
-    uint n,
-    uint run,
-    uint shift)
-{
+kernel void
+radix_histogram(global const uint *restrict keys, global uint *restrict counts, uint n, uint run, uint shift) {
     local uint hist[RADIX * SORT_GROUP];
     count_digits(keys, n, run, shift, hist);
     for (uint d = get_local_id(0); d < RADIX; d += SORT_GROUP) {
@@ -44,8 +38,8 @@ kernel void radix_scatter(
     global uint *restrict values_out,
     uint n,
     uint run,
-    uint shift)
-{
+    uint shift
+) {
     local uint hist[RADIX * SORT_GROUP];
     count_digits(keys, n, run, shift, hist);
     for (uint d = get_local_id(0); d < RADIX; d += SORT_GROUP) {
@@ -67,21 +61,13 @@ kernel void radix_scatter(
     }
 }
 
-kernel void fill_iota(
-    global uint *restrict values,
-    uint n)
-{
+kernel void fill_iota(global uint *restrict values, uint n) {
     const uint i = get_global_id(0);
     if (i < n) values[i] = i;
 }
 
 // Exclusive scan in three steps: sums of runs, one a work-item, scan of the sums by one group, scan within the runs.
-kernel void scan_sums(
-    global const uint *restrict values,
-    global ulong *restrict sums,
-    uint n,
-    uint run)
-{
+kernel void scan_sums(global const uint *restrict values, global ulong *restrict sums, uint n, uint run) {
     const ulong start = (ulong)get_global_id(0) * run;
     ulong sum = 0;
     for (ulong k = start; k < start + run && k < n; ++k) sum += values[k];
@@ -90,11 +76,7 @@ kernel void scan_sums(
 
 // One group: sums becomes its own exclusive scan; total[0] the grand total.
 SORT_ATTRIBUTE
-kernel void scan_spine(
-    global ulong *restrict sums,
-    global ulong *restrict total,
-    uint n)
-{
+kernel void scan_spine(global ulong *restrict sums, global ulong *restrict total, uint n) {
     local ulong part[SORT_GROUP];
     const uint lid = get_local_id(0);
     const uint run = (n + SORT_GROUP - 1) / SORT_GROUP;
@@ -127,8 +109,8 @@ kernel void scan_apply(
     global const ulong *restrict sums,
     global uint *restrict scanned,
     uint n,
-    uint run)
-{
+    uint run
+) {
     const ulong start = (ulong)get_global_id(0) * run;
     uint at = (uint)sums[get_global_id(0)];
     for (ulong k = start; k < start + run && k < n; ++k) {

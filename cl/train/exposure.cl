@@ -7,12 +7,14 @@
 // A work-item has PHOTO_VECS vectors of a row. Images are planar with a zero margin (see raster.cl).
 
 #define EXPOSURE 12
-#define SQUARES 10             // of the upper triangle of a 4 x 4 matrix, by rows
+#define SQUARES 10  // of the upper triangle of a 4 x 4 matrix, by rows
 #define SUMS (SQUARES + EXPOSURE)
-#define SATURATED R(0.98)      // a brighter photo says nothing of its exposure
+#define SATURATED R(0.98)  // a brighter photo says nothing of its exposure
 
 // Vectors of a work-item's row.
-typedef struct { int vecs, first, past; } row_part;
+typedef struct {
+    int vecs, first, past;
+} row_part;
 
 static inline row_part own_part(int width) {
     const int vecs = (width + LANES - 1) / LANES, first = get_global_id(0) * PHOTO_VECS;
@@ -42,8 +44,8 @@ kernel void photo_of_render(
     ulong plane,
     real shift_r,
     real shift_g,
-    real shift_b)
-{
+    real shift_b
+) {
     const row_part own = own_part(width);
     const int y = get_global_id(1);
     global const real *row = exposures + EXPOSURE * view;
@@ -52,10 +54,12 @@ kernel void photo_of_render(
     if (y >= height) return;
     for (int vec = own.first; vec < own.past; ++vec) {
         const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + vec * LANES;
-        const vmask inside = lanes_before(vec * LANES, width), counts = counted(truth + at, plane, channels, vec, width);
-        const vreal r = lanes_load(color + at), g = lanes_load(color + at + plane), b = lanes_load(color + at + 2 * plane);
-        const vreal through = channels > 3
-            ? (vreal)1 - lanes_uchar_to_real(truth + at + 4 * plane) * (real)(1.0 / 255.0) : zero;
+        const vmask inside = lanes_before(vec * LANES, width),
+                    counts = counted(truth + at, plane, channels, vec, width);
+        const vreal r = lanes_load(color + at), g = lanes_load(color + at + plane),
+                    b = lanes_load(color + at + 2 * plane);
+        const vreal through =
+            channels > 3 ? (vreal)1 - lanes_uchar_to_real(truth + at + 4 * plane) * (real)(1.0 / 255.0) : zero;
         for (int c = 0; c < 3; ++c) {
             global const real *e = row + 4 * c;
             vreal shown = lanes_mad(r, (vreal)e[0], lanes_mad(g, (vreal)e[1], lanes_mad(b, (vreal)e[2], (vreal)e[3])));
@@ -85,8 +89,8 @@ kernel void photo_of_render_vjp(
     int width,
     int height,
     int stride,
-    ulong plane)
-{
+    ulong plane
+) {
     const row_part own = own_part(width);
     const int y = get_global_id(1);
     global const real *row = exposures + EXPOSURE * view;
@@ -105,9 +109,12 @@ kernel void photo_of_render_vjp(
             v_photo[c] = lanes_if(counts, lanes_load(v + at + c * plane), zero);
         }
         for (int c = 0; c < 3; ++c)
-            lanes_store(lanes_mad(v_photo[0], (vreal)row[c],
-                                  lanes_mad(v_photo[1], (vreal)row[4 + c], v_photo[2] * (vreal)row[8 + c])),
-                        v + at + c * plane);
+            lanes_store(
+                lanes_mad(
+                    v_photo[0], (vreal)row[c], lanes_mad(v_photo[1], (vreal)row[4 + c], v_photo[2] * (vreal)row[8 + c])
+                ),
+                v + at + c * plane
+            );
         x[3] = lanes_if(counts & (most < (vreal)SATURATED), (vreal)1, zero);
         for (int c = 0; c < 3; ++c) x[c] *= x[3];
         int j = 0;
@@ -157,8 +164,8 @@ kernel void step_exposure(
     int view,
     int views,
     real rate,
-    real pull)
-{
+    real pull
+) {
     local real shares[EXPOSURE_GROUP][SUMS], sums[SUMS], moved[EXPOSURE];
     const int item = get_local_id(0);
     for (int j = 0; j < SUMS; ++j) {

@@ -18,8 +18,8 @@ kernel void wake_vectors(
     uint base_learns,
     uint skew_learns,
     uint all,
-    uint peeks)
-{
+    uint peeks
+) {
     const uint v = get_global_id(0), first = v * LANES;
     if (v >= vectors) return;
     ages[v] = (int2)(-1, -1);
@@ -58,8 +58,8 @@ kernel void settle_splats(
     real sh_lr,
     real sh_rest_lr,
     real skew_lr,
-    uint keeps_moments)
-{
+    uint keeps_moments
+) {
     const ulong i = get_global_id(0) * LANES;
     const uint part = get_global_id(1);
     const int2 age = ages[get_global_id(0)];

@@ -37,9 +37,9 @@
 
 // Strip, rows and place of a work-item.
 typedef struct {
-    int first, n;    // vectors of the row
-    int top, end;    // rows
-    ulong at;        // of the strip in row 0
+    int first, n;  // vectors of the row
+    int top, end;  // rows
+    ulong at;      // of the strip in row 0
 } strip;
 
 static inline int strips_of(int stride) { return ((stride - 2 * MARGIN_X) / LANES + STRIP - 1) / STRIP; }
@@ -63,8 +63,8 @@ kernel void unpack_image(
     int channels,
     int width,
     int height,
-    ulong plane)
-{
+    ulong plane
+) {
     const int x = (int)get_global_id(0) - MARGIN_X, y = (int)get_global_id(1) - MARGIN_Y;
     const bool inside = x >= 0 && x < width && y >= 0 && y < height;
     const ulong at = get_global_id(1) * get_global_size(0) + get_global_id(0);
@@ -83,8 +83,8 @@ kernel void image_loss(
     int height,
     int stride,
     ulong plane,
-    int segment)
-{
+    int segment
+) {
     const int strips = strips_of(stride);
     if (get_global_id(0) >= strips) return;
     const strip own = own_strip(height, stride, plane, segment);
@@ -106,13 +106,15 @@ kernel void image_loss(
                 const real *s_at = s_row + (SIDE + v) * LANES, *d_at = d_row + (SIDE + v) * LANES;
                 const vreal s = lanes_load(s_at), d = lanes_load(d_at);
                 vreal s1 = WINDOW_5 * s, d1 = WINDOW_5 * d, s2 = s1 * s, d2 = d1 * d;
-#define ADD_PAIR(w, k) { \
-                const vreal sa = lanes_load(s_at - k), sb = lanes_load(s_at + k); \
-                const vreal da = lanes_load(d_at - k), db = lanes_load(d_at + k); \
-                s1 = lanes_mad(w, sa + sb, s1); \
-                d1 = lanes_mad(w, da + db, d1); \
-                s2 = lanes_mad(w, lanes_mad(sa, sa, sb * sb), s2); \
-                d2 = lanes_mad(w, lanes_mad(da, da, db * db), d2); }
+#define ADD_PAIR(w, k) \
+    { \
+        const vreal sa = lanes_load(s_at - k), sb = lanes_load(s_at + k); \
+        const vreal da = lanes_load(d_at - k), db = lanes_load(d_at + k); \
+        s1 = lanes_mad(w, sa + sb, s1); \
+        d1 = lanes_mad(w, da + db, d1); \
+        s2 = lanes_mad(w, lanes_mad(sa, sa, sb * sb), s2); \
+        d2 = lanes_mad(w, lanes_mad(da, da, db * db), d2); \
+    }
                 PAIRS_OF_WINDOW(ADD_PAIR)
 #undef ADD_PAIR
                 PUT(0, s1);
@@ -128,14 +130,14 @@ kernel void image_loss(
         if (row < own.top + REACH) continue;
         const ulong centre = own.at + (long)(row - REACH) * stride;
         for (int v = 0; v < own.n; ++v) {
-            const vreal (*mid)[4] = &ring[slot + REACH][v];
+            const vreal(*mid)[4] = &ring[slot + REACH][v];
             vreal ms = WINDOW_5 * mid[0][0], md = WINDOW_5 * mid[0][1];
             vreal ms2 = WINDOW_5 * mid[0][2], md2 = WINDOW_5 * mid[0][3];
 #define ADD_PAIR(w, k) \
-            ms = lanes_mad(w, mid[-k * STRIP][0] + mid[k * STRIP][0], ms); \
-            md = lanes_mad(w, mid[-k * STRIP][1] + mid[k * STRIP][1], md); \
-            ms2 = lanes_mad(w, mid[-k * STRIP][2] + mid[k * STRIP][2], ms2); \
-            md2 = lanes_mad(w, mid[-k * STRIP][3] + mid[k * STRIP][3], md2);
+    ms = lanes_mad(w, mid[-k * STRIP][0] + mid[k * STRIP][0], ms); \
+    md = lanes_mad(w, mid[-k * STRIP][1] + mid[k * STRIP][1], md); \
+    ms2 = lanes_mad(w, mid[-k * STRIP][2] + mid[k * STRIP][2], ms2); \
+    md2 = lanes_mad(w, mid[-k * STRIP][3] + mid[k * STRIP][3], md2);
             PAIRS_OF_WINDOW(ADD_PAIR)
 #undef ADD_PAIR
             const vreal half_s = R(0.5) * ms * ms, half_d = R(0.5) * md * md;
@@ -178,8 +180,8 @@ kernel void image_loss_vjp(
     ulong plane,
     int segment,
     real l1_scale,
-    real ssim_scale)
-{
+    real ssim_scale
+) {
     if (get_global_id(0) >= strips_of(stride)) return;
     const strip own = own_strip(height, stride, plane, segment);
     vreal ring[RING][STRIP][3];
@@ -194,9 +196,9 @@ kernel void image_loss_vjp(
                 vreal v_mean = WINDOW_5 * lanes_load(from);
                 vreal v_hs = WINDOW_5 * lanes_load(hs), v_hd = WINDOW_5 * lanes_load(hd);
 #define ADD_PAIR(w, k) \
-                v_mean = lanes_mad(w, lanes_load(from - k) + lanes_load(from + k), v_mean); \
-                v_hs = lanes_mad(w, lanes_load(hs - k) + lanes_load(hs + k), v_hs); \
-                v_hd = lanes_mad(w, lanes_load(hd - k) + lanes_load(hd + k), v_hd);
+    v_mean = lanes_mad(w, lanes_load(from - k) + lanes_load(from + k), v_mean); \
+    v_hs = lanes_mad(w, lanes_load(hs - k) + lanes_load(hs + k), v_hs); \
+    v_hd = lanes_mad(w, lanes_load(hd - k) + lanes_load(hd + k), v_hd);
                 PAIRS_OF_WINDOW(ADD_PAIR)
 #undef ADD_PAIR
                 PUT(0, v_mean);
@@ -211,20 +213,22 @@ kernel void image_loss_vjp(
         if (row < own.top + REACH) continue;
         const ulong centre = own.at + (long)(row - REACH) * stride;
         for (int v = 0; v < own.n; ++v) {
-            const vreal (*mid)[3] = &ring[slot + REACH][v];
+            const vreal(*mid)[3] = &ring[slot + REACH][v];
             vreal v_mean = WINDOW_5 * mid[0][0], v_hs = WINDOW_5 * mid[0][1], v_hd = WINDOW_5 * mid[0][2];
 #define ADD_PAIR(w, k) \
-            v_mean = lanes_mad(w, mid[-k * STRIP][0] + mid[k * STRIP][0], v_mean); \
-            v_hs = lanes_mad(w, mid[-k * STRIP][1] + mid[k * STRIP][1], v_hs); \
-            v_hd = lanes_mad(w, mid[-k * STRIP][2] + mid[k * STRIP][2], v_hd);
+    v_mean = lanes_mad(w, mid[-k * STRIP][0] + mid[k * STRIP][0], v_mean); \
+    v_hs = lanes_mad(w, mid[-k * STRIP][1] + mid[k * STRIP][1], v_hs); \
+    v_hd = lanes_mad(w, mid[-k * STRIP][2] + mid[k * STRIP][2], v_hd);
             PAIRS_OF_WINDOW(ADD_PAIR)
 #undef ADD_PAIR
             const ulong at = centre + v * LANES;
             const vreal x = lanes_load(rendered + at), y = truth_load(truth + at);
             const vreal v_ssim = lanes_mad(x + y, v_hs, lanes_mad(x - y, v_hd, v_mean));
             const vreal sign_l1 = lanes_if(x > y, (vreal)1, lanes_if(x < y, (vreal)-1, zero));
-            lanes_store(lanes_if(lanes_before((own.first + v) * LANES, width), l1_scale * sign_l1 - ssim_scale * v_ssim, zero),
-                        v_color + at);
+            lanes_store(
+                lanes_if(lanes_before((own.first + v) * LANES, width), l1_scale * sign_l1 - ssim_scale * v_ssim, zero),
+                v_color + at
+            );
         }
     }
 }

@@ -6,8 +6,14 @@
 // Coefficient k of the colour. grad_sh [6, capacity]: the gradient of the colour and the direction (cl/render/project.cl), whose
 // product with the basis is formed here.
 static inline void step_coefficient(
-    uint k, int degree, real lr, global real *sh, global const real *grad_sh, adam_moments adam, const ulong capacity)
-{
+    uint k,
+    int degree,
+    real lr,
+    global real *sh,
+    global const real *grad_sh,
+    adam_moments adam,
+    const ulong capacity
+) {
     vreal basis[SH_COUNT];
     sh_basis(vec3_load(grad_sh + 3 * capacity, capacity), degree, basis);
     for (int c = 0; c < 3; ++c)
@@ -21,7 +27,7 @@ static inline void step_coefficient(
 #define PART_SCALE 2
 #define PART_OWN 3  // opacities, and the shape's own but the skew
 #define PART_SKEW 4
-#define PARTS 5     // then one a coefficient of the colour
+#define PARTS 5  // then one a coefficient of the colour
 #ifdef ROW_SKEW
 #define PART_MAPS (SKEW_ROTATES ? PART_QUAT : PART_SKEW)  // has the trainable skew
 #endif
@@ -29,38 +35,58 @@ static inline void step_coefficient(
 // Rows of a part, skew left out.
 static inline uint2 part_rows(uint part) {
     switch (part) {
-    case PART_MEAN: return (uint2)(ROW_MEAN, ROW_MEAN + 3);
-    case PART_QUAT: return (uint2)(ROW_QUAT, ROW_QUAT + 4);
-    case PART_SCALE: return (uint2)(ROW_LOG_SCALE, ROW_LOG_SCALE + 3);
+    case PART_MEAN:
+        return (uint2)(ROW_MEAN, ROW_MEAN + 3);
+    case PART_QUAT:
+        return (uint2)(ROW_QUAT, ROW_QUAT + 4);
+    case PART_SCALE:
+        return (uint2)(ROW_LOG_SCALE, ROW_LOG_SCALE + 3);
 #ifdef ROW_SKEW
-    case PART_OWN: return (uint2)(ROW_OPACITY_LOGIT, ROW_SKEW);
+    case PART_OWN:
+        return (uint2)(ROW_OPACITY_LOGIT, ROW_SKEW);
 #else
-    case PART_OWN: return (uint2)(ROW_OPACITY_LOGIT, GEOM_ROWS);
+    case PART_OWN:
+        return (uint2)(ROW_OPACITY_LOGIT, GEOM_ROWS);
 #endif
-    default: return (uint2)(0, 0);
+    default:
+        return (uint2)(0, 0);
     }
 }
 #define PART_ROWS 4  // at most
 
 // Steps that were sat out, of a coefficient of the colour, of a part's rows, and of the trainable skew.
-static inline void catch_up_coefficient(
-    uint k, adam_wait wait, real lr, global real *sh, adam_moments adam, const ulong capacity)
-{
+static inline void
+catch_up_coefficient(uint k, adam_wait wait, real lr, global real *sh, adam_moments adam, const ulong capacity) {
     for (int c = 0; c < 3; ++c) adam_catch_up(wait, lr, 0, 0, sh, adam, (3 * k + c) * capacity);
 }
-static inline void catch_up_rows(uint2 rows, constant real *waits, int steps, bool keeps_moments, global real *geom,
-                                 adam_moments adam, constant real *rates, const ulong capacity)
-{
+static inline void catch_up_rows(
+    uint2 rows,
+    constant real *waits,
+    int steps,
+    bool keeps_moments,
+    global real *geom,
+    adam_moments adam,
+    constant real *rates,
+    const ulong capacity
+) {
     const bool means = rows.x == ROW_MEAN;
     const adam_wait wait = waited_steps(waits, steps, means ? DRIFT_MEAN : DRIFT, keeps_moments);
     for (uint row = rows.x; row < rows.y; ++row)
-        adam_catch_up(wait, means ? (real)1 : rates[row], rates[GEOM_ROWS + row], rates[2 * GEOM_ROWS + row], geom, adam,
-                      row * capacity);
+        adam_catch_up(
+            wait, means ? (real)1 : rates[row], rates[GEOM_ROWS + row], rates[2 * GEOM_ROWS + row], geom, adam,
+            row * capacity
+        );
 }
 #ifdef ROW_SKEW
-static inline void catch_up_skew(constant real *waits, int steps, bool keeps_moments, real lr, global real *skew_s,
-                                 adam_moments adam, const ulong capacity)
-{
+static inline void catch_up_skew(
+    constant real *waits,
+    int steps,
+    bool keeps_moments,
+    real lr,
+    global real *skew_s,
+    adam_moments adam,
+    const ulong capacity
+) {
     const adam_wait wait = waited_steps(waits, steps, DRIFT_SKEW, keeps_moments);
     for (int row = 0; row < SKEW_WIDTH; ++row) adam_catch_up(wait, lr, 0, 0, skew_s, adam, row * capacity);
 }
@@ -78,9 +104,15 @@ static inline void map_skew(global real *geom, global const real *skew_s, const 
 // Adds to g, the gradients of a part's rows, those of opacity_scale * sum(|opacity|) + scale_scale * sum(scale)
 // (3DGS-MCMC's regularisers) and, where a splat has two opacities, whose mean counts then, of
 // bisect_scale * sum((one - other)^2) (3DSGS).
-static inline void regularise(uint part, vreal *g, global const real *geom, const ulong capacity, real opacity_scale,
-                              real scale_scale, real bisect_scale)
-{
+static inline void regularise(
+    uint part,
+    vreal *g,
+    global const real *geom,
+    const ulong capacity,
+    real opacity_scale,
+    real scale_scale,
+    real bisect_scale
+) {
     if (part == PART_SCALE)
         for (int c = 0; c < 3; ++c) g[c] += scale_scale * exp(lanes_load(geom + (ROW_LOG_SCALE + c) * capacity));
     if (part == PART_OWN) {
@@ -135,8 +167,8 @@ kernel void step_splats(
     real skew_correct2,
     real opacity_scale,
     real scale_scale,
-    real bisect_scale)
-{
+    real bisect_scale
+) {
     const ulong i = get_global_id(0) * LANES;
     const uint part = get_global_id(1);
     int2 age = (int2)(0, 0);
@@ -183,10 +215,8 @@ kernel void step_splats(
         for (uint row = rows.x; row < rows.y; ++row) {
             const real lr = part == PART_MEAN ? mean_lr : rates[row];
             const real low = rates[GEOM_ROWS + row], high = rates[2 * GEOM_ROWS + row];
-            if (high > 0)
-                adam_step_bounded(g[row - rows.x], lr, low, high, geom, adam, row * capacity);
-            else
-                adam_step(g[row - rows.x], lr, geom, adam, row * capacity);
+            if (high > 0) adam_step_bounded(g[row - rows.x], lr, low, high, geom, adam, row * capacity);
+            else adam_step(g[row - rows.x], lr, geom, adam, row * capacity);
         }
 #ifdef ROW_SKEW
     if (!maps) return;
@@ -215,8 +245,8 @@ kernel void sghmc_step(
     real drive,
     real keep,
     real noise,
-    uint by_covariance)
-{
+    uint by_covariance
+) {
     const uint first = get_global_id(0) * LANES;
     if (first >= n_splats) return;
     global real *at = geom + first;
@@ -243,8 +273,8 @@ kernel void mcmc_noise(
     uint seed_hi,
     uint iteration,
     real amount,
-    real reach)
-{
+    real reach
+) {
     const uint first = get_global_id(0) * LANES;
     if (first >= n_splats) return;
     global real *at = geom + first;
@@ -261,19 +291,14 @@ kernel void gather_columns(
     global const int *restrict source,
     global real *restrict moved,
     ulong capacity,
-    uint n)
-{
+    uint n
+) {
     const ulong i = get_global_id(0), row = get_global_id(1) * capacity;
     if (i < n) moved[row + i] = values[row + source[i]];
 }
 
 // values[row, i] = 0 where fresh[i]. Global size: (at least n, rows).
-kernel void zero_columns(
-    global real *restrict values,
-    global const uchar *restrict fresh,
-    ulong capacity,
-    uint n)
-{
+kernel void zero_columns(global real *restrict values, global const uchar *restrict fresh, ulong capacity, uint n) {
     const ulong i = get_global_id(0);
     if (i < n && fresh[i]) values[get_global_id(1) * capacity + i] = 0;
 }

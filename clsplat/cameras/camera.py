@@ -39,14 +39,14 @@ class Camera:
     cy: float
     cam_from_world: NDArray[np.float64]
 
-    def __init__(self, width: int, height: int, fx: float, fy: float, cx: float, cy: float,
-                 cam_from_world: ArrayLike) -> None:
+    def __init__(
+        self, width: int, height: int, fx: float, fy: float, cx: float, cy: float, cam_from_world: ArrayLike
+    ) -> None:
         if int(width) < 1 or int(height) < 1:
             raise InputError(f"camera: width x height is {width}x{height}; both must be at least 1")
         intrinsics = np.array([fx, fy, cx, cy], dtype=np.float64)
         if not np.all(np.isfinite(intrinsics)) or fx <= 0 or fy <= 0:
-            raise InputError(f"camera: fx={fx} fy={fy} cx={cx} cy={cy}; "
-                             "focal lengths must be above 0, all finite")
+            raise InputError(f"camera: fx={fx} fy={fy} cx={cx} cy={cy}; focal lengths must be above 0, all finite")
         pose = np.array(cam_from_world, dtype=np.float64)
         if pose.shape == (3, 4):
             pose = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
@@ -80,11 +80,8 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image of another size (whole field of view kept)."""
         sx, sy = width / self.width, height / self.height
-        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy,
-                      self.cam_from_world)
+        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.cam_from_world)
 
     def posed(self, cam_from_world: ArrayLike) -> Camera:
         """The same intrinsics at another pose."""
         return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, cam_from_world)
-
-

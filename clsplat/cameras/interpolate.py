@@ -65,8 +65,15 @@ def interpolate(keys: Sequence[Camera], frames: int, closed: bool = False, even:
 def resized_by_height(camera: Camera, width: int, height: int) -> Camera:
     """The camera for an image of another size and aspect: the vertical field of view is kept, the middle stays."""
     scale = height / camera.height
-    return Camera(width, height, camera.fx * scale, camera.fy * scale,
-                  width / 2 + (camera.cx - camera.width / 2) * scale, camera.cy * scale, camera.cam_from_world)
+    return Camera(
+        width,
+        height,
+        camera.fx * scale,
+        camera.fy * scale,
+        width / 2 + (camera.cx - camera.width / 2) * scale,
+        camera.cy * scale,
+        camera.cam_from_world,
+    )
 
 
 def _gaps(places: Reals, turns: Reals) -> Reals:

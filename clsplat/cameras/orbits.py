@@ -178,8 +178,10 @@ def _ring(means: Vector) -> list[Camera]:
     turn = _turn(_RING)
     flat = np.stack([np.sin(turn), np.zeros(_RING), -np.cos(turn)], axis=1)
     places = middle + distance * (flat + _LIFT * _UP)
-    return [Camera(width, tall, _FOCAL * width, _FOCAL * width, width / 2, tall / 2, look_at(place, middle, _UP))
-            for place in places]
+    return [
+        Camera(width, tall, _FOCAL * width, _FOCAL * width, width / 2, tall / 2, look_at(place, middle, _UP))
+        for place in places
+    ]
 
 
 def _turn(frames: int) -> Vector:

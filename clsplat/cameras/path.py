@@ -104,8 +104,10 @@ def path_text(camera_path: CameraPath) -> str:
     first = camera_path.cameras[0]
     for index, camera in enumerate(camera_path.cameras):
         if (camera.width, camera.height) != (first.width, first.height):
-            raise InputError(f"camera path: frame {index} is {camera.width}x{camera.height} px, the first "
-                             f"{first.width}x{first.height}; a camera_path.json has one size: write a cameras.json")
+            raise InputError(
+                f"camera path: frame {index} is {camera.width}x{camera.height} px, the first "
+                f"{first.width}x{first.height}; a camera_path.json has one size: write a cameras.json"
+            )
     step = camera_path.seconds / max(len(camera_path.keys) - (not camera_path.closed), 1)
     head = {
         "camera_type": "perspective",
@@ -117,12 +119,20 @@ def path_text(camera_path: CameraPath) -> str:
         "default_fov": _fov(first),
         "default_transition_sec": step,
     }
-    keys = [{"matrix": pose_of(key).ravel().tolist(), **_lens(key), "override_transition_enabled": False,
-             "override_transition_sec": None} for key in camera_path.keys]
+    keys = [
+        {
+            "matrix": pose_of(key).ravel().tolist(),
+            **_lens(key),
+            "override_transition_enabled": False,
+            "override_transition_sec": None,
+        }
+        for key in camera_path.keys
+    ]
     frames = [{"camera_to_world": pose_of(camera).ravel().tolist(), **_lens(camera)} for camera in camera_path.cameras]
     lines = [f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in head.items()]
-    lines += [f"{json.dumps(name)}: {_listed(entries)}" for name, entries in
-              (("keyframes", keys), ("camera_path", frames))]
+    lines += [
+        f"{json.dumps(name)}: {_listed(entries)}" for name, entries in (("keyframes", keys), ("camera_path", frames))
+    ]
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
@@ -190,8 +200,7 @@ def _entries(given: Any, key: str) -> list[dict[str, Any]]:
     return given
 
 
-def _cameras(entries: Sequence[dict[str, Any]], key: str, pose_key: str, width: int,
-             height: int) -> tuple[Camera, ...]:
+def _cameras(entries: Sequence[dict[str, Any]], key: str, pose_key: str, width: int, height: int) -> tuple[Camera, ...]:
     cameras = []
     for index, entry in enumerate(entries):
         try:
@@ -225,8 +234,9 @@ def _camera(entry: dict[str, Any], pose_key: str, width: int, height: int) -> Ca
             raise InputError("last row")
         return Camera(width, height, *pixels, cam_from_world_of(pose))
     except InputError:
-        raise InputError(f"key {pose_key!r} is no rotation and translation; expected a rigid 4 x 4 matrix, "
-                         "row by row") from None
+        raise InputError(
+            f"key {pose_key!r} is no rotation and translation; expected a rigid 4 x 4 matrix, row by row"
+        ) from None
 
 
 def _fov(camera: Camera) -> float:

@@ -25,15 +25,23 @@ from ..evaluation.chart_style import (
 )
 
 # Colour of a cell, and of the text on it.
-VERDICTS = {"survives": ("#bfe3d8", INK), "stops": ("#c3d9ef", INK), "loses": ("#f6d98f", INK),
-            "fails": ("#c2410c", "white"), "not run": ("#f2f2f2", "#666666")}
+VERDICTS = {
+    "survives": ("#bfe3d8", INK),
+    "stops": ("#c3d9ef", INK),
+    "loses": ("#f6d98f", INK),
+    "fails": ("#c2410c", "white"),
+    "not run": ("#f2f2f2", "#666666"),
+}
 
-_ARITHMETIC = (("image_error", "raster", "image", "rendering"),
-               ("gradient_error", "raster_vjp", "gradient", "its gradient"))
+_ARITHMETIC = (
+    ("image_error", "raster", "image", "rendering"),
+    ("gradient_error", "raster_vjp", "gradient", "its gradient"),
+)
 
 
-def growth_chart(records: Sequence[Mapping[str, Any]], knee: int | None, out: str | Path,
-                 rounds: Sequence[Mapping[str, Any]] = ()) -> list[Path]:
+def growth_chart(
+    records: Sequence[Mapping[str, Any]], knee: int | None, out: str | Path, rounds: Sequence[Mapping[str, Any]] = ()
+) -> list[Path]:
     """Validation PSNR against splats, with the knee marked.
 
     Parameters
@@ -61,16 +69,41 @@ def growth_chart(records: Sequence[Mapping[str, Any]], knee: int | None, out: st
         axes.plot(*zip(*curve, strict=True), marker="o", color=INK, clip_on=False, label="growth")
         if knee is not None:
             axes.axvline(knee, color=MARK, linewidth=1, linestyle=(0, (4, 2)), zorder=0.5)
-            axes.plot([knee], chosen[:1], marker="o", markersize=11, markerfacecolor="none", markeredgewidth=2,
-                      color=MARK, linestyle="none", label=f"knee: {short_count(knee)} splats, {chosen[0]:.2f} dB")
+            axes.plot(
+                [knee],
+                chosen[:1],
+                marker="o",
+                markersize=11,
+                markerfacecolor="none",
+                markeredgewidth=2,
+                color=MARK,
+                linestyle="none",
+                label=f"knee: {short_count(knee)} splats, {chosen[0]:.2f} dB",
+            )
         if rounds:
-            axes.plot([row["splats"] for row in rounds], [row["psnr"] for row in rounds], marker="s", markersize=5,
-                      color="#0072b2", linestyle="--", clip_on=False, label="whole run, then fewer splats")
+            axes.plot(
+                [row["splats"] for row in rounds],
+                [row["psnr"] for row in rounds],
+                marker="s",
+                markersize=5,
+                color="#0072b2",
+                linestyle="--",
+                clip_on=False,
+                label="whole run, then fewer splats",
+            )
         stars = [record for record in records if record.get("label")]
         for star in stars:
-            axes.plot([star["splats"]], [star["psnr"]], marker="*", markersize=13, linestyle="none", color="#0072b2",
-                      markeredgecolor="white", zorder=4,
-                      label=f"{star['label']}: {short_count(star['splats'])} splats, {star['psnr']:.2f} dB")
+            axes.plot(
+                [star["splats"]],
+                [star["psnr"]],
+                marker="*",
+                markersize=13,
+                linestyle="none",
+                color="#0072b2",
+                markeredgecolor="white",
+                zorder=4,
+                label=f"{star['label']}: {short_count(star['splats'])} splats, {star['psnr']:.2f} dB",
+            )
         sizes = [splats for splats, _ in curve] + [row["splats"] for row in (*stars, *rounds)]
         low, high = min(sizes) / 1.2, max(sizes) * 1.2
         axes.set_xlim(low, high)
@@ -115,8 +148,15 @@ def heat_map(table: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path]:
                 axes.text(x + 0.5, y + 0.5, text, color=ink, ha="center", va="center", fontsize=7.5)
         for x, column in enumerate(columns):
             own = [verdict for (_, other), (verdict, _) in by.items() if other == column and verdict != "not run"]
-            axes.text(x + 0.5, len(rows) + 0.6, f"{own.count('survives')}/{len(own)}", ha="center", va="center",
-                      fontsize=8, fontweight="bold")
+            axes.text(
+                x + 0.5,
+                len(rows) + 0.6,
+                f"{own.count('survives')}/{len(own)}",
+                ha="center",
+                va="center",
+                fontsize=8,
+                fontweight="bold",
+            )
         axes.set(xlim=(0, len(columns)), ylim=(len(rows) + 1.1, 0))
         axes.set_xticks([x + 0.5 for x in range(len(columns))], columns, rotation=35, ha="left", rotation_mode="anchor")
         axes.set_yticks([y + 0.5 for y in range(len(rows))] + [len(rows) + 0.6], [*rows, "survived"])
@@ -126,8 +166,12 @@ def heat_map(table: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path]:
         axes.grid(False)
         axes.spines[:].set_visible(False)
         used = [name for name in VERDICTS if any(verdict == name for verdict, _ in by.values())]
-        figure.legend(handles=[tile((0, 0), VERDICTS[name][0], name) for name in used], loc="outside lower center",
-                      ncols=len(used), handlelength=1.4)
+        figure.legend(
+            handles=[tile((0, 0), VERDICTS[name][0], name) for name in used],
+            loc="outside lower center",
+            ncols=len(used),
+            handlelength=1.4,
+        )
     return chart_paths(out)
 
 
@@ -174,8 +218,15 @@ def _strip(panel: Any, place: int, system: str, rows: Sequence[Mapping[str, Any]
     again = [row for row in rows if any(row["seed"] == other["seed"] and other["repeat"] for other in rows)]
     if again:
         repeated = [row["psnr"] for row in again]
-        panel.plot([place + 0.15 + 0.07 * number for number in range(len(again))], repeated, marker="D", markersize=4.5,
-                   linestyle="none", color=colour, markerfacecolor="white")
+        panel.plot(
+            [place + 0.15 + 0.07 * number for number in range(len(again))],
+            repeated,
+            marker="D",
+            markersize=4.5,
+            linestyle="none",
+            color=colour,
+            markerfacecolor="white",
+        )
         same = "=" if len({row["digest"] for row in again}) == 1 else "≠"
         panel.annotate(same, (place + 0.15 + 0.07 * len(again), repeated[-1]), va="center", fontsize=9)
         said += f"\nrepeats {max(repeated) - min(repeated):.2f} dB"
@@ -204,8 +255,10 @@ def arithmetic_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list
         for line, shape in zip(figure.subplots(len(shapes), 2, squeeze=False), shapes, strict=True):
             for axes, (error, time, what, task) in zip(line, _ARITHMETIC, strict=True):
                 # What is exact has no place on a logarithmic axis. The far ones are named first: they differ most.
-                own = sorted((row for row in rows if row["shape"] == shape and row[error] > 0),
-                             key=lambda row: (row["variant"] != "default", -abs(row[time] - 1)))
+                own = sorted(
+                    (row for row in rows if row["shape"] == shape and row[error] > 0),
+                    key=lambda row: (row["variant"] != "default", -abs(row[time] - 1)),
+                )
                 points = [(row[time], row[error], row["variant"], colours[row["kind"]]) for row in own]
                 for x, y, _, colour in points:
                     axes.plot(x, y, marker="o", color=colour, markersize=6)
@@ -214,7 +267,8 @@ def arithmetic_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list
                 axes.set_ylabel(f"error of the {what}")
                 axes.margins(0.16)
                 labels.append((axes, points))
-        system_legend(figure, {kind: {"color": colour, "marker": "o", "linestyle": "none"}
-                               for kind, colour in colours.items()})
+        system_legend(
+            figure, {kind: {"color": colour, "marker": "o", "linestyle": "none"} for kind, colour in colours.items()}
+        )
         place_labels(figure, labels)
     return chart_paths(out)

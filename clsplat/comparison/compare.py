@@ -52,8 +52,7 @@ class Run:
     def __str__(self) -> str:
         config = self.config
         again = f" repeat {self.repeat}" if self.repeat else ""
-        return (f"[{self.number}/{self.total}] {self.scene} {self.system} cap {config.cap_max} "
-                f"seed {config.seed}{again}")
+        return f"[{self.number}/{self.total}] {self.scene} {self.system} cap {config.cap_max} seed {config.seed}{again}"
 
     @property
     def stem(self) -> str:
@@ -115,11 +114,21 @@ def parse_runs(text: str) -> list[Record]:
     return records
 
 
-def compare(scenes: Iterable[Scene], systems: Sequence[System], output: str | Path, caps: Sequence[int],
-            seeds: Sequence[int], common: Mapping[str, Any] | None = None, *, save_models: bool = False,
-            curve: int = 0, repeat: int = 1, extra: Mapping[str, Any] | None = None,
-            progress: Callable[[Progress], None] | None = None,
-            on_run: Callable[[Run, Record | None], None] | None = None) -> list[Record]:
+def compare(
+    scenes: Iterable[Scene],
+    systems: Sequence[System],
+    output: str | Path,
+    caps: Sequence[int],
+    seeds: Sequence[int],
+    common: Mapping[str, Any] | None = None,
+    *,
+    save_models: bool = False,
+    curve: int = 0,
+    repeat: int = 1,
+    extra: Mapping[str, Any] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    on_run: Callable[[Run, Record | None], None] | None = None,
+) -> list[Record]:
     """Train every system at every cap with every seed on every scene, and measure it on the test views.
 
     Runs that `output` has already are not done again. The table is of all runs there, these and earlier ones.
@@ -147,8 +156,13 @@ def compare(scenes: Iterable[Scene], systems: Sequence[System], output: str | Pa
     """
     folder = Path(output)
     # Systems innermost: an interrupted comparison has as many runs of each.
-    configs = [(system.label, system.config(cap, seed, common), again) for cap in caps for seed in seeds
-               for again in range(repeat if seed == seeds[0] else 1) for system in systems]
+    configs = [
+        (system.label, system.config(cap, seed, common), again)
+        for cap in caps
+        for seed in seeds
+        for again in range(repeat if seed == seeds[0] else 1)
+        for system in systems
+    ]
     runs = RunFile(folder)
     device: Device | None = None
     warm: set[str] = set()
@@ -170,8 +184,14 @@ def compare(scenes: Iterable[Scene], systems: Sequence[System], output: str | Pa
                         warm_up(scene, config, device)
                         warm.add(label)
                     ply = folder / MODELS / f"{scene.name}-{run.stem}.ply" if save_models else None
-                    record = {"scene": identity, "system": label, "config": config.to_json(), "repeat": again,
-                              **train_and_measure(scene, config, device, progress, ply, curve), **(extra or {})}
+                    record = {
+                        "scene": identity,
+                        "system": label,
+                        "config": config.to_json(),
+                        "repeat": again,
+                        **train_and_measure(scene, config, device, progress, ply, curve),
+                        **(extra or {}),
+                    }
                     runs.add(record)
                     if on_run is not None:
                         on_run(run, record)
@@ -187,9 +207,14 @@ def warm_up(scene: Scene, config: TrainConfig, device: Device) -> None:
         trainer.step()
 
 
-def train_and_measure(scene: Scene, config: TrainConfig, device: Device,
-                      progress: Callable[[Progress], None] | None = None, ply: Path | None = None,
-                      curve: int = 0) -> Record:
+def train_and_measure(
+    scene: Scene,
+    config: TrainConfig,
+    device: Device,
+    progress: Callable[[Progress], None] | None = None,
+    ply: Path | None = None,
+    curve: int = 0,
+) -> Record:
     """One run: what compare_table.MEASURED names, and on what it was measured.
 
     `seconds` is of training, `cpu_seconds` that of all threads of this process, with preparation and the curve's
@@ -203,9 +228,15 @@ def train_and_measure(scene: Scene, config: TrainConfig, device: Device,
     """
     started = time.process_time()
     record: Record = dict.fromkeys((*MEASURED, "peak_bytes", "digest")) | {
-        "curve": [] if curve else None, "failed": None, "finite": False, "cap_held": True, "device": str(device.info),
-        "driver": f"{device.info.driver} ({device.info.version})", "version": __version__,
-        "protocol": DEFAULT_PROTOCOL.describe()}
+        "curve": [] if curve else None,
+        "failed": None,
+        "finite": False,
+        "cap_held": True,
+        "device": str(device.info),
+        "driver": f"{device.info.driver} ({device.info.version})",
+        "version": __version__,
+        "protocol": DEFAULT_PROTOCOL.describe(),
+    }
     along = curve_iterations(config.iterations, curve)
     trainer = Trainer(scene, replace(config, test_iterations=along), progress=progress, device=device)
     record["schedule"] = str(trainer.kernels.schedule)
@@ -215,21 +246,38 @@ def train_and_measure(scene: Scene, config: TrainConfig, device: Device,
         return record | {"failed": str(error)}
     cpu_seconds = time.process_time() - started
     measured = model.evaluations.get(config.iterations) or evaluate(
-        trainer.renderer, model.splats, scene.test, config.background)
+        trainer.renderer, model.splats, scene.test, config.background
+    )
     arrays = model.splats.arrays
     with tempfile.TemporaryDirectory() as folder:
         file = ply or Path(folder) / "splats.ply"
         model.splats.save(file)
         nbytes = file.stat().st_size
     return record | {
-        "psnr": measured.psnr, "ssim": measured.ssim, "seconds": model.seconds,
+        "psnr": measured.psnr,
+        "ssim": measured.ssim,
+        "seconds": model.seconds,
         "render_ms": render_ms(trainer.renderer, model.splats, scene.test, config.background),
-        "cpu_seconds": cpu_seconds, "splats": len(model.splats), "bytes": nbytes,
-        "parameters": sum(array.size for array in arrays.values()), "device_bytes": model.device_bytes,
-        "peak_bytes": model.peak_bytes, "finite": all(bool(np.isfinite(array).all()) for array in arrays.values()),
-        "cap_held": len(model.splats) <= config.cap_max, "digest": digest(arrays),
-        "curve": [{"iteration": it, "seconds": model.evaluation_seconds[it], "psnr": model.evaluations[it].psnr,
-                   "ssim": model.evaluations[it].ssim} for it in along] if curve else None,
+        "cpu_seconds": cpu_seconds,
+        "splats": len(model.splats),
+        "bytes": nbytes,
+        "parameters": sum(array.size for array in arrays.values()),
+        "device_bytes": model.device_bytes,
+        "peak_bytes": model.peak_bytes,
+        "finite": all(bool(np.isfinite(array).all()) for array in arrays.values()),
+        "cap_held": len(model.splats) <= config.cap_max,
+        "digest": digest(arrays),
+        "curve": [
+            {
+                "iteration": it,
+                "seconds": model.evaluation_seconds[it],
+                "psnr": model.evaluations[it].psnr,
+                "ssim": model.evaluations[it].ssim,
+            }
+            for it in along
+        ]
+        if curve
+        else None,
     }
 
 
@@ -264,8 +312,13 @@ def digest(arrays: Mapping[str, NDArray[Any]]) -> str:
 def scene_identity(scene: Scene) -> dict[str, Any]:
     """What tells one scene, read in one way, from another: name, size of the first view, views of either set."""
     camera = scene.views[0].camera
-    return {"name": scene.name, "width": camera.width, "height": camera.height, "train": len(scene.train),
-            "test": len(scene.test)}
+    return {
+        "name": scene.name,
+        "width": camera.width,
+        "height": camera.height,
+        "train": len(scene.train),
+        "test": len(scene.test),
+    }
 
 
 def write_table(folder: Path, records: Sequence[Record]) -> None:
@@ -278,8 +331,20 @@ def write_table(folder: Path, records: Sequence[Record]) -> None:
 
 
 # What a line of runs.jsonl must have.
-_KEYS = {"scene", "system", "config", "failed", "finite", "cap_held", "device", "driver", "schedule", "version",
-         "protocol", *MEASURED}
+_KEYS = {
+    "scene",
+    "system",
+    "config",
+    "failed",
+    "finite",
+    "cap_held",
+    "device",
+    "driver",
+    "schedule",
+    "version",
+    "protocol",
+    *MEASURED,
+}
 
 
 def run_key(record: Mapping[str, Any]) -> str:

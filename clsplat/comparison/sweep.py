@@ -33,33 +33,53 @@ CHARTS, REPORT = "charts", "report.html"
 CURVE = 12  # points along a run
 
 _TEXT = {
-    "time": ("Quality along the training",
-             "Test PSNR and SSIM against seconds of training, which leave out these measurements. Each point was "
-             "measured. The axes begin 5 dB and 0.3 below the best."),
-    "size": ("Quality against render time, bytes and splats",
-             "Each point is a training run, or the mean over its seeds. Grey: the Pareto front, which no other point "
-             "beats in both; its points are labelled by the cap on splats. A star chose its own number of splats. "
-             "Render time is the median over the test views of the fastest of five renders, on the host's clock."),
-    "equal": ("Splats needed at equal quality",
-              "How many splats a system needs for the PSNR that the reference has at each of its caps, linear in log "
-              "splats between runs. Hollow, or ≤: its smallest model is better already. Dashed: 70 %."),
-    "seeds": ("What chance does",
-              "Test PSNR of runs that differ in the seed alone, their median, and beside them (diamonds) one seed "
-              "trained again; = : the same splats, bit by bit. Spread: maximum less minimum."),
-    "arithmetic": ("Arithmetic",
-                   "What forms of exp and Φ, half-precision colour, cutoffs, tiles and lanes cost and gain on trained "
-                   "scenes: errors against the double build with the same rule, of cutoffs against one without, beside "
-                   "the time relative to the default's; geometric means over the scenes. Where there is no room for a "
-                   "name, see the table. Normalisations are other models: their line is the PSNR that training with "
-                   "them ends at, against the default's."),
+    "time": (
+        "Quality along the training",
+        "Test PSNR and SSIM against seconds of training, which leave out these measurements. Each point was "
+        "measured. The axes begin 5 dB and 0.3 below the best.",
+    ),
+    "size": (
+        "Quality against render time, bytes and splats",
+        "Each point is a training run, or the mean over its seeds. Grey: the Pareto front, which no other point "
+        "beats in both; its points are labelled by the cap on splats. A star chose its own number of splats. "
+        "Render time is the median over the test views of the fastest of five renders, on the host's clock.",
+    ),
+    "equal": (
+        "Splats needed at equal quality",
+        "How many splats a system needs for the PSNR that the reference has at each of its caps, linear in log "
+        "splats between runs. Hollow, or ≤: its smallest model is better already. Dashed: 70 %.",
+    ),
+    "seeds": (
+        "What chance does",
+        "Test PSNR of runs that differ in the seed alone, their median, and beside them (diamonds) one seed "
+        "trained again; = : the same splats, bit by bit. Spread: maximum less minimum.",
+    ),
+    "arithmetic": (
+        "Arithmetic",
+        "What forms of exp and Φ, half-precision colour, cutoffs, tiles and lanes cost and gain on trained "
+        "scenes: errors against the double build with the same rule, of cutoffs against one without, beside "
+        "the time relative to the default's; geometric means over the scenes. Where there is no room for a "
+        "name, see the table. Normalisations are other models: their line is the PSNR that training with "
+        "them ends at, against the default's.",
+    ),
 }
 
 
-def frontier(scenes: Iterable[Scene], systems: Sequence[System], output: str | Path, caps: Sequence[int],
-             seeds: Sequence[int], common: Mapping[str, Any] | None = None, *, curve: int = CURVE, repeat: int = 1,
-             more: Sequence[Record] = (), extra: Mapping[str, Any] | None = None,
-             progress: Callable[[Progress], None] | None = None,
-             on_run: Callable[[Run, Record | None], None] | None = None) -> list[Record]:
+def frontier(
+    scenes: Iterable[Scene],
+    systems: Sequence[System],
+    output: str | Path,
+    caps: Sequence[int],
+    seeds: Sequence[int],
+    common: Mapping[str, Any] | None = None,
+    *,
+    curve: int = CURVE,
+    repeat: int = 1,
+    more: Sequence[Record] = (),
+    extra: Mapping[str, Any] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    on_run: Callable[[Run, Record | None], None] | None = None,
+) -> list[Record]:
     """Train what is not in `output` yet, as `compare` does, and draw the charts of all that is there.
 
     Parameters
@@ -79,8 +99,19 @@ def frontier(scenes: Iterable[Scene], systems: Sequence[System], output: str | P
     if not chart_style.available():
         warnings.warn(f"{chart_style.MISSING}; the charts' data are written all the same", stacklevel=2)
     try:
-        return compare(scenes, systems, output, caps, seeds, common, curve=curve, repeat=repeat, extra=extra,
-                       progress=progress, on_run=on_run)
+        return compare(
+            scenes,
+            systems,
+            output,
+            caps,
+            seeds,
+            common,
+            curve=curve,
+            repeat=repeat,
+            extra=extra,
+            progress=progress,
+            on_run=on_run,
+        )
     finally:
         if (Path(output) / RUNS).exists():
             write_report(output, [*read_runs(output), *more], reference=systems[0].label)
@@ -110,8 +141,9 @@ def distinct(records: Sequence[Record]) -> list[Record]:
     return list(kept.values())
 
 
-def write_report(folder: str | Path, records: Sequence[Record], *, reference: str | None = None,
-                 arithmetic: Sequence[Row] = ()) -> list[Path]:
+def write_report(
+    folder: str | Path, records: Sequence[Record], *, reference: str | None = None, arithmetic: Sequence[Row] = ()
+) -> list[Path]:
     """Charts of records, with their data as CSV and JSON, and the page that shows them all.
 
     Parameters
@@ -139,7 +171,8 @@ def write_report(folder: str | Path, records: Sequence[Record], *, reference: st
         ("equal", equal, lambda rows, out: equal_chart(rows, first, out), equal_table(equal, first)),
         ("time", curve_rows(kept), time_chart, NONE),
         ("seeds", seeds, seeds_chart, seed_table(seeds)),
-        ("arithmetic", forms, arithmetic_chart, arithmetic_table(forms))]
+        ("arithmetic", forms, arithmetic_chart, arithmetic_table(forms)),
+    ]
     written: list[Path] = []
     sections = [_protocol(kept)]
     for name, rows, draw, (head, lines) in parts:
@@ -162,6 +195,9 @@ def write_report(folder: str | Path, records: Sequence[Record], *, reference: st
 def _protocol(records: Sequence[Record]) -> Section:
     """What was run, on what, and how it was measured."""
     iterations = sorted({record["config"]["iterations"] for record in records})
-    said = [f"{len(records)} training runs of {', '.join(map(str, iterations))} iterations, measured on test views, "
-            "from which nothing is chosen", *notes(records, summarise(records))]
+    said = [
+        f"{len(records)} training runs of {', '.join(map(str, iterations))} iterations, measured on test views, "
+        "from which nothing is chosen",
+        *notes(records, summarise(records)),
+    ]
     return Section("Protocol", [f"{line[:1].upper()}{line[1:]}." for line in said])

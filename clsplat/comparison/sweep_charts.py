@@ -48,17 +48,25 @@ def time_chart(rows: Sequence[Row], out: str | Path) -> list[Path]:
             runs: dict[tuple[str, int], list[Row]] = {}
             for row in own:
                 runs.setdefault((row["system"], row["seed"]), []).append(row)
-            for axes, key, name, shown in ((panels[0][column], "psnr", "test PSNR [dB]", _DB_SHOWN),
-                                           (panels[1][column], "ssim", "test SSIM", _SSIM_SHOWN)):
+            for axes, key, name, shown in (
+                (panels[0][column], "psnr", "test PSNR [dB]", _DB_SHOWN),
+                (panels[1][column], "ssim", "test SSIM", _SSIM_SHOWN),
+            ):
                 for (system, _), run in runs.items():
-                    axes.plot([row["seconds"] for row in run], [row[key] for row in run],
-                              **styles[system] | {"markersize": 3, "linewidth": 1.3})
+                    axes.plot(
+                        [row["seconds"] for row in run],
+                        [row[key] for row in run],
+                        **styles[system] | {"markersize": 3, "linewidth": 1.3},
+                    )
                 best = max(row[key] for row in own)
                 visible = [row for row in own if row[key] >= best - shown]
                 low, high = min(row["seconds"] for row in visible) / 1.1, max(row["seconds"] for row in visible) * 1.1
                 bottom = min(row[key] for row in visible)
-                axes.set(xscale="log", xlim=(low, high), ylim=(bottom - 0.03 * (best - bottom) - 1e-3,
-                                                              best + 0.04 * (best - bottom) + 1e-3))
+                axes.set(
+                    xscale="log",
+                    xlim=(low, high),
+                    ylim=(bottom - 0.03 * (best - bottom) - 1e-3, best + 0.04 * (best - bottom) + 1e-3),
+                )
                 log_axis(axes.xaxis, low, high)
                 if column == 0:
                     axes.set_ylabel(name)
@@ -89,8 +97,15 @@ def size_chart(rows: Sequence[Row], out: str | Path) -> list[Path]:
                 _cost_panel(axes, own, cost, unit, styles)
                 front = sorted((row for row in own if row[f"front_{cost}"]), key=lambda row: not row["auto"])
                 names = ["auto" if row["auto"] else short_count(row["cap"]) for row in front]
-                labels.append((axes, [(unit * row[cost], row["psnr"], name, shape_colour(row["shape"]))
-                                      for name, row in zip(names, front, strict=True)]))
+                labels.append(
+                    (
+                        axes,
+                        [
+                            (unit * row[cost], row["psnr"], name, shape_colour(row["shape"]))
+                            for name, row in zip(names, front, strict=True)
+                        ],
+                    )
+                )
                 if line == len(scenes) - 1:
                     axes.set_xlabel(name)
             panels[line][0].set_ylabel(f"{scene}\ntest PSNR [dB]")
@@ -112,13 +127,16 @@ def equal_chart(rows: Sequence[Row], reference: str, out: str | Path) -> list[Pa
         (panels,) = figure.subplots(1, len(scenes), squeeze=False, sharey=True)
         for axes, scene in zip(panels, scenes, strict=True):
             for system, style in styles.items():
-                own = sorted((row for row in rows if row["scene"] == scene and row["system"] == system),
-                             key=lambda row: float(row["reference_splats"]))
+                own = sorted(
+                    (row for row in rows if row["scene"] == scene and row["system"] == system),
+                    key=lambda row: float(row["reference_splats"]),
+                )
                 for bound in (False, True):
                     part = [row for row in own if bool(row["bound"]) == bound]
                     how = {"linestyle": "none", "markerfacecolor": "white"} if bound else {}
-                    axes.plot([row["reference_splats"] for row in part], [100 * row["ratio"] for row in part],
-                              **style | how)
+                    axes.plot(
+                        [row["reference_splats"] for row in part], [100 * row["ratio"] for row in part], **style | how
+                    )
             axes.axhline(100, color=INK, linewidth=1)
             axes.axhline(100 * EQUAL_AIM, color=INK, linewidth=1, linestyle=(0, (4, 3)))
             sizes = [row["reference_splats"] for row in rows if row["scene"] == scene]
@@ -136,8 +154,9 @@ def _cost_panel(axes: Any, own: Sequence[Row], cost: str, unit: float, styles: d
     front = sorted((unit * row[cost], row["psnr"]) for row in own if row[f"front_{cost}"])
     axes.plot(*zip(*front, strict=True), color=FRONT, linewidth=3.5, drawstyle="steps-post", zorder=1)
     for system, style in styles.items():
-        line = sorted((row["cap"], unit * row[cost], row["psnr"]) for row in own
-                      if row["system"] == system and not row["auto"])
+        line = sorted(
+            (row["cap"], unit * row[cost], row["psnr"]) for row in own if row["system"] == system and not row["auto"]
+        )
         if line:
             axes.plot([point[1] for point in line], [point[2] for point in line], **style)
     for row in own:

@@ -34,10 +34,19 @@ def curve_rows(records: Sequence[Record]) -> list[Row]:
     rows: list[Row] = []
     for group in _by_scene(followed).values():
         cap, iterations = _commonest([(r["config"]["cap_max"], r["config"]["iterations"], r["system"]) for r in group])
-        rows += [{"scene": scene_title(record), "cap": cap, "system": record["system"],
-                  "shape": record["config"]["shape"], "seed": record["config"]["seed"], **point}
-                 for record in group for point in record["curve"]
-                 if (record["config"]["cap_max"], record["config"]["iterations"]) == (cap, iterations)]
+        rows += [
+            {
+                "scene": scene_title(record),
+                "cap": cap,
+                "system": record["system"],
+                "shape": record["config"]["shape"],
+                "seed": record["config"]["seed"],
+                **point,
+            }
+            for record in group
+            for point in record["curve"]
+            if (record["config"]["cap_max"], record["config"]["iterations"]) == (cap, iterations)
+        ]
     return rows
 
 
@@ -54,9 +63,13 @@ def point_rows(records: Sequence[Record]) -> list[Row]:
     for row in summarise(records):
         if row["psnr"] is not None:
             means = {key: row[key]["mean"] for key in ("psnr", "ssim", "seconds", "parameters", *COSTS)}
-            rows.append({key: row[key] for key in ("scene", "system")} | {"shape": row["config"]["shape"]}
-                        | {key: row[key] for key in ("cap", "iterations")}
-                        | {"seeds": len(row["seeds"]) - len(row["failed"]), "auto": is_auto(row["system"])} | means)
+            rows.append(
+                {key: row[key] for key in ("scene", "system")}
+                | {"shape": row["config"]["shape"]}
+                | {key: row[key] for key in ("cap", "iterations")}
+                | {"seeds": len(row["seeds"]) - len(row["failed"]), "auto": is_auto(row["system"])}
+                | means
+            )
     kept: list[Row] = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         own = [row for row in rows if row["scene"] == scene]
@@ -114,10 +127,19 @@ def equal_rows(points: Sequence[Row], reference: str) -> list[Row]:
             for aim in sorted(curves.get(reference, ()), key=lambda point: float(point["splats"])):
                 splats = splats_needed(curve, aim["psnr"])
                 smallest = min(curve)[1] >= aim["psnr"]
-                rows.append({"scene": scene, "system": system, "shape": own[0]["shape"], "psnr": aim["psnr"],
-                             "reference_cap": aim["cap"], "reference_splats": aim["splats"], "splats": splats,
-                             "ratio": None if splats is None else splats / aim["splats"],
-                             "bound": "at most" if smallest else ""})
+                rows.append(
+                    {
+                        "scene": scene,
+                        "system": system,
+                        "shape": own[0]["shape"],
+                        "psnr": aim["psnr"],
+                        "reference_cap": aim["cap"],
+                        "reference_splats": aim["splats"],
+                        "splats": splats,
+                        "ratio": None if splats is None else splats / aim["splats"],
+                        "bound": "at most" if smallest else "",
+                    }
+                )
     return rows
 
 
@@ -133,15 +155,23 @@ def auto_rows(points: Sequence[Row]) -> list[Row]:
     rows: list[Row] = []
     for own in points:
         if own["auto"]:
-            swept = [point for point in points if not point["auto"] and point["scene"] == own["scene"]
-                     and point["shape"] == own["shape"]]
+            swept = [
+                point
+                for point in points
+                if not point["auto"] and point["scene"] == own["scene"] and point["shape"] == own["shape"]
+            ]
             best = max(swept, key=lambda point: float(point["psnr"]), default=None)
-            rows.append({key: own[key] for key in ("scene", "system", "shape", "psnr", "splats", "bytes")} | {
-                "best_cap": best and best["cap"], "best_psnr": best and best["psnr"],
-                "lost": best and best["psnr"] - own["psnr"],
-                "splats_ratio": best and own["splats"] / best["splats"],
-                "bytes_ratio": best and own["bytes"] / best["bytes"],
-                "front": " ".join(cost for cost in COSTS if own[f"front_{cost}"])})
+            rows.append(
+                {key: own[key] for key in ("scene", "system", "shape", "psnr", "splats", "bytes")}
+                | {
+                    "best_cap": best and best["cap"],
+                    "best_psnr": best and best["psnr"],
+                    "lost": best and best["psnr"] - own["psnr"],
+                    "splats_ratio": best and own["splats"] / best["splats"],
+                    "bytes_ratio": best and own["bytes"] / best["bytes"],
+                    "front": " ".join(cost for cost in COSTS if own[f"front_{cost}"]),
+                }
+            )
     return rows
 
 
@@ -163,11 +193,16 @@ def arithmetic_rows(records: Sequence[Row]) -> list[Row]:
     for shape, variant in dict.fromkeys((row["shape"], row["variant"]) for row in records):
         own = [row for row in records if (row["shape"], row["variant"]) == (shape, variant)]
         timed = [row for row in own if row["image_error"] is not None and (row["scene"], shape) in base]
-        ratios = {name: _geometric([row[f"{name}_ms"] / base[row["scene"], shape][f"{name}_ms"] for row in timed])
-                  for name in ("raster", "raster_vjp")}
-        rows.append({"shape": shape, "variant": variant, "kind": own[0]["kind"], "scenes": len(own)}
-                    | {name: _geometric([row[name] for row in timed]) for name in ("image_error", "gradient_error")}
-                    | ratios | {"psnr_change": statistics.fmean(row["psnr_change"] for row in own)})
+        ratios = {
+            name: _geometric([row[f"{name}_ms"] / base[row["scene"], shape][f"{name}_ms"] for row in timed])
+            for name in ("raster", "raster_vjp")
+        }
+        rows.append(
+            {"shape": shape, "variant": variant, "kind": own[0]["kind"], "scenes": len(own)}
+            | {name: _geometric([row[name] for row in timed]) for name in ("image_error", "gradient_error")}
+            | ratios
+            | {"psnr_change": statistics.fmean(row["psnr_change"] for row in own)}
+        )
     return rows
 
 
@@ -210,11 +245,22 @@ def seed_rows(records: Sequence[Record]) -> list[Row]:
     rows: list[Row] = []
     for group in _by_scene(spread).values():
         chosen = _commonest([(r["config"]["cap_max"], r["config"]["iterations"], r["system"]) for r in group])
-        rows += [{"scene": scene_title(record), "cap": chosen[0], "iterations": chosen[1], "system": record["system"],
-                  "shape": record["config"]["shape"], "seed": record["config"]["seed"],
-                  "repeat": record.get("repeat", 0), "psnr": record["psnr"], "ssim": record["ssim"],
-                  "digest": record.get("digest")}
-                 for record in group if (record["config"]["cap_max"], record["config"]["iterations"]) == chosen]
+        rows += [
+            {
+                "scene": scene_title(record),
+                "cap": chosen[0],
+                "iterations": chosen[1],
+                "system": record["system"],
+                "shape": record["config"]["shape"],
+                "seed": record["config"]["seed"],
+                "repeat": record.get("repeat", 0),
+                "psnr": record["psnr"],
+                "ssim": record["ssim"],
+                "digest": record.get("digest"),
+            }
+            for record in group
+            if (record["config"]["cap_max"], record["config"]["iterations"]) == chosen
+        ]
     return rows
 
 

@@ -26,40 +26,104 @@ def equal_table(rows: Sequence[Row], reference: str) -> Table:
 
 def auto_table(rows: Sequence[Row]) -> Table:
     """Automatic runs beside the best of the sweep. rows : of `frontier_data.auto_rows`."""
-    head = ("scene", "system", "PSNR", "splats", "MB", "best cap", "its PSNR", "lost dB", "% of its splats",
-            "% of its MB", "on the front of")
+    head = (
+        "scene",
+        "system",
+        "PSNR",
+        "splats",
+        "MB",
+        "best cap",
+        "its PSNR",
+        "lost dB",
+        "% of its splats",
+        "% of its MB",
+        "on the front of",
+    )
     lines: list[tuple[str, ...]] = []
     for row in rows:
-        best = ("",) * 5 if row["best_cap"] is None else (
-            str(row["best_cap"]), f"{row['best_psnr']:.2f}", f"{row['lost']:.2f}", f"{100 * row['splats_ratio']:.0f}",
-            f"{100 * row['bytes_ratio']:.0f}")
-        lines.append((row["scene"], row["system"], f"{row['psnr']:.2f}", f"{row['splats']:.0f}",
-                      f"{1e-6 * row['bytes']:.2f}", *best, row["front"] or "none"))
+        best = (
+            ("",) * 5
+            if row["best_cap"] is None
+            else (
+                str(row["best_cap"]),
+                f"{row['best_psnr']:.2f}",
+                f"{row['lost']:.2f}",
+                f"{100 * row['splats_ratio']:.0f}",
+                f"{100 * row['bytes_ratio']:.0f}",
+            )
+        )
+        lines.append(
+            (
+                row["scene"],
+                row["system"],
+                f"{row['psnr']:.2f}",
+                f"{row['splats']:.0f}",
+                f"{1e-6 * row['bytes']:.2f}",
+                *best,
+                row["front"] or "none",
+            )
+        )
     return head, lines
 
 
 def seed_table(rows: Sequence[Row]) -> Table:
     """PSNR over seeds, and over repeats of one. rows : of `frontier_data.seed_rows`."""
-    head = ("scene", "cap", "system", "seeds", "median PSNR", "least", "most", "spread", "runs of one seed",
-            "their spread", "same bits")
+    head = (
+        "scene",
+        "cap",
+        "system",
+        "seeds",
+        "median PSNR",
+        "least",
+        "most",
+        "spread",
+        "runs of one seed",
+        "their spread",
+        "same bits",
+    )
     lines: list[tuple[str, ...]] = []
     for scene, system in dict.fromkeys((row["scene"], row["system"]) for row in rows):
         own = [row for row in rows if (row["scene"], row["system"]) == (scene, system)]
         psnr = [row["psnr"] for row in own if not row["repeat"]]
         same = repeated(own)
         values = [row["psnr"] for row in same]
-        again = ("", "", "") if not same else (
-            str(len(same)), f"{max(values) - min(values):.4f}",
-            "yes" if len({row["digest"] for row in same}) == 1 else "no")
-        lines.append((scene, str(own[0]["cap"]), system, str(len(psnr)), f"{statistics.median(psnr):.2f}",
-                      f"{min(psnr):.2f}", f"{max(psnr):.2f}", f"{max(psnr) - min(psnr):.2f}", *again))
+        again = (
+            ("", "", "")
+            if not same
+            else (
+                str(len(same)),
+                f"{max(values) - min(values):.4f}",
+                "yes" if len({row["digest"] for row in same}) == 1 else "no",
+            )
+        )
+        lines.append(
+            (
+                scene,
+                str(own[0]["cap"]),
+                system,
+                str(len(psnr)),
+                f"{statistics.median(psnr):.2f}",
+                f"{min(psnr):.2f}",
+                f"{max(psnr):.2f}",
+                f"{max(psnr) - min(psnr):.2f}",
+                *again,
+            )
+        )
     return head, lines
 
 
 def arithmetic_table(rows: Sequence[Row]) -> Table:
     """Variants of the arithmetic. rows : of `frontier_data.arithmetic_rows`."""
-    head = ("shape", "variant", "scenes", "image error", "gradient error", "render time of default",
-            "gradient time of default", "PSNR change [dB]")
+    head = (
+        "shape",
+        "variant",
+        "scenes",
+        "image error",
+        "gradient error",
+        "render time of default",
+        "gradient time of default",
+        "PSNR change [dB]",
+    )
     lines: list[tuple[str, ...]] = []
     for row in rows:
         errors = ("" if row[name] is None else f"{row[name]:.1e}" for name in ("image_error", "gradient_error"))

@@ -11,8 +11,14 @@ Record = dict[str, Any]  # a line of runs.jsonl
 
 HEAD = ("scene", "cap", "iterations", "system", "seeds", "PSNR", "SSIM", "seconds", "splats", "parameters", "MB")
 MEASURED = ("psnr", "ssim", "seconds", "cpu_seconds", "render_ms", "splats", "parameters", "bytes", "device_bytes")
-_FROM_MEASURED = {"PSNR": ("psnr", 1.0, 2), "SSIM": ("ssim", 1.0, 4), "seconds": ("seconds", 1.0, 1),
-                  "splats": ("splats", 1.0, 0), "parameters": ("parameters", 1.0, 0), "MB": ("bytes", 1e-6, 2)}
+_FROM_MEASURED = {
+    "PSNR": ("psnr", 1.0, 2),
+    "SSIM": ("ssim", 1.0, 4),
+    "seconds": ("seconds", 1.0, 1),
+    "splats": ("splats", 1.0, 0),
+    "parameters": ("parameters", 1.0, 0),
+    "MB": ("bytes", 1e-6, 2),
+}
 
 
 def summarise(records: Sequence[Record]) -> list[Record]:
@@ -53,11 +59,19 @@ def repeats(records: Sequence[Record]) -> list[Record]:
         if record.get("digest"):
             where = [record[key] for key in ("device", "driver", "schedule", "version")]
             groups.setdefault(json.dumps([_group_key(record), record["config"]["seed"], where]), []).append(record)
-    return [{"scene": scene_title(group[0]), "cap": group[0]["config"]["cap_max"], "system": group[0]["system"],
-             "seed": group[0]["config"]["seed"], "runs": len(group),
-             "same": len({record["digest"] for record in group}) == 1,
-             "spread": max(record["psnr"] for record in group) - min(record["psnr"] for record in group)}
-            for group in groups.values() if len(group) > 1]
+    return [
+        {
+            "scene": scene_title(group[0]),
+            "cap": group[0]["config"]["cap_max"],
+            "system": group[0]["system"],
+            "seed": group[0]["config"]["seed"],
+            "runs": len(group),
+            "same": len({record["digest"] for record in group}) == 1,
+            "spread": max(record["psnr"] for record in group) - min(record["psnr"] for record in group),
+        }
+        for group in groups.values()
+        if len(group) > 1
+    ]
 
 
 def scene_title(record: Record) -> str:
@@ -68,8 +82,13 @@ def scene_title(record: Record) -> str:
 
 def cells(row: Record) -> tuple[str, ...]:
     """A row as text, under HEAD."""
-    texts = {"scene": row["scene"], "cap": str(row["cap"]), "iterations": str(row["iterations"]),
-             "system": row["system"], "seeds": str(len(row["seeds"]))}
+    texts = {
+        "scene": row["scene"],
+        "cap": str(row["cap"]),
+        "iterations": str(row["iterations"]),
+        "system": row["system"],
+        "seeds": str(len(row["seeds"])),
+    }
     for title, (key, unit, digits) in _FROM_MEASURED.items():
         values = row[key]
         texts[title] = "failed"
@@ -83,21 +102,33 @@ def cells(row: Record) -> tuple[str, ...]:
 def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
     """What a reader of the table must know, one sentence each."""
     said = ["mean ± half the spread (maximum less minimum) over the seeds"]
-    said += [f"failed: {row['system']} on {row['scene']} at cap {row['cap']}, seed {seed}: {message}"
-             for row in rows for seed, message in row["failed"].items()]
-    said += [f"{row['system']} on {row['scene']} at cap {row['cap']}: {fault}" for row in rows
-             for key, fault in (("cap_held", "more splats than the cap"), ("finite", "parameters that are not finite"))
-             if row["seeds"] and not row[key] and not row["failed"]]
+    said += [
+        f"failed: {row['system']} on {row['scene']} at cap {row['cap']}, seed {seed}: {message}"
+        for row in rows
+        for seed, message in row["failed"].items()
+    ]
+    said += [
+        f"{row['system']} on {row['scene']} at cap {row['cap']}: {fault}"
+        for row in rows
+        for key, fault in (("cap_held", "more splats than the cap"), ("finite", "parameters that are not finite"))
+        if row["seeds"] and not row[key] and not row["failed"]
+    ]
     again = repeats(records)
     if again:
         same = sum(row["same"] for row in again)
         said.append(f"repeated: {same} of {len(again)} runs gave the same splats each time, bit by bit")
-        said += [f"{row['system']} on {row['scene']} at cap {row['cap']}, seed {row['seed']}: {row['runs']} runs "
-                 f"differ, PSNR by {row['spread']:.4f} dB" for row in again if not row["same"]]
+        said += [
+            f"{row['system']} on {row['scene']} at cap {row['cap']}, seed {row['seed']}: {row['runs']} runs "
+            f"differ, PSNR by {row['spread']:.4f} dB"
+            for row in again
+            if not row["same"]
+        ]
     by_key: tuple[tuple[str, Callable[[Record], Any]], ...] = (
         ("device", lambda record: f"{record['device']} ({record['driver']})"),
-        ("schedule", lambda record: record["schedule"]), ("version", lambda record: f"clsplat {record['version']}"),
-        ("protocol", lambda record: f"PSNR {record['protocol']['PSNR']}; SSIM {record['protocol']['SSIM']}"))
+        ("schedule", lambda record: record["schedule"]),
+        ("version", lambda record: f"clsplat {record['version']}"),
+        ("protocol", lambda record: f"PSNR {record['protocol']['PSNR']}; SSIM {record['protocol']['SSIM']}"),
+    )
     for name, of in by_key:
         values = list(dict.fromkeys(of(record) for record in records))
         mixed = " (mixed: seconds and rounding are not those of one machine)" if len(values) > 1 else ""
@@ -121,8 +152,10 @@ def _group_key(record: Record) -> str:
 def _row(group: Sequence[Record]) -> Record:
     first = group[0]
     row: Record = {
-        "scene": scene_title(first), "cap": first["config"]["cap_max"],
-        "iterations": first["config"]["iterations"], "system": first["system"],
+        "scene": scene_title(first),
+        "cap": first["config"]["cap_max"],
+        "iterations": first["config"]["iterations"],
+        "system": first["system"],
         "config": {key: value for key, value in first["config"].items() if key != "seed"},
         "seeds": [record["config"]["seed"] for record in group],
         "failed": {str(record["config"]["seed"]): record["failed"] for record in group if record["failed"]},
@@ -132,8 +165,9 @@ def _row(group: Sequence[Record]) -> Record:
     done = [record for record in group if not record["failed"]]
     for key in MEASURED:
         values = [record[key] for record in done if record[key] is not None]
-        row[key] = None if not values else {
-            "mean": statistics.fmean(values), "half_spread": (max(values) - min(values)) / 2}
+        row[key] = (
+            None if not values else {"mean": statistics.fmean(values), "half_spread": (max(values) - min(values)) / 2}
+        )
     return row
 
 

@@ -53,8 +53,14 @@ class Needs:
     colour: NDArray[np.float32] | None
 
 
-def measure(renderer: Renderer, splats: Splats, views: Sequence[View],
-            background: Sequence[float] = (0.0, 0.0, 0.0), seed: int = 0, parts: bool = True) -> Needs:
+def measure(
+    renderer: Renderer,
+    splats: Splats,
+    views: Sequence[View],
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    seed: int = 0,
+    parts: bool = True,
+) -> Needs:
     """Needs of all splats on some views; one render and one backward pass each.
 
     Parameters

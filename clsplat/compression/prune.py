@@ -66,8 +66,9 @@ class Pruned:
 class Judge:
     """PSNR of models on some views, the mean over them [dB]."""
 
-    def __init__(self, renderer: Renderer, views: Sequence[View],
-                 background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+    def __init__(
+        self, renderer: Renderer, views: Sequence[View], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> None:
         self.renderer, self.views, self.background = renderer, views, background
 
     def __call__(self, splats: Splats) -> float:
@@ -77,12 +78,20 @@ class Judge:
         """PSNR of each view; 0 of a model without splats."""
         if not len(splats):
             return [0.0] * len(self.views)
-        return [min(psnr(self.renderer.render(splats, view.camera, self.background).color, view.image), MAX_PSNR)
-                for view in self.views]
+        return [
+            min(psnr(self.renderer.render(splats, view.camera, self.background).color, view.image), MAX_PSNR)
+            for view in self.views
+        ]
 
 
-def prune(splats: Splats, views: Sequence[View], judge: Judge, tolerance: float, kinds: Sequence[str] = tuple(SHARES),
-          seed: int = 0) -> Pruned:
+def prune(
+    splats: Splats,
+    views: Sequence[View],
+    judge: Judge,
+    tolerance: float,
+    kinds: Sequence[str] = tuple(SHARES),
+    seed: int = 0,
+) -> Pruned:
     """Leave out as much as the judge's views allow.
 
     Parameters
@@ -102,30 +111,50 @@ def prune(splats: Splats, views: Sequence[View], judge: Judge, tolerance: float,
     before = now = judge(splats)
     found, costs = Thresholds(), {}
     if "splats" in kinds:
-        scores = splat_scores(splats, per_pixel(measure(judge.renderer, splats, views, judge.background, seed,
-                                                        parts=False), views))
-        threshold, splats, after = _farthest(scores, splats, now, before - SHARES["splats"] * tolerance,
-                                             partial(without_splats, scores=scores), judge)
+        scores = splat_scores(
+            splats, per_pixel(measure(judge.renderer, splats, views, judge.background, seed, parts=False), views)
+        )
+        threshold, splats, after = _farthest(
+            scores, splats, now, before - SHARES["splats"] * tolerance, partial(without_splats, scores=scores), judge
+        )
         found, costs["splats"], now = replace(found, splats=threshold), now - after, after
     if "fields" not in kinds and "bands" not in kinds:
         return Pruned(splats, before, now, costs, found)
     needs = per_pixel(measure(judge.renderer, splats, views, judge.background, seed), views)
     for name, change in needs.fields.items() if "fields" in kinds else ():
         scores = field_scores(splats, name, change)
-        threshold, splats, after = _farthest(scores, splats, now, before - SHARES["fields"] * tolerance,
-                                             partial(without_field, name=name, scores=scores), judge)
+        threshold, splats, after = _farthest(
+            scores,
+            splats,
+            now,
+            before - SHARES["fields"] * tolerance,
+            partial(without_field, name=name, scores=scores),
+            judge,
+        )
         found, costs[name], now = replace(found, fields=found.fields | {name: threshold}), now - after, after
     if "bands" in kinds and splats.sh_degree:
         assert needs.colour is not None
         lower, lost = lower_bands(splats.sh, needs.colour)
-        threshold, splats, after = _farthest(band_slopes(lost), splats, now, before - SHARES["bands"] * tolerance,
-                                             partial(without_bands, lower=lower, lost=lost), judge)
+        threshold, splats, after = _farthest(
+            band_slopes(lost),
+            splats,
+            now,
+            before - SHARES["bands"] * tolerance,
+            partial(without_bands, lower=lower, lost=lost),
+            judge,
+        )
         found, costs["bands"], now = replace(found, bands=threshold), now - after, after
     return Pruned(splats, before, now, costs, found)
 
 
-def apply_thresholds(splats: Splats, views: Sequence[View], renderer: Renderer, thresholds: Thresholds,
-                     background: Sequence[float] = (0.0, 0.0, 0.0), seed: int = 0) -> Splats:
+def apply_thresholds(
+    splats: Splats,
+    views: Sequence[View],
+    renderer: Renderer,
+    thresholds: Thresholds,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    seed: int = 0,
+) -> Splats:
     """The model without the fields and bands that thresholds found on another one of its scene leave out."""
     needs = per_pixel(measure(renderer, splats, views, background, seed), views)
     for name, threshold in thresholds.fields.items():
@@ -136,8 +165,14 @@ def apply_thresholds(splats: Splats, views: Sequence[View], renderer: Renderer, 
     return splats
 
 
-def within_bytes(splats: Splats, views: Sequence[View], renderer: Renderer, limit: int,
-                 background: Sequence[float] = (0.0, 0.0, 0.0), seed: int = 0) -> Splats | None:
+def within_bytes(
+    splats: Splats,
+    views: Sequence[View],
+    renderer: Renderer,
+    limit: int,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    seed: int = 0,
+) -> Splats | None:
     """The model with as many of its fields and bands as a compact file of at most `limit` bytes holds.
 
     One threshold holds for both kinds, so that what goes is what changes the views least for its bytes.
@@ -235,8 +270,9 @@ def without_bands(splats: Splats, threshold: float, lower: Sequence[Array], lost
     return splats.with_arrays(arrays)
 
 
-def _farthest(scores: Reals, splats: Splats, now: float, floor: float, apply: Callable[[Splats, float], Splats],
-              judge: Judge) -> tuple[float, Splats, float]:
+def _farthest(
+    scores: Reals, splats: Splats, now: float, floor: float, apply: Callable[[Splats, float], Splats], judge: Judge
+) -> tuple[float, Splats, float]:
     """The highest threshold, by bisection on the ranks of the scores, that keeps PSNR at the floor or above.
 
     Returns

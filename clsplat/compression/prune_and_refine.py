@@ -25,21 +25,40 @@ from .prune import Judge, splat_scores, strongest
 
 KEPT = 0.75  # of the splats, by a round
 SETTLING = 0.3  # rate of a last part without removal: 0.2 dB better than at full rate (fox, 13 500 and 5700 splats)
-_RATES = {"scaling_lr": "log_scale", "rotation_lr": "quat", "normal_lr": "normal", "beta_lr": "beta", "nu_lr": "nu",
-          "skew_lr": "skew"}  # options by the field whose rate they are
+_RATES = {
+    "scaling_lr": "log_scale",
+    "rotation_lr": "quat",
+    "normal_lr": "normal",
+    "beta_lr": "beta",
+    "nu_lr": "nu",
+    "skew_lr": "skew",
+}  # options by the field whose rate they are
 _WARM = 10.0  # positions' first rate over their last: removing splats leaves gaps to be closed
 
 
-def without_quarter(splats: Splats, views: Sequence[View], renderer: Renderer,
-                    background: Sequence[float] = (0.0, 0.0, 0.0), seed: int = 0, count: int | None = None) -> Splats:
+def without_quarter(
+    splats: Splats,
+    views: Sequence[View],
+    renderer: Renderer,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    seed: int = 0,
+    count: int | None = None,
+) -> Splats:
     """The splats whose removal would change the views most: KEPT of them, or `count` where that is more."""
     needs = measure(renderer, splats, views, background, seed, parts=False)
     keep = max(int(KEPT * len(splats)), count or 1)
     return strongest(splats, splat_scores(splats, needs), min(keep, len(splats)))
 
 
-def trained_rounds(scene: Scene, splats: Splats, judge: Judge, floor: float, iterations: int, device: Device,
-                   progress: Callable[[Progress], None] | None = None) -> Splats:
+def trained_rounds(
+    scene: Scene,
+    splats: Splats,
+    judge: Judge,
+    floor: float,
+    iterations: int,
+    device: Device,
+    progress: Callable[[Progress], None] | None = None,
+) -> Splats:
     """Rounds for a model whose run is not known, until the judge's PSNR falls below the floor; the last good one.
 
     Rates are those that a run of clsplat's defaults, ten times as long as a round, ends with.
@@ -48,8 +67,13 @@ def trained_rounds(scene: Scene, splats: Splats, judge: Judge, floor: float, ite
     ----------
     iterations : of a round.
     """
-    config = TrainConfig(shape=splats.shape, normalisation=splats.normalisation, antialiased=splats.antialiased,
-                         iterations=10 * iterations, background=judge.background)
+    config = TrainConfig(
+        shape=splats.shape,
+        normalisation=splats.normalisation,
+        antialiased=splats.antialiased,
+        iterations=10 * iterations,
+        background=judge.background,
+    )
     good = splats
     while len(splats) > 1:
         fewer = without_quarter(splats, scene.train, judge.renderer, judge.background)
@@ -60,8 +84,15 @@ def trained_rounds(scene: Scene, splats: Splats, judge: Judge, floor: float, ite
     return good
 
 
-def fine_tune(scene: Scene, splats: Splats, config: TrainConfig, iterations: int, device: Device,
-              progress: Callable[[Progress], None] | None = None, rate: float = 1.0) -> Splats:
+def fine_tune(
+    scene: Scene,
+    splats: Splats,
+    config: TrainConfig,
+    iterations: int,
+    device: Device,
+    progress: Callable[[Progress], None] | None = None,
+    rate: float = 1.0,
+) -> Splats:
     """`splats` after some more iterations, at the rates that `config`'s run ends with; their number stays.
 
     Parameters
@@ -74,8 +105,12 @@ def fine_tune(scene: Scene, splats: Splats, config: TrainConfig, iterations: int
     with tempfile.TemporaryDirectory() as folder:
         start = Path(folder) / "start.ply"
         splats.save(start)
-        trainer = Trainer(scene, fine_tuning(config, splats, iterations, start, rate), device=device,
-                          progress=without_messages(progress))
+        trainer = Trainer(
+            scene,
+            fine_tuning(config, splats, iterations, start, rate),
+            device=device,
+            progress=without_messages(progress),
+        )
     return trainer.run().splats
 
 
@@ -103,9 +138,25 @@ def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Pat
             changes[option] = rate * value * config.rate_factor(field) / short.rate_factor(field)
     last = config.position_lr_final * config.rate_factor("mean") / short.rate_factor("mean")
     return dataclasses.replace(
-        short, shape=splats.shape, normalisation=splats.normalisation, antialiased=splats.antialiased,
-        sh_degree=splats.sh_degree, cap_max=len(splats), init=str(start), coarse_to_fine=False, sh_interval=1,
-        strategy="adc", densify_until=0.0, noise_lr=0.0, position_optimizer="adam", alternation="off",
-        save_iterations=(), test_iterations=(), opacity_lr=rate * config.opacity_lr,
-        feature_lr=rate * config.feature_lr, position_lr_init=min(_WARM * last, config.position_lr_init),
-        position_lr_final=last, **changes)
+        short,
+        shape=splats.shape,
+        normalisation=splats.normalisation,
+        antialiased=splats.antialiased,
+        sh_degree=splats.sh_degree,
+        cap_max=len(splats),
+        init=str(start),
+        coarse_to_fine=False,
+        sh_interval=1,
+        strategy="adc",
+        densify_until=0.0,
+        noise_lr=0.0,
+        position_optimizer="adam",
+        alternation="off",
+        save_iterations=(),
+        test_iterations=(),
+        opacity_lr=rate * config.opacity_lr,
+        feature_lr=rate * config.feature_lr,
+        position_lr_init=min(_WARM * last, config.position_lr_init),
+        position_lr_final=last,
+        **changes,
+    )

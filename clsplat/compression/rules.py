@@ -94,8 +94,9 @@ def standard_error(first: list[float], second: list[float]) -> float:
 def rounds_are_over(rows: list[Row], options: BudgetOptions) -> bool:
     """Whether fewer splats would not do: the last models were not good enough, or hardly a splat is left."""
     last = rows[-PATIENCE:]
-    return rows[-1]["splats"] <= FEWEST or (len(last) == PATIENCE and all(
-        meets(row, rows, options) is False for row in last))
+    return rows[-1]["splats"] <= FEWEST or (
+        len(last) == PATIENCE and all(meets(row, rows, options) is False for row in last)
+    )
 
 
 def meets(row: Row, rows: list[Row], options: BudgetOptions) -> bool | None:

@@ -79,14 +79,27 @@ class Budgeted:
     def seconds(self) -> float:
         """Of all stages: growth, held-out run, rounds, parts, refit."""
         report = self.report
-        stages = [*report.get("growth", []), *report.get("whole", []), *report.get("rounds", [])[1:],
-                  report.get("held_out", {}), report.get("refit", {})]
+        stages = [
+            *report.get("growth", []),
+            *report.get("whole", []),
+            *report.get("rounds", [])[1:],
+            report.get("held_out", {}),
+            report.get("refit", {}),
+        ]
         return float(sum(stage.get("seconds", 0.0) for stage in stages))
 
 
-def train_budget(scene: Scene, config: TrainConfig | None = None, options: BudgetOptions | None = None,
-                 progress: Report | None = None, *, output: str | Path, resume: bool = False, overwrite: bool = False,
-                 extra: dict[str, Any] | None = None) -> Budgeted:
+def train_budget(
+    scene: Scene,
+    config: TrainConfig | None = None,
+    options: BudgetOptions | None = None,
+    progress: Report | None = None,
+    *,
+    output: str | Path,
+    resume: bool = False,
+    overwrite: bool = False,
+    extra: dict[str, Any] | None = None,
+) -> Budgeted:
     """Learn the smallest model that a scene needs.
 
     Parameters
@@ -120,8 +133,16 @@ def train_budget(scene: Scene, config: TrainConfig | None = None, options: Budge
 class _Search:
     """The stages, each done once."""
 
-    def __init__(self, scene: Scene, config: TrainConfig, options: BudgetOptions, progress: Report | None,
-                 state: BudgetState, folder: ModelFolder, extra: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        options: BudgetOptions,
+        progress: Report | None,
+        state: BudgetState,
+        folder: ModelFolder,
+        extra: dict[str, Any],
+    ) -> None:
         self.scene, self.config, self.options, self.progress = scene, config, options, progress
         self.state, self.folder, self.extra = state, folder, extra
         self.split = hold_out(scene)
@@ -141,8 +162,15 @@ class _Search:
             resume = self.folder.checkpoint_path.is_file()
             config = dataclasses.replace(self.config, cap_max=values["knee"])
             self.say(f"refit: all {len(self.scene.train)} training views, at most {values['knee']} splats")
-            model = train(self.scene, config, self.progress, output=self.folder.path, resume=resume,
-                          overwrite=not resume, extra=self.extra)
+            model = train(
+                self.scene,
+                config,
+                self.progress,
+                output=self.folder.path,
+                resume=resume,
+                overwrite=not resume,
+                extra=self.extra,
+            )
             if not model.finished:
                 return Budgeted(model.splats, self.folder.path, False, values)
             self.state.save("refit_0", model.splats)
@@ -160,12 +188,26 @@ class _Search:
             if growth_is_over(rows, self.options):
                 break
             self.say(f"growth: at most {cap} splats, {iterations} iterations")
-            config = dataclasses.replace(self.config, cap_max=cap, iterations=iterations, densify_interval=interval,
-                                         save_iterations=(), test_iterations=())
+            config = dataclasses.replace(
+                self.config,
+                cap_max=cap,
+                iterations=iterations,
+                densify_interval=interval,
+                save_iterations=(),
+                test_iterations=(),
+            )
             splats, seconds = self.run_of(config)
             views = self.judge.per_view(splats)
-            rows = [*rows, {"cap": cap, "splats": len(splats), "psnr": statistics.fmean(views), "views": views,
-                            "seconds": seconds}]
+            rows = [
+                *rows,
+                {
+                    "cap": cap,
+                    "splats": len(splats),
+                    "psnr": statistics.fmean(views),
+                    "views": views,
+                    "seconds": seconds,
+                },
+            ]
             self.state.put("growth", rows)
             if len(splats) < cap:  # it grows no further by itself
                 break
@@ -177,10 +219,13 @@ class _Search:
         for cap in self.state.values["candidates"]:
             if any(row["cap"] == cap for row in rows):
                 continue
-            self.say(f"held out: at most {cap} splats, {len(self.split.train)} training views, "
-                     f"{len(self.split.test)} validation views")
-            splats, seconds = self.run_of(dataclasses.replace(self.config, cap_max=cap, save_iterations=(),
-                                                              test_iterations=()))
+            self.say(
+                f"held out: at most {cap} splats, {len(self.split.train)} training views, "
+                f"{len(self.split.test)} validation views"
+            )
+            splats, seconds = self.run_of(
+                dataclasses.replace(self.config, cap_max=cap, save_iterations=(), test_iterations=())
+            )
             self.state.save(f"whole_{cap}", splats)
             rows = [*rows, {"cap": cap, **self.row(splats, seconds)}]
             self.state.put("whole", rows)
@@ -215,8 +260,16 @@ class _Search:
         small = found.splats
         if self.options.max_bytes is not None:
             small = self.fitted(small, self.split) or small
-        self.state.put("held_out", {"psnr": now, "psnr_pruned": self.judge(small), "costs": found.costs,
-                                    "seconds": round(time.perf_counter() - start, 2), **complexity(small).to_json()})
+        self.state.put(
+            "held_out",
+            {
+                "psnr": now,
+                "psnr_pruned": self.judge(small),
+                "costs": found.costs,
+                "seconds": round(time.perf_counter() - start, 2),
+                **complexity(small).to_json(),
+            },
+        )
         self.state.put("thresholds", {"fields": found.thresholds.fields, "bands": found.thresholds.bands})
 
     def finish(self) -> Budgeted:
@@ -232,16 +285,18 @@ class _Search:
         splats = self.settle(self.scene, splats, done)
         found = values["thresholds"]
         thresholds = Thresholds(0.0, found["fields"], found["bands"])
-        splats = apply_thresholds(splats, self.scene.train, self.renderer, thresholds, self.config.background,
-                                  self.config.seed)
+        splats = apply_thresholds(
+            splats, self.scene.train, self.renderer, thresholds, self.config.background, self.config.seed
+        )
         if self.options.max_bytes is not None:
             splats = self.fitted(splats, self.scene) or splats
         path = self.folder.ply_path(self.config.iterations + self.part * (done + 1 if done else 0))
         splats.save(path, compact=True)
         missed = self.missed(path.stat().st_size)
         report = complexity(splats).to_json() | {"bytes": path.stat().st_size, "missed": missed}
-        self.state.put("refit", values["refit"] | {"seconds": values["refit"]["seconds"]
-                                                   + round(time.perf_counter() - start, 2)})
+        self.state.put(
+            "refit", values["refit"] | {"seconds": values["refit"]["seconds"] + round(time.perf_counter() - start, 2)}
+        )
         self.state.put("final", report)
         self.state.end()
         return Budgeted(splats, path, True, values)
@@ -275,16 +330,19 @@ class _Search:
     def fitted(self, splats: Splats, scene: Scene) -> Splats | None:
         """The model within the limit of bytes, if it can be."""
         assert self.options.max_bytes is not None
-        return within_bytes(splats, scene.train, self.renderer, self.options.max_bytes, self.config.background,
-                            self.config.seed)
+        return within_bytes(
+            splats, scene.train, self.renderer, self.options.max_bytes, self.config.background, self.config.seed
+        )
 
     def missed(self, nbytes: int) -> str | None:
         """What of the targets was not met, in one sentence."""
         options, reached = self.options, self.state.values["held_out"]["psnr_pruned"]
         said = []
         if options.target_psnr is not None and reached < options.target_psnr:
-            said.append(f"target PSNR {options.target_psnr:g} dB was not reached: the best model, which is kept, has "
-                        f"{reached:.2f} dB on validation views: try more --iterations or a higher --cap-max")
+            said.append(
+                f"target PSNR {options.target_psnr:g} dB was not reached: the best model, which is kept, has "
+                f"{reached:.2f} dB on validation views: try more --iterations or a higher --cap-max"
+            )
         if options.max_bytes is not None and nbytes > options.max_bytes:
             said.append(f"{nbytes} bytes are more than {options.max_bytes}: the smallest model tried is kept")
         return "; ".join(said) or None

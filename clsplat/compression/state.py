@@ -51,8 +51,10 @@ class BudgetState:
         stored = TrainConfig.from_json(self.values["config"]).to_json() | self.values["options"]
         for key, value in (config.to_json() | asdict(options)).items():
             if key not in FREE_OPTIONS and stored.get(key) != value:
-                raise InputError(f"{self.path}: --resume with {key}={value}, but the search was started with "
-                                 f"{key}={stored.get(key)}: use the same options, or --overwrite to start again")
+                raise InputError(
+                    f"{self.path}: --resume with {key}={value}, but the search was started with "
+                    f"{key}={stored.get(key)}: use the same options, or --overwrite to start again"
+                )
 
     def put(self, stage: str, value: Any) -> None:
         """A stage is done."""

@@ -44,7 +44,9 @@ class Schedule:
         if self.lanes not in (1, 8, 16):
             raise DeviceError(f"schedule {self}: LANES must be 1, 8 or 16 (cl/math/lanes.clh)")
         if self.group == 1 and self.lanes > 1 and self.vecs > 64:
-            raise DeviceError(f"schedule {self}: a work-item has at most 64 vectors (a bit each, cl/render/rasterize.cl)")
+            raise DeviceError(
+                f"schedule {self}: a work-item has at most 64 vectors (a bit each, cl/render/rasterize.cl)"
+            )
         if self.group > 1 and self.group % 32:  # sums go by parts of 16; PoCL 3.1 gets groups of 16 wrong
             raise DeviceError(f"schedule {self}: GROUP must be 1 or a multiple of 32 (cl/render/group.clh)")
 
@@ -66,9 +68,7 @@ class Schedule:
             group, vecs, lanes = (int(part) for part in text.lower().split("x"))
         except ValueError:
             names = ", ".join(SCHEDULES)
-            raise DeviceError(
-                f"schedule {text!r}: expected one of {names} or a form such as 1x16x16"
-            ) from None
+            raise DeviceError(f"schedule {text!r}: expected one of {names} or a form such as 1x16x16") from None
         return cls(group, vecs, lanes)
 
 
@@ -132,9 +132,7 @@ class Device:
         self.cl_device = cl_device
         try:
             self.context = cl.Context([cl_device])
-            self.queue = cl.CommandQueue(
-                self.context, properties=cl.command_queue_properties.PROFILING_ENABLE
-            )
+            self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         except cl.Error as error:
             raise DeviceError(f"device {info} cannot be opened: {first_line(error)}") from None
         self.programs: dict[Any, Any] = {}
@@ -256,9 +254,7 @@ def _all_devices() -> list[Found]:
 
         platforms = cl.get_platforms()
     except ImportError as error:
-        raise DeviceError(
-            f"pyopencl cannot be imported ({first_line(error)}): `pip install pyopencl`"
-        ) from None
+        raise DeviceError(f"pyopencl cannot be imported ({first_line(error)}): `pip install pyopencl`") from None
     except cl.Error:  # PLATFORM_NOT_FOUND_KHR: the loader works and knows no platform
         return []
     found = []
@@ -349,6 +345,5 @@ def _available_host_bytes() -> int:
 
 def _out_of_memory(needed: int, limit: int, of_what: str) -> DeviceError:
     return DeviceError(
-        f"device out of memory: needs {needed / MIB:.0f} MB, "
-        f"has {limit / MIB:.0f} MB {of_what}: {LESS_MEMORY}"
+        f"device out of memory: needs {needed / MIB:.0f} MB, has {limit / MIB:.0f} MB {of_what}: {LESS_MEMORY}"
     )

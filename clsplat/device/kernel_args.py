@@ -55,6 +55,4 @@ def _parse_parameter(kernel: str, text: str, real: Real) -> Parameter:
         dtype = _SCALARS.get(real if types[0] == "real" else types[0])
         if dtype is not None:
             return Parameter(name, "scalar", np.dtype(dtype))
-    raise DeviceError(
-        f"kernel {kernel}: parameter {' '.join(text.split())!r} is of no type that can be bound"
-    )
+    raise DeviceError(f"kernel {kernel}: parameter {' '.join(text.split())!r} is of no type that can be bound")

@@ -66,8 +66,13 @@ def send_to_device(device: Device, buffer: Any, array: NDArray[Any], queue: Any 
     """
     import pyopencl as cl
 
-    event = cl.enqueue_copy(queue or device.queue, buffer, np.ascontiguousarray(array), is_blocking=False,
-                            wait_for=None if after is None else [after])
+    event = cl.enqueue_copy(
+        queue or device.queue,
+        buffer,
+        np.ascontiguousarray(array),
+        is_blocking=False,
+        wait_for=None if after is None else [after],
+    )
     device.observe("upload", (array.nbytes,), event)
     return event
 

@@ -67,9 +67,7 @@ def build(
     return program
 
 
-def build_text(
-    device: Device, text: str, defines: Mapping[str, Define] | None = None, real: Real = "float"
-) -> Program:
+def build_text(device: Device, text: str, defines: Mapping[str, Define] | None = None, real: Real = "float") -> Program:
     """Program from OpenCL C text, not kept in `device`; otherwise as `build`."""
     import pyopencl as cl
 
@@ -136,9 +134,7 @@ class Kernel:
         self._queue = device.queue
         self._kernel = cl.Kernel(built, name)
         if self._kernel.num_args != len(parameters):
-            raise DeviceError(
-                f"kernel {name}: {self._kernel.num_args} parameters built, {len(parameters)} in its text"
-            )
+            raise DeviceError(f"kernel {name}: {self._kernel.num_args} parameters built, {len(parameters)} in its text")
         self._names = tuple(p.name for p in parameters)
         self._local = tuple(i for i, p in enumerate(parameters) if p.kind == "local")
         self._kernel.set_scalar_arg_dtypes([p.dtype for p in parameters])
@@ -147,9 +143,7 @@ class Kernel:
         self._marker = cl.enqueue_marker
         self._cl_error: type[Exception] = cl.Error
 
-    def __call__(
-        self, global_size: tuple[int, ...], local_size: tuple[int, ...] | None, /, **args: Any
-    ) -> Any:
+    def __call__(self, global_size: tuple[int, ...], local_size: tuple[int, ...] | None, /, **args: Any) -> Any:
         """Enqueue on the device's queue. An empty global size runs nothing (OpenCL 1.2 would refuse it).
 
         Raises
@@ -175,9 +169,7 @@ class Kernel:
             event = self._enqueue(self._queue, self._kernel, global_size, local_size)
         except self._cl_error as error:
             mend = f": {LESS_MEMORY}" if is_out_of_memory(error) else f", sizes {global_size} {local_size}"
-            raise DeviceError(
-                f"kernel {self.name} on {self._device.info}: {first_line(error)}{mend}"
-            ) from error
+            raise DeviceError(f"kernel {self.name} on {self._device.info}: {first_line(error)}{mend}") from error
         self._device.observe(self.name, global_size, event)
         return event
 
@@ -219,15 +211,11 @@ def smoke_test(device: Device) -> tuple[float, float]:
         cl.enqueue_copy(device.queue, computed, result)
         run_ms = 1e-6 * (event.profile.end - event.profile.start)
     except cl.Error as error:
-        raise DeviceError(
-            f"device {device.info} runs no kernel: {first_line(error)}: update its driver"
-        ) from None
+        raise DeviceError(f"device {device.info} runs no kernel: {first_line(error)}: update its driver") from None
     expected = np.array([math.exp(-v * v) + math.erfc(v) for v in x.tolist()])
     worst = float(np.max(np.abs(computed - expected) / expected))
     if not worst < SMOKE_TOLERANCE:
-        raise DeviceError(
-            f"device {device.info} computes wrong numbers (off by {worst:.1e}): update its driver"
-        )
+        raise DeviceError(f"device {device.info} computes wrong numbers (off by {worst:.1e}): update its driver")
     return build_ms, run_ms
 
 
@@ -252,9 +240,7 @@ def _read(name: str) -> str:
     try:
         return importlib.resources.files("clsplat_cl").joinpath(*name.split("/")).read_text(encoding="utf-8")
     except (OSError, ModuleNotFoundError):
-        raise DeviceError(
-            f"kernel source {name!r} is not in the installed package: reinstall clsplat"
-        ) from None
+        raise DeviceError(f"kernel source {name!r} is not in the installed package: reinstall clsplat") from None
 
 
 def _literal(name: str, value: Define, real: Real) -> str:

@@ -35,8 +35,14 @@ def binary_path(info: DeviceInfo, text: str, options: list[str]) -> Path | None:
     """The file of a program's binary, whether it exists or not; None when the driver, or no folder, keeps it."""
     if info.platform in SELF_CACHING:
         return None
-    place = (info.platform, info.platform_version, info.name, info.version, info.driver,
-             _cpu_features() if info.type == "CPU" else "")
+    place = (
+        info.platform,
+        info.platform_version,
+        info.name,
+        info.version,
+        info.driver,
+        _cpu_features() if info.type == "CPU" else "",
+    )
     digest = hashlib.sha256("\0".join((*place, *options, text)).encode()).hexdigest()
     try:
         return cache_folder() / "programs" / f"{digest[:40]}.bin"

@@ -34,14 +34,36 @@ _LEGEND_COLUMNS = 4
 # Of a label beside its point: across in 6 points, up in 8. Above a front and to its left there is nothing.
 _SPOTS = ((-1.0, 0.7), (0.0, 1.2), (-1.0, 0.0), (1.0, -0.7), (1.0, 0.7), (1.0, 0.0), (0.0, -1.2), (-1.0, -0.7))
 _STYLE = {
-    "figure.dpi": 100, "savefig.dpi": 200, "font.size": 9, "axes.titlesize": 10, "axes.labelsize": 9,
-    "legend.fontsize": 8.5, "xtick.labelsize": 8.5, "ytick.labelsize": 8.5, "font.family": "DejaVu Sans",
-    "text.color": INK, "axes.labelcolor": INK, "axes.edgecolor": "#8c8c8c", "xtick.color": INK, "ytick.color": INK,
-    "xtick.major.size": 3, "ytick.major.size": 3, "axes.linewidth": 0.8, "axes.spines.top": False,
-    "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e6e6e6",
-    "grid.linewidth": 0.7, "lines.linewidth": 1.6, "lines.markersize": 5, "legend.frameon": False,
-    "svg.hashsalt": "clsplat", "figure.facecolor": "white", "savefig.facecolor": "white",
-}  # fmt: skip
+    "figure.dpi": 100,
+    "savefig.dpi": 200,
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.labelsize": 9,
+    "legend.fontsize": 8.5,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "font.family": "DejaVu Sans",
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#8c8c8c",
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.major.size": 3,
+    "ytick.major.size": 3,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.7,
+    "lines.linewidth": 1.6,
+    "lines.markersize": 5,
+    "legend.frameon": False,
+    "svg.hashsalt": "clsplat",
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+}
 
 
 def available() -> bool:
@@ -106,9 +128,13 @@ def looks(systems: dict[str, str]) -> dict[str, dict[str, Any]]:
         place = seen.setdefault(shape, 0)
         seen[shape] += 1
         marker = dict(zip(SHAPES, _MARKERS, strict=True)).get(shape, "o")
-        found[label] = {"color": shape_colour(shape), "marker": marker, "linestyle": _DASHES[place % len(_DASHES)],
-                        "markerfacecolor": shape_colour(shape) if place % 2 == 0 else "white",
-                        "markeredgecolor": shape_colour(shape)}
+        found[label] = {
+            "color": shape_colour(shape),
+            "marker": marker,
+            "linestyle": _DASHES[place % len(_DASHES)],
+            "markerfacecolor": shape_colour(shape) if place % 2 == 0 else "white",
+            "markeredgecolor": shape_colour(shape),
+        }
     return {label: found[label] for label in systems}
 
 
@@ -145,8 +171,15 @@ def tile(corner: tuple[float, float], fill: str, label: str | None = None) -> An
 
 def star(shape: str) -> dict[str, Any]:
     """Keywords of `Axes.plot` for the point of a run that chose its own number of splats."""
-    return {"marker": "*", "markersize": 14, "color": shape_colour(shape), "markeredgecolor": INK,
-            "markeredgewidth": 0.9, "linestyle": "none", "zorder": 5}
+    return {
+        "marker": "*",
+        "markersize": 14,
+        "color": shape_colour(shape),
+        "markeredgecolor": INK,
+        "markeredgewidth": 0.9,
+        "linestyle": "none",
+        "zorder": 5,
+    }
 
 
 def system_legend(figure: Any, styles: dict[str, dict[str, Any]], stars: dict[str, str] | None = None) -> None:
@@ -204,8 +237,16 @@ def _place(axes: Any, points: Sequence[Label], size: float, dot: float) -> None:
             spot = (left, bottom, left + width, bottom + height)
             inside = box.x0 <= left and spot[2] <= box.x1 and box.y0 <= bottom and spot[3] <= box.y1
             if inside and not any(_overlap(spot, other) for other in taken):
-                axes.annotate(text, (x, y), (across * 6, up * 8), textcoords="offset points", color=colour, va="center",
-                              ha="center" if abs(across) < 1 else "left" if across > 0 else "right", fontsize=size)
+                axes.annotate(
+                    text,
+                    (x, y),
+                    (across * 6, up * 8),
+                    textcoords="offset points",
+                    color=colour,
+                    va="center",
+                    ha="center" if abs(across) < 1 else "left" if across > 0 else "right",
+                    fontsize=size,
+                )
                 taken.append(spot)
                 break
 

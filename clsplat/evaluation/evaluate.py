@@ -28,9 +28,14 @@ class Evaluation:
     per_view: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
-def evaluate(renderer: Renderer, splats: Splats, views: Sequence[View],
-             background: Sequence[float] = (0, 0, 0), protocol: Protocol = DEFAULT_PROTOCOL,
-             on_view: Callable[[View, Rendered], None] | None = None) -> Evaluation:
+def evaluate(
+    renderer: Renderer,
+    splats: Splats,
+    views: Sequence[View],
+    background: Sequence[float] = (0, 0, 0),
+    protocol: Protocol = DEFAULT_PROTOCOL,
+    on_view: Callable[[View, Rendered], None] | None = None,
+) -> Evaluation:
     """Render every view and compare it with its photograph.
 
     Parameters
@@ -45,10 +50,10 @@ def evaluate(renderer: Renderer, splats: Splats, views: Sequence[View],
         start = time.perf_counter()
         image = renderer.render(splats, view.camera, background)
         times.append(1e3 * (time.perf_counter() - start))
-        measured = protocol.measure(np.clip(image.color, 0, 1), view.image / np.float32(255),
-                                    view.mask)
-        per_view[view.name] = {name: min(value, MAX_PSNR) if math.isinf(value) else value
-                               for name, value in measured.items()}
+        measured = protocol.measure(np.clip(image.color, 0, 1), view.image / np.float32(255), view.mask)
+        per_view[view.name] = {
+            name: min(value, MAX_PSNR) if math.isinf(value) else value for name, value in measured.items()
+        }
         if on_view is not None:
             on_view(view, image)
     means = {key: statistics.fmean(v[key] for v in per_view.values()) for key in ("PSNR", "SSIM")}

@@ -118,8 +118,13 @@ def psnr(a: NDArray[Any], b: NDArray[Any], rounded: bool = True, mask: NDArray[n
     return float("inf") if error == 0.0 else -10.0 * float(np.log10(error))
 
 
-def ssim(a: NDArray[Any], b: NDArray[Any], padding: Padding = "valid", rounded: bool = True,
-         mask: NDArray[np.bool_] | None = None) -> float:
+def ssim(
+    a: NDArray[Any],
+    b: NDArray[Any],
+    padding: Padding = "valid",
+    rounded: bool = True,
+    mask: NDArray[np.bool_] | None = None,
+) -> float:
     """Structural similarity, the mean over its map and over channels.
 
     Parameters

@@ -44,11 +44,15 @@ class Lpips:
             import lpips
             import torch
         except ImportError as error:
-            raise InputError(f"LPIPS needs the package lpips, with PyTorch and torchvision ({_line(error)}): "
-                             "pip install 'clsplat[lpips]'") from None
+            raise InputError(
+                f"LPIPS needs the package lpips, with PyTorch and torchvision ({_line(error)}): "
+                "pip install 'clsplat[lpips]'"
+            ) from None
         except Exception as error:  # of torch and torchvision builds that do not belong together
-            raise InputError(f"LPIPS: the package lpips cannot be loaded ({_line(error)}): install versions of torch "
-                             "and torchvision that belong together") from None
+            raise InputError(
+                f"LPIPS: the package lpips cannot be loaded ({_line(error)}): install versions of torch "
+                "and torchvision that belong together"
+            ) from None
         self._torch = torch
         weights = Path(torch.hub.get_dir()) / "checkpoints" / VGG_URL.rpartition("/")[2]
         was_there = weights.is_file()
@@ -58,10 +62,14 @@ class Lpips:
                 self._net = lpips.LPIPS(net="vgg", verbose=False)
         except Exception as error:  # of the network, the disk, or a damaged file
             if was_there:
-                raise InputError(f"{weights}: LPIPS's weights cannot be read ({_line(error)}): delete the file, and "
-                                 "they are fetched again") from None
-            raise InputError(f"LPIPS: the weights of VGG16 ({VGG_MEGABYTES} MB) cannot be fetched ({_line(error)}): "
-                             f"download {VGG_URL} elsewhere and put it into {weights.parent}") from None
+                raise InputError(
+                    f"{weights}: LPIPS's weights cannot be read ({_line(error)}): delete the file, and "
+                    "they are fetched again"
+                ) from None
+            raise InputError(
+                f"LPIPS: the weights of VGG16 ({VGG_MEGABYTES} MB) cannot be fetched ({_line(error)}): "
+                f"download {VGG_URL} elsewhere and put it into {weights.parent}"
+            ) from None
 
     def __call__(self, render: Image, photo: Image, mask: Mask | None = None) -> float:
         """Distance of two images (H, W, 3), bytes or reals in 0..1.
@@ -71,8 +79,9 @@ class Lpips:
         InputError : an image below 32 px.
         """
         if min(photo.shape[:2]) < _LEAST:
-            raise InputError(f"LPIPS: an image of {photo.shape[1]}x{photo.shape[0]} px; the net needs {_LEAST} at "
-                             "least")
+            raise InputError(
+                f"LPIPS: an image of {photo.shape[1]}x{photo.shape[0]} px; the net needs {_LEAST} at least"
+            )
         a, b = (self._tensor(image) for image in _pair(render, photo, mask))
         with self._torch.inference_mode():
             return float(self._net(a, b))
@@ -98,8 +107,9 @@ class Flip:
         try:
             import flip_evaluator
         except ImportError as error:
-            raise InputError(f"FLIP needs the package flip-evaluator ({_line(error)}): "
-                             "pip install 'clsplat[flip]'") from None
+            raise InputError(
+                f"FLIP needs the package flip-evaluator ({_line(error)}): pip install 'clsplat[flip]'"
+            ) from None
         self._evaluate = flip_evaluator.evaluate
 
     def __call__(self, render: Image, photo: Image, mask: Mask | None = None) -> NDArray[np.float32]:

@@ -62,10 +62,13 @@ def write_page(path: Path, title: str, sections: Sequence[Section], style: str =
     InputError : a chart cannot be read. OutputError : cannot be written.
     """
     body = "".join(_section(section, number) for number, section in enumerate(sections, 1))
-    page = (f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-            f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
-            f"<style>{_STYLE}{style}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n{body}"
-            + (f"<script>{script}</script>\n" if script else "") + "</body>\n</html>\n")
+    page = (
+        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
+        f"<style>{_STYLE}{style}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n{body}"
+        + (f"<script>{script}</script>\n" if script else "")
+        + "</body>\n</html>\n"
+    )
     with atomic_writer(path) as stream:
         stream.write(page.encode())
     return path
@@ -102,8 +105,14 @@ def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     words = [any(re.match(r"[^\W\d_]", line[column]) for line in lines) for column in range(len(head))]
 
     def row(tag: str, cells: Sequence[str]) -> str:
-        return "<tr>" + "".join(f"<{tag}{' class=text' if word else ''}>{escape(cell)}</{tag}>"
-                                for cell, word in zip(cells, words, strict=True)) + "</tr>\n"
+        return (
+            "<tr>"
+            + "".join(
+                f"<{tag}{' class=text' if word else ''}>{escape(cell)}</{tag}>"
+                for cell, word in zip(cells, words, strict=True)
+            )
+            + "</tr>\n"
+        )
 
     body = "".join(row("td", line) for line in lines)
     return f'<div class="table"><table>\n{row("th", head)}{body}</table></div>\n'

@@ -103,8 +103,12 @@ def photo_facts(path: str | os.PathLike[str]) -> PhotoFacts:
             exif = image.getexif()
             orientation = exif.pop(ExifTags.Base.Orientation, 1)
             details = exif.get_ifd(ExifTags.IFD.Exif)
-            named = [exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model),
-                     details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)]
+            named = [
+                exif.get(ExifTags.Base.Make),
+                exif.get(ExifTags.Base.Model),
+                details.get(ExifTags.Base.FocalLength),
+                details.get(ExifTags.Base.FocalLengthIn35mmFilm),
+            ]
             kept = exif.tobytes()
         except Exception:  # a damaged EXIF block raises nearly anything; the pixels may be sound
             orientation, named, kept = 1, [], b""
@@ -146,15 +150,17 @@ def write_photo(path: str | os.PathLike[str], pixels: ImageU8, exif: bytes = b""
     jpeg = Path(path).suffix.lower() in JPEG_SUFFIXES
     options = {"quality": _PHOTO_QUALITY, "subsampling": 0} if jpeg else {}
     with atomic_writer(path) as stream:
-        Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="JPEG" if jpeg else "PNG", exif=exif,
-                                                           **options)
+        Image.fromarray(np.ascontiguousarray(pixels)).save(
+            stream, format="JPEG" if jpeg else "PNG", exif=exif, **options
+        )
 
 
 def encode_jpeg(pixels: ImageU8, quality: int = 88) -> bytes:
     """(H, W, 3) as a JPEG file with colours at full resolution, for pages that hold their images themselves."""
     stream = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="JPEG", quality=quality, subsampling=0,
-                                                       optimize=True)
+    Image.fromarray(np.ascontiguousarray(pixels)).save(
+        stream, format="JPEG", quality=quality, subsampling=0, optimize=True
+    )
     return stream.getvalue()
 
 

@@ -45,8 +45,9 @@ def sole_writer(folder: Path | None) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-                raise OutputError(f"{folder}: another run writes into it: wait for its end, or choose another "
-                                  "folder") from None
+                raise OutputError(
+                    f"{folder}: another run writes into it: wait for its end, or choose another folder"
+                ) from None
         _held.add(path)
         try:
             remove_leftovers(path)

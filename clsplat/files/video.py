@@ -17,8 +17,10 @@ from .atomic import atomic_path
 SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv")
 _QUALITY = "18"  # x264's rate factor: hardly told from the frames
 # Colours by BT.709 and said so, as players otherwise guess by the size of the image.
-_COLOURS = ("scale=out_color_matrix=bt709:out_range=tv,"
-            "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv")
+_COLOURS = (
+    "scale=out_color_matrix=bt709:out_range=tv,"
+    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv"
+)
 _OUTPUT = ["-crf", _QUALITY, "-vf", _COLOURS, "-movflags", "+faststart"]
 
 
@@ -49,8 +51,9 @@ class VideoWriter:
         self._temporary = self._whole.enter_context(atomic_path(self.path))
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         try:
             self._finish(complete=kind is None)
         except OutputError as failure:
@@ -71,8 +74,10 @@ class VideoWriter:
             self._size = (height, width)
             self._open()
         if (height, width) != self._size:
-            raise OutputError(f"{self.path}: frame {self.frames} is {width}x{height} px, the first {self._size[1]}x"
-                              f"{self._size[0]}; a video has one size: give --size")
+            raise OutputError(
+                f"{self.path}: frame {self.frames} is {width}x{height} px, the first {self._size[1]}x"
+                f"{self._size[0]}; a video has one size: give --size"
+            )
         even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         try:
             self._writer.append_data(even)
@@ -84,8 +89,17 @@ class VideoWriter:
         import imageio.v2 as imageio
 
         self._writer = imageio.get_writer(
-            self._temporary, format="FFMPEG", mode="I", fps=self.fps, codec="libx264", pixelformat="yuv420p",
-            macro_block_size=2, quality=None, output_params=_OUTPUT, ffmpeg_log_level="error")
+            self._temporary,
+            format="FFMPEG",
+            mode="I",
+            fps=self.fps,
+            codec="libx264",
+            pixelformat="yuv420p",
+            macro_block_size=2,
+            quality=None,
+            output_params=_OUTPUT,
+            ffmpeg_log_level="error",
+        )
 
     def _finish(self, complete: bool) -> None:
         """Close the file and count its frames; raises OutputError."""
@@ -115,4 +129,4 @@ def require_encoder() -> None:
         import imageio.v2  # noqa: F401
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
-        raise InputError(f"video: needs {error.name}; pip install \"clsplat[video]\"") from None
+        raise InputError(f'video: needs {error.name}; pip install "clsplat[video]"') from None

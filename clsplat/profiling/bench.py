@@ -106,8 +106,15 @@ def bench_trainer(scene: Scene, device: Device, shape: str, start: Splats | int,
             start.save(init)
         else:
             init, cap = "sfm", start
-        config = TrainConfig(shape=shape, iterations=PUBLISHED_ITERATIONS, cap_max=cap, sh_degree=sh_degree,
-                             sh_interval=1, coarse_to_fine=False, init=init)
+        config = TrainConfig(
+            shape=shape,
+            iterations=PUBLISHED_ITERATIONS,
+            cap_max=cap,
+            sh_degree=sh_degree,
+            sh_interval=1,
+            coarse_to_fine=False,
+            init=init,
+        )
         return Trainer(scene, config, device=device)
 
 
@@ -148,10 +155,17 @@ def _measure(task: str, trainer: Trainer, run: Callable[[], None], limits: Limit
         raise InputError(f"{iterations} iterations: must be 1 to {MOST_ITERATIONS}")
     done = [_timed(trainer.pipeline, run) for _ in range(WARM_UP + iterations)][WARM_UP:]
     wall_ms = statistics.median(one.wall_ms for one in done)
-    stages = [_stage_time(stage, done, trainer, limits, wall_ms) for stage in (*STAGES, HOST)
-              if any(stage in one.stage_ms for one in done)]
-    sizes = Sizes(*(int(statistics.median(dataclasses.astuple(one.sizes)[i] for one in done))
-                    for i in range(len(dataclasses.fields(Sizes)))))
+    stages = [
+        _stage_time(stage, done, trainer, limits, wall_ms)
+        for stage in (*STAGES, HOST)
+        if any(stage in one.stage_ms for one in done)
+    ]
+    sizes = Sizes(
+        *(
+            int(statistics.median(dataclasses.astuple(one.sizes)[i] for one in done))
+            for i in range(len(dataclasses.fields(Sizes)))
+        )
+    )
     largest = max((view.camera for view in trainer.scene.train), key=lambda c: c.width * c.height)
     return Report(task, trainer.config.shape, largest.width, largest.height, iterations, sizes, wall_ms, tuple(stages))
 
@@ -171,8 +185,9 @@ def _timed(pipeline: Pipeline, run: Callable[[], None]) -> _Iteration:
     frame = pipeline.frame
     assert frame is not None
     layout = frame.layout
-    sizes = Sizes(frame.splats.n, frame.n_isects, layout.width * layout.height, count_pairs(pipeline, frame),
-                  frame.sh_degree)
+    sizes = Sizes(
+        frame.splats.n, frame.n_isects, layout.width * layout.height, count_pairs(pipeline, frame), frame.sh_degree
+    )
     return _Iteration(wall_ms, stage_ms, sizes)
 
 
@@ -189,5 +204,12 @@ def _stage_time(stage: str, done: list[_Iteration], trainer: Trainer, limits: Li
         return statistics.median(rates) if any(amounts) and rates else None
 
     moved, computed = [one.bytes for one in work], [one.flops for one in work]
-    return StageTime(stage, ms, ms / wall_ms, int(statistics.median(moved)), int(statistics.median(computed)),
-                     fraction(moved, limits.copy), fraction(computed, limits.fma))
+    return StageTime(
+        stage,
+        ms,
+        ms / wall_ms,
+        int(statistics.median(moved)),
+        int(statistics.median(computed)),
+        fraction(moved, limits.copy),
+        fraction(computed, limits.fma),
+    )

@@ -98,8 +98,9 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
         "rasterize": Work((12 + record) * isects + 4 * real * pixels, pairs * (forward + BLEND)),
         # truth twice; planes: 3 and three maps of each out, 12 back, 3 out
         "loss": Work((6 + real * 27) * pixels, 3 * LOSS * pixels),
-        "rasterize_vjp": Work((12 + record + v_record) * isects + 6 * real * pixels,
-                              pairs * (forward + backward + BLEND_VJP)),
+        "rasterize_vjp": Work(
+            (12 + record + v_record) * isects + 6 * real * pixels, pairs * (forward + backward + BLEND_VJP)
+        ),
         "gather": Work((8 + v_record) * n + v_record * isects),
         "project_vjp": Work(n * (real * (2 * geometry + colour + 6 + 3 + 6) + v_record + 4)),  # colour read, 6 out
         "step": Work(real * n * (7 * geometry + 6 * colour + 6), ADAM * n * (geometry + colour)),

@@ -1,4 +1,4 @@
-"""Forms of the arithmetic of pixels and colours: speed against accuracy (cl/math/approx.clh, benchmarks/arithmetic.py)."""
+"""Forms of the arithmetic of pixels and colours: speed against accuracy (cl/math/approx.clh)."""
 
 from __future__ import annotations
 
@@ -36,8 +36,11 @@ class Arithmetic:
 
     def defines(self) -> dict[str, int | float]:
         """Build constants."""
-        return {"EXP_FORM": EXP_FORMS.index(self.exp), "PHI_FORM": PHI_FORMS.index(self.phi),
-                "SH_HALF": int(self.half_sh)}
+        return {
+            "EXP_FORM": EXP_FORMS.index(self.exp),
+            "PHI_FORM": PHI_FORMS.index(self.phi),
+            "SH_HALF": int(self.half_sh),
+        }
 
 
 DEFAULT_ARITHMETIC = Arithmetic()

@@ -64,13 +64,16 @@ def cut(count: Callable[[int, int], int], tiles_x: int, tiles_y: int, limit: int
     ------
     DeviceError : one tile alone has more.
     """
+
     def halved(first: int, past: int) -> tuple[Band, ...]:
         n_isects, n_tiles = count(first, past), past - first
         if n_isects <= limit:
             return (Band(first, past, n_isects),)
         if n_tiles == 1:
-            raise DeviceError(f"{n_isects} splats over one tile, and buffers for {limit} at most: "
-                              "use fewer splats (--cap-max) or another --device")
+            raise DeviceError(
+                f"{n_isects} splats over one tile, and buffers for {limit} at most: "
+                "use fewer splats (--cap-max) or another --device"
+            )
         unit = tiles_x if n_tiles > tiles_x else 1
         middle = first + n_tiles // unit // 2 * unit
         return halved(first, middle) + halved(middle, past)
@@ -94,15 +97,32 @@ class ChunkBinner:
         split = {"n_splats": n, "run": -(-n // chunks)}
         span, counts = pool.get("depth_span", 8 * chunks), pool.get("bucket_counts", 4 * chunks * buckets)
         starts, pairs = pool.get("bucket_starts", 4 * (buckets + 1)), pool.get("depth_pairs", 8 * n)
-        program.depth_span.over(chunks, 1, depth_key=keys, span=span, splat_isects=pool.get("splat_isects", 8 * n),
-                                **split)
+        program.depth_span.over(
+            chunks, 1, depth_key=keys, span=span, splat_isects=pool.get("splat_isects", 8 * n), **split
+        )
         program.depth_histogram.over(chunks, 1, depth_key=keys, span=span, counts=counts, n_chunks=chunks, **split)
-        program.depth_scatter.over(chunks, 1, depth_key=keys, span=span, counts=counts, pairs=pairs,
-                                   bucket_starts=starts, n_visible=pool.get("n_visible", 4), n_chunks=chunks, **split)
+        program.depth_scatter.over(
+            chunks,
+            1,
+            depth_key=keys,
+            span=span,
+            counts=counts,
+            pairs=pairs,
+            bucket_starts=starts,
+            n_visible=pool.get("n_visible", 4),
+            n_chunks=chunks,
+            **split,
+        )
         program.depth_buckets.over(
-            min(-(-n // _SPLATS_PER_CHUNK), _CHUNKS_PER_UNIT * self.units), 1, bucket_starts=starts, span=span,
-            pairs=pairs, spare=pool.get("depth_spare", 8 * n), depth_order=pool.get("depth_order", 4 * n),
-            n_chunks=chunks)
+            min(-(-n // _SPLATS_PER_CHUNK), _CHUNKS_PER_UNIT * self.units),
+            1,
+            bucket_starts=starts,
+            span=span,
+            pairs=pairs,
+            spare=pool.get("depth_spare", 8 * n),
+            depth_order=pool.get("depth_order", 4 * n),
+            n_chunks=chunks,
+        )
 
     def begin(self, n: int, tiles_x: int, tiles_y: int) -> None:
         pool, tiles, cells = self.pool, tiles_x * tiles_y, (tiles_x + 1) * (tiles_y + 1)
@@ -111,12 +131,27 @@ class ChunkBinner:
         chunks = min(most, -(-n // _SPLATS_PER_CHUNK))
         counts = pool.get("tile_counts", 4 * chunks * cells)
         self.program.count_tiles.over(
-            chunks, 1, order=pool.get("depth_order", 0), n_visible=pool.get("n_visible", 0),
-            tile_rect=pool.get("tile_rect", 0), ranked_rect=pool.get("ranked_rect", 8 * n), counts=counts,
-            tiles_x=tiles_x, tiles_y=tiles_y)
+            chunks,
+            1,
+            order=pool.get("depth_order", 0),
+            n_visible=pool.get("n_visible", 0),
+            tile_rect=pool.get("tile_rect", 0),
+            ranked_rect=pool.get("ranked_rect", 8 * n),
+            counts=counts,
+            tiles_x=tiles_x,
+            tiles_y=tiles_y,
+        )
         parts = min(self.units, -(-chunks * tiles // _SPLATS_PER_CHUNK))
-        self.program.total_tiles.over(parts, 1, counts=counts, totals=pool.get("tile_totals", 4 * tiles),
-                                      n_chunks=chunks, cells=cells, n_tiles=tiles, run=-(-tiles // parts))
+        self.program.total_tiles.over(
+            parts,
+            1,
+            counts=counts,
+            totals=pool.get("tile_totals", 4 * tiles),
+            n_chunks=chunks,
+            cells=cells,
+            n_tiles=tiles,
+            run=-(-tiles // parts),
+        )
         self._image, self._totals = (chunks, cells, tiles_x, tiles), None
 
     def count(self, first: int, past: int) -> int:
@@ -130,11 +165,22 @@ class ChunkBinner:
         pool, (chunks, cells, tiles_x, tiles) = self.pool, self._image
         lists = pool.get("lists", 4 * band.n_isects)
         self.program.list_isects.over(
-            chunks, 1, order=pool.get("depth_order", 0), n_visible=pool.get("n_visible", 0),
-            ranked_rect=pool.get("ranked_rect", 0), totals=pool.get("tile_totals", 0),
-            counts=pool.get("tile_counts", 0), tile_ranges=pool.get("tile_ranges", 8 * tiles),
-            splat_isects=pool.get("splat_isects", 0), isect_splat=pool.get("isect_splat", 4 * band.n_isects),
-            lists=lists, cells=cells, first_tile=band.first, past_tile=band.past, tiles_x=tiles_x)
+            chunks,
+            1,
+            order=pool.get("depth_order", 0),
+            n_visible=pool.get("n_visible", 0),
+            ranked_rect=pool.get("ranked_rect", 0),
+            totals=pool.get("tile_totals", 0),
+            counts=pool.get("tile_counts", 0),
+            tile_ranges=pool.get("tile_ranges", 8 * tiles),
+            splat_isects=pool.get("splat_isects", 0),
+            isect_splat=pool.get("isect_splat", 4 * band.n_isects),
+            lists=lists,
+            cells=cells,
+            first_tile=band.first,
+            past_tile=band.past,
+            tiles_x=tiles_x,
+        )
         return lists
 
 
@@ -167,10 +213,19 @@ class GroupBinner:
         if self._counted != (band.first, band.past):
             self._count(band.first, band.past)
         self.program.emit_isects.over(
-            n, order=self._order, tile_rect=pool.get("tile_rect", 0), offsets=pool.get("isect_offsets", 0),
-            splat_isects=pool.get("splat_isects", 8 * n), isect_tile=pool.get("isect_tile", 4 * n_isects),
-            isect_id=pool.get("isect_id", 4 * n_isects), isect_splat=pool.get("isect_splat", 4 * n_isects),
-            n_splats=n, first_tile=band.first, past_tile=band.past, tiles_x=self._tiles_x)
+            n,
+            order=self._order,
+            tile_rect=pool.get("tile_rect", 0),
+            offsets=pool.get("isect_offsets", 0),
+            splat_isects=pool.get("splat_isects", 8 * n),
+            isect_tile=pool.get("isect_tile", 4 * n_isects),
+            isect_id=pool.get("isect_id", 4 * n_isects),
+            isect_splat=pool.get("isect_splat", 4 * n_isects),
+            n_splats=n,
+            first_tile=band.first,
+            past_tile=band.past,
+            tiles_x=self._tiles_x,
+        )
         ranges, lists = pool.zeroed("tile_ranges", 8 * self._tiles), pool.get("isect_id", 0)
         if n_isects:
             bits = max((self._tiles - 1).bit_length(), 1)
@@ -181,7 +236,15 @@ class GroupBinner:
     def _count(self, first: int, past: int) -> None:
         pool, n = self.pool, self._n
         counts, offsets = pool.get("isect_counts", 4 * n), pool.get("isect_offsets", 4 * n)
-        self.program.count_isects.over(n, order=self._order, tile_rect=pool.get("tile_rect", 0), counts=counts,
-                                       n_splats=n, first_tile=first, past_tile=past, tiles_x=self._tiles_x)
+        self.program.count_isects.over(
+            n,
+            order=self._order,
+            tile_rect=pool.get("tile_rect", 0),
+            counts=counts,
+            n_splats=n,
+            first_tile=first,
+            past_tile=past,
+            tiles_x=self._tiles_x,
+        )
         self.sorter.scan(counts, offsets, n, pool.get("n_isects", 8))
         self._counted = (first, past)

@@ -21,8 +21,17 @@ LOW_PASS = 0.3  # px^2
 RECORD_HEAD = 10  # HEAD of cl/shape/contract.clh
 NEAR = 0.01  # world units
 
-_LOWER = ("math/lanes.clh", "math/approx.clh", "render/group.clh", "math/algebra.clh", "math/opacity.clh", "math/harmonics.clh", "camera/pinhole.clh",
-          "render/blend.clh", "shape/contract.clh")
+_LOWER = (
+    "math/lanes.clh",
+    "math/approx.clh",
+    "render/group.clh",
+    "math/algebra.clh",
+    "math/opacity.clh",
+    "math/harmonics.clh",
+    "camera/pinhole.clh",
+    "render/blend.clh",
+    "shape/contract.clh",
+)
 
 
 @dataclass(frozen=True)
@@ -103,13 +112,30 @@ class KernelBuild:
         rows: dict[str, Define] = {
             f"ROW_{field.name.upper()}": schema.offset(field.name) for field in schema.group(Group.GEOM)
         }
-        return rows | self.arithmetic.defines() | {
-            "TILE": self.schedule.tile, "BATCH": BATCH, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y,
-            "GROUP": self.schedule.group, "VECS": self.schedule.vecs, "LANES": self.lanes,
-            "SH_DEGREE": self.sh_degree, "GEOM_ROWS": schema.rows(Group.GEOM),
-            "WITH_DEPTH": int(self.with_depth), "WITH_V_ALPHA": int(self.with_v_alpha),
-            "ANTIALIASED": int(self.antialiased), "NORMALISATION": NORMALISATIONS.index(self.normalisation),
-            "PEAK_STEPS": 3 if self.real == "float" else 4,
-            "SKEW_MAX": SKEW_MAX, "SLANT_MAX": SLANT_MAX, "OPACITY_SIGNED": int(shape_named(self.shape).signed),
-            "LOW_PASS": LOW_PASS, "ALPHA_MIN": self.alpha_min, "ALPHA_MAX": self.alpha_max, "T_MIN": self.t_min,
-        }
+        return (
+            rows
+            | self.arithmetic.defines()
+            | {
+                "TILE": self.schedule.tile,
+                "BATCH": BATCH,
+                "MARGIN_X": MARGIN_X,
+                "MARGIN_Y": MARGIN_Y,
+                "GROUP": self.schedule.group,
+                "VECS": self.schedule.vecs,
+                "LANES": self.lanes,
+                "SH_DEGREE": self.sh_degree,
+                "GEOM_ROWS": schema.rows(Group.GEOM),
+                "WITH_DEPTH": int(self.with_depth),
+                "WITH_V_ALPHA": int(self.with_v_alpha),
+                "ANTIALIASED": int(self.antialiased),
+                "NORMALISATION": NORMALISATIONS.index(self.normalisation),
+                "PEAK_STEPS": 3 if self.real == "float" else 4,
+                "SKEW_MAX": SKEW_MAX,
+                "SLANT_MAX": SLANT_MAX,
+                "OPACITY_SIGNED": int(shape_named(self.shape).signed),
+                "LOW_PASS": LOW_PASS,
+                "ALPHA_MIN": self.alpha_min,
+                "ALPHA_MAX": self.alpha_max,
+                "T_MIN": self.t_min,
+            }
+        )

@@ -25,8 +25,20 @@ FULL_COUNT = 255  # splats a pixel at the bright end; the scale is logarithmic, 
 _BLACK = (0.0, 0.0, 0.0)
 # Violet over blue, teal and green to yellow: lightness L* rises evenly from 12 to 92 (CIELAB), at hues that fall evenly
 # in OKLab and as much chroma as sRGB has there.
-_CONTROL = np.array([(57, 2, 75), (60, 27, 136), (18, 68, 165), (12, 106, 148), (17, 137, 151), (25, 168, 150),
-                     (54, 200, 124), (168, 220, 95), (253, 235, 85)], np.float64)
+_CONTROL = np.array(
+    [
+        (57, 2, 75),
+        (60, 27, 136),
+        (18, 68, 165),
+        (12, 106, 148),
+        (17, 137, 151),
+        (25, 168, 150),
+        (54, 200, 124),
+        (168, 220, 95),
+        (253, 235, 85),
+    ],
+    np.float64,
+)
 _STEPS = np.linspace(0.0, 1.0, 256)
 _TABLE = np.stack([np.interp(_STEPS, np.linspace(0.0, 1.0, len(_CONTROL)), channel) for channel in _CONTROL.T], axis=1)
 _QUANTILES = (0.02, 0.98)  # of depths: a few stray splats do not stretch the range
@@ -34,8 +46,15 @@ _SAMPLES = 50_000  # pixels that are enough for quantiles
 _SOLID = 0.5  # alpha from which a pixel has a say in the range of depths
 
 
-def picture(renderer: Renderer, splats: Splats, camera: Camera, mode: str = "colour", background: ArrayLike = _BLACK,
-            near_far: tuple[float, float] | None = None, sh_degree: int | None = None) -> Picture:
+def picture(
+    renderer: Renderer,
+    splats: Splats,
+    camera: Camera,
+    mode: str = "colour",
+    background: ArrayLike = _BLACK,
+    near_far: tuple[float, float] | None = None,
+    sh_degree: int | None = None,
+) -> Picture:
     """One view of a model.
 
     Parameters
@@ -55,8 +74,13 @@ def picture(renderer: Renderer, splats: Splats, camera: Camera, mode: str = "col
     return picture_of(image, mode, background, near_far, renderer.count_splats() if mode == "splats" else None)
 
 
-def picture_of(image: Rendered, mode: str = "colour", background: ArrayLike = _BLACK,
-               near_far: tuple[float, float] | None = None, counts: Array | None = None) -> Picture:
+def picture_of(
+    image: Rendered,
+    mode: str = "colour",
+    background: ArrayLike = _BLACK,
+    near_far: tuple[float, float] | None = None,
+    counts: Array | None = None,
+) -> Picture:
     """The picture of a render in a mode (see `picture`).
 
     Parameters
@@ -130,8 +154,9 @@ def depth_range(image: Rendered) -> tuple[float, float]:
     return 1.0, 2.0
 
 
-def depth_picture(image: Rendered, near_far: tuple[float, float] | None = None,
-                  background: ArrayLike = _BLACK) -> Picture:
+def depth_picture(
+    image: Rendered, near_far: tuple[float, float] | None = None, background: ArrayLike = _BLACK
+) -> Picture:
     """Mean depth by the colour map, near bright and far dark; the background shows where the splats let it.
 
     Even in 1/depth: the near is told apart as well as the far.

@@ -39,8 +39,17 @@ def _counts(pipeline: Pipeline, frame: Frame) -> NDArray[np.int64]:
     useful = np.zeros(n_counts, np.int64)
     for _, lists in pipeline.bands(frame):
         kernels.count_program(pipeline.device).count_pairs.over(
-            n_counts, pipeline.group, tile_ranges=pool.get("tile_ranges", 0), lists=lists,
-            isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0), counts=counts, n_counts=n_counts,
-            width=layout.width, height=layout.height, tiles_x=layout.tiles_x)
+            n_counts,
+            pipeline.group,
+            tile_ranges=pool.get("tile_ranges", 0),
+            lists=lists,
+            isect_splat=pool.get("isect_splat", 0),
+            records=pool.get("records", 0),
+            counts=counts,
+            n_counts=n_counts,
+            width=layout.width,
+            height=layout.height,
+            tiles_x=layout.tiles_x,
+        )
         useful += to_host(pipeline.device, counts, np.empty(n_counts, np.uint32))
     return useful

@@ -91,12 +91,17 @@ class Frame:
 def camera_block(camera: Camera) -> NDArray[np.float64]:
     """The camera as kernels read it (order: cl/camera/pinhole.clh). Tangent clamp as in gsplat."""
     tan_x, tan_y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
-    return np.concatenate([
-        camera.rotation.ravel(), camera.translation, [camera.fx, camera.fy, camera.cx, camera.cy],
-        [-(camera.cx / camera.fx + 0.3 * tan_x), (camera.width - camera.cx) / camera.fx + 0.3 * tan_x],
-        [-(camera.cy / camera.fy + 0.3 * tan_y), (camera.height - camera.cy) / camera.fy + 0.3 * tan_y],
-        camera.position, [NEAR],
-    ])
+    return np.concatenate(
+        [
+            camera.rotation.ravel(),
+            camera.translation,
+            [camera.fx, camera.fy, camera.cx, camera.cy],
+            [-(camera.cx / camera.fx + 0.3 * tan_x), (camera.width - camera.cx) / camera.fx + 0.3 * tan_x],
+            [-(camera.cy / camera.fy + 0.3 * tan_y), (camera.height - camera.cy) / camera.fy + 0.3 * tan_y],
+            camera.position,
+            [NEAR],
+        ]
+    )
 
 
 class Pipeline:
@@ -126,8 +131,13 @@ class Pipeline:
         self._lists: Any = None  # of the band on the device
         self.group = lane_group(device)
 
-    def forward(self, splats: SplatBuffers, camera: Camera,
-                background: tuple[float, float, float] = (0, 0, 0), sh_degree: int | None = None) -> Frame:
+    def forward(
+        self,
+        splats: SplatBuffers,
+        camera: Camera,
+        background: tuple[float, float, float] = (0, 0, 0),
+        sh_degree: int | None = None,
+    ) -> Frame:
         """Render into the pool's "color", "transmittance" and (with depth) "depth" buffers.
 
         Raises
@@ -155,8 +165,7 @@ class Pipeline:
                 self._list(frame, band)
             yield band, self._lists
 
-    def backward(self, frame: Frame, v_color: Any, grads: ParameterBuffers,
-                 v_alpha: Any | None = None) -> None:
+    def backward(self, frame: Frame, v_color: Any, grads: ParameterBuffers, v_alpha: Any | None = None) -> None:
         """Gradients of the raw parameters of the last frame's splats into `grads` (overwritten).
 
         v_color, v_alpha : buffers in the frame's layout. SH bands above the frame's degree are left alone.
@@ -172,24 +181,51 @@ class Pipeline:
             if len(frame.bands) > 1:  # what the forward told of the band's isects is lost; the image must not be
                 self._rasterize(layout, band, "again_")
             self._backward_event = self.program.rasterize_vjp(
-                (band.past * group,), (group,), tile_ranges=pool.get("tile_ranges", 0), lists=lists,
-                isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0), color=pool.get("color", 0),
-                transmittance=pool.get("transmittance", 0), v_color=v_color,
-                v_alpha=v_color if v_alpha is None else v_alpha, isect_blocks=pool.get("isect_blocks", 0),
-                isect_grads=isect_grads, width=layout.width, height=layout.height, tiles_x=layout.tiles_x,
-                stride=layout.stride, plane=layout.plane,
+                (band.past * group,),
+                (group,),
+                tile_ranges=pool.get("tile_ranges", 0),
+                lists=lists,
+                isect_splat=pool.get("isect_splat", 0),
+                records=pool.get("records", 0),
+                color=pool.get("color", 0),
+                transmittance=pool.get("transmittance", 0),
+                v_color=v_color,
+                v_alpha=v_color if v_alpha is None else v_alpha,
+                isect_blocks=pool.get("isect_blocks", 0),
+                isect_grads=isect_grads,
+                width=layout.width,
+                height=layout.height,
+                tiles_x=layout.tiles_x,
+                stride=layout.stride,
+                plane=layout.plane,
             )
             self.program.gather_isect_grads.over(
-                -(-splats.n // self.kernels.lanes), self.group, splat_isects=pool.get("splat_isects", 0),
-                isect_grads=isect_grads, moments=moments, capacity=splats.capacity, n_splats=splats.n,
+                -(-splats.n // self.kernels.lanes),
+                self.group,
+                splat_isects=pool.get("splat_isects", 0),
+                isect_grads=isect_grads,
+                moments=moments,
+                capacity=splats.capacity,
+                n_splats=splats.n,
                 go_on=int(band.first > 0),
             )
         self.program.project_splats_vjp.over(
-            -(-splats.n // self.kernels.lanes), self.group, geom=splats.geom, sh=splats.sh,
-            cam=pool.get("camera", 0), moments=moments, records=pool.get("records", 0),
-            depth_key=pool.get("depth_key_kept", 0), grad_geom=grads.geom, grad_sh=grads.sh,
-            signals=self.signals(splats.capacity), capacity=splats.capacity, n_splats=splats.n,
-            sh_degree=frame.sh_degree, compact=int(isinstance(grads, CompactGradients)), width=layout.width,
+            -(-splats.n // self.kernels.lanes),
+            self.group,
+            geom=splats.geom,
+            sh=splats.sh,
+            cam=pool.get("camera", 0),
+            moments=moments,
+            records=pool.get("records", 0),
+            depth_key=pool.get("depth_key_kept", 0),
+            grad_geom=grads.geom,
+            grad_sh=grads.sh,
+            signals=self.signals(splats.capacity),
+            capacity=splats.capacity,
+            n_splats=splats.n,
+            sh_degree=frame.sh_degree,
+            compact=int(isinstance(grads, CompactGradients)),
+            width=layout.width,
             height=layout.height,
         )
 
@@ -247,11 +283,21 @@ class Pipeline:
         cam = pool.get("camera", block.nbytes)
         self._camera_event = send_to_device(self.device, cam, block)
         self.program.project_splats.over(
-            -(-n // self.kernels.lanes), self.group, geom=splats.geom, sh=splats.sh, cam=cam,
-            records=records, depth_key=pool.get("depth_key_kept", 4 * n),
+            -(-n // self.kernels.lanes),
+            self.group,
+            geom=splats.geom,
+            sh=splats.sh,
+            cam=cam,
+            records=records,
+            depth_key=pool.get("depth_key_kept", 4 * n),
             tile_rect=pool.get("tile_rect", 16 * n),
-            capacity=splats.capacity, n_splats=n, sh_degree=degree, width=layout.width, height=layout.height,
-            tiles_x=layout.tiles_x, tiles_y=layout.tiles_y,
+            capacity=splats.capacity,
+            n_splats=n,
+            sh_degree=degree,
+            width=layout.width,
+            height=layout.height,
+            tiles_x=layout.tiles_x,
+            tiles_y=layout.tiles_y,
         )
         self.binner.order(n)
         self.binner.begin(n, layout.tiles_x, layout.tiles_y)
@@ -264,19 +310,31 @@ class Pipeline:
             self.pool.zeroed("tile_ranges", 8 * n_tiles)
         self._lists = self.binner.list_isects(band) if frame.splats.n else self.pool.get("isect_splat", 0)
 
-    def _rasterize(self, layout: ImageLayout, band: Band, prefix: str,
-                   background: tuple[float, float, float] = (0, 0, 0)) -> Any:
+    def _rasterize(
+        self, layout: ImageLayout, band: Band, prefix: str, background: tuple[float, float, float] = (0, 0, 0)
+    ) -> Any:
         """Images into the buffers of these names after `prefix`; returns the event."""
         pool, group = self.pool, self.kernels.schedule.group
         r, g, b = background
         return self.program.rasterize(
-            (band.past * group,), (group,), tile_ranges=pool.get("tile_ranges", 0), lists=self._lists,
-            isect_splat=pool.get("isect_splat", 0), records=pool.get("records", 0),
-            color=self.image(prefix + "color", layout, 3), transmittance=self.image(prefix + "transmittance", layout),
+            (band.past * group,),
+            (group,),
+            tile_ranges=pool.get("tile_ranges", 0),
+            lists=self._lists,
+            isect_splat=pool.get("isect_splat", 0),
+            records=pool.get("records", 0),
+            color=self.image(prefix + "color", layout, 3),
+            transmittance=self.image(prefix + "transmittance", layout),
             depth=self.image(prefix + "depth", layout),
-            isect_blocks=pool.get("isect_blocks", self.kernels.block_bytes * band.n_isects), width=layout.width,
-            height=layout.height, tiles_x=layout.tiles_x, stride=layout.stride, plane=layout.plane, background_r=r,
-            background_g=g, background_b=b,
+            isect_blocks=pool.get("isect_blocks", self.kernels.block_bytes * band.n_isects),
+            width=layout.width,
+            height=layout.height,
+            tiles_x=layout.tiles_x,
+            stride=layout.stride,
+            plane=layout.plane,
+            background_r=r,
+            background_g=g,
+            background_b=b,
         )
 
 

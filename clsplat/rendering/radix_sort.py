@@ -49,8 +49,18 @@ class Sorter:
         for shift in range(0, key_bits, DIGIT_BITS):
             self.program.radix_histogram(size, local, keys=here[0], counts=counts, n=n, run=_SORT_RUN, shift=shift)
             self.scan(counts, starts, n_counts, total)
-            self.program.radix_scatter(size, local, keys=here[0], values=here[1], starts=starts,
-                                       keys_out=there[0], values_out=there[1], n=n, run=_SORT_RUN, shift=shift)
+            self.program.radix_scatter(
+                size,
+                local,
+                keys=here[0],
+                values=here[1],
+                starts=starts,
+                keys_out=there[0],
+                values_out=there[1],
+                n=n,
+                run=_SORT_RUN,
+                shift=shift,
+            )
             here, there = there, here
         return here
 

@@ -58,16 +58,24 @@ class Renderer:
     DeviceError : no such device, or no doubles on it. InputError : unknown precision.
     """
 
-    def __init__(self, device: str | Device | None = None, precision: str = "float32", *,
-                 schedule: Schedule | None = None, alpha_min: float = ALPHA_MIN, alpha_max: float = ALPHA_MAX,
-                 t_min: float = T_MIN, arithmetic: Arithmetic = DEFAULT_ARITHMETIC, keep: int = 1) -> None:
+    def __init__(
+        self,
+        device: str | Device | None = None,
+        precision: str = "float32",
+        *,
+        schedule: Schedule | None = None,
+        alpha_min: float = ALPHA_MIN,
+        alpha_max: float = ALPHA_MAX,
+        t_min: float = T_MIN,
+        arithmetic: Arithmetic = DEFAULT_ARITHMETIC,
+        keep: int = 1,
+    ) -> None:
         if precision not in PRECISIONS:
             raise InputError(f"precision {precision!r}: choose float32 or float64")
         self.device = device if isinstance(device, Device) else open_device(device)
         self.precision = precision
         if precision == "float64" and not self.device.has_fp64:
-            raise DeviceError(f"device {self.device.info} has no double precision: "
-                              "use float32 or another --device")
+            raise DeviceError(f"device {self.device.info} has no double precision: use float32 or another --device")
         self.schedule, self.arithmetic = schedule, arithmetic
         self._thresholds = (alpha_min, alpha_max, t_min)
         self._pipelines: dict[KernelBuild, Pipeline] = {}
@@ -75,8 +83,9 @@ class Renderer:
         self._uploaded: list[tuple[Splats, SplatBuffers]] = []  # the last rendered last
         self._last: tuple[Pipeline, Frame] | None = None
 
-    def render(self, splats: Splats, camera: Camera, background: ArrayLike = (0.0, 0.0, 0.0),
-               sh_degree: int | None = None) -> Rendered:
+    def render(
+        self, splats: Splats, camera: Camera, background: ArrayLike = (0.0, 0.0, 0.0), sh_degree: int | None = None
+    ) -> Rendered:
         """Image of the splats (semantics: those of gsplat, see ARCHITECTURE.md).
 
         Parameters
@@ -140,9 +149,18 @@ class Renderer:
         real = PRECISIONS[self.precision]
         schedule = self.schedule or schedule_for(self.device)
         alpha_min, alpha_max, t_min = self._thresholds
-        kernels = KernelBuild(splats.shape, splats.sh_degree, schedule, splats.normalisation, real,
-                              alpha_min=alpha_min, alpha_max=alpha_max, t_min=t_min,
-                              arithmetic=self.arithmetic, antialiased=splats.antialiased).for_rendering()
+        kernels = KernelBuild(
+            splats.shape,
+            splats.sh_degree,
+            schedule,
+            splats.normalisation,
+            real,
+            alpha_min=alpha_min,
+            alpha_max=alpha_max,
+            t_min=t_min,
+            arithmetic=self.arithmetic,
+            antialiased=splats.antialiased,
+        ).for_rendering()
         if kernels not in self._pipelines:
             self._pipelines[kernels] = Pipeline(self.device, kernels)
         return self._pipelines[kernels]

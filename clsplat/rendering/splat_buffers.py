@@ -27,8 +27,14 @@ def capacity_for(n: int) -> int:
 class ParameterBuffers:
     """One value per parameter of every splat: `geom` and `sh`, each [rows, capacity]. Starts at zero."""
 
-    def __init__(self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating],
-                 sh_dtype: np.dtype[np.floating] | None = None) -> None:
+    def __init__(
+        self,
+        device: Device,
+        schema: Schema,
+        capacity: int,
+        dtype: np.dtype[np.floating],
+        sh_dtype: np.dtype[np.floating] | None = None,
+    ) -> None:
         self.device, self.schema, self.capacity, self.dtype = device, schema, capacity_for(capacity), dtype
         self.dtypes = {Group.GEOM: dtype, Group.SH: sh_dtype or dtype}
         self.buffers = {group: device.alloc(self.group_bytes(group)) for group in Group}
@@ -77,14 +83,26 @@ class ParameterBuffers:
 class SplatBuffers(ParameterBuffers):
     """Splats on the device; `n` of `capacity` columns are in use."""
 
-    def __init__(self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating],
-                 sh_dtype: np.dtype[np.floating] | None = None) -> None:
+    def __init__(
+        self,
+        device: Device,
+        schema: Schema,
+        capacity: int,
+        dtype: np.dtype[np.floating],
+        sh_dtype: np.dtype[np.floating] | None = None,
+    ) -> None:
         super().__init__(device, schema, capacity, dtype, sh_dtype)
         self.n = 0
 
     @classmethod
-    def of(cls, device: Device, splats: Splats, dtype: np.dtype[np.floating],
-           capacity: int = 0, sh_dtype: np.dtype[np.floating] | None = None) -> SplatBuffers:
+    def of(
+        cls,
+        device: Device,
+        splats: Splats,
+        dtype: np.dtype[np.floating],
+        capacity: int = 0,
+        sh_dtype: np.dtype[np.floating] | None = None,
+    ) -> SplatBuffers:
         """Upload of host splats, with room for `capacity`; colour as `sh_dtype`, if given."""
         self = cls(device, splats.schema, max(capacity, len(splats)), dtype, sh_dtype)
         self.set(splats.to_numpy())

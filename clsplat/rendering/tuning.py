@@ -88,11 +88,16 @@ def _measure_one(device: Device, schedule: Schedule) -> float:
 def _scene() -> Splats:
     rng = np.random.default_rng(0)
     n = _SPLATS
-    return Splats("gaussian", {
-        "mean": rng.uniform(-1.5, 1.5, (n, 3)), "quat": rng.standard_normal((n, 4)),
-        "log_scale": rng.normal(-3.5, 0.5, (n, 3)), "opacity_logit": rng.normal(0, 2, n),
-        "sh": rng.normal(0, 1, (n, 1, 3)),
-    })
+    return Splats(
+        "gaussian",
+        {
+            "mean": rng.uniform(-1.5, 1.5, (n, 3)),
+            "quat": rng.standard_normal((n, 4)),
+            "log_scale": rng.normal(-3.5, 0.5, (n, 3)),
+            "opacity_logit": rng.normal(0, 2, n),
+            "sh": rng.normal(0, 1, (n, 1, 3)),
+        },
+    )
 
 
 def _key(device: Device) -> str:

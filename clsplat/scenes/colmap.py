@@ -57,14 +57,18 @@ def find_model(scene: Path) -> Path:
         raise InputError(f"{scene}: no such folder; give a scene folder with images/ and sparse/, or transforms.json")
     sparse = scene / "sparse"
     if not sparse.is_dir():
-        raise InputError(f"{scene}: no folder 'sparse'; a scene needs a COLMAP model in sparse/0 "
-                         "(clsplat reconstruct makes one of photos), or a transforms.json")
+        raise InputError(
+            f"{scene}: no folder 'sparse'; a scene needs a COLMAP model in sparse/0 "
+            "(clsplat reconstruct makes one of photos), or a transforms.json"
+        )
     candidates = [sparse, *sorted(folder for folder in sparse.iterdir() if folder.is_dir())]
     models = [folder for folder in candidates if _suffix(folder)]
     if not models:
-        raise InputError(f"{sparse}: no COLMAP model (cameras and images, .bin or .txt) in it or below; "
-                         "run COLMAP's mapper, or copy the missing files")
-    return max(models, key=registered_images)          # the first of equals
+        raise InputError(
+            f"{sparse}: no COLMAP model (cameras and images, .bin or .txt) in it or below; "
+            "run COLMAP's mapper, or copy the missing files"
+        )
+    return max(models, key=registered_images)  # the first of equals
 
 
 def read_model(folder: Path) -> SparseModel:
@@ -85,19 +89,22 @@ def read_model(folder: Path) -> SparseModel:
             reconstruction = pycolmap.Reconstruction(str(whole))
         photos, points = read_photos(reconstruction), read_points(reconstruction)
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
-        raise InputError(f"{folder}: COLMAP's reader refuses the model ({reason_of(error)}); the files are "
-                         "damaged or do not belong together: copy or rebuild them") from None
+        raise InputError(
+            f"{folder}: COLMAP's reader refuses the model ({reason_of(error)}); the files are "
+            "damaged or do not belong together: copy or rebuild them"
+        ) from None
     if not photos:
         raise InputError(f"{folder}: the model registers no image; rebuild it with COLMAP's mapper")
     bad = int((~np.isfinite(points.xyz)).any(axis=1).sum())
     if bad:
-        raise InputError(f"{folder}: {bad} points have a position that is not finite; the points3D file is "
-                         "damaged: rebuild it")
+        raise InputError(
+            f"{folder}: {bad} points have a position that is not finite; the points3D file is damaged: rebuild it"
+        )
     return SparseModel(photos, points)
 
 
 def _suffix(folder: Path) -> str:
-    """".bin" or ".txt" as pycolmap will choose, "" where the folder holds no model."""
+    """ ".bin" or ".txt" as pycolmap will choose, "" where the folder holds no model."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{stem}{suffix}").is_file() for stem in _FILES[:2]):
             return suffix
@@ -124,9 +131,10 @@ def read_photos(reconstruction: Any) -> list[Photo]:
     for image_id in reconstruction.reg_image_ids():
         image = reconstruction.images[image_id]
         pose = image.cam_from_world
-        pose = pose() if callable(pose) else pose         # an attribute before pycolmap 3.12
-        photos.append(Photo(image.name, np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]]),
-                            reconstruction.cameras[image.camera_id]))
+        pose = pose() if callable(pose) else pose  # an attribute before pycolmap 3.12
+        photos.append(
+            Photo(image.name, np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]]), reconstruction.cameras[image.camera_id])
+        )
     return sorted(photos, key=lambda photo: photo.name)
 
 

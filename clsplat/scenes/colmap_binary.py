@@ -41,8 +41,10 @@ class _Cursor:
         """Step over `size` bytes; returns where they began."""
         start = self.at
         if start + size > len(self.data):
-            raise InputError(f"{self.path}: the file ends early ({len(self.data)} bytes, needs at least "
-                             f"{start + size}); it is truncated or damaged: copy or rebuild it")
+            raise InputError(
+                f"{self.path}: the file ends early ({len(self.data)} bytes, needs at least "
+                f"{start + size}); it is truncated or damaged: copy or rebuild it"
+            )
         self.at += size
         return start
 
@@ -50,44 +52,46 @@ class _Cursor:
         """A name that ends in a NUL byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
-            raise InputError(f"{self.path}: the file ends inside a name; it is truncated or damaged: "
-                             "copy or rebuild it")
-        raw = self.data[self.at:end]
+            raise InputError(
+                f"{self.path}: the file ends inside a name; it is truncated or damaged: copy or rebuild it"
+            )
+        raw = self.data[self.at : end]
         self.at = end + 1
         try:
             return raw.decode("utf-8")
         except UnicodeDecodeError:
-            raise InputError(f"{self.path}: the name at byte {end - len(raw)} is not text; "
-                             "the file is damaged: copy or rebuild it") from None
+            raise InputError(
+                f"{self.path}: the name at byte {end - len(raw)} is not text; the file is damaged: copy or rebuild it"
+            ) from None
 
 
 _COUNT = struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")           # id, model, width, height; then the parameters
-_IMAGE = struct.Struct("<I4d3dI")          # id, quaternion wxyz, translation, camera id; then the name
-_POINT = struct.Struct("<Q3d3BdQ")         # id, xyz, rgb, error, track length; then the track
-_RIG = struct.Struct("<II")                # id, sensors; then the reference sensor and the others
+_CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
+_IMAGE = struct.Struct("<I4d3dI")  # id, quaternion wxyz, translation, camera id; then the name
+_POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length; then the track
+_RIG = struct.Struct("<II")  # id, sensors; then the reference sensor and the others
 _SENSOR = struct.Struct("<iI")
 _FLAG = struct.Struct("<B")
-_FRAME = struct.Struct("<II7dI")           # id, rig id, pose, number of data ids
+_FRAME = struct.Struct("<II7dI")  # id, rig id, pose, number of data ids
 _OBSERVATION_BYTES, _TRACK_BYTES, _POSE_BYTES, _DATA_ID_BYTES = 24, 8, 56, 16
 
 
 def _walk_camera(cursor: _Cursor) -> None:
     camera_id, model, width, height = cursor.take(_CAMERA)
     if not 0 <= model < len(_MODEL_PARAMS):
-        raise InputError(f"{cursor.path}: camera {camera_id} has the unknown model id {model}; "
-                         "convert it to PINHOLE with COLMAP's image_undistorter")
+        raise InputError(
+            f"{cursor.path}: camera {camera_id} has the unknown model id {model}; "
+            "convert it to PINHOLE with COLMAP's image_undistorter"
+        )
     if not (0 < width < 1 << 20 and 0 < height < 1 << 20):
-        raise InputError(f"{cursor.path}: camera {camera_id} is {width}x{height} px; "
-                         "the file is damaged: rebuild it")
+        raise InputError(f"{cursor.path}: camera {camera_id} is {width}x{height} px; the file is damaged: rebuild it")
     cursor.skip(8 * _MODEL_PARAMS[int(model)])
 
 
 def _walk_image(cursor: _Cursor) -> None:
     image_id = cursor.take(_IMAGE)[0]
     if not cursor.text():
-        raise InputError(f"{cursor.path}: image {image_id} has an empty name; "
-                         "the file is damaged: rebuild it")
+        raise InputError(f"{cursor.path}: image {image_id} has an empty name; the file is damaged: rebuild it")
     cursor.skip(_OBSERVATION_BYTES * int(cursor.take(_COUNT)[0]))
 
 
@@ -99,7 +103,7 @@ def _walk_rig(cursor: _Cursor) -> None:
     sensors = int(cursor.take(_RIG)[1])
     for index in range(sensors):
         cursor.skip(_SENSOR.size)
-        if index and cursor.take(_FLAG)[0]:        # the first one is the reference and carries no pose
+        if index and cursor.take(_FLAG)[0]:  # the first one is the reference and carries no pose
             cursor.skip(_POSE_BYTES)
 
 
@@ -108,8 +112,11 @@ def _walk_frame(cursor: _Cursor) -> None:
 
 
 _WALKERS: dict[str, Callable[[_Cursor], None]] = {
-    "cameras.bin": _walk_camera, "images.bin": _walk_image, "points3D.bin": _walk_point,
-    "rigs.bin": _walk_rig, "frames.bin": _walk_frame,
+    "cameras.bin": _walk_camera,
+    "images.bin": _walk_image,
+    "points3D.bin": _walk_point,
+    "rigs.bin": _walk_rig,
+    "frames.bin": _walk_frame,
 }
 
 
@@ -122,11 +129,12 @@ def _check_file(path: Path) -> int:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         cursor = _Cursor(path, data)
         count = int(cursor.take(_COUNT)[0])
-        for _ in range(count):                     # a lying count ends at the end of the file
+        for _ in range(count):  # a lying count ends at the end of the file
             walk(cursor)
         if cursor.at != size:
-            raise InputError(f"{path}: {size - cursor.at} bytes follow its {count} records; "
-                             "the file is damaged: copy or rebuild it")
+            raise InputError(
+                f"{path}: {size - cursor.at} bytes follow its {count} records; the file is damaged: copy or rebuild it"
+            )
     return count
 
 
@@ -182,8 +190,13 @@ class ModelView:
     model: int = _PINHOLE
 
 
-def write_binary_model(folder: Path, views: Sequence[ModelView], xyz: NDArray[np.float64],
-                       rgb: NDArray[np.uint8], error: NDArray[np.float64] | None = None) -> None:
+def write_binary_model(
+    folder: Path,
+    views: Sequence[ModelView],
+    xyz: NDArray[np.float64],
+    rgb: NDArray[np.uint8],
+    error: NDArray[np.float64] | None = None,
+) -> None:
     """Write cameras.bin, images.bin and points3D.bin; tracks follow from the views' observations.
 
     Parameters
@@ -210,12 +223,19 @@ def write_binary_model(folder: Path, views: Sequence[ModelView], xyz: NDArray[np
         for slot, point in enumerate(view.point_index):
             tracks[point].append((image_id, slot))
     errors = np.zeros(len(xyz)) if error is None else error
-    points = [_POINT.pack(index, *position, *(int(c) for c in colour), off, len(track))
-              + np.array(track, dtype="<u4").tobytes()
-              for index, (position, colour, off, track) in enumerate(zip(xyz, rgb, errors, tracks, strict=True), 1)]
-    _write(folder / "cameras.bin", len(cameras),
-           (_CAMERA.pack(camera_id, *map(int, key[:3])) + struct.pack(f"<{len(key) - 3}d", *key[3:])
-            for key, camera_id in cameras.items()))
+    points = [
+        _POINT.pack(index, *position, *(int(c) for c in colour), off, len(track))
+        + np.array(track, dtype="<u4").tobytes()
+        for index, (position, colour, off, track) in enumerate(zip(xyz, rgb, errors, tracks, strict=True), 1)
+    ]
+    _write(
+        folder / "cameras.bin",
+        len(cameras),
+        (
+            _CAMERA.pack(camera_id, *map(int, key[:3])) + struct.pack(f"<{len(key) - 3}d", *key[3:])
+            for key, camera_id in cameras.items()
+        ),
+    )
     _write(folder / "images.bin", len(views), images)
     _write(folder / "points3D.bin", len(xyz), points)
 

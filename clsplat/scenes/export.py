@@ -25,12 +25,14 @@ from .undistort import Lens, Photo, make_lens
 POINTS_FILE = "sparse_pc.ply"  # nerfstudio's name
 # Parameters of COLMAP's models by their keys in transforms.json; "f" is both focal lengths.
 _KEYS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"), "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"), "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
-}  # fmt: skip
+}
 _FISHEYE = "OPENCV_FISHEYE"
 _DENOMINATOR = ("k4", "k5", "k6")  # of FULL_OPENCV, which readers of transforms.json do not know
 
@@ -55,8 +57,11 @@ def write_transforms(path: Path, photos: Sequence[Photo], files: Sequence[str], 
         write_point_cloud(path.parent / POINTS_FILE, points)
         head["ply_file_path"] = POINTS_FILE
     # What all frames say is said once, above them.
-    shared = {key: value for key, value in (frames[0] if frames else {}).items()
-              if key != "file_path" and all(frame.get(key) == value for frame in frames[1:])}
+    shared = {
+        key: value
+        for key, value in (frames[0] if frames else {}).items()
+        if key != "file_path" and all(frame.get(key) == value for frame in frames[1:])
+    }
     if len(frames) > 1:
         shared.pop("transform_matrix", None)
         head |= shared
@@ -78,8 +83,17 @@ def write_colmap(folder: Path, photos: Sequence[Photo], points: Points, text: bo
     for photo in photos:
         lens = _plainest(photo.lens)
         names[int(lens.model)] = str(lens.model.name)
-        views.append(ModelView(photo.name, (lens.width, lens.height), tuple(map(float, lens.params)),
-                               photo.cam_from_world, np.empty((0, 2)), np.empty(0, np.int64), int(lens.model)))
+        views.append(
+            ModelView(
+                photo.name,
+                (lens.width, lens.height),
+                tuple(map(float, lens.params)),
+                photo.cam_from_world,
+                np.empty((0, 2)),
+                np.empty(0, np.int64),
+                int(lens.model),
+            )
+        )
     if text:
         _write_text(folder, views, names, points)
     else:
@@ -88,6 +102,7 @@ def write_colmap(folder: Path, photos: Sequence[Photo], points: Points, text: bo
 
 def relative_files(files: Sequence[Path], folder: Path) -> list[str]:
     """Paths of files as seen from a folder, `/` between names; of those on another drive, the whole path."""
+
     def seen(file: Path) -> str:
         try:
             return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
@@ -110,12 +125,16 @@ def _lens_keys(photo: Photo) -> dict[str, Any]:
     lens = _plainest(photo.lens)
     model = str(lens.model.name)
     if model not in _KEYS:
-        raise InputError(f"image {photo.name!r}: transforms.json has no lens of COLMAP's model {model}: undistort the "
-                         "photos first, or write a COLMAP model")
+        raise InputError(
+            f"image {photo.name!r}: transforms.json has no lens of COLMAP's model {model}: undistort the "
+            "photos first, or write a COLMAP model"
+        )
     values = dict(zip(_KEYS[model], map(float, lens.params), strict=True))
     if any(values.pop(key, 0.0) for key in _DENOMINATOR if model != _FISHEYE):
-        raise InputError(f"image {photo.name!r}: transforms.json has no k4, k5 and k6 of a perspective lens: undistort "
-                         "the photos first, or write a COLMAP model")
+        raise InputError(
+            f"image {photo.name!r}: transforms.json has no k4, k5 and k6 of a perspective lens: undistort "
+            "the photos first, or write a COLMAP model"
+        )
     if "f" in values:
         values = {"fl_x": values["f"], "fl_y": values.pop("f")} | values
     kind = _FISHEYE if model == _FISHEYE else "OPENCV" if len(values) > 4 else "PINHOLE"
@@ -132,8 +151,10 @@ def _write_text(folder: Path, views: Sequence[ModelView], names: dict[int, str],
         camera = cameras.setdefault(lens, len(cameras) + 1)
         x, y, z, w = Rotation.from_matrix(view.cam_from_world[:3, :3]).as_quat().tolist()
         images += [_line(number, w, x, y, z, *view.cam_from_world[:3, 3].tolist(), camera, view.name), ""]
-    rows = [_line(number, *xyz, *rgb, 0.0) for number, (xyz, rgb)
-            in enumerate(zip(points.xyz.tolist(), points.rgb.tolist(), strict=True), 1)]
+    rows = [
+        _line(number, *xyz, *rgb, 0.0)
+        for number, (xyz, rgb) in enumerate(zip(points.xyz.tolist(), points.rgb.tolist(), strict=True), 1)
+    ]
     tables = {"cameras": [_line(number, *lens) for lens, number in cameras.items()], "images": images, "points3D": rows}
     for name, lines in tables.items():
         with atomic_writer(folder / f"{name}.txt") as stream:

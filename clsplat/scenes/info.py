@@ -77,11 +77,18 @@ class SceneInfo:
     def to_json(self) -> dict[str, Any]:
         """Plain values, as `clsplat info --json` prints them."""
         return {
-            "kind": self.kind, "photos": self.photos, "unregistered": list(self.unregistered),
-            "unreadable": list(self.unreadable), "photo_bytes": self.photo_bytes,
+            "kind": self.kind,
+            "photos": self.photos,
+            "unregistered": list(self.unregistered),
+            "unreadable": list(self.unreadable),
+            "photo_bytes": self.photo_bytes,
             "sizes": [{"width": size[0], "height": size[1], "photos": n} for size, n in self.sizes],
-            "lenses": [asdict(lens) for lens in self.lenses], "points": self.points, "track_mean": self.track_mean,
-            "track_median": self.track_median, "test": list(self.test), "masked": self.masked,
+            "lenses": [asdict(lens) for lens in self.lenses],
+            "points": self.points,
+            "track_mean": self.track_mean,
+            "track_median": self.track_median,
+            "test": list(self.test),
+            "masked": self.masked,
             "placed": self.placed and dict(zip(("photos", "of", "error"), self.placed, strict=True)),
         }
 
@@ -111,13 +118,20 @@ def scene_info(path: str | os.PathLike[str], images: str | None = None, test_eve
     masks = masks_of(root, posed, None)
     transforms = [] if (root / "sparse").is_dir() else find_transforms(root)
     return SceneInfo(
-        " and ".join(file.name for file in transforms) or "COLMAP", len(posed.photos),
+        " and ".join(file.name for file in transforms) or "COLMAP",
+        len(posed.photos),
         _unregistered(posed, masks.values()),
-        tuple(unreadable), tuple(sizes.most_common()), sum(file.stat().st_size for file in posed.files.values()),
-        _lenses(posed), len(posed.points), float(tracks.mean()) if len(tracks) else 0.0,
+        tuple(unreadable),
+        tuple(sizes.most_common()),
+        sum(file.stat().st_size for file in posed.files.values()),
+        _lenses(posed),
+        len(posed.points),
+        float(tracks.mean()) if len(tracks) else 0.0,
         float(np.median(tracks)) if len(tracks) else 0.0,
         tuple(sorted(chosen_tests(posed, test_every, None))) if len(posed.photos) > 1 else (),
-        len(masks), _placed(root))
+        len(masks),
+        _placed(root),
+    )
 
 
 def _unregistered(posed: Posed, masks: Iterable[Path]) -> tuple[str, ...]:

@@ -83,17 +83,26 @@ def posed_by_transforms(files: list[Path], images: str | None = None) -> Posed:
     kept = {name: frame for name, frame in sorted(photos.items()) if frame.file.is_file()}
     missing = [name for name in photos if name not in kept]
     if not kept:
-        raise InputError(f"{files[0]}: none of its {len(photos)} photos is there, such as {missing[0]!r}; "
-                         "copy them beside it, or name their folder")
+        raise InputError(
+            f"{files[0]}: none of its {len(photos)} photos is there, such as {missing[0]!r}; "
+            "copy them beside it, or name their folder"
+        )
     if missing:
-        warnings.warn(f"{files[0]}: {len(missing)} of {len(photos)} frames name photos that are not there, such as "
-                      f"{missing[0]!r}; they are left out", stacklevel=3)
+        warnings.warn(
+            f"{files[0]}: {len(missing)} of {len(photos)} frames name photos that are not there, such as "
+            f"{missing[0]!r}; they are left out",
+            stacklevel=3,
+        )
     test_names = _held_out(documents, kept)
     used = set().union(*(document.listed() or kept for document in documents))
     kept = {name: frame for name, frame in kept.items() if name in used}
-    return Posed([frame.photo() for frame in kept.values()], {name: frame.file for name, frame in kept.items()},
-                 documents[0].points(), test_names,
-                 {name: mask for name, frame in kept.items() for mask in [frame.mask_file()] if mask is not None})
+    return Posed(
+        [frame.photo() for frame in kept.values()],
+        {name: frame.file for name, frame in kept.items()},
+        documents[0].points(),
+        test_names,
+        {name: mask for name, frame in kept.items() for mask in [frame.mask_file()] if mask is not None},
+    )
 
 
 def _held_out(documents: list[_Document], kept: dict[str, _Frame]) -> frozenset[str] | None:
@@ -139,8 +148,10 @@ class _Frame:
         if matrix is None:
             raise InputError(f"{self.place}: transform_matrix must be 4 x 4 finite numbers; write the poses again")
         if not is_rotation(matrix[:3, :3]):
-            raise InputError(f"{self.place}: transform_matrix has no rotation in its left 3 x 3 block; write the "
-                             "poses again, without a scale")
+            raise InputError(
+                f"{self.place}: transform_matrix has no rotation in its left 3 x 3 block; write the "
+                "poses again, without a scale"
+            )
         return cam_from_world_of(matrix)
 
     def lens(self) -> Lens:
@@ -159,8 +170,10 @@ class _Frame:
         if model in _FISHEYE or self.value("is_fisheye"):
             return make_lens("OPENCV_FISHEYE", width, height, [*core, k1, k2, k3, k4])
         if model not in _PERSPECTIVE:
-            raise InputError(f"{self.place}: camera_model {model!r} has no pinhole image; make perspective views "
-                             f"first, or use one of {', '.join((*_PERSPECTIVE[:2], _FISHEYE[0]))}")
+            raise InputError(
+                f"{self.place}: camera_model {model!r} has no pinhole image; make perspective views "
+                f"first, or use one of {', '.join((*_PERSPECTIVE[:2], _FISHEYE[0]))}"
+            )
         if k4:
             raise InputError(f"{self.place}: k4 of a perspective lens is not supported; undistort the photos first")
         return make_lens("FULL_OPENCV", width, height, [*core, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0])

@@ -51,8 +51,13 @@ def read_point_cloud(path: str | os.PathLike[str]) -> Points:
 def write_point_cloud(path: str | os.PathLike[str], points: Points) -> None:
     """Write positions (float32) and colours, binary; raises OutputError."""
     columns = [("float", name) for name in "xyz"] + [("uchar", name) for name in ("red", "green", "blue")]
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}",
-            *(f"property {kind} {name}" for kind, name in columns), "end_header"]
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(points)}",
+        *(f"property {kind} {name}" for kind, name in columns),
+        "end_header",
+    ]
     table = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     table["xyz"], table["rgb"] = points.xyz, points.rgb
     with atomic_writer(path) as stream:

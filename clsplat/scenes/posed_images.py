@@ -65,8 +65,10 @@ def _photo_folder(root: Path, images: str) -> Path:
     folder = root / images
     if not folder.is_dir():
         others = ", ".join(sorted(other.name for other in root.glob("images*") if other.is_dir()))
-        raise InputError(f"{folder}: no such folder of photos; " + (f"choose one of: {others}" if others else
-                         "put the photos there, or name their folder"))
+        raise InputError(
+            f"{folder}: no such folder of photos; "
+            + (f"choose one of: {others}" if others else "put the photos there, or name their folder")
+        )
     return folder
 
 
@@ -75,13 +77,18 @@ def _photo_files(folder: Path, names: list[str]) -> dict[str, Path]:
     missing = [name for name, file in files.items() if not file.is_file()]
     if missing:
         some = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
-        raise InputError(f"{folder}: {len(missing)} of the model's {len(names)} images are missing: {some}; "
-                         "copy them there, or name another folder of photos")
+        raise InputError(
+            f"{folder}: {len(missing)} of the model's {len(names)} images are missing: {some}; "
+            "copy them there, or name another folder of photos"
+        )
     return files
 
 
 def _warn_of_unregistered(folder: Path, registered: int) -> None:
     photos = sum(1 for file in folder.rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
     if registered < _FEW_REGISTERED * photos:
-        warnings.warn(f"{folder}: the model registers only {registered} of {photos} photos; parts of the "
-                      "scene may be missing. More overlap between photos helps.", stacklevel=4)
+        warnings.warn(
+            f"{folder}: the model registers only {registered} of {photos} photos; parts of the "
+            "scene may be missing. More overlap between photos helps.",
+            stacklevel=4,
+        )

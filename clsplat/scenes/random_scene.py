@@ -23,8 +23,15 @@ _SPREAD = 0.4  # of log scales
 _MOST_SKEWED = 0.97  # part of a bounded vector's limit; the median is 0.82 of it, as after short trainings
 
 
-def synthetic_scene(n: int, width: int = 640, height: int = 480, shape: str = DEFAULT_SHAPE, sh_degree: int = 3,
-                    n_views: int = 6, seed: int = 0) -> tuple[Scene, Splats]:
+def synthetic_scene(
+    n: int,
+    width: int = 640,
+    height: int = 480,
+    shape: str = DEFAULT_SHAPE,
+    sh_degree: int = 3,
+    n_views: int = 6,
+    seed: int = 0,
+) -> tuple[Scene, Splats]:
     """A ball of `n` random splats in a ring of cameras, and smooth images to compare with.
 
     Sizes fall as 1/sqrt(n), so that the splats over a pixel, and with them the useful pairs of an image, stay nearly
@@ -42,12 +49,16 @@ def synthetic_scene(n: int, width: int = 640, height: int = 480, shape: str = DE
     InputError : no splat, smaller images, fewer views, or an unknown shape.
     """
     if n < 1 or min(width, height) < 16 or n_views < 2:
-        raise InputError(f"synthetic scene: {n} splats, {width}x{height} px, {n_views} views; "
-                         "needs at least 1 splat, 16x16 px and 2 views")
+        raise InputError(
+            f"synthetic scene: {n} splats, {width}x{height} px, {n_views} views; "
+            "needs at least 1 splat, 16x16 px and 2 views"
+        )
     rng = np.random.default_rng(seed)
     splats = _splats(n, shape_named(shape), sh_degree, rng)
-    views = [View(f"view_{index:03d}.png", camera, _smooth_image(width, height, rng))
-             for index, camera in enumerate(ring_cameras(width, height, n_views))]
+    views = [
+        View(f"view_{index:03d}.png", camera, _smooth_image(width, height, rng))
+        for index, camera in enumerate(ring_cameras(width, height, n_views))
+    ]
     points = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
     return Scene("synthetic", Path("synthetic"), views, points), splats
 

@@ -21,8 +21,8 @@ from .options import ALPHA_USES
 from .posed_images import Posed, posed_by_colmap
 from .undistort import Photo
 
-MAX_WIDTH = 1600                # 3DGS: with resolution -1, wider images are reduced to this [px]
-_EXTENT_MARGIN = 1.1            # 3DGS: extent over the farthest camera's distance from their mean
+MAX_WIDTH = 1600  # 3DGS: with resolution -1, wider images are reduced to this [px]
+_EXTENT_MARGIN = 1.1  # 3DGS: extent over the farthest camera's distance from their mean
 
 __all__ = ["MAX_WIDTH", "Points", "Scene", "View", "load_scene"]
 
@@ -50,9 +50,13 @@ class View:
         """The view at another size [px]."""
         if (width, height) == (self.camera.width, self.camera.height):
             return self
-        return View(self.name, self.camera.resized(width, height), resize_area(self.image, width, height),
-                    None if self.mask is None else nearest(self.mask, width, height),
-                    None if self.alpha is None else resize_area(self.alpha, width, height))
+        return View(
+            self.name,
+            self.camera.resized(width, height),
+            resize_area(self.image, width, height),
+            None if self.mask is None else nearest(self.mask, width, height),
+            None if self.alpha is None else resize_area(self.alpha, width, height),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +116,17 @@ class Scene:
         return _EXTENT_MARGIN * reach if reach > 0 else 1.0
 
 
-def load_scene(path: str | os.PathLike[str], images: str | None = None, resolution: int = -1,
-               test_every: int = 8, test_list: str | os.PathLike[str] | None = None, eval: bool = True,
-               background: tuple[float, float, float] = (0.0, 0.0, 0.0), masks: str | None = None,
-               alpha: str = ALPHA_USES[0]) -> Scene:
+def load_scene(
+    path: str | os.PathLike[str],
+    images: str | None = None,
+    resolution: int = -1,
+    test_every: int = 8,
+    test_list: str | os.PathLike[str] | None = None,
+    eval: bool = True,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    masks: str | None = None,
+    alpha: str = ALPHA_USES[0],
+) -> Scene:
     """Read a scene: a folder with photos and a COLMAP model in `sparse`, or with transforms.json.
 
     Parameters
@@ -158,13 +169,19 @@ def load_scene(path: str | os.PathLike[str], images: str | None = None, resoluti
     def view(photo: Photo) -> View | str:
         return _view(photo, posed.files[photo.name], resolution, background, hiding.get(photo.name), alpha == "mask")
 
-    with ThreadPoolExecutor() as pool:          # decoding and resizing run outside the interpreter lock
+    with ThreadPoolExecutor() as pool:  # decoding and resizing run outside the interpreter lock
         found = list(pool.map(view, posed.photos))
     views = [view for view in found if isinstance(view, View)]
     _warn_of_left_out(root, [reason for reason in found if isinstance(reason, str)], len(found))
     folder = root.resolve()
-    return Scene((folder.parent if root.is_file() else folder).name, root, views, posed.points,
-                 test_names & {view.name for view in views}, background)
+    return Scene(
+        (folder.parent if root.is_file() else folder).name,
+        root,
+        views,
+        posed.points,
+        test_names & {view.name for view in views},
+        background,
+    )
 
 
 def masks_of(root: Path, posed: Posed, folder: str | None) -> dict[str, Path]:
@@ -184,8 +201,11 @@ def _warn_of_left_out(root: Path, reasons: list[str], n: int) -> None:
     if len(reasons) == n:
         raise InputError(f"{root}: none of its {n} photos can be used: {reasons[0]}")
     if reasons:
-        warnings.warn(f"{root}: {len(reasons)} of {n} photos are left out: {'; '.join(reasons[:3])}"
-                      + ("; ..." if len(reasons) > 3 else ""), stacklevel=3)
+        warnings.warn(
+            f"{root}: {len(reasons)} of {n} photos are left out: {'; '.join(reasons[:3])}"
+            + ("; ..." if len(reasons) > 3 else ""),
+            stacklevel=3,
+        )
 
 
 def read_posed(root: Path, images: str | None) -> Posed:
@@ -201,18 +221,20 @@ def chosen_tests(posed: Posed, test_every: int, test_list: str | os.PathLike[str
         chosen = sorted(posed.test_names)
     elif test_list is None:
         if test_every < 2:
-            raise InputError(f"test_every {test_every}: must be at least 2; "
-                             "to learn from all views, turn eval off")
+            raise InputError(f"test_every {test_every}: must be at least 2; to learn from all views, turn eval off")
         chosen = names[::test_every]
     else:
         chosen = _read_names(Path(test_list))
         unknown = [name for name in chosen if name not in set(names)]
         if unknown:
-            raise InputError(f"{test_list}: no view is named {unknown[0]!r} ({len(unknown)} unknown in all); "
-                             f"names look like {names[0]!r}")
+            raise InputError(
+                f"{test_list}: no view is named {unknown[0]!r} ({len(unknown)} unknown in all); "
+                f"names look like {names[0]!r}"
+            )
     if len(set(chosen)) == len(names):
-        raise InputError(f"no training view is left: all {len(names)} views are test views; "
-                         "choose fewer, or turn eval off")
+        raise InputError(
+            f"no training view is left: all {len(names)} views are test views; choose fewer, or turn eval off"
+        )
     return frozenset(chosen)
 
 
@@ -220,13 +242,21 @@ def _read_names(path: Path) -> list[str]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a list of names ({type(error).__name__}); "
-                         "give a text file with one image name a line") from None
+        raise InputError(
+            f"{path}: cannot be read as a list of names ({type(error).__name__}); "
+            "give a text file with one image name a line"
+        ) from None
     return [line.strip() for line in lines if line.strip()]
 
 
-def _view(photo: Photo, file: Path, resolution: int, background: tuple[float, float, float], mask_file: Path | None,
-          alpha_hides: bool) -> View | str:
+def _view(
+    photo: Photo,
+    file: Path,
+    resolution: int,
+    background: tuple[float, float, float],
+    mask_file: Path | None,
+    alpha_hides: bool,
+) -> View | str:
     """The view, or why there is none."""
     try:
         stored = read_image(file)

@@ -22,8 +22,10 @@ def hold_out(scene: Scene) -> Scene:
     """
     views = scene.train
     if len(views) < FEWEST:
-        raise InputError(f"{scene.path}: has {len(views)} training views; at least {FEWEST} are needed to hold one "
-                         "out: add photos, or choose the number of splats yourself (--cap-max)")
+        raise InputError(
+            f"{scene.path}: has {len(views)} training views; at least {FEWEST} are needed to hold one "
+            "out: add photos, or choose the number of splats yourself (--cap-max)"
+        )
     every = max(2, min(EVERY, len(views) // FEWEST))
     held_out = views[every // 2 :: every]
     return replace(scene, views=views, test_names=frozenset(view.name for view in held_out))

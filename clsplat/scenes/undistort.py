@@ -87,8 +87,10 @@ class Photo:
         """
         rows, columns = mask.shape
         if not _images.same_aspect((columns, rows), (width, height)):
-            raise InputError(f"image {self.name!r}: its mask is {columns}x{rows} px, the photo {width}x{height}; "
-                             "make the mask of the photo's size")
+            raise InputError(
+                f"image {self.name!r}: its mask is {columns}x{rows} px, the photo {width}x{height}; "
+                "make the mask of the photo's size"
+            )
         lens = _scaled(self.lens, width, height, self.name)
         if is_pinhole(lens):
             return nearest(mask, width, height)
@@ -108,8 +110,15 @@ def make_lens(model: str, width: int, height: int, params: list[float]) -> Lens:
 
 def pinhole_camera(lens: Lens, cam_from_world: NDArray[np.float64], width: int, height: int) -> Camera:
     """The camera of a lens without distortion, for images of this size [px]; raises what Camera raises."""
-    return Camera(width, height, lens.focal_length_x, lens.focal_length_y, lens.principal_point_x,
-                  lens.principal_point_y, cam_from_world)
+    return Camera(
+        width,
+        height,
+        lens.focal_length_x,
+        lens.focal_length_y,
+        lens.principal_point_x,
+        lens.principal_point_y,
+        cam_from_world,
+    )
 
 
 def colmap_library() -> ModuleType:
@@ -126,8 +135,10 @@ def _scaled(lens: Any, width: int, height: int, name: str) -> Any:
     if not np.isfinite(lens.params).all():
         raise InputError(f"image {name!r}: its camera has a parameter that is not finite; rebuild the model")
     if not _images.same_aspect((width, height), (lens.width, lens.height)):
-        raise InputError(f"image {name!r} is {width}x{height} px but its camera {lens.width}x{lens.height}; "
-                         "use the photos that the model was made from, whole and unrotated")
+        raise InputError(
+            f"image {name!r} is {width}x{height} px but its camera {lens.width}x{lens.height}; "
+            "use the photos that the model was made from, whole and unrotated"
+        )
     scaled = copy.copy(lens)
     if (width, height) != (lens.width, lens.height):
         scaled.rescale(width, height)
@@ -147,7 +158,8 @@ def _undistorted(image: _images.ImageU8, lens: Any, name: str) -> tuple[_images.
     pycolmap = colmap_library()
     try:
         bitmap, pinhole = pycolmap.undistort_image(
-            pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.ascontiguousarray(image)), lens)
+            pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.ascontiguousarray(image)), lens
+        )
     except (ValueError, RuntimeError, MemoryError) as error:
         raise _not_undistorted(lens, name, error) from None
     return np.ascontiguousarray(bitmap.to_array()), pinhole
@@ -162,20 +174,30 @@ def _pinhole_of(lens: Any, name: str) -> Any:
         raise _not_undistorted(lens, name, error) from None
     # A panorama comes back as it was, and asking its camera for a focal length would end the process.
     if pinhole.model.name != "PINHOLE":
-        raise InputError(f"image {name!r}: the camera model {lens.model.name} has no pinhole image; "
-                         "make perspective views of it first")
+        raise InputError(
+            f"image {name!r}: the camera model {lens.model.name} has no pinhole image; "
+            "make perspective views of it first"
+        )
     return pinhole
 
 
 def _not_undistorted(lens: Any, name: str, error: Exception) -> InputError:
-    return InputError(f"image {name!r}: its {lens.model.name} camera cannot be undistorted "
-                      f"({reason_of(error)}); undistort the photos first")
+    return InputError(
+        f"image {name!r}: its {lens.model.name} camera cannot be undistorted "
+        f"({reason_of(error)}); undistort the photos first"
+    )
 
 
 def _seen_from(pinhole: Any, lens: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where a lens puts the pixel centres of a pinhole camera: x and y [px], (H, W) each; NaN where nowhere."""
     down, across = np.mgrid[: pinhole.height, : pinhole.width] + 0.5
-    rays = np.stack([(across - pinhole.principal_point_x) / pinhole.focal_length_x,
-                     (down - pinhole.principal_point_y) / pinhole.focal_length_y, np.ones(across.shape)], axis=2)
+    rays = np.stack(
+        [
+            (across - pinhole.principal_point_x) / pinhole.focal_length_x,
+            (down - pinhole.principal_point_y) / pinhole.focal_length_y,
+            np.ones(across.shape),
+        ],
+        axis=2,
+    )
     seen = np.asarray(lens.img_from_cam(rays.reshape(-1, 3)), np.float64).reshape(*across.shape, 2)
     return seen[..., 0], seen[..., 1]

@@ -52,8 +52,10 @@ def nearest_gaussians(splats: Splats) -> Splats:
     """
     source = shape_named(splats.shape)
     if source.normalised and splats.normalisation != _PEAK:
-        raise InputError(f"convert: normalisation {splats.normalisation!r}: the height of such a splat changes with "
-                         f"the view, and that of a Gaussian does not; train with {_PEAK!r}")
+        raise InputError(
+            f"convert: normalisation {splats.normalisation!r}: the height of such a splat changes with "
+            f"the view, and that of a Gaussian does not; train with {_PEAK!r}"
+        )
     if source.signed:
         splats = splats.select(splats.opacity_logit >= 0.0)
     try:
@@ -98,8 +100,10 @@ def _round(model: dict[str, Reals], source: Shape, parameter: Field) -> dict[str
     """Scale and opacity of the Gaussians nearest to splats of a round profile."""
     values, fits = _round_fits(source, parameter)
     width, height = (np.interp(np.log(model[parameter.name]), np.log(values), column) for column in fits.T)
-    return {"log_scale": model["log_scale"] + np.log(width)[:, None],
-            "opacity_logit": _raw(height * source.opacity(model["opacity_logit"]))}
+    return {
+        "log_scale": model["log_scale"] + np.log(width)[:, None],
+        "opacity_logit": _raw(height * source.opacity(model["opacity_logit"])),
+    }
 
 
 def _raw(opacity: Reals) -> Reals:
@@ -115,8 +119,9 @@ def _between(table: Reals, slant: Reals, ratio: Reals) -> Reals:
     r = np.clip(ratio, 0.0, 1.0) * (len(_RATIOS) - 1)
     s0, r0 = np.minimum(s.astype(int), last), np.minimum(r.astype(int), len(_RATIOS) - 2)
     a, b = (s - s0)[:, None], (r - r0)[:, None]
-    mixed: Reals = ((1 - a) * ((1 - b) * table[s0, r0] + b * table[s0, r0 + 1])
-                    + a * ((1 - b) * table[s0 + 1, r0] + b * table[s0 + 1, r0 + 1]))
+    mixed: Reals = (1 - a) * ((1 - b) * table[s0, r0] + b * table[s0, r0 + 1]) + a * (
+        (1 - b) * table[s0 + 1, r0] + b * table[s0 + 1, r0 + 1]
+    )
     return mixed
 
 

@@ -46,8 +46,9 @@ def convert(splats: Splats, shape: str) -> Splats:
     else:
         model, normalisation = _gaussian(model, splats.normalisation, source, target), "peak"
     dtype = splats.mean.dtype
-    return Splats(shape, {name: values.astype(dtype) for name, values in model.items()}, normalisation,
-                  splats.antialiased)
+    return Splats(
+        shape, {name: values.astype(dtype) for name, values in model.items()}, normalisation, splats.antialiased
+    )
 
 
 def _refuse(bad: Mask, target: Shape, why: str, mend: str) -> None:
@@ -200,5 +201,8 @@ def _of_beta(model: Mapping[str, Reals], normalisation: str, source: Shape, targ
 
 
 _EQUALS: dict[str, Callable[[Mapping[str, Reals], str, Shape, Shape], Model]] = {
-    "skew": _without_skew, "opacity_minus_logit": _of_equal_opacities, "nu": _of_neutral_nu, "beta": _of_beta,
-}  # fmt: skip
+    "skew": _without_skew,
+    "opacity_minus_logit": _of_equal_opacities,
+    "nu": _of_neutral_nu,
+    "beta": _of_beta,
+}

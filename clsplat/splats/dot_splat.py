@@ -51,14 +51,19 @@ def read_splat(path: str | os.PathLike[str]) -> Splats:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check name and rights") from None
     if len(data) % RECORD.itemsize:
-        raise InputError(f"{path}: is no .splat file ({len(data)} bytes, no multiple of {RECORD.itemsize}); export it "
-                         "again")
+        raise InputError(
+            f"{path}: is no .splat file ({len(data)} bytes, no multiple of {RECORD.itemsize}); export it again"
+        )
     table = np.frombuffer(data, RECORD)
     with np.errstate(all="ignore"):  # what is not finite is found and named by the check
         logit = np.clip(GAUSSIAN.raw_opacity(table["colour"][:, 3] / 255.0), -_LOGIT_MAX, _LOGIT_MAX)
-        arrays = {"mean": table["position"], "log_scale": np.log(np.maximum(table["scale"], _LEAST_SCALE)),
-                  "quat": table["quaternion"] / 128.0 - 1.0, "opacity_logit": logit,
-                  "sh": ((table["colour"][:, :3] / 255.0 - 0.5) / SH_C0)[:, None]}
+        arrays = {
+            "mean": table["position"],
+            "log_scale": np.log(np.maximum(table["scale"], _LEAST_SCALE)),
+            "quat": table["quaternion"] / 128.0 - 1.0,
+            "opacity_logit": logit,
+            "sh": ((table["colour"][:, :3] / 255.0 - 0.5) / SH_C0)[:, None],
+        }
     try:
         return Splats(GAUSSIAN.name, {name: values.astype(np.float32) for name, values in arrays.items()})
     except InputError as error:

@@ -102,8 +102,14 @@ def read_ply(path: str | os.PathLike[str]) -> PlyModel:
     return PlyModel(shape.name, normalisation, antialiased, arrays)
 
 
-def write_ply(path: str | os.PathLike[str], shape: str, normalisation: str, arrays: Mapping[str, Array],
-              compact: bool = False, antialiased: bool = False) -> None:
+def write_ply(
+    path: str | os.PathLike[str],
+    shape: str,
+    normalisation: str,
+    arrays: Mapping[str, Array],
+    compact: bool = False,
+    antialiased: bool = False,
+) -> None:
     """Write a splat model, binary little-endian float32 (float64 is rounded), atomically.
 
     Parameters
@@ -226,8 +232,11 @@ def _schema(path: Path, header: Header, shape: Shape) -> Schema:
     missing = [name for name in _file_order(schema) if name in needed - names]
     if missing:
         own = any(missing[0] in field.ply for field in shape.fields)
-        mend = (f"shape {shape.name} has it; export the shape's columns, or name the shape that the file holds" if own
-                else "export all of 3DGS's properties")
+        mend = (
+            f"shape {shape.name} has it; export the shape's columns, or name the shape that the file holds"
+            if own
+            else "export all of 3DGS's properties"
+        )
         raise InputError(f"{path}: property {missing[0]!r} is missing; {mend}")
     for kind, name in header.properties:
         if name not in needed and name not in _NORMALS:

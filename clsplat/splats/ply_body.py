@@ -35,8 +35,9 @@ def read_body(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[
 
 def _read_binary(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[str, NDArray[Any]]]:
     order = BYTE_ORDER[header.encoding]
-    dtypes = [np.dtype([(name, order + _CODES[kind]) for kind, name in element.properties])
-              for element in header.elements]
+    dtypes = [
+        np.dtype([(name, order + _CODES[kind]) for kind, name in element.properties]) for element in header.elements
+    ]
     expected = sum(element.count * dtype.itemsize for element, dtype in zip(header.elements, dtypes, strict=True))
     available = os.fstat(stream.fileno()).st_size - stream.tell()
     if available != expected:
@@ -67,8 +68,10 @@ def _read_ascii(path: object, stream: BinaryIO, header: Header) -> dict[str, dic
         width = len(element.properties)
         table = values[at : at + element.count * width].reshape(element.count, width)
         at += table.size
-        body[element.name] = {name: _cast(path, element, name, table[:, i], _CODES[kind])
-                              for i, (kind, name) in enumerate(element.properties)}
+        body[element.name] = {
+            name: _cast(path, element, name, table[:, i], _CODES[kind])
+            for i, (kind, name) in enumerate(element.properties)
+        }
     return body
 
 
@@ -80,8 +83,10 @@ def _cast(path: object, element: Element, name: str, values: NDArray[np.float64]
         good = (values >= info.min) & (values <= info.max) & (values == np.floor(values))
         if not good.all():
             row = int(np.flatnonzero(~good)[0])
-            raise InputError(f"{path}: element {element.name!r}, row {row}: {name} is {values[row]:g}, expected a "
-                             f"whole number from {info.min} to {info.max}; export again")
+            raise InputError(
+                f"{path}: element {element.name!r}, row {row}: {name} is {values[row]:g}, expected a "
+                f"whole number from {info.min} to {info.max}; export again"
+            )
     with np.errstate(over="ignore"):  # what overflows is found and named by the check of the model
         return values.astype(dtype)
 

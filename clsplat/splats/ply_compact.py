@@ -78,8 +78,9 @@ def plan_layout(schema: Schema, arrays: Mapping[str, Array]) -> Layout:
     def size(base: int) -> int:
         """Words of four bytes for colour."""
         k = sh_coefficients(base)
-        return 3 * k * n + sum((1 + 3 * (sh_coefficients(band) - k)) * int(counts[band])
-                               for band in range(base + 1, degree + 1))
+        return 3 * k * n + sum(
+            (1 + 3 * (sh_coefficients(band) - k)) * int(counts[band]) for band in range(base + 1, degree + 1)
+        )
 
     base = min(range(degree + 1), key=size)
     bands = {band: np.flatnonzero(highest == band) for band in range(base + 1, degree + 1) if counts[band]}
@@ -109,8 +110,11 @@ def layout_bytes(schema: Schema, layout: Layout, n: int) -> int:
 def rest_columns(band: int, base: int) -> dict[str, tuple[int, int]]:
     """(coefficient, channel) of each f_rest_* of a file of degree `band`, without those up to `base`."""
     per_channel = sh_coefficients(band) - 1
-    return {f"f_rest_{channel * per_channel + k - 1}": (k, channel) for channel in range(3)
-            for k in range(sh_coefficients(base), per_channel + 1)}
+    return {
+        f"f_rest_{channel * per_channel + k - 1}": (k, channel)
+        for channel in range(3)
+        for k in range(sh_coefficients(base), per_channel + 1)
+    }
 
 
 def side_tables(schema: Schema, arrays: Mapping[str, Array], layout: Layout) -> list[Table]:
@@ -145,16 +149,25 @@ def side_fields(path: object, header: Header, schema: Schema) -> dict[str, Field
         elif element.name in {f"{_SH}{band}" for band in range(base + 1, MAX_SH_DEGREE + 1)}:
             wanted = tuple(rest_columns(int(element.name[len(_SH) :]), base))
         else:
-            raise InputError(f"{path}: element {element.name!r} does not go with this shape and the vertices' SH "
-                             f"degree {base}; export again")
+            raise InputError(
+                f"{path}: element {element.name!r} does not go with this shape and the vertices' SH "
+                f"degree {base}; export again"
+            )
         if [*element.properties] != [("uint", INDEX), *(("float", name) for name in wanted)]:
-            raise InputError(f"{path}: element {element.name!r}: its properties must be uint {INDEX} and float "
-                             f"{wanted[0]} to {wanted[-1]}; export again")
+            raise InputError(
+                f"{path}: element {element.name!r}: its properties must be uint {INDEX} and float "
+                f"{wanted[0]} to {wanted[-1]}; export again"
+            )
     return found
 
 
-def filled_in(path: object, header: Header, body: Mapping[str, Mapping[str, NDArray[Any]]], schema: Schema,
-              arrays: dict[str, Array]) -> dict[str, Array]:
+def filled_in(
+    path: object,
+    header: Header,
+    body: Mapping[str, Mapping[str, NDArray[Any]]],
+    schema: Schema,
+    arrays: dict[str, Array],
+) -> dict[str, Array]:
     """The vertices' arrays, with what the other elements hold.
 
     Parameters
@@ -198,8 +211,10 @@ def _index(path: object, element: str, index: NDArray[Any], n: int) -> Rows:
     rows = index.astype(np.int64)
     bad = np.flatnonzero((rows >= n) | (np.diff(rows, prepend=-1) <= 0))
     if bad.size:
-        raise InputError(f"{path}: element {element!r}, row {bad[0]}: index {rows[bad[0]]} must rise and be below {n}, "
-                         "the number of vertices; export again")
+        raise InputError(
+            f"{path}: element {element!r}, row {bad[0]}: index {rows[bad[0]]} must rise and be below {n}, "
+            "the number of vertices; export again"
+        )
     return rows
 
 

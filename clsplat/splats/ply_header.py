@@ -13,9 +13,19 @@ from ..errors import InputError
 BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 REAL_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
 INTEGER_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
-    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-}  # fmt: skip
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+}
 SIDE_PREFIX = "clsplat_"  # of the names of elements that may follow the vertices (ply_compact.py)
 _MAX_LINE = 4096
 _MAX_LINES = 4096

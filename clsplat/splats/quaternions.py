@@ -27,12 +27,15 @@ def rotations_vjp(quat: Array, v: Array) -> Array:
     sums, gaps = v + v.transpose(0, 2, 1), v - v.transpose(0, 2, 1)
     xy, xz, yz = sums[:, 0, 1], sums[:, 0, 2], sums[:, 1, 2]
     zy, xz_gap, yx = gaps[:, 2, 1], gaps[:, 0, 2], gaps[:, 1, 0]
-    v_unit = 2 * np.stack([
-        x * zy + y * xz_gap + z * yx,
-        w * zy + y * xy + z * xz - 2 * x * (v[:, 1, 1] + v[:, 2, 2]),
-        w * xz_gap + x * xy + z * yz - 2 * y * (v[:, 0, 0] + v[:, 2, 2]),
-        w * yx + x * xz + y * yz - 2 * z * (v[:, 0, 0] + v[:, 1, 1]),
-    ], axis=1)
+    v_unit = 2 * np.stack(
+        [
+            x * zy + y * xz_gap + z * yx,
+            w * zy + y * xy + z * xz - 2 * x * (v[:, 1, 1] + v[:, 2, 2]),
+            w * xz_gap + x * xy + z * yz - 2 * y * (v[:, 0, 0] + v[:, 2, 2]),
+            w * yx + x * xz + y * yz - 2 * z * (v[:, 0, 0] + v[:, 1, 1]),
+        ],
+        axis=1,
+    )
     along = np.sum(unit * v_unit, axis=1, keepdims=True)
     gradient: Array = (v_unit - along * unit) / norm
     return gradient

@@ -98,41 +98,113 @@ _SKEW_FLOPS = (QUADRATIC + EXP + 1 + 2 + PHI + 1, DENSITY + 1 + 2 + 2 + MOMENTS 
 # above 1, alpha 3; below 1, density 2, w and z 2, both opacities 4, sum and moments of z 5.
 _TWO_SIDED_FLOPS = (QUADRATIC + EXP + 2 + PHI + 1 + 3, 1 + DENSITY + 2 + 2 + 4 + MOMENTS + 5)
 
-GAUSSIAN = Shape("gaussian", "shape/gaussian.clh", (), record=5, moments=6, profile=profiles.gaussian,
-                 flops=_GAUSSIAN_FLOPS, lower=("shape/gaussian_pixel.clh",))
-SKEW_NORMAL = Shape("skew-normal", "shape/skew_normal.clh", (SKEW,), record=12, moments=9,
-                    profile=profiles.skew_normal, flops=_SKEW_FLOPS, skew_form="centred", normalised=True,
-                    lower=("shape/skew_pixel.clh",))
+GAUSSIAN = Shape(
+    "gaussian",
+    "shape/gaussian.clh",
+    (),
+    record=5,
+    moments=6,
+    profile=profiles.gaussian,
+    flops=_GAUSSIAN_FLOPS,
+    lower=("shape/gaussian_pixel.clh",),
+)
+SKEW_NORMAL = Shape(
+    "skew-normal",
+    "shape/skew_normal.clh",
+    (SKEW,),
+    record=12,
+    moments=9,
+    profile=profiles.skew_normal,
+    flops=_SKEW_FLOPS,
+    skew_form="centred",
+    normalised=True,
+    lower=("shape/skew_pixel.clh",),
+)
 
 # As skew-normal splatting was published: (x, y, z) is the location, R S S R' the scale matrix.
-SKEW_NORMAL_DIRECT = Shape("skew-normal-direct", "shape/skew_normal_direct.clh", (SLANT,), record=12, moments=9,
-                           profile=profiles.skew_normal_direct, flops=_SKEW_FLOPS, skew_form="direct", normalised=True,
-                           lower=("shape/skew_pixel.clh", "shape/displacement.clh"))
+SKEW_NORMAL_DIRECT = Shape(
+    "skew-normal-direct",
+    "shape/skew_normal_direct.clh",
+    (SLANT,),
+    record=12,
+    moments=9,
+    profile=profiles.skew_normal_direct,
+    flops=_SKEW_FLOPS,
+    skew_form="direct",
+    normalised=True,
+    lower=("shape/skew_pixel.clh", "shape/displacement.clh"),
+)
 # A plane through the location, one opacity a side, projected exactly.
-HALF_GAUSSIAN = Shape("half-gaussian", "shape/half_gaussian.clh", (OPACITY_MINUS, NORMAL), record=10, moments=10,
-                      profile=profiles.half_gaussian, flops=_TWO_SIDED_FLOPS,
-                      lower=("shape/displacement.clh", "shape/two_sided.clh"))
+HALF_GAUSSIAN = Shape(
+    "half-gaussian",
+    "shape/half_gaussian.clh",
+    (OPACITY_MINUS, NORMAL),
+    record=10,
+    moments=10,
+    profile=profiles.half_gaussian,
+    flops=_TWO_SIDED_FLOPS,
+    lower=("shape/displacement.clh", "shape/two_sided.clh"),
+)
 # The same divided by a finite skew: gaussian (equal opacities), skew-normal-direct (one of them 0), half-gaussian
 # (infinite skew) are its limits.
-BISECTED_SKEW = Shape("bisected-skew", "shape/bisected_skew.clh", (OPACITY_MINUS, SLANT), record=10, moments=10,
-                      profile=profiles.bisected_skew, flops=_TWO_SIDED_FLOPS, skew_form="direct",
-                      lower=("shape/displacement.clh", "shape/two_sided.clh"))
-GENERALISED_EXPONENTIAL = Shape("generalised-exponential", "shape/generalised_exponential.clh", (BETA,), record=6,
-                                moments=7, profile=profiles.generalised_exponential,
-                                # times beta, times opacity; w, its power, quotient 3, sums
-                                flops=(QUADRATIC + LOG + 1 + EXP + EXP + 1, 3 + 1 + MOMENTS + 2))
+BISECTED_SKEW = Shape(
+    "bisected-skew",
+    "shape/bisected_skew.clh",
+    (OPACITY_MINUS, SLANT),
+    record=10,
+    moments=10,
+    profile=profiles.bisected_skew,
+    flops=_TWO_SIDED_FLOPS,
+    skew_form="direct",
+    lower=("shape/displacement.clh", "shape/two_sided.clh"),
+)
+GENERALISED_EXPONENTIAL = Shape(
+    "generalised-exponential",
+    "shape/generalised_exponential.clh",
+    (BETA,),
+    record=6,
+    moments=7,
+    profile=profiles.generalised_exponential,
+    # times beta, times opacity; w, its power, quotient 3, sums
+    flops=(QUADRATIC + LOG + 1 + EXP + EXP + 1, 3 + 1 + MOMENTS + 2),
+)
 # GES as released: beta only scales the Gaussian, by 2 / (1 + exp(-0.1 (beta - 2))).
-GES_MODULATION = Shape("ges-modulation", "shape/ges_modulation.clh", (BETA,), record=5, moments=6,
-                       profile=profiles.gaussian, flops=_GAUSSIAN_FLOPS, lower=("shape/gaussian_pixel.clh",))
-STUDENT_T = Shape("student-t", "shape/student_t.clh", (NU,), record=6, moments=7, profile=profiles.student_t,
-                  # times nu, times opacity; inverse, share, e, g 5, gap 9, sums
-                  flops=(QUADRATIC + LOG1P + 1 + EXP + 1, 5 + 9 + 1 + MOMENTS + 4), signed=True)
+GES_MODULATION = Shape(
+    "ges-modulation",
+    "shape/ges_modulation.clh",
+    (BETA,),
+    record=5,
+    moments=6,
+    profile=profiles.gaussian,
+    flops=_GAUSSIAN_FLOPS,
+    lower=("shape/gaussian_pixel.clh",),
+)
+STUDENT_T = Shape(
+    "student-t",
+    "shape/student_t.clh",
+    (NU,),
+    record=6,
+    moments=7,
+    profile=profiles.student_t,
+    # times nu, times opacity; inverse, share, e, g 5, gap 9, sums
+    flops=(QUADRATIC + LOG1P + 1 + EXP + 1, 5 + 9 + 1 + MOMENTS + 4),
+    signed=True,
+)
 
 # In the order in which a file without clsplat's comment is matched by its columns.
 SHAPES = {
-    shape.name: shape for shape in (GAUSSIAN, SKEW_NORMAL, SKEW_NORMAL_DIRECT, HALF_GAUSSIAN, BISECTED_SKEW,
-                                    GENERALISED_EXPONENTIAL, GES_MODULATION, STUDENT_T)
-}  # fmt: skip
+    shape.name: shape
+    for shape in (
+        GAUSSIAN,
+        SKEW_NORMAL,
+        SKEW_NORMAL_DIRECT,
+        HALF_GAUSSIAN,
+        BISECTED_SKEW,
+        GENERALISED_EXPONENTIAL,
+        GES_MODULATION,
+        STUDENT_T,
+    )
+}
 DEFAULT_SHAPE = SKEW_NORMAL.name
 
 

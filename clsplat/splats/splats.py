@@ -33,7 +33,7 @@ class Splats:
         16, and the shape's own, such as skew (N, 3); the shape's own may be left out (neutral). Copied;
         float32 unless all are float64 arrays.
     normalisation : "peak", "pdf" or "none".
-    antialiased : whether opacities fall as the low-pass widens small splats (cl/render/project.cl), as they did in training.
+    antialiased : whether opacities fall as the low-pass widens small splats, as they did in training.
 
     Raises
     ------
@@ -48,8 +48,9 @@ class Splats:
     _schema: Schema
     _shape: str
 
-    def __init__(self, shape: str, arrays: Mapping[str, ArrayLike], normalisation: str = "peak",
-                 antialiased: bool = False) -> None:
+    def __init__(
+        self, shape: str, arrays: Mapping[str, ArrayLike], normalisation: str = "peak", antialiased: bool = False
+    ) -> None:
         descriptor = shape_named(shape)
         double = all(getattr(values, "dtype", None) == np.float64 for values in arrays.values())
         dtype: np.dtype[Any] = np.dtype(np.float64 if double and arrays else np.float32)
@@ -126,9 +127,7 @@ class Splats:
         if not ((colours >= 0.0) & (colours <= 1.0)).all():
             raise InputError("points: rgb is out of range; give whole numbers 0..255 or real numbers 0..1")
         if not 0.0 < opacity < 1.0 or not 0.0 < scale_factor < np.inf:
-            raise InputError(
-                f"points: opacity={opacity} must lie between 0 and 1, scale_factor={scale_factor} above 0"
-            )
+            raise InputError(f"points: opacity={opacity} must lie between 0 and 1, scale_factor={scale_factor} above 0")
         if sh_degree not in range(MAX_SH_DEGREE + 1):
             raise InputError(f"points: sh_degree is {sh_degree}; choose 0 to {MAX_SH_DEGREE}")
         n = len(points)
@@ -256,8 +255,10 @@ class Splats:
             opacity = source.opacity(raw.astype(np.float64))
             negative = int(np.sum(opacity < 0))
             if negative:
-                raise InputError(f"splats: {negative} of {len(self)} have a negative opacity, which shape {name} has "
-                                 "not: remove them or choose another shape")
+                raise InputError(
+                    f"splats: {negative} of {len(self)} have a negative opacity, which shape {name} has "
+                    "not: remove them or choose another shape"
+                )
             arrays["opacity_logit"] = target.raw_opacity(np.clip(opacity, *_OPACITIES)).astype(raw.dtype)
         return Splats(name, arrays, self._normalisation, self._antialiased)
 

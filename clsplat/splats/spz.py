@@ -59,16 +59,21 @@ def write_spz(path: str | os.PathLike[str], splats: Splats) -> None:
         raise InputError(f"{path}: .spz files hold Gaussians, not {splats.shape} splats; convert them first")
     farthest = float(np.abs(splats.mean).max(initial=0.0))
     if farthest > _LARGEST:
-        raise InputError(f"{path}: a splat lies {farthest:.3g} units away, .spz files reach {_LARGEST}: remove it, or "
-                         "write a .ply")
+        raise InputError(
+            f"{path}: a splat lies {farthest:.3g} units away, .spz files reach {_LARGEST}: remove it, or write a .ply"
+        )
     bits = min(_FRACTION_BITS, math.floor(math.log2(_LARGEST / max(farthest, 1e-30))))
-    head = _HEADER.pack(_MAGIC, _VERSION, len(splats), splats.sh_degree, bits,
-                        _ANTIALIASED * splats.antialiased, 0)
+    head = _HEADER.pack(_MAGIC, _VERSION, len(splats), splats.sh_degree, bits, _ANTIALIASED * splats.antialiased, 0)
     opacity = GAUSSIAN.opacity(splats.opacity_logit.astype(np.float64))
     colour = _bytes(127.5 + 38.25 * splats.sh[:, 0])
-    parts: list[NDArray[Any]] = [_positions(splats.mean, bits), _bytes(255.0 * opacity), colour,
-                                 _bytes(16.0 * (10.0 + splats.log_scale)), _rotations(splats.quat),
-                                 _harmonics(splats.sh[:, 1:])]
+    parts: list[NDArray[Any]] = [
+        _positions(splats.mean, bits),
+        _bytes(255.0 * opacity),
+        colour,
+        _bytes(16.0 * (10.0 + splats.log_scale)),
+        _rotations(splats.quat),
+        _harmonics(splats.sh[:, 1:]),
+    ]
     with atomic_writer(path) as stream:
         # No name and no time in the gzip header: the same splats are the same bytes.
         stream.write(gzip.compress(head + b"".join(part.tobytes() for part in parts), mtime=0))
@@ -89,8 +94,10 @@ def read_spz(path: str | os.PathLike[str]) -> Splats:
                 raise InputError(f"{path}: is no .spz file (it ends in the header); export it again")
             magic, version, n, degree, bits, flags, _ = _HEADER.unpack(head)
             if magic != _MAGIC or version != _VERSION or degree > MAX_SH_DEGREE:
-                raise InputError(f"{path}: is no .spz file of version {_VERSION} with SH up to degree {MAX_SH_DEGREE}; "
-                                 "write it as .ply with the program that made it")
+                raise InputError(
+                    f"{path}: is no .spz file of version {_VERSION} with SH up to degree {MAX_SH_DEGREE}; "
+                    "write it as .ply with the program that made it"
+                )
             widths = (9, 1, 3, 3, 4, 3 * (sh_coefficients(degree) - 1))
             # A gzip stream is at most 1032 times its file: a count that lies is found before anything is allocated.
             if n * sum(widths) > _GZIP_MOST * path.stat().st_size:
@@ -110,10 +117,18 @@ def read_spz(path: str | os.PathLike[str]) -> Splats:
     sh = np.concatenate([(colour.reshape(n, 1, 3) - 127.5) / 38.25, (bands - 128.0) / 128.0], axis=1)
     with np.errstate(divide="ignore"):
         logit = np.clip(GAUSSIAN.raw_opacity(opacity / 255.0), -_LOGIT_MAX, _LOGIT_MAX)
-    arrays = {"mean": _places(places.reshape(n, 3, 3)) / 2.0**bits, "quat": _quaternions(rotation.view("<u4")),
-              "log_scale": scale.reshape(n, 3) / 16.0 - 10.0, "opacity_logit": logit, "sh": sh}
-    return Splats(GAUSSIAN.name, {name: values.astype(np.float32) for name, values in arrays.items()},
-                  antialiased=bool(flags & _ANTIALIASED))
+    arrays = {
+        "mean": _places(places.reshape(n, 3, 3)) / 2.0**bits,
+        "quat": _quaternions(rotation.view("<u4")),
+        "log_scale": scale.reshape(n, 3) / 16.0 - 10.0,
+        "opacity_logit": logit,
+        "sh": sh,
+    }
+    return Splats(
+        GAUSSIAN.name,
+        {name: values.astype(np.float32) for name, values in arrays.items()},
+        antialiased=bool(flags & _ANTIALIASED),
+    )
 
 
 def _places(low_first: Bytes) -> NDArray[np.int32]:

@@ -45,10 +45,17 @@ class Complexity:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, as `clsplat info --json` prints them and results.json has them."""
-        return {"splats": self.splats, "skewed": self.skewed, "skewed_fraction": self.skewed_fraction,
-                "fields_in_use": self.fields, "splats_by_band": list(self.bands),
-                "sh_coefficients": list(self.coefficients), "parameters_in_use": self.parameters,
-                "parameters": self.stored, "compact_bytes": self.compact_bytes}
+        return {
+            "splats": self.splats,
+            "skewed": self.skewed,
+            "skewed_fraction": self.skewed_fraction,
+            "fields_in_use": self.fields,
+            "splats_by_band": list(self.bands),
+            "sh_coefficients": list(self.coefficients),
+            "parameters_in_use": self.parameters,
+            "parameters": self.stored,
+            "compact_bytes": self.compact_bytes,
+        }
 
 
 def complexity(splats: Splats) -> Complexity:
@@ -63,6 +70,12 @@ def complexity(splats: Splats) -> Complexity:
     always = sum(field.width for field in schema if field.name != "sh" and field.name not in fields)
     parameters = n * always + sum(coefficients) + sum(schema[name].width * count for name, count in fields.items())
     single = {name: values.astype(np.float32) for name, values in splats.arrays.items()}
-    return Complexity(n, fields, tuple(int(count) for count in highest), coefficients, parameters,
-                      sum(values.size for values in splats.arrays.values()),
-                      layout_bytes(schema, plan_layout(schema, single), n))
+    return Complexity(
+        n,
+        fields,
+        tuple(int(count) for count in highest),
+        coefficients,
+        parameters,
+        sum(values.size for values in splats.arrays.values()),
+        layout_bytes(schema, plan_layout(schema, single), n),
+    )

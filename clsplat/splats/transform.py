@@ -109,15 +109,17 @@ def joined(parts: Sequence[Splats]) -> Splats:
             return _stacked(alike)
     if len(shapes) == 1:
         raise InputError("join: the splats are normalised differently; show one model at a time")
-    raise InputError(f"join: splats of shapes {', '.join(shapes)} have no equals in each other; bring them to one "
-                     "shape with `clsplat convert`, or show one model at a time")
+    raise InputError(
+        f"join: splats of shapes {', '.join(shapes)} have no equals in each other; bring them to one "
+        "shape with `clsplat convert`, or show one model at a time"
+    )
 
 
 def _stacked(parts: Sequence[Splats]) -> Splats:
     """Splats of one shape below each other; missing bands of colour are 0."""
     coefficients = max(part.sh.shape[1] for part in parts)
-    arrays = {name: np.concatenate([part.arrays[name] for part in parts])
-              for name in parts[0].arrays if name != "sh"}
-    arrays["sh"] = np.concatenate([np.pad(part.sh, ((0, 0), (0, coefficients - part.sh.shape[1]), (0, 0)))
-                                   for part in parts])
+    arrays = {name: np.concatenate([part.arrays[name] for part in parts]) for name in parts[0].arrays if name != "sh"}
+    arrays["sh"] = np.concatenate(
+        [np.pad(part.sh, ((0, 0), (0, coefficients - part.sh.shape[1]), (0, 0))) for part in parts]
+    )
     return next((part for part in parts if len(part)), parts[0]).with_arrays(arrays)

@@ -50,9 +50,16 @@ class Checkpoint:
 
     def save(self, path: Path) -> None:
         """Write; raises OutputError when the disk is full or the folder read-only (the old file stays)."""
-        meta = {"version": VERSION, "iteration": self.iteration, "config": self.config, "rng": self.rng,
-                "queue": self.queue, "seconds": self.seconds, "schedule": self.schedule,
-                "n_first": self.n_first}
+        meta = {
+            "version": VERSION,
+            "iteration": self.iteration,
+            "config": self.config,
+            "rng": self.rng,
+            "queue": self.queue,
+            "seconds": self.seconds,
+            "schedule": self.schedule,
+            "n_first": self.n_first,
+        }
         arrays = {f"splats.{k}": v for k, v in self.splats.items()}
         arrays |= {f"optimizer.{k}": v for k, v in self.optimizer.items()}
         arrays["signals"] = self.signals
@@ -79,8 +86,18 @@ class Checkpoint:
             return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
         try:
-            checkpoint = cls(meta["iteration"], meta["config"], part("splats."), part("optimizer."), meta["rng"],
-                             meta["queue"], meta["seconds"], meta["schedule"], meta["n_first"], arrays["signals"])
+            checkpoint = cls(
+                meta["iteration"],
+                meta["config"],
+                part("splats."),
+                part("optimizer."),
+                meta["rng"],
+                meta["queue"],
+                meta["seconds"],
+                meta["schedule"],
+                meta["n_first"],
+                arrays["signals"],
+            )
             checkpoint._check()
         except _DAMAGE as error:
             raise _unreadable(path, str(error)) from None
@@ -106,12 +123,29 @@ class Checkpoint:
             raise ValueError("its arrays are not of the same splats")
 
 
-_KINDS = {"iteration": int, "config": dict, "rng": dict, "queue": list, "seconds": int | float, "schedule": str,
-          "n_first": int}
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, OverflowError, EOFError, RecursionError, zipfile.BadZipFile,
-           zlib.error)
+_KINDS = {
+    "iteration": int,
+    "config": dict,
+    "rng": dict,
+    "queue": list,
+    "seconds": int | float,
+    "schedule": str,
+    "n_first": int,
+}
+_DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    OverflowError,
+    EOFError,
+    RecursionError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 def _unreadable(path: Path, why: str) -> InputError:
-    return InputError(f"{path}: not a readable checkpoint ({why.splitlines()[0] if why else 'damaged'}): "
-                      "start again with --overwrite")
+    return InputError(
+        f"{path}: not a readable checkpoint ({why.splitlines()[0] if why else 'damaged'}): start again with --overwrite"
+    )

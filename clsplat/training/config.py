@@ -24,11 +24,23 @@ SAMPLINGS = ("opacity", "pull")
 FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
 # What an option is where it is not given: what was best with that strategy on validation views (benchmarks/SYSTEMS.md).
 BY_STRATEGY: dict[str, dict[str, float]] = {
-    "mcmc": {"opacity_reg": 0.001, "scale_reg": 0.001, "noise_lr": 5e5, "densify_until": 0.8,
-             "init_opacity": 0.5, "init_scale": 0.5},
-    "adc": {"opacity_reg": 0.0, "scale_reg": 0.0, "noise_lr": 0.0, "densify_until": 0.5,
-            "init_opacity": 0.2, "init_scale": 0.7},
-}  # fmt: skip
+    "mcmc": {
+        "opacity_reg": 0.001,
+        "scale_reg": 0.001,
+        "noise_lr": 5e5,
+        "densify_until": 0.8,
+        "init_opacity": 0.5,
+        "init_scale": 0.5,
+    },
+    "adc": {
+        "opacity_reg": 0.0,
+        "scale_reg": 0.0,
+        "noise_lr": 0.0,
+        "densify_until": 0.5,
+        "init_opacity": 0.2,
+        "init_scale": 0.7,
+    },
+}
 PUBLISHED_ITERATIONS = 30_000  # that 3DGS's rates are meant for
 
 
@@ -189,11 +201,31 @@ class TrainConfig:
         _one_of("alternation", self.alternation, ALTERNATIONS)
         for name in ("iterations", "cap_max", "densify_interval", "alternation_cycle"):
             _at_least(name, getattr(self, name), 1)
-        for name in ("seed", "sh_interval", "checkpoint_interval", "position_lr_init", "position_lr_final",
-                     "opacity_lr", "scaling_lr", "rotation_lr", "feature_lr", "opacity_reg",
-                     "scale_reg", "bisect_reg", "exposure_pull", "normal_lr", "beta_lr", "nu_lr", "noise_lr",
-                     "sghmc_friction", "sghmc_burn_in_friction", "grad_threshold", "depth_threshold", "opacity_reset",
-                     "dense_size"):
+        for name in (
+            "seed",
+            "sh_interval",
+            "checkpoint_interval",
+            "position_lr_init",
+            "position_lr_final",
+            "opacity_lr",
+            "scaling_lr",
+            "rotation_lr",
+            "feature_lr",
+            "opacity_reg",
+            "scale_reg",
+            "bisect_reg",
+            "exposure_pull",
+            "normal_lr",
+            "beta_lr",
+            "nu_lr",
+            "noise_lr",
+            "sghmc_friction",
+            "sghmc_burn_in_friction",
+            "grad_threshold",
+            "depth_threshold",
+            "opacity_reset",
+            "dense_size",
+        ):
             _at_least(name, getattr(self, name), 0)
         if self.skew_lr is not None:
             _at_least("skew_lr", self.skew_lr, 0)
@@ -201,8 +233,14 @@ class TrainConfig:
             raise InputError(f"random_points {self.random_points}: must be 0 to 1, a fraction of cap_max")
         if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise InputError(f"sh_degree {self.sh_degree}: must be 0 to {MAX_SH_DEGREE}")
-        for name in ("lambda_dssim", "relocation_limit", "exposure_rate", "sghmc_burn_in", "alternation_warmup",
-                     "alternation_split"):
+        for name in (
+            "lambda_dssim",
+            "relocation_limit",
+            "exposure_rate",
+            "sghmc_burn_in",
+            "alternation_warmup",
+            "alternation_split",
+        ):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{name} {getattr(self, name)}: must be 0 to 1")
         if self.position_lr_init <= 0 or self.position_lr_final <= 0:
@@ -220,8 +258,9 @@ class TrainConfig:
         3DGS's rates belong to 30 000 iterations. p is 3/4 for positions, 1/2 for rotation and the shape's own, 1/4 for
         scale, 0 otherwise; measured on validation views at 1500 iterations (ARCHITECTURE.md, "Training").
         """
-        power = {"mean": 0.75, "quat": 0.5, "skew": 0.5, "normal": 0.5, "beta": 0.5, "nu": 0.5,
-                 "log_scale": 0.25}.get(field, 0.0)
+        power = {"mean": 0.75, "quat": 0.5, "skew": 0.5, "normal": 0.5, "beta": 0.5, "nu": 0.5, "log_scale": 0.25}.get(
+            field, 0.0
+        )
         return float(max(1.0, PUBLISHED_ITERATIONS / self.iterations) ** power)
 
     @property
@@ -233,8 +272,11 @@ class TrainConfig:
     def option_types(cls) -> dict[str, Any]:
         """The type of each option's values; X of those that are X or not given."""
         hints = get_type_hints(cls)
-        optional = {key: [part for part in get_args(hint) if part is not NoneType]
-                    for key, hint in hints.items() if isinstance(hint, UnionType)}
+        optional = {
+            key: [part for part in get_args(hint) if part is not NoneType]
+            for key, hint in hints.items()
+            if isinstance(hint, UnionType)
+        }
         return hints | {key: parts[0] for key, parts in optional.items()}
 
     def to_json(self) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 The exposure of a photo is an affine map from the render's colours to its own (as in 3DGS). Whenever a view is trained
 on, its exposure goes a part of the way to the one of least squares for the present render; the mean of all exposures
 stays the identity, which is what views without a photo are shown with. 3DGS learns exposures by Adam: as good at the
-best of three rates, worse at its own (ARCHITECTURE.md). The kernels are those of cl/train/exposure.cl; without exposures, masks
+best of three rates, worse at its own (ARCHITECTURE.md). Without exposures, masks
 and transparency none of them runs.
 """
 
@@ -66,20 +66,36 @@ class PhotoLoss:
         group = min(lane_group(self.device), items)
         size = -(-items // group) * group, layout.height
         shift = [255.0 * (new - old) for new, old in zip(background, self.background, strict=True)]
-        common = {"color": image("color", layout, 3), "truth": planes, "exposures": self._exposures,
-                  "view": truth.index, "channels": channels, "width": layout.width, "height": layout.height,
-                  "stride": layout.stride, "plane": layout.plane}
-        self.program.photo_of_render(size, (group, 1), photo=photo, target=target, shift_r=shift[0], shift_g=shift[1],
-                                     shift_b=shift[2], **common)
+        common = {
+            "color": image("color", layout, 3),
+            "truth": planes,
+            "exposures": self._exposures,
+            "view": truth.index,
+            "channels": channels,
+            "width": layout.width,
+            "height": layout.height,
+            "stride": layout.stride,
+            "plane": layout.plane,
+        }
+        self.program.photo_of_render(
+            size, (group, 1), photo=photo, target=target, shift_r=shift[0], shift_g=shift[1], shift_b=shift[2], **common
+        )
         v = self.loss.gradient(layout, target, photo, truth.counted)
         parts = items * layout.height
         partial = pool.get("exposure_partial", _SUMS * parts * self.kernels.dtype.itemsize)
         self.program.photo_of_render_vjp(size, (group, 1), v=v, target=target, partial=partial, **common)
         if self.learns:
             self.program.step_exposure(
-                (EXPOSURE_GROUP,), (EXPOSURE_GROUP,), exposures=self._exposures, partial=partial, parts=parts,
-                view=truth.index, views=len(self.truths.views), rate=self.config.exposure_rate,
-                pull=self.config.exposure_pull)
+                (EXPOSURE_GROUP,),
+                (EXPOSURE_GROUP,),
+                exposures=self._exposures,
+                partial=partial,
+                parts=parts,
+                view=truth.index,
+                views=len(self.truths.views),
+                rate=self.config.exposure_rate,
+                pull=self.config.exposure_pull,
+            )
         return v
 
     def exposures(self) -> NDArray[np.floating]:

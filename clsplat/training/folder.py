@@ -62,8 +62,7 @@ class ModelFolder:
         """Point cloud of `iteration`, or the last; raises InputError when there is none."""
         found = self.iterations()
         if not found:
-            raise InputError(f"{self.path}: no point_cloud/iteration_N/point_cloud.ply in it: "
-                             "train a model first")
+            raise InputError(f"{self.path}: no point_cloud/iteration_N/point_cloud.ply in it: train a model first")
         if iteration is not None and iteration not in found:
             raise InputError(f"{self.path}: no iteration {iteration}: it has {', '.join(map(str, found))}")
         chosen = found[-1] if iteration is None else iteration
@@ -82,8 +81,14 @@ class ModelFolder:
 
     def clear(self) -> None:
         """Remove what a former run wrote, and nothing else."""
-        for path in (self.checkpoint_path, self.log_path, self.config_path, self.cameras_path, self.exposures_path,
-                     *(self.path / name for name in ("results.json", "per_view.json", "report.html"))):
+        for path in (
+            self.checkpoint_path,
+            self.log_path,
+            self.config_path,
+            self.cameras_path,
+            self.exposures_path,
+            *(self.path / name for name in ("results.json", "per_view.json", "report.html")),
+        ):
             path.unlink(missing_ok=True)
         for iteration in self.iterations():
             ply = self.ply_path(iteration)

@@ -72,8 +72,15 @@ def initial_splats(
         xyz, rgb, message = _points(scene, init, cap, rng, random_share)
         order = morton_order(xyz)
         xyz, rgb = xyz[order], rgb[order]
-        splats = Splats.from_points(xyz, rgb, shape=shape, sh_degree=sh_degree, normalisation=normalisation,
-                                    opacity=opacity, scale_factor=scale_factor)
+        splats = Splats.from_points(
+            xyz,
+            rgb,
+            shape=shape,
+            sh_degree=sh_degree,
+            normalisation=normalisation,
+            opacity=opacity,
+            scale_factor=scale_factor,
+        )
     else:
         raise InputError(f"init {init!r}: choose sfm, random, or the path of a .ply model")
     return _started(splats, rng), message
@@ -100,8 +107,11 @@ def _points(
         if not beside:
             return xyz, rgb, message
         placed = random_points(scene, beside, rng)
-        return np.concatenate([xyz, placed]), np.concatenate([rgb, rgb[nearest_of(xyz, placed)]]), (
-            f"{message}, {beside} at random where the cameras look")
+        return (
+            np.concatenate([xyz, placed]),
+            np.concatenate([rgb, rgb[nearest_of(xyz, placed)]]),
+            (f"{message}, {beside} at random where the cameras look"),
+        )
     count = min(cap, RANDOM_POINTS)
     placed = random_points(scene, count, rng)
     rgb = rng.integers(0, 256, (count, 3), dtype=np.uint8)
@@ -136,8 +146,10 @@ def check_size(scene: Scene) -> None:
     if not len(depth) or np.mean(depth < NEAR) <= _TOO_NEAR:
         return
     factor = 10.0 ** np.ceil(np.log10(10 * NEAR / np.median(depth)))
-    raise InputError(f"{scene.path}: {np.mean(depth < NEAR):.0%} of what its cameras see is nearer than the near plane "
-                     f"({NEAR:g} units): make the reconstruction about {factor:g} times as large")
+    raise InputError(
+        f"{scene.path}: {np.mean(depth < NEAR):.0%} of what its cameras see is nearer than the near plane "
+        f"({NEAR:g} units): make the reconstruction about {factor:g} times as large"
+    )
 
 
 def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene: Scene) -> NDArray[np.int64]:
@@ -167,16 +179,21 @@ def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene
     return np.sort(np.concatenate([first, rest])[:cap])
 
 
-def _from_model(path: str, shape: str, cap: int, sh_degree: int, normalisation: str,
-                antialiased: bool) -> tuple[Splats, str]:
+def _from_model(
+    path: str, shape: str, cap: int, sh_degree: int, normalisation: str, antialiased: bool
+) -> tuple[Splats, str]:
     """A model from a file, in the wanted shape, SH degree and count."""
     loaded = Splats.load(path)
     if loaded.skew.any() and loaded.normalisation != normalisation:
-        raise InputError(f"{path}: its normalisation is {loaded.normalisation}, not {normalisation}: "
-                         f"choose normalisation {loaded.normalisation}")
+        raise InputError(
+            f"{path}: its normalisation is {loaded.normalisation}, not {normalisation}: "
+            f"choose normalisation {loaded.normalisation}"
+        )
     if loaded.antialiased != antialiased:
-        raise InputError(f"{path}: its splats are {'' if loaded.antialiased else 'not '}antialiased: "
-                         f"{'use' if loaded.antialiased else 'leave out'} --antialiased")
+        raise InputError(
+            f"{path}: its splats are {'' if loaded.antialiased else 'not '}antialiased: "
+            f"{'use' if loaded.antialiased else 'leave out'} --antialiased"
+        )
     message = f"{len(loaded)} splats from {path}"
     if len(loaded) > cap:
         strength = shape_named(loaded.shape).strength(loaded.arrays)

@@ -65,12 +65,25 @@ class ImageLoss:
         partial = self.pipeline.pool.get("loss_partial", 3 * n_parts * kernels.dtype.itemsize)
         group, count = self._group, 3 * layout.width * layout.height
         size, v_color = (-(-strips // group) * group, segments, 3), image("v_color", layout, 3)
-        common = {"rendered": image("color", layout, 3) if rendered is None else rendered, "truth": truth,
-                  "v_maps": image("loss_v_maps", layout, 9), "width": layout.width, "height": layout.height,
-                  "stride": layout.stride, "plane": layout.plane, "segment": segment}
+        common = {
+            "rendered": image("color", layout, 3) if rendered is None else rendered,
+            "truth": truth,
+            "v_maps": image("loss_v_maps", layout, 9),
+            "width": layout.width,
+            "height": layout.height,
+            "stride": layout.stride,
+            "plane": layout.plane,
+            "segment": segment,
+        }
         self.program.image_loss(size, (group, 1, 1), partial=partial, **common)
-        self.program.image_loss_vjp(size, (group, 1, 1), v_color=v_color, l1_scale=(1 - self.weight) / count,
-                                    ssim_scale=self.weight / count, **common)
+        self.program.image_loss_vjp(
+            size,
+            (group, 1, 1),
+            v_color=v_color,
+            l1_scale=(1 - self.weight) / count,
+            ssim_scale=self.weight / count,
+            **common,
+        )
         self._sums = (partial, n_parts, count, counted)
         return v_color
 

@@ -38,8 +38,10 @@ class Estimate:
         return self.splats + self.isects + self.images
 
     def __str__(self) -> str:
-        return (f"{self.total / 1e6:.0f} MB of device memory (splats {self.splats / 1e6:.0f}, "
-                f"splat-tile pairs {self.isects / 1e6:.0f}, images {self.images / 1e6:.0f})")
+        return (
+            f"{self.total / 1e6:.0f} MB of device memory (splats {self.splats / 1e6:.0f}, "
+            f"splat-tile pairs {self.isects / 1e6:.0f}, images {self.images / 1e6:.0f})"
+        )
 
 
 def peak_bytes() -> int:
@@ -63,8 +65,13 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, tru
     extra += 0 if config.position_optimizer == "adam" else 6  # momentum
     buffers = [rows[Group.SH] * n * real, 9 * layout.plane * real]
     splat = _ROLES * rows[Group.GEOM] + (_ROLES - 1) * rows[Group.SH] + COMPACT_ROWS + extra
-    return Estimate(n * (splat * real + screen), n_isects * isect,
-                    _IMAGE_PLANES * layout.plane * real + truth_bytes, isect, max(buffers))
+    return Estimate(
+        n * (splat * real + screen),
+        n_isects * isect,
+        _IMAGE_PLANES * layout.plane * real + truth_bytes,
+        isect,
+        max(buffers),
+    )
 
 
 def room_for_isects(needed: Estimate, device: Device) -> int:
@@ -77,8 +84,9 @@ def check(needed: Estimate, device: Device) -> None:
     info = device.info
     mend = "lower --cap-max, use smaller images (-r 2, 4, 8), a lower --sh-degree, or another --device"
     if needed.total > info.global_mem_bytes and room_for_isects(needed, device) < _LEAST_ISECTS:
-        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, "
-                          f"the run needs about {needed}: {mend}")
+        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, the run needs about {needed}: {mend}")
     if needed.largest_buffer > info.max_alloc_bytes:
-        raise DeviceError(f"{info} allows {info.max_alloc_bytes / 1e6:.0f} MB in one buffer, "
-                          f"the run needs about {needed.largest_buffer / 1e6:.0f} MB: {mend}")
+        raise DeviceError(
+            f"{info} allows {info.max_alloc_bytes / 1e6:.0f} MB in one buffer, "
+            f"the run needs about {needed.largest_buffer / 1e6:.0f} MB: {mend}"
+        )

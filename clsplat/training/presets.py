@@ -29,14 +29,32 @@ def _gaussian_splatting() -> Values:
     mean gradient above 2e-4, clone below 0.01 of the extent and split above. Opacities are reset every 3000 of 30 000.
     """
     return {
-        "shape": "gaussian", "strategy": "adc", "position_optimizer": "adam", "alternation": "off",
-        "position_lr_init": 1.6e-4, "position_lr_final": 1.6e-6, "feature_lr": 2.5e-3, "opacity_lr": 0.05,
-        "scaling_lr": 5e-3, "rotation_lr": 1e-3, "lambda_dssim": 0.2,
-        "opacity_reg": 0.0, "scale_reg": 0.0, "bisect_reg": 0.0, "noise_lr": 0.0,
-        "init_opacity": 0.1, "init_scale": 1.0, "random_points": 0.0,
-        "densify_from": 500 / 30_000, "densify_until": 15_000 / 30_000, "densify_interval": 100,
-        "grad_threshold": 2e-4, "depth_threshold": 0.0, "dense_size": 0.01, "opacity_reset": 10,
-    }  # fmt: skip
+        "shape": "gaussian",
+        "strategy": "adc",
+        "position_optimizer": "adam",
+        "alternation": "off",
+        "position_lr_init": 1.6e-4,
+        "position_lr_final": 1.6e-6,
+        "feature_lr": 2.5e-3,
+        "opacity_lr": 0.05,
+        "scaling_lr": 5e-3,
+        "rotation_lr": 1e-3,
+        "lambda_dssim": 0.2,
+        "opacity_reg": 0.0,
+        "scale_reg": 0.0,
+        "bisect_reg": 0.0,
+        "noise_lr": 0.0,
+        "init_opacity": 0.1,
+        "init_scale": 1.0,
+        "random_points": 0.0,
+        "densify_from": 500 / 30_000,
+        "densify_until": 15_000 / 30_000,
+        "densify_interval": 100,
+        "grad_threshold": 2e-4,
+        "depth_threshold": 0.0,
+        "dense_size": 0.01,
+        "opacity_reset": 10,
+    }
 
 
 def _generalised_exponential() -> Values:
@@ -48,9 +66,13 @@ def _generalised_exponential() -> Values:
     beta every 1000 iterations and the removal of splats that beta has shrunk below 0.005.
     """
     return _gaussian_splatting() | {
-        "shape": "ges-modulation", "beta_lr": 5e-4, "grad_threshold": 3e-4,
-        "densify_from": 500 / 40_000, "densify_until": 15_000 / 40_000, "opacity_reset": 13,
-    }  # fmt: skip
+        "shape": "ges-modulation",
+        "beta_lr": 5e-4,
+        "grad_threshold": 3e-4,
+        "densify_from": 500 / 40_000,
+        "densify_until": 15_000 / 40_000,
+        "opacity_reset": 13,
+    }
 
 
 def _half_gaussian() -> Values:
@@ -71,10 +93,19 @@ def _mcmc() -> Values:
     to 25 000 of 30 000 all dead splats are relocated (opacity and scale by the Gaussian's coefficient), and 5 % added.
     """
     return _gaussian_splatting() | {
-        "strategy": "mcmc", "relocation": "length", "relocation_limit": 1.0, "sampling": "opacity", "growth": 1.05,
-        "opacity_reg": 0.01, "scale_reg": 0.01, "noise_lr": 5e5, "init_opacity": 0.5, "init_scale": 0.1,
-        "densify_until": 25_000 / 30_000, "opacity_reset": 0,
-    }  # fmt: skip
+        "strategy": "mcmc",
+        "relocation": "length",
+        "relocation_limit": 1.0,
+        "sampling": "opacity",
+        "growth": 1.05,
+        "opacity_reg": 0.01,
+        "scale_reg": 0.01,
+        "noise_lr": 5e5,
+        "init_opacity": 0.5,
+        "init_scale": 0.1,
+        "densify_until": 25_000 / 30_000,
+        "opacity_reset": 0,
+    }
 
 
 def _student_t() -> Values:
@@ -88,10 +119,17 @@ def _student_t() -> Values:
     halves. Not as released: the derivative by nu is the correct one, the low-pass of 0.3 px^2 stays on.
     """
     return _mcmc() | {
-        "shape": "student-t", "position_optimizer": "sghmc-sss", "sghmc_friction": 120.0,
-        "sghmc_burn_in": 7000 / 30_000, "sghmc_burn_in_friction": 5e5, "noise_lr": 0.0,
-        "opacity_lr": 5e-3, "nu_lr": 0.033, "relocation": "length-squared", "relocation_limit": 0.05,
-    }  # fmt: skip
+        "shape": "student-t",
+        "position_optimizer": "sghmc-sss",
+        "sghmc_friction": 120.0,
+        "sghmc_burn_in": 7000 / 30_000,
+        "sghmc_burn_in_friction": 5e5,
+        "noise_lr": 0.0,
+        "opacity_lr": 5e-3,
+        "nu_lr": 0.033,
+        "relocation": "length-squared",
+        "relocation_limit": 0.05,
+    }
 
 
 def _skew_normal() -> Values:
@@ -106,14 +144,30 @@ def _skew_normal() -> Values:
     baselines suggest SSS's code); the rates of all else: clsplat's defaults, which are 3DGS's.
     """
     return {
-        "shape": "skew-normal-direct", "normalisation": "none", "skew_map": "polar", "skew_lr": 1.25e-2,
-        "strategy": "mcmc", "relocation": "length", "relocation_limit": 0.05, "sampling": "opacity", "growth": 1.05,
-        "position_optimizer": "sghmc", "sghmc_friction": 120.0, "sghmc_burn_in": 7000 / 30_000,
-        "sghmc_burn_in_friction": 5e5, "noise_lr": 0.0, "alternation": "cyclic",
-        "opacity_reg": 0.0, "scale_reg": 0.0, "bisect_reg": 0.0, "lambda_dssim": 0.2,
-        "densify_from": 500 / 30_000, "densify_until": 25_000 / 30_000, "densify_interval": 100,
+        "shape": "skew-normal-direct",
+        "normalisation": "none",
+        "skew_map": "polar",
+        "skew_lr": 1.25e-2,
+        "strategy": "mcmc",
+        "relocation": "length",
+        "relocation_limit": 0.05,
+        "sampling": "opacity",
+        "growth": 1.05,
+        "position_optimizer": "sghmc",
+        "sghmc_friction": 120.0,
+        "sghmc_burn_in": 7000 / 30_000,
+        "sghmc_burn_in_friction": 5e5,
+        "noise_lr": 0.0,
+        "alternation": "cyclic",
+        "opacity_reg": 0.0,
+        "scale_reg": 0.0,
+        "bisect_reg": 0.0,
+        "lambda_dssim": 0.2,
+        "densify_from": 500 / 30_000,
+        "densify_until": 25_000 / 30_000,
+        "densify_interval": 100,
         "random_points": 0.0,
-    }  # fmt: skip
+    }
 
 
 def _bisected_skew() -> Values:
@@ -126,14 +180,23 @@ def _bisected_skew() -> Values:
     to 100 px about as many splats exceed as the first; the weight of the regulariser, 0.001 as clsplat's others; the
     rate of the skew, 1.25e-2 as for SNS; all other rates and the first threshold: 3DGS's.
     """
-    return _gaussian_splatting() | {"shape": "bisected-skew", "skew_lr": 1.25e-2, "depth_threshold": 1e-5,
-                                    "bisect_reg": 0.001}
+    return _gaussian_splatting() | {
+        "shape": "bisected-skew",
+        "skew_lr": 1.25e-2,
+        "depth_threshold": 1e-5,
+        "bisect_reg": 0.001,
+    }
 
 
 PRESETS: dict[str, Callable[[], Values]] = {
-    "3dgs": _gaussian_splatting, "ges": _generalised_exponential, "3d-hgs": _half_gaussian, "sss": _student_t,
-    "sns": _skew_normal, "3dsgs": _bisected_skew, "3dgs-mcmc": _mcmc,
-}  # fmt: skip
+    "3dgs": _gaussian_splatting,
+    "ges": _generalised_exponential,
+    "3d-hgs": _half_gaussian,
+    "sss": _student_t,
+    "sns": _skew_normal,
+    "3dsgs": _bisected_skew,
+    "3dgs-mcmc": _mcmc,
+}
 
 
 def preset(name: str) -> Values:
@@ -162,6 +225,7 @@ def with_preset(name: str, given: Mapping[str, Any]) -> Values:
     values = preset(name)
     for key in IDENTITY:
         if key in values and given.get(key, values[key]) != values[key]:
-            raise InputError(f"preset {name} has {key} {values[key]}, which contradicts {key} {given[key]}: "
-                             "leave out one of the two")
+            raise InputError(
+                f"preset {name} has {key} {values[key]}, which contradicts {key} {given[key]}: leave out one of the two"
+            )
     return values | dict(given)

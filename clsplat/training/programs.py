@@ -34,8 +34,13 @@ def loss_program(device: Device, kernels: KernelBuild) -> Program:
 
 def exposure_program(device: Device, kernels: KernelBuild) -> Program:
     """Exposure, masks and transparency. The program depends on lanes and precision only."""
-    defines: dict[str, Define] = {"LANES": kernels.lanes, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y,
-                                  "PHOTO_VECS": EXPOSURE_VECS, "EXPOSURE_GROUP": EXPOSURE_GROUP}
+    defines: dict[str, Define] = {
+        "LANES": kernels.lanes,
+        "MARGIN_X": MARGIN_X,
+        "MARGIN_Y": MARGIN_Y,
+        "PHOTO_VECS": EXPOSURE_VECS,
+        "EXPOSURE_GROUP": EXPOSURE_GROUP,
+    }
     return build(device, ("math/lanes.clh", "train/exposure.cl"), defines, kernels.real)
 
 
@@ -44,9 +49,24 @@ def optim_program(device: Device, kernels: KernelBuild) -> Program:
     wanted = ("ROW_", "LANES", "SKEW_", "SLANT_", "OPACITY_", "SH_", "GEOM_")
     defines = {k: v for k, v in kernels.defines().items() if k.startswith(wanted)}
     # 1 - beta is a constant of its own: as a difference of float32 it is off by 1e-5.
-    defines |= {"ADAM_BETA1": adam.BETA1, "ADAM_BETA2": adam.BETA2, "ADAM_EPS": adam.EPS,
-                "ADAM_REST1": 1.0 - adam.BETA1, "ADAM_REST2": 1.0 - adam.BETA2,
-                "SKEW_MAP": SKEW_MAPS.index(kernels.skew_map), "ADAM_WAITS": adam.WAITS}
-    files = ("math/lanes.clh", "math/algebra.clh", "math/opacity.clh", "math/harmonics.clh", "train/skew_map.clh",
-             "math/noise.clh", "train/adam.clh", "train/optim.cl", "train/lazy.cl")
+    defines |= {
+        "ADAM_BETA1": adam.BETA1,
+        "ADAM_BETA2": adam.BETA2,
+        "ADAM_EPS": adam.EPS,
+        "ADAM_REST1": 1.0 - adam.BETA1,
+        "ADAM_REST2": 1.0 - adam.BETA2,
+        "SKEW_MAP": SKEW_MAPS.index(kernels.skew_map),
+        "ADAM_WAITS": adam.WAITS,
+    }
+    files = (
+        "math/lanes.clh",
+        "math/algebra.clh",
+        "math/opacity.clh",
+        "math/harmonics.clh",
+        "train/skew_map.clh",
+        "math/noise.clh",
+        "train/adam.clh",
+        "train/optim.cl",
+        "train/lazy.cl",
+    )
     return build(device, files, defines, kernels.real)

@@ -94,15 +94,17 @@ class TrainingDisplay:
     quiet : show nothing. stream, clock : as of `LiveLine`.
     """
 
-    def __init__(self, quiet: bool = False, stream: TextIO | None = None,
-                 clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, quiet: bool = False, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.quiet, self._line = quiet, LiveLine(stream, clock)
 
     def __enter__(self) -> TrainingDisplay:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._line.close()
 
     def __call__(self, progress: Progress) -> None:
@@ -125,9 +127,13 @@ def progress_line(progress: Progress, columns: int = 0) -> str:
     share = progress.iteration / progress.iterations
     count = f"{progress.iteration}/{progress.iterations}"
     speed = f"{progress.per_second:.{0 if progress.per_second >= 10 else 1}f} it/s"
-    fields = {"loss": f"loss {progress.loss:.4f}", "PSNR": f"PSNR {progress.psnr:.2f}",
-              "splats": f"{progress.n_splats} splats", "speed": speed,
-              "left": f"{duration(progress.seconds_left)} left"}
+    fields = {
+        "loss": f"loss {progress.loss:.4f}",
+        "PSNR": f"PSNR {progress.psnr:.2f}",
+        "splats": f"{progress.n_splats} splats",
+        "speed": speed,
+        "left": f"{duration(progress.seconds_left)} left",
+    }
     percents = f"{share:4.0%}"
     for dropped in ("loss", "speed", "splats", "PSNR"):
         if not columns or len("  ".join([f"{count} {percents}", *fields.values()])) <= columns:

@@ -16,13 +16,13 @@ from .config import TrainConfig
 
 # By option: the field whose rates grow in short runs with it, and the most that a step may be.
 LIMITS = {
-    "position_lr_init": ("mean", 0.03),      # scene extents
+    "position_lr_init": ("mean", 0.03),  # scene extents
     "position_lr_final": ("mean", 0.03),
-    "scaling_lr": ("log_scale", 0.1),        # of a logarithm
-    "rotation_lr": ("quat", 0.1),            # of a quaternion, about half the angle [rad]
-    "opacity_lr": ("opacity_logit", 0.4),    # of a logit
-    "feature_lr": ("sh", 0.08),              # of a colour's coefficient
-}  # fmt: skip
+    "scaling_lr": ("log_scale", 0.1),  # of a logarithm
+    "rotation_lr": ("quat", 0.1),  # of a quaternion, about half the angle [rad]
+    "opacity_lr": ("opacity_logit", 0.4),  # of a logit
+    "feature_lr": ("sh", 0.08),  # of a colour's coefficient
+}
 
 
 def check_rates(config: TrainConfig) -> None:
@@ -38,5 +38,7 @@ def check_rates(config: TrainConfig) -> None:
         if rate > most:
             digit = 10.0 ** (math.floor(math.log10(most)) - 1)
             usable = digit * math.floor(most / digit)  # rounded down: it must pass
-            raise InputError(f"{name} {rate:g}: each of {config.iterations} iterations would take steps of "
-                             f"{rate * factor:.2g}, and training falls apart above {limit:g}: use at most {usable:.2g}")
+            raise InputError(
+                f"{name} {rate:g}: each of {config.iterations} iterations would take steps of "
+                f"{rate * factor:.2g}, and training falls apart above {limit:g}: use at most {usable:.2g}"
+            )

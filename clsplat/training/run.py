@@ -19,9 +19,17 @@ from .trainer import Model, Trainer, Visit
 __all__ = ["Model", "Progress", "train"]
 
 
-def train(scene: Scene, config: TrainConfig | None = None, progress: Callable[[Progress], None] | None = None, *,
-          output: str | Path | None = None, resume: bool = False, overwrite: bool = False,
-          extra: dict[str, Any] | None = None, visit: Visit | None = None) -> Model:
+def train(
+    scene: Scene,
+    config: TrainConfig | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    *,
+    output: str | Path | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    extra: dict[str, Any] | None = None,
+    visit: Visit | None = None,
+) -> Model:
     """Learn a splat model of a scene's training views.
 
     Parameters
@@ -67,6 +75,8 @@ def _fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:
     stored = TrainConfig.from_json(checkpoint.config).to_json()
     for key, value in config.to_json().items():
         if key not in FREE_OPTIONS and stored[key] != value:
-            raise InputError(f"{folder.path}: --resume with {key}={value}, but the run was started with "
-                             f"{key}={stored[key]}: use the same options, or --overwrite to start again")
+            raise InputError(
+                f"{folder.path}: --resume with {key}={value}, but the run was started with "
+                f"{key}={stored[key]}: use the same options, or --overwrite to start again"
+            )
     return checkpoint

@@ -78,8 +78,9 @@ def resolution_schedule(
     falling = all(a > b for a, b in pairwise(downscales))
     ends_fit = bool(stages) and fractions[0] == 0 and fractions[-1] < 1 and downscales[-1] == 1
     if not (ends_fit and rising and falling):
-        raise InputError(f"resolution schedule {list(stages)}: fractions must rise from 0 to below 1 "
-                         "and downscales fall to 1")
+        raise InputError(
+            f"resolution schedule {list(stages)}: fractions must rise from 0 to below 1 and downscales fall to 1"
+        )
     schedule: list[tuple[int, int]] = []
     for (fraction, downscale), upcoming in zip(stages, [*fractions[1:], 1.0], strict=True):
         too_small = downscale > 1 and image_side is not None and image_side < smallest_side * downscale

@@ -62,8 +62,9 @@ class Truths:
     channels : of `truth_channels`.
     """
 
-    def __init__(self, device: Device, kernels: KernelBuild, views: Sequence[View], budget: int,
-                 channels: int = _COLOR) -> None:
+    def __init__(
+        self, device: Device, kernels: KernelBuild, views: Sequence[View], budget: int, channels: int = _COLOR
+    ) -> None:
         self.device, self.views, self.budget, self.tile = device, views, budget, kernels.schedule.tile
         self.channels = channels
         self.program = loss_program(device, kernels)
@@ -112,8 +113,15 @@ class Truths:
         if upload is not None:
             cl.enqueue_barrier(self.device.queue, wait_for=[upload.event])
             self._unpacked[upload.slot] = self.program.unpack_image(
-                (layout.stride, layout.rows), (16, 1), bytes=upload.packed, truth=truth.buffer,
-                channels=self.channels, width=layout.width, height=layout.height, plane=layout.plane)
+                (layout.stride, layout.rows),
+                (16, 1),
+                bytes=upload.packed,
+                truth=truth.buffer,
+                channels=self.channels,
+                width=layout.width,
+                height=layout.height,
+                plane=layout.plane,
+            )
             truth.upload = None
         return truth.buffer
 

@@ -79,8 +79,14 @@ class Model:
 class Trainer:
     """One run: its device state and its loop."""
 
-    def __init__(self, scene: Scene, config: TrainConfig, checkpoint: Checkpoint | None = None,
-                 progress: Callable[[Progress], None] | None = None, device: Device | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        checkpoint: Checkpoint | None = None,
+        progress: Callable[[Progress], None] | None = None,
+        device: Device | None = None,
+    ) -> None:
         if not scene.train:
             raise InputError(f"{scene.path}: no training views: all are test views")
         check_rates(config)
@@ -88,22 +94,42 @@ class Trainer:
         self.device = device or open_device(config.device)
         # A resumed run keeps its schedule: another one would round otherwise.
         schedule = Schedule.parse(checkpoint.schedule) if checkpoint else schedule_for(self.device)
-        self.kernels = KernelBuild(config.shape, config.sh_degree, schedule, config.normalisation,
-                                   skew_map=config.map or SKEW_MAPS[0], antialiased=config.antialiased)
+        self.kernels = KernelBuild(
+            config.shape,
+            config.sh_degree,
+            schedule,
+            config.normalisation,
+            skew_map=config.map or SKEW_MAPS[0],
+            antialiased=config.antialiased,
+        )
         largest = max((view.camera for view in scene.train), key=lambda c: c.width * c.height)
         budget, tile = truth_budget(self.device), self.kernels.schedule.tile
         channels = truth_channels(scene.train, config.random_background)
         layout = ImageLayout(largest.width, largest.height, tile)
-        self.memory = estimate(config, self.kernels, layout, truth_bytes(scene.train, budget, tile, channels)
-                               + photo_bytes(layout, self.kernels.dtype.itemsize, config, channels))
+        self.memory = estimate(
+            config,
+            self.kernels,
+            layout,
+            truth_bytes(scene.train, budget, tile, channels)
+            + photo_bytes(layout, self.kernels.dtype.itemsize, config, channels),
+        )
         check(self.memory, self.device)
         self.rng = np.random.default_rng(config.seed)
         self.iteration, self.seconds = 0, 0.0
         if checkpoint is None:
             start, message = initial_splats(
-                scene, config.shape, config.cap_max, config.sh_degree, config.init, config.seed,
-                normalisation=config.normalisation, antialiased=config.antialiased,
-                random_share=config.random_points, opacity=config.init_opacity, scale_factor=config.init_scale)
+                scene,
+                config.shape,
+                config.cap_max,
+                config.sh_degree,
+                config.init,
+                config.seed,
+                normalisation=config.normalisation,
+                antialiased=config.antialiased,
+                random_share=config.random_points,
+                opacity=config.init_opacity,
+                scale_factor=config.init_scale,
+            )
             first = start.to_numpy()
         else:
             first = checkpoint.splats  # not as Splats: it may hold splats that the strategy is yet to mend
@@ -133,8 +159,9 @@ class Trainer:
         self.evaluations: dict[int, Evaluation] = {}
         self.evaluation_seconds: dict[int, float] = {}
         self.n_first = checkpoint.n_first if checkpoint else n_first
-        self.views = ViewSampler(scene.train, config.iterations, config.coarse_to_fine, self.rng,
-                                 checkpoint.queue if checkpoint else [])
+        self.views = ViewSampler(
+            scene.train, config.iterations, config.coarse_to_fine, self.rng, checkpoint.queue if checkpoint else []
+        )
         self._plan_schedules()
 
     def run(self, folder: ModelFolder | None = None, visit: Visit | None = None) -> Model:
@@ -166,15 +193,23 @@ class Trainer:
                 if measured:
                     self.evaluations[it] = self.evaluate(self.scene.test)
                     self.evaluation_seconds[it] = self.seconds
-                    log.write({"iteration": it, "seconds": self.seconds, "test_psnr": self.evaluations[it].psnr,
-                               "test_ssim": self.evaluations[it].ssim, "splats": self.splats.n})
+                    log.write(
+                        {
+                            "iteration": it,
+                            "seconds": self.seconds,
+                            "test_psnr": self.evaluations[it].psnr,
+                            "test_ssim": self.evaluations[it].ssim,
+                            "splats": self.splats.n,
+                        }
+                    )
                 if folder is not None and (it in config.save_iterations or ends):
                     folder.save(self.snapshot(), it)
                     if config.exposure:
                         names = [view.name for view in self.scene.train]
                         folder.write_exposures(exposures_json(names, self.photos.exposures()))
-                if folder is not None and (ends or (config.checkpoint_interval
-                                                    and it % config.checkpoint_interval == 0)):
+                if folder is not None and (
+                    ends or (config.checkpoint_interval and it % config.checkpoint_interval == 0)
+                ):
                     log.flush()
                     self.checkpoint().save(folder.checkpoint_path)
                 if visit is not None:
@@ -184,9 +219,17 @@ class Trainer:
         if folder is not None and self.iteration < config.iterations:
             log.flush()
             self.checkpoint().save(folder.checkpoint_path)
-        return Model(self.snapshot(), config, self.iteration, self.seconds, peak_bytes(),
-                     self.pipeline.pool.nbytes + self.truths.nbytes, self.evaluations, self.evaluation_seconds,
-                     None if folder is None else folder.path)
+        return Model(
+            self.snapshot(),
+            config,
+            self.iteration,
+            self.seconds,
+            peak_bytes(),
+            self.pipeline.pool.nbytes + self.truths.nbytes,
+            self.evaluations,
+            self.evaluation_seconds,
+            None if folder is None else folder.path,
+        )
 
     def step(self) -> None:
         """One iteration: one image, one optimizer step, and what the strategy does after it."""
@@ -203,16 +246,24 @@ class Trainer:
         v_color = self.photos.gradient(truth, background)
         self.pipeline.backward(frame, v_color, self.grads)
         mean_lr = self.scene.extent * self.mean_rate(it)
-        self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it,
-                            self.pipeline.pool.get("depth_key_kept", 0))
+        self.optimizer.step(
+            self.grads, mean_lr * config.rate_factor("mean"), degree, it, self.pipeline.pool.get("depth_key_kept", 0)
+        )
         if self.densify_first <= it <= self.densify_last and it % config.densify_interval == 0:
             self.densify()
         if config.noise_lr and active_blocks(it, config).base:
             self.optim_program.mcmc_noise.over(
-                -(-self.splats.n // self.kernels.lanes), self.pipeline.group, geom=self.splats.geom,
-                capacity=self.splats.capacity, n_splats=self.splats.n, seed_lo=config.seed & 0xFFFFFFFF,
-                seed_hi=config.seed >> 32, iteration=it,
-                amount=noise_amount(config.noise_lr, mean_lr, self.scene.extent), reach=noise_reach(self.scene.extent))
+                -(-self.splats.n // self.kernels.lanes),
+                self.pipeline.group,
+                geom=self.splats.geom,
+                capacity=self.splats.capacity,
+                n_splats=self.splats.n,
+                seed_lo=config.seed & 0xFFFFFFFF,
+                seed_hi=config.seed >> 32,
+                iteration=it,
+                amount=noise_amount(config.noise_lr, mean_lr, self.scene.extent),
+                reach=noise_reach(self.scene.extent),
+            )
 
     def densify(self) -> None:
         """One action of the strategy."""
@@ -220,8 +271,10 @@ class Trainer:
         self.optimizer.settle()
         arrays, signals = self.splats.download(self.splats.n), self.pipeline.read_signals(self.splats.n)
         if self.splats.n and not signals[TIMES_SEEN].any():
-            raise TrainingError(f"iteration {self.iteration}: no image shows any splat (transparent, or outside): "
-                                "check what training starts from (init) and the learning rates")
+            raise TrainingError(
+                f"iteration {self.iteration}: no image shows any splat (transparent, or outside): "
+                "check what training starts from (init) and the learning rates"
+            )
         planned = plan(self.config, arrays, signals, self.rng, moment)
         if self.config.visible_adam:  # splats seen together stay together
             mean = planned.values.get("mean", arrays["mean"][planned.source])
@@ -236,17 +289,29 @@ class Trainer:
         if len(sound) and not sound.any():
             raise TrainingError(f"iteration {self.iteration}: no splat is finite any more: lower the learning rates")
         try:
-            return Splats(self.config.shape, {name: array[sound] for name, array in arrays.items()},
-                          self.config.normalisation, self.config.antialiased)
+            return Splats(
+                self.config.shape,
+                {name: array[sound] for name, array in arrays.items()},
+                self.config.normalisation,
+                self.config.antialiased,
+            )
         except InputError as error:
             raise TrainingError(f"iteration {self.iteration}: {error}: lower the learning rates") from None
 
     def checkpoint(self) -> Checkpoint:
         """Everything that the rest of the run depends on."""
-        return Checkpoint(self.iteration, self.config.to_json(), self.splats.download(self.splats.n),
-                          self.optimizer.state() | self.photos.state(), dict(self.rng.bit_generator.state),
-                          self.views.queue, self.seconds, str(self.kernels.schedule), self.n_first,
-                          self.pipeline.read_signals(self.splats.n))
+        return Checkpoint(
+            self.iteration,
+            self.config.to_json(),
+            self.splats.download(self.splats.n),
+            self.optimizer.state() | self.photos.state(),
+            dict(self.rng.bit_generator.state),
+            self.views.queue,
+            self.seconds,
+            str(self.kernels.schedule),
+            self.n_first,
+            self.pipeline.read_signals(self.splats.n),
+        )
 
     def evaluate(self, views: list[View]) -> Evaluation:
         """Metrics of the present splats."""
@@ -263,19 +328,34 @@ class Trainer:
 
     def _report(self, value: LossValue, log: RunLog, since: int, started: float) -> None:
         if not math.isfinite(value.total):
-            raise TrainingError(f"iteration {self.iteration}: the loss is not finite: lower the learning rates; "
-                                "the last checkpoint is kept")
+            raise TrainingError(
+                f"iteration {self.iteration}: the loss is not finite: lower the learning rates; "
+                "the last checkpoint is kept"
+            )
         speed = (self.iteration - since) / (time.perf_counter() - started)
-        log.write({"iteration": self.iteration, "loss": value.total, "l1": value.l1, "ssim": value.ssim,
-                   "psnr": value.psnr, "splats": self.splats.n, "seconds": self.seconds})
+        log.write(
+            {
+                "iteration": self.iteration,
+                "loss": value.total,
+                "l1": value.l1,
+                "ssim": value.ssim,
+                "psnr": value.psnr,
+                "splats": self.splats.n,
+                "seconds": self.seconds,
+            }
+        )
         if self.progress is not None:
-            self.progress(Progress(self.iteration, self.config.iterations, value.total, value.psnr, self.splats.n,
-                                   self.seconds, speed))
+            self.progress(
+                Progress(
+                    self.iteration, self.config.iterations, value.total, value.psnr, self.splats.n, self.seconds, speed
+                )
+            )
 
     def _say(self, message: str) -> None:
         if self.progress is not None:
-            self.progress(Progress(self.iteration, self.config.iterations, math.nan, math.nan, 0, self.seconds, 0,
-                                   message))
+            self.progress(
+                Progress(self.iteration, self.config.iterations, math.nan, math.nan, 0, self.seconds, 0, message)
+            )
 
 
 def growth_factor(config: TrainConfig, n_first: int, window: int) -> float:

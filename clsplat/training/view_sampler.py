@@ -19,8 +19,9 @@ class ViewSampler:
     queue : what is left of a permutation, of a resumed run.
     """
 
-    def __init__(self, views: list[View], iterations: int, coarse_to_fine: bool, rng: np.random.Generator,
-                 queue: list[int]) -> None:
+    def __init__(
+        self, views: list[View], iterations: int, coarse_to_fine: bool, rng: np.random.Generator, queue: list[int]
+    ) -> None:
         self.views, self.rng, self.queue = views, rng, list(queue)
         side = min(min(view.camera.width, view.camera.height) for view in views)
         self._pixels = statistics.median(view.camera.width * view.camera.height for view in views)

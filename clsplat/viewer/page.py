@@ -20,7 +20,7 @@ from .camera import Pose, camera_of
 from .recording import FILE_NAME, LONGEST, Recording
 from .settings import LARGEST, SMALLEST
 from .start import Known, fov_of
-from .viewer import Picture, Viewer
+from .viewer import ViewerImage, Viewer
 
 QUALITY, MOVING_QUALITY = 95, 80  # of JPEG
 _STATUS_INTERVAL = 0.5  # seconds between changes of the status line while moving
@@ -38,8 +38,14 @@ class Page:
     folder : where paths may be saved; None: they can only be downloaded.
     """
 
-    def __init__(self, client: viser.ClientHandle, viewer: Viewer, known: Known,
-                 reload: Callable[[], str] | None = None, folder: Path | None = None) -> None:
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        viewer: Viewer,
+        known: Known,
+        reload: Callable[[], str] | None = None,
+        folder: Path | None = None,
+    ) -> None:
         self.client, self.viewer, self.known = client, viewer, known
         self._reload, self._folder = reload, folder
         self._cameras = known.by_label
@@ -62,10 +68,11 @@ class Page:
         self.viewer.leave(self.client.client_id)
         self._stop()
 
-    def send(self, shot: Picture) -> None:
+    def send(self, shot: ViewerImage) -> None:
         """Show a picture; called by the thread that makes them."""
-        self.client.scene.set_background_image(shot.picture, format="jpeg",
-                                               jpeg_quality=QUALITY if shot.still else MOVING_QUALITY)
+        self.client.scene.set_background_image(
+            shot.picture, format="jpeg", jpeg_quality=QUALITY if shot.still else MOVING_QUALITY
+        )
         self.client.flush()
         now = time.monotonic()
         self._rates = [*(moment for moment in self._rates if now - moment < 1.0), now]
@@ -73,8 +80,10 @@ class Page:
             self._told = now
             height, width = shot.picture.shape[:2]
             rate = "" if shot.still else f", {len(self._rates)} a second"
-            self.say(shot.message or f"{self.viewer.source.n_splats} splats, {width} × {height} px, "
-                                     f"{1e3 * shot.seconds:.0f} ms{rate}")
+            self.say(
+                shot.message
+                or f"{self.viewer.source.n_splats} splats, {width} × {height} px, {1e3 * shot.seconds:.0f} ms{rate}"
+            )
 
     def say(self, text: str) -> None:
         """The line on top of the panel."""
@@ -98,16 +107,24 @@ class Page:
             r, g, b = (round(255 * part) for part in chosen.background)
             ground = gui.add_rgb("Background", (r, g, b))
             ground.on_update(lambda _: self._choose("background", ground.value))
-            size = gui.add_slider("Resolution", SMALLEST, LARGEST, 64, chosen.size,
-                                  hint="Longest side of a still picture, in pixels; moving ones adapt")
+            size = gui.add_slider(
+                "Resolution",
+                SMALLEST,
+                LARGEST,
+                64,
+                chosen.size,
+                hint="Longest side of a still picture, in pixels; moving ones adapt",
+            )
             size.on_update(lambda _: self._choose("size", size.value))
             if source.sh_degree:
-                degree = gui.add_slider("SH degree", 0, source.sh_degree, 1, source.sh_degree,
-                                        hint="Bands of view-dependent colour")
+                degree = gui.add_slider(
+                    "SH degree", 0, source.sh_degree, 1, source.sh_degree, hint="Bands of view-dependent colour"
+                )
                 degree.on_update(lambda _: self._choose("sh_degree", degree.value))
             n = max(source.n_splats, 1)
-            self._cap: Any = gui.add_slider("Splats", 0, n, _step(n), n, hint="How many: those first that cover most",
-                                       visible=source.partial)
+            self._cap: Any = gui.add_slider(
+                "Splats", 0, n, _step(n), n, hint="How many: those first that cover most", visible=source.partial
+            )
             self._cap.on_update(lambda _: self._choose("cap", self._cap.value))
             if self._reload is not None:
                 button = gui.add_button("Read the file again", icon=viser.Icon.REFRESH)
@@ -116,8 +133,9 @@ class Page:
     def _add_cameras(self) -> None:
         gui = self.client.gui
         with gui.add_folder("Cameras"):
-            shown = gui.add_checkbox("Show cameras", False,
-                                     hint="Blue: trained on; orange: held out. Click the lines of one to jump to it")
+            shown = gui.add_checkbox(
+                "Show cameras", False, hint="Blue: trained on; orange: held out. Click the lines of one to jump to it"
+            )
             shown.on_update(lambda _: self._show_cameras(shown.value))
             jump = gui.add_dropdown("Jump to", (_NOWHERE, *self._cameras))
             jump.on_update(lambda _: self._jump(self._cameras.get(jump.value)))
@@ -132,6 +150,7 @@ class Page:
                     self._try(done)
                     n = len(recording.keys)
                     keys.content = f"{n or 'No'} {'key' if n == 1 else 'keys'}"
+
                 return on_click
 
             gui.add_button("Add a key", icon=viser.Icon.PLUS).on_click(changed(self._add_key))
@@ -143,8 +162,9 @@ class Page:
             closed.on_update(lambda _: setattr(recording, "closed", bool(closed.value)))
             gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY).on_click(lambda _: self._try(self._play))
             gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP).on_click(lambda _: self._stop())
-            download = gui.add_button("Download", icon=viser.Icon.DOWNLOAD,
-                                      hint="As camera_path.json, for clsplat render --path")
+            download = gui.add_button(
+                "Download", icon=viser.Icon.DOWNLOAD, hint="As camera_path.json, for clsplat render --path"
+            )
             download.on_click(lambda _: self._try(self._download))
             if self._folder is not None:
                 save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY, hint="Into the folder given at the start")
@@ -169,8 +189,9 @@ class Page:
         """Frusta are made when first wanted."""
         if shown and not self._frusta:
             for kind, items, colour in (("train", self.known.train, _TRAIN), ("test", self.known.test, _TEST)):
-                self._frusta += [self._frustum(f"/cameras/{kind}/{number}", item, colour)
-                                 for number, item in enumerate(items)]
+                self._frusta += [
+                    self._frustum(f"/cameras/{kind}/{number}", item, colour) for number, item in enumerate(items)
+                ]
         for frustum in self._frusta:
             frustum.visible = bool(shown)
 
@@ -178,8 +199,16 @@ class Page:
         camera = item.camera
         aspect = (camera.width / camera.fx) / (camera.height / camera.fy)
         frustum = self.client.scene.add_camera_frustum(
-            name, fov_of(camera), aspect, scale=self.known.size, thickness=1.5, thickness_units="screen", color=colour,
-            wxyz=_wxyz(camera), position=camera.position)
+            name,
+            fov_of(camera),
+            aspect,
+            scale=self.known.size,
+            thickness=1.5,
+            thickness_units="screen",
+            color=colour,
+            wxyz=_wxyz(camera),
+            position=camera.position,
+        )
         frustum.on_click(lambda _: self._jump(camera))
         return frustum
 

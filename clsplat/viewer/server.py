@@ -41,9 +41,18 @@ class Server:
     OutputError : the address cannot be listened at.
     """
 
-    def __init__(self, viewer: Viewer, start: Start, known: Known = NOTHING, *, host: str = DEFAULT_HOST,
-                 port: int = DEFAULT_PORT, title: str = "clsplat", reload: Callable[[], str] | None = None,
-                 folder: Path | None = None) -> None:
+    def __init__(
+        self,
+        viewer: Viewer,
+        start: Start,
+        known: Known = NOTHING,
+        *,
+        host: str = DEFAULT_HOST,
+        port: int = DEFAULT_PORT,
+        title: str = "clsplat",
+        reload: Callable[[], str] | None = None,
+        folder: Path | None = None,
+    ) -> None:
         self.viewer, self._known, self._reload, self._folder = viewer, known, reload, folder
         self._pages: dict[int, Page] = {}
         self._lock = threading.Lock()

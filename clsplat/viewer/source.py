@@ -84,8 +84,9 @@ class ModelSource:
         """What the camera sees; at full settings the bytes of `clsplat render`."""
         with self._rendering:
             splats = self._shown.part(settings.cap, settings.mode)
-            return picture(self.renderer, splats, camera, settings.mode, settings.background,
-                           sh_degree=settings.sh_degree)
+            return picture(
+                self.renderer, splats, camera, settings.mode, settings.background, sh_degree=settings.sh_degree
+            )
 
 
 class _Shown:

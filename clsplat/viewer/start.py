@@ -51,9 +51,11 @@ class Known:
     @property
     def by_label(self) -> dict[str, Camera]:
         """All of them under labels that differ, training cameras first."""
-        return {f"{kind} {number}: {item.name}": item.camera
-                for kind, items in (("train", self.train), ("test", self.test))
-                for number, item in enumerate(items)}
+        return {
+            f"{kind} {number}: {item.name}": item.camera
+            for kind, items in (("train", self.train), ("test", self.test))
+            for number, item in enumerate(items)
+        }
 
     @property
     def size(self) -> float:

@@ -77,8 +77,7 @@ class TrainingView:
     share : of the time, that pictures may take while the run goes on.
     """
 
-    def __init__(self, config: TrainConfig, share: float = SHARE,
-                 clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, config: TrainConfig, share: float = SHARE, clock: Callable[[], float] = time.monotonic) -> None:
         self.source = TrainingSource(config)
         self.viewer = Viewer(self.source, Settings(background=config.background), QUICK, clock)
         self._share, self._clock = share, clock
@@ -123,5 +122,7 @@ def run_line(progress: Progress) -> str:
     if progress.message:
         return progress.message
     done = "finished" if progress.iteration >= progress.iterations else f"{progress.per_second:.1f} a second"
-    return (f"iteration {progress.iteration} of {progress.iterations}, {done}; loss {progress.loss:.4f}, "
-            f"PSNR {progress.psnr:.2f} dB, {progress.n_splats} splats")
+    return (
+        f"iteration {progress.iteration} of {progress.iterations}, {done}; loss {progress.loss:.4f}, "
+        f"PSNR {progress.psnr:.2f} dB, {progress.n_splats} splats"
+    )

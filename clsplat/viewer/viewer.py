@@ -27,7 +27,7 @@ SECONDS = 1.0 / 16.0  # that a picture of a moving camera may take: leaves a mar
 
 
 @dataclass(frozen=True)
-class Picture:
+class ViewerImage:
     """A picture made for a looker-on.
 
     Attributes
@@ -45,7 +45,7 @@ class Picture:
 class Looker:
     """One who looks on."""
 
-    send: Callable[[Picture], None]
+    send: Callable[[ViewerImage], None]
     settings: Settings
     pose: Pose | None = None
     moved: float = -math.inf
@@ -60,8 +60,13 @@ class Viewer:
     settings : of those who have chosen nothing yet. seconds : that a picture of a moving camera may take.
     """
 
-    def __init__(self, source: Source, settings: Settings | None = None, seconds: float = SECONDS,
-                 clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        source: Source,
+        settings: Settings | None = None,
+        seconds: float = SECONDS,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.source = source
         self.settings = settings or Settings()
         self.seconds = seconds
@@ -70,7 +75,7 @@ class Viewer:
         self._lookers: dict[int, Looker] = {}
         self._lock = threading.Lock()
 
-    def join(self, who: int, send: Callable[[Picture], None]) -> None:
+    def join(self, who: int, send: Callable[[ViewerImage], None]) -> None:
         """Somebody looks on from now; `send` is called by the thread that serves."""
         with self._lock:
             self._lookers[who] = Looker(send, self.settings, pace=Pace(self.seconds))
@@ -158,18 +163,18 @@ class Viewer:
         """How many cameras move: they share the time."""
         return max(sum(now - looker.moved < REST for looker in list(self._lookers.values())), 1)
 
-    def _shot(self, pose: Pose, settings: Settings, size: int, still: bool, start: float) -> Picture:
+    def _shot(self, pose: Pose, settings: Settings, size: int, still: bool, start: float) -> ViewerImage:
         """A picture, whatever comes; blank where there is nothing to see from the pose."""
         message = ""
         try:
             camera = camera_of(pose, size)
             if camera is not None:
-                return Picture(self.source.picture(camera, settings), still, self._clock() - start)
+                return ViewerImage(self.source.picture(camera, settings), still, self._clock() - start)
         except ClsplatError as error:
             message = str(error)
         except Exception as error:  # a driver's, for one: the server goes on
             message = f"no picture: {type(error).__name__}: {error}".split("\n")[0]
-        return Picture(blank(pose, size, settings), still, self._clock() - start, message)
+        return ViewerImage(blank(pose, size, settings), still, self._clock() - start, message)
 
 
 def blank(pose: Pose, size: int, settings: Settings) -> Picture:

@@ -57,9 +57,14 @@ def test_other_cameras_are_refused() -> None:
 def test_the_viewports_matrices_are_a_pinhole() -> None:
     camera = Camera(80, 60, 70.0, 75.0, 35.0, 33.0, facing(0.3).cam_from_world)
     near, far = 0.1, 100.0
-    projection = np.array([
-        [2 * 70 / 80, 0, 1 - 2 * 35 / 80, 0], [0, 2 * 75 / 60, 2 * 33 / 60 - 1, 0],
-        [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)], [0, 0, -1, 0]])  # fmt: skip
+    projection = np.array(
+        [
+            [2 * 70 / 80, 0, 1 - 2 * 35 / 80, 0],
+            [0, 2 * 75 / 60, 2 * 33 / 60 - 1, 0],
+            [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)],
+            [0, 0, -1, 0],
+        ]
+    )
     back = camera_of_matrices(np.linalg.inv(matrix_world_of(camera)), projection, 80, 60)
     for key in ("width", "height", "fx", "fy", "cx", "cy"):
         assert getattr(back, key) == pytest.approx(getattr(camera, key))
@@ -78,8 +83,11 @@ def test_colours_come_back_through_srgb() -> None:
 
 
 def test_combined_is_premultiplied_and_bottom_up() -> None:
-    image = Rendered(np.array([[[0.3, 0.2, 0.1]], [[0.0, 0.0, 0.0]]], np.float32), np.array([[0.5], [0.0]], np.float32),
-                     np.array([[2.0], [0.0]], np.float32))
+    image = Rendered(
+        np.array([[[0.3, 0.2, 0.1]], [[0.0, 0.0, 0.0]]], np.float32),
+        np.array([[0.5], [0.0]], np.float32),
+        np.array([[2.0], [0.0]], np.float32),
+    )
     clear = combined(image, None)
     np.testing.assert_allclose(clear[1, 0], [*(0.5 * to_linear(np.float32([0.6, 0.4, 0.2]))), 0.5], rtol=1e-6)
     np.testing.assert_array_equal(clear[0, 0], 0)
@@ -160,8 +168,11 @@ def test_the_zip_takes_wheels(tmp_path: Path) -> None:
     wheels = tmp_path / "wheels"
     wheels.mkdir()
     assert "no wheel of clsplat" in error_of("blender-addon", "-o", tmp_path / "a.zip", "--wheels", wheels)
-    for name in ("clsplat-0.1.0-py3-none-any", "numpy-2.0-cp311-cp311-manylinux_2_17_x86_64",
-                 "pyopencl-2026.1-cp311-cp311-manylinux_2_28_x86_64"):
+    for name in (
+        "clsplat-0.1.0-py3-none-any",
+        "numpy-2.0-cp311-cp311-manylinux_2_17_x86_64",
+        "pyopencl-2026.1-cp311-cp311-manylinux_2_28_x86_64",
+    ):
         (wheels / f"{name}.whl").write_bytes(b"wheel")
     clsplat("blender-addon", "-o", tmp_path / "a.zip", "--wheels", wheels)
     with zipfile.ZipFile(tmp_path / "a.zip") as archive:

@@ -65,8 +65,14 @@ def blender(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
 
 
 def child(python: str, folder: Path, *cases: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([python, CHILD, folder, *cases], check=False, capture_output=True, text=True, timeout=300,
-                          env=os.environ | {"CLSPLAT_BUILD_OPTIONS": ""})
+    return subprocess.run(
+        [python, CHILD, folder, *cases],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=os.environ | {"CLSPLAT_BUILD_OPTIONS": ""},
+    )
 
 
 def picture(path: Path | str) -> np.ndarray:
@@ -149,8 +155,11 @@ def test_paths_come_in_as_animations_and_go_out_again(blender: tuple[Path, dict[
     assert fact["nearest"] > 0  # quaternions do not go the long way round between frames
     back = read_path(folder / "exported_path.json")
     assert back.fps == pytest.approx(12.5)
-    for left, right in zip((*back.cameras, read_cameras(folder / "exported_cameras.json")[0].camera),
-                           (*path.cameras, path.cameras[0]), strict=True):
+    for left, right in zip(
+        (*back.cameras, read_cameras(folder / "exported_cameras.json")[0].camera),
+        (*path.cameras, path.cameras[0]),
+        strict=True,
+    ):
         np.testing.assert_allclose(left.cam_from_world, right.cam_from_world, atol=5e-6)
         assert left.fx == pytest.approx(right.fx, rel=1e-6)
 
@@ -171,9 +180,17 @@ def test_lenses_agree_with_blenders_own_projection(blender: tuple[Path, dict[str
 
 def test_faults_stand_in_the_report_area(blender: tuple[Path, dict[str, Any]]) -> None:
     told = blender[1]["faults"]
-    for name, word in {"no camera": "no camera", "orthographic": "is orthographic", "panoramic": "is panoramic",
-                       "stretched": "scaled by", "missing": "gone.ply", "no PLY": "cameras.json",
-                       "import": "cameras.json", "cameras": "no JSON", "export": "no camera"}.items():  # fmt: skip
+    for name, word in {
+        "no camera": "no camera",
+        "orthographic": "is orthographic",
+        "panoramic": "is panoramic",
+        "stretched": "scaled by",
+        "missing": "gone.ply",
+        "no PLY": "cameras.json",
+        "import": "cameras.json",
+        "cameras": "no JSON",
+        "export": "no camera",
+    }.items():
         assert word in told[name], f"{name}: {told[name]}"
         assert "Traceback" not in told[name]
     assert picture(told["nothing"])[..., :3].max() == 0

@@ -16,9 +16,7 @@ from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera, img_names, read_cameras, write_cameras
 from clsplat.errors import InputError, OutputError
 
-IN_FOLDER = settings(
-    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+IN_FOLDER = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 names = st.text(st.characters(codec="utf-8"), min_size=1, max_size=12)
 
 
@@ -40,9 +38,15 @@ def file(tmp_path: Path) -> Path:
 def entry(**changes: Any) -> dict[str, Any]:
     """A camera at (1, 2, 3) that looks along world +x: its x axis is world -y, its y axis world -z."""
     base = {
-        "id": 0, "img_name": "a", "width": 40, "height": 30, "position": [1, 2, 3],
-        "rotation": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], "fy": 31, "fx": 30.5,
-    }  # fmt: skip
+        "id": 0,
+        "img_name": "a",
+        "width": 40,
+        "height": 30,
+        "position": [1, 2, 3],
+        "rotation": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],
+        "fy": 31,
+        "fx": 30.5,
+    }
     return {key: value for key, value in (base | changes).items() if value != "absent"}
 
 

@@ -40,9 +40,13 @@ def nerfstudio(**changes: Any) -> dict[str, Any]:
     """One frame at (1, 2, 3) with OpenGL's axes along the world's: it looks along -z, y up."""
     pose = [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]
     base = {
-        "camera_type": "perspective", "render_height": 100, "render_width": 200, "fps": 24, "seconds": 2,
+        "camera_type": "perspective",
+        "render_height": 100,
+        "render_width": 200,
+        "fps": 24,
+        "seconds": 2,
         "camera_path": [{"camera_to_world": pose, "fov": 90, "aspect": 2.0}] * 2,
-    }  # fmt: skip
+    }
     return {key: value for key, value in (base | changes).items() if value != "absent"}
 
 
@@ -65,8 +69,11 @@ def test_nerfstudios_axes_and_vertical_field_of_view() -> None:
     ahead_and_up = camera.rotation @ ([1, 2.5, 1] - camera.position)
     np.testing.assert_allclose(ahead_and_up, [0, -0.5, 2])
     written = json.loads(path_text(path))
-    assert written["camera_path"][0] == {"camera_to_world": nerfstudio()["camera_path"][0]["camera_to_world"],
-                                         "fov": pytest.approx(90), "aspect": 2.0}
+    assert written["camera_path"][0] == {
+        "camera_to_world": nerfstudio()["camera_path"][0]["camera_to_world"],
+        "fov": pytest.approx(90),
+        "aspect": 2.0,
+    }
 
 
 def test_keyframes_of_both_of_nerfstudios_viewers() -> None:
@@ -94,29 +101,36 @@ def test_a_cameras_json_is_a_path(tmp_path: Path) -> None:
 
 def frame(**changes: Any) -> dict[str, Any]:
     entry = nerfstudio()["camera_path"][0] | changes
-    return nerfstudio(camera_path=[nerfstudio()["camera_path"][0],
-                                   {key: value for key, value in entry.items() if value != "absent"}])
+    return nerfstudio(
+        camera_path=[nerfstudio()["camera_path"][0], {key: value for key, value in entry.items() if value != "absent"}]
+    )
 
 
-@pytest.mark.parametrize(("content", "words"), [
-    (nerfstudio(camera_path="absent"), ["'camera_path' is missing"]),
-    (nerfstudio(render_width="absent"), ["'render_width' is missing"]),
-    (nerfstudio(render_height=10.5), ["'render_height'", "10.5"]),
-    (nerfstudio(camera_path=[]), ["'camera_path' is empty"]),
-    (nerfstudio(camera_path=[3]), ["'camera_path'", "list of objects"]),
-    (nerfstudio(camera_type="fisheye"), ["'camera_type'", "fisheye"]),
-    (nerfstudio(fps=0), ["fps"]),
-    (nerfstudio(fps="absent", seconds=0), ["'seconds' is 0"]),
-    (frame(camera_to_world="absent"), ["camera_path[1]", "'camera_to_world' is missing"]),
-    (frame(camera_to_world=[1] * 15), ["camera_path[1]", "16 numbers"]),
-    (frame(camera_to_world=[2, *nerfstudio()["camera_path"][0]["camera_to_world"][1:]]), ["camera_path[1]", "rigid"]),
-    (frame(fov="absent"), ["camera_path[1]", "'fov' is missing"]),
-    (frame(fov=180), ["camera_path[1]", "'fov' is 180"]),
-    (frame(fov=math.inf), ["camera_path[1]", "'fov' is not finite"]),
-    (nerfstudio(keyframes=[{"matrix": "[1,", "fov": 50}]), ["keyframes[0]", "16 numbers"]),
-    ([], ["no cameras"]),
-    (7, ["a number"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (nerfstudio(camera_path="absent"), ["'camera_path' is missing"]),
+        (nerfstudio(render_width="absent"), ["'render_width' is missing"]),
+        (nerfstudio(render_height=10.5), ["'render_height'", "10.5"]),
+        (nerfstudio(camera_path=[]), ["'camera_path' is empty"]),
+        (nerfstudio(camera_path=[3]), ["'camera_path'", "list of objects"]),
+        (nerfstudio(camera_type="fisheye"), ["'camera_type'", "fisheye"]),
+        (nerfstudio(fps=0), ["fps"]),
+        (nerfstudio(fps="absent", seconds=0), ["'seconds' is 0"]),
+        (frame(camera_to_world="absent"), ["camera_path[1]", "'camera_to_world' is missing"]),
+        (frame(camera_to_world=[1] * 15), ["camera_path[1]", "16 numbers"]),
+        (
+            frame(camera_to_world=[2, *nerfstudio()["camera_path"][0]["camera_to_world"][1:]]),
+            ["camera_path[1]", "rigid"],
+        ),
+        (frame(fov="absent"), ["camera_path[1]", "'fov' is missing"]),
+        (frame(fov=180), ["camera_path[1]", "'fov' is 180"]),
+        (frame(fov=math.inf), ["camera_path[1]", "'fov' is not finite"]),
+        (nerfstudio(keyframes=[{"matrix": "[1,", "fov": 50}]), ["keyframes[0]", "16 numbers"]),
+        ([], ["no cameras"]),
+        (7, ["a number"]),
+    ],
+)
 def test_faults_name_file_and_field(tmp_path: Path, content: Any, words: list[str]) -> None:
     file = tmp_path / "path.json"
     file.write_text(json.dumps(content))

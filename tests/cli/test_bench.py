@@ -21,8 +21,21 @@ def limits_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_made_up_scene(tmp_path: Path) -> None:
     file = tmp_path / "deep" / "bench.json"
-    said = clsplat("bench", "--splats", 200, "--width", 48, "--height", 32, "--shape", "gaussian", "--iterations", 1,
-                   "--json", file)
+    said = clsplat(
+        "bench",
+        "--splats",
+        200,
+        "--width",
+        48,
+        "--height",
+        32,
+        "--shape",
+        "gaussian",
+        "--iterations",
+        1,
+        "--json",
+        file,
+    )
     assert "copy 10.0 GB/s, FMA 100 Gflop/s" in said
     training, render = said.split("render: ")
     for stage in (*STAGES, HOST):
@@ -34,7 +47,9 @@ def test_made_up_scene(tmp_path: Path) -> None:
     assert {"device", "driver", "schedule", "scene", "copy_bytes_per_s", "fma_flops_per_s"} <= set(stored)
     reports = [Report.from_json(values) for values in stored["reports"]]
     assert [(report.task, report.width, report.height) for report in reports] == [
-        ("training step", 48, 32), ("render", 48, 32)]
+        ("training step", 48, 32),
+        ("render", 48, 32),
+    ]
 
 
 def test_scene_from_its_points_and_from_a_model(tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -57,14 +72,20 @@ def test_errors(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Non
     assert "nowhere" in error_of("bench", "--device", "nowhere")
 
 
-@pytest.mark.parametrize(("stage", "said"), [
-    (StageTime("rasterize", 2, 0.4, 1, 1, 0.1, 0.61), "61 % of the FMA limit and 10 % of the copy limit: arithmetic"),
-    (StageTime("loss", 2, 0.4, 1, 1, 0.7, 0.1), ": memory limits it."),
-    (StageTime("step", 2, 0.4, 1, 0, 1.3), "130 % of the copy limit: the caches help it"),
-    (StageTime("gather", 2, 0.4, 1, 0, 0.2), "neither limits it"),
-    (StageTime("host", 2, 0.4), "waits for Python"),
-    (StageTime("transfers", 2, 0.4), "not compared"),
-])
+@pytest.mark.parametrize(
+    ("stage", "said"),
+    [
+        (
+            StageTime("rasterize", 2, 0.4, 1, 1, 0.1, 0.61),
+            "61 % of the FMA limit and 10 % of the copy limit: arithmetic",
+        ),
+        (StageTime("loss", 2, 0.4, 1, 1, 0.7, 0.1), ": memory limits it."),
+        (StageTime("step", 2, 0.4, 1, 0, 1.3), "130 % of the copy limit: the caches help it"),
+        (StageTime("gather", 2, 0.4, 1, 0, 0.2), "neither limits it"),
+        (StageTime("host", 2, 0.4), "waits for Python"),
+        (StageTime("transfers", 2, 0.4), "not compared"),
+    ],
+)
 def test_sentences(stage: StageTime, said: str) -> None:
     assert said in sentence(stage)
     assert sentence(stage).startswith(f"{stage.stage} takes 40 % of the time")

@@ -65,8 +65,19 @@ def test_prune_leaves_out_what_is_not_missed(model: Path, tmp_path: Path) -> Non
     assert out.stat().st_size < 0.8 * ply.stat().st_size
     assert f"splats: {len(small)} of {len(whole)}, " in said
     assert "validation views: PSNR " in said
-    clsplat("prune", out, "-s", json.loads((model / "config.json").read_text())["scene"]["path"], "-o", out,
-            "--tolerance", ".2", "--overwrite", "--whole", "-q")
+    clsplat(
+        "prune",
+        out,
+        "-s",
+        json.loads((model / "config.json").read_text())["scene"]["path"],
+        "-o",
+        out,
+        "--tolerance",
+        ".2",
+        "--overwrite",
+        "--whole",
+        "-q",
+    )
     assert b"clsplat_" not in out.read_bytes().split(b"end_header")[0]
 
 
@@ -134,7 +145,8 @@ def test_an_interrupted_search_says_how_to_go_on(scene: Path, tmp_path: Path, mo
         result = run("train", scene, "-m", tmp_path / "model", "--target-psnr", 10, *SEARCH)
     assert result.exit_code == 130
     assert result.stderr.splitlines()[-1] == (
-        f"stopped; what is done is kept; to go on: clsplat train --resume -m {tmp_path / 'model'}")
+        f"stopped; what is done is kept; to go on: clsplat train --resume -m {tmp_path / 'model'}"
+    )
     assert "already holds a model" in error_of("train", scene, "-m", tmp_path / "model", *SEARCH)
     said = clsplat("train", "--resume", "-m", tmp_path / "model")
     assert "validation views: PSNR" in said

@@ -156,9 +156,7 @@ def test_train_says_where_the_model_is_and_how_good(scene: Path, tmp_path: Path)
 
 
 def test_train_without_eval_learns_from_all_views(scene: Path, tmp_path: Path) -> None:
-    out = clsplat(
-        "train", scene, "-m", tmp_path / "m", *SHORT, "-w", "--shape", "gaussian", "--steps", "3", "-r", "2"
-    )
+    out = clsplat("train", scene, "-m", tmp_path / "m", *SHORT, "-w", "--shape", "gaussian", "--steps", "3", "-r", "2")
     assert "PSNR" not in out
     stored = json.loads((tmp_path / "m" / "config.json").read_text())
     assert stored["scene"]["test_names"] == []
@@ -216,9 +214,7 @@ def _names(folder: Path, names: list[str]) -> Path:
     return path
 
 
-def test_default_folder_is_named_after_the_scene(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_default_folder_is_named_after_the_scene(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert clsplat("train", scene, "--iterations", "1", "--cap-max", "20", "--quiet") == ""
     assert ply(tmp_path / "output" / scene.name, 1).is_file()
@@ -231,9 +227,7 @@ def test_existing_models_are_kept_unless_overwritten(scene: Path, tmp_path: Path
     assert "--overwrite" in error_of("train", scene, "-m", model, "--iterations", "3", *tiny)
     assert ply(model, 2).read_bytes() == before
     clsplat("train", scene, "-m", model, "--iterations", "3", *tiny, "--overwrite")
-    assert {name for name in files(model) if name.endswith(".ply")} == {
-        "point_cloud/iteration_3/point_cloud.ply"
-    }
+    assert {name for name in files(model) if name.endswith(".ply")} == {"point_cloud/iteration_3/point_cloud.ply"}
 
 
 def test_interrupt_then_resume(scene: Path, tmp_path: Path) -> None:
@@ -255,9 +249,7 @@ def test_interrupt_then_resume(scene: Path, tmp_path: Path) -> None:
         "--checkpoint-interval",
         "0",
     ]
-    process = subprocess.Popen(
-        [*PROGRAM, *map(str, args)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen([*PROGRAM, *map(str, args)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     for line in process.stderr:
         if "/100000" in line:

@@ -20,13 +20,23 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_compare_prints_a_table_and_goes_on(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    arguments = ("compare", scene, "-o", out, "--systems", "gaussian,default:growth=1.5", "--cap-max", "40",
-                 *TINY)
+    arguments = ("compare", scene, "-o", out, "--systems", "gaussian,default:growth=1.5", "--cap-max", "40", *TINY)
     first = run(*arguments, "--seeds", "0", "1")
     assert first.exit_code == 0, first.output
     lines = first.stdout.splitlines()
-    assert lines[0].split() == ["scene", "cap", "iterations", "system", "seeds", "PSNR", "SSIM", "seconds", "splats",
-                                "parameters", "MB"]  # fmt: skip
+    assert lines[0].split() == [
+        "scene",
+        "cap",
+        "iterations",
+        "system",
+        "seeds",
+        "PSNR",
+        "SSIM",
+        "seconds",
+        "splats",
+        "parameters",
+        "MB",
+    ]
     assert [line.split()[4] for line in lines[1:3]] == ["gaussian", "default:growth=1.5"]
     assert "±" in lines[1]
     assert "[4/4] yard default:growth=1.5 cap 40 seed 1: PSNR" in first.stderr
@@ -45,7 +55,8 @@ def test_compare_says_what_is_wrong(scene: Path, tmp_path: Path) -> None:
     given = ("compare", scene, "-o", tmp_path / "out")
     assert "unknown system 'cube'" in error_of(*given, "--systems", "cube")
     assert "3dgs has strategy adc, which contradicts strategy mcmc" in error_of(
-        *given, "--systems", "3dgs", "--strategy", "mcmc")
+        *given, "--systems", "3dgs", "--strategy", "mcmc"
+    )
     assert "no list of seeds" in error_of(*given, "--seeds", "-1", code=2)
     assert "no list of caps" in error_of(*given, "--cap-max", "0", code=2)
     assert "--seed" in error_of(*given, "--seed", "1", code=2)

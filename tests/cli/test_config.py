@@ -19,8 +19,9 @@ def config_of(model: Path) -> dict[str, object]:
     return config
 
 
-def test_a_former_run_s_options_are_taken_and_replaced(scene: Path, tmp_path: Path,
-                                                       tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_former_run_s_options_are_taken_and_replaced(
+    scene: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     former, again = small_model(tmp_path_factory), tmp_path / "again"
     clsplat("train", scene, "-m", again, "--config", former / "config.json", "--iterations", 3, "-q")
     taken, given = config_of(again), config_of(former)
@@ -36,11 +37,17 @@ def test_a_few_options_are_enough(scene: Path, tmp_path: Path) -> None:
     assert (config["iterations"], config["cap_max"], config["shape"]) == (2, 60, "gaussian")
 
 
-@pytest.mark.parametrize(("text", "said"), [
-    ("[1]", "expected a JSON object"), ("{", "is no JSON"), ('{"colour": 1}', "unknown option 'colour'"),
-    ('{"iterations": "many"}', "iterations is the text"), ('{"config": 3}', "config: is a number"),
-    ('{"shape": "cube"}', "cube"),
-])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[1]", "expected a JSON object"),
+        ("{", "is no JSON"),
+        ('{"colour": 1}', "unknown option 'colour'"),
+        ('{"iterations": "many"}', "iterations is the text"),
+        ('{"config": 3}', "config: is a number"),
+        ('{"shape": "cube"}', "cube"),
+    ],
+)
 def test_what_is_no_file_of_options_is_named(scene: Path, tmp_path: Path, text: str, said: str) -> None:
     file = tmp_path / "options.json"
     file.write_text(text)

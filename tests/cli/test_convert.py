@@ -89,8 +89,9 @@ def test_files_for_viewers_are_measured_as_written(model: Path, tmp_path: Path) 
         assert told is not None
         splats = load_splats(tmp_path / name)
         shown = [renderer.render(splats, entry.camera).color for entry in named]
-        assert float(told[1]) == pytest.approx(np.mean([psnr(*pair) for pair in zip(truths, shown, strict=True)]),
-                                               abs=0.006)
+        assert float(told[1]) == pytest.approx(
+            np.mean([psnr(*pair) for pair in zip(truths, shown, strict=True)]), abs=0.006
+        )
         clsplat("convert", tmp_path / name, tmp_path / f"{name}.ply")
         np.testing.assert_array_equal(Splats.load(tmp_path / f"{name}.ply").mean, splats.mean)
 
@@ -100,9 +101,19 @@ def test_a_ply_for_other_programs_has_3dgs_s_columns(model: Path, tmp_path: Path
     clsplat("convert", model, out, "--shape", "gaussian", "--approximate", "--sh-degree", "3", "-q")
     head, body = out.read_bytes().split(b"end_header\n", 1)
     names = [line.split()[-1] for line in head.decode().splitlines() if line.startswith("property float ")]
-    assert names == ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)),
-                     *(f"f_rest_{i}" for i in range(45)), "opacity", *(f"scale_{i}" for i in range(3)),
-                     *(f"rot_{i}" for i in range(4))]
+    assert names == [
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(45)),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
     assert head.splitlines()[:2] == [b"ply", b"format binary_little_endian 1.0"]
     rows = np.frombuffer(body, "<f4").reshape(-1, 62)
     splats = Splats.load(out)

@@ -80,9 +80,7 @@ def test_photos_missing_damaged_or_of_another_shape(scene: Path) -> None:
     write_png(photo, np.zeros((50, WIDTH, 3)))
     assert "view_003.png" in error_of("train", scene, "-m", scene / "n")
     photo.unlink()
-    assert "1 of the model's 10 images are missing: view_003.png" in error_of(
-        "train", scene, "-m", scene / "n"
-    )
+    assert "1 of the model's 10 images are missing: view_003.png" in error_of("train", scene, "-m", scene / "n")
     assert "images_4" in error_of("train", scene, "-m", scene / "n", "-i", "images_4")
 
 
@@ -184,9 +182,7 @@ def in_header(old: bytes, new: bytes) -> Callable[[Path], None]:
     ],
     ids=["nan", "inf", "zero-quat", "property", "list", "layout", "count", "magic", "truncated", "empty"],
 )
-def test_bad_ply(
-    copied: Path, tmp_path: Path, damage: Callable[[Path], None], words: tuple[str, ...]
-) -> None:
+def test_bad_ply(copied: Path, tmp_path: Path, damage: Callable[[Path], None], words: tuple[str, ...]) -> None:
     path = last_ply(copied)
     damage(path)
     for args in (["render", path, "--path", "orbit"], ["render", copied]):
@@ -228,9 +224,7 @@ def test_damaged_model_files(copied: Path, tmp_path: Path) -> None:
         assert "config.json" in error_of("train", "--resume", "-m", copied)
 
 
-@pytest.mark.parametrize(
-    "name", ["../out.png", "/tmp/out.png", "a/../../out.png", "..", "c:\\out.png", "\\\\host\\x"]
-)
+@pytest.mark.parametrize("name", ["../out.png", "/tmp/out.png", "a/../../out.png", "..", "c:\\out.png", "\\\\host\\x"])
 def test_camera_names_cannot_leave_the_folder(copied: Path, tmp_path: Path, name: str) -> None:
     entries = json.loads((copied / "cameras.json").read_text())[:1]
     entries[0]["img_name"] = name
@@ -244,9 +238,7 @@ def test_views_of_one_file(copied: Path, tmp_path: Path, names: tuple[str, str])
     for entry, name in zip(entries, names, strict=True):
         entry["img_name"] = name
     (tmp_path / "c.json").write_text(json.dumps(entries))
-    assert "both" in error_of(
-        "render", copied, "--cameras", tmp_path / "c.json", "-o", tmp_path / "r", "--alpha"
-    )
+    assert "both" in error_of("render", copied, "--cameras", tmp_path / "c.json", "-o", tmp_path / "r", "--alpha")
 
 
 # --- places that cannot be written, failures of the machine ------------------------------------
@@ -270,9 +262,7 @@ def test_output_below_a_file(scene: Path, model: Path, tmp_path: Path) -> None:
         (OSError(28, "No space left on device", "x.ply"), "x.ply: No space left", 1),
     ],
 )
-def test_failures_of_the_machine(
-    monkeypatch: pytest.MonkeyPatch, raised: BaseException, word: str, code: int
-) -> None:
+def test_failures_of_the_machine(monkeypatch: pytest.MonkeyPatch, raised: BaseException, word: str, code: int) -> None:
     import clsplat.scenes.scene
 
     def fail(*args: object, **extra: object) -> None:

@@ -14,8 +14,9 @@ from clsplat.evaluation import chart_style
 TINY = ["--iterations", "8", "--sh-degree", "0", "--densify-interval", "5", "--curve", "3"]
 
 
-def test_frontier_sweeps_and_draws(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory,
-                                   monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frontier_sweeps_and_draws(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(chart_style._STYLE, "savefig.dpi", 40)
     scene, out = small_capture(tmp_path_factory), tmp_path / "out"
     arguments = ("frontier", scene, "-o", out, "--cap-max", "30", "60", *TINY)
@@ -40,10 +41,21 @@ def test_frontier_sweeps_and_draws(tmp_path: Path, tmp_path_factory: pytest.Temp
 
 
 def test_frontier_without_matplotlib_says_so_and_writes_the_data(
-        tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(chart_style, "available", lambda: False)
-    done = run("frontier", small_capture(tmp_path_factory), "-o", tmp_path, "--systems", "gaussian", "--cap-max", "30",
-               "-q", *TINY)
+    done = run(
+        "frontier",
+        small_capture(tmp_path_factory),
+        "-o",
+        tmp_path,
+        "--systems",
+        "gaussian",
+        "--cap-max",
+        "30",
+        "-q",
+        *TINY,
+    )
     assert done.exit_code == 0, done.output
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("warning: charts need")]
     assert "pip install 'clsplat[charts]'" in line

@@ -67,10 +67,7 @@ def test_durations(seconds: float, text: str) -> None:
 
 
 def test_table_columns_line_up() -> None:
-    assert (
-        table(("name", "n"), [("a", "10"), ("long name", "5")])
-        == "name        n\na          10\nlong name   5"
-    )
+    assert table(("name", "n"), [("a", "10"), ("long name", "5")]) == "name        n\na          10\nlong name   5"
 
 
 def test_stems() -> None:

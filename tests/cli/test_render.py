@@ -128,8 +128,20 @@ def test_render_other_paths(model: Path, tmp_path: Path, kind: str) -> None:
 def test_render_between_chosen_cameras_and_along_the_saved_path(model: Path, tmp_path: Path) -> None:
     """The frames at the keys are those cameras' images; the path's file gives the same frames, or as many as asked."""
     named = {item.name: item.camera for item in read_cameras(model / "cameras.json")}
-    clsplat("render", model, "--path", "interpolate", "--keys", "view_003, view_004.png,view_006", "--frames", "5",
-            "--save-path", tmp_path / "path.json", "-o", tmp_path / "r")
+    clsplat(
+        "render",
+        model,
+        "--path",
+        "interpolate",
+        "--keys",
+        "view_003, view_004.png,view_006",
+        "--frames",
+        "5",
+        "--save-path",
+        tmp_path / "path.json",
+        "-o",
+        tmp_path / "r",
+    )
     splats = Splats.load(ply(model))
     for frame, key in (("frame_000", "view_003"), ("frame_004", "view_006")):
         got = np.asarray(Image.open(tmp_path / "r" / f"{frame}.png")).astype(int)
@@ -137,8 +149,9 @@ def test_render_between_chosen_cameras_and_along_the_saved_path(model: Path, tmp
         assert np.abs(got - wanted).max() < 1.5
     clsplat("render", ply(model), "--path", tmp_path / "path.json", "-o", tmp_path / "again")
     for index in range(5):
-        first, again = (np.asarray(Image.open(tmp_path / folder / f"frame_{index:03}.png")).astype(int)
-                        for folder in ("r", "again"))
+        first, again = (
+            np.asarray(Image.open(tmp_path / folder / f"frame_{index:03}.png")).astype(int) for folder in ("r", "again")
+        )
         assert np.abs(first - again).max() <= 1
     clsplat("render", ply(model), "--path", tmp_path / "path.json", "--frames", "9", "-o", tmp_path / "more")
     assert len(files(tmp_path / "more")) == 10
@@ -147,8 +160,19 @@ def test_render_between_chosen_cameras_and_along_the_saved_path(model: Path, tmp
 
 
 def test_coloured_depth_has_one_range_for_the_path(model: Path, tmp_path: Path) -> None:
-    clsplat("render", model, "--path", "orbit", "--frames", "2", "-o", tmp_path / "r", "--depth-colours",
-            "--depth-range", "1,9")
+    clsplat(
+        "render",
+        model,
+        "--path",
+        "orbit",
+        "--frames",
+        "2",
+        "-o",
+        tmp_path / "r",
+        "--depth-colours",
+        "--depth-range",
+        "1,9",
+    )
     camera = read_cameras(tmp_path / "r" / "cameras.json")[1].camera
     wanted = depth_picture(Renderer().render(Splats.load(ply(model)), camera), (1, 9))
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "r" / "orbit_001_depth.png")), wanted)
@@ -158,8 +182,24 @@ def test_render_videos_of_colour_depth_and_alpha(model: Path, tmp_path: Path) ->
     """Real files, decoded: as many frames as asked, of an even size, each near the image that was rendered."""
     imageio = pytest.importorskip("imageio.v2", reason="the extra `video` is not installed")
     pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
-    out = clsplat("render", model, "--path", "orbit", "--frames", "4", "--fps", "10", "--size", "49x35", "-o",
-                  tmp_path / "r", "--video", tmp_path / "v" / "turn.mp4", "--depth", "--alpha")
+    out = clsplat(
+        "render",
+        model,
+        "--path",
+        "orbit",
+        "--frames",
+        "4",
+        "--fps",
+        "10",
+        "--size",
+        "49x35",
+        "-o",
+        tmp_path / "r",
+        "--video",
+        tmp_path / "v" / "turn.mp4",
+        "--depth",
+        "--alpha",
+    )
     assert "4 frames of 49x35 px, 0.4 s at 10 a second" in out
     assert files(tmp_path / "v") == {"turn.mp4", "turn_depth.mp4", "turn_alpha.mp4"}
     for name in ("turn", "turn_depth", "turn_alpha"):
@@ -175,8 +215,9 @@ def test_render_videos_of_colour_depth_and_alpha(model: Path, tmp_path: Path) ->
     assert (tmp_path / "only.mp4").stat().st_size > 500
 
 
-def test_an_interrupted_video_says_so_and_leaves_nothing(model: Path, tmp_path: Path,
-                                                         monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_video_says_so_and_leaves_nothing(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
     real, calls = Renderer.render, []
 
@@ -190,7 +231,9 @@ def test_an_interrupted_video_says_so_and_leaves_nothing(model: Path, tmp_path: 
     result = run("render", model, "--path", "orbit", "--frames", "5", "--video", tmp_path / "v.mp4")
     assert result.exit_code == 130
     assert result.stderr.splitlines() == [
-        f"{tmp_path / 'v.mp4'}: not written, as only 2 of 5 frames were rendered", "error: interrupted"]
+        f"{tmp_path / 'v.mp4'}: not written, as only 2 of 5 frames were rendered",
+        "error: interrupted",
+    ]
     assert files(tmp_path) == set()
 
 
@@ -297,5 +340,3 @@ def test_eval_of_a_moved_scene(model: Path, scene: Path, tmp_path: Path) -> None
     assert "with -s" in error_of("eval", copy)
     clsplat("eval", copy, "-s", moved)
     clsplat("render", copy, "-o", tmp_path / "r")  # needs no photos
-
-

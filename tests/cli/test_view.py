@@ -65,12 +65,14 @@ def test_bad_input_is_one_line(tmp_path: Path, tmp_path_factory: pytest.TempPath
     assert "--view shows one run" in error_of("train", scene, "--view", "--budget", "auto", code=2)
 
 
-def test_without_viser_both_say_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
-                                                tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_without_viser_both_say_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     assert "pip install clsplat[view]" in error_of("view", small_model(tmp_path_factory))
     assert "pip install clsplat[view]" in error_of(
-        "train", small_capture(tmp_path_factory), "-m", tmp_path / "run", "--view", *SHORT)
+        "train", small_capture(tmp_path_factory), "-m", tmp_path / "run", "--view", *SHORT
+    )
     assert not (tmp_path / "run").exists()
 
 
@@ -79,8 +81,9 @@ class Command:
 
     def __init__(self, *args: object) -> None:
         command = [sys.executable, "-u", "-c", "from clsplat_cli.main import main; main()", *(str(arg) for arg in args)]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                                        env=os.environ | {"COLUMNS": "200"})
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ | {"COLUMNS": "200"}
+        )
         self.said = ""
         assert self.process.stdout is not None
         while not (found := re.search(r"http://localhost:(\d+)|http://127\.0\.0\.1:(\d+)", self.said)):
@@ -167,7 +170,18 @@ def test_train_view_shows_the_run(tmp_path: Path, tmp_path_factory: pytest.TempP
 def test_a_watched_model_has_the_same_bits(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
     model = small_model(tmp_path_factory)
-    clsplat("train", small_capture(tmp_path_factory), "-m", tmp_path / "run", "--eval", "--save-iterations", "20,40",
-            "--view", "--port", 0, *SHORT)
+    clsplat(
+        "train",
+        small_capture(tmp_path_factory),
+        "-m",
+        tmp_path / "run",
+        "--eval",
+        "--save-iterations",
+        "20,40",
+        "--view",
+        "--port",
+        0,
+        *SHORT,
+    )
     name = Path("point_cloud") / f"iteration_{ITERATIONS}" / "point_cloud.ply"
     assert (tmp_path / "run" / name).read_bytes() == (model / name).read_bytes()

@@ -19,8 +19,12 @@ from clsplat.errors import InputError, OutputError
 from clsplat.evaluation.chart_style import _STYLE, chart_paths, drawing, looks, place_labels, shape_colour, short_count
 from clsplat.splats.shapes import SHAPES
 
-CURVE: list[dict[str, Any]] = [{"splats": 4000, "psnr": 21.5}, {"splats": 1000, "psnr": 18.0},
-                               {"splats": 9000, "psnr": 21.6}, {"splats": 3000, "psnr": 21.45, "label": "pruned"}]
+CURVE: list[dict[str, Any]] = [
+    {"splats": 4000, "psnr": 21.5},
+    {"splats": 1000, "psnr": 18.0},
+    {"splats": 9000, "psnr": 21.6},
+    {"splats": 3000, "psnr": 21.45, "label": "pruned"},
+]
 
 
 @pytest.fixture
@@ -80,9 +84,11 @@ def test_a_knee_lies_on_the_curve(tmp_path: Path) -> None:
 
 
 def test_heat_map(tmp_path: Path, drawn: list[Any]) -> None:
-    cells = [{"row": "needles", "column": "gaussian", "verdict": "survives", "text": "+0.1"},
-             {"row": "needles", "column": "student-t", "verdict": "loses", "text": "-1.2"},
-             {"row": "one image", "column": "gaussian", "verdict": "fails", "text": "NaN"}]
+    cells = [
+        {"row": "needles", "column": "gaussian", "verdict": "survives", "text": "+0.1"},
+        {"row": "needles", "column": "student-t", "verdict": "loses", "text": "-1.2"},
+        {"row": "one image", "column": "gaussian", "verdict": "fails", "text": "NaN"},
+    ]
     heat_map(cells, tmp_path / "heat")
     (axes,) = drawn[0].axes
     assert [label.get_text() for label in axes.get_yticklabels()] == ["needles", "one image", "survived"]
@@ -114,7 +120,10 @@ def test_time_chart(tmp_path: Path, drawn: list[Any]) -> None:
     time_chart(curve_rows(runs), tmp_path / "time")
     psnr, ssim = drawn[0].axes
     assert (psnr.get_ylabel(), ssim.get_ylabel(), ssim.get_xlabel()) == (
-        "test PSNR [dB]", "test SSIM", "training time [s]")  # fmt: skip
+        "test PSNR [dB]",
+        "test SSIM",
+        "training time [s]",
+    )
     assert list(psnr.lines[0].get_xdata()) == [0.1, 0.4, 2.0, 10.0]
     assert list(ssim.lines[1].get_ydata()) == [row["ssim"] for row in runs[1]["curve"]]
     assert psnr.lines[0].get_color() == psnr.lines[1].get_color(), "one shape"
@@ -141,7 +150,9 @@ def test_seeds_chart(tmp_path: Path, drawn: list[Any]) -> None:
     seeds_chart(rows, tmp_path / "seeds")
     (axes,) = drawn[0].axes
     assert [label.get_text() for label in axes.get_xticklabels()] == [
-        "gaussian\nseeds 0.40 dB\nrepeats 0.00 dB", "3dgs\nseeds 0.40 dB\nrepeats 0.50 dB"]  # fmt: skip
+        "gaussian\nseeds 0.40 dB\nrepeats 0.00 dB",
+        "3dgs\nseeds 0.40 dB\nrepeats 0.50 dB",
+    ]
     assert words(axes) == ["=", "≠"]
     dots, median, repeats = axes.lines[:3]
     assert sorted(dots.get_ydata()) == pytest.approx([20.0, 20.1, 20.2, 20.3, 20.4])
@@ -152,15 +163,37 @@ def test_seeds_chart(tmp_path: Path, drawn: list[Any]) -> None:
 
 
 def test_arithmetic_chart(tmp_path: Path, drawn: list[Any]) -> None:
-    records = [{"scene": scene, "variant": variant, "kind": kind, "shape": shape, "image_error": error * worse,
-                "gradient_error": 10 * error * worse, "raster_ms": ms * slow, "raster_vjp_ms": 3 * ms * slow,
-                "psnr_change": -0.1 * worse}
-               for scene, slow, worse in (("near", 1.0, 0.5), ("far", 7.0, 2.0))
-               for shape, ms in (("gaussian", 5.0), ("skew-normal", 8.0))
-               for variant, kind, error, ms in (("erfc", "Phi", 1e-7, 2 * ms), ("default", "default", 1e-6, ms),
-                                                ("double", "exact", 0.0, 4 * ms))]
-    models = [{"scene": "near", "shape": "skew-normal", "variant": "normalisation pdf", "kind": "normalisation",
-               "image_error": None, "gradient_error": None, "psnr_change": 0.25}]
+    records = [
+        {
+            "scene": scene,
+            "variant": variant,
+            "kind": kind,
+            "shape": shape,
+            "image_error": error * worse,
+            "gradient_error": 10 * error * worse,
+            "raster_ms": ms * slow,
+            "raster_vjp_ms": 3 * ms * slow,
+            "psnr_change": -0.1 * worse,
+        }
+        for scene, slow, worse in (("near", 1.0, 0.5), ("far", 7.0, 2.0))
+        for shape, ms in (("gaussian", 5.0), ("skew-normal", 8.0))
+        for variant, kind, error, ms in (
+            ("erfc", "Phi", 1e-7, 2 * ms),
+            ("default", "default", 1e-6, ms),
+            ("double", "exact", 0.0, 4 * ms),
+        )
+    ]
+    models = [
+        {
+            "scene": "near",
+            "shape": "skew-normal",
+            "variant": "normalisation pdf",
+            "kind": "normalisation",
+            "image_error": None,
+            "gradient_error": None,
+            "psnr_change": 0.25,
+        }
+    ]
     rows = arithmetic_rows([*records, *models])
     arithmetic_chart(rows, tmp_path / "arithmetic")
     assert [axes.get_title() for axes in drawn[0].axes] == ["gaussian", "gaussian", "skew-normal", "skew-normal"]
@@ -203,7 +236,14 @@ def test_colours_are_told_apart() -> None:
 
 def test_short_counts() -> None:
     assert [short_count(n) for n in (7, 950, 1000, 2500, 20_000, 999_900, 3e6)] == [
-        "7", "950", "1k", "2.5k", "20k", "1M", "3M"]  # fmt: skip
+        "7",
+        "950",
+        "1k",
+        "2.5k",
+        "20k",
+        "1M",
+        "3M",
+    ]
 
 
 def test_suffixes_are_taken_off_once() -> None:

@@ -68,10 +68,16 @@ def test_a_run_is_the_training_it_names(scene: Scene, compared: Path) -> None:
 
 def test_the_files_have_all_runs(compared: Path) -> None:
     assert [(r["config"]["seed"], r["system"]) for r in done(compared)] == [
-        (0, "gaussian"), (0, "default"), (1, "gaussian"), (1, "default")]  # fmt: skip
+        (0, "gaussian"),
+        (0, "default"),
+        (1, "gaussian"),
+        (1, "default"),
+    ]
     rows = json.loads((compared / "results.json").read_text())["rows"]
     assert [(row["cap"], row["system"], row["seeds"]) for row in rows] == [
-        (CAP, "gaussian", [0, 1]), (CAP, "default", [0, 1])]  # fmt: skip
+        (CAP, "gaussian", [0, 1]),
+        (CAP, "default", [0, 1]),
+    ]
     table = (compared / "table.md").read_text().splitlines()
     assert table[0] == f"| {' | '.join(HEAD)} |"
     assert len([line for line in table if line.startswith("| yard 48x36 |")]) == 2
@@ -94,10 +100,21 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int, int]]:
 def recorded(config: TrainConfig, system: str, **values: object) -> Record:
     """A line of runs.jsonl as training would have made it."""
     measured = dict.fromkeys(MEASURED, 1.0) | {"psnr": 20.0 + config.seed, "ssim": 0.5, "splats": 10}
-    return {"scene": {"name": "yard", "width": 8, "height": 6, "train": 3, "test": 1}, "system": system,
-            "config": config.to_json(), "failed": None, "finite": True, "cap_held": True, "device": "d",
-            "driver": "v", "schedule": "1x16x16", "version": "0", "protocol": {"PSNR": "p", "SSIM": "s"},
-            **measured, **values}  # fmt: skip
+    return {
+        "scene": {"name": "yard", "width": 8, "height": 6, "train": 3, "test": 1},
+        "system": system,
+        "config": config.to_json(),
+        "failed": None,
+        "finite": True,
+        "cap_held": True,
+        "device": "d",
+        "driver": "v",
+        "schedule": "1x16x16",
+        "version": "0",
+        "protocol": {"PSNR": "p", "SSIM": "s"},
+        **measured,
+        **values,
+    }
 
 
 def test_runs_are_done_once(scene: Scene, counted: list[Any], tmp_path: Path) -> None:
@@ -117,8 +134,7 @@ def test_runs_are_done_once(scene: Scene, counted: list[Any], tmp_path: Path) ->
     assert len(done(tmp_path)) == 6
 
 
-def test_all_systems_caps_and_seeds_are_run_systems_innermost(scene: Scene, counted: list[Any],
-                                                              tmp_path: Path) -> None:
+def test_all_systems_caps_and_seeds_are_run_systems_innermost(scene: Scene, counted: list[Any], tmp_path: Path) -> None:
     compare([scene], parse_systems("gaussian,default"), tmp_path, [9, 5], [1, 0], SHORT)
     expected = [(shape, cap, seed) for cap in (9, 5) for seed in (1, 0) for shape in ("gaussian", "skew-normal")]
     assert counted == expected
@@ -176,8 +192,9 @@ def test_repeats_are_the_same_bits(scene: Scene, tmp_path: Path) -> None:
 
 
 def test_repeats_that_differ_are_told() -> None:
-    records = [recorded(TrainConfig(), "a", digest=text, repeat=place, psnr=20.0 + place)
-               for place, text in enumerate("xy")]
+    records = [
+        recorded(TrainConfig(), "a", digest=text, repeat=place, psnr=20.0 + place) for place, text in enumerate("xy")
+    ]
     (row,) = repeats(records)
     assert (row["same"], row["spread"], row["runs"]) == (False, 1.0, 2)
     assert any("2 runs differ, PSNR by 1.0000 dB" in line for line in notes(records, summarise(records)))
@@ -201,8 +218,9 @@ def test_curve_iterations() -> None:
     assert curve_iterations(1000, 1) == (1000,)
 
 
-def test_failed_runs_are_told_and_the_comparison_goes_on(scene: Scene, tmp_path: Path,
-                                                         monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_runs_are_told_and_the_comparison_goes_on(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = Trainer.run
 
     def fail(self: Trainer) -> object:
@@ -260,7 +278,10 @@ def test_scenes_keep_their_order_and_caps_rise() -> None:
     records = [recorded(TrainConfig(cap_max=cap), "a") for cap in (9, 5)]
     records += [recorded(TrainConfig(cap_max=5), "a", scene=small)]
     assert [(row["scene"], row["cap"]) for row in summarise(records)] == [
-        ("yard 8x6", 5), ("yard 8x6", 9), ("attic 8x6", 5)]  # fmt: skip
+        ("yard 8x6", 5),
+        ("yard 8x6", 9),
+        ("attic 8x6", 5),
+    ]
 
 
 def test_notes_say_what_is_not_like_for_like() -> None:

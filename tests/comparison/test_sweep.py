@@ -61,8 +61,14 @@ def test_splats_needed_is_linear_in_log_splats() -> None:
 def test_points_and_fronts() -> None:
     points = point_rows(sweep())
     assert [(p["system"], p["cap"], p["front_splats"]) for p in points] == [
-        ("gaussian", 1000, False), ("default", 1000, True), ("auto default", 1500, True), ("gaussian", 2000, False),
-        ("default", 2000, False), ("gaussian", 4000, False), ("default", 4000, True)]  # fmt: skip
+        ("gaussian", 1000, False),
+        ("default", 1000, True),
+        ("auto default", 1500, True),
+        ("gaussian", 2000, False),
+        ("default", 2000, False),
+        ("gaussian", 4000, False),
+        ("default", 4000, True),
+    ]
     assert [p["auto"] for p in points].count(True) == 1
     assert points[0]["render_ms"] == 10
     assert points[0]["shape"] == "gaussian"
@@ -84,7 +90,10 @@ def test_a_scene_of_one_cap_is_no_sweep_and_other_lengths_are_left_out() -> None
 def test_equal_quality() -> None:
     rows = equal_rows(point_rows(sweep()), "gaussian")
     assert [(row["system"], row["reference_cap"], row["bound"]) for row in rows] == [
-        ("default", 1000, "at most"), ("default", 2000, ""), ("default", 4000, "")]  # fmt: skip
+        ("default", 1000, "at most"),
+        ("default", 2000, ""),
+        ("default", 4000, ""),
+    ]
     assert [row["ratio"] for row in rows] == pytest.approx([1.0, 2**-0.5, 2**-0.5])
     head, lines = equal_table(rows, "gaussian")
     assert head == ("scene", "system", "gaussian, cap 1000", "gaussian, cap 2000", "gaussian, cap 4000")
@@ -101,17 +110,36 @@ def test_automatic_runs_are_set_beside_the_best_of_their_shape() -> None:
     assert row["lost"] == pytest.approx(0.05)
     assert row["splats_ratio"] == row["bytes_ratio"] == pytest.approx(0.375)
     assert auto_table([row])[1][0][3:] == (
-        "1500", "0.30", "4000", "22.50", "0.05", "38", "38", "render_ms bytes splats")  # fmt: skip
+        "1500",
+        "0.30",
+        "4000",
+        "22.50",
+        "0.05",
+        "38",
+        "38",
+        "render_ms bytes splats",
+    )
     (alone,) = auto_rows(point_rows([record for record in sweep() if record["system"] != "default"]))
     assert alone["lost"] is None
     assert auto_table([alone])[1][0][5] == ""
     assert [is_auto(label) for label in ("auto", "auto 20 dB", "auto:x=1", "automatic", "default")] == [
-        True, True, True, False, False]  # fmt: skip
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_curves_are_of_the_cap_that_most_were_followed_at() -> None:
-    runs = [recorded("a", 10, curve=curve(20)), recorded("b", 10, curve=curve(21)), recorded("b", 99, curve=curve(22)),
-            recorded("c", 99), recorded("a", 10, curve=curve(20), repeat=1), recorded("d", 10, failed="x", curve=[])]
+    runs = [
+        recorded("a", 10, curve=curve(20)),
+        recorded("b", 10, curve=curve(21)),
+        recorded("b", 99, curve=curve(22)),
+        recorded("c", 99),
+        recorded("a", 10, curve=curve(20), repeat=1),
+        recorded("d", 10, failed="x", curve=[]),
+    ]
     rows = curve_rows(runs)
     assert {(row["system"], row["cap"]) for row in rows} == {("a", 10), ("b", 10)}
     assert [row["iteration"] for row in rows] == [1, 4, 20, 100] * 2
@@ -143,10 +171,15 @@ def test_rows_are_written_as_csv_and_json(tmp_path: Path) -> None:
 
 def test_a_page_needs_nothing_beside_it(tmp_path: Path) -> None:
     svg = tmp_path / "a.svg"
-    svg.write_text('<?xml version="1.0"?>\n<!DOCTYPE svg>\n<svg width="9"><metadata>x</metadata><path id="m1"/>'
-                   '<use xlink:href="#m1" clip-path="url(#p)"/></svg>')
-    path = write_page(tmp_path / "r.html", "a & b", [
-        Section("one", ["<b>"], svg, ("name", "n"), [("x", "1"), ("y", "2")], ["a.csv"]), Section("two", chart=svg)])
+    svg.write_text(
+        '<?xml version="1.0"?>\n<!DOCTYPE svg>\n<svg width="9"><metadata>x</metadata><path id="m1"/>'
+        '<use xlink:href="#m1" clip-path="url(#p)"/></svg>'
+    )
+    path = write_page(
+        tmp_path / "r.html",
+        "a & b",
+        [Section("one", ["<b>"], svg, ("name", "n"), [("x", "1"), ("y", "2")], ["a.csv"]), Section("two", chart=svg)],
+    )
     text = path.read_text()
     assert "<title>a &amp; b</title>" in text
     assert "&lt;b&gt;" in text
@@ -155,7 +188,7 @@ def test_a_page_needs_nothing_beside_it(tmp_path: Path) -> None:
     assert text.count('id="c2-m1"') == 1, "charts of one page have ids of their own"
     assert "metadata" not in text
     assert text.count("<?xml") == text.count("<script") == text.count("http") == 0
-    assert '<th class=text>name</th><th>n</th>' in text
+    assert "<th class=text>name</th><th>n</th>" in text
     assert '<a href="a.csv">' in text
     with pytest.raises(InputError, match="draw the chart again"):
         write_page(path, "t", [Section("one", chart=tmp_path / "none.svg")])
@@ -163,8 +196,9 @@ def test_a_page_needs_nothing_beside_it(tmp_path: Path) -> None:
 
 def test_report_without_matplotlib(tmp_path: Path, undrawn: None) -> None:
     paths = frontier.write_report(tmp_path, [*sweep(), *seeds()], reference="gaussian")
-    assert {path.name for path in paths} == {f"{name}.{kind}" for name in ("size", "equal", "time", "seeds")
-                                             for kind in ("csv", "json")} | {"report.html"}
+    assert {path.name for path in paths} == {
+        f"{name}.{kind}" for name in ("size", "equal", "time", "seeds") for kind in ("csv", "json")
+    } | {"report.html"}
     text = (tmp_path / "report.html").read_text()
     assert text.count("pip install") == 4
     assert "<svg" not in text
@@ -184,8 +218,9 @@ def test_equal_runs_of_two_folders_count_once(tmp_path: Path, undrawn: None) -> 
 # --- the sweep ---------------------------------------------------------------------------------
 
 
-def test_an_interrupted_sweep_leaves_charts_and_goes_on(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory,
-                                                        monkeypatch: pytest.MonkeyPatch, undrawn: None) -> None:
+def test_an_interrupted_sweep_leaves_charts_and_goes_on(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, undrawn: None
+) -> None:
     made = []
 
     def train_and_measure(_: Any, config: Any, *more: Any) -> Record:

@@ -56,12 +56,25 @@ def change(renderer: Renderer, splats: Splats, scene: Scene, without: Callable[[
     """(N,) squared change of the images by each splat's other form."""
     views = scene.train[:2]
     whole = [renderer.render(splats, view.camera).color.astype(np.float64) for view in views]
-    return np.array([sum(float(np.sum((renderer.render(without(i), view.camera).color - image) ** 2))
-                         for view, image in zip(views, whole, strict=True)) for i in range(len(splats))])
+    return np.array(
+        [
+            sum(
+                float(np.sum((renderer.render(without(i), view.camera).color - image) ** 2))
+                for view, image in zip(views, whole, strict=True)
+            )
+            for i in range(len(splats))
+        ]
+    )
 
 
-@pytest.mark.parametrize("shape", ["skew-normal", pytest.param("bisected-skew", marks=pytest.mark.slow),
-                                   pytest.param("student-t", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        "skew-normal",
+        pytest.param("bisected-skew", marks=pytest.mark.slow),
+        pytest.param("student-t", marks=pytest.mark.slow),
+    ],
+)
 def test_removal_is_the_change_of_the_images(renderer: Renderer, scene: Scene, shape: str) -> None:
     splats = some_splats(scene, shape)
     true = change(renderer, splats, scene, lambda i: splats.select(np.arange(N) != i))
@@ -73,10 +86,13 @@ def test_removal_is_the_change_of_the_images(renderer: Renderer, scene: Scene, s
     assert np.median(found[shown] / true[shown]) == pytest.approx(1, abs=0.2)
 
 
-@pytest.mark.parametrize(("shape", "field"), [
-    ("skew-normal", "skew"), pytest.param("generalised-exponential", "beta", marks=pytest.mark.slow)])
-def test_fields_are_ranked_by_the_change_of_the_images(renderer: Renderer, scene: Scene, shape: str,
-                                                       field: str) -> None:
+@pytest.mark.parametrize(
+    ("shape", "field"),
+    [("skew-normal", "skew"), pytest.param("generalised-exponential", "beta", marks=pytest.mark.slow)],
+)
+def test_fields_are_ranked_by_the_change_of_the_images(
+    renderer: Renderer, scene: Scene, shape: str, field: str
+) -> None:
     splats = some_splats(scene, shape)
     neutral = splats.schema[field].neutral
 
@@ -140,8 +156,9 @@ def test_lower_degrees_are_least_squares() -> None:
 
 def test_splats_that_no_view_sees_need_nothing_and_keep_their_colour(renderer: Renderer, scene: Scene) -> None:
     arrays = some_splats(scene, "skew-normal").to_numpy()
-    arrays["mean"][3] = scene.train[0].camera.position - 5 * (scene.points.xyz.mean(axis=0)
-                                                              - scene.train[0].camera.position)
+    arrays["mean"][3] = scene.train[0].camera.position - 5 * (
+        scene.points.xyz.mean(axis=0) - scene.train[0].camera.position
+    )
     splats = Splats("skew-normal", arrays)
     needs = measure(renderer, splats, scene.train[:1])
     assert needs.colour is not None

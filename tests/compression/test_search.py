@@ -36,8 +36,10 @@ CONFIG = TrainConfig(iterations=30, cap_max=200, sh_degree=1, densify_interval=5
 
 
 def rows(*psnr: float, **more: Any) -> list[dict[str, Any]]:
-    return [{"cap": 1000 * 2**i, "splats": 1000 * 2**i, "psnr": value, "views": [value], **more}
-            for i, value in enumerate(psnr)]
+    return [
+        {"cap": 1000 * 2**i, "splats": 1000 * 2**i, "psnr": value, "views": [value], **more}
+        for i, value in enumerate(psnr)
+    ]
 
 
 def test_caps_double_up_to_the_largest() -> None:
@@ -106,8 +108,9 @@ def test_the_fewest_splats_that_are_good_enough() -> None:
     assert chosen_of(rows(30.0, 29.0, fitted_psnr=None), BudgetOptions(max_bytes=1)) == 1
 
 
-@pytest.mark.parametrize("values", [{"tolerance": -0.1}, {"target_psnr": 0.0}, {"max_bytes": 0},
-                                    {"tolerance": float("nan")}])
+@pytest.mark.parametrize(
+    "values", [{"tolerance": -0.1}, {"target_psnr": 0.0}, {"max_bytes": 0}, {"tolerance": float("nan")}]
+)
 def test_options_that_make_no_sense(values: dict[str, float]) -> None:
     with pytest.raises(InputError, match="must be"):
         BudgetOptions(**values)  # type: ignore[arg-type]
@@ -119,12 +122,15 @@ def test_fine_tuning_goes_on_at_the_runs_last_rates() -> None:
     short = fine_tuning(config, splats, 200, Path("start.ply"), rate=0.5)
     assert (short.iterations, short.cap_max, short.sh_degree, short.init) == (200, 3, 1, "start.ply")
     assert short.position_lr_final * short.rate_factor("mean") == pytest.approx(
-        config.position_lr_final * config.rate_factor("mean"))
+        config.position_lr_final * config.rate_factor("mean")
+    )
     assert short.scaling_lr * short.rate_factor("log_scale") == pytest.approx(
-        0.5 * config.scaling_lr * config.rate_factor("log_scale"))
+        0.5 * config.scaling_lr * config.rate_factor("log_scale")
+    )
     assert short.skew_lr is not None
     assert short.skew_lr * short.rate_factor("skew") == pytest.approx(
-        0.5 * splats.schema["skew"].lr * config.rate_factor("skew"))
+        0.5 * splats.schema["skew"].lr * config.rate_factor("skew")
+    )
     assert short.opacity_lr == 0.5 * config.opacity_lr
     assert short.densify_until == short.noise_lr == 0
 
@@ -168,8 +174,9 @@ class Stop:
         self.left = number
 
     def __call__(self, progress: Progress) -> None:
-        self.left -= progress.message.split(":")[0].split()[0:1] in ([word] for word in (
-            "growth", "held", "round", "last", "refit"))
+        self.left -= progress.message.split(":")[0].split()[0:1] in (
+            [word] for word in ("growth", "held", "round", "last", "refit")
+        )
         if not self.left:
             raise KeyboardInterrupt
 

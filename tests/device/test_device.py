@@ -76,8 +76,9 @@ def test_schedules_cover_a_tile_and_round_trip():
         assert Schedule.parse(str(schedule)) == schedule == Schedule.parse(name)
 
 
-@pytest.mark.parametrize("text", ["1x16", "1x16x8", "axbxc", "", "0x16x16", "8x1x32", "-1x-16x16", "1x64x4",
-                                  "8x32x1", "16x16x1"])
+@pytest.mark.parametrize(
+    "text", ["1x16", "1x16x8", "axbxc", "", "0x16x16", "8x1x32", "-1x-16x16", "1x64x4", "8x32x1", "16x16x1"]
+)
 def test_bad_schedule_is_refused_in_one_line(text):
     with pytest.raises(DeviceError, match="schedule") as caught:
         Schedule.parse(text)

@@ -28,8 +28,10 @@ def test_the_name_depends_on_everything_that_the_binary_does() -> None:
     assert first is not None
     assert first == binary_path(INFO, "text", ["-a"]) == binary_path(replace(INFO, index="1:0"), "text", ["-a"])
     others = [binary_path(INFO, "text ", ["-a"]), binary_path(INFO, "text", ["-a", "-b"])]
-    others += [binary_path(replace(INFO, **{field: "other"}), "text", ["-a"])
-               for field in ("platform", "platform_version", "name", "version", "driver")]
+    others += [
+        binary_path(replace(INFO, **{field: "other"}), "text", ["-a"])
+        for field in ("platform", "platform_version", "name", "version", "driver")
+    ]
     assert len({first, *others}) == 8
 
 
@@ -45,8 +47,9 @@ def test_drivers_that_keep_their_own_are_left_to_it() -> None:
 
 
 @given(binary=st.binary(max_size=200), cut=st.integers(0, 300), place=st.integers(0, 300))
-def test_a_damaged_file_is_a_miss(tmp_path_factory: pytest.TempPathFactory, binary: bytes, cut: int,
-                                  place: int) -> None:
+def test_a_damaged_file_is_a_miss(
+    tmp_path_factory: pytest.TempPathFactory, binary: bytes, cut: int, place: int
+) -> None:
     path = tmp_path_factory.mktemp("bin") / "a.bin"
     assert load_binary(path) is None
     store_binary(path, binary)

@@ -39,11 +39,19 @@ print(hashlib.sha256(image.color.tobytes()).hexdigest())
 
 def start(device: str, cache: Path) -> subprocess.Popen[str]:
     """A process that renders, with its caches in the folder."""
-    environment = os.environ | {"XDG_CACHE_HOME": str(cache), "POCL_CACHE_DIR": str(cache / "pocl"),
-                                OPTIONS_VARIABLE: "-cl-opt-disable"}  # builds in half the time
+    environment = os.environ | {
+        "XDG_CACHE_HOME": str(cache),
+        "POCL_CACHE_DIR": str(cache / "pocl"),
+        OPTIONS_VARIABLE: "-cl-opt-disable",
+    }  # builds in half the time
     (cache / "pocl").mkdir(parents=True, exist_ok=True)
-    return subprocess.Popen([sys.executable, "-c", CHILD, device], env=environment, text=True,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(
+        [sys.executable, "-c", CHILD, device],
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
 
 
 def digest(process: subprocess.Popen[str]) -> str:
@@ -71,17 +79,21 @@ def test_processes_share_an_empty_and_a_damaged_cache(index: str, tmp_path: Path
 
 def test_help_imports_neither_numpy_nor_opencl() -> None:
     """0.3 s are allowed: this says why it takes less, on any machine."""
-    check = ("import sys; from clsplat_cli.main import main\n"
-             "try: main(['--help'])\nexcept SystemExit: print([m for m in ('numpy', 'pyopencl', 'PIL') "
-             "if m in sys.modules])")
+    check = (
+        "import sys; from clsplat_cli.main import main\n"
+        "try: main(['--help'])\nexcept SystemExit: print([m for m in ('numpy', 'pyopencl', 'PIL') "
+        "if m in sys.modules])"
+    )
     run = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)
     assert run.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_a_command_does_not_import_opencl(name: str) -> None:
-    check = ("import sys; from clsplat_cli.main import main\n"
-             f"try: main(['{name}', '--help'])\nexcept SystemExit: print([m for m in ('pyopencl', 'scipy', 'PIL', "
-             "'pycolmap') if m in sys.modules])")
+    check = (
+        "import sys; from clsplat_cli.main import main\n"
+        f"try: main(['{name}', '--help'])\nexcept SystemExit: print([m for m in ('pyopencl', 'scipy', 'PIL', "
+        "'pycolmap') if m in sys.modules])"
+    )
     run = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)
     assert run.stdout.splitlines()[-1] == "[]"

@@ -26,7 +26,11 @@ def test_every_command_is_recorded_once(device: Device) -> None:
     device.queue.finish()
     assert [launch.name for launch in inner] == ["smoke"]
     assert [(launch.name, launch.size) for launch in launches] == [
-        ("upload", (400,)), ("fill", (400,)), ("smoke", (128,)), ("download", (400,))]
+        ("upload", (400,)),
+        ("fill", (400,)),
+        ("smoke", (128,)),
+        ("download", (400,)),
+    ]
     assert all(launch.ms >= 0 for launch in launches)
     assert inner[0].ms > 0
     assert {"upload", "fill", "download"} <= set(TRANSFERS)

@@ -87,6 +87,7 @@ def test_unusable_images_are_named() -> None:
 
 # --- masks and exposures -------------------------------------------------------------------
 
+
 def test_masked_pixels_are_in_no_metric() -> None:
     """Whatever stands there; PSNR is that of the other pixels, SSIM that of windows around them."""
     mask = np.ones(A.shape[:2], bool)

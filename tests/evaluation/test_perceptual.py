@@ -45,9 +45,12 @@ def packages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., l
             return measure
 
         lpips: Any = SimpleNamespace(LPIPS=make)
-        torch = SimpleNamespace(from_numpy=lambda array: array, inference_mode=nullcontext,
-                                Tensor=type("Tensor", (), {}),  # SciPy asks for it
-                                hub=SimpleNamespace(get_dir=lambda: str(tmp_path / "hub")))
+        torch = SimpleNamespace(
+            from_numpy=lambda array: array,
+            inference_mode=nullcontext,
+            Tensor=type("Tensor", (), {}),  # SciPy asks for it
+            hub=SimpleNamespace(get_dir=lambda: str(tmp_path / "hub")),
+        )
         monkeypatch.setitem(sys.modules, "lpips", lpips)
         monkeypatch.setitem(sys.modules, "torch", torch)
         if import_fails is not None:
@@ -113,8 +116,9 @@ def test_lpips_says_what_is_missing(packages: Any, monkeypatch: pytest.MonkeyPat
         Flip()
 
 
-def test_eval_has_both_in_files_and_on_the_page(packages: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
-                                                tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_eval_has_both_in_files_and_on_the_page(
+    packages: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     packages()
     model = Path(shutil.copytree(small_model(tmp_path_factory), tmp_path / "model"))
 

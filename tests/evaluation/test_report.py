@@ -41,8 +41,13 @@ def measured(label: str, n: int = 3, error: float = 0.05, mask: bool = False) ->
         name = f"<{index}>.jpg"
         shots[name] = shot_of(photo, color, hides if mask else None)
         psnr[name] = 30.0 - index
-    return Measured(label, {"splats": "7"}, [("shape", "round & flat")],
-                    {"PSNR": psnr, "SSIM": {name: value / 40 for name, value in psnr.items()}}, shots)
+    return Measured(
+        label,
+        {"splats": "7"},
+        [("shape", "round & flat")],
+        {"PSNR": psnr, "SSIM": {name: value / 40 for name, value in psnr.items()}},
+        shots,
+    )
 
 
 def images(text: str) -> list[tuple[str, np.ndarray]]:

@@ -91,11 +91,15 @@ def test_places_that_take_no_files(capture: Path, model: Path, tmp_path: Path, k
     commands = [
         ["train", capture, "-m", place / "m", *SHORT],
         ["train", capture, "-m", place / "m", "--budget", "auto", *SHORT],
-        ["convert", model, place / "o.ply"], ["cameras", model, place / "t.json"],
-        ["cameras", model, place / "sparse" / "0"], ["render", model, "-o", place / "r"],
-        ["prune", model, "-o", place / "p.ply"], ["compare", capture, "-o", place / "c"],
-        ["frontier", capture, "-o", place / "f"], ["blender-addon", "-o", place / "a.zip"],
-    ]  # fmt: skip
+        ["convert", model, place / "o.ply"],
+        ["cameras", model, place / "t.json"],
+        ["cameras", model, place / "sparse" / "0"],
+        ["render", model, "-o", place / "r"],
+        ["prune", model, "-o", place / "p.ply"],
+        ["compare", capture, "-o", place / "c"],
+        ["frontier", capture, "-o", place / "f"],
+        ["blender-addon", "-o", place / "a.zip"],
+    ]
     if kind == "a file":
         place.write_bytes(b"mine")
         for command in commands:

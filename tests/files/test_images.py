@@ -15,9 +15,7 @@ from scenes_data import scene_folder
 from clsplat.errors import InputError, OutputError
 from clsplat.files.images import image_size, read_image, resize_area, write_png
 
-FIXTURE_OK = settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+FIXTURE_OK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 pixels = st.tuples(st.integers(1, 12), st.integers(1, 12), st.sampled_from([3, 4])).flatmap(
     lambda shape: arrays(np.uint8, shape)
 )
@@ -89,9 +87,7 @@ def test_transparent_pixels_do_not_colour_their_neighbours() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(image=pixels, width=st.integers(1, 20), height=st.integers(1, 20), level=st.integers(0, 255))
-def test_resize_gives_the_size_and_keeps_constants(
-    image: np.ndarray, width: int, height: int, level: int
-) -> None:
+def test_resize_gives_the_size_and_keeps_constants(image: np.ndarray, width: int, height: int, level: int) -> None:
     assert resize_area(image, width, height).shape == (height, width, image.shape[2])
     flat = np.full_like(image[:, :, :3], level)
     assert (resize_area(flat, width, height) == level).all()

@@ -17,8 +17,18 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 def test_train_scenes(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scene = small_capture(tmp_path_factory)
     out = tmp_path / "scenes.jsonl"
-    options = ["--scenes", scene.name, "--shapes", "skew-normal", "--caps", "100", "--iterations", "8",
-               "--out", str(out)]
+    options = [
+        "--scenes",
+        scene.name,
+        "--shapes",
+        "skew-normal",
+        "--caps",
+        "100",
+        "--iterations",
+        "8",
+        "--out",
+        str(out),
+    ]
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
     command = [sys.executable, str(BENCHMARKS / "train_scenes.py")]
     done = subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
@@ -82,14 +92,24 @@ def test_budget(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Non
     out = tmp_path / "budget"
     command = [sys.executable, str(BENCHMARKS / "budget.py"), "--out", str(out)]
     for _ in range(2):
-        subprocess.run([*command, "--smoke", "--scenes", scene.name, "--work", str(tmp_path / "work")], env=environment,
-                       capture_output=True, text=True, check=True)
+        subprocess.run(
+            [*command, "--smoke", "--scenes", scene.name, "--work", str(tmp_path / "work")],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
     (row,) = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
     assert row["system"].startswith("auto skew-normal")
     assert row["splats"] == row["budget"]["final"]["splats"] <= 60
     assert {"device", "driver", "schedule", "commit", "psnr", "render_ms"} <= set(row)
-    best = row | {"system": "skew-normal", "splats": 2 * row["splats"], "bytes": 4 * row["bytes"],
-                  "psnr": row["psnr"] + 0.5, "seconds": 0.5 * row["seconds"]}
+    best = row | {
+        "system": "skew-normal",
+        "splats": 2 * row["splats"],
+        "bytes": 4 * row["bytes"],
+        "psnr": row["psnr"] + 0.5,
+        "seconds": 0.5 * row["seconds"],
+    }
     (tmp_path / "frontier").mkdir()
     (tmp_path / "frontier" / "runs.jsonl").write_text(json.dumps(best) + "\n")
     printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
@@ -164,8 +184,18 @@ def test_frontier(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> N
 def test_photos(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     scene = small_capture(tmp_path_factory)
     out = tmp_path / "photos.jsonl"
-    command = [sys.executable, str(BENCHMARKS / "photos.py"), "--smoke", "--scenes", f"{scene.name}:1",
-               "--out", str(out), "--options", "", "exposure=true,antialiased=true"]
+    command = [
+        sys.executable,
+        str(BENCHMARKS / "photos.py"),
+        "--smoke",
+        "--scenes",
+        f"{scene.name}:1",
+        "--out",
+        str(out),
+        "--options",
+        "",
+        "exposure=true,antialiased=true",
+    ]
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
     for _ in range(2):
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
@@ -182,13 +212,21 @@ def test_visible_adam(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) 
     scene = small_capture(tmp_path_factory)
     out = tmp_path / "visible.jsonl"
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
-    command = [sys.executable, str(BENCHMARKS / "visible_adam.py"), "--smoke", "--scenes", f"{scene.name}:1:60",
-               "--out", str(out)]
+    command = [
+        sys.executable,
+        str(BENCHMARKS / "visible_adam.py"),
+        "--smoke",
+        "--scenes",
+        f"{scene.name}:1:60",
+        "--out",
+        str(out),
+    ]
     for _ in range(2):
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     rows = [json.loads(line) for line in out.read_text().splitlines()]
     assert [(row["task"], row["options"]) for row in rows] == [
-        (task, f"visible_adam={on}") for task in ("wide", "train") for on in ("false", "true")]
+        (task, f"visible_adam={on}") for task in ("wide", "train") for on in ("false", "true")
+    ]
     for row in rows:
         assert {"device", "driver", "schedule", "commit", "load"} <= set(row)
         assert 0 < row["splats_seen"] <= row["vectors_seen"] <= 1

@@ -42,10 +42,12 @@ NOT_RUN = (
     (r"python docs/api\.py", "test_docstrings_are_rendered runs it"),
     (r"\.venv/bin/clsplat devices", "measures schedules; test_device.py and test_cli.py run it"),
     (r"clsplat view |clsplat train .*--view", "serves until it is stopped; test_cli_view.py runs it"),
-)  # fmt: skip
+)
 # Minutes, or one more of a kind of which another is run.
-SLOW = re.compile(r"clsplat (demo|compare|frontier|bench|reconstruct|prune)|--(budget|target-psnr|video|config|report)"
-                  r"|PHOTOS|-r 2|\.splat|gaussians\.ply|-direct")
+SLOW = re.compile(
+    r"clsplat (demo|compare|frontier|bench|reconstruct|prune)|--(budget|target-psnr|video|config|report)"
+    r"|PHOTOS|-r 2|\.splat|gaussians\.ply|-direct"
+)
 REAL_PHOTOS = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data") / "sceaux_castle"
 # What every training command gets that does not say otherwise, and the values that stand in for those it has.
 FEW = {"--iterations": "8", "--cap-max": "60", "--seeds": "0", "--seed": "1"}
@@ -114,12 +116,15 @@ def stand_ins(folder: Path, words: list[str], factory: pytest.TempPathFactory) -
         write_png(folder / "SCENE" / "masks" / f"{photo.name}.png", mask)
 
 
-@pytest.mark.parametrize("command", [
-    pytest.param(command, marks=[pytest.mark.slow] if SLOW.search(command) else []) for command in RUN])
-def test_commands_run(command: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory,
-                      monkeypatch: pytest.MonkeyPatch) -> None:
-    assert command.removeprefix(".venv/bin/").startswith("clsplat "), \
+@pytest.mark.parametrize(
+    "command", [pytest.param(command, marks=[pytest.mark.slow] if SLOW.search(command) else []) for command in RUN]
+)
+def test_commands_run(
+    command: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert command.removeprefix(".venv/bin/").startswith("clsplat "), (
         f"{COMMANDS_SEEN[command]}: {command!r} is neither run nor in NOT_RUN"
+    )
     words = shortened(command)
     if "--video" in words:
         pytest.importorskip("imageio_ffmpeg", reason="imageio[ffmpeg] is not installed (pip install clsplat[video])")
@@ -183,8 +188,9 @@ def test_every_command_is_in_the_guide() -> None:
 
 
 @pytest.mark.parametrize("page", [page for page, text in TEXTS.items() if blocks(text, "python")])
-def test_python_runs(page: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory,
-                     monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_runs(
+    page: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All Python of a page as one program, where the demo was made."""
     shutil.copytree(small_capture(tmp_path_factory), tmp_path / "out" / "scene")
     monkeypatch.chdir(tmp_path)
@@ -200,8 +206,10 @@ def test_links_lead_somewhere() -> None:
                 assert ((ROOT / page).parent / target).exists(), f"{page}: {target}"
         for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)]+)\)", text):
             other = TEXTS[((ROOT / page).parent / target).resolve().relative_to(ROOT).as_posix() if target else page]
-            heads = [re.sub(r"[^\w -]", "", head).strip().lower().replace(" ", "-")
-                     for head in re.findall(r"^#+ (.*)$", other, re.M)]
+            heads = [
+                re.sub(r"[^\w -]", "", head).strip().lower().replace(" ", "-")
+                for head in re.findall(r"^#+ (.*)$", other, re.M)
+            ]
             assert anchor in heads, f"{page}: {target}#{anchor}"
 
 
@@ -211,8 +219,9 @@ def source_texts() -> list[str]:
     for path in [file for folder in ("clsplat", "cli", "blender") for file in (ROOT / folder).glob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.JoinedStr):
-                found.append("".join(str(part.value) if isinstance(part, ast.Constant) else "\0"
-                                     for part in node.values))
+                found.append(
+                    "".join(str(part.value) if isinstance(part, ast.Constant) else "\0" for part in node.values)
+                )
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.append(node.value)
     return found
@@ -249,7 +258,8 @@ def test_docstrings_are_rendered(tmp_path: Path) -> None:
 def test_docstrings_without_pdoc(tmp_path: Path) -> None:
     if importlib.util.find_spec("pdoc"):
         pytest.skip("pdoc is installed")
-    done = subprocess.run([sys.executable, str(ROOT / "docs" / "api.py"), str(tmp_path)], capture_output=True,
-                          text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "docs" / "api.py"), str(tmp_path)], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 1
     assert done.stderr == 'error: pdoc is not installed: pip install "clsplat[docs]"\n'

@@ -16,8 +16,11 @@ def test_a_share_of_every_reader_s_inputs() -> None:
     """Another share each day would be another test each day: the seed stays."""
     readers = list(READERS)
     with ThreadPoolExecutor(2) as pool:
-        results = [result for part in pool.map(lambda part: campaign(part, INPUTS), (readers[::2], readers[1::2]))
-                   for result in part]
+        results = [
+            result
+            for part in pool.map(lambda part: campaign(part, INPUTS), (readers[::2], readers[1::2]))
+            for result in part
+        ]
     assert {result.inputs for result in results} == {INPUTS}
     assert [fault for result in results for fault in result.faults] == []
     assert all(result.refused > INPUTS / 5 for result in results), "the damage is too slight"
@@ -37,13 +40,16 @@ READERS = {{"planted": Sample(lambda folder: (folder / "a").write_bytes(b"sound"
 """
 
 
-@pytest.mark.parametrize(("body", "said"), [
-    ("bytearray(2 * ROOM)", "MemoryError"),
-    pytest.param("os._exit(7)", "ended (7)", marks=pytest.mark.slow),
-    pytest.param("raise ValueError('no')", "ValueError: no", marks=pytest.mark.slow),
-    pytest.param("raise InputError('two\\nlines')", "several lines", marks=pytest.mark.slow),
-    pytest.param("while True: pass", "took longer", marks=pytest.mark.slow),
-])
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("bytearray(2 * ROOM)", "MemoryError"),
+        pytest.param("os._exit(7)", "ended (7)", marks=pytest.mark.slow),
+        pytest.param("raise ValueError('no')", "ValueError: no", marks=pytest.mark.slow),
+        pytest.param("raise InputError('two\\nlines')", "several lines", marks=pytest.mark.slow),
+        pytest.param("while True: pass", "took longer", marks=pytest.mark.slow),
+    ],
+)
 def test_faults_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: str, said: str) -> None:
     (tmp_path / "planted.py").write_text(PLANTED.format(body=body))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))

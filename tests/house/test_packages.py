@@ -16,9 +16,21 @@ ROOT = Path(__file__).resolve().parents[2]
 
 # The rule: a package imports only packages to its left, and inside a package no import runs in a circle.
 PACKAGES = (
-    "errors", "_version", "files", "splats", "cameras", "scenes", "device", "rendering", "evaluation", "training",
-    "compression", "comparison", "profiling", "viewer",
-)  # fmt: skip
+    "errors",
+    "_version",
+    "files",
+    "splats",
+    "cameras",
+    "scenes",
+    "device",
+    "rendering",
+    "evaluation",
+    "training",
+    "compression",
+    "comparison",
+    "profiling",
+    "viewer",
+)
 # These three stand side by side: none imports another.
 LAST = ("comparison", "profiling", "viewer")
 
@@ -59,8 +71,9 @@ def kernel_sources() -> dict[str, str]:
     folder = ROOT / "cl"
     return {
         str(path.relative_to(folder)): COMMENT.sub(" ", path.read_text())
-        for path in sorted(folder.rglob("*.cl*")) if path.suffix in (".cl", ".clh")
-    }  # fmt: skip
+        for path in sorted(folder.rglob("*.cl*"))
+        if path.suffix in (".cl", ".clh")
+    }
 
 
 def imports_of(name: str, path: Path) -> set[str]:
@@ -91,10 +104,12 @@ def foreign_imports(tree: ast.AST) -> set[str]:
 def code_strings(tree: ast.AST) -> Iterator[str]:
     """String constants that are not docstrings."""
     documents = {
-        id(node.body[0].value) for node in ast.walk(tree)
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and node.body
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        and node.body
         and isinstance(node.body[0], ast.Expr)
-    }  # fmt: skip
+    }
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in documents:
             yield node.value
@@ -145,8 +160,9 @@ def test_the_packages_are_installed() -> None:
     """Each folder with modules is in pyproject.toml."""
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
     folders = {path.parent.relative_to(ROOT) for path in (ROOT / "clsplat").rglob("*.py")}
-    assert {".".join(folder.parts) for folder in folders} == {name for name in listed if name.startswith("clsplat.")
-                                                              or name == "clsplat"}
+    assert {".".join(folder.parts) for folder in folders} == {
+        name for name in listed if name.startswith("clsplat.") or name == "clsplat"
+    }
 
 
 @pytest.mark.parametrize("library", OWNERS)
@@ -160,7 +176,7 @@ def test_only_shape_files_name_shapes() -> None:
         path.relative_to(ROOT).as_posix().removeprefix("clsplat/")
         for path in (*(ROOT / "clsplat").rglob("*.py"), *(ROOT / "cli").glob("*.py"))
         if path.name != "shapes.py" and set(SHAPES) & set(code_strings(ast.parse(path.read_text())))
-    }  # fmt: skip
+    }
     assert naming == set(SHAPE_NAMES_IN)
     words = re.compile("|".join(name.replace("-", "[-_ ]?") for name in SHAPES), re.I)
     for name, text in kernel_sources().items():

@@ -38,8 +38,21 @@ def test_every_kernel_has_one_stage() -> None:
 
 
 def test_shared_kernels_belong_to_what_came_before() -> None:
-    names = ["project_splats", "copy", "fill_iota", "radix_histogram", "scan_sums", "radix_scatter", "count_isects",
-             "scan_sums", "scan_apply", "emit_isects", "radix_scatter", "find_tile_ranges", "rasterize"]
+    names = [
+        "project_splats",
+        "copy",
+        "fill_iota",
+        "radix_histogram",
+        "scan_sums",
+        "radix_scatter",
+        "count_isects",
+        "scan_sums",
+        "scan_apply",
+        "emit_isects",
+        "radix_scatter",
+        "find_tile_ranges",
+        "rasterize",
+    ]
     stages = [stage for stage, _ in by_stage(Launch(name, (1,), None) for name in names)]
     assert stages == ["project", "transfers", *["depth sort"] * 4, *["binning"] * 4, *["tile sort"] * 2, "rasterize"]
     with pytest.raises(KeyError):
@@ -47,8 +60,16 @@ def test_shared_kernels_belong_to_what_came_before() -> None:
 
 
 # One lane, a wide vector and a narrow one; alpha of either sign.
-@pytest.mark.parametrize(("shape", "schedule"), [("gaussian", "cpu16"), ("gaussian", "cpu8"), ("gaussian", "scalar"),
-                                                 ("skew-normal", "cpu16"), ("student-t", "cpu16")])
+@pytest.mark.parametrize(
+    ("shape", "schedule"),
+    [
+        ("gaussian", "cpu16"),
+        ("gaussian", "cpu8"),
+        ("gaussian", "scalar"),
+        ("skew-normal", "cpu16"),
+        ("student-t", "cpu16"),
+    ],
+)
 def test_useful_pairs_are_those_of_the_reference(shape: str, schedule: str, devices: list[Device]) -> None:
     """Pixel by pixel, front to back: |alpha| at the cutoff or above, and no splat before has finished the pixel."""
     arrays = random_splats(5, 40) | {"opacity_logit": np.random.default_rng(6).uniform(0, 4, 40)}
@@ -95,9 +116,19 @@ def test_a_step_and_an_image_have_their_stages(devices: list[Device]) -> None:
     limits = Limits(1e9, 1e9)
     training, render = measure_training(trainer, limits, 2), measure_render(trainer, limits, 2)
     assert [stage.stage for stage in training.stages] == [
-        *(name for name in STAGES if name != "strategy"), "strategy", HOST]
+        *(name for name in STAGES if name != "strategy"),
+        "strategy",
+        HOST,
+    ]
     assert [stage.stage for stage in render.stages] == [
-        "project", "depth sort", "binning", "tile sort", "rasterize", "transfers", HOST]
+        "project",
+        "depth sort",
+        "binning",
+        "tile sort",
+        "rasterize",
+        "transfers",
+        HOST,
+    ]
     for report in (training, render):
         sizes = report.sizes
         assert (sizes.splats, sizes.pixels, sizes.sh_degree) == (400, 48 * 32, 3)

@@ -66,10 +66,16 @@ def sh_basis(direction: Array, degree: int) -> Array:
         [c[0] * np.ones_like(x)],
         [-c[1] * y, c[1] * z, -c[1] * x],
         [c[2] * x * y, -c[2] * y * z, c[3] * (2 * zz - xx - yy), -c[2] * x * z, c[4] * (xx - yy)],
-        [-c[5] * y * (3 * xx - yy), c[6] * x * y * z, -c[7] * y * (4 * zz - xx - yy),
-         c[8] * z * (2 * zz - 3 * xx - 3 * yy), -c[7] * x * (4 * zz - xx - yy),
-         c[9] * z * (xx - yy), -c[5] * x * (xx - 3 * yy)],
-    ]  # fmt: skip
+        [
+            -c[5] * y * (3 * xx - yy),
+            c[6] * x * y * z,
+            -c[7] * y * (4 * zz - xx - yy),
+            c[8] * z * (2 * zz - 3 * xx - 3 * yy),
+            -c[7] * x * (4 * zz - xx - yy),
+            c[9] * z * (xx - yy),
+            -c[5] * x * (xx - 3 * yy),
+        ],
+    ]
     return np.stack([value for band in bands[: degree + 1] for value in band], -1)
 
 
@@ -78,8 +84,9 @@ def jacobian(point: Array, camera: Camera) -> Array:
     x, y, z = np.moveaxis(point, -1, 0)
     tangents = []
     for tangent, size, focal, centre in (
-        (x / z, camera.width, camera.fx, camera.cx), (y / z, camera.height, camera.fy, camera.cy)
-    ):  # fmt: skip
+        (x / z, camera.width, camera.fx, camera.cx),
+        (y / z, camera.height, camera.fy, camera.cy),
+    ):
         margin = CLAMP_MARGIN * 0.5 * size / focal
         low, high = -(centre / focal + margin), (size - centre) / focal + margin
         tangents.append(np.where(tangent.real < low, low, np.where(tangent.real > high, high, tangent)))

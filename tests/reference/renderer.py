@@ -24,9 +24,7 @@ from reference.skewed import SKEWED
 
 NEAR_PLANE = 0.01  # splats with a camera z below this are skipped
 REFERENCES = SKEWED | RADIAL
-FIELDS = {
-    name: ("mean", "quat", "log_scale", "opacity_logit", *own.fields, "sh") for name, own in REFERENCES.items()
-}
+FIELDS = {name: ("mean", "quat", "log_scale", "opacity_logit", *own.fields, "sh") for name, own in REFERENCES.items()}
 STEP = 1e-20  # of the complex step; its square must vanish beside 1
 
 
@@ -76,8 +74,14 @@ def antialiased_kernel(arrays: Mapping[str, Array], geometry: Geometry, shape: s
     return kernel._replace(amplitude=factor * own.amplitude, amplitude_minus=minus)
 
 
-def project(arrays: Mapping[str, Array], camera: Camera, shape: str = "gaussian", normalisation: str = "peak",
-            sh_degree: int | None = None, antialiased: bool = False) -> Screen:
+def project(
+    arrays: Mapping[str, Array],
+    camera: Camera,
+    shape: str = "gaussian",
+    normalisation: str = "peak",
+    sh_degree: int | None = None,
+    antialiased: bool = False,
+) -> Screen:
     """Raw splats (fields as stored, real or complex) to the screen; `sh_degree` None means all stored."""
     world = projected_point(arrays, shape)
     point = world @ camera.rotation.T + camera.translation
@@ -118,8 +122,9 @@ def alpha_maps(screen: Screen, camera: Camera, alpha_min: float = 1 / 255, alpha
     return np.where(np.abs(alpha.real) < alpha_min, 0.0, alpha)
 
 
-def blend(alphas: Sequence[Array], colors: Sequence[Array], depths: Sequence[Array], background: ArrayLike,
-          t_min: float) -> Rendered:
+def blend(
+    alphas: Sequence[Array], colors: Sequence[Array], depths: Sequence[Array], background: ArrayLike, t_min: float
+) -> Rendered:
     """Front-to-back blending of B variants at once: per splat alphas (B, P), colors (B, 3), depths (B,).
 
     A pixel is finished for good by the splat that would take its transmittance to <= t_min; that splat
@@ -153,10 +158,18 @@ def visible_order(values: Mapping[str, Array], camera: Camera, shape: str) -> ND
     return order[z[order] >= NEAR_PLANE]
 
 
-def render_reference(arrays: Mapping[str, ArrayLike], camera: Camera, shape: str = "gaussian",
-                     normalisation: str = "peak", background: ArrayLike = (0.0, 0.0, 0.0),
-                     alpha_min: float = 1 / 255, alpha_max: float = 0.99, t_min: float = 1e-4,
-                     sh_degree: int | None = None, antialiased: bool = False) -> Rendered:
+def render_reference(
+    arrays: Mapping[str, ArrayLike],
+    camera: Camera,
+    shape: str = "gaussian",
+    normalisation: str = "peak",
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    alpha_min: float = 1 / 255,
+    alpha_max: float = 0.99,
+    t_min: float = 1e-4,
+    sh_degree: int | None = None,
+    antialiased: bool = False,
+) -> Rendered:
     """Render raw splats: `arrays` holds mean (N, 3), quat (N, 4), log_scale (N, 3), opacity_logit (N,),
     sh (N, K, 3) and the shape's own.
     """
@@ -172,12 +185,21 @@ def render_reference(arrays: Mapping[str, ArrayLike], camera: Camera, shape: str
     return Rendered(image.color.reshape(*size, 3), image.alpha.reshape(size), image.depth.reshape(size))
 
 
-def reference_gradients(arrays: Mapping[str, ArrayLike], camera: Camera, v_color: ArrayLike,
-                        v_alpha: ArrayLike | None = None, shape: str = "gaussian",
-                        normalisation: str = "peak", background: ArrayLike = (0.0, 0.0, 0.0),
-                        alpha_min: float = 1 / 255, alpha_max: float = 0.99, t_min: float = 1e-4,
-                        sh_degree: int | None = None, fields: Sequence[str] | None = None,
-                        antialiased: bool = False) -> dict[str, Array]:
+def reference_gradients(
+    arrays: Mapping[str, ArrayLike],
+    camera: Camera,
+    v_color: ArrayLike,
+    v_alpha: ArrayLike | None = None,
+    shape: str = "gaussian",
+    normalisation: str = "peak",
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    alpha_min: float = 1 / 255,
+    alpha_max: float = 0.99,
+    t_min: float = 1e-4,
+    sh_degree: int | None = None,
+    fields: Sequence[str] | None = None,
+    antialiased: bool = False,
+) -> dict[str, Array]:
     """Gradient of sum(v_color * color) + sum(v_alpha * alpha) with respect to the raw values.
 
     Clamps and thresholds count as constant where they act. `v_color` is (H, W, 3), `v_alpha` (H, W) or
@@ -203,10 +225,11 @@ def reference_gradients(arrays: Mapping[str, ArrayLike], camera: Camera, v_color
         replaced = [
             [*values_of[:place], new, *values_of[place + 1 :]]
             for values_of, new in (
-                (alphas, alpha_maps(bumped, camera, alpha_min, alpha_max)), (colors, bumped.color),
+                (alphas, alpha_maps(bumped, camera, alpha_min, alpha_max)),
+                (colors, bumped.color),
                 (depths, bumped.depth),
             )
-        ]  # fmt: skip
+        ]
         image = blend(*replaced, background=background, t_min=t_min)
         loss = np.einsum("bpc,pc->b", image.color, weights) + np.einsum("bp,p->b", image.alpha, weights_alpha)
         start = 0

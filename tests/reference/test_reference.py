@@ -166,10 +166,12 @@ def test_one_round_splat_by_hand():
     """On the axis: sigma² = (f s / z)² + 0.3, alpha = o exp(-r²/(2 sigma²)), over the background."""
     camera = Camera(5, 3, 10.0, 10.0, 2.5, 1.5, np.eye(4))
     arrays = {
-        "mean": np.array([[0.0, 0.0, 2.0]]), "quat": np.array([[2.0, 0.0, 0.0, 0.0]]),
-        "log_scale": np.log([[0.2, 0.2, 0.2]]), "opacity_logit": np.array([0.0]),
+        "mean": np.array([[0.0, 0.0, 2.0]]),
+        "quat": np.array([[2.0, 0.0, 0.0, 0.0]]),
+        "log_scale": np.log([[0.2, 0.2, 0.2]]),
+        "opacity_logit": np.array([0.0]),
         "sh": np.array([[[1.0, 0.0, -9.0]]]),
-    }  # fmt: skip
+    }
     image = render_reference(arrays, camera, background=(0.0, 1.0, 1.0))
     r2 = (np.arange(5) - 2.0) ** 2 + (np.arange(3)[:, None] - 1.0) ** 2
     alpha = 0.5 * np.exp(-0.5 * r2 / 1.3)

@@ -45,19 +45,26 @@ def case_of(shape: str, normalisation: str = "peak", dtype: type = np.float32, *
 DEFAULT = [("gaussian", "peak"), ("skew-normal", "peak"), ("bisected-skew", "peak"), ("ges-modulation", "peak")]
 
 
-@pytest.mark.parametrize(("shape", "normalisation"), [
-    pytest.param(*kernel, marks=[] if kernel in DEFAULT else pytest.mark.slow) for kernel in KERNELS])
-def test_image_and_gradients_equal_the_reference(make_renderer: MakeRenderer, device: Device, shape: str,
-                                                 normalisation: str) -> None:
+@pytest.mark.parametrize(
+    ("shape", "normalisation"),
+    [pytest.param(*kernel, marks=[] if kernel in DEFAULT else pytest.mark.slow) for kernel in KERNELS],
+)
+def test_image_and_gradients_equal_the_reference(
+    make_renderer: MakeRenderer, device: Device, shape: str, normalisation: str
+) -> None:
     case = case_of(shape, normalisation)
     plain = replace(case, antialiased=False)
     assert np.abs(case.image.color - plain.image.color).max() > 0.05, "the mode changes nothing here"
     case.check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
 
 
-@pytest.mark.parametrize("shape", [
-    "skew-normal", *(pytest.param(name, marks=pytest.mark.slow)
-                     for name in ("gaussian", "bisected-skew", "ges-modulation"))])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        "skew-normal",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("gaussian", "bisected-skew", "ges-modulation")),
+    ],
+)
 def test_double_precision_and_differences(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
     """One opacity, two, a displacement, and a size that is learned."""
     case_of(shape, dtype=np.float64).check(make_renderer(device, "float64"), ROUNDING, ROUNDING)
@@ -73,8 +80,13 @@ def test_double_precision_and_differences(make_renderer: MakeRenderer, device: D
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])
 def test_a_small_splat_keeps_its_volume(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
     """The sum of alpha over an image falls with the square of its size, however small the splat is on it."""
-    arrays = {"mean": [[0.0, 0.0, 0.0]], "quat": [[1.0, 0.0, 0.0, 0.0]], "log_scale": np.log([[0.05, 0.03, 0.04]]),
-              "opacity_logit": [2.0], "sh": [[[0.3, 0.2, 0.1]]]}
+    arrays = {
+        "mean": [[0.0, 0.0, 0.0]],
+        "quat": [[1.0, 0.0, 0.0, 0.0]],
+        "log_scale": np.log([[0.05, 0.03, 0.04]]),
+        "opacity_logit": [2.0],
+        "sh": [[[0.3, 0.2, 0.1]]],
+    }
     if shape != "gaussian":
         arrays["skew"] = [[0.9 * SKEW_MAX, 0.2, -0.1]]
     camera = random_camera(2, 320, 320)
@@ -83,23 +95,25 @@ def test_a_small_splat_keeps_its_volume(make_renderer: MakeRenderer, device: Dev
     kept = {}
     for antialiased in (False, True):
         splats = Splats(shape, {name: np.asarray(value) for name, value in arrays.items()}, antialiased=antialiased)
-        sums = [renderer.render(splats, camera.resized(size, size), BACKGROUND).alpha.sum() * (320 / size) ** 2
-                for size in (320, 160, 80, 40)]
+        sums = [
+            renderer.render(splats, camera.resized(size, size), BACKGROUND).alpha.sum() * (320 / size) ** 2
+            for size in (320, 160, 80, 40)
+        ]
         kept[antialiased] = np.array(sums) / sums[0]
     np.testing.assert_allclose(kept[True], 1.0, atol=0.02)
     assert kept[False][-1] > 2
 
 
-@pytest.mark.parametrize(("source", "target"), [("skew-normal", "skew-normal-direct"),
-                                                ("ges-modulation", "gaussian")])
+@pytest.mark.parametrize(("source", "target"), [("skew-normal", "skew-normal-direct"), ("ges-modulation", "gaussian")])
 def test_exact_conversions_stay_exact(make_renderer: MakeRenderer, device: Device, source: str, target: str) -> None:
     """Both forms have one volume on the screen."""
     case = case_of(source)
     renderer = make_renderer(device)
     other = convert(case.splats, target)
     assert other.antialiased
-    np.testing.assert_allclose(renderer.render(other, case.camera).color,
-                               renderer.render(case.splats, case.camera).color, atol=2e-5)
+    np.testing.assert_allclose(
+        renderer.render(other, case.camera).color, renderer.render(case.splats, case.camera).color, atol=2e-5
+    )
 
 
 @pytest.mark.parametrize("shape", ["skew-normal"])
@@ -141,8 +155,9 @@ def _model(antialiased: bool) -> Splats:
 def test_training_and_the_command_line(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> None:
     """The same gradients as the renderer's, and a file that says how it is to be shown."""
     folder = small_capture(tmp_path_factory)
-    clsplat("train", folder, "-m", tmp_path / "model", "--iterations", 20, "--cap-max", 200, "--antialiased", "-q",
-            "--eval")
+    clsplat(
+        "train", folder, "-m", tmp_path / "model", "--iterations", 20, "--cap-max", 200, "--antialiased", "-q", "--eval"
+    )
     model = Splats.load(tmp_path / "model" / "point_cloud" / "iteration_20" / "point_cloud.ply")
     assert model.antialiased
     scene = load_scene(folder)
@@ -152,5 +167,11 @@ def test_training_and_the_command_line(tmp_path_factory: pytest.TempPathFactory,
     plain = Splats(model.shape, model.arrays, model.normalisation)
     images = [Renderer().render(each, scene.test[0].camera).color for each in (model, plain)]
     assert np.abs(images[0] - images[1]).max() > 1e-3
-    assert "antialiased" in error_of("train", folder, "-m", tmp_path / "other", "--init",
-                                     tmp_path / "model" / "point_cloud" / "iteration_20" / "point_cloud.ply")
+    assert "antialiased" in error_of(
+        "train",
+        folder,
+        "-m",
+        tmp_path / "other",
+        "--init",
+        tmp_path / "model" / "point_cloud" / "iteration_20" / "point_cloud.ply",
+    )

@@ -24,8 +24,9 @@ def case(dtype: type = np.float64) -> Case:
     return Case(random_splats(2, 12, 3), camera, "skew-normal", dtype=dtype, thresholds=SMOOTH)
 
 
-@pytest.mark.parametrize("form", [pytest.param(form, marks=() if form.phi == "logistic" else pytest.mark.slow)
-                                  for form in FORMS], ids=str)
+@pytest.mark.parametrize(
+    "form", [pytest.param(form, marks=() if form.phi == "logistic" else pytest.mark.slow) for form in FORMS], ids=str
+)
 def test_a_form_has_the_gradient_of_its_own_image(device: Device, form: Arithmetic) -> None:
     """In double, along one direction of all parameters."""
     c = case()

@@ -73,9 +73,15 @@ def assert_same(got: Arrays, want: Arrays, tolerance: float = 0.0) -> None:
 
 
 # The least limit cuts rows along x.
-@pytest.mark.parametrize(("kind", "shape", "schedule"), [
-    ("CPU", "gaussian", "cpu16"), ("CPU", "skew-normal", "cpu8"), ("GPU", "gaussian", "gpu64"),
-    ("GPU", "skew-normal", "cpu16")])
+@pytest.mark.parametrize(
+    ("kind", "shape", "schedule"),
+    [
+        ("CPU", "gaussian", "cpu16"),
+        ("CPU", "skew-normal", "cpu8"),
+        ("GPU", "gaussian", "gpu64"),
+        ("GPU", "skew-normal", "cpu16"),
+    ],
+)
 def test_bands_give_what_one_band_gives(device: Device, kind: str, shape: str, schedule: str) -> None:
     device = told(device, kind)
     whole, want = rendered(device, shape, schedule, None)
@@ -101,9 +107,11 @@ def test_bands_give_what_one_band_gives(device: Device, kind: str, shape: str, s
 
 def test_both_binners_give_the_same(device: Device) -> None:
     """In groups of another size a compiler may add in another order, too."""
-    assert_same(rendered(told(device, "GPU"), "gaussian", "cpu16", None)[1],
-                rendered(told(device, "CPU"), "gaussian", "cpu16", None)[1],
-                0.0 if device.info.platform == POCL else REGROUPED)
+    assert_same(
+        rendered(told(device, "GPU"), "gaussian", "cpu16", None)[1],
+        rendered(told(device, "CPU"), "gaussian", "cpu16", None)[1],
+        0.0 if device.info.platform == POCL else REGROUPED,
+    )
 
 
 def test_training_in_bands_has_the_same_bits(devices: list[Device], tmp_path: Path) -> None:
@@ -157,8 +165,15 @@ def test_binning_is_that_of_numpy(device: Device, kind: str, n: int) -> None:
             check_band(binner, pool, keys, rect, first, past, tiles_x)
 
 
-def check_band(binner: ChunkBinner | GroupBinner, pool: Pool, keys: NDArray[np.uint32], rect: NDArray[np.int32],
-               first: int, past: int, tiles_x: int) -> None:
+def check_band(
+    binner: ChunkBinner | GroupBinner,
+    pool: Pool,
+    keys: NDArray[np.uint32],
+    rect: NDArray[np.int32],
+    first: int,
+    past: int,
+    tiles_x: int,
+) -> None:
     """Splats of each tile front to back, and each splat's ids in order of its tiles."""
     order = np.argsort(keys, kind="stable")
     tiles = np.arange(first, past)

@@ -43,8 +43,13 @@ def camera() -> Camera:
 
 def one_splat(**fields: object) -> Splats:
     """A large, nearly opaque splat two units before the camera of `facing`."""
-    arrays = {"mean": [[0, 0, 2]], "quat": [[1, 0, 0, 0]], "log_scale": [[1, 1, -3]], "opacity_logit": [9.0],
-              "sh": np.zeros((1, 16, 3))} | fields
+    arrays = {
+        "mean": [[0, 0, 2]],
+        "quat": [[1, 0, 0, 0]],
+        "log_scale": [[1, 1, -3]],
+        "opacity_logit": [9.0],
+        "sh": np.zeros((1, 16, 3)),
+    } | fields
     return Splats("skew-normal", {name: np.asarray(values, np.float32) for name, values in arrays.items()})
 
 

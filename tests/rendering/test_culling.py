@@ -37,8 +37,9 @@ FAMILIES = ("gaussian", "skew-normal", "half-gaussian", "generalised-exponential
 
 
 @pytest.mark.parametrize("schedule", ["cpu16", pytest.param("cpu8", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("shape", [shape if shape in FAMILIES else pytest.param(shape, marks=pytest.mark.slow)
-                                   for shape in SHAPES])
+@pytest.mark.parametrize(
+    "shape", [shape if shape in FAMILIES else pytest.param(shape, marks=pytest.mark.slow) for shape in SHAPES]
+)
 def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, schedule: str) -> None:
     form = Schedule.parse(schedule)
     kernels = KernelBuild(shape, 3, form)

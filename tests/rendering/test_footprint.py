@@ -58,13 +58,19 @@ def single_splats(shape: str, normalisation: str, dtype: type) -> list[Case]:
     return cases
 
 
-@pytest.mark.parametrize(("shape", "precision", "tolerance"), [
-    *(pytest.param(shape, "float32", IMAGE_FLOAT32, marks=[] if shape in QUICK else pytest.mark.slow)
-      for shape in SHAPES),
-    ("skew-normal", "float64", ROUNDING),
-])  # fmt: skip
-def test_no_pixel_is_lost(make_renderer: MakeRenderer, device: Device, shape: str, precision: str,
-                          tolerance: float) -> None:
+@pytest.mark.parametrize(
+    ("shape", "precision", "tolerance"),
+    [
+        *(
+            pytest.param(shape, "float32", IMAGE_FLOAT32, marks=[] if shape in QUICK else pytest.mark.slow)
+            for shape in SHAPES
+        ),
+        ("skew-normal", "float64", ROUNDING),
+    ],
+)
+def test_no_pixel_is_lost(
+    make_renderer: MakeRenderer, device: Device, shape: str, precision: str, tolerance: float
+) -> None:
     """A pixel lost would miss an alpha of 1/255 at least."""
     renderer = make_renderer(device, precision)
     covered = 0
@@ -76,8 +82,9 @@ def test_no_pixel_is_lost(make_renderer: MakeRenderer, device: Device, shape: st
 
 @pytest.mark.slow
 @pytest.mark.parametrize("normalisation", ["pdf", "none"])
-def test_no_pixel_is_lost_in_other_normalisations(make_renderer: MakeRenderer, device: Device,
-                                                  normalisation: str) -> None:
+def test_no_pixel_is_lost_in_other_normalisations(
+    make_renderer: MakeRenderer, device: Device, normalisation: str
+) -> None:
     renderer = make_renderer(device)
     for case in single_splats("skew-normal", normalisation, np.float32):
         case.check_image(case.render(renderer), IMAGE_FLOAT32)
@@ -111,8 +118,9 @@ def true_boxes(kernel: Kernel) -> NDArray[np.float64]:
     return boxes
 
 
-def kernel_boxes(device: Device, shape: str, arrays: Arrays,
-                 camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def kernel_boxes(
+    device: Device, shape: str, arrays: Arrays, camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """First and last pixel row of each splat (N, 2), and its tiles (N, 4): first x, y, past-the-end x, y."""
     kernels = KernelBuild(shape, 3, default_schedule(device.cl_device)).for_rendering()
     pipeline = Pipeline(device, kernels)

@@ -62,8 +62,9 @@ def differences(renderer: Renderer, case: Case, field: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("place", "shape", "normalisation", "schedule"), BUILDS)
-def test_gradients_are_those_of_the_image(make_renderer: MakeRenderer, devices: list[Device], place: int,
-                                          shape: str, normalisation: str, schedule: str) -> None:
+def test_gradients_are_those_of_the_image(
+    make_renderer: MakeRenderer, devices: list[Device], place: int, shape: str, normalisation: str, schedule: str
+) -> None:
     if not devices:
         pytest.skip("no OpenCL device")
     camera = random_camera(1, 23, 17)
@@ -86,8 +87,7 @@ def test_gradients_are_those_of_the_image(make_renderer: MakeRenderer, devices: 
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_gradients_through_the_default_thresholds(make_renderer: MakeRenderer, device: Device,
-                                                  shape: str) -> None:
+def test_gradients_through_the_default_thresholds(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
     """One direction, with a step so small that no pixel crosses a threshold."""
     camera = random_camera(4, 41, 27)
     case = Case(random_splats(4, 24, 3), camera, shape, dtype=np.float64)

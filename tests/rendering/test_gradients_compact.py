@@ -35,8 +35,9 @@ def test_written_out_they_are_the_backward_s_own(device: Device, degree: int) ->
     kernels = KernelBuild("gaussian", 3, default_schedule(device.cl_device))
     pipeline = Pipeline(device, kernels)
     buffers = SplatBuffers.of(device, splats, kernels.dtype)
-    whole, compact = (kind(device, splats.schema, buffers.capacity, buffers.dtype)
-                      for kind in (ParameterBuffers, CompactGradients))
+    whole, compact = (
+        kind(device, splats.schema, buffers.capacity, buffers.dtype) for kind in (ParameterBuffers, CompactGradients)
+    )
     frame = pipeline.forward(buffers, random_camera(), sh_degree=degree)
     v_color = pipeline.image("v_color", frame.layout, 3)
     given = np.random.default_rng(4).standard_normal((frame.layout.height, frame.layout.width, 3))
@@ -50,7 +51,8 @@ def test_written_out_they_are_the_backward_s_own(device: Device, degree: int) ->
     used = (degree + 1) ** 2
     for name, array in expected.items():
         assert not array[unseen, :used].any() if name == "sh" else not array[unseen].any(), name
-    np.testing.assert_allclose(got["sh"][:, :used], expected["sh"][:, :used], rtol=1e-6,
-                               atol=1e-6 * np.abs(expected["sh"]).max())
+    np.testing.assert_allclose(
+        got["sh"][:, :used], expected["sh"][:, :used], rtol=1e-6, atol=1e-6 * np.abs(expected["sh"]).max()
+    )
     for name in set(expected) - {"sh"}:
         np.testing.assert_array_equal(got[name], expected[name], err_msg=name)

@@ -39,8 +39,9 @@ def run_under_oclgrind(tmp_path: Path, what: str, mode: str) -> str:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("what", [
-    "render", "sort", *(pytest.param(f"render-{what}", marks=pytest.mark.slow) for what in ("all", "hazards"))])
+@pytest.mark.parametrize(
+    "what", ["render", "sort", *(pytest.param(f"render-{what}", marks=pytest.mark.slow) for what in ("all", "hazards"))]
+)
 def test_kernels_are_clean(tmp_path: Path, what: str, mode: str) -> None:
     report = run_under_oclgrind(tmp_path, what, mode)
     assert not report, report[:3000]

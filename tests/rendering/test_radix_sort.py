@@ -13,8 +13,31 @@ from clsplat.device.device import Device
 from clsplat.device.memory import Pool, to_device, to_host
 from clsplat.rendering.radix_sort import Sorter
 
-SIZES = [0, 1, 2, 15, 16, 17, 63, 64, 65, 255, 256, 257, 1023, 1024, 1025, 4095, 4096, 4097, 8191, 8193,
-         16384, 16385, 100_003]  # about every run, group, block and chunk boundary
+SIZES = [
+    0,
+    1,
+    2,
+    15,
+    16,
+    17,
+    63,
+    64,
+    65,
+    255,
+    256,
+    257,
+    1023,
+    1024,
+    1025,
+    4095,
+    4096,
+    4097,
+    8191,
+    8193,
+    16384,
+    16385,
+    100_003,
+]  # about every run, group, block and chunk boundary
 ALL_BITS = 32
 UINT32, UINT64 = np.uint32, np.uint64
 

@@ -27,9 +27,9 @@ from clsplat.splats.splats import Splats
 
 SKEWED = "skew-normal"
 # What hangs on the raster and not on the formulas is tested with two shapes, with every other one among the slow tests.
-BOTH = pytest.mark.parametrize("shape", [
-    pytest.param(name, marks=[] if name in ("gaussian", SKEWED) else pytest.mark.slow) for name in SHAPES
-])  # fmt: skip
+BOTH = pytest.mark.parametrize(
+    "shape", [pytest.param(name, marks=[] if name in ("gaussian", SKEWED) else pytest.mark.slow) for name in SHAPES]
+)
 EVERY = pytest.mark.parametrize("shape", SHAPES)
 
 
@@ -40,8 +40,9 @@ def cloud(shape: str, normalisation: str = "peak", dtype: type = np.float32) -> 
 
 
 @BOTH
-def test_every_schedule_agrees_with_the_reference(make_renderer: MakeRenderer,
-                                                  scheduled: tuple[Device, Schedule], shape: str) -> None:
+def test_every_schedule_agrees_with_the_reference(
+    make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule], shape: str
+) -> None:
     renderer = make_renderer(scheduled[0], schedule=scheduled[1])
     cloud(shape).check(renderer, IMAGE_FLOAT32, GRADIENT_FLOAT32)
     for case in thin_cases(shape).values():
@@ -58,8 +59,9 @@ def test_one_lane_agrees_with_the_reference(make_renderer: MakeRenderer, devices
 
 
 @pytest.mark.parametrize(("shape", "normalisation"), KERNELS)
-def test_every_normalisation_agrees_with_the_reference(make_renderer: MakeRenderer, device: Device,
-                                                       shape: str, normalisation: str) -> None:
+def test_every_normalisation_agrees_with_the_reference(
+    make_renderer: MakeRenderer, device: Device, shape: str, normalisation: str
+) -> None:
     cloud(shape, normalisation).check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
 
 
@@ -86,8 +88,9 @@ def test_schedules_and_devices_agree(make_renderer: MakeRenderer, devices: list[
 
 
 @BOTH
-def test_the_same_again_gives_the_same_bits(make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule],
-                                            shape: str) -> None:
+def test_the_same_again_gives_the_same_bits(
+    make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule], shape: str
+) -> None:
     case, renderer = cloud(shape), make_renderer(scheduled[0], schedule=scheduled[1])
     first, again = [(case.render(renderer), case.backward(renderer)) for _ in range(2)]
     for name in ("color", "alpha", "depth"):
@@ -176,8 +179,9 @@ def test_needles(make_renderer: MakeRenderer, device: Device, shape: str) -> Non
 
 
 @BOTH
-def test_opaque_stack_ends_for_good(make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule],
-                                    shape: str) -> None:
+def test_opaque_stack_ends_for_good(
+    make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule], shape: str
+) -> None:
     """Pixels finish in the first batch, others later; splats behind, thin ones too, take no part then."""
     case = stack(shape)
     order = visible_order(prepared(case.values, shape), case.camera, shape)
@@ -307,8 +311,7 @@ def test_one_renderer_serves_changing_scenes_and_sizes(make_renderer: MakeRender
         case.check_image(case.render(renderer), IMAGE_FLOAT32)
 
 
-def test_gradients_without_alpha_are_those_of_zero_alpha_weights(make_renderer: MakeRenderer,
-                                                                 device: Device) -> None:
+def test_gradients_without_alpha_are_those_of_zero_alpha_weights(make_renderer: MakeRenderer, device: Device) -> None:
     case, renderer = cloud(SKEWED), make_renderer(device)
     v_color, v_alpha = case.weights
     case.render(renderer)

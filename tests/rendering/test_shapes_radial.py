@@ -31,8 +31,11 @@ from clsplat.splats.splats import Splats
 EVERY = pytest.mark.parametrize("shape", RADIAL)
 PEAKED_TO_FLAT = np.geomspace(*BETA_BOUNDS, 9)
 HEAVY_TO_GAUSSIAN = np.geomspace(*NU_BOUNDS, 9)
-OWN = {"student-t": ("nu", HEAVY_TO_GAUSSIAN), "generalised-exponential": ("beta", PEAKED_TO_FLAT),
-       "ges-modulation": ("beta", PEAKED_TO_FLAT)}  # fmt: skip
+OWN = {
+    "student-t": ("nu", HEAVY_TO_GAUSSIAN),
+    "generalised-exponential": ("beta", PEAKED_TO_FLAT),
+    "ges-modulation": ("beta", PEAKED_TO_FLAT),
+}
 FACING = Camera(31, 23, 300.0, 300.0, 15.3, 11.6, np.eye(4))
 
 
@@ -90,8 +93,9 @@ def test_logarithms_in_float32(device: Device, lanes: int) -> None:
 
 
 @pytest.mark.parametrize("nu", [1.0, 2.5, 30.0, 1e4])
-def test_student_t_is_the_line_integral_of_its_3d_kernel(make_renderer: MakeRenderer, device: Device,
-                                                             nu: float) -> None:
+def test_student_t_is_the_line_integral_of_its_3d_kernel(
+    make_renderer: MakeRenderer, device: Device, nu: float
+) -> None:
     """(1 + q3/nu)^-((nu+3)/2) integrated along z, relative to the integral through the centre.
 
     On the axis the projection's linearisation is f/z times x and y; the low-pass belongs to the 3D scale matrix.
@@ -160,8 +164,9 @@ def test_negative_alpha_is_clamped_cut_off_and_takes_light_away(make_renderer: M
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_stacks_of_both_signs_agree_with_the_reference(make_renderer: MakeRenderer, device: Device,
-                                                       precision: str) -> None:
+def test_stacks_of_both_signs_agree_with_the_reference(
+    make_renderer: MakeRenderer, device: Device, precision: str
+) -> None:
     """Saturated opacities of both signs, transmittances far above 1 and down to the end."""
     arrays = for_shape(random_splats(3, 40, 1), "student-t")
     arrays["opacity_logit"] = np.where(np.arange(40) % 3, 1.0, -1.0) * np.tile([0.2, 1.0, 2.8, 3.5], 10)
@@ -274,8 +279,9 @@ def single_splats(shape: str, dtype: type) -> list[SignedCase]:
 
 @EVERY
 @pytest.mark.parametrize(("precision", "tolerance"), [("float32", IMAGE_FLOAT32), ("float64", ROUNDING)])
-def test_no_pixel_is_lost(make_renderer: MakeRenderer, device: Device, shape: str, precision: str,
-                          tolerance: float) -> None:
+def test_no_pixel_is_lost(
+    make_renderer: MakeRenderer, device: Device, shape: str, precision: str, tolerance: float
+) -> None:
     """A pixel lost would miss an alpha of 1/255 at least."""
     renderer, covered = make_renderer(device, precision), 0
     for case in single_splats(shape, np.dtype(precision).type):

@@ -155,8 +155,12 @@ def test_sides_are_those_of_the_field(shape: str) -> None:
     """Seen from the side, more is on the side that the vector points to."""
     camera = Camera(41, 27, 400.0, 400.0, 20.5, 13.5, np.eye(4))
     arrays = one_splat(0, shape)
-    arrays |= {"mean": np.array([[0.0, 0.0, 20.0]]), "quat": np.array([[1.0, 0.0, 0.0, 0.0]]),
-               "log_scale": np.full((1, 3), -1.2), "opacity_logit": np.array([2.0])}
+    arrays |= {
+        "mean": np.array([[0.0, 0.0, 20.0]]),
+        "quat": np.array([[1.0, 0.0, 0.0, 0.0]]),
+        "log_scale": np.full((1, 3), -1.2),
+        "opacity_logit": np.array([2.0]),
+    }
     arrays |= {name: np.array([[5.0, 0.0, 0.0]]) for name in ("skew", "normal") if name in arrays}
     if "opacity_minus_logit" in arrays:
         arrays["opacity_minus_logit"] = np.array([-2.0])
@@ -182,8 +186,9 @@ def test_long_slants_act_as_the_bound(make_renderer: MakeRenderer, device: Devic
 
 
 @pytest.mark.parametrize("shape", ["skew-normal", "skew-normal-direct"])
-def test_splats_without_skew_take_the_short_way_and_get_the_same(device: Device, make_renderer: MakeRenderer,
-                                                                 shape: str) -> None:
+def test_splats_without_skew_take_the_short_way_and_get_the_same(
+    device: Device, make_renderer: MakeRenderer, shape: str
+) -> None:
     """Half of the splats have none: image and gradients are those of the reference, which knows no such way."""
     arrays = random_splats(11, 16, 2)
     arrays["skew"][::2] = 0.0

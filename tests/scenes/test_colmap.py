@@ -27,15 +27,18 @@ def folder(tmp_path: Path) -> Path:
 
 # --- lenses --------------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize("scale", [1.0, 0.5])
-@pytest.mark.parametrize(("model", "params"), [
-    ("SIMPLE_RADIAL", [300, 205, 148, -0.2]),
-    ("RADIAL", [300, 205, 148, 0.15, 0.02]),
-    ("OPENCV", [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]),
-    ("OPENCV_FISHEYE", [200, 205, 202, 149, 0.02, 0.01, 0, 0]),
-])
-def test_undistorted_photo_shows_points_where_its_camera_says(model: str, params: list[float],
-                                                              scale: float) -> None:
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", [300, 205, 148, -0.2]),
+        ("RADIAL", [300, 205, 148, 0.15, 0.02]),
+        ("OPENCV", [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]),
+        ("OPENCV_FISHEYE", [200, 205, 202, 149, 0.02, 0.01, 0, 0]),
+    ],
+)
+def test_undistorted_photo_shows_points_where_its_camera_says(model: str, params: list[float], scale: float) -> None:
     """Round dots drawn where the lens puts them must lie where the pinhole camera puts them."""
     import pycolmap
 
@@ -61,7 +64,7 @@ def test_undistorted_photo_shows_points_where_its_camera_says(model: str, params
         assert np.linalg.norm(found - expected) < 0.15
         checked += 1
     assert checked >= 15
-    assert (flat[:4].sum(), flat[-4:].sum()) == (0, 0)      # the ground is black, so is what the border gets
+    assert (flat[:4].sum(), flat[-4:].sum()) == (0, 0)  # the ground is black, so is what the border gets
 
 
 def _radial(r2: np.ndarray, *k: float) -> np.ndarray:
@@ -77,12 +80,12 @@ def _fisheye(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _put_by_hand(model: str, p: list[float], x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Pixels of rays (x, y, 1) by the formulas of https://colmap.github.io/cameras.html, in float64."""
-    if model == "FOV":                                             # fx fy cx cy omega (Devernay & Faugeras 2001)
+    if model == "FOV":  # fx fy cx cy omega (Devernay & Faugeras 2001)
         r = np.hypot(x, y)
         distorted = np.arctan(2 * r * np.tan(p[4] / 2)) / p[4]
         factor = np.where(r > 0, distorted / np.where(r > 0, r, 1), 2 * np.tan(p[4] / 2) / p[4])
         return np.stack([p[0] * factor * x + p[2], p[1] * factor * y + p[3]], axis=-1)
-    shared = model in ("SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")    # one focal length
+    shared = model in ("SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")  # one focal length
     fx, fy, cx, cy = (p[0], p[0], p[1], p[2]) if shared else p[:4]
     k = p[3:] if shared else p[4:]
     if "FISHEYE" in model:
@@ -90,14 +93,14 @@ def _put_by_hand(model: str, p: list[float], x: np.ndarray, y: np.ndarray) -> np
     r2, xy = x * x + y * y, x * y
     if model in ("SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"):
         u, v = x * _radial(r2, *k), y * _radial(r2, *k)
-    elif model == "OPENCV":                                        # k1 k2 p1 p2
+    elif model == "OPENCV":  # k1 k2 p1 p2
         u = x * _radial(r2, *k[:2]) + 2 * k[2] * xy + k[3] * (r2 + 2 * x * x)
         v = y * _radial(r2, *k[:2]) + 2 * k[3] * xy + k[2] * (r2 + 2 * y * y)
-    elif model == "FULL_OPENCV":                                   # k1 k2 p1 p2 k3 k4 k5 k6
+    elif model == "FULL_OPENCV":  # k1 k2 p1 p2 k3 k4 k5 k6
         ratio = _radial(r2, k[0], k[1], k[4]) / _radial(r2, *k[5:])
         u = x * ratio + 2 * k[2] * xy + k[3] * (r2 + 2 * x * x)
         v = y * ratio + 2 * k[3] * xy + k[2] * (r2 + 2 * y * y)
-    else:                                                          # THIN_PRISM_FISHEYE: k1 k2 p1 p2 k3 k4 s1 s2
+    else:  # THIN_PRISM_FISHEYE: k1 k2 p1 p2 k3 k4 s1 s2
         radial = _radial(r2, k[0], k[1], k[4], k[5])
         u = x * radial + 2 * k[2] * xy + k[3] * (r2 + 2 * x * x) + k[6] * r2
         v = y * radial + 2 * k[3] * xy + k[2] * (r2 + 2 * y * y) + k[7] * r2
@@ -124,6 +127,7 @@ def test_every_lens_is_undistorted_as_its_formula_says(model: str) -> None:
     Nothing of the library is in the expectation: the photo is drawn by inverting the formula here, the expected image
     along the rays of the camera that comes back.
     """
+
     def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return 127.5 + 60 * np.sin(9 * x + 2 * y) + 60 * np.cos(8 * y - 3 * x)
 
@@ -155,18 +159,21 @@ def test_every_lens_is_undistorted_as_its_formula_says(model: str) -> None:
     inside = ((at > 1) & (at < (199, 149))).all(axis=-1)
     assert inside.mean() > 0.9
     off = np.abs(flat[..., 0] - pattern(x, y))[inside]
-    assert off.mean() < 0.7                 # rounding twice alone is 0.35 in the mean
-    assert off.max() < 5                    # bilinear between pixels; half a pixel off would be 4 in the mean
+    assert off.mean() < 0.7  # rounding twice alone is 0.35 in the mean
+    assert off.max() < 5  # bilinear between pixels; half a pixel off would be 4 in the mean
     mask = photo.fit_mask(picture > 127, 200, 150)
     sure = inside & (np.abs(pattern(x, y) - 127.5) > 12)
     np.testing.assert_array_equal(mask[sure], (pattern(x, y) > 127.5)[sure])
 
 
-@pytest.mark.parametrize(("model", "params"), [
-    ("PINHOLE", [300, 310, 190, 155]),
-    ("OPENCV", [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]),
-    ("OPENCV_FISHEYE", [200, 205, 202, 149, 0.02, 0.01, 0, 0]),
-])
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("PINHOLE", [300, 310, 190, 155]),
+        ("OPENCV", [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]),
+        ("OPENCV_FISHEYE", [200, 205, 202, 149, 0.02, 0.01, 0, 0]),
+    ],
+)
 @pytest.mark.parametrize("reduced", [1, 2])
 def test_mask_follows_the_photo(model: str, params: list[float], reduced: int) -> None:
     """A mask that is a threshold of the photo is that threshold of the fitted photo, but along edges."""
@@ -217,9 +224,15 @@ def test_distorted_scene_loads(folder: Path) -> None:
     assert (view.camera.width, view.camera.height) != (WIDTH, HEIGHT)
 
 
-@pytest.mark.parametrize(("model", "params", "word"), [
-    (17, [40.0, 30.0], "EQUIRECTANGULAR"), (1, [np.nan, FY, CX, CY], "not finite"),
-    (99, [1.0] * 4, "model id 99"), (1, [-FX, FY, CX, CY], "focal")])
+@pytest.mark.parametrize(
+    ("model", "params", "word"),
+    [
+        (17, [40.0, 30.0], "EQUIRECTANGULAR"),
+        (1, [np.nan, FY, CX, CY], "not finite"),
+        (99, [1.0] * 4, "model id 99"),
+        (1, [-FX, FY, CX, CY], "focal"),
+    ],
+)
 def test_unusable_lens_is_refused(folder: Path, model: int, params: list[float], word: str) -> None:
     cameras = folder / "sparse" / "0" / "cameras.bin"
     cameras.write_bytes(struct.pack(f"<QIiQQ{len(params)}d", 1, 1, model, WIDTH, HEIGHT, *params))
@@ -229,6 +242,7 @@ def test_unusable_lens_is_refused(folder: Path, model: int, params: list[float],
 
 
 # --- damage ----------------------------------------------------------------------
+
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes]]:
@@ -281,8 +295,9 @@ def test_lying_counts_are_refused(whole: dict[str, dict[str, bytes]], tmp_path: 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damage_gives_a_model_or_a_message(whole: dict[str, dict[str, bytes]], tmp_path: Path, suffix: str,
-                                           data: st.DataObject) -> None:
+def test_damage_gives_a_model_or_a_message(
+    whole: dict[str, dict[str, bytes]], tmp_path: Path, suffix: str, data: st.DataObject
+) -> None:
     files = whole[suffix]
     name = data.draw(st.sampled_from(sorted(files)))
     content = bytearray(files[name])

@@ -71,7 +71,7 @@ def test_photos_are_well_lit_and_rich() -> None:
         assert (image < 0.02).mean() < 0.01
         assert (image > 0.995).mean() < 0.02
         steps = np.abs(np.diff(image, axis=1)).max(axis=2)
-        assert (steps > 0.3).mean() > 0.01                     # hard edges
+        assert (steps > 0.3).mean() > 0.01  # hard edges
 
 
 def test_points_lie_on_the_surfaces(scene: Scene) -> None:
@@ -79,7 +79,7 @@ def test_points_lie_on_the_surfaces(scene: Scene) -> None:
     on_ground = (np.abs(xyz[:, 2]) < 1e-4) & (np.linalg.norm(xyz[:, :2], axis=1) < GROUND_RADIUS)
     on_dome = np.abs(np.linalg.norm(xyz, axis=1) - DOME_RADIUS) < 1e-3
     assert 0.2 < on_ground.mean() < 0.5
-    assert 0.01 < on_dome.mean() < 0.3                # far ones are in few of so few views
+    assert 0.01 < on_dome.mean() < 0.3  # far ones are in few of so few views
     things = xyz[~on_ground & ~on_dome]
     assert np.linalg.norm(things[:, :2], axis=1).max() < 2
     assert things[:, 2].min() >= 0
@@ -107,7 +107,7 @@ def test_tracks_are_true(folder: Path, scene: Scene) -> None:
         origin = np.broadcast_to(camera.position, offset.shape).astype(np.float32)
         hits = world.cast(origin, (offset / distance[:, None]).astype(np.float32))
         np.testing.assert_allclose(hits.distance, distance, atol=2e-3)
-        dull = hits.surface != SURFACES.index("ball")                    # its highlight moves with the view
+        dull = hits.surface != SURFACES.index("ball")  # its highlight moves with the view
         color = np.array([point.color for point in points])
         agree += int((np.abs(255 * hits.color - color).max(axis=1) < 8)[dull].sum())
         count += int(dull.sum())
@@ -125,7 +125,7 @@ def test_hidden_points_are_not_seen() -> None:
         assert not visible(world, camera, behind, hits.normal).any()
         of = hits.surface == panel
         if of.sum() > 50:
-            across = cameras[(cameras.index(camera) + 10) % 20]         # the other side of the ring
+            across = cameras[(cameras.index(camera) + 10) % 20]  # the other side of the ring
             assert not visible(world, across, hits.position[of], hits.normal[of]).any()
             assert visible(world, camera, hits.position[of], hits.normal[of]).all()
             break
@@ -138,9 +138,10 @@ def test_panel_sides_differ() -> None:
     normal_to_panel = np.array([-np.sin(0.6), np.cos(0.6), 0.0])
     along = np.array([np.cos(0.6), np.sin(0.6), 0.0])
     places = np.array([0.55, -0.75, 0.55]) + np.linspace(-0.5, 0.5, 21)[:, None] * along
-    sides = [world.cast((places - 0.2 * normal).astype(np.float32),
-                        np.broadcast_to(normal, places.shape).astype(np.float32))
-             for normal in (normal_to_panel, -normal_to_panel)]
+    sides = [
+        world.cast((places - 0.2 * normal).astype(np.float32), np.broadcast_to(normal, places.shape).astype(np.float32))
+        for normal in (normal_to_panel, -normal_to_panel)
+    ]
     assert all((side.surface == SURFACES.index("panel")).all() for side in sides)
     assert np.abs(sides[0].color - sides[1].color).max(axis=1).mean() > 0.2
     np.testing.assert_allclose(sides[0].normal, -sides[1].normal, atol=1e-6)

@@ -22,12 +22,14 @@ from clsplat.splats.splats import Splats
 
 # Lenses, and what they are written as: transforms.json knows a few forms only.
 LENSES = {
-    "SIMPLE_PINHOLE": [33.0, 18.5, 16.25], "PINHOLE": [33.0, 31.0, 18.5, 16.25],
-    "SIMPLE_RADIAL": [33.0, 18.5, 16.25, -0.1], "RADIAL": [33.0, 18.5, 16.25, -0.1, 0.02],
+    "SIMPLE_PINHOLE": [33.0, 18.5, 16.25],
+    "PINHOLE": [33.0, 31.0, 18.5, 16.25],
+    "SIMPLE_RADIAL": [33.0, 18.5, 16.25, -0.1],
+    "RADIAL": [33.0, 18.5, 16.25, -0.1, 0.02],
     "OPENCV": [33.0, 31.0, 18.5, 16.25, -0.1, 0.02, 1e-3, -2e-3],
     "FULL_OPENCV": [33.0, 31.0, 18.5, 16.25, -0.1, 0.02, 1e-3, -2e-3, 0.01, 0.0, 0.0, 0.0],
     "OPENCV_FISHEYE": [33.0, 31.0, 18.5, 16.25, 0.01, 0.002, 0.0, 1e-4],
-}  # fmt: skip
+}
 
 
 @pytest.fixture
@@ -37,8 +39,9 @@ def garden(tmp_path: Path) -> Path:
 
 def with_lens(garden: Path, model: str) -> Posed:
     posed = read_posed(garden, None)
-    photos = [Photo(photo.name, photo.cam_from_world, make_lens(model, 40, 30, LENSES[model]))
-              for photo in posed.photos]
+    photos = [
+        Photo(photo.name, photo.cam_from_world, make_lens(model, 40, 30, LENSES[model])) for photo in posed.photos
+    ]
     return Posed(photos, posed.files, posed.points)
 
 
@@ -81,8 +84,10 @@ def test_transforms_come_back(garden: Path, model: str) -> None:
 def test_plain_lenses_are_written_as_such(garden: Path, tmp_path: Path) -> None:
     """3DGS reads PINHOLE only, and transforms.json is read as FULL_OPENCV."""
     posed = read_posed(garden, None)
-    photos = [Photo(p.name, p.cam_from_world, make_lens("FULL_OPENCV", 40, 30, [33, 31, 18.5, 16.25, *[0] * 8]))
-              for p in posed.photos]
+    photos = [
+        Photo(p.name, p.cam_from_world, make_lens("FULL_OPENCV", 40, 30, [33, 31, 18.5, 16.25, *[0] * 8]))
+        for p in posed.photos
+    ]
     write_colmap(tmp_path / "out", photos, posed.points)
     assert {photo.lens.model.name for photo in read_model(tmp_path / "out").photos} == {"PINHOLE"}
 
@@ -129,8 +134,9 @@ def test_a_model_s_cameras_and_centres(tmp_path: Path, tmp_path_factory: pytest.
     assert "3 cameras" in clsplat("cameras", tmp_path / "path.json", tmp_path / "t" / "transforms.json")
 
 
-def test_what_has_no_cameras_or_no_form_is_refused(garden: Path, tmp_path: Path,
-                                                   tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_what_has_no_cameras_or_no_form_is_refused(
+    garden: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     ply = sorted(small_model(tmp_path_factory).glob("point_cloud/*/point_cloud.ply"))[0]
     assert "has no cameras" in error_of("cameras", ply, tmp_path / "out.json")
     posed = with_lens(garden, "RADIAL")

@@ -50,7 +50,9 @@ def test_masks_in_folders_of_photos(tmp_path: Path) -> None:
     for file in ("a.jpg.png", "left/b.png"):
         write_mask(tmp_path / file, left_half())
     assert mask_files(tmp_path, ["a.jpg", "left/b.jpg", "right/b.jpg"]) == {
-        "a.jpg": tmp_path / "a.jpg.png", "left/b.jpg": tmp_path / "left/b.png"}
+        "a.jpg": tmp_path / "a.jpg.png",
+        "left/b.jpg": tmp_path / "left/b.png",
+    }
 
 
 def test_masks_follow_the_size_of_the_photos(folder: Path) -> None:

@@ -31,8 +31,9 @@ def opengl(pose: np.ndarray) -> list[list[float]]:
 
 
 def frames(folder: str = "images/") -> list[Values]:
-    return [{"file_path": folder + view.name, "transform_matrix": opengl(view.cam_from_world)}
-            for view in model_views()]
+    return [
+        {"file_path": folder + view.name, "transform_matrix": opengl(view.cam_from_world)} for view in model_views()
+    ]
 
 
 LENS = {"w": WIDTH, "h": HEIGHT, "fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY}
@@ -113,8 +114,14 @@ def blender_set(folder: Path) -> Path:
         chosen = model_views()[::every]
         for view in chosen:
             write_png(folder / name / f"{view.name[:-4]}.png", photo)
-        own = [{"file_path": f"./{name}/{view.name[:-4]}", "rotation": 0.1,
-                "transform_matrix": opengl(view.cam_from_world)} for view in chosen]
+        own = [
+            {
+                "file_path": f"./{name}/{view.name[:-4]}",
+                "rotation": 0.1,
+                "transform_matrix": opengl(view.cam_from_world),
+            }
+            for view in chosen
+        ]
         write(folder, {"camera_angle_x": 0.7, "frames": own}, f"transforms_{name}.json")
     return folder
 
@@ -145,9 +152,16 @@ def test_lists_of_nerfstudio_split(folder: Path) -> None:
 
 def test_points_of_a_ply(folder: Path) -> None:
     xyz, rgb = cloud()
-    header = "\n".join(["ply", "format ascii 1.0", f"element vertex {len(xyz)}",
-                        *(f"property float {name}" for name in "xyz"),
-                        *(f"property uchar {name}" for name in ("red", "green", "blue")), "end_header\n"])
+    header = "\n".join(
+        [
+            "ply",
+            "format ascii 1.0",
+            f"element vertex {len(xyz)}",
+            *(f"property float {name}" for name in "xyz"),
+            *(f"property uchar {name}" for name in ("red", "green", "blue")),
+            "end_header\n",
+        ]
+    )
     rows = [" ".join(map(str, (*map(float, at), *map(int, colour)))) for at, colour in zip(xyz, rgb, strict=True)]
     (folder / "cloud.ply").write_text(header + "\n".join(rows) + "\n")
     points = load_scene(write(folder, LENS | {"ply_file_path": "cloud.ply", "frames": frames()})).points
@@ -251,15 +265,23 @@ def test_lego_has_its_own_split() -> None:
 
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=3), max_leaves=6)
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=6,
+)
 
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_fuzz_succeeds_or_says_why(folder: Path, data: st.DataObject) -> None:
     """Any value of the file, at any depth, replaced by anything: a scene, or one line that names the file."""
-    whole = LENS | {"k1": 0.0, "camera_model": "OPENCV", "test_filenames": [f"images/{NAMES[1]}"],
-                    "ply_file_path": "", "applied_transform": np.eye(4).tolist(), "frames": frames()[:3]}
+    whole = LENS | {
+        "k1": 0.0,
+        "camera_model": "OPENCV",
+        "test_filenames": [f"images/{NAMES[1]}"],
+        "ply_file_path": "",
+        "applied_transform": np.eye(4).tolist(),
+        "frames": frames()[:3],
+    }
     for _ in range(data.draw(st.integers(1, 3))):
         inner: Any = whole
         while True:

@@ -51,6 +51,7 @@ def staged(tmp_path: Path, photo: PhotoFile) -> Prepared | str:
 
 # --- finding -------------------------------------------------------------------------------
 
+
 def test_photos_are_found_below_but_not_hidden_ones_or_masks(tmp_path: Path) -> None:
     for name in ("b.JPG", "a.png", "day/2.tif", "day/1.jpg", ".hidden/x.png", ".y.png", "masks/a.png"):
         put(tmp_path / name)
@@ -117,12 +118,20 @@ def test_fingerprint_follows_every_change(tmp_path: Path) -> None:
 
 # --- reading -------------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_photos_are_turned_upright(tmp_path: Path, orientation: int) -> None:
     """The stored image is the upright one turned back as EXIF's table of orientations says."""
-    back = {1: lambda a: a, 2: lambda a: a[:, ::-1], 3: lambda a: a[::-1, ::-1], 4: lambda a: a[::-1],
-            5: lambda a: a.swapaxes(0, 1), 6: lambda a: np.rot90(a, 1), 7: lambda a: np.rot90(a, 2).swapaxes(0, 1),
-            8: lambda a: np.rot90(a, -1)}[orientation]
+    back = {
+        1: lambda a: a,
+        2: lambda a: a[:, ::-1],
+        3: lambda a: a[::-1, ::-1],
+        4: lambda a: a[::-1],
+        5: lambda a: a.swapaxes(0, 1),
+        6: lambda a: np.rot90(a, 1),
+        7: lambda a: np.rot90(a, 2).swapaxes(0, 1),
+        8: lambda a: np.rot90(a, -1),
+    }[orientation]
     file = put(tmp_path / "a.png", np.ascontiguousarray(back(PICTURE)), exif=exif(orientation, "Phone"))
     np.testing.assert_array_equal(read_image(file, upright=True), PICTURE)
     facts = photo_facts(file)
@@ -147,8 +156,8 @@ def png16(pixels: np.ndarray) -> bytes:
     header = struct.pack(">IIBBBBB", width, height, 16, (0, 4, 2, 6)[channels - 1], 0, 0, 0)
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(lines)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks)
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
@@ -209,10 +218,16 @@ def test_transparency_and_masks_hide_pixels_from_features(tmp_path: Path) -> Non
 
 
 def test_photos_of_one_size_and_camera_share_a_lens(tmp_path: Path) -> None:
-    files = [put(tmp_path / "1.jpg", exif=exif(1, "A")), put(tmp_path / "2.jpg", exif=exif(1, "A")),
-             put(tmp_path / "3.jpg", exif=exif(1, "B")), put(tmp_path / "d" / "4.jpg", PICTURE[:8], exif=exif(1, "A"))]
-    ready = [Prepared(PhotoFile(str(file.relative_to(tmp_path)), file), photo_facts(file), f"{number}.jpg")
-             for number, file in enumerate(files)]
+    files = [
+        put(tmp_path / "1.jpg", exif=exif(1, "A")),
+        put(tmp_path / "2.jpg", exif=exif(1, "A")),
+        put(tmp_path / "3.jpg", exif=exif(1, "B")),
+        put(tmp_path / "d" / "4.jpg", PICTURE[:8], exif=exif(1, "A")),
+    ]
+    ready = [
+        Prepared(PhotoFile(str(file.relative_to(tmp_path)), file), photo_facts(file), f"{number}.jpg")
+        for number, file in enumerate(files)
+    ]
 
     def grouped(mode: str) -> list[list[str]]:
         return [[photo.staged for photo in group] for group in same_camera(ready, mode)]

@@ -73,8 +73,10 @@ def aligned_error(scene: Scene) -> tuple[float, float]:
     scale = (sizes * np.diag(sign)).sum() / (a**2).sum()
     spread = np.linalg.norm(b, axis=1).max()
     off = np.linalg.norm(scale * a @ turn.T - b, axis=1).max() / spread
-    angles = [np.degrees(np.arccos(np.clip((turn @ view.camera.rotation[2]) @ pose[2, :3], -1, 1)))
-              for view, pose in zip(scene.views, poses, strict=True)]
+    angles = [
+        np.degrees(np.arccos(np.clip((turn @ view.camera.rotation[2]) @ pose[2, :3], -1, 1)))
+        for view, pose in zip(scene.views, poses, strict=True)
+    ]
     return float(off), float(max(angles))
 
 
@@ -167,11 +169,15 @@ def test_a_crash_of_the_library_is_one_line(tmp_path: Path, monkeypatch: pytest.
     """A child that dies by a signal, and one that ends without a result."""
     photo_walk.write_walk(tmp_path / "walk", 3)
     start = subprocess.Popen
-    programs = {"signal SIGABRT": "import os; os.abort()", "exit code 3: out of luck":
-                "import sys; print('out of luck', file=sys.stderr); sys.exit(3)"}
+    programs = {
+        "signal SIGABRT": "import os; os.abort()",
+        "exit code 3: out of luck": "import sys; print('out of luck', file=sys.stderr); sys.exit(3)",
+    }
     for reason, program in programs.items():
-        monkeypatch.setattr("clsplat.scenes.reconstruct.sfm_process.subprocess.Popen", lambda command, program=program, **options: start(
-            [sys.executable, "-c", program], **options))
+        monkeypatch.setattr(
+            "clsplat.scenes.reconstruct.sfm_process.subprocess.Popen",
+            lambda command, program=program, **options: start([sys.executable, "-c", program], **options),
+        )
         with pytest.raises(InputError, match=rf"structure from motion failed \({reason}"):
             reconstruct(tmp_path / "walk", tmp_path / "scene")
         assert [entry.name for entry in tmp_path.iterdir()] == ["walk"]
@@ -186,8 +192,10 @@ def test_what_a_killed_run_left_goes_and_another_run_is_kept_out(tmp_path: Path)
         assert not any(work.iterdir())
     assert not left.exists()
     left.mkdir()
-    program = "import sys; from clsplat.files.lock import sole_writer; from pathlib import Path\n" \
-              "with sole_writer(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    program = (
+        "import sys; from clsplat.files.lock import sole_writer; from pathlib import Path\n"
+        "with sole_writer(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    )
     command = [sys.executable, "-c", program, left]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
@@ -201,10 +209,13 @@ def test_what_a_killed_run_left_goes_and_another_run_is_kept_out(tmp_path: Path)
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_ctrl_c_leaves_nothing(walk: Path, tmp_path: Path) -> None:
     program = "from clsplat_cli.main import main; main()"
-    child = subprocess.Popen([sys.executable, "-c", program, "reconstruct", walk, "-o", tmp_path / "scene"],
-                             stderr=subprocess.PIPE, text=True,
-                             # Shells have their background jobs ignore it, and these what they start.
-                             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    child = subprocess.Popen(
+        [sys.executable, "-c", program, "reconstruct", walk, "-o", tmp_path / "scene"],
+        stderr=subprocess.PIPE,
+        text=True,
+        # Shells have their background jobs ignore it, and these what they start.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     deadline = time.monotonic() + 60
     while not list(tmp_path.glob(".scene.unfinished/database.db")) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -219,8 +230,9 @@ def test_estimate_grows_with_photos_and_their_size(tmp_path: Path) -> None:
     small, large = tmp_path / "small.png", tmp_path / "large.png"
     Image.new("L", (400, 300)).save(small)
     Image.new("L", (4000, 3000)).save(large)
-    seconds = [module.estimated_seconds([PhotoFile(file.name, file)] * count) for file in (small, large)
-               for count in (20, 140)]
+    seconds = [
+        module.estimated_seconds([PhotoFile(file.name, file)] * count) for file in (small, large) for count in (20, 140)
+    ]
     assert seconds[0] < min(seconds[1:3])
     assert seconds[3] > 10 * seconds[2], "all pairs: faster than the photos"
 
@@ -280,8 +292,12 @@ def test_same_photos_same_model_and_a_video(walk: Path, tmp_path: Path) -> None:
     files = []
     for name in ("a", "b"):
         reconstruct(walk, tmp_path / name, tell=steps.append)
-        files.append([(tmp_path / name / "sparse" / "0" / f"{stem}.bin").read_bytes()
-                      for stem in ("cameras", "images", "points3D")])
+        files.append(
+            [
+                (tmp_path / name / "sparse" / "0" / f"{stem}.bin").read_bytes()
+                for stem in ("cameras", "images", "points3D")
+            ]
+        )
     assert files[0] == files[1]
     assert [step for step in steps if step.label == "photos placed"][-1] == Step("photos placed", 8, 8)
     pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")

@@ -49,6 +49,7 @@ def _message(error: pytest.ExceptionInfo[InputError]) -> str:
 
 # --- reading -------------------------------------------------------------------------------
 
+
 def test_scene_holds_what_was_written(folder: Path) -> None:
     scene = load_scene(folder)
     xyz, rgb = cloud()
@@ -118,12 +119,15 @@ def test_few_registered_images_warn(folder: Path) -> None:
 
 
 def test_pillow_is_loaded_before_pycolmap() -> None:
-    code = ("import sys, clsplat.scenes.scene\n"
-            "sys.exit(0 if 'PIL.Image' in sys.modules and 'pycolmap' not in sys.modules else 1)")
+    code = (
+        "import sys, clsplat.scenes.scene\n"
+        "sys.exit(0 if 'PIL.Image' in sys.modules and 'pycolmap' not in sys.modules else 1)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 # --- split, extent -------------------------------------------------------------------------
+
 
 def test_split_holds_out_every_eighth(folder: Path) -> None:
     scene = load_scene(folder)
@@ -158,8 +162,11 @@ def test_extent_is_of_the_training_cameras(folder: Path) -> None:
 
 # --- sizes ---------------------------------------------------------------------------------
 
-@pytest.mark.parametrize(("resolution", "size"), [
-    (-1, (40, 30)), (1, (40, 30)), (2, (20, 15)), (4, (10, 8)), (8, (5, 4)), (13, (13, 9)), (30, (30, 22))])
+
+@pytest.mark.parametrize(
+    ("resolution", "size"),
+    [(-1, (40, 30)), (1, (40, 30)), (2, (20, 15)), (4, (10, 8)), (8, (5, 4)), (13, (13, 9)), (30, (30, 22))],
+)
 def test_resolution(folder: Path, resolution: int, size: tuple[int, int]) -> None:
     view = load_scene(folder, resolution=resolution).views[2]
     assert (view.camera.width, view.camera.height) == size
@@ -199,7 +206,7 @@ def testphoto_of_another_aspect_is_refused(folder: Path, size: tuple[int, int]) 
 
 def test_transparent_photos_get_the_background(folder: Path) -> None:
     image = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
-    image[..., 0], image[: HEIGHT // 2, :, 3], image[HEIGHT // 2:, :, 3] = 200, 255, 51
+    image[..., 0], image[: HEIGHT // 2, :, 3], image[HEIGHT // 2 :, :, 3] = 200, 255, 51
     write_png(folder / "images" / NAMES[0], image)
     black, white = load_scene(folder).images[0], load_scene(folder, background=(1, 1, 1)).images[0]
     np.testing.assert_array_equal(black[0, 0], [200, 0, 0])
@@ -209,6 +216,7 @@ def test_transparent_photos_get_the_background(folder: Path) -> None:
 
 
 # --- refusals ------------------------------------------------------------------------------
+
 
 def test_missing_parts_are_named(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
@@ -261,14 +269,19 @@ def test_points_that_are_not_finite(folder: Path) -> None:
 
 # --- the real scenes -----------------------------------------------------------------------
 
+
 @pytest.mark.data
-@pytest.mark.parametrize(("name", "n_views", "size", "n_points", "track", "reprojection_px"), [
-    ("fox", 50, (400, 713), 13204, 6.1, 0.28),
-    ("sceaux_castle", 11, (400, 296), 8865, 4.7, 0.07),
-    ("kitchen", 25, (400, 267), 21014, 3.0, 0.21),
-])
-def test_real_scene_reprojects(name: str, n_views: int, size: tuple[int, int], n_points: int, track: float,
-                               reprojection_px: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "n_views", "size", "n_points", "track", "reprojection_px"),
+    [
+        ("fox", 50, (400, 713), 13204, 6.1, 0.28),
+        ("sceaux_castle", 11, (400, 296), 8865, 4.7, 0.07),
+        ("kitchen", 25, (400, 267), 21014, 3.0, 0.21),
+    ],
+)
+def test_real_scene_reprojects(
+    name: str, n_views: int, size: tuple[int, int], n_points: int, track: float, reprojection_px: float
+) -> None:
     import pycolmap
 
     folder = scene_folder(name)

@@ -26,8 +26,9 @@ def test_test_views_are_gone_and_training_views_held_out(scene: Scene) -> None:
     assert len(split.train) == 4
 
 
-@pytest.mark.parametrize(("n", "places"), [(3, [1]), (4, [1, 3]), (9, [1, 4, 7]), (21, [3, 10, 17]),
-                                           (43, [3, 10, 17, 24, 31, 38])])
+@pytest.mark.parametrize(
+    ("n", "places"), [(3, [1]), (4, [1, 3]), (9, [1, 4, 7]), (21, [3, 10, 17]), (43, [3, 10, 17, 24, 31, 38])]
+)
 def test_how_many_are_held_out(scene: Scene, n: int, places: list[int]) -> None:
     views = [replace(scene.views[0], name=f"{i:03}") for i in range(n)]
     split = hold_out(Scene("many", Path("many"), views, scene.points))

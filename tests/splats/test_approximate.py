@@ -67,9 +67,17 @@ def test_images_are_nearer_than_with_equal_moments(shape: str) -> None:
     for seed in (7, 8, 9):
         camera = random_camera(seed, 41, 27)
         for i in range(len(splats)):
-            truth, *others = (render_reference(model.select(np.arange(len(splats)) == i).arrays, camera, model.shape,
-                                               model.normalisation, alpha_min=0.0, t_min=0.0).alpha
-                              for model in (splats, near, equal))
+            truth, *others = (
+                render_reference(
+                    model.select(np.arange(len(splats)) == i).arrays,
+                    camera,
+                    model.shape,
+                    model.normalisation,
+                    alpha_min=0.0,
+                    t_min=0.0,
+                ).alpha
+                for model in (splats, near, equal)
+            )
             errors[:, i] += [float(np.sum((other - truth) ** 2)) for other in others]
     assert errors[1].sum() > 0
     assert errors[0].sum() < 0.75 * errors[1].sum()
@@ -91,9 +99,17 @@ def image_errors(splats: Splats, others: list[Splats]) -> np.ndarray:
     for seed in (7, 8):
         camera = random_camera(seed, 41, 27)
         for i in range(len(splats)):
-            truth, *shown = (render_reference(model.select(np.arange(len(splats)) == i).arrays, camera, model.shape,
-                                              model.normalisation, alpha_min=0.0, t_min=0.0).alpha
-                             for model in (splats, *others))
+            truth, *shown = (
+                render_reference(
+                    model.select(np.arange(len(splats)) == i).arrays,
+                    camera,
+                    model.shape,
+                    model.normalisation,
+                    alpha_min=0.0,
+                    t_min=0.0,
+                ).alpha
+                for model in (splats, *others)
+            )
             errors += [float(np.sum((image - truth) ** 2)) for image in shown]
     return errors
 
@@ -114,16 +130,20 @@ def test_two_opacities_are_nearer_than_their_mean(shape: str) -> None:
     assert near < 0.6 * mean
 
 
-@pytest.mark.parametrize(("shape", "field", "values"), [
-    ("generalised-exponential", "beta", [0.7, 1.2, 3.0, 6.0]),
-    ("student-t", "nu", [1.0, 2.0, 4.0, 10.0]),
-])
+@pytest.mark.parametrize(
+    ("shape", "field", "values"),
+    [
+        ("generalised-exponential", "beta", [0.7, 1.2, 3.0, 6.0]),
+        ("student-t", "nu", [1.0, 2.0, 4.0, 10.0]),
+    ],
+)
 def test_round_profiles_are_nearer_than_the_plain_gaussian(shape: str, field: str, values: list[float]) -> None:
     arrays = for_shape(random_splats(7, 12, 0), shape)
     arrays["opacity_logit"] = np.linspace(0.3, 1.0, 12)  # signed or not
     splats = Splats(shape, arrays | {field: np.repeat(values, 3)})
-    near, same = image_errors(splats, [nearest_gaussians(splats),
-                                       plain(splats, SHAPES[shape].opacity(arrays["opacity_logit"]))])
+    near, same = image_errors(
+        splats, [nearest_gaussians(splats), plain(splats, SHAPES[shape].opacity(arrays["opacity_logit"]))]
+    )
     assert near < 0.6 * same
 
 

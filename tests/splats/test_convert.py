@@ -30,8 +30,11 @@ def some(shape: str, normalisation: str = "peak", dtype: type = np.float64, **fi
 
 def neutral(shape: str, dtype: type = np.float64) -> Splats:
     """Splats of `shape` that are Gaussians."""
-    return Splats(shape, {name: value.astype(dtype) for name, value in random_splats(7, 12, 2).items()
-                          if name != "skew"} | logit(shape, dtype))
+    return Splats(
+        shape,
+        {name: value.astype(dtype) for name, value in random_splats(7, 12, 2).items() if name != "skew"}
+        | logit(shape, dtype),
+    )
 
 
 def logit(shape: str, dtype: type) -> dict[str, np.ndarray]:
@@ -41,10 +44,17 @@ def logit(shape: str, dtype: type) -> dict[str, np.ndarray]:
 def assert_equal_images(got: Splats, want: Splats, tolerance: float) -> None:
     for seed in (7, 8):
         images = [
-            render_reference(splats.arrays, random_camera(seed, 41, 27), splats.shape, splats.normalisation,
-                             BACKGROUND, alpha_min=0.0, t_min=0.0)
+            render_reference(
+                splats.arrays,
+                random_camera(seed, 41, 27),
+                splats.shape,
+                splats.normalisation,
+                BACKGROUND,
+                alpha_min=0.0,
+                t_min=0.0,
+            )
             for splats in (got, want)
-        ]  # fmt: skip
+        ]
         for name in ("color", "alpha", "depth"):
             difference = np.abs(getattr(images[0], name) - getattr(images[1], name)).max()
             assert difference < tolerance, f"{name}: off by {difference:.1e}"
@@ -98,10 +108,15 @@ def test_long_skews_and_needles() -> None:
         convert(too_long, "skew-normal")
 
 
-@pytest.mark.parametrize(("source", "target"), [
-    *(("gaussian", name) for name in SHAPES), *((name, "gaussian") for name in SHAPES),
-    ("bisected-skew", "half-gaussian"), ("student-t", "skew-normal-direct"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [
+        *(("gaussian", name) for name in SHAPES),
+        *((name, "gaussian") for name in SHAPES),
+        ("bisected-skew", "half-gaussian"),
+        ("student-t", "skew-normal-direct"),
+    ],
+)
 def test_every_shape_holds_the_gaussian(source: str, target: str) -> None:
     splats = neutral(source)
     converted = convert(splats, target)
@@ -130,14 +145,17 @@ def test_two_sides_without_skew_mix() -> None:
     assert_equal_images(convert(splats, "gaussian"), splats, ROUNDING)
 
 
-@pytest.mark.parametrize(("source", "target", "message"), [
-    ("skew-normal", "gaussian", "11 of 12 splats are skewed"),
-    ("skew-normal-direct", "bisected-skew", "11 of 12 splats are skewed"),
-    ("half-gaussian", "gaussian", "12 of 12 splats have two different opacities"),
-    ("bisected-skew", "half-gaussian", "11 of 12 splats have two different opacities"),
-    ("generalised-exponential", "gaussian", "12 of 12 splats have a beta that is not 2"),
-    ("student-t", "gaussian", "4 of 12 splats have a negative opacity"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("source", "target", "message"),
+    [
+        ("skew-normal", "gaussian", "11 of 12 splats are skewed"),
+        ("skew-normal-direct", "bisected-skew", "11 of 12 splats are skewed"),
+        ("half-gaussian", "gaussian", "12 of 12 splats have two different opacities"),
+        ("bisected-skew", "half-gaussian", "11 of 12 splats have two different opacities"),
+        ("generalised-exponential", "gaussian", "12 of 12 splats have a beta that is not 2"),
+        ("student-t", "gaussian", "4 of 12 splats have a negative opacity"),
+    ],
+)
 def test_splats_without_an_equal_are_counted(source: str, target: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         convert(some(source), target)

@@ -41,18 +41,24 @@ const file = process.argv[2];
 const bytes = fs.readFileSync(file);
 const buffer = bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength);
 """
-GS3D = PRELUDE + """
+GS3D = (
+    PRELUDE
+    + """
 const G = await import('@mkkellogg/gaussian-splats-3d');
 const read = file.endsWith('.ply') ? G.PlyParser.parseToUncompressedSplatArray(buffer, 3)
                                    : G.SplatParser.parseStandardSplatToUncompressedSplatArray(buffer);
 console.log(JSON.stringify(read.splats));
 """
-GSPLAT = PRELUDE + """
+)
+GSPLAT = (
+    PRELUDE
+    + """
 const G = await import('gsplat');
 const loader = file.endsWith('.ply') ? G.PLYLoader : G.Loader;
 const data = loader.LoadFromArrayBuffer(buffer, new G.Scene()).data;
 console.log(JSON.stringify([data.positions, data.scales, data.rotations, data.colors].map(a => Array.from(a))));
 """
+)
 SPARK = """
 <script type="importmap">
 {"imports": {"three": "/three/build/three.module.js", "three/addons/": "/three/examples/jsm/"}}
@@ -91,16 +97,24 @@ def node(tmp_path: Path, script: str, *arguments: object) -> str:
 def by_splat_transform(tmp_path: Path, file: Path) -> Found:
     package("@playcanvas/splat-transform")
     table = tmp_path / "read.csv"
-    subprocess.run(["node", MODULES / "@playcanvas/splat-transform" / "bin" / "cli.mjs", "-q", file, table], check=True,
-                   capture_output=True, timeout=60)
+    subprocess.run(
+        ["node", MODULES / "@playcanvas/splat-transform" / "bin" / "cli.mjs", "-q", file, table],
+        check=True,
+        capture_output=True,
+        timeout=60,
+    )
     rows = np.genfromtxt(table, delimiter=",", names=True)
 
     def columns(*names: str) -> np.ndarray:
         return np.stack([rows[name] for name in names], axis=1)
 
-    found = {"mean": columns("x", "y", "z"), "scale": np.exp(columns("scale_0", "scale_1", "scale_2")),
-             "quat": columns("rot_0", "rot_1", "rot_2", "rot_3"), "opacity": 1 / (1 + np.exp(-rows["opacity"])),
-             "colour": 0.5 + SH_C0 * columns("f_dc_0", "f_dc_1", "f_dc_2")}
+    found = {
+        "mean": columns("x", "y", "z"),
+        "scale": np.exp(columns("scale_0", "scale_1", "scale_2")),
+        "quat": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        "opacity": 1 / (1 + np.exp(-rows["opacity"])),
+        "colour": 0.5 + SH_C0 * columns("f_dc_0", "f_dc_1", "f_dc_2"),
+    }
     if "f_rest_44" in rows.dtype.names:
         found["rest"] = columns(*(f"f_rest_{i}" for i in range(45))).reshape(-1, 3, 15).transpose(0, 2, 1)
     return found
@@ -110,16 +124,26 @@ def by_gaussian_splats_3d(tmp_path: Path, file: Path) -> Found:
     package("@mkkellogg/gaussian-splats-3d")
     rows = json.loads(node(tmp_path, GS3D, file))
     table = np.array([[row[str(i)] if isinstance(row, dict) else row[i] for i in range(14)] for row in rows])
-    return {"mean": table[:, :3], "scale": table[:, 3:6], "quat": table[:, 6:10], "colour": table[:, 10:13] / 255,
-            "opacity": table[:, 13] / 255}
+    return {
+        "mean": table[:, :3],
+        "scale": table[:, 3:6],
+        "quat": table[:, 6:10],
+        "colour": table[:, 10:13] / 255,
+        "opacity": table[:, 13] / 255,
+    }
 
 
 def by_gsplat(tmp_path: Path, file: Path) -> Found:
     package("gsplat")
     places, scales, rotations, colours = (np.array(part) for part in json.loads(node(tmp_path, GSPLAT, file)))
     colours = colours.reshape(-1, 4) / 255
-    return {"mean": places.reshape(-1, 3), "scale": scales.reshape(-1, 3), "quat": rotations.reshape(-1, 4),
-            "colour": colours[:, :3], "opacity": colours[:, 3]}
+    return {
+        "mean": places.reshape(-1, 3),
+        "scale": scales.reshape(-1, 3),
+        "quat": rotations.reshape(-1, 4),
+        "colour": colours[:, :3],
+        "opacity": colours[:, 3],
+    }
 
 
 def by_spark(tmp_path: Path, file: Path) -> Found:
@@ -147,8 +171,13 @@ def by_spark(tmp_path: Path, file: Path) -> Found:
     finally:
         server.shutdown()
         server.server_close()
-    return {"mean": table[:, :3], "scale": table[:, 3:6], "quat": table[:, 6:10], "opacity": table[:, 10],
-            "colour": table[:, 11:]}
+    return {
+        "mean": table[:, :3],
+        "scale": table[:, 3:6],
+        "quat": table[:, 6:10],
+        "opacity": table[:, 10],
+        "colour": table[:, 11:],
+    }
 
 
 def by_plyfile(tmp_path: Path, file: Path) -> Found:
@@ -156,9 +185,14 @@ def by_plyfile(tmp_path: Path, file: Path) -> Found:
     rows = plyfile.PlyData.read(file)["vertex"].data
     table = np.stack([rows[name] for name in rows.dtype.names[:62]], axis=1).astype(np.float64)
     assert not table[:, 3:6].any()
-    return {"mean": table[:, :3], "colour": 0.5 + SH_C0 * table[:, 6:9],
-            "rest": table[:, 9:54].reshape(-1, 3, 15).transpose(0, 2, 1), "opacity": 1 / (1 + np.exp(-table[:, 54])),
-            "scale": np.exp(table[:, 55:58]), "quat": table[:, 58:]}
+    return {
+        "mean": table[:, :3],
+        "colour": 0.5 + SH_C0 * table[:, 6:9],
+        "rest": table[:, 9:54].reshape(-1, 3, 15).transpose(0, 2, 1),
+        "opacity": 1 / (1 + np.exp(-table[:, 54])),
+        "scale": np.exp(table[:, 55:58]),
+        "quat": table[:, 58:],
+    }
 
 
 # Relative, of scales; absolute, of the rest. Bytes are cut off or rounded; Spark packs what it reads.
@@ -167,15 +201,23 @@ BYTES = {"mean": 1e-6, "scale": 1e-5, "quat": 0.01, "opacity": 4e-3, "colour": 4
 EXACT = dict.fromkeys(("mean", "scale", "quat", "opacity", "colour", "rest"), 2e-6)
 
 READERS: list[tuple[Callable[[Path, Path], Found], str, dict[str, float]]] = [
-    (by_splat_transform, "gaussian.ply", EXACT), (by_splat_transform, "skewed.ply", EXACT),
-    (by_splat_transform, "gaussian.spz", EXACT), (by_splat_transform, "gaussian.splat", EXACT | {"quat": 0.01}),
-    (by_gaussian_splats_3d, "gaussian.ply", BYTES), (by_gaussian_splats_3d, "skewed.ply", BYTES),
+    (by_splat_transform, "gaussian.ply", EXACT),
+    (by_splat_transform, "skewed.ply", EXACT),
+    (by_splat_transform, "gaussian.spz", EXACT),
+    (by_splat_transform, "gaussian.splat", EXACT | {"quat": 0.01}),
+    (by_gaussian_splats_3d, "gaussian.ply", BYTES),
+    (by_gaussian_splats_3d, "skewed.ply", BYTES),
     (by_gaussian_splats_3d, "gaussian.splat", BYTES),
-    (by_gsplat, "gaussian.ply", BYTES), (by_gsplat, "skewed.ply", BYTES), (by_gsplat, "gaussian.splat", BYTES),
-    (by_spark, "gaussian.ply", SPARK_ROUNDING), (by_spark, "skewed.ply", SPARK_ROUNDING),
-    (by_spark, "gaussian.spz", SPARK_ROUNDING), (by_spark, "gaussian.splat", SPARK_ROUNDING),
-    (by_plyfile, "gaussian.ply", EXACT), (by_plyfile, "skewed.ply", EXACT),
-]  # fmt: skip
+    (by_gsplat, "gaussian.ply", BYTES),
+    (by_gsplat, "skewed.ply", BYTES),
+    (by_gsplat, "gaussian.splat", BYTES),
+    (by_spark, "gaussian.ply", SPARK_ROUNDING),
+    (by_spark, "skewed.ply", SPARK_ROUNDING),
+    (by_spark, "gaussian.spz", SPARK_ROUNDING),
+    (by_spark, "gaussian.splat", SPARK_ROUNDING),
+    (by_plyfile, "gaussian.ply", EXACT),
+    (by_plyfile, "skewed.ply", EXACT),
+]
 
 
 @pytest.fixture(scope="module")
@@ -191,30 +233,49 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("reader", "name", "tolerances"), READERS,
-                         ids=[f"{reader.__name__[3:]}-{name}" for reader, name, _ in READERS])
-def test_others_find_our_values(files: Path, tmp_path: Path, reader: Callable[[Path, Path], Found], name: str,
-                                tolerances: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    ("reader", "name", "tolerances"), READERS, ids=[f"{reader.__name__[3:]}-{name}" for reader, name, _ in READERS]
+)
+def test_others_find_our_values(
+    files: Path, tmp_path: Path, reader: Callable[[Path, Path], Found], name: str, tolerances: dict[str, float]
+) -> None:
     readers = {".ply": Splats.load, ".spz": read_spz, ".splat": read_splat}
     ours = readers[Path(name).suffix](files / name)
     found = reader(tmp_path, files / name)
     unit = ours.quat / np.linalg.norm(ours.quat, axis=1, keepdims=True)
     theirs = found["quat"] / np.linalg.norm(found["quat"], axis=1, keepdims=True)
-    wanted = {"mean": ours.mean, "scale": np.exp(ours.log_scale), "opacity": 1 / (1 + np.exp(-ours.opacity_logit)),
-              "colour": np.clip(0.5 + SH_C0 * ours.sh[:, 0], 0, 1), "rest": ours.sh[:, 1:]}
+    wanted = {
+        "mean": ours.mean,
+        "scale": np.exp(ours.log_scale),
+        "opacity": 1 / (1 + np.exp(-ours.opacity_logit)),
+        "colour": np.clip(0.5 + SH_C0 * ours.sh[:, 0], 0, 1),
+        "rest": ours.sh[:, 1:],
+    }
     assert np.abs(np.abs(np.sum(unit * theirs, axis=1)) - 1).max() < tolerances["quat"]
     for field in set(found) - {"quat"}:
         values = np.clip(found[field], 0, 1) if field == "colour" else found[field]
         relative = field == "scale"
-        np.testing.assert_allclose(values, wanted[field], rtol=tolerances[field] if relative else 0,
-                                   atol=1e-7 if relative else tolerances[field], err_msg=field)
+        np.testing.assert_allclose(
+            values,
+            wanted[field],
+            rtol=tolerances[field] if relative else 0,
+            atol=1e-7 if relative else tolerances[field],
+            err_msg=field,
+        )
 
 
 @pytest.mark.parametrize("name", ["back.ply", "back.spz"])
 def test_we_read_what_splat_transform_writes(files: Path, tmp_path: Path, name: str) -> None:
     package("@playcanvas/splat-transform")
-    command = ["node", MODULES / "@playcanvas/splat-transform" / "bin" / "cli.mjs", "-q", "--spz-version", "3",
-               files / "gaussian.ply", tmp_path / name]
+    command = [
+        "node",
+        MODULES / "@playcanvas/splat-transform" / "bin" / "cli.mjs",
+        "-q",
+        "--spz-version",
+        "3",
+        files / "gaussian.ply",
+        tmp_path / name,
+    ]
     subprocess.run(command, check=True, capture_output=True, timeout=60)
     ours = Splats.load(files / "gaussian.ply")
     back = read_spz(tmp_path / name) if name.endswith(".spz") else Splats.load(tmp_path / name)

@@ -18,9 +18,7 @@ from clsplat.splats.fields import Field
 from clsplat.splats.ply import read_ply, write_ply
 from clsplat.splats.shapes import SHAPES
 
-IN_FOLDER = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+IN_FOLDER = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 ORDER_DEGREE_1 = (
     "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 " + " ".join(f"f_rest_{i}" for i in range(9)) + " opacity "
     "scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 skew_0 skew_1 skew_2"
@@ -32,8 +30,13 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "model.ply"
 
 
-def save(file: Path, columns: dict[str, list[float]], fmt: str = "binary_little_endian", kind: str = "float",
-         comments: tuple[str, ...] = ()) -> Path:
+def save(
+    file: Path,
+    columns: dict[str, list[float]],
+    fmt: str = "binary_little_endian",
+    kind: str = "float",
+    comments: tuple[str, ...] = (),
+) -> Path:
     """A PLY written by this test's own few lines, to be independent of the writer."""
     n = len(next(iter(columns.values())))
     head = ["ply", f"format {fmt} 1.0", *(f"comment {c}" for c in comments), f"element vertex {n}"]

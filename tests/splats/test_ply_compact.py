@@ -52,8 +52,13 @@ def same_but_for_bands(read: Arrays, arrays: Arrays) -> None:
 
 
 @IN_FOLDER
-@given(shape=st.sampled_from(sorted(SHAPES)), n=st.integers(0, 40), seed=st.integers(0, 2**32 - 1),
-       some=st.sampled_from([0.0, 0.1, 0.6, 1.0]), degree=st.integers(0, 3))
+@given(
+    shape=st.sampled_from(sorted(SHAPES)),
+    n=st.integers(0, 40),
+    seed=st.integers(0, 2**32 - 1),
+    some=st.sampled_from([0.0, 0.1, 0.6, 1.0]),
+    degree=st.integers(0, 3),
+)
 def test_round_trip_keeps_every_bit(file: Path, shape: str, n: int, seed: int, some: float, degree: int) -> None:
     arrays = sparse_arrays(shape, n, seed, some, degree)
     write_ply(file, shape, "pdf", arrays, compact=True)
@@ -140,8 +145,12 @@ def test_other_encodings_are_read(file: Path) -> None:
         kinds = [line.split()[1] for line in part.splitlines()[1:]]
         for _ in range(int(part.split()[1])):
             row, at = words[at : at + len(kinds)], at + len(kinds)
-            lines.append(" ".join(str(word if kind == "uint" else word.view(np.float32))
-                                  for word, kind in zip(row, kinds, strict=True)))
+            lines.append(
+                " ".join(
+                    str(word if kind == "uint" else word.view(np.float32))
+                    for word, kind in zip(row, kinds, strict=True)
+                )
+            )
     text = "\n".join(lines).encode()
     head = head.replace(b"binary_little_endian", b"ascii") + b"end_header\n"
     file.write_bytes(head + text)

@@ -14,9 +14,7 @@ from clsplat.errors import InputError, OutputError
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 
-IN_FOLDER = settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+IN_FOLDER = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def same(a: Splats, b: Splats) -> None:

@@ -48,8 +48,13 @@ def test_spz_comes_back_within_its_rounding(tmp_path: Path, degree: int) -> None
 
 def test_bytes_of_spz_are_the_format_s(tmp_path: Path) -> None:
     """One splat, worked out by hand."""
-    arrays = {"mean": [[-0.5, 4.0, 7.5]], "quat": [[-0.8, 0.6, 0.0, 0.0]], "log_scale": [[-10.0, 0.0, 9.0]],
-              "opacity_logit": [0.0], "sh": [[[0.0, 1.0, -9.0]]]}
+    arrays = {
+        "mean": [[-0.5, 4.0, 7.5]],
+        "quat": [[-0.8, 0.6, 0.0, 0.0]],
+        "log_scale": [[-10.0, 0.0, 9.0]],
+        "opacity_logit": [0.0],
+        "sh": [[[0.0, 1.0, -9.0]]],
+    }
     write_spz(tmp_path / "a.spz", Splats("gaussian", arrays))
     data = gzip.decompress((tmp_path / "a.spz").read_bytes())
     assert HEADER.unpack(data[:16]) == (0x5053474E, 3, 1, 0, 20, 0, 0)
@@ -98,10 +103,14 @@ def test_damaged_spz_is_refused(tmp_path: Path) -> None:
     whole = gzip.decompress(data)
     lying = HEADER.pack(0x5053474E, 3, 2**32 - 1, 3, 12, 0, 0)
     cases = {
-        "ends in the header": gzip.compress(whole[:7]), "of version 3": gzip.compress(b"NGSQ" + whole[4:]),
-        "too short": gzip.compress(lying + whole[16:]), "does not hold the 12": gzip.compress(whole[:-1]),
-        "does not hold": gzip.compress(whole + b"1"), "damaged": data[:-20], "cannot be read": whole,
-    }  # fmt: skip
+        "ends in the header": gzip.compress(whole[:7]),
+        "of version 3": gzip.compress(b"NGSQ" + whole[4:]),
+        "too short": gzip.compress(lying + whole[16:]),
+        "does not hold the 12": gzip.compress(whole[:-1]),
+        "does not hold": gzip.compress(whole + b"1"),
+        "damaged": data[:-20],
+        "cannot be read": whole,
+    }
     for said, damaged in cases.items():
         file.write_bytes(damaged)
         with pytest.raises(InputError, match=said):
@@ -121,8 +130,11 @@ def test_splat_comes_back_within_its_rounding(tmp_path: Path) -> None:
     colours = [np.clip(0.5 + 0.28209479 * sh[:, 0], 0, 1) for sh in (read.sh, splats.sh[order])]
     np.testing.assert_allclose(colours[0], colours[1], atol=0.5 / 255 + 1e-6)
     data = file.read_bytes()
-    for said, damaged in {"multiple of 32": data[:-1], "finite": b"\0\0\xc0\x7f" + data[4:],
-                          "norm is 0": data[:28] + bytes([128] * 4) + data[32:]}.items():
+    for said, damaged in {
+        "multiple of 32": data[:-1],
+        "finite": b"\0\0\xc0\x7f" + data[4:],
+        "norm is 0": data[:28] + bytes([128] * 4) + data[32:],
+    }.items():
         file.write_bytes(damaged)
         with pytest.raises(InputError, match=said):
             read_splat(file)

@@ -52,8 +52,9 @@ def test_harmonics_turn_with_their_directions() -> None:
 
 
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal", "half-gaussian"])
-def test_images_stay_where_the_camera_goes_along(shape: str, devices: list[Device],
-                                                 make_renderer: MakeRenderer) -> None:
+def test_images_stay_where_the_camera_goes_along(
+    shape: str, devices: list[Device], make_renderer: MakeRenderer
+) -> None:
     splats, camera = random_splats(shape, 60, 2), random_camera(0, 70, 50)
     renderer = make_renderer(devices[0], "float32")
     given = matrix()

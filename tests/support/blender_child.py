@@ -77,8 +77,9 @@ def cameras() -> Any:
 
 def install() -> Facts:
     start = time.perf_counter()
-    bpy.ops.extensions.package_install_files(filepath=str(FOLDER / "addon.zip"), repo="user_default",
-                                             enable_on_install=True)
+    bpy.ops.extensions.package_install_files(
+        filepath=str(FOLDER / "addon.zip"), repo="user_default", enable_on_install=True
+    )
     return {"enabled": ADDON in bpy.context.preferences.addons, "seconds": time.perf_counter() - start}
 
 
@@ -89,9 +90,15 @@ def imported() -> Facts:
     colours = np.empty(4 * len(mesh.vertices), np.float32)
     mesh.attributes["color"].data.foreach_get("color", colours)
     thinned = splats(points=10)
-    return {"points": len(mesh.vertices), "attributes": sorted(mesh.attributes.keys()), "ply": item.clsplat_ply,
-            "rotation": list(item.rotation_euler), "first": list(mesh.vertices[0].co),
-            "colour": colours[:4].tolist(), "thinned": len(thinned.data.vertices)}
+    return {
+        "points": len(mesh.vertices),
+        "attributes": sorted(mesh.attributes.keys()),
+        "ply": item.clsplat_ply,
+        "rotation": list(item.rotation_euler),
+        "first": list(mesh.vertices[0].co),
+        "colour": colours[:4].tolist(),
+        "thinned": len(thinned.data.vertices),
+    }
 
 
 def frames() -> Facts:
@@ -149,9 +156,12 @@ def animation() -> Facts:
         made.frame_set(frame)
         turns.append(made.camera.rotation_quaternion.copy())
     nearest = min(first.dot(second) for first, second in itertools.pairwise(turns))
-    return {"frames": [made.frame_start, made.frame_end], "nearest": nearest,
-            "fps": made.render.fps / made.render.fps_base,
-            "files": sorted(str(path) for path in FOLDER.glob("animation_*.png"))}
+    return {
+        "frames": [made.frame_start, made.frame_end],
+        "nearest": nearest,
+        "fps": made.render.fps / made.render.fps_base,
+        "files": sorted(str(path) for path in FOLDER.glob("animation_*.png")),
+    }
 
 
 def projections() -> Facts:
@@ -168,20 +178,28 @@ def projections() -> Facts:
                 data.lens, data.sensor_width, data.sensor_height = rng.uniform((20, 20, 15), (60, 40, 30)).tolist()
                 data.shift_x, data.shift_y = rng.uniform(-0.4, 0.4, 2).tolist()
                 data.clip_start = 0.3
-                item.matrix_world = (Matrix.Translation(rng.normal(size=3).tolist())
-                                     @ Matrix.Rotation(rng.uniform(0, 3), 4, Vector(rng.normal(size=3).tolist()))
-                                     @ Matrix.Scale(1.5, 4))
+                item.matrix_world = (
+                    Matrix.Translation(rng.normal(size=3).tolist())
+                    @ Matrix.Rotation(rng.uniform(0, 3), 4, Vector(rng.normal(size=3).tolist()))
+                    @ Matrix.Scale(1.5, 4)
+                )
                 made.render.resolution_x, made.render.resolution_y = width * 2, height * 2
                 made.render.resolution_percentage = 50
                 made.render.pixel_aspect_x, made.render.pixel_aspect_y = aspects
                 bpy.context.view_layer.update()
-                matrix = item.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=width, y=height,
-                                                 scale_x=aspects[0], scale_y=aspects[1])
+                matrix = item.calc_matrix_camera(
+                    bpy.context.evaluated_depsgraph_get(), x=width, y=height, scale_x=aspects[0], scale_y=aspects[1]
+                )
                 view = item.matrix_world.normalized().inverted()
-                cases.append({
-                    "lens": [data.lens, data.sensor_width, data.sensor_height, fit, data.shift_x, data.shift_y],
-                    "raster": [width, height, *aspects], "world": [list(row) for row in item.matrix_world],
-                    "view": [list(row) for row in view], "projection": [list(row) for row in matrix]})
+                cases.append(
+                    {
+                        "lens": [data.lens, data.sensor_width, data.sensor_height, fit, data.shift_x, data.shift_y],
+                        "raster": [width, height, *aspects],
+                        "world": [list(row) for row in item.matrix_world],
+                        "view": [list(row) for row in view],
+                        "projection": [list(row) for row in matrix],
+                    }
+                )
     return {"cases": cases}
 
 
@@ -273,8 +291,11 @@ def viewport() -> Facts:
             lens = item.calc_matrix_camera(depsgraph, x=size[0], y=size[1])
             view = item.matrix_world.normalized().inverted()
             data = SimpleNamespace(view_matrix=view, window_matrix=lens)
-            context = SimpleNamespace(region=SimpleNamespace(width=size[0], height=size[1]), region_data=data,
-                                      space_data=SimpleNamespace(clip_start=0.01, clip_end=100.0))
+            context = SimpleNamespace(
+                region=SimpleNamespace(width=size[0], height=size[1]),
+                region_data=data,
+                space_data=SimpleNamespace(clip_start=0.01, clip_end=100.0),
+            )
             offscreen = gpu.types.GPUOffScreen(*size, format="RGBA32F")
             across = Matrix(((2 / size[0], 0, 0, -1), (0, 2 / size[1], 0, -1), (0, 0, 1, 0), (0, 0, 0, 1)))
             shown = []

@@ -8,16 +8,43 @@ from clsplat.comparison.table import MEASURED, Record
 from clsplat.training.config import TrainConfig
 
 
-def recorded(system: str, cap: int = 1000, psnr: float = 20.0, seed: int = 0, *, shape: str = "gaussian",
-             iterations: int = 100, scene: str = "yard", **values: Any) -> Record:
+def recorded(
+    system: str,
+    cap: int = 1000,
+    psnr: float = 20.0,
+    seed: int = 0,
+    *,
+    shape: str = "gaussian",
+    iterations: int = 100,
+    scene: str = "yard",
+    **values: Any,
+) -> Record:
     """A run of `cap` splats that took cap / 100 ms to render."""
     config = TrainConfig(shape=shape, cap_max=cap, seed=seed, iterations=iterations)
-    return {"scene": {"name": scene, "width": 8, "height": 6, "train": 3, "test": 1}, "system": system,
-            "config": config.to_json(), "failed": None, "finite": True, "cap_held": True, "device": "d", "driver": "v",
-            "schedule": "1x16x16", "version": "0", "protocol": {"PSNR": "p", "SSIM": "s"},
-            **dict.fromkeys(MEASURED, 1.0), "psnr": psnr, "ssim": psnr / 40, "splats": cap, "bytes": 200 * cap,
-            "render_ms": cap / 100, "seconds": cap / 50, "digest": f"{system} {cap} {seed}", "repeat": 0,
-            "curve": None, **values}  # fmt: skip
+    return {
+        "scene": {"name": scene, "width": 8, "height": 6, "train": 3, "test": 1},
+        "system": system,
+        "config": config.to_json(),
+        "failed": None,
+        "finite": True,
+        "cap_held": True,
+        "device": "d",
+        "driver": "v",
+        "schedule": "1x16x16",
+        "version": "0",
+        "protocol": {"PSNR": "p", "SSIM": "s"},
+        **dict.fromkeys(MEASURED, 1.0),
+        "psnr": psnr,
+        "ssim": psnr / 40,
+        "splats": cap,
+        "bytes": 200 * cap,
+        "render_ms": cap / 100,
+        "seconds": cap / 50,
+        "digest": f"{system} {cap} {seed}",
+        "repeat": 0,
+        "curve": None,
+        **values,
+    }
 
 
 def curve(last: float) -> list[dict[str, float]]:
@@ -27,15 +54,22 @@ def curve(last: float) -> list[dict[str, float]]:
 
 def sweep(scene: str = "yard") -> list[Record]:
     """Two systems at three caps, the second half a doubling better; an automatic run; five seeds and two repeats."""
-    runs = [recorded("gaussian", cap, psnr, scene=scene, curve=curve(psnr))
-            for cap, psnr in ((1000, 20.0), (2000, 21.0), (4000, 22.0))]
-    runs += [recorded("default", cap, psnr, scene=scene, shape="skew-normal", curve=curve(psnr))
-             for cap, psnr in ((1000, 20.5), (2000, 21.5), (4000, 22.5))]
+    runs = [
+        recorded("gaussian", cap, psnr, scene=scene, curve=curve(psnr))
+        for cap, psnr in ((1000, 20.0), (2000, 21.0), (4000, 22.0))
+    ]
+    runs += [
+        recorded("default", cap, psnr, scene=scene, shape="skew-normal", curve=curve(psnr))
+        for cap, psnr in ((1000, 20.5), (2000, 21.5), (4000, 22.5))
+    ]
     return [*runs, recorded("auto default", 1500, 22.45, scene=scene, shape="skew-normal", iterations=300)]
 
 
 def seeds() -> list[Record]:
     """Five seeds of two systems, and two repeats of the first."""
-    runs = [recorded(system, 500, 20 + seed / 10, seed, scene="attic") for system in ("gaussian", "3dgs")
-            for seed in range(5)]
+    runs = [
+        recorded(system, 500, 20 + seed / 10, seed, scene="attic")
+        for system in ("gaussian", "3dgs")
+        for seed in range(5)
+    ]
     return runs + [record | {"repeat": again} for record in (runs[0], runs[5]) for again in (1, 2)]

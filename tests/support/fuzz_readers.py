@@ -92,9 +92,22 @@ def make_transforms(folder: Path) -> None:
         frames.append({"file_path": f"images/{view.name}", "transform_matrix": pose.tolist()})
     write_png(folder / "masks" / "shot_0.png", photo_of(0)[:, :, 1])
     frames[0]["mask_path"] = "masks/shot_0.png"
-    values = {"fl_x": FX, "fl_y": FY, "cx": 18.5, "cy": 16.25, "w": 40, "h": 30, "k1": 0.01, "k2": 0.0, "p1": 0.0,
-              "p2": 0.0, "camera_model": "OPENCV", "frames": frames, "ply_file_path": "points.ply",
-              "applied_transform": np.eye(4)[:3].tolist()}
+    values = {
+        "fl_x": FX,
+        "fl_y": FY,
+        "cx": 18.5,
+        "cy": 16.25,
+        "w": 40,
+        "h": 30,
+        "k1": 0.01,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+        "camera_model": "OPENCV",
+        "frames": frames,
+        "ply_file_path": "points.ply",
+        "applied_transform": np.eye(4)[:3].tolist(),
+    }
     (folder / "transforms.json").write_text(json.dumps(values))
     make_ascii(folder)
 
@@ -144,8 +157,9 @@ def make_checkpoint(folder: Path) -> None:
     arrays = small_splats().to_numpy()
     state = {f"{kind}.{name}": np.zeros_like(values) for kind in ("m", "v") for name, values in arrays.items()}
     rng = dict(np.random.default_rng(0).bit_generator.state)
-    Checkpoint(40, config.to_json(), arrays, state, rng, [2, 0, 1], 1.5, "1x16x16", 6, np.ones((3, 6), np.float32)
-               ).save(folder / "checkpoint.npz")
+    Checkpoint(
+        40, config.to_json(), arrays, state, rng, [2, 0, 1], 1.5, "1x16x16", 6, np.ones((3, 6), np.float32)
+    ).save(folder / "checkpoint.npz")
 
 
 def read_checkpoint(folder: Path) -> None:
@@ -183,8 +197,11 @@ def make_search(folder: Path) -> None:
 
     from clsplat.compression.rules import BudgetOptions
 
-    values = {"config": TrainConfig(iterations=100).to_json(), "options": asdict(BudgetOptions()),
-              "scene": {"path": "/data", "resolution": 2}}
+    values = {
+        "config": TrainConfig(iterations=100).to_json(),
+        "options": asdict(BudgetOptions()),
+        "scene": {"path": "/data", "resolution": 2},
+    }
     (folder / "budget.json").write_text(json.dumps(values))
 
 
@@ -250,8 +267,9 @@ def read_photographs(folder: Path) -> None:
     fingerprint(folder / "photos")
     with tempfile.TemporaryDirectory() as work:
         (Path(work) / "photos").mkdir()
-        ready = [prepare(photo, number, Path(work) / "photos", Path(work) / "masks")
-                 for number, photo in enumerate(found)]
+        ready = [
+            prepare(photo, number, Path(work) / "photos", Path(work) / "masks") for number, photo in enumerate(found)
+        ]
     same_camera([photo for photo in ready if not isinstance(photo, str)], "auto")
     for line in ready:
         if isinstance(line, str):  # those are left out, with this line
@@ -262,8 +280,14 @@ def make_blender(folder: Path) -> None:
     for part, index in (("train", 0), ("train", 1), ("test", 2)):
         write_png(folder / part / f"r_{index}.png", np.dstack([photo_of(index), photo_of(index)[:, :, 1]]))
     for part, places in (("train", (0, 1)), ("test", (2,))):
-        frames = [{"file_path": f"./{part}/r_{i}", "rotation": 0.1,
-                   "transform_matrix": np.linalg.inv(model_views()[i].cam_from_world).tolist()} for i in places]
+        frames = [
+            {
+                "file_path": f"./{part}/r_{i}",
+                "rotation": 0.1,
+                "transform_matrix": np.linalg.inv(model_views()[i].cam_from_world).tolist(),
+            }
+            for i in places
+        ]
         (folder / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
 
 
@@ -277,10 +301,13 @@ READERS = {
     "ply": Sample(lambda f: small_splats().save(f / "model.ply"), lambda f: finite(read_ply(f / "model.ply").arrays)),
     "ply-compact": Sample(make_compact, lambda f: finite(read_ply(f / "model.ply").arrays)),
     "point-cloud": Sample(make_ascii, lambda f: read_point_cloud(f / "points.ply")),
-    "splat": Sample(lambda f: write_splat(f / "a.splat", small_splats("gaussian")),
-                    lambda f: finite(read_splat(f / "a.splat").arrays)),
-    "spz": Sample(lambda f: write_spz(f / "a.spz", small_splats("gaussian", 2)),
-                  lambda f: finite(read_spz(f / "a.spz").arrays)),
+    "splat": Sample(
+        lambda f: write_splat(f / "a.splat", small_splats("gaussian")),
+        lambda f: finite(read_splat(f / "a.splat").arrays),
+    ),
+    "spz": Sample(
+        lambda f: write_spz(f / "a.spz", small_splats("gaussian", 2)), lambda f: finite(read_spz(f / "a.spz").arrays)
+    ),
     "colmap-bin": Sample(make_scene, lambda f: read_model(find_model(f)), "sparse"),
     "colmap-txt": Sample(lambda f: make_scene(f, ".txt"), lambda f: read_model(find_model(f)), "sparse"),
     "scene": Sample(make_masked, read_scene),

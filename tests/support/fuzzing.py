@@ -1,6 +1,6 @@
 """Damaged files for every reader: what is damaged, and a campaign that survives what the readers do with it.
 
-    python tests/support/fuzzing.py TABLE READER,... FIRST COUNT SEED   # the worker: JSON lines, of inputs begun and of faults
+    python tests/support/fuzzing.py TABLE READER,... FIRST COUNT SEED   # the worker
 
 A reader is sound where each input ends with an error of clsplat's own in one line, or with a result that its check
 accepts. All else is a fault: another exception (MemoryError too: the worker's address space is bounded), a message of
@@ -31,13 +31,60 @@ import numpy as np
 
 SECONDS = 10
 ROOM = 1 << 30  # bytes of address space above what the worker has at its start; the samples have some kB
-_ODD_BYTES = [b"\0" * 8, b"\xff" * 8, b"\xff" * 4, b"\xff\xff\xff\x7f", b"\0\0\xc0\x7f", b"\0\0\x80\x7f",
-              np.float64(np.nan).tobytes(), np.float64(np.inf).tobytes(), np.float64(1e300).tobytes(),
-              (1 << 40).to_bytes(8, "little"), (1 << 62).to_bytes(8, "little"), (1 << 31).to_bytes(4, "little"),
-              b"\n", b" ", b"-", b"\"", b"\xc3\x28", b"nan", b" 1e999 ", b" -1 ", b" 99999999999999999999 ", b"0x10"]
-_ODD_VALUES: list[Any] = [None, True, "", "x", "\0", "a\nb", -1, 0, 1, 2.5, 1e300, -1e300, 10**30, float("nan"),
-                          float("inf"), [], [1], [[]], {}, {"a": 1}, "../../etc", "/", ".", "é" * 300,
-                          "é" * 300 + "/a.png", "a/" * 3000, "\ud800", [None] * 4]
+_ODD_BYTES = [
+    b"\0" * 8,
+    b"\xff" * 8,
+    b"\xff" * 4,
+    b"\xff\xff\xff\x7f",
+    b"\0\0\xc0\x7f",
+    b"\0\0\x80\x7f",
+    np.float64(np.nan).tobytes(),
+    np.float64(np.inf).tobytes(),
+    np.float64(1e300).tobytes(),
+    (1 << 40).to_bytes(8, "little"),
+    (1 << 62).to_bytes(8, "little"),
+    (1 << 31).to_bytes(4, "little"),
+    b"\n",
+    b" ",
+    b"-",
+    b'"',
+    b"\xc3\x28",
+    b"nan",
+    b" 1e999 ",
+    b" -1 ",
+    b" 99999999999999999999 ",
+    b"0x10",
+]
+_ODD_VALUES: list[Any] = [
+    None,
+    True,
+    "",
+    "x",
+    "\0",
+    "a\nb",
+    -1,
+    0,
+    1,
+    2.5,
+    1e300,
+    -1e300,
+    10**30,
+    float("nan"),
+    float("inf"),
+    [],
+    [1],
+    [[]],
+    {},
+    {"a": 1},
+    "../../etc",
+    "/",
+    ".",
+    "é" * 300,
+    "é" * 300 + "/a.png",
+    "a/" * 3000,
+    "\ud800",
+    [None] * 4,
+]
 
 
 class TooLong(BaseException):
@@ -79,8 +126,9 @@ def campaign(readers: Sequence[str], count: int, seed: int = 0, table: str = "fu
             said, code = process.stderr.read(), process.wait()
         if code == 0:
             break
-        results[reader].faults.append({"reader": reader, "seed": seed, "input": first,
-                                       "fault": f"the process ended ({code}): {said[-300:]}"})
+        results[reader].faults.append(
+            {"reader": reader, "seed": seed, "input": first, "fault": f"the process ended ({code}): {said[-300:]}"}
+        )
         left = left[left.index(reader) :]
         first += 1
     return list(results.values())
@@ -238,8 +286,15 @@ def _odd_npz(path: Path, rng: np.random.Generator) -> None:
     if name == "meta":
         arrays["meta"] = np.frombuffer(odd_json(json.loads(arrays["meta"].tobytes()), rng), np.uint8)
     else:
-        odd: list[Any] = [arrays[name][:-1], arrays[name].astype(str), np.full_like(arrays[name], -1), np.zeros(3),
-                          arrays[name].astype(np.float64) * np.nan, arrays[name][..., None], np.float32(1.0)]
+        odd: list[Any] = [
+            arrays[name][:-1],
+            arrays[name].astype(str),
+            np.full_like(arrays[name], -1),
+            np.zeros(3),
+            arrays[name].astype(np.float64) * np.nan,
+            arrays[name][..., None],
+            np.float32(1.0),
+        ]
         kind = int(rng.integers(len(odd) + 1))
         if kind == len(odd):
             del arrays[name]

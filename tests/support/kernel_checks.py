@@ -30,9 +30,10 @@ Arrays = dict[str, NDArray[np.floating]]
 
 # (shape, normalisation) of every kernel there is.
 KERNELS = [
-    (shape.name, normalisation) for shape in SHAPES.values()
+    (shape.name, normalisation)
+    for shape in SHAPES.values()
     for normalisation in (NORMALISATIONS if shape.normalised else NORMALISATIONS[:1])
-]  # fmt: skip
+]
 BACKGROUND = (0.2, 0.5, 0.9)
 SMOOTH = {"alpha_min": 0.0, "alpha_max": 1.0, "t_min": 0.0}
 
@@ -67,13 +68,29 @@ class Case:
 
     @cached_property
     def image(self) -> Rendered:
-        return render_reference(self.values, self.camera, self.shape, self.normalisation, BACKGROUND,
-                                antialiased=self.antialiased, **self.thresholds)
+        return render_reference(
+            self.values,
+            self.camera,
+            self.shape,
+            self.normalisation,
+            BACKGROUND,
+            antialiased=self.antialiased,
+            **self.thresholds,
+        )
 
     @cached_property
     def gradients(self) -> Arrays:
-        return reference_gradients(self.values, self.camera, *self.weights, self.shape, self.normalisation,
-                                   BACKGROUND, fields=self.fields, antialiased=self.antialiased, **self.thresholds)
+        return reference_gradients(
+            self.values,
+            self.camera,
+            *self.weights,
+            self.shape,
+            self.normalisation,
+            BACKGROUND,
+            fields=self.fields,
+            antialiased=self.antialiased,
+            **self.thresholds,
+        )
 
     @cached_property
     def decided(self) -> NDArray[np.bool_]:

@@ -10,8 +10,16 @@ from clsplat.splats.shapes import Shape
 
 Arrays = dict[str, np.ndarray]
 
-ALL_SHAPES = [shapes.GAUSSIAN, shapes.SKEW_NORMAL, shapes.SKEW_NORMAL_DIRECT, shapes.HALF_GAUSSIAN,
-              shapes.BISECTED_SKEW, shapes.GENERALISED_EXPONENTIAL, shapes.GES_MODULATION, shapes.STUDENT_T]
+ALL_SHAPES = [
+    shapes.GAUSSIAN,
+    shapes.SKEW_NORMAL,
+    shapes.SKEW_NORMAL_DIRECT,
+    shapes.HALF_GAUSSIAN,
+    shapes.BISECTED_SKEW,
+    shapes.GENERALISED_EXPONENTIAL,
+    shapes.GES_MODULATION,
+    shapes.STUDENT_T,
+]
 
 
 def random_model(shape: Shape, n: int, seed: int, dead: float = 0.3, sh_degree: int = 1) -> Arrays:

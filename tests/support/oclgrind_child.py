@@ -28,8 +28,14 @@ SCHEDULES = {
     "uninitialized": ("1x16x16", "1x256x1", "64x4x1"),
 }
 
-HAZARDS = ("at and behind the near plane", "centroid and location across it", "values that overflow",
-           "screen-filling, 3e5 px", "needles 1:10^4", "opacity 1")
+HAZARDS = (
+    "at and behind the near plane",
+    "centroid and location across it",
+    "values that overflow",
+    "screen-filling, 3e5 px",
+    "needles 1:10^4",
+    "opacity 1",
+)
 
 HELPERS = """
 kernel void put(global const uint *restrict from, global uint *restrict to, ulong at)
@@ -206,8 +212,13 @@ def main() -> None:
     append_to_sources({"render/group.clh": NO_PREFETCH})
     if mode == "uninitialized":
         make_traceable(device)
-    {"render": render_some, "render-all": render_all, "render-hazards": render_hazards, "sort": sort_and_scan,
-     "faults": faults}[what](device, mode)
+    {
+        "render": render_some,
+        "render-all": render_all,
+        "render-hazards": render_hazards,
+        "sort": sort_and_scan,
+        "faults": faults,
+    }[what](device, mode)
     device.queue.finish()
     print("finished")
 

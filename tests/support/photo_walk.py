@@ -47,7 +47,7 @@ def picture(index: int, count: int = N_PHOTOS, fisheye: bool = False) -> NDArray
     centre, directions = -pose[:3, :3].T @ pose[:3, 3], rays @ pose[:3, :3]
     image, nearest = np.zeros(x.shape), np.full(x.shape, np.inf)
     for side in (-1.0, 1.0):
-        normal = np.array([side, 0.0, -1.0]) / np.sqrt(2)       # the wall through (0, 0, 1)
+        normal = np.array([side, 0.0, -1.0]) / np.sqrt(2)  # the wall through (0, 0, 1)
         with np.errstate(divide="ignore"):
             depth = (normal @ (np.array([0.0, 0.0, 1.0]) - centre)) / (directions @ normal)
         hit = (depth > 0) & (depth < nearest)
@@ -77,6 +77,7 @@ def _texture(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float
         column, row = np.floor(x).astype(int), np.floor(y).astype(int)
         s, t = x - column, y - row
         corner = [[table[(row + j) % 256, (column + i) % 256] for i in (0, 1)] for j in (0, 1)]
-        total += weight * ((corner[0][0] * (1 - s) + corner[0][1] * s) * (1 - t)
-                           + (corner[1][0] * (1 - s) + corner[1][1] * s) * t)
+        total += weight * (
+            (corner[0][0] * (1 - s) + corner[0][1] * s) * (1 - t) + (corner[1][0] * (1 - s) + corner[1][1] * s) * t
+        )
     return total

@@ -29,8 +29,12 @@ class Client:
         self.panel: dict[str, dict[str, Any]] = {}
         self.pictures: list[bytes] = []
         self.received: list[dict[str, Any]] = []
-        self._socket = connect(f"ws://127.0.0.1:{port}", subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
-                               max_size=None, compression=None)
+        self._socket = connect(
+            f"ws://127.0.0.1:{port}",
+            subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
+            max_size=None,
+            compression=None,
+        )
 
     def __enter__(self) -> Client:
         return self
@@ -46,13 +50,29 @@ class Client:
         """The line is cut."""
         self._socket.socket.close()
 
-    def look(self, position: Sequence[float] = (0, 0, -3), wxyz: Sequence[float] = (1, 0, 0, 0), fov: float = 1.0,
-             width: int = 96, height: int = 64) -> None:
+    def look(
+        self,
+        position: Sequence[float] = (0, 0, -3),
+        wxyz: Sequence[float] = (1, 0, 0, 0),
+        fov: float = 1.0,
+        width: int = 96,
+        height: int = 64,
+    ) -> None:
         """Tell of a camera."""
-        self.send({"type": "ViewerCameraMessage", "wxyz": [float(part) for part in wxyz],
-                   "position": [float(part) for part in position], "fov": float(fov),
-                   "near": 0.01, "far": 1000.0, "image_height": height, "image_width": width, "look_at": [0, 0, 0],
-                   "up_direction": [0, -1, 0]})
+        self.send(
+            {
+                "type": "ViewerCameraMessage",
+                "wxyz": [float(part) for part in wxyz],
+                "position": [float(part) for part in position],
+                "fov": float(fov),
+                "near": 0.01,
+                "far": 1000.0,
+                "image_height": height,
+                "image_width": width,
+                "look_at": [0, 0, 0],
+                "up_direction": [0, -1, 0],
+            }
+        )
 
     def set(self, label: str, value: Any) -> None:
         """Change an element of the panel (a button: press it)."""
@@ -86,8 +106,9 @@ class Client:
             return False
         assert isinstance(data, bytes)
         size = int.from_bytes(data[8:16], "little")
-        inner = zstandard.ZstdDecompressor().decompress(data[16 : 16 + size],
-                                                        max_output_size=int.from_bytes(data[:8], "little"))
+        inner = zstandard.ZstdDecompressor().decompress(
+            data[16 : 16 + size], max_output_size=int.from_bytes(data[:8], "little")
+        )
         for message in msgspec.msgpack.decode(inner)["messages"]:
             kind = message["type"]
             self.received.append(message)

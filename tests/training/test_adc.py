@@ -29,10 +29,17 @@ def signals_of(gradient: np.ndarray, depth: np.ndarray | None = None, seen: int 
     return np.array(rows, np.float32)
 
 
-def planned(arrays: Arrays, shape: Shape, signals: np.ndarray, cap: int = 10_000, seed: int = 0,
-            **options: float | None) -> Plan:
-    return plan_adc(arrays, shape, signals, np.random.default_rng(seed), cap,
-                    **({"extent": EXTENT, "grad_threshold": THRESHOLD} | options))  # type: ignore[arg-type]
+def planned(
+    arrays: Arrays, shape: Shape, signals: np.ndarray, cap: int = 10_000, seed: int = 0, **options: float | None
+) -> Plan:
+    return plan_adc(
+        arrays,
+        shape,
+        signals,
+        np.random.default_rng(seed),
+        cap,
+        **({"extent": EXTENT, "grad_threshold": THRESHOLD} | options),
+    )  # type: ignore[arg-type]
 
 
 def plain(n: int, scale: float, opacity: float = 0.5) -> Arrays:
@@ -45,11 +52,16 @@ def plain(n: int, scale: float, opacity: float = 0.5) -> Arrays:
 
 
 @settings(max_examples=60, deadline=None)
-@given(n=st.integers(1, 120), seed=st.integers(0, 10_000), dead=st.floats(0, 1), spare=st.integers(-20, 150),
-       by_axis=st.booleans(), large=st.booleans(), shape=st.sampled_from(ALL_SHAPES))
-def test_laws_of_a_plan(
-    n: int, seed: int, dead: float, spare: int, by_axis: bool, large: bool, shape: Shape
-) -> None:
+@given(
+    n=st.integers(1, 120),
+    seed=st.integers(0, 10_000),
+    dead=st.floats(0, 1),
+    spare=st.integers(-20, 150),
+    by_axis=st.booleans(),
+    large=st.booleans(),
+    shape=st.sampled_from(ALL_SHAPES),
+)
+def test_laws_of_a_plan(n: int, seed: int, dead: float, spare: int, by_axis: bool, large: bool, shape: Shape) -> None:
     arrays = random_model(shape, n, seed, dead)
     rng = np.random.default_rng(seed)
     signals = signals_of(*(rng.exponential(scale, n) for scale in (THRESHOLD, 0.1)))
@@ -94,8 +106,9 @@ def test_small_ones_are_cloned_in_place_and_large_ones_split() -> None:
         else:
             assert plan.source.tolist() == [0, 2, 1, 1]
             assert plan.fresh.tolist() == [False] * 2 + [True] * 2
-            np.testing.assert_allclose(moved["log_scale"][2:], arrays["log_scale"][:2] - math.log(SPLIT_SHRINK),
-                                       rtol=1e-6)
+            np.testing.assert_allclose(
+                moved["log_scale"][2:], arrays["log_scale"][:2] - math.log(SPLIT_SHRINK), rtol=1e-6
+            )
             assert not np.array_equal(moved["mean"][2], moved["mean"][3])
 
 
@@ -200,8 +213,9 @@ def test_either_gradient_splits_along_the_longest_axis_and_keeps_mean_and_varian
     np.testing.assert_array_equal(moved["opacity_logit"], arrays["opacity_logit"][[0, 0]])
 
 
-@pytest.mark.parametrize("shape", [shapes.SKEW_NORMAL, shapes.SKEW_NORMAL_DIRECT, shapes.BISECTED_SKEW],
-                         ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "shape", [shapes.SKEW_NORMAL, shapes.SKEW_NORMAL_DIRECT, shapes.BISECTED_SKEW], ids=lambda s: s.name
+)
 def test_halves_of_a_skewed_splat_keep_the_skew_across_the_axis_and_half_of_it_along(shape: Shape) -> None:
     arrays = random_model(shape, 1, 3, dead=0)
     arrays["log_scale"][:] = np.log([0.1, 0.3, 0.2])
@@ -276,8 +290,9 @@ def test_a_reset_lowers_opacities_and_their_state_only(shape: Shape) -> None:
     arrays = random_model(shape, 200, 0, dead=0.3)
     for name in opacity_names(arrays):
         arrays[name][:2] = (40.0, 1.0)
-    plan = planned(arrays, shape, signals_of(np.linspace(0, 2, 200) * THRESHOLD, np.linspace(0, 1, 200)),
-                   depth_threshold=0.5)
+    plan = planned(
+        arrays, shape, signals_of(np.linspace(0, 2, 200) * THRESHOLD, np.linspace(0, 1, 200)), depth_threshold=0.5
+    )
     before = plan.apply(arrays)
     reset = with_reset(plan, arrays, shape)
     after = reset.apply(arrays)

@@ -9,8 +9,9 @@ import pytest
 from clsplat.training.alternation import active_blocks
 from clsplat.training.config import TrainConfig
 
-CONFIG = TrainConfig(iterations=100, alternation="cyclic", alternation_warmup=0.2, alternation_cycle=10,
-                     alternation_split=0.3)
+CONFIG = TrainConfig(
+    iterations=100, alternation="cyclic", alternation_warmup=0.2, alternation_cycle=10, alternation_split=0.3
+)
 
 
 def pattern(config: TrainConfig) -> str:

@@ -31,13 +31,33 @@ def rewritten(path: Path, **changes: Any) -> None:
     np.savez(path, **arrays)
 
 
-@pytest.mark.parametrize("changes", [
-    {"queue": None}, {"queue": [0, "one"]}, {"queue": [True]}, {"iteration": -1}, {"iteration": 2.5},
-    {"seconds": "long"}, {"seconds": float("nan")}, {"n_first": 0}, {"rng": {}}, {"rng": {"bit_generator": "MT19937"}},
-    {"version": "2\n2"}, {"meta": None}, {"signals": None}, {"signals": np.ones(3)}, {"splats.mean": np.ones((5, 3))},
-    {"splats.mean": np.array(["x"] * 6)}, {"splats.mean": None}, {"optimizer.m.mean": np.float32(1)},
-    {"config": {"iterations": "many"}}, {"config": [1]}, {"config": {"colour": 1}},
-], ids=str)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"queue": None},
+        {"queue": [0, "one"]},
+        {"queue": [True]},
+        {"iteration": -1},
+        {"iteration": 2.5},
+        {"seconds": "long"},
+        {"seconds": float("nan")},
+        {"n_first": 0},
+        {"rng": {}},
+        {"rng": {"bit_generator": "MT19937"}},
+        {"version": "2\n2"},
+        {"meta": None},
+        {"signals": None},
+        {"signals": np.ones(3)},
+        {"splats.mean": np.ones((5, 3))},
+        {"splats.mean": np.array(["x"] * 6)},
+        {"splats.mean": None},
+        {"optimizer.m.mean": np.float32(1)},
+        {"config": {"iterations": "many"}},
+        {"config": [1]},
+        {"config": {"colour": 1}},
+    ],
+    ids=str,
+)
 def test_checkpoints_of_something_else(tmp_path: Path, changes: dict[str, Any]) -> None:
     make_checkpoint(tmp_path)
     read_checkpoint(tmp_path)
@@ -50,14 +70,22 @@ def test_checkpoints_of_something_else(tmp_path: Path, changes: dict[str, Any]) 
             Checkpoint.load(tmp_path / "checkpoint.npz")
 
 
-@pytest.mark.parametrize(("values", "said"), [
-    ({"iterations": "many"}, "iterations is the text 'many'; expected a whole number"),
-    ({"iterations": 2.5}, "expected a whole number"), ({"iterations": True}, "iterations is true"),
-    ({"lambda_dssim": float("inf")}, "expected a finite number"),
-    ({"background": [0, 0]}, "expected a list"), ({"save_iterations": 3}, "expected a list"),
-    ({"save_iterations": ["a"]}, "expected a list"), ({"visible_adam": 1}, "expected true or false"),
-    ({"device": 3}, "or null"), ({"iterations": None}, "iterations is null"), ([], "config: is a list"),
-])
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"iterations": "many"}, "iterations is the text 'many'; expected a whole number"),
+        ({"iterations": 2.5}, "expected a whole number"),
+        ({"iterations": True}, "iterations is true"),
+        ({"lambda_dssim": float("inf")}, "expected a finite number"),
+        ({"background": [0, 0]}, "expected a list"),
+        ({"save_iterations": 3}, "expected a list"),
+        ({"save_iterations": ["a"]}, "expected a list"),
+        ({"visible_adam": 1}, "expected true or false"),
+        ({"device": 3}, "or null"),
+        ({"iterations": None}, "iterations is null"),
+        ([], "config: is a list"),
+    ],
+)
 def test_options_of_another_kind_are_named(values: Any, said: str) -> None:
     with pytest.raises(InputError, match=said):
         TrainConfig.from_json(values)
@@ -69,10 +97,15 @@ def test_options_come_back() -> None:
     assert TrainConfig.from_json({"init_opacity": None, "skew_lr": None}) == TrainConfig()
 
 
-@pytest.mark.parametrize(("config", "said"), [
-    ("[" * 100_000, "is no JSON"), ('{"config": {"background": [0, 0, NaN]}}', "background"),
-    ('{"config": {"background": [0, 0, 2]}}', "from 0 to 1"), ('{"scene": {"test_names": [3]}}', "must be names"),
-])
+@pytest.mark.parametrize(
+    ("config", "said"),
+    [
+        ("[" * 100_000, "is no JSON"),
+        ('{"config": {"background": [0, 0, NaN]}}', "background"),
+        ('{"config": {"background": [0, 0, 2]}}', "from 0 to 1"),
+        ('{"scene": {"test_names": [3]}}', "must be names"),
+    ],
+)
 def test_model_folders(tmp_path: Path, config: str, said: str) -> None:
     make_model(tmp_path)
     read_model_folder(tmp_path)

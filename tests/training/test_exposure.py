@@ -50,8 +50,9 @@ def views_of(masks: bool, alphas: bool) -> list[View]:
         if alpha is not None:  # no colour shall lie halfway between two bytes
             halfway = np.abs(laid_over(image, alpha) % 1 - 0.5) < 1e-3
             alpha[halfway.any(axis=2)] = 255
-        views.append(View(f"{i}.png", Camera(width, height, 25.0, 26.0, width / 2, height / 2, np.eye(4)), image, mask,
-                          alpha))
+        views.append(
+            View(f"{i}.png", Camera(width, height, 25.0, 26.0, width / 2, height / 2, np.eye(4)), image, mask, alpha)
+        )
     return views
 
 
@@ -64,8 +65,9 @@ def photo_loss(device: Device, schedule: Schedule, real: Real, views: list[View]
     return PhotoLoss(ImageLoss(Pipeline(device, kernels), 0.2), truths, config, BEHIND)
 
 
-def wanted_of(color: NDArray[np.float64], exposure: NDArray[np.float64],
-              view: View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def wanted_of(
+    color: NDArray[np.float64], exposure: NDArray[np.float64], view: View
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The render as the photo, and the photo over the render's background; both (H, W, 3)."""
     shown = color @ exposure[:, :3].T + exposure[:, 3]
     opaque = np.full(view.image.shape[:2], 255, np.uint8)
@@ -115,10 +117,13 @@ def test_the_reference_gradient_is_that_of_differences() -> None:
         assert v[place] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-5, abs=1e-9)
 
 
-@pytest.mark.parametrize(("masks", "alphas", "real", "tolerance"), [
-    (False, False, "float", 5e-5), (True, True, "float", 5e-5), (True, True, "double", ROUNDING)])
-def test_gradients_and_step_equal_the_reference(scheduled: tuple[Device, Schedule], real: Real, tolerance: float,
-                                                masks: bool, alphas: bool) -> None:
+@pytest.mark.parametrize(
+    ("masks", "alphas", "real", "tolerance"),
+    [(False, False, "float", 5e-5), (True, True, "float", 5e-5), (True, True, "double", ROUNDING)],
+)
+def test_gradients_and_step_equal_the_reference(
+    scheduled: tuple[Device, Schedule], real: Real, tolerance: float, masks: bool, alphas: bool
+) -> None:
     """A truth without mask or opacity lies among those with them."""
     views = views_of(masks, alphas)
     device, schedule = scheduled
@@ -133,8 +138,7 @@ def test_gradients_and_step_equal_the_reference(scheduled: tuple[Device, Schedul
         layout = truth.layout
         color = np.random.default_rng(iteration).random((*view.image.shape[:2], 3)).astype(np.float32)
         to_device(device, photos.pipeline.image("color", layout, 3), layout.pack(color, dtype))
-        planes = to_host(device, photos.gradient(truth, NEW),
-                         np.empty((3, layout.rows, layout.stride), dtype))
+        planes = to_host(device, photos.gradient(truth, NEW), np.empty((3, layout.rows, layout.stride), dtype))
         v = gradient_of(color.astype(np.float64), exposures[i], view)
         found = layout.unpack(planes)
         assert relative_error(found, v) < tolerance
@@ -164,6 +168,7 @@ def test_without_any_of_it_no_kernel_runs(device: Device) -> None:
 
 # --- what is learned -----------------------------------------------------------------------
 
+
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(small_capture(tmp_path_factory))
@@ -175,8 +180,9 @@ CONFIG = TrainConfig(iterations=200, cap_max=2500, sh_degree=0, coarse_to_fine=F
 def exposed(scene: Scene, gains: NDArray[np.float64]) -> Scene:
     """Training photos with gains around 0.75, the test photos' own."""
     of = dict(zip([view.name for view in scene.train], 0.75 * gains, strict=True))
-    views = [replace(view, image=np.rint(of.get(view.name, 0.75) * view.image).astype(np.uint8))
-             for view in scene.views]
+    views = [
+        replace(view, image=np.rint(of.get(view.name, 0.75) * view.image).astype(np.uint8)) for view in scene.views
+    ]
     return replace(scene, views=views)
 
 
@@ -199,6 +205,7 @@ def test_exposures_of_photos_are_found(capture: Scene) -> None:
 
 def test_what_a_mask_hides_is_not_learned(capture: Scene) -> None:
     """A magenta block at the left or the right of each photo, masked and not."""
+
     def blotted(view: View, side: int, masked: bool) -> View:
         height, width = view.image.shape[:2]
         hidden = np.zeros((height, width), bool)
@@ -211,21 +218,31 @@ def test_what_a_mask_hides_is_not_learned(capture: Scene) -> None:
 
     excess = {}
     for masked in (False, True):
-        scene = replace(capture, views=[view if view.name in capture.test_names else blotted(view, i % 2, masked)
-                                        for i, view in enumerate(capture.views)])
+        scene = replace(
+            capture,
+            views=[
+                view if view.name in capture.test_names else blotted(view, i % 2, masked)
+                for i, view in enumerate(capture.views)
+            ],
+        )
         model = Trainer(scene, CONFIG).run().splats
-        excess[masked] = np.mean([magenta(np.clip(Renderer().render(model, view.camera).color, 0, 1))
-                                  - magenta(view.image / 255) for view in scene.test])
+        excess[masked] = np.mean(
+            [
+                magenta(np.clip(Renderer().render(model, view.camera).color, 0, 1)) - magenta(view.image / 255)
+                for view in scene.test
+            ]
+        )
     assert excess[False] > 0.02
     assert excess[True] < 0.2 * excess[False]
 
 
 def test_random_backgrounds_show_through_nothing_opaque(capture: Scene) -> None:
     """Photos of a black object on transparent ground: black splats and none look the same over black only."""
+
     def on_nothing(view: View) -> View:
         height, width = view.image.shape[:2]
         alpha = np.zeros((height, width), np.uint8)
-        alpha[height // 3: 2 * height // 3, width // 3: 2 * width // 3] = 255
+        alpha[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3] = 255
         return replace(view, image=np.zeros_like(view.image), alpha=alpha)
 
     views = [on_nothing(view) for view in capture.views]
@@ -264,6 +281,17 @@ def test_exposure_json_multiplies_from_the_left() -> None:
 
 def test_on_the_command_line(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> None:
     folder = small_capture(tmp_path_factory)
-    clsplat("train", folder, "-m", tmp_path / "model", "--iterations", 10, "--cap-max", 200, "--exposure",
-            "--random-background", "-q")
+    clsplat(
+        "train",
+        folder,
+        "-m",
+        tmp_path / "model",
+        "--iterations",
+        10,
+        "--cap-max",
+        200,
+        "--exposure",
+        "--random-background",
+        "-q",
+    )
     assert len(json.loads((tmp_path / "model" / "exposure.json").read_text())) == len(load_scene(folder).views)

@@ -91,8 +91,9 @@ def test_random_points_have_their_own_limit_and_need_no_extent() -> None:
 
 
 def test_the_same_seed_gives_the_same_splats() -> None:
-    runs = [initial_splats(scene(9), init=init, cap=20, seed=seed)[0]
-            for init in ("random", "sfm") for seed in (1, 1, 2)]
+    runs = [
+        initial_splats(scene(9), init=init, cap=20, seed=seed)[0] for init in ("random", "sfm") for seed in (1, 1, 2)
+    ]
     for a, b, c in (runs[:3], runs[3:]):
         np.testing.assert_array_equal(a.mean, b.mean)
         np.testing.assert_array_equal(a.skew, b.skew)
@@ -118,8 +119,10 @@ def test_fields_start_off_their_stationary_point_in_all_directions() -> None:
 def saved(path: Path, shape: str, skew: np.ndarray | None = None, normalisation: str = "peak") -> Splats:
     rng = np.random.default_rng(1)
     arrays = {
-        "mean": rng.standard_normal((12, 3)), "quat": rng.standard_normal((12, 4)),
-        "log_scale": rng.standard_normal((12, 3)), "opacity_logit": rng.permutation(np.arange(12.0)),
+        "mean": rng.standard_normal((12, 3)),
+        "quat": rng.standard_normal((12, 4)),
+        "log_scale": rng.standard_normal((12, 3)),
+        "opacity_logit": rng.permutation(np.arange(12.0)),
         "sh": rng.standard_normal((12, 4, 3)),
     }
     if skew is not None:
@@ -161,8 +164,10 @@ def test_a_skewed_model_of_another_normalisation_is_refused(tmp_path: Path) -> N
     assert splats.normalisation == "pdf"
 
 
-@pytest.mark.parametrize(("options", "words"), [({"init": "grid"}, "sfm, random"), ({"cap": 0}, "cap 0"),
-                                                ({"init": "missing.ply"}, "missing.ply")])
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"init": "grid"}, "sfm, random"), ({"cap": 0}, "cap 0"), ({"init": "missing.ply"}, "missing.ply")],
+)
 def test_what_cannot_be_used(options: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
         initial_splats(scene(10), **options)
@@ -197,8 +202,14 @@ def test_a_scene_before_the_near_plane_is_refused() -> None:
 def test_random_points_beside_few() -> None:
     """A fraction of the cap; of itself a tenth, where the scene has fewer points. In colours of neighbours."""
     source = scene(60)
-    for share, cap, ours, placed in ((None, 500, 60, 0), (None, 601, 60, 60), (0.5, 100, 50, 50), (0.0, 10_000, 60, 0),
-                                     (1.0, 40, 1, 39), (0.1, 30, 27, 3)):
+    for share, cap, ours, placed in (
+        (None, 500, 60, 0),
+        (None, 601, 60, 60),
+        (0.5, 100, 50, 50),
+        (0.0, 10_000, 60, 0),
+        (1.0, 40, 1, 39),
+        (0.1, 30, 27, 3),
+    ):
         splats, message = initial_splats(source, cap=cap, random_share=share)
         assert len(splats) == ours + placed
         assert (f"{placed} at random" in message) == (placed > 0)

@@ -43,9 +43,11 @@ STEPS = 36
 CULLED = 0xFFFFFFFF
 TOLERANCE = 1e-5  # float32 steps: some ulp of the value each, in the dense form also where gradients are 0
 
-VISIBLE = [*(case for case in CASES if case.get("skew_map") not in ("linear", "radial")),
-           {"shape": "skew-normal", "strategy": "mcmc"},
-           {"shape": "skew-normal", "alternation": "cyclic", "alternation_warmup": 0.0, "alternation_cycle": 7}]
+VISIBLE = [
+    *(case for case in CASES if case.get("skew_map") not in ("linear", "radial")),
+    {"shape": "skew-normal", "strategy": "mcmc"},
+    {"shape": "skew-normal", "alternation": "cyclic", "alternation_warmup": 0.0, "alternation_cycle": 7},
+]
 
 
 def keys(buffers: SplatBuffers, seen: np.ndarray) -> Any:
@@ -55,8 +57,14 @@ def keys(buffers: SplatBuffers, seen: np.ndarray) -> Any:
     return buffer
 
 
-def step(buffers: SplatBuffers, optimizer: Optimizer, grads: dict[str, np.ndarray], seen: np.ndarray, iteration: int,
-         sh_degree: int = 2) -> None:
+def step(
+    buffers: SplatBuffers,
+    optimizer: Optimizer,
+    grads: dict[str, np.ndarray],
+    seen: np.ndarray,
+    iteration: int,
+    sh_degree: int = 2,
+) -> None:
     """A step on the gradients of the splats seen, at a falling rate of the positions."""
     on_device = CompactGradients(buffers.device, buffers.schema, CAPACITY, buffers.dtype)
     on_device.upload({name: np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), a, 0) for name, a in grads.items()})
@@ -83,8 +91,9 @@ def test_lazy_steps_equal_dense_ones(device: Device, options: dict[str, object])
     config = config_of(**options)
     splats = some_splats(config.shape)
     dense = started(device, config, splats)
-    lazy = {name: started(device, replace(config, visible_adam=True, optimizer=name), splats)
-            for name in ("fused", "numpy")}
+    lazy = {
+        name: started(device, replace(config, visible_adam=True, optimizer=name), splats) for name in ("fused", "numpy")
+    }
     rng, plans, waited = np.random.default_rng(8), {13: growing, 25: shrinking}, False
     for iteration in range(1, STEPS + 1):
         n = dense[0].n
@@ -194,8 +203,17 @@ def test_a_plan_in_another_order_makes_the_same_splats(make_plan: Callable[..., 
 
 # --- in training -----------------------------------------------------------------------------
 
-CONFIG = TrainConfig(shape="skew-normal", iterations=60, cap_max=700, sh_degree=1, densify_interval=20,
-                     checkpoint_interval=0, densify_until=0.8, grad_threshold=1e-6, visible_adam=True)
+CONFIG = TrainConfig(
+    shape="skew-normal",
+    iterations=60,
+    cap_max=700,
+    sh_degree=1,
+    densify_interval=20,
+    checkpoint_interval=0,
+    densify_until=0.8,
+    grad_threshold=1e-6,
+    visible_adam=True,
+)
 
 
 @pytest.fixture(scope="module")
@@ -251,8 +269,9 @@ def test_actions_leave_splats_in_morton_order(wide: tuple[Scene, TrainConfig], d
     for _ in range(20):
         trainer.step()
     assert trainer.splats.n > 500
-    np.testing.assert_array_equal(morton_order(trainer.splats.download(trainer.splats.n)["mean"]),
-                                  np.arange(trainer.splats.n))
+    np.testing.assert_array_equal(
+        morton_order(trainer.splats.download(trainer.splats.n)["mean"]), np.arange(trainer.splats.n)
+    )
 
 
 def test_what_reads_a_run_does_not_change_it(wide: tuple[Scene, TrainConfig], tmp_path: Path) -> None:

@@ -18,8 +18,17 @@ def iterations(path: Path) -> list[int]:
 
 def test_a_resumed_log_goes_on_where_the_checkpoint_is(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
-    lines = [b'{"iteration": 50}', b'{"iteration": 100}', b"\xff\xfe no text", b"7", b'{"iteration": "x"}', b"[]",
-             b'{"iteration": 150}', b'{"iteration": 20', b'{"iteration": 1e999}']
+    lines = [
+        b'{"iteration": 50}',
+        b'{"iteration": 100}',
+        b"\xff\xfe no text",
+        b"7",
+        b'{"iteration": "x"}',
+        b"[]",
+        b'{"iteration": 150}',
+        b'{"iteration": 20',
+        b'{"iteration": 1e999}',
+    ]
     path.write_bytes(b"\n".join(lines))
     log = RunLog(path, 100)
     assert iterations(path) == [50, 100], "written before anything else happens"

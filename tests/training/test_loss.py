@@ -21,15 +21,17 @@ from clsplat.training.loss import ImageLoss, LossValue
 SIZES = [(1, 1), (2, 3), (7, 40), (19, 27), (16, 16), (5, 97), (70, 37)]
 
 
-def loss_of(device: Device, schedule: Schedule = SCHEDULES["cpu16"], real: Real = "float",
-            weight: float = 0.2) -> ImageLoss:
+def loss_of(
+    device: Device, schedule: Schedule = SCHEDULES["cpu16"], real: Real = "float", weight: float = 0.2
+) -> ImageLoss:
     if real == "double" and not device.has_fp64:
         pytest.skip("no double precision")
     return ImageLoss(Pipeline(device, KernelBuild("gaussian", 0, schedule, real=real)), weight)
 
 
-def compared(loss: ImageLoss, color: NDArray[np.floating],
-             truth: NDArray[np.uint8]) -> tuple[LossValue, NDArray[np.floating]]:
+def compared(
+    loss: ImageLoss, color: NDArray[np.floating], truth: NDArray[np.uint8]
+) -> tuple[LossValue, NDArray[np.floating]]:
     """Value, and gradient (H, W, 3), of an image against a truth."""
     device, dtype = loss.device, loss.kernels.dtype
     layout = ImageLayout(truth.shape[1], truth.shape[0])
@@ -63,12 +65,12 @@ def expected(height: int, width: int, weight: float) -> tuple[float, NDArray[np.
     """The reference's loss and gradient of `pair`."""
     color, truth = pair(height, width)
     of_l1 = np.sign(color - truth / 255) / color.size
-    return (reference_loss(color, truth / 255, weight),
-            (1 - weight) * of_l1 + weight * expected_of_ssim(height, width))
+    return (reference_loss(color, truth / 255, weight), (1 - weight) * of_l1 + weight * expected_of_ssim(height, width))
 
 
-@pytest.mark.parametrize(("real", "weight", "tolerance"),
-                         [("double", 0.2, ROUNDING), ("double", 1.0, ROUNDING), ("float", 0.2, 2e-5)])
+@pytest.mark.parametrize(
+    ("real", "weight", "tolerance"), [("double", 0.2, ROUNDING), ("double", 1.0, ROUNDING), ("float", 0.2, 2e-5)]
+)
 def test_loss_and_gradient_equal_the_reference(
     scheduled: tuple[Device, Schedule], real: Real, weight: float, tolerance: float
 ) -> None:

@@ -89,6 +89,7 @@ def test_opaque_splats_stay_and_the_dtype_is_kept() -> None:
 
 def test_noise_grows_with_the_scene_and_not_faster() -> None:
     """The step is covariance times amount, and the rate of the means has the extent in it."""
+
     def step(extent: float) -> float:
         return extent**2 * noise_amount(5e5, 1e-4 * extent, extent)
 

@@ -38,9 +38,15 @@ CASES = [
     {"shape": "half-gaussian", **SGHMC, "bisect_reg": 3.0},
     {"shape": "generalised-exponential"},
     {"shape": "student-t", **SGHMC, "position_optimizer": "sghmc-sss"},
-    {"shape": "bisected-skew", "skew_map": "coupled", **SGHMC, "alternation": "cyclic",
-     "alternation_warmup": 2.5 / ITERATIONS, "alternation_cycle": 3},
-]  # fmt: skip
+    {
+        "shape": "bisected-skew",
+        "skew_map": "coupled",
+        **SGHMC,
+        "alternation": "cyclic",
+        "alternation_warmup": 2.5 / ITERATIONS,
+        "alternation_cycle": 3,
+    },
+]
 
 
 def some_directions() -> np.ndarray:
@@ -84,8 +90,7 @@ def config_of(**options: object) -> TrainConfig:
 
 
 def kernels_of(device: Device, config: TrainConfig, sh_degree: int = 2) -> KernelBuild:
-    return KernelBuild(config.shape, sh_degree, default_schedule(device.cl_device),
-                       skew_map=config.map or SKEW_MAPS[0])
+    return KernelBuild(config.shape, sh_degree, default_schedule(device.cl_device), skew_map=config.map or SKEW_MAPS[0])
 
 
 def started(device: Device, config: TrainConfig, splats: Splats) -> tuple[SplatBuffers, Optimizer]:
@@ -95,8 +100,11 @@ def started(device: Device, config: TrainConfig, splats: Splats) -> tuple[SplatB
 
 
 def gradients(buffers: SplatBuffers, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    grads = {name: rng.standard_normal(array.shape).astype(np.float32)
-             for name, array in buffers.download(buffers.n).items() if name != "sh"}  # fmt: skip
+    grads = {
+        name: rng.standard_normal(array.shape).astype(np.float32)
+        for name, array in buffers.download(buffers.n).items()
+        if name != "sh"
+    }
     colour = rng.standard_normal((buffers.n, 2, 3)).astype(np.float32)  # its gradient, and the direction
     colour[:, 1] = rng.choice(DIRECTIONS, buffers.n)
     return grads | {"sh": colour}
@@ -109,8 +117,9 @@ def ones(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {key: np.ones_like(value) for key, value in arrays.items()} | {"sh": colour}
 
 
-def step(buffers: SplatBuffers, optimizer: Optimizer, grads: dict[str, np.ndarray], iteration: int,
-         sh_degree: int = 2) -> None:
+def step(
+    buffers: SplatBuffers, optimizer: Optimizer, grads: dict[str, np.ndarray], iteration: int, sh_degree: int = 2
+) -> None:
     on_device = CompactGradients(buffers.device, buffers.schema, CAPACITY, buffers.dtype)
     on_device.upload(grads)
     optimizer.step(on_device, MEAN_LR, sh_degree, iteration)
@@ -208,8 +217,9 @@ def test_a_plan_moves_parameters_and_states(devices: list[Device], name: str) ->
 
 @pytest.mark.parametrize("name", ["fused", "numpy"])
 def test_a_frozen_block_keeps_values_moments_and_count(devices: list[Device], name: str) -> None:
-    config = config_of(shape="skew-normal-direct", optimizer=name, alternation="cyclic", alternation_warmup=0,
-                       alternation_cycle=4)  # two iterations each
+    config = config_of(
+        shape="skew-normal-direct", optimizer=name, alternation="cyclic", alternation_warmup=0, alternation_cycle=4
+    )  # two iterations each
     buffers, optimizer = started(devices[0], config, some_splats(config.shape))
     rng = np.random.default_rng(3)
     for iteration in range(1, 7):
@@ -310,8 +320,16 @@ def test_mcmc_noise_follows_the_stronger_opacity_of_either_sign(devices: list[De
     kernels = kernels_of(device, config_of(shape=shape))
     buffers = SplatBuffers.of(device, splats, kernels.dtype)
     optim_program(device, kernels).mcmc_noise.over(
-        -(-buffers.n // kernels.lanes), geom=buffers.geom, capacity=buffers.capacity, n_splats=buffers.n, seed_lo=3,
-        seed_hi=7, iteration=9, amount=50.0, reach=0.05)
+        -(-buffers.n // kernels.lanes),
+        geom=buffers.geom,
+        capacity=buffers.capacity,
+        n_splats=buffers.n,
+        seed_lo=3,
+        seed_hi=7,
+        iteration=9,
+        amount=50.0,
+        reach=0.05,
+    )
     arrays = splats.to_numpy()
     strength = kind.strength(arrays)
     assert np.sum(strength < 0.05) > 5

@@ -13,20 +13,46 @@ from clsplat.training.config import TrainConfig
 from clsplat.training.optim.skew_map import map_named
 from clsplat.training.presets import IDENTITY, PRESETS, preset, with_preset
 
-SHAPE_OF = {"3dgs": "gaussian", "ges": "ges-modulation", "3d-hgs": "half-gaussian", "sss": "student-t",
-            "sns": "skew-normal-direct", "3dsgs": "bisected-skew", "3dgs-mcmc": "gaussian"}
+SHAPE_OF = {
+    "3dgs": "gaussian",
+    "ges": "ges-modulation",
+    "3d-hgs": "half-gaussian",
+    "sss": "student-t",
+    "sns": "skew-normal-direct",
+    "3dsgs": "bisected-skew",
+    "3dgs-mcmc": "gaussian",
+}
 # The papers' numbers once more, as (key, value).
 PUBLISHED = [
-    ("3dgs", "densify_until", 0.5), ("3dgs", "grad_threshold", 2e-4), ("3dgs", "init_opacity", 0.1),
-    ("3dgs", "init_scale", 1.0), ("3dgs", "opacity_reset", 10), ("3dgs", "opacity_lr", 0.05), ("3dgs", "noise_lr", 0),
-    ("3dgs", "opacity_reg", 0), ("ges", "grad_threshold", 3e-4), ("ges", "densify_until", 0.375),
-    ("3d-hgs", "normal_lr", 3e-3), ("3d-hgs", "densify_until", 2 / 3), ("3dgs-mcmc", "noise_lr", 5e5),
-    ("3dgs-mcmc", "opacity_reg", 0.01), ("3dgs-mcmc", "scale_reg", 0.01), ("3dgs-mcmc", "init_scale", 0.1),
-    ("3dgs-mcmc", "densify_until", 5 / 6), ("sss", "sghmc_friction", 120), ("sss", "opacity_lr", 5e-3),
-    ("sss", "relocation_limit", 0.05), ("sss", "relocation", "length-squared"), ("sss", "sghmc_burn_in", 7 / 30),
-    ("sss", "position_optimizer", "sghmc-sss"), ("sns", "normalisation", "none"), ("sns", "skew_map", "polar"),
-    ("sns", "alternation", "cyclic"), ("sns", "opacity_reg", 0), ("3dsgs", "strategy", "adc"),
-]  # fmt: skip
+    ("3dgs", "densify_until", 0.5),
+    ("3dgs", "grad_threshold", 2e-4),
+    ("3dgs", "init_opacity", 0.1),
+    ("3dgs", "init_scale", 1.0),
+    ("3dgs", "opacity_reset", 10),
+    ("3dgs", "opacity_lr", 0.05),
+    ("3dgs", "noise_lr", 0),
+    ("3dgs", "opacity_reg", 0),
+    ("ges", "grad_threshold", 3e-4),
+    ("ges", "densify_until", 0.375),
+    ("3d-hgs", "normal_lr", 3e-3),
+    ("3d-hgs", "densify_until", 2 / 3),
+    ("3dgs-mcmc", "noise_lr", 5e5),
+    ("3dgs-mcmc", "opacity_reg", 0.01),
+    ("3dgs-mcmc", "scale_reg", 0.01),
+    ("3dgs-mcmc", "init_scale", 0.1),
+    ("3dgs-mcmc", "densify_until", 5 / 6),
+    ("sss", "sghmc_friction", 120),
+    ("sss", "opacity_lr", 5e-3),
+    ("sss", "relocation_limit", 0.05),
+    ("sss", "relocation", "length-squared"),
+    ("sss", "sghmc_burn_in", 7 / 30),
+    ("sss", "position_optimizer", "sghmc-sss"),
+    ("sns", "normalisation", "none"),
+    ("sns", "skew_map", "polar"),
+    ("sns", "alternation", "cyclic"),
+    ("sns", "opacity_reg", 0),
+    ("3dsgs", "strategy", "adc"),
+]
 
 
 def described(name: str) -> Shape:

@@ -69,13 +69,16 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
     os.close(found.master)
 
 
-@pytest.mark.parametrize(("columns", "expected"), [
-    (100, "500/1000 [##########----------]  loss 0.1234  PSNR 20.50  40000 splats  10 it/s  50 s left"),
-    (80, "500/1000 [####-----]  loss 0.1234  PSNR 20.50  40000 splats  10 it/s  50 s left"),
-    (70, "500/1000 [######------]  PSNR 20.50  40000 splats  10 it/s  50 s left"),
-    (40, "500/1000 [##---]  PSNR 20.50  50 s left"),
-    (20, "500/1000  50%  50 s"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        (100, "500/1000 [##########----------]  loss 0.1234  PSNR 20.50  40000 splats  10 it/s  50 s left"),
+        (80, "500/1000 [####-----]  loss 0.1234  PSNR 20.50  40000 splats  10 it/s  50 s left"),
+        (70, "500/1000 [######------]  PSNR 20.50  40000 splats  10 it/s  50 s left"),
+        (40, "500/1000 [##---]  PSNR 20.50  50 s left"),
+        (20, "500/1000  50%  50 s"),
+    ],
+)
 def test_the_line_fits_the_terminal(terminal: Terminal, columns: int, expected: str) -> None:
     terminal.resize(columns)
     with TrainingDisplay(stream=terminal.stream) as display:

@@ -54,8 +54,10 @@ def test_half_of_them_are_where_most_cameras_look(middle: tuple[float, float, fl
 
 
 def test_the_scale_of_the_world_does_not_matter() -> None:
-    small, large = (random_points(scene(looking(size * ring(), np.zeros(3)), 4.0 * size), 500, np.random.default_rng(3))
-                    for size in (1.0, 1000.0))
+    small, large = (
+        random_points(scene(looking(size * ring(), np.zeros(3)), 4.0 * size), 500, np.random.default_rng(3))
+        for size in (1.0, 1000.0)
+    )
     np.testing.assert_allclose(1000 * small, large, rtol=1e-6)
 
 

@@ -38,18 +38,24 @@ def one(shape: Shape, opacity: float, own: float = 0.0, minus: float = 0.0) -> A
 def integral(f: Callable[[float], float]) -> float:
     """Over the line, in pieces: heavy tails, cusps and steps at 0."""
     edges = [-np.inf, -100, -10, -3, -1, -0.1, 0, 0.1, 1, 3, 10, 100, np.inf]
-    return sum(quad(f, a, b, limit=400, epsabs=1e-10, epsrel=1e-9)[0]
-               for a, b in itertools.pairwise(edges))
+    return sum(quad(f, a, b, limit=400, epsabs=1e-10, epsrel=1e-9)[0] for a, b in itertools.pairwise(edges))
 
 
 # Shape, its own parameter, relative error (see densify._NODES).
 KERNELS = [
-    (shapes.GAUSSIAN, 0.0, 1e-9), (shapes.GES_MODULATION, 3.0, 1e-9),
-    (shapes.SKEW_NORMAL, 0.3, 1e-9), (shapes.SKEW_NORMAL, SKEW_MAX, 1e-9),
-    (shapes.SKEW_NORMAL_DIRECT, 3.0, 1e-9), (shapes.SKEW_NORMAL_DIRECT, SLANT_MAX, 1e-9),
-    (shapes.HALF_GAUSSIAN, 0.0, 1e-9), (shapes.BISECTED_SKEW, SLANT_MAX, 1e-9),
-    (shapes.STUDENT_T, NU_BOUNDS[0], 2e-7), (shapes.STUDENT_T, 3.0, 1e-7), (shapes.STUDENT_T, NU_BOUNDS[1], 1e-7),
-    (shapes.GENERALISED_EXPONENTIAL, BETA_BOUNDS[0], 1e-8), (shapes.GENERALISED_EXPONENTIAL, 1.0, 1e-8),
+    (shapes.GAUSSIAN, 0.0, 1e-9),
+    (shapes.GES_MODULATION, 3.0, 1e-9),
+    (shapes.SKEW_NORMAL, 0.3, 1e-9),
+    (shapes.SKEW_NORMAL, SKEW_MAX, 1e-9),
+    (shapes.SKEW_NORMAL_DIRECT, 3.0, 1e-9),
+    (shapes.SKEW_NORMAL_DIRECT, SLANT_MAX, 1e-9),
+    (shapes.HALF_GAUSSIAN, 0.0, 1e-9),
+    (shapes.BISECTED_SKEW, SLANT_MAX, 1e-9),
+    (shapes.STUDENT_T, NU_BOUNDS[0], 2e-7),
+    (shapes.STUDENT_T, 3.0, 1e-7),
+    (shapes.STUDENT_T, NU_BOUNDS[1], 1e-7),
+    (shapes.GENERALISED_EXPONENTIAL, BETA_BOUNDS[0], 1e-8),
+    (shapes.GENERALISED_EXPONENTIAL, 1.0, 1e-8),
     (shapes.GENERALISED_EXPONENTIAL, BETA_BOUNDS[1], 1e-4),
 ]
 
@@ -78,8 +84,11 @@ def test_gaussian_formula_as_published() -> None:
     """3DGS-MCMC's double sum with explicit binomials."""
     for opacity, ratio in [(0.5, 2), (0.3, 5), (0.97, 12)]:
         new = 1 - (1 - opacity) ** (1 / ratio)
-        total = sum(math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
-                    for i in range(1, ratio + 1) for k in range(i))
+        total = sum(
+            math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+            for i in range(1, ratio + 1)
+            for k in range(i)
+        )
         raw, factor = relocation(shapes.GAUSSIAN, one(shapes.GAUSSIAN, opacity), np.array([ratio]))
         assert shapes.GAUSSIAN.opacity(raw["opacity_logit"])[0] == pytest.approx(new, rel=1e-9)
         assert factor[0] == pytest.approx(opacity / total, rel=1e-9)
@@ -97,8 +106,13 @@ def test_skewed_factors_against_the_table_for_half_the_opacity(slant: float, pub
 
 def test_neutral_shapes_get_the_gaussians_factor() -> None:
     _, gaussian = relocation(shapes.GAUSSIAN, one(shapes.GAUSSIAN, 0.7), np.array([4]))
-    for shape, own in [(shapes.SKEW_NORMAL, 0.0), (shapes.SKEW_NORMAL_DIRECT, 0.0), (shapes.HALF_GAUSSIAN, 0.0),
-                       (shapes.BISECTED_SKEW, 2.0), (shapes.GENERALISED_EXPONENTIAL, 2.0)]:
+    for shape, own in [
+        (shapes.SKEW_NORMAL, 0.0),
+        (shapes.SKEW_NORMAL_DIRECT, 0.0),
+        (shapes.HALF_GAUSSIAN, 0.0),
+        (shapes.BISECTED_SKEW, 2.0),
+        (shapes.GENERALISED_EXPONENTIAL, 2.0),
+    ]:
         _, factor = relocation(shape, one(shape, 0.7, own, minus=0.7), np.array([4]))
         assert factor[0] == pytest.approx(gaussian[0], rel=1e-9), shape.name
     _, factor = relocation(shapes.STUDENT_T, one(shapes.STUDENT_T, 0.7, 1e4), np.array([4]))
@@ -137,16 +151,24 @@ def test_rows_do_not_mix(shape: Shape) -> None:
 
 
 def equal(a: Plan, b: Plan) -> bool:
-    return (np.array_equal(a.source, b.source) and np.array_equal(a.fresh, b.fresh)
-            and all(np.array_equal(a.values[name], b.values[name]) for name in a.values))
+    return (
+        np.array_equal(a.source, b.source)
+        and np.array_equal(a.fresh, b.fresh)
+        and all(np.array_equal(a.values[name], b.values[name]) for name in a.values)
+    )
 
 
 @settings(max_examples=60, deadline=None)
-@given(n=st.integers(1, 200), seed=st.integers(0, 10_000), dead=st.floats(0, 1), growth=st.floats(1, 2),
-       spare=st.integers(-50, 200), rule=st.sampled_from(sorted(RULES)), shape=st.sampled_from(ALL_SHAPES))
-def test_laws_of_a_plan(
-    n: int, seed: int, dead: float, growth: float, spare: int, rule: str, shape: Shape
-) -> None:
+@given(
+    n=st.integers(1, 200),
+    seed=st.integers(0, 10_000),
+    dead=st.floats(0, 1),
+    growth=st.floats(1, 2),
+    spare=st.integers(-50, 200),
+    rule=st.sampled_from(sorted(RULES)),
+    shape=st.sampled_from(ALL_SHAPES),
+)
+def test_laws_of_a_plan(n: int, seed: int, dead: float, growth: float, spare: int, rule: str, shape: Shape) -> None:
     arrays = random_model(shape, n, seed, dead)
     cap = max(1, n + spare)
     plan = plan_relocation(arrays, shape, np.random.default_rng(seed), cap, growth=growth, rule=rule)
@@ -191,8 +213,11 @@ def test_laws_of_a_plan(
 
 def gaussians(logit: np.ndarray) -> Arrays:
     logit = np.asarray(logit, np.float32)
-    return {"mean": np.zeros((len(logit), 3), np.float32), "log_scale": np.zeros((len(logit), 3), np.float32),
-            "opacity_logit": logit}
+    return {
+        "mean": np.zeros((len(logit), 3), np.float32),
+        "log_scale": np.zeros((len(logit), 3), np.float32),
+        "opacity_logit": logit,
+    }
 
 
 def test_draws_are_in_proportion_to_the_strength() -> None:

@@ -30,8 +30,9 @@ from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
 
 # Every part of the strategy acts: growth from 2252 points to the cap, noise, all resolutions and SH degrees.
-CONFIG = TrainConfig(iterations=80, cap_max=2400, sh_degree=1, densify_interval=10, checkpoint_interval=30,
-                     strategy="mcmc")
+CONFIG = TrainConfig(
+    iterations=80, cap_max=2400, sh_degree=1, densify_interval=10, checkpoint_interval=30, strategy="mcmc"
+)
 CAMERA = clsplat.Camera(27, 19, 25.0, 26.0, 13.0, 9.0, np.eye(4))
 
 
@@ -96,8 +97,12 @@ def press_ctrl_c_at_50(progress: Progress) -> None:
 
 @pytest.mark.parametrize(
     ("optimizer", "changes", "interval"),
-    [("fused", {}, 30), ("numpy", {}, 30), ("fused", {"sampling": "pull"}, 37),
-     ("fused", {"strategy": "adc", "densify_until": 0.8, "opacity_reset": 2}, 37)],
+    [
+        ("fused", {}, 30),
+        ("numpy", {}, 30),
+        ("fused", {"sampling": "pull"}, 37),
+        ("fused", {"strategy": "adc", "densify_until": 0.8, "opacity_reset": 2}, 37),
+    ],
     ids=["fused", "numpy", "pull", "adc"],
 )
 def test_a_crashed_run_resumes_to_the_same_model(
@@ -112,21 +117,15 @@ def test_a_crashed_run_resumes_to_the_same_model(
     with pytest.raises(KeyboardInterrupt):
         train(scene, config, raise_at_50, output=tmp_path / "m")
     said: list[str] = []
-    resumed = train(
-        scene, config, lambda progress: said.append(progress.message), output=tmp_path / "m", resume=True
-    )
+    resumed = train(scene, config, lambda progress: said.append(progress.message), output=tmp_path / "m", resume=True)
     assert f"iteration {interval}" in said[0]
     assert resumed.finished
     assert ply(tmp_path / "m") == ply(whole)
-    logged = [
-        json.loads(line)["iteration"] for line in (tmp_path / "m" / "log.jsonl").read_text().splitlines()
-    ]
+    logged = [json.loads(line)["iteration"] for line in (tmp_path / "m" / "log.jsonl").read_text().splitlines()]
     assert logged == [50, 80]
 
 
-def test_ctrl_c_saves_and_resumes_to_the_same_model(
-    scene: Scene, uninterrupted: Path, tmp_path: Path
-) -> None:
+def test_ctrl_c_saves_and_resumes_to_the_same_model(scene: Scene, uninterrupted: Path, tmp_path: Path) -> None:
     before = signal.getsignal(signal.SIGINT)
     stopped = train(scene, CONFIG, press_ctrl_c_at_50, output=tmp_path / "m")
     assert not stopped.finished
@@ -166,9 +165,7 @@ def test_a_cap_below_the_points_holds_from_the_start(scene: Scene) -> None:
     assert model.path is None
 
 
-def test_models_are_not_overwritten_and_resume_wants_the_same_config(
-    scene: Scene, uninterrupted: Path
-) -> None:
+def test_models_are_not_overwritten_and_resume_wants_the_same_config(scene: Scene, uninterrupted: Path) -> None:
     kept = ply(uninterrupted)
     with pytest.raises(OutputError, match="--overwrite"):
         train(scene, CONFIG, output=uninterrupted)
@@ -177,9 +174,7 @@ def test_models_are_not_overwritten_and_resume_wants_the_same_config(
     assert ply(uninterrupted) == kept
 
 
-def test_a_loss_that_is_not_finite_stops_the_run(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loss_that_is_not_finite_stops_the_run(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ImageLoss, "value", lambda self: LossValue(float("nan"), 0, 0, 0))
     with pytest.raises(TrainingError, match=r"iteration 50: .* learning rates"):
         train(scene, CONFIG, output=tmp_path / "m")
@@ -217,14 +212,18 @@ def test_noise_equals_numpy(scene: Scene, default_device: Device, tmp_path: Path
     moved = trainer.snapshot()
     amount = 5 * scene.extent
     expected = add_noise(
-        splats.mean, splats.quat, splats.log_scale, 1 / (1 + np.exp(-splats.opacity_logit)), config.seed, 1, amount,
-        noise_reach(scene.extent)
+        splats.mean,
+        splats.quat,
+        splats.log_scale,
+        1 / (1 + np.exp(-splats.opacity_logit)),
+        config.seed,
+        1,
+        amount,
+        noise_reach(scene.extent),
     )
     shift = np.abs(expected - splats.mean).max()
     assert shift > 1e-2
-    np.testing.assert_allclose(
-        moved.mean, expected, rtol=0, atol=2e-5 * max(shift, 1) + 2 * rate * scene.extent
-    )
+    np.testing.assert_allclose(moved.mean, expected, rtol=0, atol=2e-5 * max(shift, 1) + 2 * rate * scene.extent)
     for name in ("quat", "log_scale", "opacity_logit"):
         np.testing.assert_allclose(getattr(moved, name), getattr(splats, name), rtol=1e-6)
 
@@ -233,9 +232,7 @@ def test_regularisers_pull_opacity_and_scale_down(scene: Scene, default_device: 
     """Gradients of the mean opacity and the mean scale, added to those of the image."""
     grads: list[dict[str, NDArray[Any]]] = []
     for weight in (0.0, 10.0):
-        trainer = Trainer(
-            scene, replace(CONFIG, opacity_reg=weight, scale_reg=2 * weight), device=default_device
-        )
+        trainer = Trainer(scene, replace(CONFIG, opacity_reg=weight, scale_reg=2 * weight), device=default_device)
         first = trainer.snapshot()
         trainer.step()
         moments = trainer.optimizer.state()  # a tenth of the gradients after one step
@@ -255,8 +252,9 @@ def test_rows_of_the_schema_fit_both_buffers() -> None:
     assert schema.group(Group.GEOM)[-1].name == "skew"
 
 
-def test_splats_that_are_not_finite_are_mended_or_left_out(scene: Scene, tmp_path: Path,
-                                                           default_device: Device) -> None:
+def test_splats_that_are_not_finite_are_mended_or_left_out(
+    scene: Scene, tmp_path: Path, default_device: Device
+) -> None:
     """Broken between two actions of the strategy: saved without them, resumed with them, then relocated."""
     config = replace(CONFIG, iterations=40)
     trainer = Trainer(scene, config, device=default_device)
@@ -275,7 +273,8 @@ def test_splats_that_are_not_finite_are_mended_or_left_out(scene: Scene, tmp_pat
         assert len(run.snapshot()) == run.splats.n
     for name, array in trainer.snapshot().arrays.items():
         np.testing.assert_array_equal(array, resumed.snapshot().arrays[name])
-    trainer.splats.upload({name: np.full_like(array, np.nan)
-                           for name, array in trainer.splats.download(trainer.splats.n).items()})
+    trainer.splats.upload(
+        {name: np.full_like(array, np.nan) for name, array in trainer.splats.download(trainer.splats.n).items()}
+    )
     with pytest.raises(TrainingError, match="no splat is finite"):
         trainer.snapshot()

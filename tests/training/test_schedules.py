@@ -19,8 +19,9 @@ def test_decay_is_log_linear_and_constant_beyond() -> None:
     assert rate(-1) == pytest.approx(1.6e-4)
 
 
-@pytest.mark.parametrize("arguments", [(0.0, 1.0, 5), (1.0, -1.0, 5), (1.0, float("nan"), 5),
-                                       (float("inf"), 1.0, 5), (1.0, 1.0, 0)])
+@pytest.mark.parametrize(
+    "arguments", [(0.0, 1.0, 5), (1.0, -1.0, 5), (1.0, float("nan"), 5), (float("inf"), 1.0, 5), (1.0, 1.0, 0)]
+)
 def test_decay_rejects(arguments: tuple[float, float, int]) -> None:
     with pytest.raises(InputError):
         exponential_decay(*arguments)
@@ -55,8 +56,9 @@ def test_any_run_starts_at_zero_refines_and_ends_at_full_resolution(iterations: 
     assert downscale_at(schedule, iterations) == 1
 
 
-@pytest.mark.parametrize("stages", [[], [(0.1, 2), (0.5, 1)], [(0.0, 2)], [(0.0, 1), (0.5, 1)],
-                                    [(0.0, 4), (0.0, 1)], [(0.0, 4), (1.0, 1)]])
+@pytest.mark.parametrize(
+    "stages", [[], [(0.1, 2), (0.5, 1)], [(0.0, 2)], [(0.0, 1), (0.5, 1)], [(0.0, 4), (0.0, 1)], [(0.0, 4), (1.0, 1)]]
+)
 def test_resolution_schedule_rejects(stages: list[tuple[float, int]]) -> None:
     with pytest.raises(InputError, match="resolution schedule"):
         resolution_schedule(100, stages)

@@ -55,8 +55,9 @@ def test_a_step_is_the_formula() -> None:
     for by_covariance in (False, True):
         spread = covariance_times(quat, log_scale, xi) if by_covariance else xi
         p = gate * 0.7 * momentum - 0.2 * direction + gate * 3.0 * spread
-        got = step(mean, momentum, direction, xi, quat, log_scale, strength,
-                   Coefficients(0.5, 0.2, 0.7, 3.0, by_covariance))
+        got = step(
+            mean, momentum, direction, xi, quat, log_scale, strength, Coefficients(0.5, 0.2, 0.7, 3.0, by_covariance)
+        )
         np.testing.assert_allclose(got[1], p, rtol=1e-13)
         np.testing.assert_allclose(got[0], mean + 0.5 * p, rtol=1e-13)
 
@@ -119,6 +120,7 @@ def test_the_variance_in_a_quadratic_well_is_the_stationary_one() -> None:
     mean, momentum = np.zeros((n, 3)), np.zeros((n, 3))
     quat, log_scale, strength = np.eye(1, 4).repeat(n, 0), np.zeros((n, 3)), np.zeros(n)
     for iteration in range(60):
-        mean, momentum = step(mean, momentum, mean / width**2, normal3(1, iteration, n, STREAM), quat, log_scale,
-                              strength, c)
+        mean, momentum = step(
+            mean, momentum, mean / width**2, normal3(1, iteration, n, STREAM), quat, log_scale, strength, c
+        )
     np.testing.assert_allclose(np.cov(mean.ravel(), momentum.ravel()), expected, rtol=0.05, atol=0.02 * expected.min())

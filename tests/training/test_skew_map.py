@@ -69,8 +69,9 @@ def test_coupled_is_a_slant_in_the_worlds_frame() -> None:
     """Turning the splat leaves the vector in the world where it was."""
     s, quat = np.random.default_rng(1).standard_normal((6, 3)), some_quats(6)
     eta = SkewMap("coupled").forward(s, quat)
-    np.testing.assert_allclose(Rotation.from_quat(quat, scalar_first=True).apply(eta),
-                               SkewMap("radial").forward(s, quat), atol=1e-13)
+    np.testing.assert_allclose(
+        Rotation.from_quat(quat, scalar_first=True).apply(eta), SkewMap("radial").forward(s, quat), atol=1e-13
+    )
 
 
 @maps

@@ -60,8 +60,9 @@ def test_splats_out_of_sight_leave_their_colour_alone(devices: list[Device], mak
 def test_scales_are_held_down_alike_in_all_large_scenes() -> None:
     """The weight of the mean scale, in units of the scene's extent."""
     config = TrainConfig(scale_reg=0.01)
-    small, published, large = (Rules(config, extent).penalty(10).scale * extent
-                               for extent in (1.0, PUBLISHED_EXTENT, 1e4))
+    small, published, large = (
+        Rules(config, extent).penalty(10).scale * extent for extent in (1.0, PUBLISHED_EXTENT, 1e4)
+    )
     assert published == pytest.approx(large)
     assert small == pytest.approx(published / PUBLISHED_EXTENT)
 
@@ -69,8 +70,9 @@ def test_scales_are_held_down_alike_in_all_large_scenes() -> None:
 def test_training_stops_when_nothing_shows(scene: Scene, devices: list[Device], tmp_path: Path) -> None:
     transparent = Splats.from_points(scene.points.xyz[:50], scene.points.rgb[:50], "gaussian", 0, opacity=1e-3)
     transparent.save(tmp_path / "start.ply")
-    config = TrainConfig(shape="gaussian", sh_degree=0, iterations=20, densify_interval=5, cap_max=50,
-                         init=str(tmp_path / "start.ply"))
+    config = TrainConfig(
+        shape="gaussian", sh_degree=0, iterations=20, densify_interval=5, cap_max=50, init=str(tmp_path / "start.ply")
+    )
     trainer = Trainer(scene, config, device=devices[0])
     with pytest.raises(TrainingError, match=r"iteration 5: no image shows any splat .*check what training starts from"):
         trainer.run()
@@ -83,8 +85,9 @@ def test_training_refuses_rates_that_it_does_not_survive(scene: Scene, devices: 
 
 def test_the_units_of_the_scene_do_not_matter(scene: Scene, devices: list[Device]) -> None:
     """3DGS-MCMC as published throws splats out of large scenes."""
-    config = TrainConfig(shape="gaussian", sh_degree=0, iterations=40, cap_max=300, strategy="mcmc",
-                         densify_interval=10)
+    config = TrainConfig(
+        shape="gaussian", sh_degree=0, iterations=40, cap_max=300, strategy="mcmc", densify_interval=10
+    )
     psnr = []
     for unit in (1.0, 1e4):
         points = replace(scene.points, xyz=scene.points.xyz * unit)

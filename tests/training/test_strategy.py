@@ -19,8 +19,13 @@ from clsplat.training.density.strategy import Moment
 N = 100
 
 
-def action(config: TrainConfig, iteration: int = 100, seed: int = 0, arrays: Arrays | None = None,
-           signals: np.ndarray | None = None) -> tuple[Arrays, Plan]:
+def action(
+    config: TrainConfig,
+    iteration: int = 100,
+    seed: int = 0,
+    arrays: Arrays | None = None,
+    signals: np.ndarray | None = None,
+) -> tuple[Arrays, Plan]:
     shape = shapes.shape_named(config.shape)
     arrays = random_model(shape, N, 1) if arrays is None else arrays
     signals = np.zeros((3, N)) if signals is None else signals
@@ -75,8 +80,12 @@ def test_pull_is_read_only_when_asked_for() -> None:
 
 
 def adc(**options: object) -> TrainConfig:
-    return TrainConfig(**({"shape": "gaussian", "strategy": "adc", "iterations": 30_000, "opacity_reset": 10,
-                           "cap_max": 1000} | options))  # type: ignore[arg-type]
+    return TrainConfig(
+        **(
+            {"shape": "gaussian", "strategy": "adc", "iterations": 30_000, "opacity_reset": 10, "cap_max": 1000}
+            | options
+        )
+    )  # type: ignore[arg-type]
 
 
 def test_adc_resets_when_3dgs_does() -> None:

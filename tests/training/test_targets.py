@@ -23,9 +23,14 @@ SIZES = [(40, 30), (17, 65), (64, 48), (40, 30)]  # width and height
 
 def some_views() -> list[View]:
     rng = np.random.default_rng(0)
-    return [View(f"{i}.png", clsplat.Camera(width, height, 25.0, 26.0, width / 2, height / 2, np.eye(4)),
-                 rng.integers(0, 256, (height, width, 3)).astype(np.uint8))
-            for i, (width, height) in enumerate(SIZES)]
+    return [
+        View(
+            f"{i}.png",
+            clsplat.Camera(width, height, 25.0, 26.0, width / 2, height / 2, np.eye(4)),
+            rng.integers(0, 256, (height, width, 3)).astype(np.uint8),
+        )
+        for i, (width, height) in enumerate(SIZES)
+    ]
 
 
 def truths_of(device: Device, budget: int) -> Truths:
@@ -90,8 +95,9 @@ def test_what_is_promised_is_enough(device: Device, budget: int) -> None:
     assert truth_budget(device) == device.info.global_mem_bytes // 4
 
 
-def test_training_does_not_depend_on_what_stays(tmp_path_factory: pytest.TempPathFactory,
-                                                devices: list[Device]) -> None:
+def test_training_does_not_depend_on_what_stays(
+    tmp_path_factory: pytest.TempPathFactory, devices: list[Device]
+) -> None:
     """The same bits with all images on the device and with none."""
     scene = load_scene(small_capture(tmp_path_factory))
     config = TrainConfig(iterations=10, cap_max=300, sh_degree=1)

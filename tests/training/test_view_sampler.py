@@ -27,8 +27,9 @@ def test_permutations_and_their_rest_in_a_resumed_run(views: list[View]) -> None
 
 def test_size_goes_with_iteration_and_splats(views: list[View]) -> None:
     assert (WIDTH, HEIGHT) == (48, 36), "too small for coarse stages: made larger here"
-    large = [View(view.name, Camera(480, 360, 400, 400, 240, 180, view.camera.cam_from_world), view.image)
-             for view in views]
+    large = [
+        View(view.name, Camera(480, 360, 400, 400, 240, 180, view.camera.cam_from_world), view.image) for view in views
+    ]
     sampler = ViewSampler(large, 1000, True, np.random.default_rng(0), [])
     # 480 x 360 px: 8 pixels a splat, and many more
     assert [sampler.next(iteration, 21_600)[1] for iteration in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]

@@ -40,10 +40,16 @@ def wall() -> Splats:
     y, x = np.mgrid[-1.5:1.5:25j, -2.0:2.0:33j]
     n = x.size
     colour = np.stack([x < 0, x >= 0, np.zeros_like(x)], axis=-1).reshape(n, 3) * (0.6 + 0.25 * y.reshape(n, 1))
-    return Splats("gaussian", {
-        "mean": np.stack([x, y, np.full_like(x, 4.0)], axis=-1).reshape(n, 3).astype(np.float32),
-        "quat": np.tile(np.float32([1, 0, 0, 0]), (n, 1)), "log_scale": np.full((n, 3), np.log(0.1), np.float32),
-        "opacity_logit": np.full(n, 6.0, np.float32), "sh": ((colour - 0.5) / SH_C0)[:, None].astype(np.float32)})
+    return Splats(
+        "gaussian",
+        {
+            "mean": np.stack([x, y, np.full_like(x, 4.0)], axis=-1).reshape(n, 3).astype(np.float32),
+            "quat": np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+            "log_scale": np.full((n, 3), np.log(0.1), np.float32),
+            "opacity_logit": np.full(n, 6.0, np.float32),
+            "sh": ((colour - 0.5) / SH_C0)[:, None].astype(np.float32),
+        },
+    )
 
 
 @pytest.fixture(scope="module")

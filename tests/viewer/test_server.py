@@ -54,8 +54,14 @@ class Running:
         self.viewer = Viewer(self.source, Settings(background=BACKGROUND))
         cameras = [NamedCamera(f"view_{seed}", random_camera(seed)) for seed in range(3)]
         self.reloads = 0
-        self.server = Server(self.viewer, start_of(model().mean, [item.camera for item in cameras]),
-                             Known(tuple(cameras[:2]), tuple(cameras[2:])), port=0, reload=self.reload, folder=folder)
+        self.server = Server(
+            self.viewer,
+            start_of(model().mean, [item.camera for item in cameras]),
+            Known(tuple(cameras[:2]), tuple(cameras[2:])),
+            port=0,
+            reload=self.reload,
+            folder=folder,
+        )
         self.worker = threading.Thread(target=self.viewer.run)
         self.worker.start()
 
@@ -191,9 +197,16 @@ def test_senseless_messages_change_nothing(running: Running, capfd: pytest.Captu
 
 
 ABSURD: list[dict[str, Any]] = [
-    {"position": (float("nan"), 0, 0)}, {"position": (1e300, 0, 0)}, {"fov": float("nan")}, {"fov": 1e9}, {"fov": -1.0},
-    {"width": 10**12, "height": -4}, {"width": 0, "height": 0}, {"wxyz": (0, 0, 0, 0)}, {"wxyz": (float("inf"),) * 4},
-]  # fmt: skip
+    {"position": (float("nan"), 0, 0)},
+    {"position": (1e300, 0, 0)},
+    {"fov": float("nan")},
+    {"fov": 1e9},
+    {"fov": -1.0},
+    {"width": 10**12, "height": -4},
+    {"width": 0, "height": 0},
+    {"wxyz": (0, 0, 0, 0)},
+    {"wxyz": (float("inf"),) * 4},
+]
 
 
 def test_absurd_cameras_harm_nobody(running: Running) -> None:
@@ -243,8 +256,11 @@ def test_a_path_is_recorded_and_saved(running: Running, tmp_path: Path) -> None:
         walked: list[float] = []
         while len(walked) < 5:
             assert client.receive(5.0)
-            walked = [message["position"][0] for message in client.received
-                      if message["type"] == "SetCameraPositionMessage" and not message["initial"]]
+            walked = [
+                message["position"][0]
+                for message in client.received
+                if message["type"] == "SetCameraPositionMessage" and not message["initial"]
+            ]
         client.set("Stop", True)
         assert walked == sorted(walked)
         assert 0.0 < walked[-1] < 2.0
@@ -275,8 +291,20 @@ def test_nothing_of_a_message_is_markup() -> None:
 @pytest.mark.slow
 def test_the_benchmark_runs(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     model, out = small_model(tmp_path_factory), tmp_path / "viewer.jsonl"
-    command = [sys.executable, str(Path(__file__).parents[2] / "benchmarks" / "viewer.py"), "--scenes", model.name,
-               "--models", str(model.parent), "--windows", "320x240", "--seconds", "0.5", "--out", str(out)]
+    command = [
+        sys.executable,
+        str(Path(__file__).parents[2] / "benchmarks" / "viewer.py"),
+        "--scenes",
+        model.name,
+        "--models",
+        str(model.parent),
+        "--windows",
+        "320x240",
+        "--seconds",
+        "0.5",
+        "--out",
+        str(out),
+    ]
     subprocess.run(command, check=True, capture_output=True)
     (row,) = [json.loads(line) for line in out.read_text().splitlines()]
     assert row["fps_moving"] > 1

@@ -23,7 +23,7 @@ from clsplat.training.trainer import Trainer
 from clsplat.viewer.camera import Pose
 from clsplat.viewer.settings import Settings
 from clsplat.viewer.training import SHARE, TrainingSource, TrainingView, run_line
-from clsplat.viewer.viewer import Picture
+from clsplat.viewer.viewer import ViewerImage
 
 CONFIG = TrainConfig(iterations=40, cap_max=2400, sh_degree=1, densify_interval=10, strategy="mcmc")
 LAZY = TrainConfig(iterations=30, cap_max=2400, sh_degree=1, densify_interval=10, strategy="mcmc", visible_adam=True)
@@ -39,11 +39,12 @@ def pose_of(scene: Scene) -> Pose:
     return Pose((1, 0, 0, 0), tuple(camera.position), 1.0, 64, 48)
 
 
-@pytest.mark.parametrize("config", [
-    pytest.param(CONFIG, id="dense"), pytest.param(LAZY, id="visible", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "config", [pytest.param(CONFIG, id="dense"), pytest.param(LAZY, id="visible", marks=pytest.mark.slow)]
+)
 def test_a_run_that_is_watched_has_the_bits_of_one_that_is_not(scene: Scene, config: TrainConfig) -> None:
     unseen = train(scene, config).splats.to_numpy()
-    view, shots = TrainingView(config, share=1e9), list[Picture]()
+    view, shots = TrainingView(config, share=1e9), list[ViewerImage]()
     view.viewer.join(1, shots.append)
 
     def visit(trainer: Trainer, stop: threading.Event) -> None:
@@ -110,7 +111,7 @@ def test_pictures_take_no_more_than_their_share() -> None:
 
 
 def test_a_paused_run_waits_and_still_shows(scene: Scene) -> None:
-    view, shots, iterations = TrainingView(CONFIG), list[Picture](), list[int]()
+    view, shots, iterations = TrainingView(CONFIG), list[ViewerImage](), list[int]()
     view.viewer.join(1, shots.append)
 
     def visit(trainer: Trainer, stop: threading.Event) -> None:
@@ -155,6 +156,7 @@ def test_ctrl_c_ends_a_paused_run(scene: Scene, tmp_path: Path) -> None:
 
 def test_a_line_tells_of_the_run() -> None:
     assert run_line(Progress(50, 100, 0.1234567, 20.0, 300, 2.0, 25.0)) == (
-        "iteration 50 of 100, 25.0 a second; loss 0.1235, PSNR 20.00 dB, 300 splats")
+        "iteration 50 of 100, 25.0 a second; loss 0.1235, PSNR 20.00 dB, 300 splats"
+    )
     assert "finished" in run_line(Progress(100, 100, 0.1, 20.0, 300, 2.0, 25.0))
     assert run_line(Progress(0, 100, math.nan, math.nan, 0, 0.0, 0.0, "so it begins")) == "so it begins"

@@ -23,7 +23,7 @@ from clsplat.viewer.render_queue import Wishes
 from clsplat.viewer.settings import LARGEST, SMALLEST, Settings
 from clsplat.viewer.source import ModelSource, Watch, coverage
 from clsplat.viewer.start import Known, fov_of, start_of
-from clsplat.viewer.viewer import REST, Picture, Viewer
+from clsplat.viewer.viewer import REST, Viewer, ViewerImage
 
 AHEAD = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 1.0, 96, 64)
 BACKGROUND = (0.2, 0.4, 0.6)
@@ -169,20 +169,42 @@ def test_moving_pictures_get_smaller_until_they_come_in_time() -> None:
 # --- settings --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "value", "expected"), [
-    ("mode", "depth", "depth"), ("background", (255, 0, 51), (1.0, 0.0, 0.2)), ("size", 640, 640),
-    ("size", 1, SMALLEST), ("size", 10**12, LARGEST), ("sh_degree", 1.0, 1), ("sh_degree", -4, 0), ("cap", 10, 10),
-    ("cap", -1, 0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("mode", "depth", "depth"),
+        ("background", (255, 0, 51), (1.0, 0.0, 0.2)),
+        ("size", 640, 640),
+        ("size", 1, SMALLEST),
+        ("size", 10**12, LARGEST),
+        ("sh_degree", 1.0, 1),
+        ("sh_degree", -4, 0),
+        ("cap", 10, 10),
+        ("cap", -1, 0),
+    ],
+)
 def test_usable_values_are_taken(name: str, value: object, expected: object) -> None:
     assert getattr(Settings().changed(name, value, MODES), name) == expected
 
 
-@pytest.mark.parametrize(("name", "value"), [
-    ("mode", "../../etc/passwd"), ("mode", None), ("mode", ["depth"]), ("background", "red"), ("background", (1, 2)),
-    ("background", (0, 0, 300)), ("background", (0, 0, math.nan)), ("background", None), ("size", math.nan),
-    ("size", "640"), ("size", math.inf), ("sh_degree", None), ("cap", {}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mode", "../../etc/passwd"),
+        ("mode", None),
+        ("mode", ["depth"]),
+        ("background", "red"),
+        ("background", (1, 2)),
+        ("background", (0, 0, 300)),
+        ("background", (0, 0, math.nan)),
+        ("background", None),
+        ("size", math.nan),
+        ("size", "640"),
+        ("size", math.inf),
+        ("sh_degree", None),
+        ("cap", {}),
+    ],
+)
 def test_unusable_values_change_nothing(name: str, value: object) -> None:
     before = Settings(mode="alpha", cap=3)
     assert before.changed(name, value, MODES) == before
@@ -194,7 +216,7 @@ def test_unusable_values_change_nothing(name: str, value: object) -> None:
 def test_small_while_moving_and_full_when_still() -> None:
     clock = Clock()
     source = Plain(clock, seconds=0.2)
-    viewer, shots = Viewer(source, clock=clock), list[Picture]()
+    viewer, shots = Viewer(source, clock=clock), list[ViewerImage]()
     viewer.join(1, shots.append)
     for _ in range(20):
         viewer.move(1, AHEAD)
@@ -235,12 +257,14 @@ def test_everybody_has_settings_of_their_own() -> None:
     assert viewer.serve()
     assert viewer.serve()
     assert [(settings.mode, settings.background) for _, settings in source.asked] == [
-        ("depth", BACKGROUND), ("colour", BACKGROUND)]
+        ("depth", BACKGROUND),
+        ("colour", BACKGROUND),
+    ]
 
 
 @pytest.mark.parametrize("error", [DeviceError("out of memory"), ValueError("a bug\nof a driver"), MemoryError()])
 def test_a_picture_that_cannot_be_made_is_blank_and_says_why(error: Exception) -> None:
-    clock, shots = Clock(), list[Picture]()
+    clock, shots = Clock(), list[ViewerImage]()
     viewer = Viewer(Plain(clock, error=error), Settings(background=BACKGROUND), clock=clock)
     viewer.join(1, shots.append)
     viewer.move(1, AHEAD)
@@ -253,7 +277,7 @@ def test_a_picture_that_cannot_be_made_is_blank_and_says_why(error: Exception) -
 
 @pytest.mark.parametrize("pose", NONE, ids=range(len(NONE)))
 def test_absurd_cameras_see_a_blank_picture(pose: Pose) -> None:
-    clock, shots = Clock(), list[Picture]()
+    clock, shots = Clock(), list[ViewerImage]()
     viewer = Viewer(Plain(clock), Settings(background=BACKGROUND), clock=clock)
     viewer.join(1, shots.append)
     viewer.move(1, pose)
@@ -263,9 +287,9 @@ def test_absurd_cameras_see_a_blank_picture(pose: Pose) -> None:
 
 def test_a_line_that_breaks_ends_with_itself() -> None:
     clock = Clock()
-    viewer, shots = Viewer(Plain(clock), clock=clock), list[Picture]()
+    viewer, shots = Viewer(Plain(clock), clock=clock), list[ViewerImage]()
 
-    def broken(shot: Picture) -> None:
+    def broken(shot: ViewerImage) -> None:
         raise ConnectionError("reset by peer")
 
     viewer.join(1, broken)

@@ -19,7 +19,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 8, 12, 40
 def shares(counts: NDArray[np.int64]) -> list[float]:
     """Share of the values in each of BINS [%], of counts by error."""
     whole = max(int(counts.sum()), 1)
-    return [100.0 * float(counts[first:last + 1].sum()) / whole for first, last in BINS]
+    return [100.0 * float(counts[first : last + 1].sum()) / whole for first, last in BINS]
 
 
 def quantile(counts: NDArray[np.int64], share: float) -> int:
@@ -43,33 +43,42 @@ def histogram(labels: Sequence[str], counts: Sequence[NDArray[np.int64]]) -> str
     for tick in range(5):
         share = top * tick / 4
         y = _TOP + high * (1 - tick / 4)
-        parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
-                     f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{share:g} %</text>')
+        parts.append(
+            f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
+            f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{share:g} %</text>'
+        )
     for place, (first, last) in enumerate(BINS):
         name = str(first) if first == last else f"{first}–{last}"
         middle = _LEFT + (place + 0.5) * step
         parts.append(f'<text x="{middle:.1f}" y="{_HEIGHT - _BOTTOM + 16}" text-anchor="middle">{name}</text>')
         for model, (label, of_model) in enumerate(zip(labels, by_model, strict=True)):
             tall = high * of_model[place] / top
-            parts.append(f'<rect x="{_LEFT + (place + 0.1) * step + model * bar:.1f}" y="{_TOP + high - tall:.1f}" '
-                         f'width="{bar:.1f}" height="{tall:.1f}" fill="{category_colour(model)}">'
-                         f"<title>{escape(label)}: {of_model[place]:.1f} % differ by {name}</title></rect>")
-    parts.append(f'<text x="{_LEFT + wide / 2:.0f}" y="{_HEIGHT - 6}" text-anchor="middle">absolute error, '
-                 "steps of 255</text>")
+            parts.append(
+                f'<rect x="{_LEFT + (place + 0.1) * step + model * bar:.1f}" y="{_TOP + high - tall:.1f}" '
+                f'width="{bar:.1f}" height="{tall:.1f}" fill="{category_colour(model)}">'
+                f"<title>{escape(label)}: {of_model[place]:.1f} % differ by {name}</title></rect>"
+            )
+    parts.append(
+        f'<text x="{_LEFT + wide / 2:.0f}" y="{_HEIGHT - 6}" text-anchor="middle">absolute error, steps of 255</text>'
+    )
     spoken = f"Bar chart of errors: {'; '.join(map(_spoken, labels, counts))}"
-    drawing = (f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(spoken)}">'
-               + "".join(parts) + "</svg>")
+    drawing = (
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(spoken)}">' + "".join(parts) + "</svg>"
+    )
     return f'<figure class="histogram">{drawing}{_legend(labels) if len(labels) > 1 else ""}</figure>\n'
 
 
 def _spoken(label: str, counts: NDArray[np.int64]) -> str:
-    return (f"{label}: half of the values are within {quantile(counts, 0.5)}, 95 % within {quantile(counts, 0.95)} "
-            "of 255")
+    return (
+        f"{label}: half of the values are within {quantile(counts, 0.5)}, 95 % within {quantile(counts, 0.95)} of 255"
+    )
 
 
 def _legend(labels: Sequence[str]) -> str:
-    keys = "".join(f'<span><i style="background:{category_colour(place)}"></i>{escape(label)}</span>'
-                   for place, label in enumerate(labels))
+    keys = "".join(
+        f'<span><i style="background:{category_colour(place)}"></i>{escape(label)}</span>'
+        for place, label in enumerate(labels)
+    )
     return f"<figcaption>{keys}</figcaption>"
 
 

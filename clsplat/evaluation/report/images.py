@@ -46,8 +46,9 @@ class ComparedImage:
         return self.photo.shape[1], self.photo.shape[0]
 
 
-def shot_of(photo: Picture, color: NDArray[Any], mask: NDArray[np.bool_] | None = None,
-            flip: NDArray[np.float32] | None = None) -> ComparedImage:
+def shot_of(
+    photo: Picture, color: NDArray[Any], mask: NDArray[np.bool_] | None = None, flip: NDArray[np.float32] | None = None
+) -> ComparedImage:
     """A view's photo and render for the page.
 
     Parameters
@@ -60,8 +61,14 @@ def shot_of(photo: Picture, color: NDArray[Any], mask: NDArray[np.bool_] | None 
     counts = np.bincount((difference if mask is None else difference[mask]).ravel(), minlength=LEVELS)
     mean = np.rint(difference.mean(axis=2)).astype(np.uint8)
     hidden = None if mask is None else _reduced(np.where(mask, np.uint8(0), np.uint8(255))) >= 128
-    return ComparedImage(_reduced(photo), _reduced(render), _reduced(mean), hidden, counts,
-                None if flip is None else _reduced(to_bytes(flip)))
+    return ComparedImage(
+        _reduced(photo),
+        _reduced(render),
+        _reduced(mean),
+        hidden,
+        counts,
+        None if flip is None else _reduced(to_bytes(flip)),
+    )
 
 
 def full_scale(shots: list[ComparedImage]) -> float:

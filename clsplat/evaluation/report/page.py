@@ -66,10 +66,13 @@ def write_eval_report(path: Path, models: Sequence[Measured], what: str, protoco
     """
     names = list(models[0].shots)
     for model in models[1:]:
-        if set(model.shots) != set(names) or any(model.shots[name].size != models[0].shots[name].size
-                                                 for name in names):
-            raise InputError(f"{path}: {model.label} and {models[0].label} were measured on different views or sizes; "
-                             "compare models of one scene, or measure them one by one")
+        if set(model.shots) != set(names) or any(
+            model.shots[name].size != models[0].shots[name].size for name in names
+        ):
+            raise InputError(
+                f"{path}: {model.label} and {models[0].label} were measured on different views or sizes; "
+                "compare models of one scene, or measure them one by one"
+            )
     psnr = {name: statistics.fmean(model.per_view["PSNR"][name] for model in models) for name in names}
     worst_first = sorted(names, key=lambda name: psnr[name])
     every = [shot for model in models for shot in model.shots.values()]
@@ -78,19 +81,39 @@ def write_eval_report(path: Path, models: Sequence[Measured], what: str, protoco
     many = len(models) > 1
     title = f"{what}: " + (f"{len(models)} models" if many else models[0].label)
     low, high = psnr[worst_first[0]], psnr[worst_first[-1]]
-    summary = [f"PSNR {low:.2f} to {high:.2f} dB{' (means over the models)' if many else ''}; "
-               f"the worst view is {worst_first[0]}."]
+    summary = [
+        f"PSNR {low:.2f} to {high:.2f} dB{' (means over the models)' if many else ''}; "
+        f"the worst view is {worst_first[0]}."
+    ]
     sections = [
-        Section("Means", summary, head=("model", *(_UNITS.get(m, m) for m in _metrics(models)), *models[0].costs),
-                lines=[(model.label, *(_number(m, model.mean(m)) for m in _metrics(models)), *model.costs.values())
-                       for model in models]),
-        Section("Views", ["Worst first; a click on a heading sorts by it."],
-                markup=_view_table(models, worst_first, shown)),
+        Section(
+            "Means",
+            summary,
+            head=("model", *(_UNITS.get(m, m) for m in _metrics(models)), *models[0].costs),
+            lines=[
+                (model.label, *(_number(m, model.mean(m)) for m in _metrics(models)), *model.costs.values())
+                for model in models
+            ],
+        ),
+        Section(
+            "Views", ["Worst first; a click on a heading sorts by it."], markup=_view_table(models, worst_first, shown)
+        ),
         Section("Images", _about_images(every, len(shown), len(names), full), markup="".join(shown.values())),
-        Section("Errors", [_spread(model) for model in models],
-                markup=histogram([model.label for model in models], [model.counts for model in models])),
-        Section("How it was measured", [*protocol, *(["Pixels that a mask hides are left out of all numbers."] *
-                                                    any(shot.hidden is not None for shot in every))]),
+        Section(
+            "Errors",
+            [_spread(model) for model in models],
+            markup=histogram([model.label for model in models], [model.counts for model in models]),
+        ),
+        Section(
+            "How it was measured",
+            [
+                *protocol,
+                *(
+                    ["Pixels that a mask hides are left out of all numbers."]
+                    * any(shot.hidden is not None for shot in every)
+                ),
+            ],
+        ),
         *(Section(model.label if many else "Model", lines=model.facts, head=("", "")) for model in models),
     ]
     return write_page(path, title, sections, STYLE, SCRIPT)
@@ -106,13 +129,17 @@ def _number(metric: str, value: float) -> str:
 
 def _about_images(shots: Sequence[ComparedImage], shown: int, n: int, full: float) -> list[str]:
     text = ["Drag over an image, or use the arrow keys, to wipe between the render and the photo."]
-    text.append(f"Error maps: absolute difference, mean of the channels, all on one scale; {full:g} of the full range "
-                "and more is brightest.")
+    text.append(
+        f"Error maps: absolute difference, mean of the channels, all on one scale; {full:g} of the full range "
+        "and more is brightest."
+    )
     if any(shot.hidden is not None for shot in shots):
         text.append("Masked pixels are striped.")
     if shown < n:
-        text.append(f"{shown} of {n} views are shown: the {min(_WORST, shown)} worst, and others spread evenly, "
-                    f"as far as {IMAGE_BYTES / 1e6:g} MB go.")
+        text.append(
+            f"{shown} of {n} views are shown: the {min(_WORST, shown)} worst, and others spread evenly, "
+            f"as far as {IMAGE_BYTES / 1e6:g} MB go."
+        )
     if any(max(shot.size) >= LONGEST for shot in shots):
         text.append(f"Images are reduced to {LONGEST} pixels at most; numbers are of whole images.")
     return text
@@ -129,11 +156,16 @@ def _spread(model: Measured) -> str:
 def _view_table(models: Sequence[Measured], names: Sequence[str], shown: Mapping[str, str]) -> str:
     metrics = _metrics(models)
     columns = [(metric, model) for metric in metrics for model in models]
-    heads = ["view", *(_UNITS.get(metric, metric) + (f", {model.label}" if len(models) > 1 else "")
-                       for metric, model in columns)]
+    heads = [
+        "view",
+        *(_UNITS.get(metric, metric) + (f", {model.label}" if len(models) > 1 else "") for metric, model in columns),
+    ]
     first = " aria-sort=ascending" if len(models) == 1 else ""
-    head = "".join(f'<th scope="col"{" class=text" if place == 0 else ""}{first if place == 1 else ""}>'
-                   f"<button type=button>{escape(text)}</button></th>" for place, text in enumerate(heads))
+    head = "".join(
+        f'<th scope="col"{" class=text" if place == 0 else ""}{first if place == 1 else ""}>'
+        f"<button type=button>{escape(text)}</button></th>"
+        for place, text in enumerate(heads)
+    )
     body = ""
     for name in names:
         cells = ""
@@ -144,8 +176,10 @@ def _view_table(models: Sequence[Measured], names: Sequence[str], shown: Mapping
             cells += f'<td data-value="{value!r}"{" class=best" if best else ""}>{_number(metric, value)}</td>'
         text = f'<a href="#{_anchor(names, name)}">{escape(name)}</a>' if name in shown else escape(name)
         body += f'<tr><th scope="row" class="text" data-value="{escape(name)}">{text}</th>{cells}</tr>\n'
-    return (f'<div class="table"><table class="sortable"><thead><tr>{head}</tr></thead>\n'
-            f"<tbody>{body}</tbody></table></div>\n")
+    return (
+        f'<div class="table"><table class="sortable"><thead><tr>{head}</tr></thead>\n'
+        f"<tbody>{body}</tbody></table></div>\n"
+    )
 
 
 # --- the images --------------------------------------------------------------------------------
@@ -181,9 +215,11 @@ def _spread_evenly(names: Sequence[str]) -> list[str]:
 
 
 def _view(models: Sequence[Measured], name: str, full: float, stops: str, anchor: str) -> str:
-    numbers = "; ".join((f"{model.label}: " if len(models) > 1 else "")
-                        + ", ".join(f"{metric} {_number(metric, model.per_view[metric][name])}"
-                                    for metric in _metrics(models)) for model in models)
+    numbers = "; ".join(
+        (f"{model.label}: " if len(models) > 1 else "")
+        + ", ".join(f"{metric} {_number(metric, model.per_view[metric][name])}" for metric in _metrics(models))
+        for model in models
+    )
     width, height = models[0].shots[name].size
     parts = [_wipe(models, name)]
     for model in models:
@@ -191,8 +227,10 @@ def _view(models: Sequence[Measured], name: str, full: float, stops: str, anchor
         parts.append(_map(data_uri(map_of(shot.error, full, shot.hidden)), f"Error{of}", name, stops, full))
         if shot.flip is not None:
             parts.append(_map(data_uri(map_of(shot.flip, 1.0, shot.hidden)), f"FLIP{of}", name, stops, 1.0))
-    return (f'<h3 id="{anchor}">{escape(name)} <small>{escape(numbers)}</small></h3>\n'
-            f'<div class="images" style="--shape: {width / height:.4f}">{"".join(parts)}</div>\n')
+    return (
+        f'<h3 id="{anchor}">{escape(name)} <small>{escape(numbers)}</small></h3>\n'
+        f'<div class="images" style="--shape: {width / height:.4f}">{"".join(parts)}</div>\n'
+    )
 
 
 def _wipe(models: Sequence[Measured], name: str) -> str:
@@ -202,27 +240,35 @@ def _wipe(models: Sequence[Measured], name: str) -> str:
     images = ""
     for key, (label, picture) in enumerate([*sides, ("photo", first.photo)]):
         side = "over" if key == 0 else "under" if key == len(models) else ""
-        images += (f'<img data-key="{key}" class="{side}" width="{width}" height="{height}" '
-                   f'alt="{escape(name)}, {escape(label)}" src="{data_uri(veiled(picture, first.hidden))}">')
+        images += (
+            f'<img data-key="{key}" class="{side}" width="{width}" height="{height}" '
+            f'alt="{escape(name)}, {escape(label)}" src="{data_uri(veiled(picture, first.hidden))}">'
+        )
     labels = [label for label, _ in sides] + ["photo"]
     if len(models) > 1:
         caption = "".join(_choice(labels, chosen, side) for chosen, side in ((0, "left"), (len(models), "right")))
     else:
         caption = "<span>render</span><span>photo</span>"
-    return (f'<figure><div class="wipe" style="aspect-ratio: {width} / {height}">{images}'
-            f'<input type="range" min="0" max="100" step="any" value="50" '
-            f'aria-label="Wipe between two images of {escape(name)}"></div>'
-            f'<figcaption class="sides">{caption}</figcaption></figure>\n')
+    return (
+        f'<figure><div class="wipe" style="aspect-ratio: {width} / {height}">{images}'
+        f'<input type="range" min="0" max="100" step="any" value="50" '
+        f'aria-label="Wipe between two images of {escape(name)}"></div>'
+        f'<figcaption class="sides">{caption}</figcaption></figure>\n'
+    )
 
 
 def _choice(labels: Sequence[str], chosen: int, side: str) -> str:
-    options = "".join(f'<option value="{key}"{" selected" if key == chosen else ""}>{escape(label)}</option>'
-                      for key, label in enumerate(labels))
+    options = "".join(
+        f'<option value="{key}"{" selected" if key == chosen else ""}>{escape(label)}</option>'
+        for key, label in enumerate(labels)
+    )
     return f'<select aria-label="Image on the {side}">{options}</select>'
 
 
 def _map(uri: str, title: str, name: str, stops: str, full: float) -> str:
-    return (f'<figure><div class="map"><img alt="{escape(title)}, {escape(name)}" src="{uri}"></div>'
-            f'<div class="bar" style="background: linear-gradient(90deg, {stops})"></div>'
-            f'<figcaption class="sides"><span>0</span><span>{escape(title)}</span><span>{full:g}</span></figcaption>'
-            f"</figure>\n")
+    return (
+        f'<figure><div class="map"><img alt="{escape(title)}, {escape(name)}" src="{uri}"></div>'
+        f'<div class="bar" style="background: linear-gradient(90deg, {stops})"></div>'
+        f'<figcaption class="sides"><span>0</span><span>{escape(title)}</span><span>{full:g}</span></figcaption>'
+        f"</figure>\n"
+    )

@@ -19,21 +19,22 @@ from ...files.images import write_png
 from ..colmap_binary import ModelView, write_binary_model
 from .world import SURFACES, Hits, World
 
-RING_RADIUS = 3.6                              # of the ring of cameras, world units
-_HEIGHTS = (0.75, 1.9)                     # first half of the views low, second half high
+RING_RADIUS = 3.6  # of the ring of cameras, world units
+_HEIGHTS = (0.75, 1.9)  # first half of the views low, second half high
 RING_TARGET = np.array([0.0, 0.0, 0.5])
-_FOCAL = 0.9                               # of the image width: 58 degrees across
-_SUBPIXELS = (0.25, 0.75)                  # 2x2 supersampling
+_FOCAL = 0.9  # of the image width: 58 degrees across
+_SUBPIXELS = (0.25, 0.75)  # 2x2 supersampling
 
 _POINTS = 3000
 _FEWEST_OBSERVATIONS = 3
 # Parts of the point cloud by surface: thin and small things get more than their area.
 _SHARES = {"ground": 0.36, "dome": 0.16, "box": 0.16, "ball": 0.08, "panel": 0.12, "poles": 0.12}
-_DEPTH_TOLERANCE = 2e-3                    # world units: float32 casting is good to some 1e-5
+_DEPTH_TOLERANCE = 2e-3  # world units: float32 casting is good to some 1e-5
 
 
-def write_capture(folder: str | os.PathLike[str], width: int = 200, height: int = 150, n_views: int = 40,
-                  seed: int = 0) -> Path:
+def write_capture(
+    folder: str | os.PathLike[str], width: int = 200, height: int = 150, n_views: int = 40, seed: int = 0
+) -> Path:
     """Render the little world from two rings of cameras and write it as a COLMAP scene.
 
     Parameters
@@ -53,8 +54,7 @@ def write_capture(folder: str | os.PathLike[str], width: int = 200, height: int 
     OutputError : the folder holds something, or cannot be written.
     """
     if width < 16 or height < 16 or n_views < 4:
-        raise InputError(f"capture: {width}x{height} px, {n_views} views; "
-                         "needs at least 16x16 px and 4 views")
+        raise InputError(f"capture: {width}x{height} px, {n_views} views; needs at least 16x16 px and 4 views")
     root = Path(folder)
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise OutputError(f"{root}: already there and not an empty folder; name another one")
@@ -67,9 +67,16 @@ def write_capture(folder: str | os.PathLike[str], width: int = 200, height: int 
     xyz, seen = points.position[kept].astype(np.float64), seen[:, kept]
     rgb = np.rint(255 * points.color[kept]).astype(np.uint8)
     views = [
-        ModelView(_name(index), (width, height), (camera.fx, camera.fy, camera.cx, camera.cy),
-                  camera.cam_from_world, _project(camera, xyz[of_view])[0], np.flatnonzero(of_view))
-        for index, (camera, of_view) in enumerate(zip(cameras, seen, strict=True))]
+        ModelView(
+            _name(index),
+            (width, height),
+            (camera.fx, camera.fy, camera.cx, camera.cy),
+            camera.cam_from_world,
+            _project(camera, xyz[of_view])[0],
+            np.flatnonzero(of_view),
+        )
+        for index, (camera, of_view) in enumerate(zip(cameras, seen, strict=True))
+    ]
     write_binary_model(root / "sparse" / "0", views, xyz, rgb)
     return root
 
@@ -94,14 +101,12 @@ def ring_cameras(width: int, height: int, n_views: int) -> list[Camera]:
 
 def photograph(world: World, camera: Camera) -> NDArray[np.float32]:
     """(H, W, 3) colours 0..1: the mean of 2x2 rays a pixel."""
-    rays = [_cast(world, camera, _pixels(camera) + np.array([dx, dy])).color
-            for dy in _SUBPIXELS for dx in _SUBPIXELS]
+    rays = [_cast(world, camera, _pixels(camera) + np.array([dx, dy])).color for dy in _SUBPIXELS for dx in _SUBPIXELS]
     photo: NDArray[np.float32] = np.mean(rays, axis=0).reshape(camera.height, camera.width, 3)
     return photo
 
 
-def visible(world: World, camera: Camera, xyz: NDArray[np.floating],
-            normal: NDArray[np.floating]) -> NDArray[np.bool_]:
+def visible(world: World, camera: Camera, xyz: NDArray[np.floating], normal: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Which surface points the camera sees.
 
     That is: inside the image, on the side of the surface that faces the camera, and with nothing nearer on
@@ -129,22 +134,22 @@ def _surface_points(world: World, cameras: list[Camera], rng: np.random.Generato
         pixels = _pixels(camera) + rng.random((camera.width * camera.height, 2))
         surface = world.distances(*_rays(camera, pixels)).argmin(axis=0)
         counts = [max(1, round(_POINTS * _SHARES[name] / len(cameras))) for name in SURFACES]
-        picks = [rng.permutation(np.flatnonzero(surface == index))[:count]
-                 for index, count in enumerate(counts)]
+        picks = [rng.permutation(np.flatnonzero(surface == index))[:count] for index, count in enumerate(counts)]
         chosen.append(_cast(world, camera, pixels[np.concatenate(picks)]))
     return Hits(*(np.concatenate([getattr(hits, part.name) for hits in chosen]) for part in fields(Hits)))
 
 
 def _pixels(camera: Camera) -> NDArray[np.float64]:
     """(H * W, 2) corners x, y of all pixels, row by row."""
-    y, x = np.mgrid[:camera.height, :camera.width]
+    y, x = np.mgrid[: camera.height, : camera.width]
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
 
 
 def _rays(camera: Camera, pixels: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Origins and unit directions (R, 3) of the rays through pixel positions (R, 2)."""
-    local = np.concatenate([(pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy),
-                            np.ones((len(pixels), 1))], axis=1)
+    local = np.concatenate(
+        [(pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones((len(pixels), 1))], axis=1
+    )
     direction = local @ camera.rotation / np.linalg.norm(local, axis=1, keepdims=True)
     origin = np.broadcast_to(camera.position.astype(np.float32), direction.shape)
     return origin, direction.astype(np.float32)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 Rays = NDArray[np.float32]
 
 _FAR = np.float32(np.inf)
-_NEAR = 1e-3                               # rays that leave a surface do not meet it again
+_NEAR = 1e-3  # rays that leave a surface do not meet it again
 _SUN = np.array([0.45, -0.35, 0.82]) / np.linalg.norm([0.45, -0.35, 0.82])
-_AMBIENT, _DIFFUSE = 0.62, 0.42            # together a little above 1 in full sun
+_AMBIENT, _DIFFUSE = 0.62, 0.42  # together a little above 1 in full sun
 
 GROUND_RADIUS = 5.0
 DOME_RADIUS = 14.0
@@ -59,8 +59,8 @@ class World:
     """The scene; `seed` moves the poles and changes the ground's noise."""
 
     seed: int = 0
-    poles: NDArray[np.float32] = field(init=False)     # (5, 2) feet
-    noise: NDArray[np.float32] = field(init=False)     # (64, 64) lattice of 0..1, periodic
+    poles: NDArray[np.float32] = field(init=False)  # (5, 2) feet
+    noise: NDArray[np.float32] = field(init=False)  # (64, 64) lattice of 0..1, periodic
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.seed)
@@ -75,10 +75,16 @@ class World:
         at = origin[:, :2] + ground[:, None] * direction[:, :2]
         ground = np.where((ground > _NEAR) & (_dot(at, at) < GROUND_RADIUS**2), ground, _FAR)
         poles = np.min([_pole(origin, direction, foot) for foot in self.poles], axis=0)
-        return np.stack([
-            ground, _ball(origin, direction, np.zeros(3), DOME_RADIUS, inside=True),
-            _box(origin, direction), _ball(origin, direction, _BALL_CENTRE, _BALL_RADIUS, inside=False),
-            _panel(origin, direction), poles]).astype(np.float32)
+        return np.stack(
+            [
+                ground,
+                _ball(origin, direction, np.zeros(3), DOME_RADIUS, inside=True),
+                _box(origin, direction),
+                _ball(origin, direction, _BALL_CENTRE, _BALL_RADIUS, inside=False),
+                _panel(origin, direction),
+                poles,
+            ]
+        ).astype(np.float32)
 
     def cast(self, origin: Rays, direction: Rays) -> Hits:
         """First surface along each ray, with its colour in the sun's light and shadow."""
@@ -104,7 +110,7 @@ class World:
         slant = np.maximum(normal @ sun, 0.0) * ~np.isfinite(blocked).any(axis=0)
         sky = 0.8 + 0.2 * normal[:, 2]
         lit: Rays = paint * (_AMBIENT * sky + _DIFFUSE * slant)[:, None]
-        if glossy:                          # Blinn-Phong: the one colour here that changes with the view
+        if glossy:  # Blinn-Phong: the one colour here that changes with the view
             half = sun - direction
             shine = np.maximum(_dot(normal, half) / np.sqrt(_dot(half, half)), 0.0) ** 40
             lit += (0.5 * (slant > 0) * shine).astype(np.float32)[:, None]
@@ -116,8 +122,9 @@ class World:
         a, b = u - iu, v - iv
         a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
         at = [[self.noise[(iu + i) % 64, (iv + j) % 64] for j in (0, 1)] for i in (0, 1)]
-        blended: NDArray[np.float32] = ((1 - a) * ((1 - b) * at[0][0] + b * at[0][1])
-                                        + a * ((1 - b) * at[1][0] + b * at[1][1]))
+        blended: NDArray[np.float32] = (1 - a) * ((1 - b) * at[0][0] + b * at[0][1]) + a * (
+            (1 - b) * at[1][0] + b * at[1][1]
+        )
         return blended
 
     def _ground_paint(self, position: Rays, direction: Rays) -> tuple[Rays, Rays]:
@@ -148,8 +155,10 @@ class World:
         deep = np.array([[0.75, 0.16, 0.13], [0.13, 0.30, 0.62], [0.16, 0.45, 0.24]])[axis]
         outward = np.zeros_like(local)
         outward[np.arange(len(axis)), axis] = np.sign(local[np.arange(len(axis)), axis])
-        return (np.where(dark[:, None], deep, pale).astype(np.float32),
-                (outward @ _turned(_BOX_ANGLE).T).astype(np.float32))
+        return (
+            np.where(dark[:, None], deep, pale).astype(np.float32),
+            (outward @ _turned(_BOX_ANGLE).T).astype(np.float32),
+        )
 
     def _ball_paint(self, position: Rays, direction: Rays) -> tuple[Rays, Rays]:
         normal = ((position - _BALL_CENTRE) / _BALL_RADIUS).astype(np.float32)
@@ -162,7 +171,7 @@ class World:
     def _panel_paint(self, position: Rays, direction: Rays) -> tuple[Rays, Rays]:
         local = (position - _PANEL_CENTRE) @ _turned(_PANEL_ANGLE)
         x, z = local[:, 0] / _PANEL_HALF[0], local[:, 2] / _PANEL_HALF[1]
-        front = direction @ _turned(_PANEL_ANGLE)[:, 1].astype(np.float32) > 0       # its face looks along -y
+        front = direction @ _turned(_PANEL_ANGLE)[:, 1].astype(np.float32) > 0  # its face looks along -y
         mural = _mix((0.95, 0.75, 0.20), (0.70, 0.15, 0.45), (z + 1) / 2)
         mural[np.abs(_wave(3 * x + z)) < 0.2] = (0.10, 0.18, 0.40)
         mural[(x - 0.25) ** 2 * 2 + (z - 0.2) ** 2 < 0.16] = (0.97, 0.96, 0.92)
@@ -177,8 +186,15 @@ class World:
         offset = position[:, None, :2] - self.poles
         which = (offset[:, :, 0] ** 2 + offset[:, :, 1] ** 2).argmin(axis=1)
         stripe = np.floor(position[:, 2] / 0.15 + which).astype(int) % 2 == 0
-        colors = np.stack([_rgb(0.85, 0.15, 0.12), _rgb(0.10, 0.35, 0.75), _rgb(0.10, 0.50, 0.25),
-                           _rgb(0.55, 0.20, 0.55), _rgb(0.15, 0.15, 0.18)])
+        colors = np.stack(
+            [
+                _rgb(0.85, 0.15, 0.12),
+                _rgb(0.10, 0.35, 0.75),
+                _rgb(0.10, 0.50, 0.25),
+                _rgb(0.55, 0.20, 0.55),
+                _rgb(0.15, 0.15, 0.18),
+            ]
+        )
         paint = np.where(stripe[:, None], colors[which], _rgb(0.96, 0.95, 0.92))
         normal = np.zeros_like(position)
         normal[:, :2] = offset[np.arange(len(which)), which] / _POLE_RADIUS
@@ -216,8 +232,9 @@ def _constant(like: Rays, value: tuple[float, ...] | NDArray[np.float64]) -> Ray
     return np.broadcast_to(np.asarray(value, np.float32), like.shape)
 
 
-def _ball(origin: Rays, direction: Rays, centre: NDArray[np.float64], radius: float,
-          inside: bool) -> NDArray[np.float32]:
+def _ball(
+    origin: Rays, direction: Rays, centre: NDArray[np.float64], radius: float, inside: bool
+) -> NDArray[np.float32]:
     """Distance to a sphere, met from inside or from outside."""
     to = origin - centre.astype(np.float32)
     b = _dot(to, direction)
@@ -254,7 +271,7 @@ def _pole(origin: Rays, direction: Rays, foot: NDArray[np.float32]) -> NDArray[n
     nearest = np.full(len(origin), _FAR)
     to, step = origin[:, :2] - foot, direction[:, :2]
     across = to[:, 0] * step[:, 1] - to[:, 1] * step[:, 0]
-    near = np.flatnonzero(across * across < _POLE_RADIUS**2 * _dot(step, step))     # few rays pass that near
+    near = np.flatnonzero(across * across < _POLE_RADIUS**2 * _dot(step, step))  # few rays pass that near
     to, step, start, climb = to[near], step[near], origin[near, 2], direction[near, 2]
     a, b = np.maximum(_dot(step, step), 1e-12), _dot(to, step)
     side = (-b - np.sqrt(np.maximum(_POLE_RADIUS**2 * a - across[near] ** 2, 0))) / a

@@ -86,8 +86,9 @@ def find_photos(path: Path) -> list[PhotoFile]:
     InputError : no such folder, or no photograph of a kind that is read.
     """
     if not path.is_dir():
-        raise InputError(f"{path}: no such folder; give a folder of photos, or a video file "
-                         f"({', '.join(sorted(VIDEO_SUFFIXES))})")
+        raise InputError(
+            f"{path}: no such folder; give a folder of photos, or a video file ({', '.join(sorted(VIDEO_SUFFIXES))})"
+        )
     home = _home(path)
     names = _photo_names(home)
     if not names:
@@ -99,8 +100,10 @@ def find_photos(path: Path) -> list[PhotoFile]:
             raise InputError(f"{home}: the name {name!a} cannot be written into a model; rename the photo")
     folder = path / MASK_FOLDER
     masks = mask_files(folder, names) if folder.is_dir() else {}
-    return [PhotoFile(scene_name, home / name, masks.get(name))
-            for name, scene_name in zip(names, _scene_names(names), strict=True)]
+    return [
+        PhotoFile(scene_name, home / name, masks.get(name))
+        for name, scene_name in zip(names, _scene_names(names), strict=True)
+    ]
 
 
 def unread_kinds(path: Path) -> str:
@@ -115,8 +118,11 @@ def fingerprint(path: Path) -> str:
     ------
     InputError : as `find_photos`.
     """
-    files = [path] if is_video(path) else [
-        file for photo in find_photos(path) for file in (photo.file, photo.mask) if file is not None]
+    files = (
+        [path]
+        if is_video(path)
+        else [file for photo in find_photos(path) for file in (photo.file, photo.mask) if file is not None]
+    )
     digest = hashlib.sha256()
     for file in files:
         try:
@@ -179,13 +185,19 @@ def same_camera(photos: Sequence[Prepared], mode: str) -> list[list[Prepared]]:
     for photo in photos:
         size = photo.facts.width, photo.facts.height
         folder = PurePosixPath(photo.source.name).parent
-        key: object = {"auto": (size, photo.facts.camera), "single": None, "per-image": photo.staged,
-                       "per-folder": folder}[mode]
+        key: object = {
+            "auto": (size, photo.facts.camera),
+            "single": None,
+            "per-image": photo.staged,
+            "per-folder": folder,
+        }[mode]
         group = groups.setdefault(key, [])
         first = group[0].facts if group else photo.facts
         if (first.width, first.height) != size:
-            raise InputError(f"{photo.source.file}: is {size[0]}x{size[1]} px, {group[0].source.name} {first.width}x"
-                             f"{first.height}; photos of one camera have one size: leave out --camera-mode {mode}")
+            raise InputError(
+                f"{photo.source.file}: is {size[0]}x{size[1]} px, {group[0].source.name} {first.width}x"
+                f"{first.height}; photos of one camera have one size: leave out --camera-mode {mode}"
+            )
         group.append(photo)
     return list(groups.values())
 
@@ -205,10 +217,14 @@ def _names(home: Path, suffixes: frozenset[str]) -> list[str]:
     found = []
     for folder, folders, files in os.walk(home):
         below = Path(folder).relative_to(home)
-        folders[:] = [name for name in folders
-                      if not name.startswith(".") and not (below == Path() and name == MASK_FOLDER)]
-        found += [(below / name).as_posix() for name in files
-                  if not name.startswith(".") and Path(name).suffix.lower() in suffixes]
+        folders[:] = [
+            name for name in folders if not name.startswith(".") and not (below == Path() and name == MASK_FOLDER)
+        ]
+        found += [
+            (below / name).as_posix()
+            for name in files
+            if not name.startswith(".") and Path(name).suffix.lower() in suffixes
+        ]
     return sorted(found)
 
 
@@ -233,8 +249,10 @@ def _upright_mask(path: Path, photo: Path, facts: PhotoFacts) -> Mask:
     mask = read_mask(path)
     rows, columns = mask.shape
     if not same_aspect((columns, rows), (facts.width, facts.height)):
-        raise InputError(f"{path}: is {columns}x{rows} px, the photo {photo.name} {facts.width}x{facts.height}; "
-                         "make the mask of the photo's size, upright")
+        raise InputError(
+            f"{path}: is {columns}x{rows} px, the photo {photo.name} {facts.width}x{facts.height}; "
+            "make the mask of the photo's size, upright"
+        )
     return nearest(mask, facts.width, facts.height)
 
 

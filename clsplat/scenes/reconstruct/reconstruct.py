@@ -34,8 +34,16 @@ from .sfm_worker import ENOUGH
 from .undistorted_scene import SparseModel, write_flat_model, write_flat_photo
 from .video_frames import extract_frames
 
-__all__ = ["CAMERA_MODELS", "CAMERA_MODES", "MATCHERS", "ReconstructOptions", "Reconstructed", "estimated_seconds",
-           "made_from", "reconstruct"]
+__all__ = [
+    "CAMERA_MODELS",
+    "CAMERA_MODES",
+    "MATCHERS",
+    "ReconstructOptions",
+    "Reconstructed",
+    "estimated_seconds",
+    "made_from",
+    "reconstruct",
+]
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -67,9 +75,13 @@ class Reconstructed:
     seconds: float
 
 
-def reconstruct(photos: str | os.PathLike[str], scene: str | os.PathLike[str],
-                options: ReconstructOptions | None = None, tell: Tell | None = None,
-                overwrite: bool = False) -> Reconstructed:
+def reconstruct(
+    photos: str | os.PathLike[str],
+    scene: str | os.PathLike[str],
+    options: ReconstructOptions | None = None,
+    tell: Tell | None = None,
+    overwrite: bool = False,
+) -> Reconstructed:
     """Find the poses of photographs and write them as a scene: images/, sparse/0/, masks/ and reconstruct.json.
 
     The scene appears whole or not at all. Images are upright and without distortion (PINHOLE).
@@ -96,8 +108,9 @@ def reconstruct(photos: str | os.PathLike[str], scene: str | os.PathLike[str],
     say: Tell = tell or (lambda step: None)
     with _unfinished(target.absolute()) as work:
         if is_video(source):
-            given = extract_frames(source, work / "frames", options.frames,
-                                   lambda seen: say(Step("video frames looked at", seen)))
+            given = extract_frames(
+                source, work / "frames", options.frames, lambda seen: say(Step("video frames looked at", seen))
+            )
         else:
             given = find_photos(source)
         mark = fingerprint(source)
@@ -107,23 +120,43 @@ def reconstruct(photos: str | os.PathLike[str], scene: str | os.PathLike[str],
         names = [photo.staged for photo in ready]
         (work / "pairs.txt").write_text("".join(f"{names[a]} {names[b]}\n" for a, b in pairs))
         masks = complete_masks(ready, work / "masks")
-        job = {"masks": masks and str(masks), "groups": groups, "n_pairs": len(pairs),
-               "doubled": _longest_side(ready[len(ready) // 2].facts, options) < SMALL,
-               "camera_model": options.camera_model, "max_size": options.max_size, "seed": options.seed}
+        job = {
+            "masks": masks and str(masks),
+            "groups": groups,
+            "n_pairs": len(pairs),
+            "doubled": _longest_side(ready[len(ready) // 2].facts, options) < SMALL,
+            "camera_model": options.camera_model,
+            "max_size": options.max_size,
+            "seed": options.seed,
+        }
         models = run_sfm(work, job, say, str(source))
         folder = max(models, key=lambda name: models[name])
         model = SparseModel(Path(folder))
         registered = [photo for photo in ready if photo.staged in model.names]
         _warn_of_rest(source, ready, registered, models)
-        views = list(_each("photos undistorted", lambda photo: write_flat_photo(model, photo, work / "scene"),
-                           registered, say))
+        views = list(
+            _each("photos undistorted", lambda photo: write_flat_photo(model, photo, work / "scene"), registered, say)
+        )
         write_flat_model(model, views, work / "scene")
         points = model.points
-        result = Reconstructed(target, len(ready), len(registered), len(points), float(points.track_length.mean()),
-                               float(model.errors.mean()), time.perf_counter() - start)
-        write_json(work / "scene" / RECORD, {
-            "source": str(source.resolve()), "fingerprint": mark, "options": asdict(options),
-            **{key: value for key, value in asdict(result).items() if key != "scene"}})
+        result = Reconstructed(
+            target,
+            len(ready),
+            len(registered),
+            len(points),
+            float(points.track_length.mean()),
+            float(model.errors.mean()),
+            time.perf_counter() - start,
+        )
+        write_json(
+            work / "scene" / RECORD,
+            {
+                "source": str(source.resolve()),
+                "fingerprint": mark,
+                "options": asdict(options),
+                **{key: value for key, value in asdict(result).items() if key != "scene"},
+            },
+        )
         _put(work / "scene", target)
     return result
 
@@ -139,7 +172,7 @@ def estimated_seconds(photos: Sequence[PhotoFile], options: ReconstructOptions |
     facts = photo_facts(photos[0].file)
     side = _longest_side(facts, options)
     megapixels = facts.width * facts.height * (side / max(facts.width, facts.height)) ** 2 / 1e6
-    features = min(1.0, 3.0 * megapixels)                          # of the most
+    features = min(1.0, 3.0 * megapixels)  # of the most
     pairs = len(_pairs(len(photos), _sequential(options, photos[0].file, len(photos))))
     search = len(photos) * megapixels * (4.9 if side < SMALL else 1.2)
     return (search + 0.2 * pairs * features**2 + 0.5 * len(photos)) / (os.cpu_count() or 1)
@@ -206,8 +239,10 @@ def _prepared(given: Sequence[PhotoFile], source: Path, work: Path, say: Tell) -
         more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         warnings.warn(f"left out: {reasons[0]}{more}", stacklevel=3)
     if len(ready) < FEWEST:
-        raise InputError(f"{source}: {len(ready)} photos that can be read; at least {FEWEST} are needed, 30 or more "
-                         "that overlap are better")
+        raise InputError(
+            f"{source}: {len(ready)} photos that can be read; at least {FEWEST} are needed, 30 or more "
+            "that overlap are better"
+        )
     return ready
 
 
@@ -232,18 +267,25 @@ def _pairs(photos: int, sequential: bool) -> list[tuple[int, int]]:
     return sorted(near | net)
 
 
-def _warn_of_rest(source: Path, ready: Sequence[Prepared], registered: Sequence[Prepared],
-                  models: dict[str, int]) -> None:
+def _warn_of_rest(
+    source: Path, ready: Sequence[Prepared], registered: Sequence[Prepared], models: dict[str, int]
+) -> None:
     placed = {photo.staged for photo in registered}
     rest = [photo.source.name for photo in ready if photo.staged not in placed]
     if len(registered) < ENOUGH * len(ready):
-        warnings.warn(f"{source}: only {len(registered)} of {len(ready)} photos could be placed; left out are "
-                      f"{', '.join(rest[:3])}{', ...' if len(rest) > 3 else ''}. Take more photos in between, with "
-                      "steps of a few degrees, sharp and of things at rest", stacklevel=3)
+        warnings.warn(
+            f"{source}: only {len(registered)} of {len(ready)} photos could be placed; left out are "
+            f"{', '.join(rest[:3])}{', ...' if len(rest) > 3 else ''}. Take more photos in between, with "
+            "steps of a few degrees, sharp and of things at rest",
+            stacklevel=3,
+        )
     parts = sum(size >= FEWEST for size in models.values())
     if rest and parts > 1:
-        warnings.warn(f"{source}: the photos fall into {parts} parts that do not hang together; the largest "
-                      f"({len(registered)} photos) is kept", stacklevel=3)
+        warnings.warn(
+            f"{source}: the photos fall into {parts} parts that do not hang together; the largest "
+            f"({len(registered)} photos) is kept",
+            stacklevel=3,
+        )
 
 
 def _each(label: str, function: Callable[[T], R], items: Sequence[T], say: Tell) -> Iterator[R]:

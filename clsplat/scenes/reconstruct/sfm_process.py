@@ -53,14 +53,23 @@ def run_sfm(work: Path, job: dict[str, Any], tell: Tell, source: str) -> dict[st
     """
     work = work.resolve()
     database = work / "database.db"
-    whole = job | {"database": str(database), "photos": str(work / "photos"), "pairs": str(work / "pairs.txt"),
-                   "output": str(work / "sparse")}
+    whole = job | {
+        "database": str(database),
+        "photos": str(work / "photos"),
+        "pairs": str(work / "pairs.txt"),
+        "output": str(work / "sparse"),
+    }
     (work / "job.json").write_text(json.dumps(whole), encoding="utf-8")
     log = work / "log.txt"
     with log.open("wb") as errors:
-        child = subprocess.Popen([sys.executable, "-m", f"{__package__}.sfm_worker", str(work / "job.json")], stderr=errors,
-                                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=_environment(),
-                                 start_new_session=True)
+        child = subprocess.Popen(
+            [sys.executable, "-m", f"{__package__}.sfm_worker", str(work / "job.json")],
+            stderr=errors,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=_environment(),
+            start_new_session=True,
+        )
     try:
         last = _watch(child, database, tell)
     finally:
@@ -70,12 +79,16 @@ def run_sfm(work: Path, job: dict[str, Any], tell: Tell, source: str) -> dict[st
             if stream is not None:
                 stream.close()
     if "models" not in last:
-        raise InputError(f"{source}: structure from motion failed ({_reason(last, child.returncode, log)}); try other "
-                         "photos, or a smaller --max-size")
+        raise InputError(
+            f"{source}: structure from motion failed ({_reason(last, child.returncode, log)}); try other "
+            "photos, or a smaller --max-size"
+        )
     models: dict[str, int] = last["models"]
     if not models:
-        raise InputError(f"{source}: no two photos fit together, so none has a pose; take photos that overlap by more "
-                         "than half, sharp, of things at rest and with texture")
+        raise InputError(
+            f"{source}: no two photos fit together, so none has a pose; take photos that overlap by more "
+            "than half, sharp, of things at rest and with texture"
+        )
     return models
 
 

@@ -27,9 +27,14 @@ ENOUGH = 0.8  # of the photos registered; below, they are matched once more
 _FAR_OFF, _NARROW = 4.0, 1.5  # reprojection error [px] and angle [degrees] of points to leave out, as COLMAP's mapper
 _PEAK = 0.003  # SIFT's contrast threshold; COLMAP's 0.0067 finds too little in small or soft photos
 # Lens models of many parameters run astray on the first photos: these are placed with one, and the others come last.
-_FIRST_MODEL = {"RADIAL": "SIMPLE_RADIAL", "OPENCV": "SIMPLE_RADIAL", "FULL_OPENCV": "SIMPLE_RADIAL",
-                "RADIAL_FISHEYE": "SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE": "SIMPLE_RADIAL_FISHEYE",
-                "THIN_PRISM_FISHEYE": "SIMPLE_RADIAL_FISHEYE"}
+_FIRST_MODEL = {
+    "RADIAL": "SIMPLE_RADIAL",
+    "OPENCV": "SIMPLE_RADIAL",
+    "FULL_OPENCV": "SIMPLE_RADIAL",
+    "RADIAL_FISHEYE": "SIMPLE_RADIAL_FISHEYE",
+    "OPENCV_FISHEYE": "SIMPLE_RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE": "SIMPLE_RADIAL_FISHEYE",
+}
 _FISHEYE_FOCAL = 0.6  # of the longest side, where EXIF does not say; COLMAP's 1.2 is no fisheye's
 # Of a photo. COLMAP takes 8192, for GPUs: matching a pair then takes 0.54 s of a CPU core instead of 0.19 s.
 _FEATURES = 4096
@@ -90,8 +95,9 @@ def _find_features(colmap: Any, job: dict[str, Any], photos: list[str]) -> None:
     options.sift.peak_threshold = _PEAK
     options.sift.max_num_features = _FEATURES
     options.sift.first_octave = -1 if job["doubled"] else 0
-    colmap.extract_features(job["database"], job["photos"], photos, colmap.CameraMode.AUTO, reader, options,
-                            colmap.Device.cpu)
+    colmap.extract_features(
+        job["database"], job["photos"], photos, colmap.CameraMode.AUTO, reader, options, colmap.Device.cpu
+    )
 
 
 def _trust_focal_lengths(colmap: Any, path: str) -> None:
@@ -134,8 +140,14 @@ def _map(colmap: Any, job: dict[str, Any], output: Path, photos: int) -> dict[st
         placed += 1
         _tell(done=placed)
 
-    models = colmap.incremental_mapping(job["database"], job["photos"], output, options,
-                                        initial_image_pair_callback=first_pair, next_image_callback=one_more)
+    models = colmap.incremental_mapping(
+        job["database"],
+        job["photos"],
+        output,
+        options,
+        initial_image_pair_callback=first_pair,
+        next_image_callback=one_more,
+    )
     return {str(output / str(index)): model.num_reg_images() for index, model in models.items()}
 
 

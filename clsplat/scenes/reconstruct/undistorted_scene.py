@@ -57,8 +57,14 @@ class SparseModel:
         rays = np.asarray(lens.cam_from_img(np.array([xy for xy, _ in seen]).reshape(-1, 2))).reshape(-1, 2)
         kept = np.isfinite(rays).all(axis=1)
         pixels = rays[kept] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        return ModelView(scene_name, (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy),
-                         camera.cam_from_world, pixels, np.array([row for _, row in seen], np.int64)[kept])
+        return ModelView(
+            scene_name,
+            (camera.width, camera.height),
+            (camera.fx, camera.fy, camera.cx, camera.cy),
+            camera.cam_from_world,
+            pixels,
+            np.array([row for _, row in seen], np.int64)[kept],
+        )
 
 
 def write_flat_photo(model: SparseModel, photo: Prepared, scene: Path) -> ModelView:
@@ -76,8 +82,10 @@ def write_flat_photo(model: SparseModel, photo: Prepared, scene: Path) -> ModelV
     mask = photo.mask()
     write_photo(scene / "images" / photo.source.name, flat)
     if mask is not None:
-        write_png(scene / MASK_FOLDER / f"{photo.source.name}.png",
-                  np.where(posed.fit_mask(mask, width, height), 255, 0).astype(np.uint8))
+        write_png(
+            scene / MASK_FOLDER / f"{photo.source.name}.png",
+            np.where(posed.fit_mask(mask, width, height), 255, 0).astype(np.uint8),
+        )
     return model.view(photo.staged, camera, photo.source.name)
 
 

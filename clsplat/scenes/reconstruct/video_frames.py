@@ -21,8 +21,9 @@ _RATE = ("-r", "25")
 _STEADY = "setpts=N/25/TB"
 
 
-def extract_frames(video: Path, folder: Path, frames: int = FRAMES,
-                   seen: Callable[[int], None] | None = None) -> list[PhotoFile]:
+def extract_frames(
+    video: Path, folder: Path, frames: int = FRAMES, seen: Callable[[int], None] | None = None
+) -> list[PhotoFile]:
     """Write the sharpest frame of each of `frames` equal stretches into `folder`, as JPEG.
 
     Sharpness is the variance of the Laplacian of the grey image.
@@ -50,8 +51,21 @@ def extract_frames(video: Path, folder: Path, frames: int = FRAMES,
     chosen = sharpest(sharpness, frames)
     folder.mkdir(parents=True, exist_ok=True)
     wanted = "+".join(f"eq(n\\,{index})" for index in chosen)
-    _run([*_ffmpeg(video), "-vf", f"select={wanted},{_STEADY}", "-q:v", "1", "-qmin", "1", "-start_number", "0",
-          str(folder / "%06d.jpg")], video)
+    _run(
+        [
+            *_ffmpeg(video),
+            "-vf",
+            f"select={wanted},{_STEADY}",
+            "-q:v",
+            "1",
+            "-qmin",
+            "1",
+            "-start_number",
+            "0",
+            str(folder / "%06d.jpg"),
+        ],
+        video,
+    )
     files = []
     for order, index in enumerate(chosen):
         written, file = folder / f"{order:06}.jpg", folder / f"frame_{index:05}.jpg"

@@ -107,16 +107,21 @@ def plan_adc(
         values[name] = arrays[name][source]
         values[name][len(stay) + len(clone) :] = halves
     fresh = np.arange(len(source)) >= len(stay)
-    return Plan(source, values, fresh, state_source=source, added=len(clone) + 2 * len(split),
-                removed=len(keep) - len(stay))
+    return Plan(
+        source, values, fresh, state_source=source, added=len(clone) + 2 * len(split), removed=len(keep) - len(stay)
+    )
 
 
 def with_reset(plan: Plan, arrays: Mapping[str, Array], shape: Shape) -> Plan:
     """The plan, then 3DGS's opacity reset: |opacity| at most RESET_OPACITY, and its optimizer state zero."""
     names = opacity_names(arrays)
     after = {name: plan.values.get(name, arrays[name][plan.source]) for name in names}
-    low = {name: raw_of_thickness(shape, np.minimum(thickness(shape, after[name]), -math.log1p(-RESET_OPACITY)),
-                                  after[name]) for name in names}
+    low = {
+        name: raw_of_thickness(
+            shape, np.minimum(thickness(shape, after[name]), -math.log1p(-RESET_OPACITY)), after[name]
+        )
+        for name in names
+    }
     return replace(plan, values=plan.values | low, reset_fields=plan.reset_fields + names)
 
 
@@ -130,8 +135,9 @@ def _score(signals: Array, grad_threshold: float, depth_threshold: float, extent
     return np.where(np.isfinite(score), score, 0.0)
 
 
-def _best(score: Reals, splits: NDArray[np.bool_], clones: NDArray[np.bool_], keep: NDArray[np.bool_],
-          cap: int) -> tuple[Rows, Rows]:
+def _best(
+    score: Reals, splits: NDArray[np.bool_], clones: NDArray[np.bool_], keep: NDArray[np.bool_], cap: int
+) -> tuple[Rows, Rows]:
     """Rows to split and rows to clone, rising, for which there is room."""
     rows = np.flatnonzero(splits | clones)
     rows = rows[np.argsort(-score[rows], kind="stable")]

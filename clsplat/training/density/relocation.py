@@ -85,8 +85,9 @@ def plan_relocation(
     if rule not in RULES:
         raise InputError(f"unknown relocation rule {rule!r}: choose one of {', '.join(RULES)}")
     if not 1 <= growth < math.inf or not 0 < min_opacity < 1 or not 0 <= limit <= 1:
-        raise InputError(f"growth {growth} must be at least 1, min_opacity {min_opacity} between 0 and 1, "
-                         f"limit {limit} 0 to 1")
+        raise InputError(
+            f"growth {growth} must be at least 1, min_opacity {min_opacity} between 0 and 1, limit {limit} 0 to 1"
+        )
     n = len(arrays["mean"])
     sound = finite_rows(arrays)
     if n and not sound.any():
@@ -101,16 +102,18 @@ def plan_relocation(
     weakest = np.argsort(strength[dead], kind="stable")[: int(limit * n)]
     moving = np.sort(np.concatenate([np.flatnonzero(~sound), dead[weakest]]))
 
-    drawn = donors[_draw(_weights(strength[donors], None if pull is None else pull[donors]),
-                         len(moving) + n_new - n, rng)]
+    drawn = donors[
+        _draw(_weights(strength[donors], None if pull is None else pull[donors]), len(moving) + n_new - n, rng)
+    ]
     source = np.arange(n_new, dtype=np.int64)
     source[moving] = drawn[: len(moving)]
     source[n:] = drawn[len(moving) :]
 
     copies = np.bincount(drawn, minlength=n)
     targets = np.flatnonzero(copies)
-    raw, factor = relocation(shape, {name: array[targets] for name, array in arrays.items()}, copies[targets] + 1,
-                             min_opacity)
+    raw, factor = relocation(
+        shape, {name: array[targets] for name, array in arrays.items()}, copies[targets] + 1, min_opacity
+    )
     values = {}
     for name in names:
         values[name] = arrays[name].copy()
@@ -156,8 +159,9 @@ def relocation(
     return raw, factor
 
 
-def _length_factor(shape: Shape, arrays: Mapping[str, Array], opacity: Reals, new_opacity: Reals,
-                   count: NDArray[np.integer]) -> Reals:
+def _length_factor(
+    shape: Shape, arrays: Mapping[str, Array], opacity: Reals, new_opacity: Reals, count: NDArray[np.integer]
+) -> Reals:
     """Integral of the one over integral of the stack; opacities are (N, S)."""
     z, weight = _nodes()
     profile = shape.profile(z, arrays)  # (N, S, K)

@@ -35,8 +35,9 @@ class Moment:
     extent: float
 
 
-def plan(config: TrainConfig, arrays: Mapping[str, Array], signals: Array, rng: np.random.Generator,
-         moment: Moment) -> Plan:
+def plan(
+    config: TrainConfig, arrays: Mapping[str, Array], signals: Array, rng: np.random.Generator, moment: Moment
+) -> Plan:
     """The plan of one action.
 
     Parameters
@@ -53,14 +54,28 @@ def plan(config: TrainConfig, arrays: Mapping[str, Array], signals: Array, rng: 
         # The profile has peak 1; without that the length factor would be another one for each view.
         scaled = config.normalisation == "peak" or not shape.normalised
         return plan_relocation(
-            arrays, shape, rng, config.cap_max, growth=moment.growth, limit=config.relocation_limit,
+            arrays,
+            shape,
+            rng,
+            config.cap_max,
+            growth=moment.growth,
+            limit=config.relocation_limit,
             rule=config.relocation if scaled else "opacity-only",
-            pull=signals[0] if config.sampling == "pull" else None)
+            pull=signals[0] if config.sampling == "pull" else None,
+        )
     every = reset_interval(config)
     grown = plan_adc(
-        arrays, shape, signals, rng, config.cap_max, extent=moment.extent, grad_threshold=config.grad_threshold,
-        depth_threshold=config.depth_threshold, dense_size=config.dense_size,
-        prune_large=0 < every < moment.iteration)
+        arrays,
+        shape,
+        signals,
+        rng,
+        config.cap_max,
+        extent=moment.extent,
+        grad_threshold=config.grad_threshold,
+        depth_threshold=config.depth_threshold,
+        dense_size=config.dense_size,
+        prune_large=0 < every < moment.iteration,
+    )
     return with_reset(grown, arrays, shape) if resets(config, moment) else grown
 
 

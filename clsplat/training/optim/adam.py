@@ -31,8 +31,9 @@ class NumpyAdam:
     first, second : name to first and second moments.
     """
 
-    def __init__(self, params: Mapping[str, Array], beta1: float = BETA1, beta2: float = BETA2,
-                 eps: float = EPS) -> None:
+    def __init__(
+        self, params: Mapping[str, Array], beta1: float = BETA1, beta2: float = BETA2, eps: float = EPS
+    ) -> None:
         self.beta1, self.beta2, self.eps = beta1, beta2, eps
         self.step_count = 0
         self.first = {name: np.zeros_like(param) for name, param in params.items()}
@@ -66,9 +67,7 @@ class NumpyAdam:
         ascent: Array = (m / correction1) / (np.sqrt(v) / correction2 + self.eps)
         return ascent
 
-    def step(
-        self, params: Mapping[str, Array], grads: Mapping[str, Array], lrs: Mapping[str, ArrayLike]
-    ) -> None:
+    def step(self, params: Mapping[str, Array], grads: Mapping[str, Array], lrs: Mapping[str, ArrayLike]) -> None:
         """Update every array of `params` in place.
 
         Parameters

@@ -83,8 +83,9 @@ class FusedOptimizer:
         self.waiting = Waiting(splats, kernels) if rules.config.visible_adam else None
         self._lazy_from = _NO_PART if self.waiting is None else 0 if rules.geometry_waits else _PARTS
 
-    def step(self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int,
-             depth_key: Any = None) -> None:
+    def step(
+        self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int, depth_key: Any = None
+    ) -> None:
         blocks, skew, sghmc = self.rules.blocks(iteration), self.skew, self.rules.sghmc
         if self.waiting is not None:
             self.waiting.wake(self._counts, blocks, depth_key)
@@ -96,12 +97,25 @@ class FusedOptimizer:
         of_skew = _corrections(self._counts[1])
         penalty = self.rules.penalty(self.splats.n)
         self.program.step_splats(
-            (self._columns, _PARTS + sh_coefficients(sh_degree)), (GROUP_ITEMS, 1), geom=self.splats.geom,
-            grad_geom=grads.geom, sh=self.splats.sh, grad_sh=grads.sh, **self._state_arguments(), sh_degree=sh_degree,
-            base_learns=int(blocks.base), means_learn=int(blocks.base and sghmc is None),
-            skew_learns=int(blocks.skew), mean_lr=mean_lr, **_corrections(self.steps),
-            skew_correct1=of_skew["correct1"], skew_correct2=of_skew["correct2"], opacity_scale=penalty.opacity,
-            scale_scale=penalty.scale, bisect_scale=penalty.bisect)
+            (self._columns, _PARTS + sh_coefficients(sh_degree)),
+            (GROUP_ITEMS, 1),
+            geom=self.splats.geom,
+            grad_geom=grads.geom,
+            sh=self.splats.sh,
+            grad_sh=grads.sh,
+            **self._state_arguments(),
+            sh_degree=sh_degree,
+            base_learns=int(blocks.base),
+            means_learn=int(blocks.base and sghmc is None),
+            skew_learns=int(blocks.skew),
+            mean_lr=mean_lr,
+            **_corrections(self.steps),
+            skew_correct1=of_skew["correct1"],
+            skew_correct2=of_skew["correct2"],
+            opacity_scale=penalty.opacity,
+            scale_scale=penalty.scale,
+            bisect_scale=penalty.bisect,
+        )
         if self.waiting is not None:
             self.waiting.drifts.advance(blocks, self._counts, mean_lr)
 
@@ -139,11 +153,13 @@ class FusedOptimizer:
         for group in Group:
             rows = splats.schema.rows(group)
             splats.buffers[group], self.spare[group] = self._gather(
-                splats.buffers[group], source, self.spare[group], n_new, rows)
+                splats.buffers[group], source, self.spare[group], n_new, rows
+            )
             for moments in (self.first, self.second):
                 if state_source is not None:
                     moments.buffers[group], self.spare[group] = self._gather(
-                        moments.buffers[group], state_source, self.spare[group], n_new, rows)
+                        moments.buffers[group], state_source, self.spare[group], n_new, rows
+                    )
                 self._zero(moments.buffers[group], fresh_buffer, n_new, rows)
         for rows_of_state in self._own_state():
             if state_source is not None:
@@ -161,8 +177,11 @@ class FusedOptimizer:
         for role, buffers in (("first", self.first), ("second", self.second)):
             state |= {f"{role}.{name}": array for name, array in buffers.download(n, self._base_names).items()}
         if self.skew is not None:
-            state |= {"skew_s": self.skew.s.get(n), "first.skew": self.skew.first.get(n),
-                      "second.skew": self.skew.second.get(n)}
+            state |= {
+                "skew_s": self.skew.s.get(n),
+                "first.skew": self.skew.first.get(n),
+                "second.skew": self.skew.second.get(n),
+            }
         if self.momentum is not None:
             state["momentum"] = self.momentum.get(n)
         return state if self.waiting is None else state | self.waiting.state()
@@ -195,28 +214,59 @@ class FusedOptimizer:
         """Arguments that step_splats and settle_splats share; what the shape or the options lack is not looked at."""
         skew, waiting = self.skew, self.waiting
         rows = [self.first.geom] * 3 if skew is None else [skew.s.buffer, skew.first.buffer, skew.second.buffer]
-        return {"geom_m": self.first.geom, "geom_v": self.second.geom, "sh_m": self.first.sh, "sh_v": self.second.sh,
-                "skew_s": rows[0], "skew_m": rows[1], "skew_v": rows[2], "rates": self._rates,
-                "ages": self._rates if waiting is None else waiting.ages,
-                "waits": self._rates if waiting is None else waiting.table, "lazy_from": self._lazy_from,
-                "capacity": self.splats.capacity, "sh_lr": self._sh_rates[0], "sh_rest_lr": self._sh_rates[-1],
-                "skew_lr": self.rules.rates.get("skew", 0.0)}
+        return {
+            "geom_m": self.first.geom,
+            "geom_v": self.second.geom,
+            "sh_m": self.first.sh,
+            "sh_v": self.second.sh,
+            "skew_s": rows[0],
+            "skew_m": rows[1],
+            "skew_v": rows[2],
+            "rates": self._rates,
+            "ages": self._rates if waiting is None else waiting.ages,
+            "waits": self._rates if waiting is None else waiting.table,
+            "lazy_from": self._lazy_from,
+            "capacity": self.splats.capacity,
+            "sh_lr": self._sh_rates[0],
+            "sh_rest_lr": self._sh_rates[-1],
+            "skew_lr": self.rules.rates.get("skew", 0.0),
+        }
 
     def _settle(self, splats: SplatBuffers, skew_s: Any, keeps_moments: bool) -> None:
         """The steps that woken splats sat out, on these values."""
         arguments = self._state_arguments() | ({} if skew_s is None else {"skew_s": skew_s})
         self.program.settle_splats(
-            (self._columns, _PARTS + sh_coefficients(splats.schema.sh_degree)), (GROUP_ITEMS, 1), geom=splats.geom,
-            sh=splats.sh, keeps_moments=int(keeps_moments), **arguments)
+            (self._columns, _PARTS + sh_coefficients(splats.schema.sh_degree)),
+            (GROUP_ITEMS, 1),
+            geom=splats.geom,
+            sh=splats.sh,
+            keeps_moments=int(keeps_moments),
+            **arguments,
+        )
 
     def _sghmc(self, sghmc: Sghmc, momentum: Rows, grads: CompactGradients, mean_lr: float, iteration: int) -> None:
         c, seed = self.rules.coefficients(sghmc, iteration, mean_lr), self.rules.config.seed
         self.program.sghmc_step.over(
-            self._columns, self._group, geom=self.splats.geom, grad_geom=grads.geom, adam_m=self.first.geom,
-            adam_v=self.second.geom, momentum=momentum.buffer, capacity=self.splats.capacity,
-            n_splats=self.splats.n, seed_lo=seed & 0xFFFFFFFF, seed_hi=seed >> 32, iteration=iteration,
-            stream=STREAM, length=c.length, drive=c.drive, keep=c.keep, noise=c.noise,
-            by_covariance=int(c.by_covariance), **_corrections(self.steps))
+            self._columns,
+            self._group,
+            geom=self.splats.geom,
+            grad_geom=grads.geom,
+            adam_m=self.first.geom,
+            adam_v=self.second.geom,
+            momentum=momentum.buffer,
+            capacity=self.splats.capacity,
+            n_splats=self.splats.n,
+            seed_lo=seed & 0xFFFFFFFF,
+            seed_hi=seed >> 32,
+            iteration=iteration,
+            stream=STREAM,
+            length=c.length,
+            drive=c.drive,
+            keep=c.keep,
+            noise=c.noise,
+            by_covariance=int(c.by_covariance),
+            **_corrections(self.steps),
+        )
 
     def _own_state(self) -> list[Rows]:
         """State that is not in `first` and `second`."""
@@ -254,16 +304,29 @@ class FusedOptimizer:
 
     def _gather(self, values: Any, source: Any, spare: Any, n: int, rows: int) -> tuple[Any, Any]:
         """The gathered buffer and the one that is spare now."""
-        self.program.gather_columns((-(-n // GROUP_ITEMS) * GROUP_ITEMS, rows), (GROUP_ITEMS, 1), values=values,
-                                    source=source, moved=spare, capacity=self.splats.capacity, n=n)
+        self.program.gather_columns(
+            (-(-n // GROUP_ITEMS) * GROUP_ITEMS, rows),
+            (GROUP_ITEMS, 1),
+            values=values,
+            source=source,
+            moved=spare,
+            capacity=self.splats.capacity,
+            n=n,
+        )
         return spare, values
 
     def _gather_rows(self, rows: Rows, source: Any, n: int) -> None:
         rows.buffer, rows.spare = self._gather(rows.buffer, source, rows.spare, n, rows.width)
 
     def _zero(self, values: Any, fresh: Any, n: int, rows: int) -> None:
-        self.program.zero_columns((-(-n // GROUP_ITEMS) * GROUP_ITEMS, rows), (GROUP_ITEMS, 1), values=values,
-                                  fresh=fresh, capacity=self.splats.capacity, n=n)
+        self.program.zero_columns(
+            (-(-n // GROUP_ITEMS) * GROUP_ITEMS, rows),
+            (GROUP_ITEMS, 1),
+            values=values,
+            fresh=fresh,
+            capacity=self.splats.capacity,
+            n=n,
+        )
 
 
 def _corrections(steps: int) -> dict[str, float]:
@@ -274,6 +337,9 @@ def _corrections(steps: int) -> dict[str, float]:
 def _rate_table(schema: Schema, rules: Rules, dtype: np.dtype[np.floating]) -> Array:
     """Per row of geom (3, G): its rate, and its bounds, 0 and 0 without."""
     fields = schema.group(Group.GEOM)
-    columns = [(rules.rates.get(field.name, 0.0), *(field.bounds or (0.0, 0.0))) for field in fields
-               for _ in range(field.width)]
+    columns = [
+        (rules.rates.get(field.name, 0.0), *(field.bounds or (0.0, 0.0)))
+        for field in fields
+        for _ in range(field.width)
+    ]
     return np.array(columns, dtype).T.copy()

@@ -101,8 +101,16 @@ def covariance_times(quat: Array, log_scale: Array, vector: Array) -> NDArray[np
     return product
 
 
-def add_noise(mean: Array, quat: Array, log_scale: Array, strength: Array, seed: int, iteration: int,
-              amount: float, reach: float = math.inf) -> Array:
+def add_noise(
+    mean: Array,
+    quat: Array,
+    log_scale: Array,
+    strength: Array,
+    seed: int,
+    iteration: int,
+    amount: float,
+    reach: float = math.inf,
+) -> Array:
     """Means after the noise step: mean + Sigma (xi gate amount), but by `reach` at most.
 
     Parameters

@@ -24,8 +24,9 @@ class Optimizer(Protocol):
     (skew_map.py), all else by Adam. A block that does not learn (blocks.py) keeps values, moments and step count.
     """
 
-    def step(self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int,
-             depth_key: Any = None) -> None:
+    def step(
+        self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int, depth_key: Any = None
+    ) -> None:
         """One step on all splats, or with `visible_adam` on those seen (optim_lazy.py); regularisers included.
 
         Parameters
@@ -53,8 +54,9 @@ class Optimizer(Protocol):
         """Go on from `state`; raises InputError when an entry is missing or unknown."""
 
 
-def make_optimizer(device: Device, kernels: KernelBuild, splats: SplatBuffers, config: TrainConfig,
-                   extent: float) -> Optimizer:
+def make_optimizer(
+    device: Device, kernels: KernelBuild, splats: SplatBuffers, config: TrainConfig, extent: float
+) -> Optimizer:
     """The optimizer that the config names; `extent` of the scene [world units]."""
     rules = Rules(config, extent)
     if config.optimizer == "fused":

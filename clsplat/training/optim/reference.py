@@ -44,8 +44,9 @@ class HostOptimizer:
         self.drifts = Drifts()
         self._none_waits()
 
-    def step(self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int,
-             depth_key: Any = None) -> None:
+    def step(
+        self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int, depth_key: Any = None
+    ) -> None:
         blocks, skew_map, n = self.rules.blocks(iteration), self.rules.map, self.splats.n
         params, gradients = self.splats.download(n), grads.written_out(n)
         geometry: Rows = slice(None)  # the splats that step
@@ -168,19 +169,35 @@ class HostOptimizer:
         params["skew"][changed] = skew_map.forward(skew_s[changed], params["quat"][changed])
         return skew_s
 
-    def _drift(self, adam: NumpyAdam, name: str, rows: Rows, waited: NDArray[np.int64], table: Array, kind: int,
-               rate: Array, keeps_moments: bool) -> Array:
+    def _drift(
+        self,
+        adam: NumpyAdam,
+        name: str,
+        rows: Rows,
+        waited: NDArray[np.int64],
+        table: Array,
+        kind: int,
+        rate: Array,
+        keeps_moments: bool,
+    ) -> Array:
         """How far a field's values fall; the moments shrink unless kept."""
         first, second = adam.first[name][rows], adam.second[name][rows]
-        decay1, decay2, drift = (
-            table[row][waited].reshape(-1, *[1] * (first.ndim - 1)) for row in (0, 1, 2 + kind))
+        decay1, decay2, drift = (table[row][waited].reshape(-1, *[1] * (first.ndim - 1)) for row in (0, 1, 2 + kind))
         moved: Array = rate * drift * ascent(first, second)
         if not keeps_moments:
             adam.first[name][rows], adam.second[name][rows] = first * decay1, second * decay2
         return moved
 
-    def _step_field(self, field: Field, params: dict[str, Array], grad: Array, rows: Rows, mean_lr: float,
-                    sh_degree: int, iteration: int) -> None:
+    def _step_field(
+        self,
+        field: Field,
+        params: dict[str, Array],
+        grad: Array,
+        rows: Rows,
+        mean_lr: float,
+        sh_degree: int,
+        iteration: int,
+    ) -> None:
         """One step of a field of the base block; `mean` comes first, so that SGHMC sees the old covariance."""
         name, value, grad = field.name, params[field.name][rows], grad[rows]
         if field.bounds is not None:  # on the logarithm
@@ -204,6 +221,13 @@ class HostOptimizer:
         assert self.rules.sghmc is not None
         xi = normal3(self.rules.config.seed, iteration, len(grad), STREAM)
         mean, self.momentum = sghmc_step(
-            params["mean"], self.momentum, self.base.direction("mean", grad), xi, params["quat"], params["log_scale"],
-            self.rules.shape.strength(params), self.rules.coefficients(self.rules.sghmc, iteration, mean_lr))
+            params["mean"],
+            self.momentum,
+            self.base.direction("mean", grad),
+            xi,
+            params["quat"],
+            params["log_scale"],
+            self.rules.shape.strength(params),
+            self.rules.coefficients(self.rules.sghmc, iteration, mean_lr),
+        )
         return mean

@@ -38,9 +38,16 @@ class Rules:
     def rates(self) -> dict[str, float]:
         """Adam's rate per field; the mean's changes with the iteration and is given at each step."""
         config = self.config
-        rates = {"quat": config.rotation_lr, "log_scale": config.scaling_lr, "opacity_logit": config.opacity_lr,
-                 "opacity_minus_logit": config.opacity_lr, "sh": config.feature_lr,
-                 "normal": config.normal_lr, "beta": config.beta_lr, "nu": config.nu_lr}
+        rates = {
+            "quat": config.rotation_lr,
+            "log_scale": config.scaling_lr,
+            "opacity_logit": config.opacity_lr,
+            "opacity_minus_logit": config.opacity_lr,
+            "sh": config.feature_lr,
+            "normal": config.normal_lr,
+            "beta": config.beta_lr,
+            "nu": config.nu_lr,
+        }
         for field in self.shape.fields:
             if field.name == "skew":
                 rates["skew"] = field.lr if config.skew_lr is None else config.skew_lr
@@ -73,8 +80,13 @@ class Rules:
         config = self.config
         if config.position_optimizer == "adam":
             return None
-        return Sghmc(config.position_optimizer == "sghmc-sss", self.extent, config.sghmc_friction,
-                     config.sghmc_burn_in_friction, int(config.sghmc_burn_in * config.iterations))
+        return Sghmc(
+            config.position_optimizer == "sghmc-sss",
+            self.extent,
+            config.sghmc_friction,
+            config.sghmc_burn_in_friction,
+            int(config.sghmc_burn_in * config.iterations),
+        )
 
     def coefficients(self, sghmc: Sghmc, iteration: int, mean_lr: float) -> Coefficients:
         """Of SGHMC's step, from the rate that Adam would take."""

@@ -81,8 +81,16 @@ class Sghmc:
         return Coefficients(length, length * factor, keep, noise * math.sqrt(2.0 * unit * friction), burning)
 
 
-def step(mean: Array, momentum: Array, direction: Array, xi: Array, quat: Array, log_scale: Array, strength: Array,
-         c: Coefficients) -> tuple[Array, Array]:
+def step(
+    mean: Array,
+    momentum: Array,
+    direction: Array,
+    xi: Array,
+    quat: Array,
+    log_scale: Array,
+    strength: Array,
+    c: Coefficients,
+) -> tuple[Array, Array]:
     """Means and momenta after one step.
 
     Parameters

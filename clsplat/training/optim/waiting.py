@@ -46,10 +46,20 @@ class Waiting:
         everyone, blocks = blocks is None, blocks or Blocks(False, False)
         self._sent = send_to_device(self.device, self.table, self._table())  # kept: letting go waits
         self.program.wake_vectors(
-            (-(-self._capacity // GROUP_ITEMS) * GROUP_ITEMS,), (GROUP_ITEMS,), last=self._last, ages=self.ages,
-            depth_key=self._last if everyone else depth_key, vectors=self._capacity, n_splats=self.splats.n,
-            base_steps=steps[0], skew_steps=steps[1], base_learns=int(blocks.base), skew_learns=int(blocks.skew),
-            all=int(everyone), peeks=int(peeks))
+            (-(-self._capacity // GROUP_ITEMS) * GROUP_ITEMS,),
+            (GROUP_ITEMS,),
+            last=self._last,
+            ages=self.ages,
+            depth_key=self._last if everyone else depth_key,
+            vectors=self._capacity,
+            n_splats=self.splats.n,
+            base_steps=steps[0],
+            skew_steps=steps[1],
+            base_learns=int(blocks.base),
+            skew_learns=int(blocks.skew),
+            all=int(everyone),
+            peeks=int(peeks),
+        )
 
     def none_waits(self, steps: Steps) -> None:
         """All vectors are up to date, whatever splats they now hold."""
