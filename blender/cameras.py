@@ -166,9 +166,9 @@ class ExportCameras(bpy.types.Operator, ExportHelper):  # type: ignore[misc]
 
     filename_ext = ".json"
     filter_glob: _FILTER  # type: ignore[valid-type]
-    content: bpy.props.EnumProperty(
+    content: bpy.props.EnumProperty(  # type: ignore[valid-type]
         name="Content",
-        items=[  # type: ignore[valid-type]
+        items=[
             ("PATH", "Animation (camera_path.json)", "The scene's camera, frame by frame, as nerfstudio has it"),
             ("CAMERAS", "Cameras (cameras.json)", "The selected cameras, or all, at this frame, as 3DGS has them"),
         ],

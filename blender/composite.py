@@ -116,9 +116,9 @@ class Composite(bpy.types.Operator):  # type: ignore[misc]
     bl_label = "Composite With Meshes"
     bl_options = {"REGISTER", "UNDO"}
 
-    engine: bpy.props.EnumProperty(
+    engine: bpy.props.EnumProperty(  # type: ignore[valid-type]
         name="Engine",
-        items=[  # type: ignore[valid-type]
+        items=[
             ("CYCLES", "Cycles", "Path tracing"),
             ("BLENDER_EEVEE", "EEVEE", "Needs a graphics card"),
             ("BLENDER_WORKBENCH", "Workbench", "Needs a graphics card"),

@@ -39,7 +39,7 @@ class Points:
 
 
 @dataclass(frozen=True, eq=False)
-class SparseModel:
+class SparseReconstruction:
     """A sparse model: registered photos sorted by name, and points."""
 
     photos: list[Photo]
@@ -71,7 +71,7 @@ def find_model(scene: Path) -> Path:
     return max(models, key=registered_images)  # the first of equals
 
 
-def read_model(folder: Path) -> SparseModel:
+def read_model(folder: Path) -> SparseReconstruction:
     """Read a binary or text model; missing points give an empty cloud.
 
     Raises
@@ -100,7 +100,7 @@ def read_model(folder: Path) -> SparseModel:
         raise InputError(
             f"{folder}: {bad} points have a position that is not finite; the points3D file is damaged: rebuild it"
         )
-    return SparseModel(photos, points)
+    return SparseReconstruction(photos, points)
 
 
 def _suffix(folder: Path) -> str:

@@ -216,7 +216,7 @@ def test_links_lead_somewhere() -> None:
 def source_texts() -> list[str]:
     """Text constants of the source, with a NUL where a value is filled in."""
     found = []
-    for path in [file for folder in ("clsplat", "cli", "blender") for file in (ROOT / folder).glob("*.py")]:
+    for path in [file for folder in ("clsplat", "cli", "blender") for file in (ROOT / folder).rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.JoinedStr):
                 found.append(
