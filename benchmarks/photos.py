@@ -21,6 +21,8 @@ from typing import Any
 
 import common
 
+from clsplat.splats.color import BLACK
+
 KEY = ("scene", "shape", "options", "seed", "iterations", "cap", "platform", "schedule", "commit")
 SHOWN = (1, 2, 4)  # parts of the size
 WHITE = {"lego"}
@@ -74,7 +76,7 @@ def run(place: str, shape: str, options: str, seed: int, args: argparse.Namespac
     if any(all(row[k] == value for k, value in key.items()) for row in common.read(args.out)):
         return
     white = name in WHITE
-    background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
+    background = (1.0, 1.0, 1.0) if white else BLACK
     scene = load_scene(common.data_folder() / name, resolution=int(reduction), background=background)
     (system,) = parse_systems(f"{shape}:{options}" if options else shape)
     trainer = Trainer(

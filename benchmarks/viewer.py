@@ -29,6 +29,8 @@ from typing import Any
 import common
 import numpy as np
 
+from clsplat.splats.color import BLACK
+
 sys.path.insert(0, str(common.ROOT / "tests"))
 
 KEYS, FRAMES = 4, 4000  # training cameras on the path, poses between them
@@ -117,9 +119,7 @@ def serve(model: Path, device: str | None) -> None:
 
     places = np.array([camera.position for camera in path_of(model)])
     loaded = load_model(model)
-    viewing = Viewing(
-        loaded, None, known_cameras(loaded, None, None, None), (0.0, 0.0, 0.0), "127.0.0.1", 0, None, device
-    )
+    viewing = Viewing(loaded, None, known_cameras(loaded, None, None, None), BLACK, "127.0.0.1", 0, None, device)
     make = viewing.source.picture
 
     def stamped(camera: Any, settings: Any) -> Any:

@@ -9,6 +9,7 @@ import click
 
 from clsplat.comparison.methods import DEFAULT, parse_systems
 from clsplat.errors import InputError
+from clsplat.splats.color import BLACK
 from clsplat.training.presets import PRESETS
 
 from .options import (
@@ -103,7 +104,7 @@ def options_and_scenes(
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two scenes are called {name}: rename one of the folders")
-    background = common.get("background", (0.0, 0.0, 0.0))
+    background = common.get("background", BLACK)
     return common, (read_scene(path, reading, background)[0] for path in paths)
 
 

@@ -14,13 +14,13 @@ import click
 from clsplat.errors import InputError, OutputError
 from clsplat.evaluation.metrics import DEFAULT_PROTOCOL, PROTOCOLS, Protocol, protocol_named
 from clsplat.files.json_file import read_object, write_json
+from clsplat.splats.color import Color
 from clsplat.splats.stats import complexity
 
 from .eval_pages import Measurement, ViewRecorder, write_model_page
 from .models import LoadedModel, load_model, scene_of
 from .options import (
     PATH,
-    RGB,
     background_of,
     background_options,
     device_option,
@@ -85,7 +85,7 @@ def evaluate_models(
     report: Path | None,
     no_report: bool,
     save_renders: Path | None,
-    background: RGB | None,
+    background: Color | None,
     white_background: bool,
     iteration: int | None,
     device: str | None,
@@ -151,7 +151,7 @@ def measure_model(
     renderer: Renderer,
     protocol: Protocol = DEFAULT_PROTOCOL,
     view_set: str = "test",
-    background: RGB | None = None,
+    background: Color | None = None,
     renders: Path | None = None,
     recorder: ViewRecorder | None = None,
     quiet: bool = False,

@@ -12,13 +12,12 @@ from clsplat.cameras.cameras_json import NamedCamera, bare_name, read_cameras
 from clsplat.errors import InputError
 from clsplat.files.json_file import real_of
 from clsplat.scenes.options import ALPHA_USES
+from clsplat.splats.color import BLACK, Color
 from clsplat.splats.splats import Splats
 from clsplat.training.folder import ModelFolder
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
-
-    from .options import RGB
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class LoadedModel:
     splats: Splats
     folder: ModelFolder | None = None
     iteration: int | None = None
-    background: RGB = (0.0, 0.0, 0.0)
+    background: Color = BLACK
     scene: dict[str, Any] | None = None
 
     @property
@@ -63,7 +62,7 @@ def load_model(path: Path, iteration: int | None = None) -> LoadedModel:
         raise InputError(f"{path}: no such model folder or PLY file")
     folder = ModelFolder(path)
     ply, found = folder.latest_ply(iteration)
-    background: RGB = (0.0, 0.0, 0.0)
+    background: Color = BLACK
     scene: dict[str, Any] = {}
     if folder.config_path.is_file():
         background, scene = _recorded(folder)
@@ -141,7 +140,7 @@ def one_model(model: Path | None, model_path: Path | None) -> Path:
     return given
 
 
-def _recorded(folder: ModelFolder) -> tuple[RGB, dict[str, Any]]:
+def _recorded(folder: ModelFolder) -> tuple[Color, dict[str, Any]]:
     """Background and scene of a config.json; checked, because people edit it."""
     stored = folder.read_config()
     config, scene = stored.get("config", {}), stored.get("scene", {})

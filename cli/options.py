@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import click
 
 from clsplat.scenes.options import ALPHA_USES
+from clsplat.splats.color import Color
 from clsplat.splats.shapes import NORMALISATIONS, SHAPES
 from clsplat.training.config import (
     ALTERNATIONS,
@@ -25,7 +26,6 @@ from clsplat.training.config import (
 from clsplat.training.optim.skew_map import SKEW_MAPS
 
 F = TypeVar("F", bound=Callable[..., Any])
-RGB = tuple[float, float, float]
 
 PATH = click.Path(path_type=Path)
 SETS = ("test", "train", "all")
@@ -47,12 +47,12 @@ _METAVARS = {"init": "sfm|random|FILE.ply"}
 _OWN = ("background", "device", "save_iterations", "test_iterations")
 
 
-class Color(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
+class ColorType(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
     """R,G,B, each 0 to 1."""
 
     name = "R,G,B"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> RGB:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Color:
         if isinstance(value, tuple):
             return value
         try:
@@ -132,12 +132,12 @@ set_option = click.option(
 def background_options(function: F) -> F:
     """`--background R,G,B` and `-w`; read them with `background_of`."""
     function = click.option(
-        "--background", type=Color(), metavar="R,G,B", help="Colour behind the splats, each 0 to 1."
+        "--background", type=ColorType(), metavar="R,G,B", help="Colour behind the splats, each 0 to 1."
     )(function)
     return click.option("-w", "--white-background", is_flag=True, help="The same as --background 1,1,1.")(function)
 
 
-def background_of(background: RGB | None, white: bool) -> RGB | None:
+def background_of(background: Color | None, white: bool) -> Color | None:
     """The background asked for, if any."""
     if background is not None and white:
         raise click.UsageError("give --background or --white-background, not both")

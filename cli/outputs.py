@@ -13,11 +13,11 @@ import numpy as np
 from clsplat.cameras.cameras_json import bare_name
 from clsplat.errors import InputError
 from clsplat.files.atomic import atomic_writer
+from clsplat.splats.color import BLACK, Color
 
 if TYPE_CHECKING:
     from clsplat.rendering.renderer import Rendered
 
-    from .options import RGB
 
 _FULL_SCALE = 65535
 
@@ -78,7 +78,7 @@ class ImageWriter:
         format: str,
         extras: Sequence[str] = (),
         near_far: tuple[float, float] | None = None,
-        background: RGB = (0.0, 0.0, 0.0),
+        background: Color = BLACK,
     ) -> None:
         self.folder, self.format, self.extras = folder, format, extras
         self.near_far, self.background = near_far, background
@@ -126,7 +126,7 @@ class VideoFiles:
         fps: float,
         extras: Sequence[str] = (),
         near_far: tuple[float, float] | None = None,
-        background: RGB = (0.0, 0.0, 0.0),
+        background: Color = BLACK,
     ) -> None:
         from clsplat.files.video import VideoWriter
 

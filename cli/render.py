@@ -16,11 +16,11 @@ from clsplat.cameras.cameras_json import NamedCamera, named_cameras, read_camera
 from clsplat.cameras.interpolate import resized_by_height
 from clsplat.cameras.path import DEFAULT_FPS, write_path
 from clsplat.errors import InputError
+from clsplat.splats.color import Color
 
 from .models import LoadedModel, both_forms, load_model, one_model, recorded_cameras, scene_of
 from .options import (
     PATH,
-    RGB,
     background_of,
     background_options,
     device_option,
@@ -94,7 +94,7 @@ def render(
     depth: bool,
     depth_colours: bool,
     depth_range: tuple[float, float] | None,
-    background: RGB | None,
+    background: Color | None,
     white_background: bool,
     iteration: int | None,
     device: str | None,
@@ -162,7 +162,7 @@ def render_views(
     model: LoadedModel,
     views: Sequence[NamedCamera],
     output: Path | None,
-    background: RGB,
+    background: Color,
     device: str | None = None,
     format: str = "png",
     extras: Sequence[str] = (),

@@ -10,6 +10,7 @@ import click
 
 from clsplat.errors import InputError, OutputError
 from clsplat.files.json_file import read_object
+from clsplat.splats.color import Color
 from clsplat.training.config import TrainConfig
 from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
@@ -154,9 +155,7 @@ def train(
         report(model, test_metrics(model, loaded))
 
 
-def read_scene(
-    path: Path, reading: dict[str, Any], background: tuple[float, float, float]
-) -> tuple[Scene, dict[str, Any]]:
+def read_scene(path: Path, reading: dict[str, Any], background: Color) -> tuple[Scene, dict[str, Any]]:
     """The scene, and what config.json shall say of how it was read.
 
     reading : any of SCENE_KEYS; the others take load_scene's defaults, without test views.

@@ -12,12 +12,12 @@ import click
 
 from clsplat.cameras.cameras_json import named_cameras
 from clsplat.errors import ClsplatError, InputError
+from clsplat.splats.color import Color
 from clsplat.training.folder import ModelFolder
 
 from .models import LoadedModel, both_forms, load_model, one_model, recorded_cameras, scene_of
 from .options import (
     PATH,
-    RGB,
     background_of,
     background_options,
     device_option,
@@ -86,7 +86,7 @@ def view(
     port: int,
     host: str,
     folder: Path | None,
-    background: RGB | None,
+    background: Color | None,
     white_background: bool,
     iteration: int | None,
     device: str | None,
@@ -138,7 +138,7 @@ class Viewing:
         model: LoadedModel,
         iteration: int | None,
         known: Known,
-        background: RGB,
+        background: Color,
         host: str,
         port: int,
         folder: Path | None,

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
+from ..splats.color import BLACK, Color
 from ..splats.fields import Array, Field, sh_coefficients, sh_degree_of
 from ..splats.harmonics import sh_basis
 from ..splats.optical_depth import opacity_names
@@ -57,7 +58,7 @@ def measure(
     renderer: Renderer,
     splats: Splats,
     views: Sequence[View],
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Color = BLACK,
     seed: int = 0,
     parts: bool = True,
 ) -> Needs:

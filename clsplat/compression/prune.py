@@ -20,6 +20,7 @@ from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
+from ..splats.color import BLACK, Color
 from ..splats.fields import Array, sh_coefficients
 from ..splats.ply_compact import bands_in_use, in_use, layout_bytes, plan_layout
 from ..splats.splats import Splats
@@ -66,9 +67,7 @@ class Pruned:
 class Judge:
     """PSNR of models on some views, the mean over them [dB]."""
 
-    def __init__(
-        self, renderer: Renderer, views: Sequence[View], background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ) -> None:
+    def __init__(self, renderer: Renderer, views: Sequence[View], background: Color = BLACK) -> None:
         self.renderer, self.views, self.background = renderer, views, background
 
     def __call__(self, splats: Splats) -> float:
@@ -152,7 +151,7 @@ def apply_thresholds(
     views: Sequence[View],
     renderer: Renderer,
     thresholds: Thresholds,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Color = BLACK,
     seed: int = 0,
 ) -> Splats:
     """The model without the fields and bands that thresholds found on another one of its scene leave out."""
@@ -170,7 +169,7 @@ def within_bytes(
     views: Sequence[View],
     renderer: Renderer,
     limit: int,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Color = BLACK,
     seed: int = 0,
 ) -> Splats | None:
     """The model with as many of its fields and bands as a compact file of at most `limit` bytes holds.

@@ -16,6 +16,7 @@ from typing import Any
 from ..device.device import Device
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene, View
+from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from ..training.config import TrainConfig
 from ..training.log import Progress
@@ -40,7 +41,7 @@ def without_quarter(
     splats: Splats,
     views: Sequence[View],
     renderer: Renderer,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Color = BLACK,
     seed: int = 0,
     count: int | None = None,
 ) -> Splats:

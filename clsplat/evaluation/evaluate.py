@@ -12,6 +12,7 @@ import numpy as np
 
 from ..rendering.renderer import Rendered, Renderer
 from ..scenes.scene import View
+from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from .metrics import DEFAULT_PROTOCOL, Protocol
 
@@ -32,7 +33,7 @@ def evaluate(
     renderer: Renderer,
     splats: Splats,
     views: Sequence[View],
-    background: Sequence[float] = (0, 0, 0),
+    background: Color = BLACK,
     protocol: Protocol = DEFAULT_PROTOCOL,
     on_view: Callable[[View, Rendered], None] | None = None,
 ) -> Evaluation:

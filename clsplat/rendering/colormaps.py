@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..cameras.camera import Camera
 from ..errors import InputError
+from ..splats.color import BLACK
 from ..splats.fields import Array
 from ..splats.shapes import SKEW_LIMIT, shape_named
 from ..splats.splats import SH_C0, Splats
@@ -22,7 +23,6 @@ Picture = NDArray[np.uint8]
 MODES = ("colour", "depth", "alpha", "splats", "skew")
 FULL_COUNT = 255  # splats a pixel at the bright end; the scale is logarithmic, as counts spread over decades
 
-_BLACK = (0.0, 0.0, 0.0)
 # Violet over blue, teal and green to yellow: lightness L* rises evenly from 12 to 92 (CIELAB), at hues that fall evenly
 # in OKLab and as much chroma as sRGB has there.
 _CONTROL = np.array(
@@ -51,7 +51,7 @@ def picture(
     splats: Splats,
     camera: Camera,
     mode: str = "colour",
-    background: ArrayLike = _BLACK,
+    background: ArrayLike = BLACK,
     near_far: tuple[float, float] | None = None,
     sh_degree: int | None = None,
 ) -> Picture:
@@ -70,14 +70,14 @@ def picture(
     """
     if mode not in MODES:
         raise InputError(f"picture {mode!r}: choose one of {', '.join(MODES)}")
-    image = renderer.render(splats, camera, _BLACK if mode == "skew" else background, sh_degree)
+    image = renderer.render(splats, camera, BLACK if mode == "skew" else background, sh_degree)
     return picture_of(image, mode, background, near_far, renderer.count_splats() if mode == "splats" else None)
 
 
 def picture_of(
     image: Rendered,
     mode: str = "colour",
-    background: ArrayLike = _BLACK,
+    background: ArrayLike = BLACK,
     near_far: tuple[float, float] | None = None,
     counts: Array | None = None,
 ) -> Picture:
@@ -155,7 +155,7 @@ def depth_range(image: Rendered) -> tuple[float, float]:
 
 
 def depth_picture(
-    image: Rendered, near_far: tuple[float, float] | None = None, background: ArrayLike = _BLACK
+    image: Rendered, near_far: tuple[float, float] | None = None, background: ArrayLike = BLACK
 ) -> Picture:
     """Mean depth by the colour map, near bright and far dark; the background shows where the splats let it.
 

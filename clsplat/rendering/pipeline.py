@@ -19,6 +19,7 @@ from ..cameras.camera import Camera
 from ..device.device import TILES, Device
 from ..device.memory import Pool, fill_zero, send_to_device, to_device, to_host
 from ..device.program import lane_group
+from ..splats.color import BLACK, Color
 from .binning import MAX_ISECTS, Band, cut, make_binner
 from .build import MARGIN_X, MARGIN_Y, NEAR, KernelBuild
 from .splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers
@@ -135,7 +136,7 @@ class Pipeline:
         self,
         splats: SplatBuffers,
         camera: Camera,
-        background: tuple[float, float, float] = (0, 0, 0),
+        background: Color = BLACK,
         sh_degree: int | None = None,
     ) -> Frame:
         """Render into the pool's "color", "transmittance" and (with depth) "depth" buffers.
@@ -310,9 +311,7 @@ class Pipeline:
             self.pool.zeroed("tile_ranges", 8 * n_tiles)
         self._lists = self.binner.list_isects(band) if frame.splats.n else self.pool.get("isect_splat", 0)
 
-    def _rasterize(
-        self, layout: ImageLayout, band: Band, prefix: str, background: tuple[float, float, float] = (0, 0, 0)
-    ) -> Any:
+    def _rasterize(self, layout: ImageLayout, band: Band, prefix: str, background: Color = BLACK) -> Any:
         """Images into the buffers of these names after `prefix`; returns the event."""
         pool, group = self.pool, self.kernels.schedule.group
         r, g, b = background

@@ -12,6 +12,7 @@ from ..device.device import Device, Schedule, open_device
 from ..device.memory import to_device
 from ..device.program import Real
 from ..errors import DeviceError, InputError
+from ..splats.color import BLACK
 from ..splats.fields import Array
 from ..splats.splats import Splats
 from .arithmetic import DEFAULT_ARITHMETIC, Arithmetic
@@ -84,7 +85,7 @@ class Renderer:
         self._last: tuple[Pipeline, Frame] | None = None
 
     def render(
-        self, splats: Splats, camera: Camera, background: ArrayLike = (0.0, 0.0, 0.0), sh_degree: int | None = None
+        self, splats: Splats, camera: Camera, background: ArrayLike = BLACK, sh_degree: int | None = None
     ) -> Rendered:
         """Image of the splats (semantics: those of gsplat, see ARCHITECTURE.md).
 

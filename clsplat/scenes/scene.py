@@ -15,6 +15,7 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..files.images import ImageU8, read_image, resize_area
 from ..files.masks import FOLDER, NO_MASKS, Mask, mask_files, nearest, read_mask
+from ..splats.color import BLACK, Color
 from .colmap import Points
 from .nerfstudio import find_transforms, posed_by_transforms
 from .options import ALPHA_USES
@@ -78,7 +79,7 @@ class Scene:
     views: list[View]
     points: Points
     test_names: frozenset[str] = frozenset()
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Color = BLACK
 
     @property
     def cameras(self) -> list[Camera]:
@@ -123,7 +124,7 @@ def load_scene(
     test_every: int = 8,
     test_list: str | os.PathLike[str] | None = None,
     eval: bool = True,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Color = BLACK,
     masks: str | None = None,
     alpha: str = ALPHA_USES[0],
 ) -> Scene:
@@ -253,7 +254,7 @@ def _view(
     photo: Photo,
     file: Path,
     resolution: int,
-    background: tuple[float, float, float],
+    background: Color,
     mask_file: Path | None,
     alpha_hides: bool,
 ) -> View | str:
@@ -281,7 +282,7 @@ def _view(
     return replace(view, mask=None) if view.mask.all() else view
 
 
-def _opaque(image: ImageU8, background: tuple[float, float, float]) -> ImageU8:
+def _opaque(image: ImageU8, background: Color) -> ImageU8:
     """(H, W, 3 or 4) with straight alpha, composited over the background."""
     if image.shape[2] == 3:
         return image

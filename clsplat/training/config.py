@@ -10,6 +10,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from ..errors import InputError
 from ..files.json_file import kind, real_of
+from ..splats.color import BLACK, Color
 from ..splats.fields import MAX_SH_DEGREE
 from ..splats.shapes import DEFAULT_SHAPE, check_normalisation, shape_named
 from .optim.skew_map import check_map, map_named
@@ -140,7 +141,7 @@ class TrainConfig:
     sh_degree: int = 3
     sh_interval: int = 0
     lambda_dssim: float = 0.2
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Color = BLACK
     random_background: bool = False
     exposure: bool = False
     exposure_rate: float = 0.2

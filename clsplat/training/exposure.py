@@ -19,12 +19,11 @@ from ..device.memory import to_device, to_host
 from ..device.program import lane_group
 from ..errors import InputError
 from ..rendering.pipeline import ImageLayout
+from ..splats.color import Color
 from .config import TrainConfig
 from .loss import ImageLoss
 from .programs import EXPOSURE_GROUP, EXPOSURE_VECS, exposure_program
 from .targets import Truth, Truths
-
-RGB = tuple[float, float, float]
 
 _KEY = "exposure"  # of the state
 _SIZE = 12  # rows of three factors and an offset
@@ -40,7 +39,7 @@ class PhotoLoss:
     background : that transparent photos lie over.
     """
 
-    def __init__(self, loss: ImageLoss, truths: Truths, config: TrainConfig, background: RGB) -> None:
+    def __init__(self, loss: ImageLoss, truths: Truths, config: TrainConfig, background: Color) -> None:
         self.loss, self.truths, self.config, self.background = loss, truths, config, background
         self.device, self.pipeline, self.kernels = loss.device, loss.pipeline, loss.kernels
         self.learns = config.exposure
@@ -52,7 +51,7 @@ class PhotoLoss:
         self._exposures = self.device.alloc(self._rows.nbytes)
         to_device(self.device, self._exposures, self._rows)
 
-    def gradient(self, truth: Truth, background: RGB) -> Any:
+    def gradient(self, truth: Truth, background: Color) -> Any:
         """Gradient with respect to the pipeline's "color", rendered over `background`; the exposure makes its step."""
         planes = self.truths.planes(truth)
         if not self.in_use:

@@ -20,7 +20,7 @@ from .camera import Pose, camera_of
 from .recording import FILE_NAME, LONGEST, Recording
 from .settings import LARGEST, SMALLEST
 from .start import Known, fov_of
-from .viewer import ViewerImage, Viewer
+from .viewer import Viewer, ViewerImage
 
 QUALITY, MOVING_QUALITY = 95, 80  # of JPEG
 _STATUS_INTERVAL = 0.5  # seconds between changes of the status line while moving

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NoReturn
 
-RGB = tuple[float, float, float]
+from ..splats.color import BLACK, Color
 
 SMALLEST, LARGEST = 64, 4096  # longest side of a picture [px]
 DEFAULT_SIZE = 1920
@@ -27,7 +27,7 @@ class Settings:
     """
 
     mode: str = "colour"
-    background: RGB = (0.0, 0.0, 0.0)
+    background: Color = BLACK
     size: int = DEFAULT_SIZE
     sh_degree: int | None = None
     cap: int | None = None
@@ -52,7 +52,7 @@ class Settings:
             return self
 
 
-def _rgb(given: Any) -> RGB:
+def _rgb(given: Any) -> Color:
     r, g, b = (float(part) / 255.0 for part in given)
     if not all(0.0 <= part <= 1.0 for part in (r, g, b)):
         _unusable()

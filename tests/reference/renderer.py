@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.cameras.camera import Camera
+from clsplat.splats.color import BLACK
 from reference.formulas import determinant, inverse_2x2, jacobian, normal_cdf, rotation, sh_basis
 from reference.radial import RADIAL
 from reference.shape import Array, Geometry, Kernel
@@ -163,7 +164,7 @@ def render_reference(
     camera: Camera,
     shape: str = "gaussian",
     normalisation: str = "peak",
-    background: ArrayLike = (0.0, 0.0, 0.0),
+    background: ArrayLike = BLACK,
     alpha_min: float = 1 / 255,
     alpha_max: float = 0.99,
     t_min: float = 1e-4,
@@ -192,7 +193,7 @@ def reference_gradients(
     v_alpha: ArrayLike | None = None,
     shape: str = "gaussian",
     normalisation: str = "peak",
-    background: ArrayLike = (0.0, 0.0, 0.0),
+    background: ArrayLike = BLACK,
     alpha_min: float = 1 / 255,
     alpha_max: float = 0.99,
     t_min: float = 1e-4,
