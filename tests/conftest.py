@@ -6,12 +6,16 @@ The default device is the first; the others are for the slow tests, as building 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
+from cli_runner import HEIGHT, N_VIEWS, SHORT, WIDTH, clsplat
 
 from clsplat.device.device import SCHEDULES, Device, Schedule, default_schedule, list_devices, open_device
 from clsplat.device.program import OPTIONS_VARIABLE
 from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.demo.scene import write_capture
+from clsplat.scenes.scene import Scene, load_scene
 
 MakeRenderer = Callable[..., Renderer]
 
@@ -88,3 +92,23 @@ def make_renderer() -> MakeRenderer:
         return kept[key]
 
     return make
+
+
+@pytest.fixture(scope="session")
+def capture_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small capture with known ground truth; tests must not write into it."""
+    return write_capture(tmp_path_factory.mktemp("small") / "yard", WIDTH, HEIGHT, N_VIEWS)
+
+
+@pytest.fixture(scope="session")
+def scene(capture_folder: Path) -> Scene:
+    """The small capture, loaded; every 8th view is a test view."""
+    return load_scene(capture_folder)
+
+
+@pytest.fixture(scope="session")
+def model_folder(capture_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a model of the small capture, trained by the command line; tests must not write into it."""
+    folder = tmp_path_factory.mktemp("small") / "model"
+    clsplat("train", capture_folder, "-m", folder, "--eval", "--save-iterations", "20,40", *SHORT)
+    return folder

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from cli_runner import HEIGHT, N_VIEWS, WIDTH, clsplat, error_of, small_capture, small_model
+from cli_runner import HEIGHT, N_VIEWS, WIDTH, clsplat, error_of
 from clsplat_cli.bench import sentence
 
 from clsplat.profiling.bench import Report, StageTime
@@ -52,16 +52,16 @@ def test_made_up_scene(tmp_path: Path) -> None:
     ]
 
 
-def test_scene_from_its_points_and_from_a_model(tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene, model = small_capture(tmp_path_factory), small_model(tmp_path_factory)
+def test_scene_from_its_points_and_from_a_model(capture_folder: Path, model_folder: Path) -> None:
+    scene, model = capture_folder, model_folder
     said = clsplat("bench", "-s", scene, "--splats", 90, "--shape", "gaussian", "--iterations", 1)
     assert f"yard, up to {WIDTH}x{HEIGHT} px: 90 gaussian splats" in said
     assert N_VIEWS > 1
     assert " skew-normal splats" in clsplat("bench", "-s", scene, "-m", model, "--sh-degree", 1, "--iterations", 1)
 
 
-def test_errors(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene = small_capture(tmp_path_factory)
+def test_errors(tmp_path: Path, capture_folder: Path) -> None:
+    scene = capture_folder
     assert "with -s" in error_of("bench", "-r", 2, code=2)
     assert "use -r" in error_of("bench", "-s", scene, "--width", 64, code=2)
     assert "not both" in error_of("bench", "-s", scene, "-m", tmp_path, "--splats", 5, code=2)

@@ -7,23 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import clsplat, error_of, small_capture, small_model
+from cli_runner import clsplat, error_of
 
 from clsplat.splats.convert import convert
 from clsplat.splats.splats import Splats
 from clsplat.training.folder import ModelFolder
 
 SEARCH = ("--eval", "--iterations", 20, "--cap-max", 150, "--sh-degree", 0, "--densify-interval", 5)
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_model(tmp_path_factory)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_capture(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

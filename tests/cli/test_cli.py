@@ -20,8 +20,6 @@ from cli_runner import (
     clsplat,
     error_of,
     run,
-    small_capture,
-    small_model,
 )
 
 from clsplat.cameras.cameras_json import read_cameras
@@ -29,16 +27,6 @@ from clsplat.scenes.scene import load_scene
 from clsplat.splats.ply import read_ply
 
 PROGRAM = [sys.executable, "-c", "from clsplat_cli.main import main; main()"]
-
-
-@pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_capture(tmp_path_factory)
-
-
-@pytest.fixture(scope="session")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_model(tmp_path_factory)
 
 
 def files(folder: Path) -> set[str]:

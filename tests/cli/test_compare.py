@@ -6,16 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
-from cli_runner import SHORT, clsplat, error_of, run, small_capture
+from cli_runner import SHORT, clsplat, error_of, run
 
 from clsplat.training.presets import PRESETS, preset
 
 TINY = ["--iterations", "12", "--sh-degree", "1", "--densify-interval", "5"]
-
-
-@pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_capture(tmp_path_factory)
 
 
 def test_compare_prints_a_table_and_goes_on(scene: Path, tmp_path: Path) -> None:

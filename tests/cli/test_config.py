@@ -6,12 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from cli_runner import CAP, clsplat, error_of, small_capture, small_model
-
-
-@pytest.fixture
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_capture(tmp_path_factory)
+from cli_runner import CAP, clsplat, error_of
 
 
 def config_of(model: Path) -> dict[str, object]:
@@ -19,10 +14,8 @@ def config_of(model: Path) -> dict[str, object]:
     return config
 
 
-def test_a_former_run_s_options_are_taken_and_replaced(
-    scene: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    former, again = small_model(tmp_path_factory), tmp_path / "again"
+def test_a_former_run_s_options_are_taken_and_replaced(scene: Path, tmp_path: Path, model_folder: Path) -> None:
+    former, again = model_folder, tmp_path / "again"
     clsplat("train", scene, "-m", again, "--config", former / "config.json", "--iterations", 3, "-q")
     taken, given = config_of(again), config_of(former)
     assert given["cap_max"] == CAP

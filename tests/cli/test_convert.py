@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import clsplat, error_of, small_model
+from cli_runner import clsplat, error_of
 from clsplat_cli.models import load_splats
 
 from clsplat.cameras.cameras_json import read_cameras
@@ -16,11 +16,6 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import GAUSSIAN, SHAPES, SKEW_NORMAL, SKEW_NORMAL_DIRECT
 from clsplat.splats.splats import Splats
 from clsplat.training.folder import ModelFolder
-
-
-@pytest.fixture(scope="session")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_model(tmp_path_factory)
 
 
 def test_converted_model_shows_the_same_image(model: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import N_VIEWS, SHORT, WIDTH, error_of, run, small_capture, small_model
+from cli_runner import N_VIEWS, SHORT, WIDTH, error_of, run
 from clsplat_cli import main as main_module
 from clsplat_cli.main import INTERRUPTED
 
@@ -18,15 +18,10 @@ from clsplat.files.images import write_png
 MODEL_FILES = ["cameras.bin", "images.bin", "points3D.bin"]
 
 
-@pytest.fixture(scope="session")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_model(tmp_path_factory)
-
-
 @pytest.fixture
-def scene(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene(tmp_path: Path, capture_folder: Path) -> Path:
     """A copy of the capture, to damage."""
-    return Path(shutil.copytree(small_capture(tmp_path_factory), tmp_path / "yard"))
+    return Path(shutil.copytree(capture_folder, tmp_path / "yard"))
 
 
 @pytest.fixture

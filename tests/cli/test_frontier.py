@@ -7,18 +7,16 @@ import shutil
 from pathlib import Path
 
 import pytest
-from cli_runner import clsplat, error_of, run, small_capture
+from cli_runner import clsplat, error_of, run
 
 from clsplat.evaluation import chart_style
 
 TINY = ["--iterations", "8", "--sh-degree", "0", "--densify-interval", "5", "--curve", "3"]
 
 
-def test_frontier_sweeps_and_draws(
-    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frontier_sweeps_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capture_folder: Path) -> None:
     monkeypatch.setitem(chart_style._STYLE, "savefig.dpi", 40)
-    scene, out = small_capture(tmp_path_factory), tmp_path / "out"
+    scene, out = capture_folder, tmp_path / "out"
     arguments = ("frontier", scene, "-o", out, "--cap-max", "30", "60", *TINY)
     first = run(*arguments)
     assert first.exit_code == 0, first.output
@@ -41,12 +39,12 @@ def test_frontier_sweeps_and_draws(
 
 
 def test_frontier_without_matplotlib_says_so_and_writes_the_data(
-    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capture_folder: Path
 ) -> None:
     monkeypatch.setattr(chart_style, "available", lambda: False)
     done = run(
         "frontier",
-        small_capture(tmp_path_factory),
+        capture_folder,
         "-o",
         tmp_path,
         "--systems",
@@ -62,8 +60,8 @@ def test_frontier_without_matplotlib_says_so_and_writes_the_data(
     assert {path.name for path in (tmp_path / "charts").iterdir()} == {"time.csv", "time.json"}
 
 
-def test_frontier_says_what_is_wrong(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene = small_capture(tmp_path_factory)
+def test_frontier_says_what_is_wrong(tmp_path: Path, capture_folder: Path) -> None:
+    scene = capture_folder
     assert "give scenes, or --charts-only" in error_of("frontier", "-o", tmp_path / "out", code=2)
     assert "give scenes, or --charts-only" in error_of("frontier", scene, "-o", tmp_path, "--charts-only", code=2)
     assert f"{tmp_path / 'out'}: cannot be read" in error_of("frontier", "-o", tmp_path / "out", "--charts-only")

@@ -17,8 +17,6 @@ from cli_runner import (
     clsplat,
     error_of,
     run,
-    small_capture,
-    small_model,
 )
 from PIL import Image
 
@@ -28,16 +26,6 @@ from clsplat.rendering.colormaps import depth_picture
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
 from clsplat.splats.splats import Splats
-
-
-@pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_capture(tmp_path_factory)
-
-
-@pytest.fixture(scope="session")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_model(tmp_path_factory)
 
 
 def files(folder: Path) -> set[str]:

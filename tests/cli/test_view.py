@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import ITERATIONS, N_VIEWS, SHORT, TEST_NAMES, clsplat, error_of, small_capture, small_model
+from cli_runner import ITERATIONS, N_VIEWS, SHORT, TEST_NAMES, clsplat, error_of
 from clsplat_cli.models import load_model
 from clsplat_cli.view import known_cameras
 from PIL import Image
@@ -26,8 +26,8 @@ from clsplat.viewer.settings import Settings
 from clsplat.viewer.source import ModelSource
 
 
-def test_a_still_picture_has_the_bytes_of_render(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    model = small_model(tmp_path_factory)
+def test_a_still_picture_has_the_bytes_of_render(tmp_path: Path, model_folder: Path) -> None:
+    model = model_folder
     position = tuple(known_cameras(load_model(model), None, None, None).test[0].camera.position)
     camera = camera_of(Pose((0.9, 0.1, -0.3, 0.2), position, 0.9, 130, 70), 1280)
     assert isinstance(camera, Camera)
@@ -38,9 +38,9 @@ def test_a_still_picture_has_the_bytes_of_render(tmp_path: Path, tmp_path_factor
     assert len(np.unique(shown)) > 50
 
 
-def test_cameras_are_split_as_the_run_did(tmp_path_factory: pytest.TempPathFactory) -> None:
-    model = load_model(small_model(tmp_path_factory))
-    scene = small_capture(tmp_path_factory)
+def test_cameras_are_split_as_the_run_did(capture_folder: Path, model_folder: Path) -> None:
+    model = load_model(model_folder)
+    scene = capture_folder
     for known in (known_cameras(model, None, None, None), known_cameras(model, scene, None, 2)):
         assert [item.name for item in known.test] == [name.removesuffix(".png") for name in TEST_NAMES]
         assert len(known.train) == N_VIEWS - len(TEST_NAMES)
@@ -48,9 +48,9 @@ def test_cameras_are_split_as_the_run_did(tmp_path_factory: pytest.TempPathFacto
     assert not known_cameras(ply, None, None, None).by_label
 
 
-def test_bad_input_is_one_line(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_bad_input_is_one_line(tmp_path: Path, capture_folder: Path, model_folder: Path) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
-    model, scene = small_model(tmp_path_factory), small_capture(tmp_path_factory)
+    model, scene = model_folder, capture_folder
     assert "no such model folder or PLY file" in error_of("view", tmp_path / "none")
     assert "give one model folder" in error_of("view", code=2)
     assert "no iteration 7" in error_of("view", model, "--iteration", "7")
@@ -66,13 +66,11 @@ def test_bad_input_is_one_line(tmp_path: Path, tmp_path_factory: pytest.TempPath
 
 
 def test_without_viser_both_say_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capture_folder: Path, model_folder: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "pip install clsplat[view]" in error_of("view", small_model(tmp_path_factory))
-    assert "pip install clsplat[view]" in error_of(
-        "train", small_capture(tmp_path_factory), "-m", tmp_path / "run", "--view", *SHORT
-    )
+    assert "pip install clsplat[view]" in error_of("view", model_folder)
+    assert "pip install clsplat[view]" in error_of("train", capture_folder, "-m", tmp_path / "run", "--view", *SHORT)
     assert not (tmp_path / "run").exists()
 
 
@@ -101,10 +99,10 @@ class Command:
 
 
 @pytest.fixture
-def viewing(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Command, Path]]:
+def viewing(tmp_path: Path, model_folder: Path) -> Iterator[tuple[Command, Path]]:
     pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
     ply = tmp_path / "model.ply"
-    ply.write_bytes(load_model(small_model(tmp_path_factory)).ply.read_bytes())
+    ply.write_bytes(load_model(model_folder).ply.read_bytes())
     command = Command("view", ply, "--port", 0)
     yield command, ply
     if command.process.poll() is None:
@@ -134,12 +132,12 @@ def test_view_shows_a_file_that_changes_and_ends_with_ctrl_c(viewing: tuple[Comm
 
 
 @pytest.mark.slow
-def test_train_view_shows_the_run(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_train_view_shows_the_run(tmp_path: Path, capture_folder: Path) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
     from viewer_client import Client
 
     options = [*SHORT[2:], "--iterations", 100000]
-    command = Command("train", small_capture(tmp_path_factory), "-m", tmp_path / "run", "--view", "--port", 0, *options)
+    command = Command("train", capture_folder, "-m", tmp_path / "run", "--view", "--port", 0, *options)
     try:
         client = Client(command.port)
         client.look((0, 0, -3))
@@ -167,12 +165,12 @@ def test_train_view_shows_the_run(tmp_path: Path, tmp_path_factory: pytest.TempP
 
 
 @pytest.mark.slow
-def test_a_watched_model_has_the_same_bits(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_watched_model_has_the_same_bits(tmp_path: Path, capture_folder: Path, model_folder: Path) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
-    model = small_model(tmp_path_factory)
+    model = model_folder
     clsplat(
         "train",
-        small_capture(tmp_path_factory),
+        capture_folder,
         "-m",
         tmp_path / "run",
         "--eval",

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cli_runner import small_capture
 
 from clsplat.comparison import compare as module
 from clsplat.comparison.compare import Run, compare, curve_iterations, digest, scene_identity
@@ -18,7 +17,7 @@ from clsplat.comparison.table import HEAD, MEASURED, Record, cells, markdown, no
 from clsplat.errors import InputError, TrainingError
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
 from clsplat.training.run import train
@@ -26,11 +25,6 @@ from clsplat.training.trainer import Trainer
 
 CAP = 60
 SHORT: dict[str, Any] = {"iterations": 20, "sh_degree": 1, "densify_interval": 5}
-
-
-@pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(small_capture(tmp_path_factory))
 
 
 def done(folder: Path) -> list[Record]:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_runner import small_capture
 from frontier_records import curve, recorded, seeds, sweep
 
 from clsplat.comparison import compare as compare_module
@@ -219,7 +218,7 @@ def test_equal_runs_of_two_folders_count_once(tmp_path: Path, undrawn: None) -> 
 
 
 def test_an_interrupted_sweep_leaves_charts_and_goes_on(
-    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, undrawn: None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undrawn: None, capture_folder: Path
 ) -> None:
     made = []
 
@@ -233,7 +232,7 @@ def test_an_interrupted_sweep_leaves_charts_and_goes_on(
 
     monkeypatch.setattr(compare_module, "warm_up", lambda *arguments: None)
     monkeypatch.setattr(compare_module, "train_and_measure", train_and_measure)
-    scene, systems = load_scene(small_capture(tmp_path_factory)), parse_systems("gaussian,default")
+    scene, systems = load_scene(capture_folder), parse_systems("gaussian,default")
     arguments = ([scene], systems, tmp_path, [20, 40], [0], {"iterations": 9})
     with pytest.warns(UserWarning, match=r"clsplat\[charts\]"), pytest.raises(KeyboardInterrupt):
         frontier.frontier(*arguments)

@@ -6,22 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from cli_runner import small_capture
 from conftest import MakeRenderer
 
 from clsplat.compression.importance import Needs, lower_bands, measure
 from clsplat.device.device import Device
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 
 N, SEEDS = 12, 48
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(small_capture(tmp_path_factory))
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import small_capture, small_model
 from conftest import MakeRenderer
 
 from clsplat.compression.prune import (
@@ -30,14 +29,14 @@ from clsplat.training.folder import ModelFolder
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return hold_out(load_scene(small_capture(tmp_path_factory)))
+def scene(capture_folder: Path) -> Scene:
+    return hold_out(load_scene(capture_folder))
 
 
 @pytest.fixture(scope="module")
-def splats(tmp_path_factory: pytest.TempPathFactory) -> Splats:
+def splats(model_folder: Path) -> Splats:
     """A trained model, to which are added 40 splats that hide behind the cameras or are transparent."""
-    arrays = Splats.load(ModelFolder(small_model(tmp_path_factory)).latest_ply()[0]).to_numpy()
+    arrays = Splats.load(ModelFolder(model_folder).latest_ply()[0]).to_numpy()
     more = {name: np.concatenate([values, values[:40]]) for name, values in arrays.items()}
     more["mean"][-20:] += 1e4
     more["opacity_logit"][-40:-20] = -12

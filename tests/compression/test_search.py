@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cli_runner import small_capture
 
 import clsplat
 from clsplat.compression.prune_and_refine import fine_tuning
@@ -26,7 +25,7 @@ from clsplat.compression.rules import (
 )
 from clsplat.compression.search import train_budget
 from clsplat.errors import InputError, OutputError
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
 from clsplat.training.log import Progress
@@ -136,11 +135,6 @@ def test_fine_tuning_goes_on_at_the_runs_last_rates() -> None:
 
 
 # --- whole searches ----------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(small_capture(tmp_path_factory))
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cli_runner import clsplat, error_of, small_model
+from cli_runner import clsplat, error_of
 
 from clsplat.errors import InputError
 from clsplat.evaluation.perceptual import VGG_URL, Flip, Lpips
@@ -117,10 +117,10 @@ def test_lpips_says_what_is_missing(packages: Any, monkeypatch: pytest.MonkeyPat
 
 
 def test_eval_has_both_in_files_and_on_the_page(
-    packages: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+    packages: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model_folder: Path
 ) -> None:
     packages()
-    model = Path(shutil.copytree(small_model(tmp_path_factory), tmp_path / "model"))
+    model = Path(shutil.copytree(model_folder, tmp_path / "model"))
 
     def evaluate(reference: np.ndarray, test: np.ndarray, kind: str, **options: bool) -> tuple[Any, float, Any]:
         assert kind == "LDR"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import TEST_NAMES, clsplat, error_of, small_model
+from cli_runner import TEST_NAMES, clsplat, error_of
 from clsplat_cli.eval_pages import ViewRecorder
 from PIL import Image
 
@@ -176,8 +176,8 @@ def test_a_page_is_bounded_and_says_so(tmp_path: Path, monkeypatch: pytest.Monke
 # --- clsplat eval --------------------------------------------------------------------------------
 
 
-def test_eval_writes_the_page(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    model = Path(shutil.copytree(small_model(tmp_path_factory), tmp_path / "model"))
+def test_eval_writes_the_page(tmp_path: Path, model_folder: Path) -> None:
+    model = Path(shutil.copytree(model_folder, tmp_path / "model"))
     (model / "report.html").unlink(missing_ok=True)  # other tests measure the shared model
     said = clsplat("eval", model, "--no-report")
     assert not (model / "report.html").exists()

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-from cli_runner import SHORT, clsplat, error_of, run, small_capture, small_model
+from cli_runner import SHORT, clsplat, error_of, run
 from files.test_lock import HOLD
 
 from clsplat.splats.splats import Splats
@@ -38,19 +38,9 @@ def read_only(folder: Path) -> Iterator[Path]:
         yield folder
 
 
-@pytest.fixture
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_capture(tmp_path_factory)
-
-
-@pytest.fixture
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_model(tmp_path_factory)
-
-
-def test_a_disk_that_fills_up_keeps_the_last_checkpoint(capture: Path, tmp_path: Path) -> None:
+def test_a_disk_that_fills_up_keeps_the_last_checkpoint(capture_folder: Path, tmp_path: Path) -> None:
     """With room for one checkpoint, not for two; more room, and the run goes on to the bits of one in peace."""
-    common = ["train", capture, "--checkpoint-interval", "20", "--quiet", *SHORT, "-m"]
+    common = ["train", capture_folder, "--checkpoint-interval", "20", "--quiet", *SHORT, "-m"]
     clsplat(*common, tmp_path / "peace")
     size = (tmp_path / "peace" / "checkpoint.npz").stat().st_size
     with mounted(tmp_path / "disk", "-t", "tmpfs", "-o", f"size={size * 3 // 2 // 4096 * 4}k", "tmpfs") as disk:
@@ -65,7 +55,7 @@ def test_a_disk_that_fills_up_keeps_the_last_checkpoint(capture: Path, tmp_path:
         assert folder.ply_path(60).read_bytes() == ModelFolder(tmp_path / "peace").ply_path(60).read_bytes()
 
 
-def test_a_full_disk_keeps_old_files(model: Path, tmp_path: Path) -> None:
+def test_a_full_disk_keeps_old_files(model_folder: Path, tmp_path: Path) -> None:
     with mounted(tmp_path / "disk", "-t", "tmpfs", "-o", "size=64k", "tmpfs") as disk:
         for name in ("a.ply", "a.spz", "a.splat", "t.json"):
             (disk / name).write_bytes(b"old")
@@ -73,10 +63,10 @@ def test_a_full_disk_keeps_old_files(model: Path, tmp_path: Path) -> None:
             while rest.write(bytes(4096)):
                 pass
         for name in ("a.ply", "a.spz", "a.splat"):
-            assert "No space left" in error_of("convert", model, disk / name, "--approximate", "--overwrite")
-        assert "No space left" in error_of("cameras", model, disk / "t.json", "--overwrite")
-        assert "No space left" in error_of("render", model, "-o", disk / "renders", "--quiet")
-        assert "No space left" in error_of("train", small_scene(model), "-m", disk / "model", *SHORT)
+            assert "No space left" in error_of("convert", model_folder, disk / name, "--approximate", "--overwrite")
+        assert "No space left" in error_of("cameras", model_folder, disk / "t.json", "--overwrite")
+        assert "No space left" in error_of("render", model_folder, "-o", disk / "renders", "--quiet")
+        assert "No space left" in error_of("train", small_scene(model_folder), "-m", disk / "model", *SHORT)
         for name in ("a.ply", "a.spz", "a.splat", "t.json"):
             assert (disk / name).read_bytes() == b"old"
 
@@ -86,18 +76,18 @@ def small_scene(model: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["read-only", "a file"])
-def test_places_that_take_no_files(capture: Path, model: Path, tmp_path: Path, kind: str) -> None:
+def test_places_that_take_no_files(capture_folder: Path, model_folder: Path, tmp_path: Path, kind: str) -> None:
     place = tmp_path / "place"
     commands = [
-        ["train", capture, "-m", place / "m", *SHORT],
-        ["train", capture, "-m", place / "m", "--budget", "auto", *SHORT],
-        ["convert", model, place / "o.ply"],
-        ["cameras", model, place / "t.json"],
-        ["cameras", model, place / "sparse" / "0"],
-        ["render", model, "-o", place / "r"],
-        ["prune", model, "-o", place / "p.ply"],
-        ["compare", capture, "-o", place / "c"],
-        ["frontier", capture, "-o", place / "f"],
+        ["train", capture_folder, "-m", place / "m", *SHORT],
+        ["train", capture_folder, "-m", place / "m", "--budget", "auto", *SHORT],
+        ["convert", model_folder, place / "o.ply"],
+        ["cameras", model_folder, place / "t.json"],
+        ["cameras", model_folder, place / "sparse" / "0"],
+        ["render", model_folder, "-o", place / "r"],
+        ["prune", model_folder, "-o", place / "p.ply"],
+        ["compare", capture_folder, "-o", place / "c"],
+        ["frontier", capture_folder, "-o", place / "f"],
         ["blender-addon", "-o", place / "a.zip"],
     ]
     if kind == "a file":
@@ -123,8 +113,8 @@ def refused(*command: object) -> str:
     return result.stderr.splitlines()[-1]
 
 
-def test_a_model_in_a_read_only_folder_is_used(model: Path, tmp_path: Path) -> None:
-    shutil.copytree(model, tmp_path / "model")
+def test_a_model_in_a_read_only_folder_is_used(model_folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(model_folder, tmp_path / "model")
     with read_only(tmp_path / "model") as folder:
         assert "splats" in clsplat("info", folder)
         clsplat("convert", folder, tmp_path / "o.ply", "--quiet")
@@ -133,19 +123,19 @@ def test_a_model_in_a_read_only_folder_is_used(model: Path, tmp_path: Path) -> N
     assert len(Splats.load(tmp_path / "o.ply")) > 0
 
 
-def test_two_comparisons_in_one_folder(capture: Path, tmp_path: Path) -> None:
+def test_two_comparisons_in_one_folder(capture_folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("fcntl")
     (tmp_path / "c").mkdir()
     with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path / "c")], stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"held\n"
         for command in ("compare", "frontier"):
-            assert "another run writes into it" in refused(command, capture, "-o", tmp_path / "c")
+            assert "another run writes into it" in refused(command, capture_folder, "-o", tmp_path / "c")
         holder.kill()
 
 
-def test_metrics_are_said_where_they_cannot_be_written(model: Path, tmp_path: Path) -> None:
-    shutil.copytree(model, tmp_path / "model")
+def test_metrics_are_said_where_they_cannot_be_written(model_folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(model_folder, tmp_path / "model")
     with read_only(tmp_path / "model") as folder:
         result = run("eval", folder)
     assert result.exit_code == 1

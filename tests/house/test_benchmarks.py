@@ -9,13 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli_runner import small_capture
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
-def test_train_scenes(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene = small_capture(tmp_path_factory)
+def test_train_scenes(tmp_path: Path, capture_folder: Path) -> None:
+    scene = capture_folder
     out = tmp_path / "scenes.jsonl"
     options = [
         "--scenes",
@@ -66,8 +65,8 @@ def test_stages(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_systems(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene = small_capture(tmp_path_factory)
+def test_systems(tmp_path: Path, capture_folder: Path) -> None:
+    scene = capture_folder
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
     command = [sys.executable, str(BENCHMARKS / "systems.py"), "--out", str(tmp_path)]
     options = [scene.name, "--groups", "factors", "--caps", "60", "--seeds", "0", "--iterations", "4"]
@@ -86,8 +85,8 @@ def test_systems(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> No
     assert any(expected in line for line in page.splitlines() if line.startswith("| skew-normal | ")), page
 
 
-def test_budget(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene = small_capture(tmp_path_factory)
+def test_budget(tmp_path: Path, capture_folder: Path) -> None:
+    scene = capture_folder
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
     out = tmp_path / "budget"
     command = [sys.executable, str(BENCHMARKS / "budget.py"), "--out", str(out)]
@@ -141,8 +140,8 @@ def test_scalar(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_time_to_quality(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene = small_capture(tmp_path_factory)
+def test_time_to_quality(tmp_path: Path, capture_folder: Path) -> None:
+    scene = capture_folder
     out = tmp_path / "times.jsonl"
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
     command = [sys.executable, str(BENCHMARKS / "time_to_quality.py"), "--out", str(out)]
@@ -159,8 +158,8 @@ def test_time_to_quality(tmp_path: Path, tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.mark.slow
-def test_frontier(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene = small_capture(tmp_path_factory)
+def test_frontier(tmp_path: Path, capture_folder: Path) -> None:
+    scene = capture_folder
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
     out = tmp_path / "frontier"
     command = [sys.executable, str(BENCHMARKS / "frontier.py"), "--out", str(out)]
@@ -181,8 +180,8 @@ def test_frontier(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> N
 
 
 @pytest.mark.slow
-def test_photos(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene = small_capture(tmp_path_factory)
+def test_photos(tmp_path: Path, capture_folder: Path) -> None:
+    scene = capture_folder
     out = tmp_path / "photos.jsonl"
     command = [
         sys.executable,
@@ -208,8 +207,8 @@ def test_photos(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Non
         assert f"{row['corrected']:.2f}" in done.stdout
 
 
-def test_visible_adam(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene = small_capture(tmp_path_factory)
+def test_visible_adam(tmp_path: Path, capture_folder: Path) -> None:
+    scene = capture_folder
     out = tmp_path / "visible.jsonl"
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
     command = [
@@ -252,8 +251,8 @@ def test_stability(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_arithmetic(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scene = small_capture(tmp_path_factory)
+def test_arithmetic(tmp_path: Path, capture_folder: Path) -> None:
+    scene = capture_folder
     out = tmp_path / "arithmetic.jsonl"
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
     command = [sys.executable, str(BENCHMARKS / "arithmetic.py"), "--smoke", "--scenes", scene.name, "--out", str(out)]

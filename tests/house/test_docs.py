@@ -22,7 +22,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
-from cli_runner import run, small_capture, small_model
+from cli_runner import run
 from clsplat_cli.main import COMMANDS, main
 
 import clsplat
@@ -98,15 +98,15 @@ def shortened(command: str) -> list[str]:
     return words
 
 
-def stand_ins(folder: Path, words: list[str], factory: pytest.TempPathFactory) -> None:
+def stand_ins(folder: Path, words: list[str], capture: Path, model: Path) -> None:
     """What the words name: a scene, photographs, models."""
     makes = {"train": "-m", "reconstruct": "-o"}.get(words[0]) if "--resume" not in words else None
     target = next((after for word, after in pairwise(words) if word == makes), None)
     for name in ("SCENE", "MODEL", "OTHER", "SMALL"):
         if any(name in word.split("/") for word in words) and name != target:
-            shutil.copytree((small_capture if name == "SCENE" else small_model)(factory), folder / name)
+            shutil.copytree(capture if name == "SCENE" else model, folder / name)
     if "PHOTOS" in words:
-        photos = (REAL_PHOTOS if REAL_PHOTOS.is_dir() else small_capture(factory)) / "images"
+        photos = (REAL_PHOTOS if REAL_PHOTOS.is_dir() else capture) / "images"
         shutil.copytree(photos, folder / "PHOTOS")
     if "--masks" in words:
         (photo, *_) = sorted((folder / "SCENE" / "images").iterdir())
@@ -120,7 +120,7 @@ def stand_ins(folder: Path, words: list[str], factory: pytest.TempPathFactory) -
     "command", [pytest.param(command, marks=[pytest.mark.slow] if SLOW.search(command) else []) for command in RUN]
 )
 def test_commands_run(
-    command: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+    command: str, tmp_path: Path, capture_folder: Path, model_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert command.removeprefix(".venv/bin/").startswith("clsplat "), (
         f"{COMMANDS_SEEN[command]}: {command!r} is neither run nor in NOT_RUN"
@@ -128,7 +128,7 @@ def test_commands_run(
     words = shortened(command)
     if "--video" in words:
         pytest.importorskip("imageio_ffmpeg", reason="imageio[ffmpeg] is not installed (pip install clsplat[video])")
-    stand_ins(tmp_path, words, tmp_path_factory)
+    stand_ins(tmp_path, words, capture_folder, model_folder)
     monkeypatch.chdir(tmp_path)
     before = set(tmp_path.rglob("*"))
     result = run(*words)
@@ -188,11 +188,9 @@ def test_every_command_is_in_the_guide() -> None:
 
 
 @pytest.mark.parametrize("page", [page for page, text in TEXTS.items() if blocks(text, "python")])
-def test_python_runs(
-    page: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_python_runs(page: str, tmp_path: Path, capture_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All Python of a page as one program, where the demo was made."""
-    shutil.copytree(small_capture(tmp_path_factory), tmp_path / "out" / "scene")
+    shutil.copytree(capture_folder, tmp_path / "out" / "scene")
     monkeypatch.chdir(tmp_path)
     source = "\n".join(blocks(TEXTS[page], "python"))
     source = re.sub(r"iterations=\d+", "iterations=8", re.sub(r"cap_max=\d+", "cap_max=60", source))

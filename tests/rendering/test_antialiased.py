@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import clsplat, error_of, small_capture
+from cli_runner import clsplat, error_of
 from conftest import MakeRenderer
 from kernel_checks import BACKGROUND, KERNELS, SMOOTH, Arrays, Case
 from reference.formulas import SKEW_MAX
@@ -152,9 +152,9 @@ def _model(antialiased: bool) -> Splats:
     return Splats("gaussian", arrays, antialiased=antialiased)
 
 
-def test_training_and_the_command_line(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> None:
+def test_training_and_the_command_line(tmp_path: Path, capture_folder: Path) -> None:
     """The same gradients as the renderer's, and a file that says how it is to be shown."""
-    folder = small_capture(tmp_path_factory)
+    folder = capture_folder
     clsplat(
         "train", folder, "-m", tmp_path / "model", "--iterations", 20, "--cap-max", 200, "--antialiased", "-q", "--eval"
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import clsplat, error_of, small_model
+from cli_runner import clsplat, error_of
 from small_scene import NAMES, write_garden
 
 from clsplat.cameras.cameras_json import read_cameras
@@ -112,8 +112,8 @@ def test_a_scene_is_written_and_trains_as_before(garden: Path, tmp_path: Path) -
         np.testing.assert_array_equal(one.image, two.image)
 
 
-def test_a_model_s_cameras_and_centres(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    model = small_model(tmp_path_factory)
+def test_a_model_s_cameras_and_centres(tmp_path: Path, model_folder: Path) -> None:
+    model = model_folder
     said = clsplat("cameras", model, tmp_path / "sparse" / "0")
     named, found = read_cameras(model / "cameras.json"), read_model(tmp_path / "sparse" / "0")
     assert sorted(f"{entry.name}.png" for entry in named) == [photo.name for photo in found.photos]
@@ -134,10 +134,8 @@ def test_a_model_s_cameras_and_centres(tmp_path: Path, tmp_path_factory: pytest.
     assert "3 cameras" in clsplat("cameras", tmp_path / "path.json", tmp_path / "t" / "transforms.json")
 
 
-def test_what_has_no_cameras_or_no_form_is_refused(
-    garden: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    ply = sorted(small_model(tmp_path_factory).glob("point_cloud/*/point_cloud.ply"))[0]
+def test_what_has_no_cameras_or_no_form_is_refused(garden: Path, tmp_path: Path, model_folder: Path) -> None:
+    ply = sorted(model_folder.glob("point_cloud/*/point_cloud.ply"))[0]
     assert "has no cameras" in error_of("cameras", ply, tmp_path / "out.json")
     posed = with_lens(garden, "RADIAL")
     write_colmap(garden / "sparse" / "0", posed.photos, posed.points)

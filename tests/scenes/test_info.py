@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import clsplat, error_of, small_capture, small_model
+from cli_runner import clsplat, error_of
 from small_scene import HEIGHT, N_POINTS, NAMES, WIDTH, write_garden
 
 from clsplat.cameras.camera import Camera
@@ -95,8 +95,8 @@ def test_a_lens_without_a_focal_length_is_named(tmp_path: Path) -> None:
         assert "has a focal length of" in error_of("info", garden)
 
 
-def test_models_and_scenes_are_told_apart(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    model, scene = small_model(tmp_path_factory), small_capture(tmp_path_factory)
+def test_models_and_scenes_are_told_apart(tmp_path: Path, capture_folder: Path, model_folder: Path) -> None:
+    model, scene = model_folder, capture_folder
     said = clsplat("info", model, scene)
     assert "400 splats" in said
     assert "10 photos with poses" in said

@@ -6,16 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from cli_runner import small_capture
 
 from clsplat.errors import InputError
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.scenes.split import hold_out
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(small_capture(tmp_path_factory))
 
 
 def test_test_views_are_gone_and_training_views_held_out(scene: Scene) -> None:

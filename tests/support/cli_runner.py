@@ -1,14 +1,9 @@
-"""Running the command line in tests, and the small capture that it runs on."""
+"""Run the command line in tests; sizes of the small capture (tests/conftest.py) that most of them run on."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
 from click.testing import CliRunner, Result
 from clsplat_cli.main import main
-
-from clsplat.scenes.demo.scene import write_capture
 
 WIDTH, HEIGHT, N_VIEWS = 48, 36, 10
 TEST_NAMES = ["view_000.png", "view_008.png"]  # every 8th of ten
@@ -24,33 +19,6 @@ SHORT = [
     "--densify-interval",
     "10",
 ]
-
-_kept: dict[str, Path] = {}
-
-
-def small_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture's folder, made once for the whole run; read only."""
-    if "capture" not in _kept:
-        _kept["capture"] = write_capture(tmp_path_factory.mktemp("small") / "yard", WIDTH, HEIGHT, N_VIEWS)
-    return _kept["capture"]
-
-
-def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A model of the capture, trained with --eval by the command line; read only."""
-    if "model" not in _kept:
-        model = tmp_path_factory.mktemp("small") / "model"
-        clsplat(
-            "train",
-            small_capture(tmp_path_factory),
-            "-m",
-            model,
-            "--eval",
-            "--save-iterations",
-            "20,40",
-            *SHORT,
-        )
-        _kept["model"] = model
-    return _kept["model"]
 
 
 def run(*args: object) -> Result:

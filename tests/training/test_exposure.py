@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import clsplat, small_capture
+from cli_runner import clsplat
 from numpy.typing import NDArray
 from reference.loss import reference_loss, reference_loss_gradient
 from reference.tolerances import ROUNDING, relative_error
@@ -169,11 +169,6 @@ def test_without_any_of_it_no_kernel_runs(device: Device) -> None:
 # --- what is learned -----------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(small_capture(tmp_path_factory))
-
-
 CONFIG = TrainConfig(iterations=200, cap_max=2500, sh_degree=0, coarse_to_fine=False, seed=1)
 
 
@@ -186,12 +181,12 @@ def exposed(scene: Scene, gains: NDArray[np.float64]) -> Scene:
     return replace(scene, views=views)
 
 
-def test_exposures_of_photos_are_found(capture: Scene) -> None:
+def test_exposures_of_photos_are_found(scene: Scene) -> None:
     """Photos of known gains, of mean 1: the gains are learned, and views of gain 1 are better for it."""
-    n = len(capture.train)
+    n = len(scene.train)
     gains = np.random.default_rng(2).permutation(np.linspace(0.7, 1.3, n))
-    scene = exposed(capture, gains)
-    trainers = [Trainer(scene, replace(CONFIG, exposure=exposure)) for exposure in (False, True)]
+    changed = exposed(scene, gains)
+    trainers = [Trainer(changed, replace(CONFIG, exposure=exposure)) for exposure in (False, True)]
     for trainer in trainers:
         trainer.run()
     learned = trainers[1].photos.exposures()
@@ -199,11 +194,11 @@ def test_exposures_of_photos_are_found(capture: Scene) -> None:
     grey = 0.4
     of_grey = (grey * learned[:, :, :3].sum(axis=2) + learned[:, :, 3]).mean(axis=1) / grey
     assert np.corrcoef(of_grey, gains)[0, 1] > 0.95
-    plain, compensated = (trainer.evaluate(scene.test).psnr for trainer in trainers)
+    plain, compensated = (trainer.evaluate(changed.test).psnr for trainer in trainers)
     assert compensated > plain + 0.5
 
 
-def test_what_a_mask_hides_is_not_learned(capture: Scene) -> None:
+def test_what_a_mask_hides_is_not_learned(scene: Scene) -> None:
     """A magenta block at the left or the right of each photo, masked and not."""
 
     def blotted(view: View, side: int, masked: bool) -> View:
@@ -218,25 +213,25 @@ def test_what_a_mask_hides_is_not_learned(capture: Scene) -> None:
 
     excess = {}
     for masked in (False, True):
-        scene = replace(
-            capture,
+        changed = replace(
+            scene,
             views=[
-                view if view.name in capture.test_names else blotted(view, i % 2, masked)
-                for i, view in enumerate(capture.views)
+                view if view.name in scene.test_names else blotted(view, i % 2, masked)
+                for i, view in enumerate(scene.views)
             ],
         )
-        model = Trainer(scene, CONFIG).run().splats
+        model = Trainer(changed, CONFIG).run().splats
         excess[masked] = np.mean(
             [
                 magenta(np.clip(Renderer().render(model, view.camera).color, 0, 1)) - magenta(view.image / 255)
-                for view in scene.test
+                for view in changed.test
             ]
         )
     assert excess[False] > 0.02
     assert excess[True] < 0.2 * excess[False]
 
 
-def test_random_backgrounds_show_through_nothing_opaque(capture: Scene) -> None:
+def test_random_backgrounds_show_through_nothing_opaque(scene: Scene) -> None:
     """Photos of a black object on transparent ground: black splats and none look the same over black only."""
 
     def on_nothing(view: View) -> View:
@@ -245,10 +240,10 @@ def test_random_backgrounds_show_through_nothing_opaque(capture: Scene) -> None:
         alpha[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3] = 255
         return replace(view, image=np.zeros_like(view.image), alpha=alpha)
 
-    views = [on_nothing(view) for view in capture.views]
+    views = [on_nothing(view) for view in scene.views]
     coverage = {}
     for random in (False, True):
-        trainer = Trainer(replace(capture, views=views), replace(CONFIG, random_background=random))
+        trainer = Trainer(replace(scene, views=views), replace(CONFIG, random_background=random))
         model = trainer.run().splats
         alpha = Renderer().render(model, views[1].camera).alpha
         inside = views[1].alpha > 0
@@ -257,19 +252,19 @@ def test_random_backgrounds_show_through_nothing_opaque(capture: Scene) -> None:
     assert coverage[True] > coverage[False] + 0.3
 
 
-def test_a_resumed_run_has_the_same_exposures(capture: Scene, tmp_path: Path) -> None:
+def test_a_resumed_run_has_the_same_exposures(scene: Scene, tmp_path: Path) -> None:
     config = replace(CONFIG, iterations=40, exposure=True, random_background=True)
-    whole = train(capture, config, output=tmp_path / "whole")
-    trainer = Trainer(capture, config)
+    whole = train(scene, config, output=tmp_path / "whole")
+    trainer = Trainer(scene, config)
     for _ in range(23):
         trainer.step()
     trainer.checkpoint().save(tmp_path / "half.npz")
-    resumed = Trainer(capture, config, Checkpoint.load(tmp_path / "half.npz"))
+    resumed = Trainer(scene, config, Checkpoint.load(tmp_path / "half.npz"))
     splats = resumed.run().splats
     for name, array in whole.splats.arrays.items():
         np.testing.assert_array_equal(array, splats.arrays[name])
     stored = json.loads((tmp_path / "whole" / "exposure.json").read_text())
-    assert stored == exposures_json([view.name for view in capture.train], resumed.photos.exposures())
+    assert stored == exposures_json([view.name for view in scene.train], resumed.photos.exposures())
 
 
 def test_exposure_json_multiplies_from_the_left() -> None:
@@ -279,8 +274,8 @@ def test_exposure_json_multiplies_from_the_left() -> None:
     np.testing.assert_allclose(colour @ stored[:, :3] + stored[:, 3], exposure[0, :, :3] @ colour + exposure[0, :, 3])
 
 
-def test_on_the_command_line(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> None:
-    folder = small_capture(tmp_path_factory)
+def test_on_the_command_line(tmp_path: Path, capture_folder: Path) -> None:
+    folder = capture_folder
     clsplat(
         "train",
         folder,

@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cli_runner import small_capture
 from numpy.typing import NDArray
 
 import clsplat
 from clsplat.device.device import Device, open_device
 from clsplat.errors import InputError, OutputError, TrainingError
 from clsplat.evaluation.evaluate import evaluate
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.splats.fields import Group
 from clsplat.splats.splats import Splats
 from clsplat.training.checkpoint import Checkpoint
@@ -34,11 +33,6 @@ CONFIG = TrainConfig(
     iterations=80, cap_max=2400, sh_degree=1, densify_interval=10, checkpoint_interval=30, strategy="mcmc"
 )
 CAMERA = clsplat.Camera(27, 19, 25.0, 26.0, 13.0, 9.0, np.eye(4))
-
-
-@pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(small_capture(tmp_path_factory))
 
 
 @pytest.fixture(scope="session")

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import small_capture
 from conftest import MakeRenderer
 
 from clsplat.device.device import Device
 from clsplat.errors import InputError, TrainingError
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
@@ -23,11 +22,6 @@ from clsplat.training.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 from hazards import crafted, static
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(small_capture(tmp_path_factory))
 
 
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal", "skew-normal-direct"])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from cli_runner import small_capture
 from numpy.typing import NDArray
 
 import clsplat
@@ -95,11 +96,9 @@ def test_what_is_promised_is_enough(device: Device, budget: int) -> None:
     assert truth_budget(device) == device.info.global_mem_bytes // 4
 
 
-def test_training_does_not_depend_on_what_stays(
-    tmp_path_factory: pytest.TempPathFactory, devices: list[Device]
-) -> None:
+def test_training_does_not_depend_on_what_stays(devices: list[Device], capture_folder: Path) -> None:
     """The same bits with all images on the device and with none."""
-    scene = load_scene(small_capture(tmp_path_factory))
+    scene = load_scene(capture_folder)
     config = TrainConfig(iterations=10, cap_max=300, sh_degree=1)
     models = []
     for kept in (True, False):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from cli_runner import HEIGHT, N_VIEWS, WIDTH, small_capture
+from cli_runner import HEIGHT, N_VIEWS, WIDTH
 
 from clsplat.cameras.camera import Camera
 from clsplat.scenes.scene import View, load_scene
@@ -12,8 +14,8 @@ from clsplat.training.view_sampler import ViewSampler
 
 
 @pytest.fixture(scope="module")
-def views(tmp_path_factory: pytest.TempPathFactory) -> list[View]:
-    return load_scene(small_capture(tmp_path_factory), eval=False).views
+def views(capture_folder: Path) -> list[View]:
+    return load_scene(capture_folder, eval=False).views
 
 
 def test_permutations_and_their_rest_in_a_resumed_run(views: list[View]) -> None:

@@ -19,7 +19,6 @@ from reference.scenes import for_shape, random_camera, random_splats
 
 pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
 
-from cli_runner import small_model
 from viewer_client import Client
 from websockets.exceptions import ConnectionClosed
 
@@ -289,8 +288,8 @@ def test_nothing_of_a_message_is_markup() -> None:
 
 
 @pytest.mark.slow
-def test_the_benchmark_runs(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    model, out = small_model(tmp_path_factory), tmp_path / "viewer.jsonl"
+def test_the_benchmark_runs(tmp_path: Path, model_folder: Path) -> None:
+    model, out = model_folder, tmp_path / "viewer.jsonl"
     command = [
         sys.executable,
         str(Path(__file__).parents[2] / "benchmarks" / "viewer.py"),

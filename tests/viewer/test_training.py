@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import small_capture
 
 from clsplat.errors import InputError
 from clsplat.rendering.colormaps import MODES
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.config import TrainConfig
 from clsplat.training.log import Progress
 from clsplat.training.run import train
@@ -27,11 +26,6 @@ from clsplat.viewer.viewer import ViewerImage
 
 CONFIG = TrainConfig(iterations=40, cap_max=2400, sh_degree=1, densify_interval=10, strategy="mcmc")
 LAZY = TrainConfig(iterations=30, cap_max=2400, sh_degree=1, densify_interval=10, strategy="mcmc", visible_adam=True)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(small_capture(tmp_path_factory))
 
 
 def pose_of(scene: Scene) -> Pose:
