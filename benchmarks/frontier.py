@@ -21,10 +21,10 @@ from typing import NamedTuple
 import common
 
 from clsplat.comparison.compare import Run, compare
-from clsplat.comparison.methods import parse_systems
+from clsplat.comparison.methods import parse_methods
 from clsplat.comparison.sweep import distinct, read_runs, write_report
 from clsplat.comparison.sweep_rows import auto_rows, equal_rows, point_rows, seed_rows
-from clsplat.comparison.sweep_tables import Table, auto_table, equal_table, seed_table
+from clsplat.comparison.sweep_tables import TextTable, auto_table, equal_table, seed_table
 from clsplat.comparison.table import HEAD, Record, cells, notes, repeats, summarise
 from clsplat.scenes.scene import load_scene
 from clsplat.splats.shapes import SHAPES
@@ -93,7 +93,7 @@ def run(group: Group, args: argparse.Namespace) -> None:
     scenes = (load_scene(common.data_folder() / name, resolution=size, eval=True) for name, size in sizes.items())
     compare(
         scenes,
-        parse_systems(",".join(group.systems)),
+        parse_methods(",".join(group.systems)),
         args.out,
         group.caps,
         range(group.seeds),
@@ -108,7 +108,7 @@ def run(group: Group, args: argparse.Namespace) -> None:
 def print_tables(records: Sequence[Record]) -> None:
     """All runs, splats at equal quality, automatic runs, seeds."""
     rows, points = summarise(records), point_rows(records)
-    tables: list[tuple[str, Table]] = [
+    tables: list[tuple[str, TextTable]] = [
         ("", (HEAD, [cells(row) for row in rows])),
         (f"splats for the PSNR of {REFERENCE}", equal_table(equal_rows(points, REFERENCE), REFERENCE)),
         ("automatic runs", auto_table(auto_rows(points))),

@@ -56,7 +56,7 @@ def main() -> None:
 
 def run(place: str, shape: str, options: str, seed: int, args: argparse.Namespace) -> None:
     """One run; appends its line."""
-    from clsplat.comparison.methods import parse_systems
+    from clsplat.comparison.methods import parse_methods
     from clsplat.device.device import open_device
     from clsplat.rendering.tuning import schedule_for
     from clsplat.scenes.scene import load_scene
@@ -78,7 +78,7 @@ def run(place: str, shape: str, options: str, seed: int, args: argparse.Namespac
     white = name in WHITE
     background = (1.0, 1.0, 1.0) if white else BLACK
     scene = load_scene(common.data_folder() / name, resolution=int(reduction), background=background)
-    (system,) = parse_systems(f"{shape}:{options}" if options else shape)
+    (system,) = parse_methods(f"{shape}:{options}" if options else shape)
     trainer = Trainer(
         scene, system.config(args.cap, seed, {"iterations": args.iterations, "background": background}), device=device
     )

@@ -27,8 +27,8 @@ from hazards import coupled, crafted, slant_arithmetic
 from hazards.capacity import CAPACITY, capacity_row
 from hazards.report import print_tables, write_charts
 from hazards.static import Renderers, static_row
-from hazards.systems import OPTIMIZERS, SYSTEMS
 from hazards.training import TRAINING, Trainings, build_options
+from hazards.variants import OPTIMIZERS, VARIANTS
 
 from clsplat.device.device import Device, list_devices, open_device
 from clsplat.rendering.tuning import schedule_for
@@ -112,7 +112,7 @@ def static_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
 
 def training_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
     runs = Trainings(devices[0], devices[1] if len(devices) > 1 else None, *([20, 4] if smoke else []))
-    for system in SYSTEMS[:1] if smoke else SYSTEMS:
+    for system in VARIANTS[:1] if smoke else VARIANTS:
         for optimizer in some(OPTIMIZERS, smoke, ("adam",)):
             for hazard in some(TRAINING, smoke, SMOKE["training"]):
                 yield (

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import common
 
 from clsplat.comparison.compare import RUNS, Run, compare
-from clsplat.comparison.methods import System, parse_systems
+from clsplat.comparison.methods import Method, parse_methods
 from clsplat.comparison.table import Record, markdown
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.splats.shapes import SHAPES
@@ -60,11 +60,11 @@ class Group(NamedTuple):
     iterations: int = 1000
     validate: bool = False
 
-    def contestants(self) -> list[System]:
+    def contestants(self) -> list[Method]:
         """The systems, shapes with the options of BASE."""
         return [
             replace(system, changes=BASE | dict(system.changes)) if system.base in SHAPES else system
-            for system in parse_systems(",".join(self.systems))
+            for system in parse_methods(",".join(self.systems))
         ]
 
 
@@ -291,7 +291,7 @@ def short(label: str) -> str:
     return label
 
 
-def own_runs(records: list[Record], system: System, cap: int, iterations: int) -> dict[int, Record]:
+def own_runs(records: list[Record], system: Method, cap: int, iterations: int) -> dict[int, Record]:
     """A system's runs by seed: those made with the options it has now."""
 
     def same(record: Record) -> bool:

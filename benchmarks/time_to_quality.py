@@ -54,7 +54,7 @@ def main() -> None:
 
 def run(name: str, options: str, seed: int, args: argparse.Namespace) -> None:
     """One training; appends its line."""
-    from clsplat.comparison.methods import parse_systems
+    from clsplat.comparison.methods import parse_methods
     from clsplat.device.device import open_device
     from clsplat.rendering.tuning import schedule_for
     from clsplat.scenes.scene import load_scene
@@ -72,7 +72,7 @@ def run(name: str, options: str, seed: int, args: argparse.Namespace) -> None:
     } | {k: environment[k] for k in KEY if k in environment}
     if any(all(row[k] == value for k, value in key.items()) for row in common.read(args.out)):
         return
-    (system,) = parse_systems(f"default:{options}" if options else "default")
+    (system,) = parse_methods(f"default:{options}" if options else "default")
     config = system.config(args.cap, seed, {"iterations": args.iterations})
     scene = load_scene(common.data_folder() / name, resolution=RESOLUTION.get(name, -1), eval=True)
     if args.validate:

@@ -68,7 +68,7 @@ def run(
     task: str, name: str, n: int, shape: str, options: str, seed: int, iterations: int, args: argparse.Namespace
 ) -> None:
     """One run; appends its line."""
-    from clsplat.comparison.methods import parse_systems
+    from clsplat.comparison.methods import parse_methods
     from clsplat.device.device import open_device
     from clsplat.rendering.tuning import schedule_for
     from clsplat.scenes.scene import load_scene
@@ -76,7 +76,7 @@ def run(
 
     device, load = open_device(args.device), os.getloadavg()[0]
     environment = common.environment(device, schedule_for(device))
-    (system,) = parse_systems(f"{shape}:{options}" if options else shape)
+    (system,) = parse_methods(f"{shape}:{options}" if options else shape)
     name, reduction, cap = [*name.split(":"), "-1", str(n)][:3]
     key = {
         "task": task,

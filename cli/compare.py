@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.comparison.methods import DEFAULT, parse_systems
+from clsplat.comparison.methods import DEFAULT, parse_methods
 from clsplat.errors import InputError
 from clsplat.splats.color import BLACK
 from clsplat.training.presets import PRESETS
@@ -78,7 +78,7 @@ def compare_systems(
     with TrainingDisplay(quiet) as display:
         records = compare(
             loaded,
-            parse_systems(systems),
+            parse_methods(systems),
             output,
             flat(caps) or [5000],
             flat(seeds) or [0],

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from clsplat.errors import InputError, OutputError
-from clsplat.evaluation.metrics import DEFAULT_PROTOCOL, PROTOCOLS, Protocol, protocol_named
+from clsplat.evaluation.metrics import DEFAULT_PROTOCOL, PROTOCOLS, MetricProtocol, protocol_named
 from clsplat.files.json_file import read_object, write_json
 from clsplat.splats.color import Color
 from clsplat.splats.stats import complexity
@@ -149,7 +149,7 @@ def measure_model(
     model: LoadedModel,
     scene: Scene,
     renderer: Renderer,
-    protocol: Protocol = DEFAULT_PROTOCOL,
+    protocol: MetricProtocol = DEFAULT_PROTOCOL,
     view_set: str = "test",
     background: Color | None = None,
     renders: Path | None = None,
@@ -249,7 +249,7 @@ def _ending(view_set: str) -> str:
     return "" if view_set == "test" else f"_{view_set}"
 
 
-def describe(protocol: Protocol) -> str:
+def describe(protocol: MetricProtocol) -> str:
     """One line on how the numbers were taken."""
     said = protocol.describe()
     return f"protocol {said['name']}: PSNR {said['PSNR']}; SSIM {said['SSIM']}"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.comparison.methods import parse_systems
+from clsplat.comparison.methods import parse_methods
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
 from .compare import flat, options_and_scenes, say_run
@@ -98,11 +98,11 @@ def draw_frontier(
     Writes DIR/report.html, DIR/charts (PNG, SVG, and their data as CSV and JSON) and what `clsplat compare` writes.
     Runs that are there are not done again; after Ctrl-C the charts show what is there, and the same command goes on.
     """
-    from clsplat.comparison.sweep import distinct, frontier, read_runs, write_report
+    from clsplat.comparison.sweep import distinct, read_runs, sweep, write_report
 
     if charts_only == bool(scenes):
         raise click.UsageError("give scenes, or --charts-only to draw the runs that are there")
-    contestants = parse_systems(systems)
+    contestants = parse_methods(systems)
     more = [record for path in add for record in read_runs(path)]
     if charts_only:
         records = read_runs(output)
@@ -110,7 +110,7 @@ def draw_frontier(
     else:
         common, loaded = options_and_scenes(ctx, scenes, values)
         with TrainingDisplay(quiet) as display:
-            records = frontier(
+            records = sweep(
                 loaded,
                 contestants,
                 output,

@@ -54,7 +54,8 @@ def prune_model(
 ) -> None:
     """Write MODEL, a folder or any splat PLY, without splats, skew and SH bands that its images do not miss.
 
-    Some of the training views judge: their PSNR falls by no more than the tolerance. Test views are never looked at.
+    Some training views are held out to measure the loss: their PSNR falls by no more than the tolerance.
+    Test views are never used.
     A PLY needs the scene, -s; every 8th of its views then counts as a test view.
     """
     if output.is_dir():
@@ -77,7 +78,7 @@ def pruned_model(
     loaded: LoadedModel, scene: Scene, tolerance: float, iterations: int, device: str | None, display: TrainingDisplay
 ) -> Pruned:
     """The smaller model, and what it cost."""
-    from clsplat.compression.prune import SHARES, Judge, prune
+    from clsplat.compression.prune import SHARES, Validation, prune
     from clsplat.device.device import open_device
     from clsplat.rendering.renderer import Renderer
     from clsplat.scenes.split import hold_out
@@ -85,16 +86,18 @@ def pruned_model(
     opened = open_device(device)
     renderer = Renderer(opened)
     split = hold_out(scene)
-    judge = Judge(renderer, split.test, loaded.background)
+    validation = Validation(renderer, split.test, loaded.background)
     splats = loaded.splats
     if not iterations:
-        return prune(splats, scene.train, judge, tolerance)
+        return prune(splats, scene.train, validation, tolerance)
     from clsplat.compression.prune_and_refine import trained_rounds
 
-    before = judge(splats)
-    splats = trained_rounds(scene, splats, judge, before - SHARES["splats"] * tolerance, iterations, opened, display)
-    now = judge(splats)
-    parts = prune(splats, scene.train, judge, max(now - before + tolerance, 0.0), ("fields", "bands"))
+    before = validation.psnr(splats)
+    splats = trained_rounds(
+        scene, splats, validation, before - SHARES["splats"] * tolerance, iterations, opened, display
+    )
+    now = validation.psnr(splats)
+    parts = prune(splats, scene.train, validation, max(now - before + tolerance, 0.0), ("fields", "bands"))
     return replace(parts, before=before, costs={"splats": before - now, **parts.costs})
 
 

@@ -10,8 +10,8 @@ from typing import Any
 from clsplat.comparison.charts import heat_map
 
 from .crafted import STATIC
-from .systems import SYSTEMS
 from .training import TRAINING
+from .variants import VARIANTS
 
 Row = dict[str, Any]
 ORDER = ("survives", "stops", "loses", "fails")  # the worst of a cell's runs counts
@@ -40,7 +40,7 @@ def cells(rows: Iterable[Row]) -> list[dict[str, str]]:
     for row in rows:
         by.setdefault((row["hazard"], row["system"]), []).append(row)
     systems = list(dict.fromkeys(system for _, system in by))
-    known = [name for system in SYSTEMS for name in (system.shape, system.label)]
+    known = [name for system in VARIANTS for name in (system.shape, system.label)]
     systems.sort(key=known.index)
     order = [*STATIC, *TRAINING]
     hazards = sorted(

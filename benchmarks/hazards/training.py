@@ -28,7 +28,7 @@ from clsplat.training.initialise import initial_splats
 
 from . import worlds
 from .crafted import unit
-from .systems import OPTIMIZERS, System
+from .variants import OPTIMIZERS, Variant
 
 ITERATIONS, CAP, SH_DEGREE = 200, 400, 1
 TOLERANCE_DB = 0.5
@@ -66,7 +66,7 @@ class Hazard:
     rates: float = 1.0
     start: Start | None = None
     only: tuple[str, ...] = tuple(OPTIMIZERS)
-    of: Callable[[System], bool] = lambda system: True
+    of: Callable[[Variant], bool] = lambda system: True
     build: str = ""
     other_device: bool = False
 
@@ -97,11 +97,11 @@ def own_at_bound(splats: Splats) -> Splats:
     return Splats(splats.shape, values, splats.normalisation)
 
 
-def has_own_limit(system: System) -> bool:
+def has_own_limit(system: Variant) -> bool:
     return any(own.limit is not None or own.bounds is not None for own in SHAPES[system.shape].fields)
 
 
-def is_skewed(system: System) -> bool:
+def is_skewed(system: Variant) -> bool:
     return SHAPES[system.shape].skew_form is not None
 
 
@@ -176,7 +176,7 @@ class Trainings:
     def __post_init__(self) -> None:
         self.renderer = Renderer(self.device)
 
-    def row(self, name: str, system: System, optimizer: str) -> dict[str, Any] | None:
+    def row(self, name: str, system: Variant, optimizer: str) -> dict[str, Any] | None:
         """One hazard, one system, one optimizer; None where there is nothing to run."""
         hazard, scene = TRAINING[name], worlds.capture(self.views)
         if (hazard.other_device and self.other is None) or not hazard.of(system) or optimizer not in hazard.only:
@@ -195,14 +195,14 @@ class Trainings:
         lost = row["twin_psnr"] - psnr
         return row | {"psnr": psnr, "lost_db": lost, "verdict": "survives" if lost <= TOLERANCE_DB else "loses"}
 
-    def twin(self, system: System, optimizer: str) -> dict[str, float]:
+    def twin(self, system: Variant, optimizer: str) -> dict[str, float]:
         """PSNR of every view after a run with nothing wrong."""
         key = (system.label, optimizer)
         if key not in self.twins:
             self.twins[key] = self.run(worlds.capture(self.views), system, optimizer, Hazard())["psnr"]
         return self.twins[key]
 
-    def run(self, world: Scene, system: System, optimizer: str, hazard: Hazard) -> dict[str, Any]:
+    def run(self, world: Scene, system: Variant, optimizer: str, hazard: Hazard) -> dict[str, Any]:
         """Train into a folder, and look into every file of it."""
         config = TrainConfig(
             **(
@@ -266,7 +266,7 @@ def build_options(options: str) -> Iterator[None]:
                 os.environ[OPTIONS_VARIABLE] = before
 
 
-def rates_of(hazard: Hazard, system: System) -> dict[str, Any]:
+def rates_of(hazard: Hazard, system: Variant) -> dict[str, Any]:
     """Every rate of the config times the hazard's factor."""
     if hazard.rates == 1:
         return {}

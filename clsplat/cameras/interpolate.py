@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..splats.fields import DoubleArray
 from .camera import Camera
-
-Reals = NDArray[np.float64]
 
 # Keys repeated on either side of a closed path: what an end changes in a cubic spline decays by 2 + sqrt(3) a key.
 _WRAPPED = 10
@@ -56,9 +54,9 @@ def interpolate(keys: Sequence[Camera], frames: int, closed: bool = False, even:
     start, end = times[wrapped], times[wrapped + n - (not closed)]
     at = start + (end - start) * np.arange(frames) / max(frames if closed else frames - 1, 1)
     at = np.minimum(at, end)
-    position: Reals = CubicSpline(times, places, bc_type="natural")(at)
-    rotation: Reals = RotationSpline(times, turns)(at).as_matrix()
-    lens: Reals = PchipInterpolator(times, lenses)(at)
+    position: DoubleArray = CubicSpline(times, places, bc_type="natural")(at)
+    rotation: DoubleArray = RotationSpline(times, turns)(at).as_matrix()
+    lens: DoubleArray = PchipInterpolator(times, lenses)(at)
     return [_camera(first, *frame) for frame in zip(position, rotation, lens, strict=True)]
 
 
@@ -76,17 +74,17 @@ def resized_by_height(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-def _gaps(places: Reals, turns: Reals) -> Reals:
+def _gaps(places: DoubleArray, turns: DoubleArray) -> DoubleArray:
     """How long each stretch between two keys takes: its length and its turn, each over the mean one."""
     moves = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    gaps: Reals = turns / max(float(turns.mean()), _LEAST_TURN)
+    gaps: DoubleArray = turns / max(float(turns.mean()), _LEAST_TURN)
     if moves.any():
         gaps = gaps + moves / moves.mean()
     mean = float(gaps.mean())
     return np.maximum(gaps, _LEAST_GAP * mean) if mean > 0 else np.ones(len(gaps))
 
 
-def _camera(pattern: Camera, position: Reals, rotation: Reals, lens: Reals) -> Camera:
+def _camera(pattern: Camera, position: DoubleArray, rotation: DoubleArray, lens: DoubleArray) -> Camera:
     """A camera of the pattern's size; `rotation` is camera to world."""
     pose = np.eye(4)
     pose[:3, :3] = rotation.T

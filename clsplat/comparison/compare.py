@@ -30,7 +30,7 @@ from ..splats.splats import Splats
 from ..training.config import FREE_OPTIONS, TrainConfig
 from ..training.log import Progress
 from ..training.trainer import Trainer
-from .methods import System
+from .methods import Method
 from .table import MEASURED, Record, markdown, notes, summarise
 
 RUNS, TABLE, RESULTS, MODELS = "runs.jsonl", "table.md", "results.json", "models"
@@ -116,7 +116,7 @@ def parse_runs(text: str) -> list[Record]:
 
 def compare(
     scenes: Iterable[Scene],
-    systems: Sequence[System],
+    systems: Sequence[Method],
     output: str | Path,
     caps: Sequence[int],
     seeds: Sequence[int],

@@ -20,7 +20,7 @@ _WORDS = {"true": True, "on": True, "yes": True, "1": True, "false": False, "off
 
 
 @dataclass(frozen=True)
-class System:
+class Method:
     """One contestant.
 
     Parameters
@@ -60,7 +60,7 @@ class System:
             raise InputError(f"system {self.label}: {error}") from None
 
 
-def parse_systems(text: str) -> list[System]:
+def parse_methods(text: str) -> list[Method]:
     """Systems of a list such as `3dgs,gaussian,sns:alternation=off,skew_map=coupled`.
 
     A comma before `key=value` goes on with the changes of the system before it.
@@ -90,13 +90,13 @@ def _known() -> tuple[str, ...]:
     return (DEFAULT, *PRESETS, *SHAPES)
 
 
-def _system(name: str, changes: list[str]) -> System:
+def _system(name: str, changes: list[str]) -> Method:
     base = name.replace("_", "-")
     if base not in _known():
         raise InputError(f"unknown system {name!r}: choose one of {', '.join(_known())}")
     values = dict(_change(name, change) for change in changes)
     said = ",".join(f"{key}={change.partition('=')[2].strip()}" for key, change in zip(values, changes, strict=False))
-    return System(f"{base}:{said}" if said else base, base, values)
+    return Method(f"{base}:{said}" if said else base, base, values)
 
 
 def _change(name: str, change: str) -> tuple[str, Any]:

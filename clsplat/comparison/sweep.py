@@ -14,10 +14,10 @@ from ..scenes.scene import Scene
 from ..training.log import Progress
 from .charts import arithmetic_chart, seeds_chart
 from .compare import RUNS, Run, compare, parse_runs, run_key
-from .methods import System
+from .methods import Method
 from .sweep_charts import equal_chart, size_chart, time_chart
 from .sweep_rows import (
-    Row,
+    ChartRow,
     arithmetic_rows,
     auto_rows,
     curve_rows,
@@ -26,7 +26,7 @@ from .sweep_rows import (
     seed_rows,
     write_rows,
 )
-from .sweep_tables import NONE, Table, arithmetic_table, auto_table, equal_table, seed_table
+from .sweep_tables import NONE, TextTable, arithmetic_table, auto_table, equal_table, seed_table
 from .table import HEAD, Record, cells, notes, summarise
 
 CHARTS, REPORT = "charts", "report.html"
@@ -65,9 +65,9 @@ _TEXT = {
 }
 
 
-def frontier(
+def sweep(
     scenes: Iterable[Scene],
-    systems: Sequence[System],
+    systems: Sequence[Method],
     output: str | Path,
     caps: Sequence[int],
     seeds: Sequence[int],
@@ -142,7 +142,7 @@ def distinct(records: Sequence[Record]) -> list[Record]:
 
 
 def write_report(
-    folder: str | Path, records: Sequence[Record], *, reference: str | None = None, arithmetic: Sequence[Row] = ()
+    folder: str | Path, records: Sequence[Record], *, reference: str | None = None, arithmetic: Sequence[ChartRow] = ()
 ) -> list[Path]:
     """Charts of records, with their data as CSV and JSON, and the page that shows them all.
 
@@ -166,7 +166,7 @@ def write_report(
     points, seeds = point_rows(kept), seed_rows(kept)
     first = reference or next((point["system"] for point in points if not point["auto"]), "")
     equal, auto, forms = equal_rows(points, first), auto_rows(points), arithmetic_rows(arithmetic)
-    parts: list[tuple[str, Sequence[Row], Callable[[Any, Path], list[Path]], Table]] = [
+    parts: list[tuple[str, Sequence[ChartRow], Callable[[Any, Path], list[Path]], TextTable]] = [
         ("size", points, size_chart, auto_table(auto)),
         ("equal", equal, lambda rows, out: equal_chart(rows, first, out), equal_table(equal, first)),
         ("time", curve_rows(kept), time_chart, NONE),

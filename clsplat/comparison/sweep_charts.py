@@ -23,7 +23,7 @@ from ..evaluation.chart_style import (
     star,
     system_legend,
 )
-from .sweep_rows import Row
+from .sweep_rows import ChartRow
 
 # Below these the curves' first moments would press all else together.
 _DB_SHOWN, _SSIM_SHOWN = 5.0, 0.3
@@ -31,7 +31,7 @@ _COSTS = {"render_ms": ("render time [ms]", 1.0), "bytes": ("file [MB]", 1e-6), 
 EQUAL_AIM = 0.7  # share of the reference's splats that is looked for
 
 
-def time_chart(rows: Sequence[Row], out: str | Path) -> list[Path]:
+def time_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
     """Test PSNR above, SSIM below, against seconds of training; a column a scene, a line a run.
 
     The axes begin 5 dB (0.3) below the best. rows : of `frontier_data.curve_rows`. out : path without a suffix.
@@ -45,7 +45,7 @@ def time_chart(rows: Sequence[Row], out: str | Path) -> list[Path]:
         panels = figure.subplots(2, len(scenes), squeeze=False, sharex="col")
         for column, scene in enumerate(scenes):
             own = [row for row in rows if row["scene"] == scene]
-            runs: dict[tuple[str, int], list[Row]] = {}
+            runs: dict[tuple[str, int], list[ChartRow]] = {}
             for row in own:
                 runs.setdefault((row["system"], row["seed"]), []).append(row)
             for axes, key, name, shown in (
@@ -76,7 +76,7 @@ def time_chart(rows: Sequence[Row], out: str | Path) -> list[Path]:
     return chart_paths(out)
 
 
-def size_chart(rows: Sequence[Row], out: str | Path) -> list[Path]:
+def size_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
     """Test PSNR against render time, file size and splats; a row a scene.
 
     The Pareto front is grey, its points labelled by cap. Points of a system at several caps are joined; stars
@@ -114,7 +114,7 @@ def size_chart(rows: Sequence[Row], out: str | Path) -> list[Path]:
     return chart_paths(out)
 
 
-def equal_chart(rows: Sequence[Row], reference: str, out: str | Path) -> list[Path]:
+def equal_chart(rows: Sequence[ChartRow], reference: str, out: str | Path) -> list[Path]:
     """Splats needed for the PSNR of the reference, as a share of the reference's; a column a scene.
 
     A hollow point is a bound: the smallest model is better already. What is out of reach has no point.
@@ -149,7 +149,7 @@ def equal_chart(rows: Sequence[Row], reference: str, out: str | Path) -> list[Pa
     return chart_paths(out)
 
 
-def _cost_panel(axes: Any, own: Sequence[Row], cost: str, unit: float, styles: dict[str, dict[str, Any]]) -> None:
+def _cost_panel(axes: Any, own: Sequence[ChartRow], cost: str, unit: float, styles: dict[str, dict[str, Any]]) -> None:
     """One panel of the size chart, without labels."""
     front = sorted((unit * row[cost], row["psnr"]) for row in own if row[f"front_{cost}"])
     axes.plot(*zip(*front, strict=True), color=FRONT, linewidth=3.5, drawstyle="steps-post", zorder=1)
@@ -169,7 +169,7 @@ def _cost_panel(axes: Any, own: Sequence[Row], cost: str, unit: float, styles: d
     log_axis(axes.xaxis, low, high)
 
 
-def _scenes(rows: Sequence[Row], out: str | Path) -> list[str]:
+def _scenes(rows: Sequence[ChartRow], out: str | Path) -> list[str]:
     if not rows:
         raise InputError(f"{out}: a chart needs points")
     return list(dict.fromkeys(row["scene"] for row in rows))

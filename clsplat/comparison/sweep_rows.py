@@ -18,20 +18,20 @@ from typing import Any
 from ..files.atomic import atomic_writer
 from .table import Record, scene_title, summarise
 
-Row = dict[str, Any]
+ChartRow = dict[str, Any]
 
 COSTS = ("render_ms", "bytes", "splats")  # what PSNR is drawn against
 AUTO = "auto"  # first word of the system of a run that chose its own number of splats
 LEAST_SEEDS = 3  # that show a spread
 
 
-def curve_rows(records: Sequence[Record]) -> list[Row]:
+def curve_rows(records: Sequence[Record]) -> list[ChartRow]:
     """Points along runs: "scene", "cap", "system", "shape", "seed", "iteration", "seconds", "psnr", "ssim".
 
     For each scene of the cap and iterations at which most systems were followed.
     """
     followed = [record for record in records if record.get("curve") and not record.get("repeat")]
-    rows: list[Row] = []
+    rows: list[ChartRow] = []
     for group in _by_scene(followed).values():
         cap, iterations = _commonest([(r["config"]["cap_max"], r["config"]["iterations"], r["system"]) for r in group])
         rows += [
@@ -50,7 +50,7 @@ def curve_rows(records: Sequence[Record]) -> list[Row]:
     return rows
 
 
-def point_rows(records: Sequence[Record]) -> list[Row]:
+def point_rows(records: Sequence[Record]) -> list[ChartRow]:
     """One point for each system and cap of the scenes that have several: means over seeds, of all runs not failed.
 
     Returns
@@ -70,7 +70,7 @@ def point_rows(records: Sequence[Record]) -> list[Row]:
                 | {"seeds": len(row["seeds"]) - len(row["failed"]), "auto": is_auto(row["system"])}
                 | means
             )
-    kept: list[Row] = []
+    kept: list[ChartRow] = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         own = [row for row in rows if row["scene"] == scene]
         swept = [row for row in own if not row["auto"]]
@@ -101,7 +101,7 @@ def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
     return front
 
 
-def equal_rows(points: Sequence[Row], reference: str) -> list[Row]:
+def equal_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow]:
     """How many splats each system needs for the PSNR of the reference system.
 
     Parameters
@@ -114,9 +114,9 @@ def equal_rows(points: Sequence[Row], reference: str) -> list[Row]:
     reference's, dB), "reference_cap", "reference_splats", "splats" and "ratio" (None where the system does not reach
     it), "bound" ("" or "at most": its smallest model is better already).
     """
-    rows: list[Row] = []
+    rows: list[ChartRow] = []
     for scene in dict.fromkeys(point["scene"] for point in points):
-        curves: dict[str, list[Row]] = {}
+        curves: dict[str, list[ChartRow]] = {}
         for point in points:
             if point["scene"] == scene and not point["auto"]:
                 curves.setdefault(point["system"], []).append(point)
@@ -143,7 +143,7 @@ def equal_rows(points: Sequence[Row], reference: str) -> list[Row]:
     return rows
 
 
-def auto_rows(points: Sequence[Row]) -> list[Row]:
+def auto_rows(points: Sequence[ChartRow]) -> list[ChartRow]:
     """Runs that chose their own number of splats beside the best of the sweep with their shape.
 
     Returns
@@ -152,7 +152,7 @@ def auto_rows(points: Sequence[Row]) -> list[Row]:
     "best_psnr", "lost" (best less own, dB), "splats_ratio" and "bytes_ratio" (own / best), "front" (costs on whose
     front it lies). None for each of the best's where the shape was not swept.
     """
-    rows: list[Row] = []
+    rows: list[ChartRow] = []
     for own in points:
         if own["auto"]:
             swept = [
@@ -175,7 +175,7 @@ def auto_rows(points: Sequence[Row]) -> list[Row]:
     return rows
 
 
-def arithmetic_rows(records: Sequence[Row]) -> list[Row]:
+def arithmetic_rows(records: Sequence[ChartRow]) -> list[ChartRow]:
     """Variants of the arithmetic, their errors and times over scenes.
 
     Parameters
@@ -189,7 +189,7 @@ def arithmetic_rows(records: Sequence[Row]) -> list[Row]:
     "raster" and "raster_vjp", the times over those of the variant "default" in the same scene; the mean "psnr_change".
     """
     base = {(row["scene"], row["shape"]): row for row in records if row["variant"] == "default"}
-    rows: list[Row] = []
+    rows: list[ChartRow] = []
     for shape, variant in dict.fromkeys((row["shape"], row["variant"]) for row in records):
         own = [row for row in records if (row["shape"], row["variant"]) == (shape, variant)]
         timed = [row for row in own if row["image_error"] is not None and (row["scene"], shape) in base]
@@ -229,7 +229,7 @@ def splats_needed(curve: Sequence[tuple[float, float]], psnr: float) -> float | 
     return None
 
 
-def seed_rows(records: Sequence[Record]) -> list[Row]:
+def seed_rows(records: Sequence[Record]) -> list[ChartRow]:
     """Runs that show what chance does: those of systems with LEAST_SEEDS seeds or more, and their repeats.
 
     Returns
@@ -242,7 +242,7 @@ def seed_rows(records: Sequence[Record]) -> list[Row]:
     for record in done:
         seeds.setdefault(_setting(record), set()).add(record["config"]["seed"])
     spread = [record for record in done if len(seeds[_setting(record)]) >= LEAST_SEEDS]
-    rows: list[Row] = []
+    rows: list[ChartRow] = []
     for group in _by_scene(spread).values():
         chosen = _commonest([(r["config"]["cap_max"], r["config"]["iterations"], r["system"]) for r in group])
         rows += [
@@ -264,7 +264,7 @@ def seed_rows(records: Sequence[Record]) -> list[Row]:
     return rows
 
 
-def write_rows(folder: Path, name: str, rows: Sequence[Row]) -> list[Path]:
+def write_rows(folder: Path, name: str, rows: Sequence[ChartRow]) -> list[Path]:
     """Write NAME.csv and NAME.json; returns their paths."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
     text = io.StringIO()

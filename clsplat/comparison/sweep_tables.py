@@ -5,13 +5,13 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 
-from .sweep_rows import Row
+from .sweep_rows import ChartRow
 
-Table = tuple[tuple[str, ...], list[tuple[str, ...]]]
-NONE: Table = (), []
+TextTable = tuple[tuple[str, ...], list[tuple[str, ...]]]
+NONE: TextTable = (), []
 
 
-def equal_table(rows: Sequence[Row], reference: str) -> Table:
+def equal_table(rows: Sequence[ChartRow], reference: str) -> TextTable:
     """Splats needed at equal PSNR, as a share of the reference's; a column for each of its caps.
 
     rows : of `frontier_data.equal_rows`.
@@ -24,7 +24,7 @@ def equal_table(rows: Sequence[Row], reference: str) -> Table:
     return ("scene", "system", *(f"{reference}, cap {cap}" for cap in caps)), lines
 
 
-def auto_table(rows: Sequence[Row]) -> Table:
+def auto_table(rows: Sequence[ChartRow]) -> TextTable:
     """Automatic runs beside the best of the sweep. rows : of `frontier_data.auto_rows`."""
     head = (
         "scene",
@@ -66,7 +66,7 @@ def auto_table(rows: Sequence[Row]) -> Table:
     return head, lines
 
 
-def seed_table(rows: Sequence[Row]) -> Table:
+def seed_table(rows: Sequence[ChartRow]) -> TextTable:
     """PSNR over seeds, and over repeats of one. rows : of `frontier_data.seed_rows`."""
     head = (
         "scene",
@@ -112,7 +112,7 @@ def seed_table(rows: Sequence[Row]) -> Table:
     return head, lines
 
 
-def arithmetic_table(rows: Sequence[Row]) -> Table:
+def arithmetic_table(rows: Sequence[ChartRow]) -> TextTable:
     """Variants of the arithmetic. rows : of `frontier_data.arithmetic_rows`."""
     head = (
         "shape",
@@ -132,13 +132,13 @@ def arithmetic_table(rows: Sequence[Row]) -> Table:
     return head, lines
 
 
-def repeated(rows: Sequence[Row]) -> list[Row]:
+def repeated(rows: Sequence[ChartRow]) -> list[ChartRow]:
     """Of one system's rows those of the seed that was trained more than once."""
     seeds = {row["seed"] for row in rows if row["repeat"]}
     return [row for row in rows if row["seed"] in seeds]
 
 
-def _share(row: Row) -> str:
+def _share(row: ChartRow) -> str:
     if row["ratio"] is None:
         return "not reached"
     return f"{'≤ ' if row['bound'] else ''}{100 * row['ratio']:.0f} %"

@@ -25,21 +25,19 @@ from numpy.typing import NDArray
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
 from ..splats.color import BLACK, Color
-from ..splats.fields import Array, Field, sh_coefficients, sh_degree_of
+from ..splats.fields import Array, DoubleArray, Field, sh_coefficients, sh_degree_of
 from ..splats.harmonics import sh_basis
 from ..splats.optical_depth import opacity_names
 from ..splats.ply_compact import movable
 from ..splats.shapes import Shape, shape_named
 from ..splats.splats import SH_C0, Splats
 
-Reals = NDArray[np.float64]
-
 _RIDGE = 1e-3  # of A_ll's mean diagonal: coefficients that no view determines stay as they are
 _CHUNK = 8192  # splats whose systems are solved at once
 
 
 @dataclass(frozen=True)
-class Needs:
+class Importance:
     """Squared changes of the images, summed over pixels, channels and views (0..1 is black to white).
 
     Parameters
@@ -49,20 +47,20 @@ class Needs:
     colour : (N, K (K + 1) / 2) the upper triangle of A, row by row; None where it was not asked for.
     """
 
-    removal: Reals
-    fields: dict[str, Reals]
+    removal: DoubleArray
+    fields: dict[str, DoubleArray]
     colour: NDArray[np.float32] | None
 
 
-def measure(
+def measure_importance(
     renderer: Renderer,
     splats: Splats,
     views: Sequence[View],
     background: Color = BLACK,
     seed: int = 0,
     parts: bool = True,
-) -> Needs:
-    """Needs of all splats on some views; one render and one backward pass each.
+) -> Importance:
+    """Importance of all splats on some views; one render and one backward pass each.
 
     Parameters
     ----------
@@ -90,7 +88,7 @@ def measure(
             seen = np.flatnonzero(weight)
             basis = basis[seen]
             colour[seen] += weight[seen, None].astype(np.float32) * (basis[:, rows] * basis[:, columns])
-    return Needs(removal, dropped, colour)
+    return Importance(removal, dropped, colour)
 
 
 def droppable(splats: Splats) -> list[Field]:
@@ -102,12 +100,12 @@ def droppable(splats: Splats) -> list[Field]:
     return [field for field in movable(splats.schema) if field.name != "skew" or form == "centred"]
 
 
-def lower_bands(sh: Array, colour: NDArray[np.float32]) -> tuple[list[Array], Reals]:
+def lower_bands(sh: Array, colour: NDArray[np.float32]) -> tuple[list[Array], DoubleArray]:
     """Colours of each lower degree, as good as they can be on the views of `colour`, and what is lost by them.
 
     Parameters
     ----------
-    sh : (N, K, 3). colour : see `Needs`.
+    sh : (N, K, 3). colour : see `Importance`.
 
     Returns
     -------
@@ -132,32 +130,32 @@ def lower_bands(sh: Array, colour: NDArray[np.float32]) -> tuple[list[Array], Re
     return lower, np.maximum.accumulate(np.maximum(lost, 0.0)[:, ::-1], axis=1)[:, ::-1]
 
 
-def _per_opacity(shape: Shape, raw: Array) -> Reals:
+def _per_opacity(shape: Shape, raw: Array) -> DoubleArray:
     """o over do/draw, by which a gradient of the raw opacity becomes the image's change without the splat."""
     wide = raw.astype(np.float64)
     if shape.signed:  # tanh: o / (1 - o^2)
-        factor: Reals = 0.5 * np.sinh(np.clip(2.0 * wide, -60.0, 60.0))
+        factor: DoubleArray = 0.5 * np.sinh(np.clip(2.0 * wide, -60.0, 60.0))
     else:  # logistic: 1 / (1 - o)
         factor = 1.0 + np.exp(np.minimum(wide, 60.0))
     return factor
 
 
-def _first_order(field: Field, values: Array, grads: Array) -> Reals:
+def _first_order(field: Field, values: Array, grads: Array) -> DoubleArray:
     """The image's change by a field's way to its neutral value; of a bounded field, in its logarithm."""
     wide, neutral = values.astype(np.float64), np.asarray(field.neutral)
     way = wide * np.log(wide / neutral) if field.bounds is not None else wide - neutral
-    product: Reals = (way * grads).reshape(len(values), field.width).sum(axis=1)
+    product: DoubleArray = (way * grads).reshape(len(values), field.width).sum(axis=1)
     return product
 
 
-def _directions(splats: Splats, view: View) -> Reals:
+def _directions(splats: Splats, view: View) -> DoubleArray:
     """(N, 3) unit vectors from the camera to the splats."""
     away = splats.mean.astype(np.float64) - view.camera.position
-    unit: Reals = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    unit: DoubleArray = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
     return unit
 
 
-def _square(triangle: NDArray[np.float32], coefficients: int) -> Reals:
+def _square(triangle: NDArray[np.float32], coefficients: int) -> DoubleArray:
     """(N, K, K) symmetric matrices of their upper triangles."""
     rows, columns = np.triu_indices(coefficients)
     full = np.zeros((len(triangle), coefficients, coefficients))

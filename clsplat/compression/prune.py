@@ -1,8 +1,8 @@
 """Leaving out what images do not miss: whole splats, own fields such as the skew, SH bands.
 
-Each kind of part is ranked by the squared change of the training images per byte saved (needs.py), and goes as far as
-the validation views allow: the threshold is found by bisection on the ranks, so that their PSNR falls by no more than
-the kind's share of the tolerance; what one kind leaves unused, the next may use.
+Each kind of part is ranked by the squared change of the training images per byte saved (importance.py). Bisection on
+the ranks finds the threshold at which the validation PSNR falls by the kind's share of the tolerance. The next kind may
+use what one kind leaves of its share.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from ..evaluation.metrics import psnr
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
 from ..splats.color import BLACK, Color
-from ..splats.fields import Array, sh_coefficients
+from ..splats.fields import Array, DoubleArray, sh_coefficients
 from ..splats.ply_compact import bands_in_use, in_use, layout_bytes, plan_layout
 from ..splats.splats import Splats
-from .importance import Needs, Reals, lower_bands, measure
+from .importance import Importance, lower_bands, measure_importance
 
 SHARES = {"splats": 0.5, "fields": 0.75, "bands": 1.0}  # of the tolerance, spent once the kind is done
 _STEPS = 10  # of a bisection: one in a thousand of the ranks
@@ -64,13 +64,13 @@ class Pruned:
     thresholds: Thresholds
 
 
-class Judge:
+class Validation:
     """PSNR of models on some views, the mean over them [dB]."""
 
     def __init__(self, renderer: Renderer, views: Sequence[View], background: Color = BLACK) -> None:
         self.renderer, self.views, self.background = renderer, views, background
 
-    def __call__(self, splats: Splats) -> float:
+    def psnr(self, splats: Splats) -> float:
         return statistics.fmean(self.per_view(splats))
 
     def per_view(self, splats: Splats) -> list[float]:
@@ -86,18 +86,18 @@ class Judge:
 def prune(
     splats: Splats,
     views: Sequence[View],
-    judge: Judge,
+    validation: Validation,
     tolerance: float,
     kinds: Sequence[str] = tuple(SHARES),
     seed: int = 0,
 ) -> Pruned:
-    """Leave out as much as the judge's views allow.
+    """Leave out as much as the validation views allow.
 
     Parameters
     ----------
-    views : training views, on which needs are measured. judge : of the validation views.
+    views : training views, on which needs are measured. validation : of the validation views.
     tolerance : that PSNR on the validation views may fall by [dB]. kinds : any of SHARES, in their order.
-    seed : of the signs (see `needs.measure`).
+    seed : of the signs (see `measure_importance`).
 
     Raises
     ------
@@ -107,20 +107,28 @@ def prune(
         raise InputError("prune: the model has no splats")
     if not tolerance >= 0:
         raise InputError(f"tolerance {tolerance}: must be at least 0 dB")
-    before = now = judge(splats)
+    before = now = validation.psnr(splats)
     found, costs = Thresholds(), {}
     if "splats" in kinds:
         scores = splat_scores(
-            splats, per_pixel(measure(judge.renderer, splats, views, judge.background, seed, parts=False), views)
+            splats,
+            per_pixel(
+                measure_importance(validation.renderer, splats, views, validation.background, seed, parts=False), views
+            ),
         )
         threshold, splats, after = _farthest(
-            scores, splats, now, before - SHARES["splats"] * tolerance, partial(without_splats, scores=scores), judge
+            scores,
+            splats,
+            now,
+            before - SHARES["splats"] * tolerance,
+            partial(without_splats, scores=scores),
+            validation,
         )
         found, costs["splats"], now = replace(found, splats=threshold), now - after, after
     if "fields" not in kinds and "bands" not in kinds:
         return Pruned(splats, before, now, costs, found)
-    needs = per_pixel(measure(judge.renderer, splats, views, judge.background, seed), views)
-    for name, change in needs.fields.items() if "fields" in kinds else ():
+    importance = per_pixel(measure_importance(validation.renderer, splats, views, validation.background, seed), views)
+    for name, change in importance.fields.items() if "fields" in kinds else ():
         scores = field_scores(splats, name, change)
         threshold, splats, after = _farthest(
             scores,
@@ -128,19 +136,19 @@ def prune(
             now,
             before - SHARES["fields"] * tolerance,
             partial(without_field, name=name, scores=scores),
-            judge,
+            validation,
         )
         found, costs[name], now = replace(found, fields=found.fields | {name: threshold}), now - after, after
     if "bands" in kinds and splats.sh_degree:
-        assert needs.colour is not None
-        lower, lost = lower_bands(splats.sh, needs.colour)
+        assert importance.colour is not None
+        lower, lost = lower_bands(splats.sh, importance.colour)
         threshold, splats, after = _farthest(
             band_slopes(lost),
             splats,
             now,
             before - SHARES["bands"] * tolerance,
             partial(without_bands, lower=lower, lost=lost),
-            judge,
+            validation,
         )
         found, costs["bands"], now = replace(found, bands=threshold), now - after, after
     return Pruned(splats, before, now, costs, found)
@@ -155,12 +163,12 @@ def apply_thresholds(
     seed: int = 0,
 ) -> Splats:
     """The model without the fields and bands that thresholds found on another one of its scene leave out."""
-    needs = per_pixel(measure(renderer, splats, views, background, seed), views)
+    importance = per_pixel(measure_importance(renderer, splats, views, background, seed), views)
     for name, threshold in thresholds.fields.items():
-        splats = without_field(splats, threshold, name, field_scores(splats, name, needs.fields[name]))
+        splats = without_field(splats, threshold, name, field_scores(splats, name, importance.fields[name]))
     if thresholds.bands:
-        assert needs.colour is not None
-        splats = without_bands(splats, thresholds.bands, *lower_bands(splats.sh, needs.colour))
+        assert importance.colour is not None
+        splats = without_bands(splats, thresholds.bands, *lower_bands(splats.sh, importance.colour))
     return splats
 
 
@@ -182,10 +190,10 @@ def within_bytes(
     """
     if body_bytes(splats) <= limit - HEADER_BYTES:
         return splats
-    needs = per_pixel(measure(renderer, splats, views, background, seed), views)
-    assert needs.colour is not None
-    lower, lost = lower_bands(splats.sh, needs.colour)
-    scores = {name: field_scores(splats, name, change) for name, change in needs.fields.items()}
+    importance = per_pixel(measure_importance(renderer, splats, views, background, seed), views)
+    assert importance.colour is not None
+    lower, lost = lower_bands(splats.sh, importance.colour)
+    scores = {name: field_scores(splats, name, change) for name, change in importance.fields.items()}
     every = np.concatenate([band_slopes(lost), *scores.values()])
     ranked = np.unique(every[np.isfinite(every)])
     low, high = -1, len(ranked) - 1
@@ -213,42 +221,44 @@ def body_bytes(splats: Splats) -> int:
     return layout_bytes(splats.schema, plan_layout(splats.schema, single), len(splats))
 
 
-def per_pixel(needs: Needs, views: Sequence[View]) -> Needs:
+def per_pixel(importance: Importance, views: Sequence[View]) -> Importance:
     """Means over the pixels and channels of the views, instead of sums: they are of one size in scenes of any size."""
     count = 3 * sum(view.camera.width * view.camera.height for view in views)
-    colour = None if needs.colour is None else needs.colour / np.float32(count)
-    return Needs(needs.removal / count, {name: change / count for name, change in needs.fields.items()}, colour)
+    colour = None if importance.colour is None else importance.colour / np.float32(count)
+    return Importance(
+        importance.removal / count, {name: change / count for name, change in importance.fields.items()}, colour
+    )
 
 
-def splat_scores(splats: Splats, needs: Needs) -> Reals:
+def splat_scores(splats: Splats, importance: Importance) -> DoubleArray:
     """(N,) change per byte of each splat."""
     width = sum(values[:1].size for values in splats.arrays.values())
-    return needs.removal / (4 * width)
+    return importance.removal / (4 * width)
 
 
-def field_scores(splats: Splats, name: str, change: Reals) -> Reals:
+def field_scores(splats: Splats, name: str, change: DoubleArray) -> DoubleArray:
     """(N,) change per byte of each splat's field; infinite where it is neutral already."""
     own = splats.schema[name]
     return np.where(in_use(own, splats.arrays[name]), change / (4 * (own.width + _INDEX)), np.inf)
 
 
-def band_slopes(lost: Reals) -> Reals:
+def band_slopes(lost: DoubleArray) -> DoubleArray:
     """(N * degree,) loss per byte of each step of a degree down, from those that any step can have."""
     words = [3 * sh_coefficients(degree) for degree in range(lost.shape[1])]
     return ((lost[:, :-1] - lost[:, 1:]) / (4 * np.diff(words))).ravel()
 
 
-def without_splats(splats: Splats, threshold: float, scores: Reals) -> Splats:
+def without_splats(splats: Splats, threshold: float, scores: DoubleArray) -> Splats:
     """Those whose score is above the threshold."""
     return splats.select(scores > threshold)
 
 
-def strongest(splats: Splats, scores: Reals, count: int) -> Splats:
+def strongest(splats: Splats, scores: DoubleArray, count: int) -> Splats:
     """The `count` splats of the highest scores, in their order."""
     return splats.select(np.sort(np.argsort(-scores, kind="stable")[:count]))
 
 
-def without_field(splats: Splats, threshold: float, name: str, scores: Reals) -> Splats:
+def without_field(splats: Splats, threshold: float, name: str, scores: DoubleArray) -> Splats:
     """A field's neutral value for splats whose score is not above the threshold."""
     own = splats.schema[name]
     arrays = splats.to_numpy()
@@ -256,8 +266,8 @@ def without_field(splats: Splats, threshold: float, name: str, scores: Reals) ->
     return splats.with_arrays(arrays)
 
 
-def without_bands(splats: Splats, threshold: float, lower: Sequence[Array], lost: Reals) -> Splats:
-    """Of each splat the SH degree of the least loss + threshold * bytes; `lower`, `lost`: see `needs.lower_bands`."""
+def without_bands(splats: Splats, threshold: float, lower: Sequence[Array], lost: DoubleArray) -> Splats:
+    """Give each splat the SH degree with the least `lost` + threshold * bytes; `lower`, `lost`: see `lower_bands`."""
     words = np.array([3 * sh_coefficients(degree) for degree in range(lost.shape[1])])
     degrees: NDArray[np.int64] = np.argmin(lost + threshold * 4 * words, axis=1)
     arrays = splats.to_numpy()
@@ -270,7 +280,12 @@ def without_bands(splats: Splats, threshold: float, lower: Sequence[Array], lost
 
 
 def _farthest(
-    scores: Reals, splats: Splats, now: float, floor: float, apply: Callable[[Splats, float], Splats], judge: Judge
+    scores: DoubleArray,
+    splats: Splats,
+    now: float,
+    floor: float,
+    apply: Callable[[Splats, float], Splats],
+    validation: Validation,
 ) -> tuple[float, Splats, float]:
     """The highest threshold, by bisection on the ranks of the scores, that keeps PSNR at the floor or above.
 
@@ -286,7 +301,7 @@ def _farthest(
         if middle <= low:
             break
         candidate = apply(splats, float(ranked[middle - 1]))
-        value = judge(candidate)
+        value = validation.psnr(candidate)
         if value >= floor:
             low, best = middle, (float(ranked[middle - 1]), candidate, value)
         else:

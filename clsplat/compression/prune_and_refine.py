@@ -21,8 +21,8 @@ from ..splats.splats import Splats
 from ..training.config import TrainConfig
 from ..training.log import Progress
 from ..training.trainer import Trainer
-from .importance import measure
-from .prune import Judge, splat_scores, strongest
+from .importance import measure_importance
+from .prune import Validation, splat_scores, strongest
 
 KEPT = 0.75  # of the splats, by a round
 SETTLING = 0.3  # rate of a last part without removal: 0.2 dB better than at full rate (fox, 13 500 and 5700 splats)
@@ -46,21 +46,21 @@ def without_quarter(
     count: int | None = None,
 ) -> Splats:
     """The splats whose removal would change the views most: KEPT of them, or `count` where that is more."""
-    needs = measure(renderer, splats, views, background, seed, parts=False)
+    importance = measure_importance(renderer, splats, views, background, seed, parts=False)
     keep = max(int(KEPT * len(splats)), count or 1)
-    return strongest(splats, splat_scores(splats, needs), min(keep, len(splats)))
+    return strongest(splats, splat_scores(splats, importance), min(keep, len(splats)))
 
 
 def trained_rounds(
     scene: Scene,
     splats: Splats,
-    judge: Judge,
+    validation: Validation,
     floor: float,
     iterations: int,
     device: Device,
     progress: Callable[[Progress], None] | None = None,
 ) -> Splats:
-    """Rounds for a model whose run is not known, until the judge's PSNR falls below the floor; the last good one.
+    """Rounds for a model whose run is not known, until the validation PSNR falls below the floor; the last good one.
 
     Rates are those that a run of clsplat's defaults, ten times as long as a round, ends with.
 
@@ -73,13 +73,13 @@ def trained_rounds(
         normalisation=splats.normalisation,
         antialiased=splats.antialiased,
         iterations=10 * iterations,
-        background=judge.background,
+        background=validation.background,
     )
     good = splats
     while len(splats) > 1:
-        fewer = without_quarter(splats, scene.train, judge.renderer, judge.background)
+        fewer = without_quarter(splats, scene.train, validation.renderer, validation.background)
         splats = fine_tune(scene, fewer, config, iterations, device, progress)
-        if judge(splats) < floor:
+        if validation.psnr(splats) < floor:
             break
         good = splats
     return good

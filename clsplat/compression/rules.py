@@ -17,7 +17,7 @@ FEWEST = 50  # splats: no round goes below
 
 # A model: "splats", "psnr"; "cap" (growth, whole runs), "views" (growth), "fitted_psnr" (where bytes are limited);
 # "lost" (the first of the rounds): how much lower its PSNR is than that of the best whole run.
-Row = dict[str, Any]
+ModelRow = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def growth_caps(most: int) -> list[int]:
     return [*caps, most]
 
 
-def growth_is_over(rows: list[Row], options: BudgetOptions) -> bool:
+def growth_is_over(rows: list[ModelRow], options: BudgetOptions) -> bool:
     """Whether the last doublings gained too little, or the target is reached."""
     if options.target_psnr is not None and rows and rows[-1]["psnr"] >= options.target_psnr:
         return True
@@ -62,7 +62,7 @@ def growth_is_over(rows: list[Row], options: BudgetOptions) -> bool:
     return bool(before) and max(row["psnr"] for row in rows) - max(before) < options.tolerance
 
 
-def candidates(rows: list[Row], options: BudgetOptions) -> list[int]:
+def candidates(rows: list[ModelRow], options: BudgetOptions) -> list[int]:
     """Caps that may be the knee, rising: the smallest that is as good as the best, and the smallest that may be.
 
     The latter differs from the best by less than the standard error: short runs cannot tell them apart, whole ones may.
@@ -78,7 +78,7 @@ def candidates(rows: list[Row], options: BudgetOptions) -> list[int]:
     return sorted({may_be, sure})
 
 
-def knee_of(whole: list[Row], options: BudgetOptions) -> int:
+def knee_of(whole: list[ModelRow], options: BudgetOptions) -> int:
     """The smallest cap of whole runs that is as good as the best of them."""
     best = max(float(row["psnr"]) for row in whole)
     knee: int = next(row["cap"] for row in whole if row["psnr"] >= best - KNEE_SHARE * options.tolerance)
@@ -91,7 +91,7 @@ def standard_error(first: list[float], second: list[float]) -> float:
     return statistics.stdev(differences) / math.sqrt(len(differences)) if len(differences) > 1 else 0.0
 
 
-def rounds_are_over(rows: list[Row], options: BudgetOptions) -> bool:
+def rounds_are_over(rows: list[ModelRow], options: BudgetOptions) -> bool:
     """Whether fewer splats would not do: the last models were not good enough, or hardly a splat is left."""
     last = rows[-PATIENCE:]
     return rows[-1]["splats"] <= FEWEST or (
@@ -99,7 +99,7 @@ def rounds_are_over(rows: list[Row], options: BudgetOptions) -> bool:
     )
 
 
-def meets(row: Row, rows: list[Row], options: BudgetOptions) -> bool | None:
+def meets(row: ModelRow, rows: list[ModelRow], options: BudgetOptions) -> bool | None:
     """Whether a model of the rounds is good enough beside the others; None: not yet small enough."""
     floor = options.target_psnr
     if floor is None:
@@ -109,12 +109,12 @@ def meets(row: Row, rows: list[Row], options: BudgetOptions) -> bool | None:
     return bool(row["psnr"] >= floor)
 
 
-def rounds_allowed(rows: list[Row], options: BudgetOptions) -> float:
+def rounds_allowed(rows: list[ModelRow], options: BudgetOptions) -> float:
     """PSNR that rounds may lose [dB]: their share of the tolerance, and what the knee has left of its own."""
     return (KNEE_SHARE + ROUNDS_SHARE) * options.tolerance - float(rows[0].get("lost", KNEE_SHARE * options.tolerance))
 
 
-def chosen_of(rows: list[Row], options: BudgetOptions) -> int:
+def chosen_of(rows: list[ModelRow], options: BudgetOptions) -> int:
     """Number of rounds after which the model is the one wanted; of none that is, after which it is best."""
     if options.max_bytes is not None:
         fitting = [row["fitted_psnr"] for row in rows if row["fitted_psnr"] is not None]

@@ -39,13 +39,13 @@ from ..training.folder import ModelFolder
 from ..training.log import Progress
 from ..training.run import train
 from ..training.trainer import Trainer
-from .prune import Judge, Thresholds, apply_thresholds, prune, within_bytes
+from .prune import Thresholds, Validation, apply_thresholds, prune, within_bytes
 from .prune_and_refine import SETTLING, fine_tune, without_messages, without_quarter
 from .rules import (
     FEWEST,
     PARTS_SHARE,
     BudgetOptions,
-    Row,
+    ModelRow,
     candidates,
     chosen_of,
     growth_caps,
@@ -57,7 +57,7 @@ from .state import BudgetState
 
 GROWTH_PART, ROUND_PART = 4, 10  # the run's iterations over those of a run of growth, and of a round
 
-Report = Callable[[Progress], None]
+ProgressCallback = Callable[[Progress], None]
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def train_budget(
     scene: Scene,
     config: TrainConfig | None = None,
     options: BudgetOptions | None = None,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
     *,
     output: str | Path,
     resume: bool = False,
@@ -138,7 +138,7 @@ class _Search:
         scene: Scene,
         config: TrainConfig,
         options: BudgetOptions,
-        progress: Report | None,
+        progress: ProgressCallback | None,
         state: BudgetState,
         folder: ModelFolder,
         extra: dict[str, Any],
@@ -148,7 +148,7 @@ class _Search:
         self.split = hold_out(scene)
         self.device: Device = open_device(config.device)
         self.renderer = Renderer(self.device)
-        self.judge = Judge(self.renderer, self.split.test, config.background)
+        self.validation = Validation(self.renderer, self.split.test, config.background)
         self.part = max(config.iterations // ROUND_PART, 1)
 
     def run(self) -> Budgeted:
@@ -181,7 +181,7 @@ class _Search:
         """Short runs at rising caps."""
         iterations = max(self.config.iterations // GROWTH_PART, 1)
         interval = max(self.config.densify_interval // GROWTH_PART, 1)
-        rows: list[Row] = self.state.values.get("growth", [])
+        rows: list[ModelRow] = self.state.values.get("growth", [])
         for cap in growth_caps(self.config.cap_max):
             if any(row["cap"] == cap for row in rows):
                 continue
@@ -197,7 +197,7 @@ class _Search:
                 test_iterations=(),
             )
             splats, seconds = self.run_of(config)
-            views = self.judge.per_view(splats)
+            views = self.validation.per_view(splats)
             rows = [
                 *rows,
                 {
@@ -215,7 +215,7 @@ class _Search:
 
     def decide(self) -> None:
         """A whole run at each cap that may be the knee."""
-        rows: list[Row] = self.state.values.get("whole", [])
+        rows: list[ModelRow] = self.state.values.get("whole", [])
         for cap in self.state.values["candidates"]:
             if any(row["cap"] == cap for row in rows):
                 continue
@@ -239,7 +239,7 @@ class _Search:
             knee = next(row for row in values["whole"] if row["cap"] == values["knee"])
             best = max(row["psnr"] for row in values["whole"])
             self.state.put("rounds", [knee | {"lost": best - knee["psnr"]}])
-        rows: list[Row] = values["rounds"]
+        rows: list[ModelRow] = values["rounds"]
         while not rounds_are_over(rows, goal):
             start = time.perf_counter()
             splats = self.round(self.split, self.state.model(f"held_out_{len(rows) - 1}"), len(rows))
@@ -252,11 +252,11 @@ class _Search:
         """Fields and bands that the validation views do not miss."""
         values, start = self.state.values, time.perf_counter()
         splats = self.settle(self.split, self.state.model(f"held_out_{values['chosen']}"), values["chosen"])
-        now = self.judge(splats)
+        now = self.validation.psnr(splats)
         allowed = PARTS_SHARE * self.options.tolerance
         if self.options.target_psnr is not None:
             allowed = max(now - self.options.target_psnr, 0.0)
-        found = prune(splats, self.split.train, self.judge, allowed, ("fields", "bands"), self.config.seed)
+        found = prune(splats, self.split.train, self.validation, allowed, ("fields", "bands"), self.config.seed)
         small = found.splats
         if self.options.max_bytes is not None:
             small = self.fitted(small, self.split) or small
@@ -264,7 +264,7 @@ class _Search:
             "held_out",
             {
                 "psnr": now,
-                "psnr_pruned": self.judge(small),
+                "psnr_pruned": self.validation.psnr(small),
                 "costs": found.costs,
                 "seconds": round(time.perf_counter() - start, 2),
                 **complexity(small).to_json(),
@@ -319,12 +319,12 @@ class _Search:
         model = Trainer(self.split, config, progress=without_messages(self.progress), device=self.device).run()
         return model.splats, round(model.seconds, 2)
 
-    def row(self, splats: Splats, seconds: float) -> Row:
+    def row(self, splats: Splats, seconds: float) -> ModelRow:
         """A model of the rounds; with a limit of bytes, as good as it is once it fits."""
-        row: Row = {"splats": len(splats), "psnr": self.judge(splats), "seconds": seconds}
+        row: ModelRow = {"splats": len(splats), "psnr": self.validation.psnr(splats), "seconds": seconds}
         if self.options.max_bytes is not None:
             fitted = self.fitted(splats, self.split)
-            row |= {"fitted_psnr": None if fitted is None else self.judge(fitted)}
+            row |= {"fitted_psnr": None if fitted is None else self.validation.psnr(fitted)}
         return row
 
     def fitted(self, splats: Splats, scene: Scene) -> Splats | None:

@@ -14,7 +14,7 @@ from ..rendering.renderer import Rendered, Renderer
 from ..scenes.scene import View
 from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
-from .metrics import DEFAULT_PROTOCOL, Protocol
+from .metrics import DEFAULT_PROTOCOL, MetricProtocol
 
 MAX_PSNR = 100.0  # stands in for the infinity of two equal images, which JSON cannot hold
 
@@ -34,7 +34,7 @@ def evaluate(
     splats: Splats,
     views: Sequence[View],
     background: Color = BLACK,
-    protocol: Protocol = DEFAULT_PROTOCOL,
+    protocol: MetricProtocol = DEFAULT_PROTOCOL,
     on_view: Callable[[View, Rendered], None] | None = None,
 ) -> Evaluation:
     """Render every view and compare it with its photograph.

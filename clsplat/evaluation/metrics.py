@@ -1,7 +1,7 @@
 """Image quality: PSNR and SSIM, and the protocol that says how they were taken.
 
 "PSNR" and "SSIM" differ between tools by rounding and by padding, enough to change a ranking; every table
-therefore names its `Protocol`.
+therefore names its `MetricProtocol`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SSIM_C2 = 0.03**2
 
 
 @dataclass(frozen=True, slots=True)
-class Protocol:
+class MetricProtocol:
     """How metrics are taken.
 
     Parameters
@@ -64,11 +64,11 @@ class Protocol:
         return {"name": name, "PSNR": f"per image, {images}", "SSIM": f"{window}, {images}"}
 
 
-PROTOCOLS = {p.name: p for p in (Protocol("clsplat", True, "valid"), Protocol("3dgs", True, "zero"))}
+PROTOCOLS = {p.name: p for p in (MetricProtocol("clsplat", True, "valid"), MetricProtocol("3dgs", True, "zero"))}
 DEFAULT_PROTOCOL = PROTOCOLS["clsplat"]
 
 
-def protocol_named(name: str) -> Protocol:
+def protocol_named(name: str) -> MetricProtocol:
     """Protocol of `name`; raises InputError listing the known names."""
     try:
         return PROTOCOLS[name]

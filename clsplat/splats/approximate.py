@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .convert import Reals, convert, direct_form, restretched, to_world
-from .fields import Field
+from .convert import convert, direct_form, restretched, to_world
+from .fields import DoubleArray, Field
 from .shapes import GAUSSIAN, NORMALISATIONS, SLANT_MAX, Shape, shape_named
 from .splats import Splats
 
@@ -72,7 +72,7 @@ def nearest_gaussians(splats: Splats) -> Splats:
     return Splats(GAUSSIAN.name, arrays, antialiased=splats.antialiased)
 
 
-def _lopsided(model: dict[str, Reals], source: Shape) -> dict[str, Reals]:
+def _lopsided(model: dict[str, DoubleArray], source: Shape) -> dict[str, DoubleArray]:
     """Mean, rotation, scale and opacity of the Gaussians nearest to splats with a skew or a plane."""
     direct = direct_form(model, source) if source.skew_form == "centred" else model
     if source.skew_form is None:  # a plane
@@ -96,7 +96,7 @@ def _lopsided(model: dict[str, Reals], source: Shape) -> dict[str, Reals]:
     return frame | {"mean": mean, "opacity_logit": _raw(height * opacity)}
 
 
-def _round(model: dict[str, Reals], source: Shape, parameter: Field) -> dict[str, Reals]:
+def _round(model: dict[str, DoubleArray], source: Shape, parameter: Field) -> dict[str, DoubleArray]:
     """Scale and opacity of the Gaussians nearest to splats of a round profile."""
     values, fits = _round_fits(source, parameter)
     width, height = (np.interp(np.log(model[parameter.name]), np.log(values), column) for column in fits.T)
@@ -106,33 +106,33 @@ def _round(model: dict[str, Reals], source: Shape, parameter: Field) -> dict[str
     }
 
 
-def _raw(opacity: Reals) -> Reals:
+def _raw(opacity: DoubleArray) -> DoubleArray:
     """Raw values; a fit may be higher than 1, where a profile is flatter than a Gaussian."""
     with np.errstate(divide="ignore"):
         return np.clip(GAUSSIAN.raw_opacity(np.clip(opacity, 0.0, 1.0)), -_RAW_MAX, _RAW_MAX)
 
 
-def _between(table: Reals, slant: Reals, ratio: Reals) -> Reals:
+def _between(table: DoubleArray, slant: DoubleArray, ratio: DoubleArray) -> DoubleArray:
     """Rows (N, ...) of a table over _SLANTS and _RATIOS, linear between its nodes; infinite slants have their own."""
     last = len(_SLANTS) - 2
     s = np.where(np.isinf(slant), last + 1.0, np.minimum(slant, SLANT_MAX) / SLANT_MAX * last)
     r = np.clip(ratio, 0.0, 1.0) * (len(_RATIOS) - 1)
     s0, r0 = np.minimum(s.astype(int), last), np.minimum(r.astype(int), len(_RATIOS) - 2)
     a, b = (s - s0)[:, None], (r - r0)[:, None]
-    mixed: Reals = (1 - a) * ((1 - b) * table[s0, r0] + b * table[s0, r0 + 1]) + a * (
+    mixed: DoubleArray = (1 - a) * ((1 - b) * table[s0, r0] + b * table[s0, r0 + 1]) + a * (
         (1 - b) * table[s0 + 1, r0] + b * table[s0 + 1, r0 + 1]
     )
     return mixed
 
 
-def _lines() -> Reals:
+def _lines() -> DoubleArray:
     """(slants, ratios, points) the profiles themselves."""
     from scipy.special import ndtr  # lazy: the command line starts without scipy
 
     with np.errstate(invalid="ignore"):  # infinity times 0: the plane itself
         side = np.nan_to_num(ndtr(_SLANTS[:, None] * _LINE), nan=0.5)[:, None]
     ratio = _RATIOS[:, None]
-    lines: Reals = np.exp(-0.5 * _LINE**2) * (ratio + (1.0 - ratio) * side)
+    lines: DoubleArray = np.exp(-0.5 * _LINE**2) * (ratio + (1.0 - ratio) * side)
     return lines
 
 
@@ -152,7 +152,7 @@ def _line_peaks() -> NDArray[np.float64]:
 
 
 @cache
-def _round_fits(source: Shape, parameter: Field) -> tuple[Reals, Reals]:
+def _round_fits(source: Shape, parameter: Field) -> tuple[DoubleArray, DoubleArray]:
     """(P,) values of a profile's parameter, and (P, 2) width and height of the nearest Gaussian in the plane."""
     assert parameter.bounds is not None
     values = np.geomspace(*parameter.bounds, _PARAMETERS)
@@ -160,7 +160,7 @@ def _round_fits(source: Shape, parameter: Field) -> tuple[Reals, Reals]:
     return values, _fits(_RADII, profiles, _RADII * (profiles >= _FAINTEST), False)[:, 1:]
 
 
-def _fits(x: Reals, profiles: Reals, weights: Reals, moves: bool) -> Reals:
+def _fits(x: DoubleArray, profiles: DoubleArray, weights: DoubleArray, moves: bool) -> DoubleArray:
     """(M, 3) centre, width and height of the Gaussians nearest to profiles (M, X), by weighted least squares.
 
     moves : whether the centre may; else it is 0.

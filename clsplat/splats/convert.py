@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .checks import LIMIT_SLACK
-from .fields import Array
+from .fields import Array, DoubleArray
 from .optical_depth import raw_of_thickness, thickness
 from .quaternions import rotations
 from .shapes import SKEW_MAX, SLANT_MAX, Shape, shape_named
 from .splats import Splats
 
-Reals = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Model = dict[str, Reals]
+Model = dict[str, DoubleArray]
 
 EQUAL = 1e-6  # two opacities are the same where their raw values differ by no more: float32's rounding
 
@@ -86,7 +85,7 @@ def _centred(model: Model, target: Shape) -> Model:
     return model | frame | {"mean": model["mean"] + shift, "skew": turned * np.minimum(length, SKEW_MAX)}
 
 
-def _displaced(t: Reals | float) -> Reals | float:
+def _displaced(t: DoubleArray | float) -> DoubleArray | float:
     """|delta|^2 = |eta|^2 / (1 + |eta|^2) where the shift m has |m|^2 = t."""
     return 0.5 * math.pi * t / (1.0 + t)
 
@@ -94,20 +93,20 @@ def _displaced(t: Reals | float) -> Reals | float:
 _SKEW_FORMS: dict[str, Callable[[Model, Shape], Model]] = {"centred": _centred, "direct": direct_form}
 
 
-def _bounded(vectors: Reals, limit: float) -> Reals:
+def _bounded(vectors: DoubleArray, limit: float) -> DoubleArray:
     """As the kernels take them: longer ones (N, 3) are shortened to `limit`."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    short: Reals = vectors * np.minimum(limit / np.maximum(lengths, 1e-300), 1.0)
+    short: DoubleArray = vectors * np.minimum(limit / np.maximum(lengths, 1e-300), 1.0)
     return short
 
 
-def to_world(model: Model, vectors: Reals) -> Reals:
+def to_world(model: Model, vectors: DoubleArray) -> DoubleArray:
     """R S v (N, 3)."""
-    moved: Reals = np.einsum("nij,nj->ni", rotations(model["quat"]), np.exp(model["log_scale"]) * vectors)
+    moved: DoubleArray = np.einsum("nij,nj->ni", rotations(model["quat"]), np.exp(model["log_scale"]) * vectors)
     return moved
 
 
-def restretched(model: Model, along: Reals, factor: Reals) -> tuple[Model, Reals]:
+def restretched(model: Model, along: DoubleArray, factor: DoubleArray) -> tuple[Model, DoubleArray]:
     """Rotation and scale of R S H H' S R', H = I but `factor` (N, 1) along the vectors `along` (N, 3); and the vectors
     in the new unit frame.
 
@@ -133,11 +132,11 @@ def restretched(model: Model, along: Reals, factor: Reals) -> tuple[Model, Reals
     return frame, turned
 
 
-def _quaternions(matrices: Reals) -> Reals:
+def _quaternions(matrices: DoubleArray) -> DoubleArray:
     """w, x, y, z (N, 4) of rotation matrices (N, 3, 3)."""
     from scipy.spatial.transform import Rotation  # lazy: a third of a second to import
 
-    xyzw: Reals = Rotation.from_matrix(matrices).as_quat()
+    xyzw: DoubleArray = Rotation.from_matrix(matrices).as_quat()
     return xyzw[:, [3, 0, 1, 2]]
 
 
@@ -158,7 +157,7 @@ def _gaussian(model: Model, normalisation: str, source: Shape, target: Shape) ->
     return core
 
 
-def _without_skew(model: Mapping[str, Reals], normalisation: str, source: Shape, target: Shape) -> Model:
+def _without_skew(model: Mapping[str, DoubleArray], normalisation: str, source: Shape, target: Shape) -> Model:
     if not source.normalised:
         return {}  # a matter of the two opacities
     skewed: Mask = np.any(model["skew"] != 0.0, axis=1)
@@ -169,7 +168,7 @@ def _without_skew(model: Mapping[str, Reals], normalisation: str, source: Shape,
     return {"opacity_logit": _raw_of(source, 0.5 * source.opacity(model["opacity_logit"]))}
 
 
-def _of_equal_opacities(model: Mapping[str, Reals], normalisation: str, source: Shape, target: Shape) -> Model:
+def _of_equal_opacities(model: Mapping[str, DoubleArray], normalisation: str, source: Shape, target: Shape) -> Model:
     """Also where the two sides mix alike everywhere, as the skew is 0."""
     plus, minus = model["opacity_logit"], model["opacity_minus_logit"]
     equal = np.abs(plus - minus) <= EQUAL * np.maximum(1.0, np.abs(plus))
@@ -179,28 +178,28 @@ def _of_equal_opacities(model: Mapping[str, Reals], normalisation: str, source: 
     return {"opacity_logit": np.where(equal, plus, mean)}
 
 
-def _raw_of(shape: Shape, opacity: Array) -> Reals:
+def _raw_of(shape: Shape, opacity: Array) -> DoubleArray:
     """Raw values of opacities, those of 0 and 1 too."""
     with np.errstate(divide="ignore"):
-        raw: Reals = np.clip(shape.raw_opacity(opacity), -80.0, 80.0)
+        raw: DoubleArray = np.clip(shape.raw_opacity(opacity), -80.0, 80.0)
     return raw
 
 
-def _of_neutral_nu(model: Mapping[str, Reals], normalisation: str, source: Shape, target: Shape) -> Model:
+def _of_neutral_nu(model: Mapping[str, DoubleArray], normalisation: str, source: Shape, target: Shape) -> Model:
     (neutral,) = next(field.neutral for field in source.fields if field.name == "nu")
     finite: Mask = model["nu"] < neutral * (1.0 - LIMIT_SLACK)
     _refuse(finite, target, f"have nu below {neutral:g}", "raise it")
     return {}
 
 
-def _of_beta(model: Mapping[str, Reals], normalisation: str, source: Shape, target: Shape) -> Model:
+def _of_beta(model: Mapping[str, DoubleArray], normalisation: str, source: Shape, target: Shape) -> Model:
     if source.name == "ges-modulation":  # a Gaussian of other scales at every beta
         return {"log_scale": model["log_scale"] - np.log(0.5 + 0.5 * np.exp(-0.1 * (model["beta"] - 2.0)))[:, None]}
     _refuse(np.abs(model["beta"] - 2.0) > EQUAL, target, "have a beta that is not 2", "set it to 2")
     return {}
 
 
-_EQUALS: dict[str, Callable[[Mapping[str, Reals], str, Shape, Shape], Model]] = {
+_EQUALS: dict[str, Callable[[Mapping[str, DoubleArray], str, Shape, Shape], Model]] = {
     "skew": _without_skew,
     "opacity_minus_logit": _of_equal_opacities,
     "nu": _of_neutral_nu,

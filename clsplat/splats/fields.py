@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
+DoubleArray = NDArray[np.float64]
 
 MAX_SH_DEGREE = 3
 

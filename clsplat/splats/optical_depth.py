@@ -11,10 +11,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from .fields import Array
+from .fields import Array, DoubleArray
 from .shapes import Shape
-
-Reals = NDArray[np.float64]
 
 THINNEST = 1e-37  # its raw value is finite in float32
 FARTHEST = 1e15  # coordinate; what SGHMC has thrown beyond never comes back, and breaks the bounds of viewers
@@ -36,19 +34,21 @@ def finite_rows(arrays: Mapping[str, Array]) -> NDArray[np.bool_]:
     return finite
 
 
-def thickness(shape: Shape, raw: Array) -> Reals:
+def thickness(shape: Shape, raw: Array) -> DoubleArray:
     """-log(1 - |o|) of the raw values of an opacity."""
     wide = raw.astype(np.float64)
-    thick: Reals = np.logaddexp(0.0, 2.0 * np.abs(wide)) - math.log(2.0) if shape.signed else np.logaddexp(0.0, wide)
+    thick: DoubleArray = (
+        np.logaddexp(0.0, 2.0 * np.abs(wide)) - math.log(2.0) if shape.signed else np.logaddexp(0.0, wide)
+    )
     return np.maximum(thick, 0.0)
 
 
-def raw_of_thickness(shape: Shape, thick: Reals, old: Array) -> Reals:
+def raw_of_thickness(shape: Shape, thick: DoubleArray, old: Array) -> DoubleArray:
     """Raw values of |o| = 1 - exp(-thick), with the sign of the raw values `old` where opacities have one."""
     thick = np.maximum(thick, THINNEST)
     opacity = -np.expm1(-thick)
     if shape.signed:  # artanh
-        raw: Reals = np.copysign(0.5 * (np.log1p(opacity) + thick), old)
+        raw: DoubleArray = np.copysign(0.5 * (np.log1p(opacity) + thick), old)
         return raw
     raw = np.log(opacity) + thick
     return raw

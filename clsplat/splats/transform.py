@@ -5,21 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import InputError
 from .convert import convert
-from .fields import Array, sh_coefficients
+from .fields import Array, DoubleArray, sh_coefficients
 from .harmonics import sh_basis
 from .splats import Splats
-
-Reals = NDArray[np.float64]
 
 _DIRECTIONS = 64  # that a band of harmonics is sampled in; it has 7 functions at most
 _TOLERANCE = 1e-4  # of a matrix that is to be a rotation times a scale; float32 transforms differ by 1e-6
 
 
-def similarity(matrix: ArrayLike) -> tuple[float, Reals, Reals]:
+def similarity(matrix: ArrayLike) -> tuple[float, DoubleArray, DoubleArray]:
     """Scale s, rotation R (3, 3) and translation t (3,) of a (4, 4) matrix that is x -> s R x + t.
 
     Raises
@@ -70,7 +68,7 @@ def placed(splats: Splats, matrix: ArrayLike) -> Splats:
     return splats.with_arrays(arrays)
 
 
-def turned_harmonics(sh: Array, rotation: Reals) -> Array:
+def turned_harmonics(sh: Array, rotation: DoubleArray) -> Array:
     """Coefficients (N, K, 3) of the same colours in directions turned by `rotation`: c'(R d) = c(d).
 
     Bands do not mix: each one's matrix is that which maps the band's values in some directions to those in the

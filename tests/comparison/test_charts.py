@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from frontier_records import recorded, seeds, sweep
+from sweep_records import run_record, seed_records, sweep_records
 
 from clsplat.comparison import charts
 from clsplat.comparison import sweep_charts as frontier_charts
@@ -100,7 +100,7 @@ def test_heat_map(tmp_path: Path, drawn: list[Any]) -> None:
 
 
 def test_size_chart(tmp_path: Path, drawn: list[Any]) -> None:
-    rows = point_rows(sweep())
+    rows = point_rows(sweep_records())
     size_chart(rows, tmp_path / "size")
     render, size, splats = drawn[0].axes
     assert [axes.get_xlabel() for axes in (render, size, splats)] == ["render time [ms]", "file [MB]", "splats"]
@@ -116,7 +116,10 @@ def test_size_chart(tmp_path: Path, drawn: list[Any]) -> None:
 
 
 def test_time_chart(tmp_path: Path, drawn: list[Any]) -> None:
-    runs = [recorded("gaussian", curve=sweep()[0]["curve"]), recorded("3dgs", curve=sweep()[1]["curve"])]
+    runs = [
+        run_record("gaussian", curve=sweep_records()[0]["curve"]),
+        run_record("3dgs", curve=sweep_records()[1]["curve"]),
+    ]
     time_chart(curve_rows(runs), tmp_path / "time")
     psnr, ssim = drawn[0].axes
     assert (psnr.get_ylabel(), ssim.get_ylabel(), ssim.get_xlabel()) == (
@@ -133,19 +136,19 @@ def test_time_chart(tmp_path: Path, drawn: list[Any]) -> None:
 
 
 def test_equal_chart(tmp_path: Path, drawn: list[Any]) -> None:
-    equal_chart(equal_rows(point_rows(sweep()), "gaussian"), "gaussian", tmp_path / "equal")
+    equal_chart(equal_rows(point_rows(sweep_records()), "gaussian"), "gaussian", tmp_path / "equal")
     (axes,) = drawn[0].axes
     reached, bound = axes.lines[:2]
     assert list(reached.get_xdata()) == [2000, 4000]
     assert list(reached.get_ydata()) == pytest.approx([100 / 2**0.5] * 2)
     assert (list(bound.get_xdata()), bound.get_markerfacecolor()) == ([1000], "white")
-    out_of_reach = [row for row in equal_rows(point_rows(sweep()), "default") if row["ratio"] is None]
+    out_of_reach = [row for row in equal_rows(point_rows(sweep_records()), "default") if row["ratio"] is None]
     with pytest.raises(InputError, match="needs points"):
         equal_chart(out_of_reach, "default", tmp_path / "none")
 
 
 def test_seeds_chart(tmp_path: Path, drawn: list[Any]) -> None:
-    rows = seed_rows(seeds())
+    rows = seed_rows(seed_records())
     rows[-1] |= {"psnr": 20.5, "digest": "another"}
     seeds_chart(rows, tmp_path / "seeds")
     (axes,) = drawn[0].axes

@@ -12,7 +12,7 @@ import pytest
 
 from clsplat.comparison import compare as module
 from clsplat.comparison.compare import Run, compare, curve_iterations, digest, scene_identity
-from clsplat.comparison.methods import parse_systems
+from clsplat.comparison.methods import parse_methods
 from clsplat.comparison.table import HEAD, MEASURED, Record, cells, markdown, notes, repeats, summarise
 from clsplat.errors import InputError, TrainingError
 from clsplat.evaluation.evaluate import evaluate
@@ -35,7 +35,7 @@ def done(folder: Path) -> list[Record]:
 def compared(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished comparison; read only."""
     folder = tmp_path_factory.mktemp("compared")
-    compare([scene], parse_systems("gaussian,default"), folder, [CAP], [0, 1], SHORT, save_models=True)
+    compare([scene], parse_methods("gaussian,default"), folder, [CAP], [0, 1], SHORT, save_models=True)
     return folder
 
 
@@ -117,25 +117,25 @@ def test_runs_are_done_once(scene: Scene, counted: list[Any], tmp_path: Path) ->
     def on_run(run: Run, record: Record | None) -> None:
         seen.append((run.number, record is not None))
 
-    systems = parse_systems("gaussian,default")
+    systems = parse_methods("gaussian,default")
     compare([scene], systems, tmp_path, [CAP], [0], SHORT, on_run=on_run)
     assert seen == [(1, False), (1, True), (2, False), (2, True)]
     # The device and what is saved on the way make no other run; a seed, an option, a system do.
     compare([scene], systems, tmp_path, [CAP], [0, 1], SHORT | {"device": "0:0"}, on_run=on_run)
-    compare([scene], parse_systems("gaussian"), tmp_path, [CAP], [0], SHORT | {"opacity_lr": 0.01})
-    compare([scene], parse_systems("gaussian:opacity_lr=0.01"), tmp_path, [CAP], [0], SHORT)
+    compare([scene], parse_methods("gaussian"), tmp_path, [CAP], [0], SHORT | {"opacity_lr": 0.01})
+    compare([scene], parse_methods("gaussian:opacity_lr=0.01"), tmp_path, [CAP], [0], SHORT)
     assert [seed for _, _, seed in counted] == [0, 0, 1, 1, 0, 0]
     assert len(done(tmp_path)) == 6
 
 
 def test_all_systems_caps_and_seeds_are_run_systems_innermost(scene: Scene, counted: list[Any], tmp_path: Path) -> None:
-    compare([scene], parse_systems("gaussian,default"), tmp_path, [9, 5], [1, 0], SHORT)
+    compare([scene], parse_methods("gaussian,default"), tmp_path, [9, 5], [1, 0], SHORT)
     expected = [(shape, cap, seed) for cap in (9, 5) for seed in (1, 0) for shape in ("gaussian", "skew-normal")]
     assert counted == expected
 
 
 def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp_path: Path) -> None:
-    systems = parse_systems("gaussian,default,gaussian:growth=1.1")
+    systems = parse_methods("gaussian,default,gaussian:growth=1.1")
 
     def interrupt(run: Run, record: Record | None) -> None:
         if run.number == 3:
@@ -156,7 +156,7 @@ def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp
 
 
 def test_a_curve_is_measured_along_the_run(scene: Scene, tmp_path: Path) -> None:
-    systems = parse_systems("gaussian")
+    systems = parse_methods("gaussian")
     compare([scene], systems, tmp_path, [CAP], [0], SHORT)
     (plain,) = done(tmp_path)
     assert plain["curve"] is None
@@ -175,14 +175,14 @@ def test_a_curve_is_measured_along_the_run(scene: Scene, tmp_path: Path) -> None
 
 
 def test_repeats_are_the_same_bits(scene: Scene, tmp_path: Path) -> None:
-    records = compare([scene], parse_systems("gaussian"), tmp_path, [CAP], [0, 1], SHORT, repeat=2)
+    records = compare([scene], parse_methods("gaussian"), tmp_path, [CAP], [0, 1], SHORT, repeat=2)
     assert [(r["config"]["seed"], r["repeat"]) for r in records] == [(0, 0), (0, 1), (1, 0)]
     first, again, other = (record["digest"] for record in records)
     assert first == again != other
     (row,) = summarise(records)
     assert row["seeds"] == [0, 1], "repeats do not count in the mean"
     assert "repeated: 1 of 1 runs gave the same splats each time, bit by bit" in notes(records, [row])
-    assert len(compare([scene], parse_systems("gaussian"), tmp_path, [CAP], [0, 1], SHORT, repeat=2)) == 3
+    assert len(compare([scene], parse_methods("gaussian"), tmp_path, [CAP], [0, 1], SHORT, repeat=2)) == 3
 
 
 def test_repeats_that_differ_are_told() -> None:
@@ -223,7 +223,7 @@ def test_failed_runs_are_told_and_the_comparison_goes_on(
         return run(self)
 
     monkeypatch.setattr(Trainer, "run", fail)
-    records = compare([scene], parse_systems("gaussian:growth=2,gaussian"), tmp_path, [30], [0], SHORT)
+    records = compare([scene], parse_methods("gaussian:growth=2,gaussian"), tmp_path, [30], [0], SHORT)
     assert [record["failed"] for record in records] == ["iteration 7: the loss is not finite", None]
     assert not records[0]["finite"]
     bad, good = summarise(records)
@@ -237,9 +237,9 @@ def test_failed_runs_are_told_and_the_comparison_goes_on(
 def test_bad_input(scene: Scene, counted: list[Any], tmp_path: Path) -> None:
     untested = Scene(scene.name, scene.path, scene.views, scene.points)
     with pytest.raises(InputError, match="no test views to measure on"):
-        compare([untested], parse_systems("gaussian"), tmp_path, [CAP], [0])
+        compare([untested], parse_methods("gaussian"), tmp_path, [CAP], [0])
     with pytest.raises(InputError, match="contradicts"):
-        compare([scene], parse_systems("gaussian,3dgs"), tmp_path, [CAP], [0], {"strategy": "mcmc"})
+        compare([scene], parse_methods("gaussian,3dgs"), tmp_path, [CAP], [0], {"strategy": "mcmc"})
     assert not counted
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from clsplat.comparison.methods import parse_systems
+from clsplat.comparison.methods import parse_methods
 from clsplat.errors import InputError
 from clsplat.training.config import TrainConfig
 from clsplat.training.presets import preset
 
 
 def test_presets_shapes_and_the_default() -> None:
-    gaussian, mcmc, default = parse_systems("gaussian, 3DGS_mcmc ,default".lower())
+    gaussian, mcmc, default = parse_methods("gaussian, 3DGS_mcmc ,default".lower())
     assert gaussian.config(5, 1) == TrainConfig(shape="gaussian", cap_max=5, seed=1)
     assert default.config(5, 1) == TrainConfig(cap_max=5, seed=1)
     assert mcmc.label == "3dgs-mcmc"
@@ -20,7 +20,7 @@ def test_presets_shapes_and_the_default() -> None:
 
 def test_changes_follow_a_colon_and_go_on_after_commas() -> None:
     text = "3dgs:strategy=mcmc,opacity-lr=1e-3,coarse_to_fine=off,gaussian,default:growth=2"
-    first, second, third = parse_systems(text)
+    first, second, third = parse_methods(text)
     assert first.label == "3dgs:strategy=mcmc,opacity_lr=1e-3,coarse_to_fine=off"
     config = first.config(9, 0)
     assert (config.strategy, config.opacity_lr, config.coarse_to_fine) == ("mcmc", 1e-3, False)
@@ -31,12 +31,12 @@ def test_changes_follow_a_colon_and_go_on_after_commas() -> None:
 
 def test_common_options_hold_for_all_but_changes_win() -> None:
     common = {"iterations": 11, "opacity_lr": 0.5, "strategy": "adc"}
-    plain, changed = parse_systems("3dgs,3dgs:opacity_lr=0.25")
+    plain, changed = parse_methods("3dgs,3dgs:opacity_lr=0.25")
     assert plain.config(1, 0, common).opacity_lr == 0.5
     assert changed.config(1, 0, common).opacity_lr == 0.25
     assert changed.config(1, 0, common).iterations == 11
     # A change of what a preset is stands in its name; a common option does not.
-    (other,) = parse_systems("3dgs:strategy=mcmc")
+    (other,) = parse_methods("3dgs:strategy=mcmc")
     assert other.config(1, 0, common).strategy == "mcmc"
     with pytest.raises(InputError, match="preset 3dgs has strategy adc, which contradicts strategy mcmc"):
         plain.config(1, 0, {"strategy": "mcmc"})
@@ -61,14 +61,14 @@ def test_common_options_hold_for_all_but_changes_win() -> None:
 )
 def test_faulty_lists_are_named(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said) as caught:
-        parse_systems(text)
+        parse_methods(text)
     assert "\n" not in str(caught.value)
 
 
 def test_options_that_do_not_fit_name_the_system() -> None:
-    (system,) = parse_systems("gaussian:strategy=hope")
+    (system,) = parse_methods("gaussian:strategy=hope")
     with pytest.raises(InputError, match="system gaussian:strategy=hope: strategy 'hope': choose one of"):
         system.config(1, 0)
     for key in ("shape", "cap_max", "seed"):
         with pytest.raises(InputError, match=f"{key} is set for each run"):
-            parse_systems("default")[0].config(1, 0, {key: 1})
+            parse_methods("default")[0].config(1, 0, {key: 1})

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from frontier_records import curve, recorded, seeds, sweep
+from sweep_records import curve_points, run_record, seed_records, sweep_records
 
 from clsplat.comparison import compare as compare_module
-from clsplat.comparison import sweep as frontier
-from clsplat.comparison.methods import parse_systems
+from clsplat.comparison.methods import parse_methods
+from clsplat.comparison.sweep import read_runs, sweep, write_report
 from clsplat.comparison.sweep_rows import (
     auto_rows,
     curve_rows,
@@ -58,7 +58,7 @@ def test_splats_needed_is_linear_in_log_splats() -> None:
 
 
 def test_points_and_fronts() -> None:
-    points = point_rows(sweep())
+    points = point_rows(sweep_records())
     assert [(p["system"], p["cap"], p["front_splats"]) for p in points] == [
         ("gaussian", 1000, False),
         ("default", 1000, True),
@@ -74,20 +74,20 @@ def test_points_and_fronts() -> None:
 
 
 def test_points_are_means_of_runs_that_did_not_fail() -> None:
-    runs = [recorded("a", cap, 20.0 + seed, seed) for cap in (10, 20) for seed in (0, 1)]
-    runs += [recorded("a", 10, 30.0, 0, repeat=1), recorded("b", 10, failed="lost")]
+    runs = [run_record("a", cap, 20.0 + seed, seed) for cap in (10, 20) for seed in (0, 1)]
+    runs += [run_record("a", 10, 30.0, 0, repeat=1), run_record("b", 10, failed="lost")]
     points = point_rows(runs)
     assert [(p["system"], p["seeds"], p["psnr"]) for p in points] == [("a", 2, 20.5), ("a", 2, 20.5)]
 
 
 def test_a_scene_of_one_cap_is_no_sweep_and_other_lengths_are_left_out() -> None:
-    assert point_rows(seeds()) == []
-    longer = recorded("gaussian", 4000, 30.0, iterations=900)
-    assert max(p["psnr"] for p in point_rows([*sweep(), longer])) == 22.5
+    assert point_rows(seed_records()) == []
+    longer = run_record("gaussian", 4000, 30.0, iterations=900)
+    assert max(p["psnr"] for p in point_rows([*sweep_records(), longer])) == 22.5
 
 
 def test_equal_quality() -> None:
-    rows = equal_rows(point_rows(sweep()), "gaussian")
+    rows = equal_rows(point_rows(sweep_records()), "gaussian")
     assert [(row["system"], row["reference_cap"], row["bound"]) for row in rows] == [
         ("default", 1000, "at most"),
         ("default", 2000, ""),
@@ -97,14 +97,14 @@ def test_equal_quality() -> None:
     head, lines = equal_table(rows, "gaussian")
     assert head == ("scene", "system", "gaussian, cap 1000", "gaussian, cap 2000", "gaussian, cap 4000")
     assert lines == [("yard 8x6", "default", "≤ 100 %", "71 %", "71 %")]
-    other = equal_rows(point_rows(sweep()), "default")
+    other = equal_rows(point_rows(sweep_records()), "default")
     assert [row["splats"] for row in other][-1] is None
     assert equal_table(other, "default")[1][0][-1] == "not reached"
-    assert equal_rows(point_rows(sweep()), "none") == []
+    assert equal_rows(point_rows(sweep_records()), "none") == []
 
 
 def test_automatic_runs_are_set_beside_the_best_of_their_shape() -> None:
-    (row,) = auto_rows(point_rows(sweep()))
+    (row,) = auto_rows(point_rows(sweep_records()))
     assert (row["best_cap"], row["front"]) == (4000, "render_ms bytes splats")
     assert row["lost"] == pytest.approx(0.05)
     assert row["splats_ratio"] == row["bytes_ratio"] == pytest.approx(0.375)
@@ -118,7 +118,7 @@ def test_automatic_runs_are_set_beside_the_best_of_their_shape() -> None:
         "38",
         "render_ms bytes splats",
     )
-    (alone,) = auto_rows(point_rows([record for record in sweep() if record["system"] != "default"]))
+    (alone,) = auto_rows(point_rows([record for record in sweep_records() if record["system"] != "default"]))
     assert alone["lost"] is None
     assert auto_table([alone])[1][0][5] == ""
     assert [is_auto(label) for label in ("auto", "auto 20 dB", "auto:x=1", "automatic", "default")] == [
@@ -132,12 +132,12 @@ def test_automatic_runs_are_set_beside_the_best_of_their_shape() -> None:
 
 def test_curves_are_of_the_cap_that_most_were_followed_at() -> None:
     runs = [
-        recorded("a", 10, curve=curve(20)),
-        recorded("b", 10, curve=curve(21)),
-        recorded("b", 99, curve=curve(22)),
-        recorded("c", 99),
-        recorded("a", 10, curve=curve(20), repeat=1),
-        recorded("d", 10, failed="x", curve=[]),
+        run_record("a", 10, curve=curve_points(20)),
+        run_record("b", 10, curve=curve_points(21)),
+        run_record("b", 99, curve=curve_points(22)),
+        run_record("c", 99),
+        run_record("a", 10, curve=curve_points(20), repeat=1),
+        run_record("d", 10, failed="x", curve=[]),
     ]
     rows = curve_rows(runs)
     assert {(row["system"], row["cap"]) for row in rows} == {("a", 10), ("b", 10)}
@@ -146,17 +146,17 @@ def test_curves_are_of_the_cap_that_most_were_followed_at() -> None:
 
 
 def test_seeds_and_repeats() -> None:
-    rows = seed_rows([*seeds(), *sweep()])
+    rows = seed_rows([*seed_records(), *sweep_records()])
     assert len(rows) == 14
     _, lines = seed_table(rows)
     assert lines[0] == ("attic 8x6", "500", "gaussian", "5", "20.20", "20.00", "20.40", "0.40", "3", "0.0000", "yes")
     rows[-1]["digest"] = "another"
     assert seed_table(rows)[1][1][-1] == "no"
-    assert seed_rows(seeds()[:2]) == []
+    assert seed_rows(seed_records()[:2]) == []
 
 
 def test_rows_are_written_as_csv_and_json(tmp_path: Path) -> None:
-    rows = point_rows(sweep())
+    rows = point_rows(sweep_records())
     paths = write_rows(tmp_path / "deep", "size", rows)
     assert [path.name for path in paths] == ["size.csv", "size.json"]
     assert json.loads(paths[1].read_text()) == rows
@@ -194,7 +194,7 @@ def test_a_page_needs_nothing_beside_it(tmp_path: Path) -> None:
 
 
 def test_report_without_matplotlib(tmp_path: Path, undrawn: None) -> None:
-    paths = frontier.write_report(tmp_path, [*sweep(), *seeds()], reference="gaussian")
+    paths = write_report(tmp_path, [*sweep_records(), *seed_records()], reference="gaussian")
     assert {path.name for path in paths} == {
         f"{name}.{kind}" for name in ("size", "equal", "time", "seeds") for kind in ("csv", "json")
     } | {"report.html"}
@@ -203,12 +203,12 @@ def test_report_without_matplotlib(tmp_path: Path, undrawn: None) -> None:
     assert "<svg" not in text
     assert "71 %" in text
     with pytest.raises(InputError, match="no runs to draw"):
-        frontier.write_report(tmp_path, [])
+        write_report(tmp_path, [])
 
 
 def test_equal_runs_of_two_folders_count_once(tmp_path: Path, undrawn: None) -> None:
-    again = [record | {"psnr": 1.0} for record in sweep()]
-    frontier.write_report(tmp_path, [*sweep(), *again])
+    again = [record | {"psnr": 1.0} for record in sweep_records()]
+    write_report(tmp_path, [*sweep_records(), *again])
     rows = json.loads((tmp_path / "charts" / "size.json").read_text())
     assert [row["seeds"] for row in rows] == [1] * 7
     assert min(row["psnr"] for row in rows) == 20.0
@@ -227,20 +227,20 @@ def test_an_interrupted_sweep_leaves_charts_and_goes_on(
         if len(made) == 4:
             raise KeyboardInterrupt
         psnr = 20 + config.cap_max / 100
-        values = recorded("", config.cap_max, psnr, curve=curve(psnr))
+        values = run_record("", config.cap_max, psnr, curve=curve_points(psnr))
         return {key: value for key, value in values.items() if key not in ("scene", "system", "config", "repeat")}
 
     monkeypatch.setattr(compare_module, "warm_up", lambda *arguments: None)
     monkeypatch.setattr(compare_module, "train_and_measure", train_and_measure)
-    scene, systems = load_scene(capture_folder), parse_systems("gaussian,default")
+    scene, systems = load_scene(capture_folder), parse_methods("gaussian,default")
     arguments = ([scene], systems, tmp_path, [20, 40], [0], {"iterations": 9})
     with pytest.warns(UserWarning, match=r"clsplat\[charts\]"), pytest.raises(KeyboardInterrupt):
-        frontier.frontier(*arguments)
+        sweep(*arguments)
     shown = json.loads((tmp_path / "charts" / "size.json").read_text())
     assert [(row["system"], row["cap"]) for row in shown] == [("gaussian", 20), ("default", 20), ("gaussian", 40)]
     assert (tmp_path / "report.html").exists()
     with pytest.warns(UserWarning, match=r"clsplat\[charts\]"):
-        records = frontier.frontier(*arguments, more=[recorded("auto", 30, 25.0)])
+        records = sweep(*arguments, more=[run_record("auto", 30, 25.0)])
     assert made == [20, 20, 40, 40, 40]
     assert len(records) == 4
     shown = json.loads((tmp_path / "charts" / "size.json").read_text())
@@ -249,7 +249,7 @@ def test_an_interrupted_sweep_leaves_charts_and_goes_on(
 
 def test_runs_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"runs.jsonl: cannot be read .*give the folder of a comparison"):
-        frontier.read_runs(tmp_path)
+        read_runs(tmp_path)
     (tmp_path / "runs.jsonl").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match="cannot be read"):
-        frontier.read_runs(tmp_path / "runs.jsonl")
+        read_runs(tmp_path / "runs.jsonl")

@@ -1,4 +1,4 @@
-"""Needs of splats: against images without the splat, without its skew, with other colours, rendered one by one."""
+"""Importance of splats: against images without the splat, without its skew, with other colours, rendered one by one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import MakeRenderer
 
-from clsplat.compression.importance import Needs, lower_bands, measure
+from clsplat.compression.importance import Importance, lower_bands, measure_importance
 from clsplat.device.device import Device
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
@@ -38,12 +38,12 @@ def some_splats(scene: Scene, shape: str) -> Splats:
     return Splats(shape, arrays)
 
 
-def mean_needs(renderer: Renderer, splats: Splats, scene: Scene) -> Needs:
+def mean_importance(renderer: Renderer, splats: Splats, scene: Scene) -> Importance:
     """Of many seeds: what a single one estimates."""
-    every = [measure(renderer, splats, scene.train[:2], seed=seed) for seed in range(SEEDS)]
-    colour = np.mean([needs.colour for needs in every if needs.colour is not None], axis=0)
-    fields = {name: np.mean([needs.fields[name] for needs in every], axis=0) for name in every[0].fields}
-    return Needs(np.mean([needs.removal for needs in every], axis=0), fields, colour)
+    every = [measure_importance(renderer, splats, scene.train[:2], seed=seed) for seed in range(SEEDS)]
+    colour = np.mean([importance.colour for importance in every if importance.colour is not None], axis=0)
+    fields = {name: np.mean([importance.fields[name] for importance in every], axis=0) for name in every[0].fields}
+    return Importance(np.mean([importance.removal for importance in every], axis=0), fields, colour)
 
 
 def change(renderer: Renderer, splats: Splats, scene: Scene, without: Callable[[int], Splats]) -> np.ndarray:
@@ -72,7 +72,7 @@ def change(renderer: Renderer, splats: Splats, scene: Scene, without: Callable[[
 def test_removal_is_the_change_of_the_images(renderer: Renderer, scene: Scene, shape: str) -> None:
     splats = some_splats(scene, shape)
     true = change(renderer, splats, scene, lambda i: splats.select(np.arange(N) != i))
-    found = mean_needs(renderer, splats, scene).removal
+    found = mean_importance(renderer, splats, scene).removal
     shown = true > 1e-3 * true.max()
     assert shown.sum() >= N // 2
     # 48 seeds: each estimate has a relative deviation of sqrt(2 / 48) = 0.2 at most.
@@ -96,21 +96,21 @@ def test_fields_are_ranked_by_the_change_of_the_images(
         return Splats(shape, arrays)
 
     true = change(renderer, splats, scene, without)
-    found = mean_needs(renderer, splats, scene).fields[field]
+    found = mean_importance(renderer, splats, scene).fields[field]
     shown = true > 1e-2 * true.max()
     assert np.corrcoef(np.log(found[shown]), np.log(true[shown]))[0, 1] > 0.8
 
 
 @pytest.mark.slow
 def test_the_direct_forms_skew_is_not_a_field_to_drop(renderer: Renderer, scene: Scene) -> None:
-    assert measure(renderer, some_splats(scene, "skew-normal-direct"), scene.train[:1]).fields == {}
+    assert measure_importance(renderer, some_splats(scene, "skew-normal-direct"), scene.train[:1]).fields == {}
 
 
 def test_lower_degrees_lose_what_they_say(renderer: Renderer, scene: Scene) -> None:
     splats = some_splats(scene, "skew-normal")
-    needs = mean_needs(renderer, splats, scene)
-    assert needs.colour is not None
-    lower, lost = lower_bands(splats.sh, needs.colour)
+    importance = mean_importance(renderer, splats, scene)
+    assert importance.colour is not None
+    lower, lost = lower_bands(splats.sh, importance.colour)
     assert lower[0].shape == (N, 1, 3)
     assert not lost[:, 1].any()
 
@@ -154,18 +154,18 @@ def test_splats_that_no_view_sees_need_nothing_and_keep_their_colour(renderer: R
         scene.points.xyz.mean(axis=0) - scene.train[0].camera.position
     )
     splats = Splats("skew-normal", arrays)
-    needs = measure(renderer, splats, scene.train[:1])
-    assert needs.colour is not None
-    assert needs.removal[3] == 0 == needs.fields["skew"][3]
-    lower, lost = lower_bands(splats.sh, needs.colour)
+    importance = measure_importance(renderer, splats, scene.train[:1])
+    assert importance.colour is not None
+    assert importance.removal[3] == 0 == importance.fields["skew"][3]
+    lower, lost = lower_bands(splats.sh, importance.colour)
     np.testing.assert_array_equal(lower[0][3], splats.sh[3, :1])
     assert lost[3, 0] == 0
-    assert needs.removal[np.arange(N) != 3].max() > 0
+    assert importance.removal[np.arange(N) != 3].max() > 0
 
 
 @pytest.mark.slow
 def test_every_shape_is_measured(renderer: Renderer, scene: Scene) -> None:
     for shape in SHAPES:
-        needs = measure(renderer, some_splats(scene, shape), scene.train[:1])
-        assert np.isfinite(needs.removal).all()
-        assert needs.removal.max() > 0, shape
+        importance = measure_importance(renderer, some_splats(scene, shape), scene.train[:1])
+        assert np.isfinite(importance.removal).all()
+        assert importance.removal.max() > 0, shape

@@ -1,4 +1,4 @@
-"""Leaving parts out: as far as the judge allows, the least needed first, what stays keeps its bits; limits of bytes."""
+"""Pruning stays within the validation tolerance, removes the least important parts first and keeps the other bits."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from conftest import MakeRenderer
 
 from clsplat.compression.prune import (
-    Judge,
     Thresholds,
+    Validation,
     apply_thresholds,
     band_slopes,
     prune,
@@ -45,19 +45,19 @@ def splats(model_folder: Path) -> Splats:
 
 
 @pytest.fixture(scope="module")
-def judge(scene: Scene, devices: list[Device], make_renderer: MakeRenderer) -> Judge:
-    return Judge(make_renderer(devices[0]), scene.test)
+def validation(scene: Scene, devices: list[Device], make_renderer: MakeRenderer) -> Validation:
+    return Validation(make_renderer(devices[0]), scene.test)
 
 
 @pytest.fixture(scope="module")
-def renderer(judge: Judge) -> Renderer:
-    return judge.renderer
+def renderer(validation: Validation) -> Renderer:
+    return validation.renderer
 
 
-def test_prune_keeps_within_the_tolerance(splats: Splats, scene: Scene, judge: Judge) -> None:
-    pruned = prune(splats, scene.train, judge, 0.3)
-    assert pruned.before == judge(splats)
-    assert pruned.after == judge(pruned.splats) >= pruned.before - 0.3
+def test_prune_keeps_within_the_tolerance(splats: Splats, scene: Scene, validation: Validation) -> None:
+    pruned = prune(splats, scene.train, validation, 0.3)
+    assert pruned.before == validation.psnr(splats)
+    assert pruned.after == validation.psnr(pruned.splats) >= pruned.before - 0.3
     assert set(pruned.costs) == {"splats", "skew", "bands"}
     assert sum(pruned.costs.values()) == pytest.approx(pruned.before - pruned.after)
     assert len(pruned.splats) <= len(splats) - 40, "what shows nowhere goes first"
@@ -67,28 +67,28 @@ def test_prune_keeps_within_the_tolerance(splats: Splats, scene: Scene, judge: J
     np.testing.assert_array_equal(splats.log_scale[kept], pruned.splats.log_scale)
 
 
-def test_more_tolerance_leaves_less(splats: Splats, scene: Scene, judge: Judge, tmp_path: Path) -> None:
+def test_more_tolerance_leaves_less(splats: Splats, scene: Scene, validation: Validation, tmp_path: Path) -> None:
     sizes = []
     for tolerance in (0.0, 0.2, 2.0):
-        prune(splats, scene.train, judge, tolerance).splats.save(tmp_path / "model.ply", compact=True)
+        prune(splats, scene.train, validation, tolerance).splats.save(tmp_path / "model.ply", compact=True)
         sizes.append((tmp_path / "model.ply").stat().st_size)
     assert sizes[0] > sizes[1] > sizes[2]
 
 
-def test_kinds_are_left_alone_unless_asked_for(splats: Splats, scene: Scene, judge: Judge) -> None:
-    pruned = prune(splats, scene.train, judge, 0.3, ("bands",))
+def test_kinds_are_left_alone_unless_asked_for(splats: Splats, scene: Scene, validation: Validation) -> None:
+    pruned = prune(splats, scene.train, validation, 0.3, ("bands",))
     np.testing.assert_array_equal(pruned.splats.skew, splats.skew)
     assert set(pruned.costs) == {"bands"}
     assert pruned.thresholds.splats == 0
     assert not pruned.thresholds.fields
 
 
-def test_thresholds_do_the_same_again(splats: Splats, scene: Scene, judge: Judge) -> None:
-    pruned = prune(splats, scene.train, judge, 0.3, ("fields", "bands"))
-    again = apply_thresholds(splats, scene.train, judge.renderer, pruned.thresholds)
+def test_thresholds_do_the_same_again(splats: Splats, scene: Scene, validation: Validation) -> None:
+    pruned = prune(splats, scene.train, validation, 0.3, ("fields", "bands"))
+    again = apply_thresholds(splats, scene.train, validation.renderer, pruned.thresholds)
     for name, values in pruned.splats.arrays.items():
         np.testing.assert_array_equal(again.arrays[name], values, err_msg=name)
-    same = apply_thresholds(splats, scene.train, judge.renderer, Thresholds())
+    same = apply_thresholds(splats, scene.train, validation.renderer, Thresholds())
     for name, values in splats.arrays.items():
         np.testing.assert_array_equal(same.arrays[name], values, err_msg=name)
 
@@ -123,9 +123,9 @@ def test_rules_on_small_arrays() -> None:
     assert (flat.sh[[0, 2], 0] == 7).all()
 
 
-def test_bad_input(splats: Splats, scene: Scene, judge: Judge) -> None:
+def test_bad_input(splats: Splats, scene: Scene, validation: Validation) -> None:
     with pytest.raises(InputError, match="tolerance -1"):
-        prune(splats, scene.train, judge, -1)
+        prune(splats, scene.train, validation, -1)
     with pytest.raises(InputError, match="no splats"):
-        prune(splats.select([]), scene.train, judge, 0.1)
-    assert judge(splats.select([])) == 0
+        prune(splats.select([]), scene.train, validation, 0.1)
+    assert validation.psnr(splats.select([])) == 0

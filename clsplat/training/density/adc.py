@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import TrainingError
-from ...splats.fields import Array
-from ...splats.optical_depth import Reals, finite_rows, opacity_names, raw_of_thickness, thickness
+from ...splats.fields import Array, DoubleArray
+from ...splats.optical_depth import finite_rows, opacity_names, raw_of_thickness, thickness
 from ...splats.quaternions import rotations
 from ...splats.shapes import Shape
 from .edit import Plan
@@ -125,18 +125,18 @@ def with_reset(plan: Plan, arrays: Mapping[str, Array], shape: Shape) -> Plan:
     return replace(plan, values=plan.values | low, reset_fields=plan.reset_fields + names)
 
 
-def _score(signals: Array, grad_threshold: float, depth_threshold: float, extent: float) -> Reals:
+def _score(signals: Array, grad_threshold: float, depth_threshold: float, extent: float) -> DoubleArray:
     """(N,) mean gradient over its threshold, the higher of the two; 0 where it is not finite."""
     seen = np.maximum(signals[2].astype(np.float64), 1.0)
     tiny = np.finfo(np.float64).tiny
-    score: Reals = signals[0] / seen / max(grad_threshold, tiny)
+    score: DoubleArray = signals[0] / seen / max(grad_threshold, tiny)
     if depth_threshold > 0:
         score = np.fmax(score, signals[1] * extent / seen / depth_threshold)
     return np.where(np.isfinite(score), score, 0.0)
 
 
 def _best(
-    score: Reals, splits: NDArray[np.bool_], clones: NDArray[np.bool_], keep: NDArray[np.bool_], cap: int
+    score: DoubleArray, splits: NDArray[np.bool_], clones: NDArray[np.bool_], keep: NDArray[np.bool_], cap: int
 ) -> tuple[Rows, Rows]:
     """Rows to split and rows to clone, rising, for which there is room."""
     rows = np.flatnonzero(splits | clones)
@@ -174,7 +174,9 @@ def _halves_along_axis(parents: Mapping[str, Array], shape: Shape) -> dict[str, 
     return _placed(parents, shape, shift, changed)
 
 
-def _placed(parents: Mapping[str, Array], shape: Shape, shift: Reals, changed: dict[str, Array]) -> dict[str, Array]:
+def _placed(
+    parents: Mapping[str, Array], shape: Shape, shift: DoubleArray, changed: dict[str, Array]
+) -> dict[str, Array]:
     """`changed` and the means: centroids move by `shift`, in the parents' deviations along their own axes."""
     old, new = (np.exp(of["log_scale"].astype(np.float64)) for of in (parents, changed))
     step = old * (shift + _centroid(parents, shape)) - new * _centroid({**parents, **changed}, shape)
@@ -182,18 +184,18 @@ def _placed(parents: Mapping[str, Array], shape: Shape, shift: Reals, changed: d
     return changed | {"mean": parents["mean"] + step}
 
 
-def _delta(arrays: Mapping[str, Array]) -> Reals:
+def _delta(arrays: Mapping[str, Array]) -> DoubleArray:
     """(N, 3) delta of the direct form in the splat's own frame: of a slant, or of a plane's normal."""
     if "normal" in arrays:
         normal = arrays["normal"].astype(np.float64)
-        unit: Reals = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        unit: DoubleArray = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         return unit
     slant = arrays["skew"].astype(np.float64)
-    delta: Reals = slant / np.sqrt(1.0 + np.sum(slant**2, axis=1, keepdims=True))
+    delta: DoubleArray = slant / np.sqrt(1.0 + np.sum(slant**2, axis=1, keepdims=True))
     return delta
 
 
-def _centroid(arrays: Mapping[str, Array], shape: Shape) -> Reals:
+def _centroid(arrays: Mapping[str, Array], shape: Shape) -> DoubleArray:
     """(N, 3) from the stored position to the centroid, in deviations along the splat's own axes.
 
     Of two opacities the halves on either side of a plane are placed about the plane, not about the centroid.

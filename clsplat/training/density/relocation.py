@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, TrainingError
-from ...splats.fields import Array
-from ...splats.optical_depth import Reals, finite_rows, opacity_names, raw_of_thickness, thickness
+from ...splats.fields import Array, DoubleArray
+from ...splats.optical_depth import finite_rows, opacity_names, raw_of_thickness, thickness
 from ...splats.shapes import Shape
 from .edit import Plan
 
@@ -132,7 +132,7 @@ def plan_relocation(
 
 def relocation(
     shape: Shape, arrays: Mapping[str, Array], ratio: NDArray[np.integer], min_opacity: float = 0.0
-) -> tuple[dict[str, Reals], Reals]:
+) -> tuple[dict[str, DoubleArray], DoubleArray]:
     """What each of `ratio` equal splats has that replace one.
 
     Parameters
@@ -160,8 +160,12 @@ def relocation(
 
 
 def _length_factor(
-    shape: Shape, arrays: Mapping[str, Array], opacity: Reals, new_opacity: Reals, count: NDArray[np.integer]
-) -> Reals:
+    shape: Shape,
+    arrays: Mapping[str, Array],
+    opacity: DoubleArray,
+    new_opacity: DoubleArray,
+    count: NDArray[np.integer],
+) -> DoubleArray:
     """Integral of the one over integral of the stack; opacities are (N, S)."""
     z, weight = _nodes()
     profile = shape.profile(z, arrays)  # (N, S, K)
@@ -169,12 +173,12 @@ def _length_factor(
     alpha = np.minimum(np.einsum("nsk,ns->nk", profile, new_opacity), 1.0)
     with np.errstate(divide="ignore"):  # alpha = 1 of an opaque splat: the stack is opaque too
         stack = -np.expm1(count[:, None] * np.log1p(-alpha)) @ weight
-    factor: Reals = one / np.maximum(stack, 1e-300)
+    factor: DoubleArray = one / np.maximum(stack, 1e-300)
     return np.where(count > 1, factor, 1.0)
 
 
 @lru_cache(maxsize=1)
-def _nodes() -> tuple[Reals, Reals]:
+def _nodes() -> tuple[DoubleArray, DoubleArray]:
     """Nodes and weights of integrals over a line, (2 _NODES,) each, symmetric about 0."""
     u = (np.arange(_NODES) + 0.5) / _NODES
     reach = math.asinh(_FARTHEST / _KNEE)
@@ -186,14 +190,14 @@ def _nodes() -> tuple[Reals, Reals]:
     return nodes, weights
 
 
-def _weights(strength: Reals, pull: Array | None) -> Reals:
+def _weights(strength: DoubleArray, pull: Array | None) -> DoubleArray:
     """What donors are drawn in proportion to; never all 0."""
     if pull is not None and np.isfinite(pull).all() and (strength * pull).any():
         strength = strength * pull.astype(np.float64)
     return strength if strength.any() else np.ones_like(strength)
 
 
-def _draw(weights: Reals, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _draw(weights: DoubleArray, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """`count` indices in proportion to `weights` (at least 0, not all 0), with replacement."""
     if count == 0:
         return np.zeros(0, np.int64)

@@ -10,7 +10,7 @@ from clsplat.training.optim.skew_map import MAPS
 
 
 @dataclass(frozen=True)
-class System:
+class Variant:
     """A column of the table: a shape and the map of its skew ("" without one)."""
 
     shape: str
@@ -26,8 +26,8 @@ class System:
         return {"shape": self.shape} | ({"skew_map": self.skew_map} if self.skew_map else {})
 
 
-SYSTEMS = tuple(
-    System(shape.name, skew_map)
+VARIANTS = tuple(
+    Variant(shape.name, skew_map)
     for shape in SHAPES.values()
     for skew_map in (MAPS[shape.skew_form] if shape.skew_form else ("",))
 )

@@ -8,7 +8,7 @@ from clsplat.comparison.table import MEASURED, Record
 from clsplat.training.config import TrainConfig
 
 
-def recorded(
+def run_record(
     system: str,
     cap: int = 1000,
     psnr: float = 20.0,
@@ -47,28 +47,28 @@ def recorded(
     }
 
 
-def curve(last: float) -> list[dict[str, float]]:
+def curve_points(last: float) -> list[dict[str, float]]:
     """Four points along a run that ends at `last` dB."""
     return [{"iteration": n, "seconds": n / 10, "psnr": last - 8 / n, "ssim": 0.5 + n / 500} for n in (1, 4, 20, 100)]
 
 
-def sweep(scene: str = "yard") -> list[Record]:
+def sweep_records(scene: str = "yard") -> list[Record]:
     """Two systems at three caps, the second half a doubling better; an automatic run; five seeds and two repeats."""
     runs = [
-        recorded("gaussian", cap, psnr, scene=scene, curve=curve(psnr))
+        run_record("gaussian", cap, psnr, scene=scene, curve=curve_points(psnr))
         for cap, psnr in ((1000, 20.0), (2000, 21.0), (4000, 22.0))
     ]
     runs += [
-        recorded("default", cap, psnr, scene=scene, shape="skew-normal", curve=curve(psnr))
+        run_record("default", cap, psnr, scene=scene, shape="skew-normal", curve=curve_points(psnr))
         for cap, psnr in ((1000, 20.5), (2000, 21.5), (4000, 22.5))
     ]
-    return [*runs, recorded("auto default", 1500, 22.45, scene=scene, shape="skew-normal", iterations=300)]
+    return [*runs, run_record("auto default", 1500, 22.45, scene=scene, shape="skew-normal", iterations=300)]
 
 
-def seeds() -> list[Record]:
+def seed_records() -> list[Record]:
     """Five seeds of two systems, and two repeats of the first."""
     runs = [
-        recorded(system, 500, 20 + seed / 10, seed, scene="attic")
+        run_record(system, 500, 20 + seed / 10, seed, scene="attic")
         for system in ("gaussian", "3dgs")
         for seed in range(5)
     ]
