@@ -24,7 +24,8 @@ from clsplat.device.device import open_device
 from clsplat.files.images import read_image
 from clsplat.files.video import VideoWriter
 from clsplat.rendering.tuning import schedule_for
-from clsplat.scenes.reconstruct.reconstruct import ReconstructOptions, reconstruct
+from clsplat.scenes.reconstruct.options import ReconstructOptions
+from clsplat.scenes.reconstruct.reconstruct import reconstruct
 from clsplat.training.config import TrainConfig
 
 # Name to the scene with poses and the reduction at which both ways are trained.

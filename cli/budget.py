@@ -10,7 +10,7 @@ import click
 from clsplat.compression.rules import TOLERANCE, BudgetOptions
 from clsplat.compression.state import FILE, BudgetState
 from clsplat.errors import InputError, OutputError
-from clsplat.files.lock import sole_writer
+from clsplat.files.lock import folder_lock
 from clsplat.training.config import TrainConfig
 
 from .options import Decibels, F
@@ -74,7 +74,7 @@ def is_search(folder: Path) -> bool:
 def forget_search(folder: Path) -> None:
     """Before another run takes the folder: what a search left there is not of it. OutputError while it is going on."""
     if is_search(folder):
-        with sole_writer(folder):
+        with folder_lock(folder):
             BudgetState(folder).remove()
 
 

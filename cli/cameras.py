@@ -13,7 +13,7 @@ from .options import PATH, iteration_option, overwrite_option, quiet_option
 
 if TYPE_CHECKING:
     from clsplat.scenes.colmap import Points
-    from clsplat.scenes.undistort import Photo
+    from clsplat.scenes.undistort import RegisteredImage
 
 FORMATS = ("transforms", "colmap", "colmap-text", "cameras")
 OPAQUE = 0.5  # splats of this opacity and above are points of a model
@@ -73,13 +73,13 @@ def write_cameras_of(
         click.echo(f"{output}: {len(photos)} cameras{said}")
 
 
-def _of_scene(scene: Path, images: str | None) -> tuple[list[Photo], list[Path], Points]:
+def _of_scene(scene: Path, images: str | None) -> tuple[list[RegisteredImage], list[Path], Points]:
     """Photos, their files, and points. Names lose the one folder that all of them lie in."""
     from dataclasses import replace
 
-    from clsplat.scenes.scene import read_posed
+    from clsplat.scenes.scene import read_posed_images
 
-    posed = read_posed(scene, images)
+    posed = read_posed_images(scene, images)
     first = {photo.name.partition("/")[0] if "/" in photo.name else None for photo in posed.photos}
     cut = len(first.pop() or "") + 1 if len(first) == 1 and None not in first else 0
     return (
@@ -89,7 +89,7 @@ def _of_scene(scene: Path, images: str | None) -> tuple[list[Photo], list[Path],
     )
 
 
-def _of_model(source: Path, iteration: int | None) -> tuple[list[Photo], Points]:
+def _of_model(source: Path, iteration: int | None) -> tuple[list[RegisteredImage], Points]:
     """Photos of a model's or a file's cameras, and a model's opaque splats."""
     import numpy as np
 
@@ -97,7 +97,7 @@ def _of_model(source: Path, iteration: int | None) -> tuple[list[Photo], Points]
     from clsplat.cameras.path import read_path
     from clsplat.files.json_file import read_json
     from clsplat.scenes.colmap import Points
-    from clsplat.scenes.undistort import Photo, make_lens
+    from clsplat.scenes.undistort import RegisteredImage, make_lens
     from clsplat.splats.shapes import shape_named
     from clsplat.splats.splats import SH_C0
 
@@ -121,11 +121,11 @@ def _of_model(source: Path, iteration: int | None) -> tuple[list[Photo], Points]
     for entry in named:
         camera = entry.camera
         lens = make_lens("PINHOLE", camera.width, camera.height, [camera.fx, camera.fy, camera.cx, camera.cy])
-        photos.append(Photo(f"{entry.name}.png", camera.cam_from_world, lens))
+        photos.append(RegisteredImage(f"{entry.name}.png", camera.cam_from_world, lens))
     return photos, points
 
 
-def _write_3dgs(output: Path, photos: list[Photo]) -> None:
+def _write_3dgs(output: Path, photos: list[RegisteredImage]) -> None:
     from clsplat.cameras.cameras_json import named_cameras, write_cameras
     from clsplat.scenes.undistort import is_pinhole, pinhole_camera
 

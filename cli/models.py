@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.cameras.cameras_json import NamedCamera, bare_name, read_cameras
+from clsplat.cameras.cameras_json import NamedCamera, read_cameras
 from clsplat.errors import InputError
-from clsplat.files.json_file import real_of
+from clsplat.files.image_names import bare_name
+from clsplat.files.json_file import to_real
 from clsplat.scenes.options import ALPHA_USES
 from clsplat.splats.color import BLACK, Color
 from clsplat.splats.splats import Splats
@@ -148,7 +149,7 @@ def _recorded(folder: ModelFolder) -> tuple[Color, dict[str, Any]]:
     if not isinstance(config, dict) or not isinstance(scene, dict):
         raise InputError(f"{file}: config and scene must be objects: restore the file as it was written")
     rgb = config.get("background", [0, 0, 0])
-    parts = [real_of(part) for part in rgb] if isinstance(rgb, list) else []
+    parts = [to_real(part) for part in rgb] if isinstance(rgb, list) else []
     if len(parts) != 3 or not all(part is not None and 0 <= part <= 1 for part in parts):
         raise InputError(f"{file}: config.background is {rgb!r}: expected three numbers from 0 to 1")
     kinds = {"path": str, "images": str, "resolution": int, "masks": str, "alpha": str, "test_names": list}

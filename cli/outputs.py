@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from clsplat.cameras.cameras_json import bare_name
 from clsplat.errors import InputError
 from clsplat.files.atomic import atomic_writer
+from clsplat.files.image_names import bare_name
 from clsplat.splats.color import BLACK, Color
 
 if TYPE_CHECKING:

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from clsplat.cameras.cameras_json import NamedCamera, bare_name
+from clsplat.cameras.cameras_json import NamedCamera
 from clsplat.cameras.interpolate import interpolate, resized_by_height
 from clsplat.cameras.path import DEFAULT_FPS, CameraPath, read_path
 from clsplat.errors import InputError
+from clsplat.files.image_names import bare_name
 
 from .models import LoadedModel
 from .options import PATH

@@ -16,7 +16,7 @@ from .options import PATH, overwrite_option, quiet_option
 from .progress import duration
 
 if TYPE_CHECKING:
-    from clsplat.scenes.reconstruct.reconstruct import Reconstructed
+    from clsplat.scenes.reconstruct.reconstruct import ReconstructionResult
     from clsplat.scenes.reconstruct.sfm_process import Step
 
 _DEFAULTS = ReconstructOptions()
@@ -81,7 +81,7 @@ def reconstruct_scene(photos: Path, scene: Path, overwrite: bool, quiet: bool, *
 
 def run_reconstruction(
     photos: Path, scene: Path, options: ReconstructOptions, overwrite: bool, quiet: bool
-) -> Reconstructed:
+) -> ReconstructionResult:
     """Reconstruct with a live display."""
     from clsplat.scenes.reconstruct.reconstruct import reconstruct
 
@@ -89,7 +89,7 @@ def run_reconstruction(
         return reconstruct(photos, scene, options, display, overwrite)
 
 
-def report(result: Reconstructed) -> None:
+def report(result: ReconstructionResult) -> None:
     """Say what came of it."""
     click.echo(
         f"{result.scene}: {result.registered} of {result.photos} photos placed, {result.points} points seen by "
@@ -105,11 +105,11 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
     OutputError : the scene that is there was made of other photos. Others as `reconstruct`.
     """
     from clsplat.scenes.reconstruct.photo_files import find_photos, is_video
-    from clsplat.scenes.reconstruct.reconstruct import estimated_seconds, made_from
+    from clsplat.scenes.reconstruct.reconstruct import estimate_seconds, is_made_from
 
     scene = model.parent / f"{photos.resolve().stem if is_video(photos) else photos.resolve().name}-scene"
     options = ReconstructOptions()
-    made = made_from(scene, photos)
+    made = is_made_from(scene, photos)
     if made:
         if not quiet:
             click.echo(f"{photos}: no poses: {scene} was reconstructed of it before and is used", err=True)
@@ -123,7 +123,7 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
         what = f"{options.frames} frames"
         if not is_video(photos):
             found = find_photos(photos)
-            what = f"{len(found)} photos, {_minutes(estimated_seconds(found, options))}"
+            what = f"{len(found)} photos, {_minutes(estimate_seconds(found, options))}"
         click.echo(f"{photos}: no poses: reconstructing {scene} first ({what})", err=True)
     result = run_reconstruction(photos, scene, options, overwrite, quiet)
     if not quiet:

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
+from ..files.image_names import bare_name
 from ..files.json_file import kind, matrix, number, read_json, size, value
 from .camera import Camera
 
@@ -29,15 +30,6 @@ class NamedCamera:
 
     name: str
     camera: Camera
-
-
-IMAGE_SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
-
-
-def bare_name(name: str) -> str:
-    """An image's name without its extension; other names, dots included, stay."""
-    stem, dot, suffix = name.rpartition(".")
-    return stem if stem and dot + suffix.lower() in IMAGE_SUFFIXES else name
 
 
 def img_names(names: Sequence[str]) -> list[str]:

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..splats.splats import Splats
 from .camera import Camera
-from .looked_at import where_axes_meet
 
 Vector = NDArray[np.float64]
 
+# Least eigenvalue of the mean of I - d d' below which the optical axes d count as parallel (about 4 degrees).
+_PARALLEL = 5e-3
 # Variance of x axes about level, (6 degrees)^2, below which tilting up no further is worth it.
 _LEVELLING = 1e-2
 # Without cameras: 3DGS worlds come from cameras, whose y axis points down; 60 degrees across, 4:3.
@@ -143,6 +144,17 @@ def spiral(splats: Splats, cameras: Sequence[Camera] = (), frames: int = 60) -> 
     local = radii * np.stack([np.cos(turn), np.sin(turn), np.sin(turn / _SPIRAL_TURNS)], axis=1)
     up = -centre.rotation[1]
     return [centre.posed(look_at(place, target, up)) for place in centre.position + local @ centre.rotation]
+
+
+def where_axes_meet(cameras: Sequence[Camera]) -> NDArray[np.float64] | None:
+    """(3,) the point nearest to all optical axes; None where they are parallel."""
+    centres = np.array([camera.position for camera in cameras])
+    axes = np.array([camera.rotation[2] for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    system = across.mean(axis=0)
+    if np.linalg.eigvalsh(system)[0] <= _PARALLEL:
+        return None
+    return np.asarray(np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(cameras)), np.float64)
 
 
 def look_at(position: Vector, target: Vector, up: Vector) -> Vector:

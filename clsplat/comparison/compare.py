@@ -23,7 +23,7 @@ from ..evaluation.evaluate import evaluate
 from ..evaluation.metrics import DEFAULT_PROTOCOL
 from ..files.atomic import atomic_writer
 from ..files.json_file import write_json
-from ..files.lock import sole_writer
+from ..files.lock import folder_lock
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene, View
 from ..splats.splats import Splats
@@ -166,7 +166,7 @@ def compare(
     runs = RunFile(folder)
     device: Device | None = None
     warm: set[str] = set()
-    with sole_writer(folder):
+    with folder_lock(folder):
         try:
             for scene in scenes:
                 if not scene.test:

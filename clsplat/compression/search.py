@@ -28,7 +28,7 @@ from typing import Any
 
 from ..device.device import Device, open_device
 from ..errors import OutputError
-from ..files.lock import sole_writer
+from ..files.lock import folder_lock
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
 from ..scenes.split import hold_out
@@ -122,7 +122,7 @@ def train_budget(
     elif (folder.is_used or state.path.exists()) and not overwrite:
         raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
     folder.prepare()
-    with sole_writer(folder.path):
+    with folder_lock(folder.path):
         if not resume:
             folder.clear()
             record = {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names)}

@@ -19,17 +19,17 @@ from PIL import ExifTags, Image, ImageOps
 
 from ..errors import InputError, OutputError
 from .atomic import atomic_writer
+from .image_names import JPEG_SUFFIXES
 
 ImageU8 = NDArray[np.uint8]
 
-JPEG_SUFFIXES = (".jpg", ".jpeg")
 _PHOTO_QUALITY = 97  # of a JPEG that is made of another: its error stays far below the first one's
 _ALPHA_MODES = ("RGBA", "RGBa", "LA", "La", "PA")
 _SIXTEEN_BIT_MODES = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 
 
 @dataclass(frozen=True)
-class PhotoFacts:
+class PhotoHeader:
     """What a photo's header says.
 
     Parameters
@@ -89,7 +89,7 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         return image.size
 
 
-def photo_facts(path: str | os.PathLike[str]) -> PhotoFacts:
+def read_photo_header(path: str | os.PathLike[str]) -> PhotoHeader:
     """Size, kind and camera. The header is enough, but for PNG, where EXIF may stand at the end.
 
     Raises
@@ -115,7 +115,7 @@ def photo_facts(path: str | os.PathLike[str]) -> PhotoFacts:
         width, height = image.size[::-1] if orientation in (5, 6, 7, 8) else image.size
         plain = orientation == 1 and image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L") and not deep
         plain = plain and "transparency" not in image.info
-        return PhotoFacts(width, height, plain, tuple(str(value) for value in named if value), kept)
+        return PhotoHeader(width, height, plain, tuple(str(value) for value in named if value), kept)
 
 
 def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU8) -> None:

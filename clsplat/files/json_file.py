@@ -89,7 +89,7 @@ def kind(given: object) -> str:
     return "a number"
 
 
-def real_of(given: object) -> float | None:
+def to_real(given: object) -> float | None:
     """A JSON number, infinite where it is too large; None of anything else."""
     if isinstance(given, bool) or not isinstance(given, (int, float)):
         return None
@@ -100,7 +100,7 @@ def real_of(given: object) -> float | None:
 
 
 def _finite(given: object, key: str) -> float:
-    real = real_of(given)
+    real = to_real(given)
     if real is None:
         raise InputError(f"key {key!r} is {kind(given)}; expected a number")
     if not math.isfinite(real):

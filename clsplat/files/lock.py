@@ -20,7 +20,7 @@ _held: set[Path] = set()
 
 
 @contextmanager
-def sole_writer(folder: Path | None) -> Iterator[None]:
+def folder_lock(folder: Path | None) -> Iterator[None]:
     """Keep other runs out of a folder while the block lasts; what a killed one has left half written is removed.
 
     The lock is the operating system's, on the folder itself: it ends with the process, however that ends. A block

@@ -11,7 +11,7 @@ from .images import read_image
 
 Mask = NDArray[np.bool_]
 
-FOLDER = "masks"  # inside a scene, unless another is named
+MASK_FOLDER = "masks"  # inside a scene, unless another is named
 NO_MASKS = "none"  # in the place of a folder
 _COUNTS = 127.5  # from this mean of the channels on
 
@@ -42,7 +42,7 @@ def read_mask(path: Path) -> Mask:
     return counts
 
 
-def nearest(mask: Mask, width: int, height: int) -> Mask:
+def resize_mask(mask: Mask, width: int, height: int) -> Mask:
     """The mask at another size [px], each pixel from the nearest one."""
     rows, columns = mask.shape
     at_rows = ((np.arange(height) + 0.5) * rows / height).astype(int)

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, reason_of
-from .colmap_binary import check_binary_model, registered_images
-from .undistort import Photo, colmap_library
+from .colmap_binary import check_binary_model, count_registered
+from .undistort import RegisteredImage, colmap_library
 
 _FILES = ("cameras", "images", "points3D")
 
@@ -42,7 +42,7 @@ class Points:
 class SparseReconstruction:
     """A sparse model: registered photos sorted by name, and points."""
 
-    photos: list[Photo]
+    photos: list[RegisteredImage]
     points: Points
 
 
@@ -68,7 +68,7 @@ def find_model(scene: Path) -> Path:
             f"{sparse}: no COLMAP model (cameras and images, .bin or .txt) in it or below; "
             "run COLMAP's mapper, or copy the missing files"
         )
-    return max(models, key=registered_images)  # the first of equals
+    return max(models, key=count_registered)  # the first of equals
 
 
 def read_model(folder: Path) -> SparseReconstruction:
@@ -87,7 +87,7 @@ def read_model(folder: Path) -> SparseReconstruction:
     try:
         with _complete(folder, suffix) as whole:
             reconstruction = pycolmap.Reconstruction(str(whole))
-        photos, points = read_photos(reconstruction), read_points(reconstruction)
+        photos, points = read_registered(reconstruction), read_points(reconstruction)
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
         raise InputError(
             f"{folder}: COLMAP's reader refuses the model ({reason_of(error)}); the files are "
@@ -125,7 +125,7 @@ def _complete(folder: Path, suffix: str) -> Iterator[Path]:
         yield whole
 
 
-def read_photos(reconstruction: Any) -> list[Photo]:
+def read_registered(reconstruction: Any) -> list[RegisteredImage]:
     """Registered photos of a pycolmap.Reconstruction, sorted by name."""
     photos = []
     for image_id in reconstruction.reg_image_ids():
@@ -133,7 +133,9 @@ def read_photos(reconstruction: Any) -> list[Photo]:
         pose = image.cam_from_world
         pose = pose() if callable(pose) else pose  # an attribute before pycolmap 3.12
         photos.append(
-            Photo(image.name, np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]]), reconstruction.cameras[image.camera_id])
+            RegisteredImage(
+                image.name, np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]]), reconstruction.cameras[image.camera_id]
+            )
         )
     return sorted(photos, key=lambda photo: photo.name)
 

@@ -155,7 +155,7 @@ def check_binary_model(folder: Path) -> None:
             _check_file(path)
 
 
-def registered_images(folder: Path) -> int:
+def count_registered(folder: Path) -> int:
     """How many images the model in a folder registers, from images.bin's count or images.txt's lines."""
     binary = folder / "images.bin"
     if binary.is_file():

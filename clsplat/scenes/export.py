@@ -20,7 +20,7 @@ from ..files.atomic import atomic_writer
 from .colmap import Points
 from .colmap_binary import ModelView, write_binary_model
 from .point_cloud import write_point_cloud
-from .undistort import Lens, Photo, make_lens
+from .undistort import Lens, RegisteredImage, make_lens
 
 POINTS_FILE = "sparse_pc.ply"  # nerfstudio's name
 # Parameters of COLMAP's models by their keys in transforms.json; "f" is both focal lengths.
@@ -37,7 +37,7 @@ _FISHEYE = "OPENCV_FISHEYE"
 _DENOMINATOR = ("k4", "k5", "k6")  # of FULL_OPENCV, which readers of transforms.json do not know
 
 
-def write_transforms(path: Path, photos: Sequence[Photo], files: Sequence[str], points: Points) -> None:
+def write_transforms(path: Path, photos: Sequence[RegisteredImage], files: Sequence[str], points: Points) -> None:
     """Write cameras, each with its lens, and the points beside them.
 
     Parameters
@@ -72,7 +72,7 @@ def write_transforms(path: Path, photos: Sequence[Photo], files: Sequence[str], 
         stream.write(("{\n" + ",\n".join(lines) + "\n}\n").encode("utf-8"))
 
 
-def write_colmap(folder: Path, photos: Sequence[Photo], points: Points, text: bool = False) -> None:
+def write_colmap(folder: Path, photos: Sequence[RegisteredImage], points: Points, text: bool = False) -> None:
     """Write cameras, images and points3D, .bin or .txt, into a folder, which is made when absent.
 
     Raises
@@ -120,7 +120,7 @@ def _plainest(lens: Lens) -> Lens:
     return lens
 
 
-def _lens_keys(photo: Photo) -> dict[str, Any]:
+def _lens_keys(photo: RegisteredImage) -> dict[str, Any]:
     """A lens as transforms.json has it; raises InputError."""
     lens = _plainest(photo.lens)
     model = str(lens.model.name)

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from ..cameras.cameras_json import IMAGE_SUFFIXES
 from ..errors import InputError
+from ..files.image_names import IMAGE_SUFFIXES
 from ..files.images import image_size
-from ..files.json_file import read_json, real_of
+from ..files.json_file import read_json, to_real
 from .nerfstudio import find_transforms
-from .posed_images import Posed
+from .posed_images import PosedImages
 from .reconstruct.reconstruct import RECORD
-from .scene import chosen_tests, masks_of, read_posed
+from .scene import find_masks, read_posed_images, select_test_names
 from .undistort import is_pinhole
 
 _DIGITS = 6  # significant ones of a focal length, by which lenses are told apart
@@ -106,7 +106,7 @@ def scene_info(path: str | os.PathLike[str], images: str | None = None, test_eve
     InputError : a missing folder or photo, or a damaged model.
     """
     root = Path(path)
-    posed = read_posed(root, images)
+    posed = read_posed_images(root, images)
     sizes: Counter[tuple[int, int]] = Counter()
     unreadable = []
     for name, file in posed.files.items():
@@ -115,7 +115,7 @@ def scene_info(path: str | os.PathLike[str], images: str | None = None, test_eve
         except InputError:
             unreadable.append(name)
     tracks = posed.points.track_length
-    masks = masks_of(root, posed, None)
+    masks = find_masks(root, posed, None)
     transforms = [] if (root / "sparse").is_dir() else find_transforms(root)
     return SceneInfo(
         " and ".join(file.name for file in transforms) or "COLMAP",
@@ -128,13 +128,13 @@ def scene_info(path: str | os.PathLike[str], images: str | None = None, test_eve
         len(posed.points),
         float(tracks.mean()) if len(tracks) else 0.0,
         float(np.median(tracks)) if len(tracks) else 0.0,
-        tuple(sorted(chosen_tests(posed, test_every, None))) if len(posed.photos) > 1 else (),
+        tuple(sorted(select_test_names(posed, test_every, None))) if len(posed.photos) > 1 else (),
         len(masks),
         _placed(root),
     )
 
 
-def _unregistered(posed: Posed, masks: Iterable[Path]) -> tuple[str, ...]:
+def _unregistered(posed: PosedImages, masks: Iterable[Path]) -> tuple[str, ...]:
     """Photos beside the posed ones, by their paths below the folder that holds them all."""
     files = {file.resolve() for file in posed.files.values()}
     known = files | {file.resolve() for file in masks}
@@ -148,14 +148,14 @@ def _placed(root: Path) -> tuple[int, int, float] | None:
         return None
     record = read_json(root / RECORD, "a scene of clsplat reconstruct")
     values = record if isinstance(record, dict) else {}
-    found = [real_of(values.get(key)) for key in ("registered", "photos", "error")]
+    found = [to_real(values.get(key)) for key in ("registered", "photos", "error")]
     registered, photos, error = (value if value is not None and math.isfinite(value) else -1.0 for value in found)
     if min(registered, photos, error) < 0:
         raise InputError(f"{root / RECORD}: registered, photos and error must be numbers; remove the file")
     return int(registered), int(photos), error
 
 
-def _lenses(posed: Posed) -> tuple[LensUse, ...]:
+def _lenses(posed: PosedImages) -> tuple[LensUse, ...]:
     uses: Counter[LensUse] = Counter()
     for photo in posed.photos:
         lens = photo.lens

@@ -21,15 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import is_rotation
-from ..cameras.cameras_json import IMAGE_SUFFIXES
 from ..cameras.path import cam_from_world_of
 from ..errors import InputError
+from ..files.image_names import IMAGE_SUFFIXES
 from ..files.images import image_size
-from ..files.json_file import read_json, real_of
+from ..files.json_file import read_json, to_real
 from .colmap import Points, read_model
 from .point_cloud import read_point_cloud
-from .posed_images import Posed
-from .undistort import Lens, Photo, make_lens
+from .posed_images import PosedImages
+from .undistort import Lens, RegisteredImage, make_lens
 
 FILE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
 
@@ -57,7 +57,7 @@ def find_transforms(path: Path) -> list[Path]:
     return [path / FILE] if (path / FILE).is_file() else []
 
 
-def posed_by_transforms(files: list[Path], images: str | None = None) -> Posed:
+def read_transforms(files: list[Path], images: str | None = None) -> PosedImages:
     """Posed photos of transforms files.
 
     Parameters
@@ -96,7 +96,7 @@ def posed_by_transforms(files: list[Path], images: str | None = None) -> Posed:
     test_names = _held_out(documents, kept)
     used = set().union(*(document.listed() or kept for document in documents))
     kept = {name: frame for name, frame in kept.items() if name in used}
-    return Posed(
+    return PosedImages(
         [frame.photo() for frame in kept.values()],
         {name: frame.file for name, frame in kept.items()},
         documents[0].points(),
@@ -129,8 +129,8 @@ class _Frame:
     def place(self) -> str:
         return f"{self.document.path}: frame {self.number}"
 
-    def photo(self) -> Photo:
-        return Photo(self.name, self.pose(), self.lens())
+    def photo(self) -> RegisteredImage:
+        return RegisteredImage(self.name, self.pose(), self.lens())
 
     def mask_file(self) -> Path | None:
         """nerfstudio's mask_path."""
@@ -199,7 +199,7 @@ class _Frame:
         value = self.value(key)
         if value is None:
             return default
-        real = real_of(value)
+        real = to_real(value)
         if real is None or not abs(real) < _LARGEST:
             raise InputError(f"{self.place}: {key} is {str(value)[:40]!r}; it must be a number")
         return real
@@ -277,7 +277,7 @@ class _Document:
     def applied(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points of the COLMAP model, moved as its poses were."""
         matrix = _matrix(self.values["applied_transform"])
-        scale = real_of(self.values.get("applied_scale", 1.0))
+        scale = to_real(self.values.get("applied_scale", 1.0))
         if matrix is None or scale is None or not 0 < scale < _LARGEST:
             raise InputError(f"{self.path}: applied_transform must be 3 x 4 numbers and applied_scale above 0")
         moved: NDArray[np.float64] = scale * (xyz @ matrix[:3, :3].T + matrix[:3, 3])

@@ -6,16 +6,16 @@ import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..cameras.cameras_json import IMAGE_SUFFIXES
 from ..errors import InputError
+from ..files.image_names import IMAGE_SUFFIXES
 from .colmap import Points, find_model, read_model
-from .undistort import Photo
+from .undistort import RegisteredImage
 
 _FEW_REGISTERED = 0.8
 
 
 @dataclass(frozen=True, eq=False)
-class Posed:
+class PosedImages:
     """Posed photos and points.
 
     Parameters
@@ -27,7 +27,7 @@ class Posed:
     masks : files of masks that the files name, by their photos' names.
     """
 
-    photos: list[Photo]
+    photos: list[RegisteredImage]
     files: dict[str, Path]
     points: Points
     test_names: frozenset[str] | None = None
@@ -39,7 +39,7 @@ class Posed:
         return [photo.name for photo in self.photos]
 
 
-def posed_by_colmap(root: Path, images: str | None) -> Posed:
+def read_colmap(root: Path, images: str | None) -> PosedImages:
     """A folder with photos and a COLMAP model in `sparse`.
 
     Parameters
@@ -58,7 +58,7 @@ def posed_by_colmap(root: Path, images: str | None) -> Posed:
     folder = _photo_folder(root, images or "images")
     files = _photo_files(folder, [photo.name for photo in model.photos])
     _warn_of_unregistered(folder, len(files))
-    return Posed(model.photos, files, model.points)
+    return PosedImages(model.photos, files, model.points)
 
 
 def _photo_folder(root: Path, images: str) -> Path:

@@ -14,13 +14,13 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..errors import InputError
 from ..files.images import ImageU8, read_image, resize_area
-from ..files.masks import FOLDER, NO_MASKS, Mask, mask_files, nearest, read_mask
+from ..files.masks import MASK_FOLDER, NO_MASKS, Mask, mask_files, read_mask, resize_mask
 from ..splats.color import BLACK, Color
 from .colmap import Points
-from .nerfstudio import find_transforms, posed_by_transforms
+from .nerfstudio import find_transforms, read_transforms
 from .options import ALPHA_USES
-from .posed_images import Posed, posed_by_colmap
-from .undistort import Photo
+from .posed_images import PosedImages, read_colmap
+from .undistort import RegisteredImage
 
 MAX_WIDTH = 1600  # 3DGS: with resolution -1, wider images are reduced to this [px]
 _EXTENT_MARGIN = 1.1  # 3DGS: extent over the farthest camera's distance from their mean
@@ -55,7 +55,7 @@ class View:
             self.name,
             self.camera.resized(width, height),
             resize_area(self.image, width, height),
-            None if self.mask is None else nearest(self.mask, width, height),
+            None if self.mask is None else resize_mask(self.mask, width, height),
             None if self.alpha is None else resize_area(self.alpha, width, height),
         )
 
@@ -162,12 +162,12 @@ def load_scene(
         raise InputError(f"alpha {alpha!r}: choose one of {', '.join(ALPHA_USES)}")
     if resolution < 1 and resolution != -1:
         raise InputError(f"resolution {resolution}: use 1, 2, 4, 8, a width in pixels, or -1")
-    posed = read_posed(root, images)
-    test_names = chosen_tests(posed, test_every, test_list) if eval else frozenset()
+    posed = read_posed_images(root, images)
+    test_names = select_test_names(posed, test_every, test_list) if eval else frozenset()
 
-    hiding = masks_of(root, posed, masks)
+    hiding = find_masks(root, posed, masks)
 
-    def view(photo: Photo) -> View | str:
+    def view(photo: RegisteredImage) -> View | str:
         return _view(photo, posed.files[photo.name], resolution, background, hiding.get(photo.name), alpha == "mask")
 
     with ThreadPoolExecutor() as pool:  # decoding and resizing run outside the interpreter lock
@@ -185,11 +185,11 @@ def load_scene(
     )
 
 
-def masks_of(root: Path, posed: Posed, folder: str | None) -> dict[str, Path]:
+def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, Path]:
     """Files of masks, by the names of their photos."""
     if folder == NO_MASKS:
         return {}
-    named = (root.parent if root.is_file() else root) / (folder or FOLDER)
+    named = (root.parent if root.is_file() else root) / (folder or MASK_FOLDER)
     if folder is not None and not named.is_dir():
         raise InputError(f"{named}: no such folder of masks; name another, or {NO_MASKS!r} for no masks")
     found = mask_files(named, posed.names)
@@ -209,14 +209,14 @@ def _warn_of_left_out(root: Path, reasons: list[str], n: int) -> None:
         )
 
 
-def read_posed(root: Path, images: str | None) -> Posed:
+def read_posed_images(root: Path, images: str | None) -> PosedImages:
     transforms = find_transforms(root)
     if transforms and not (root / "sparse").is_dir():
-        return posed_by_transforms(transforms, images)
-    return posed_by_colmap(root, images)
+        return read_transforms(transforms, images)
+    return read_colmap(root, images)
 
 
-def chosen_tests(posed: Posed, test_every: int, test_list: str | os.PathLike[str] | None) -> frozenset[str]:
+def select_test_names(posed: PosedImages, test_every: int, test_list: str | os.PathLike[str] | None) -> frozenset[str]:
     names = posed.names
     if test_list is None and posed.test_names is not None:
         chosen = sorted(posed.test_names)
@@ -251,7 +251,7 @@ def _read_names(path: Path) -> list[str]:
 
 
 def _view(
-    photo: Photo,
+    photo: RegisteredImage,
     file: Path,
     resolution: int,
     background: Color,

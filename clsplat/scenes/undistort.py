@@ -15,7 +15,7 @@ from ..errors import InputError, reason_of
 
 # Before pycolmap on purpose (see images.py), hence also pycolmap only inside functions.
 from ..files import images as _images
-from ..files.masks import nearest
+from ..files.masks import resize_mask
 
 Lens = Any  # a pycolmap.Camera
 
@@ -25,7 +25,7 @@ _DISTORTED_PINHOLES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 
 @dataclass(frozen=True, eq=False)
-class Photo:
+class RegisteredImage:
     """A registered image: its file name inside the images folder, its pose and its lens.
 
     Parameters
@@ -93,7 +93,7 @@ class Photo:
             )
         lens = _scaled(self.lens, width, height, self.name)
         if is_pinhole(lens):
-            return nearest(mask, width, height)
+            return resize_mask(mask, width, height)
         across, down = _seen_from(_pinhole_of(lens, self.name), lens)
         # Outside the outermost pixel centres the image is blank (bilinear); rays that no pixel sees are NaN.
         inside = (across >= 0.5) & (across <= width - 0.5) & (down >= 0.5) & (down <= height - 0.5)

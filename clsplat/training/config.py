@@ -9,7 +9,7 @@ from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from ..errors import InputError
-from ..files.json_file import kind, real_of
+from ..files.json_file import kind, to_real
 from ..splats.color import BLACK, Color
 from ..splats.fields import MAX_SH_DEGREE
 from ..splats.shapes import DEFAULT_SHAPE, check_normalisation, shape_named
@@ -309,7 +309,7 @@ def _is_a(value: Any, hint: Any) -> bool:
         same_length = parts[1:] == (...,) or (isinstance(value, tuple) and len(value) == len(parts))
         return isinstance(value, tuple) and same_length and all(_is_a(part, parts[0]) for part in value)
     if hint is float:
-        real = real_of(value)
+        real = to_real(value)
         return real is not None and math.isfinite(real)
     return isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.looked_at import where_axes_meet
+from ..cameras.orbits import where_axes_meet
 from ..splats.fields import Array
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..cameras.cameras_json import named_cameras
 from ..errors import InputError, OutputError
-from ..files.lock import sole_writer
+from ..files.lock import folder_lock
 from ..scenes.scene import Scene
 from .checkpoint import Checkpoint
 from .config import FREE_OPTIONS, TrainConfig
@@ -57,7 +57,7 @@ def train(
         elif folder.is_used and not overwrite:
             raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
         folder.prepare()
-    with sole_writer(None if folder is None else folder.path):
+    with folder_lock(None if folder is None else folder.path):
         trainer = Trainer(scene, config, checkpoint, progress)
         if folder is not None:
             if checkpoint is None:

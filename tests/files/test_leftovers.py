@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.files.atomic import atomic_path
-from clsplat.files.lock import sole_writer
+from clsplat.files.lock import folder_lock
 
 pytest.importorskip("fcntl")
 KILLED = """
@@ -36,7 +36,7 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
         path.write_bytes(b"")
     with atomic_path(tmp_path / "living.ply") as temporary:
         temporary.write_bytes(b"half")
-        with sole_writer(tmp_path):
+        with folder_lock(tmp_path):
             assert temporary.exists()
     assert not left[0].exists()
     assert target.read_bytes() == b"old"

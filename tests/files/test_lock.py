@@ -13,15 +13,15 @@ from clsplat_cli.budget import forget_search
 
 from clsplat.compression.state import FILE
 from clsplat.errors import OutputError
-from clsplat.files.lock import sole_writer
+from clsplat.files.lock import folder_lock
 
 pytest.importorskip("fcntl")
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from clsplat.files.lock import sole_writer
-with sole_writer(Path(sys.argv[1])):
+from clsplat.files.lock import folder_lock
+with folder_lock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
 """
@@ -38,23 +38,23 @@ def holder(folder: Path) -> subprocess.Popen[str]:
 def test_another_process_keeps_out_until_it_ends(tmp_path: Path, end: signal.Signals) -> None:
     process = holder(tmp_path)
     try:
-        with pytest.raises(OutputError, match="another run writes into it"), sole_writer(tmp_path):
+        with pytest.raises(OutputError, match="another run writes into it"), folder_lock(tmp_path):
             pytest.fail("came in")
     finally:
         process.send_signal(end)
         process.wait(10)
     time.sleep(0.05)
-    with sole_writer(tmp_path):
+    with folder_lock(tmp_path):
         pass
 
 
 def test_blocks_within_a_block_are_one_writer(tmp_path: Path) -> None:
-    with sole_writer(tmp_path):
-        with sole_writer(tmp_path / "."):
+    with folder_lock(tmp_path):
+        with folder_lock(tmp_path / "."):
             pass
         assert refused(tmp_path), "the inner end has not let go"
     assert not refused(tmp_path)
-    with sole_writer(None):
+    with folder_lock(None):
         pass
 
 

@@ -16,7 +16,7 @@ from clsplat.errors import InputError
 from clsplat.scenes.colmap import read_model
 from clsplat.scenes.colmap_binary import check_binary_model, write_binary_model
 from clsplat.scenes.scene import load_scene
-from clsplat.scenes.undistort import Photo, make_lens
+from clsplat.scenes.undistort import RegisteredImage, make_lens
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_undistorted_photo_shows_points_where_its_camera_says(model: str, params
         at = np.ravel(lens.img_from_cam(np.array([[*ray, 1.0]]))) * scale
         image += 200 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 4.5)
     picture = np.repeat(np.clip(image, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-    flat, camera = Photo("dots", np.eye(4), lens).fit(picture)
+    flat, camera = RegisteredImage("dots", np.eye(4), lens).fit(picture)
     assert flat.shape == (camera.height, camera.width, 3)
     checked = 0
     for ray in rays:
@@ -151,7 +151,7 @@ def test_every_lens_is_undistorted_as_its_formula_says(model: str) -> None:
     rays = invert(pixels)
     np.testing.assert_allclose(_put_by_hand(model, p, rays[..., 0], rays[..., 1]), pixels, atol=1e-6)
     picture = np.rint(pattern(rays[..., 0], rays[..., 1])).astype(np.uint8)
-    photo = Photo("pattern", np.eye(4), make_lens(model, 200, 150, p))
+    photo = RegisteredImage("pattern", np.eye(4), make_lens(model, 200, 150, p))
     flat, camera = photo.fit(np.repeat(picture[..., None], 3, axis=2))
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     x, y = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
@@ -179,7 +179,7 @@ def test_mask_follows_the_photo(model: str, params: list[float], reduced: int) -
     """A mask that is a threshold of the photo is that threshold of the fitted photo, but along edges."""
     import pycolmap
 
-    photo = Photo("disc", np.eye(4), pycolmap.Camera(model=model, width=400, height=300, params=params))
+    photo = RegisteredImage("disc", np.eye(4), pycolmap.Camera(model=model, width=400, height=300, params=params))
     y, x = np.mgrid[:300, :400] // reduced * reduced
     mask = ((x - 120) ** 2 + (y - 100) ** 2 < 90**2) | (x > 330)
     flat, camera = photo.fit(np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2))
@@ -196,7 +196,7 @@ def test_mask_is_false_outside_the_photo() -> None:
 
     # This lens leaves a sliver of the fitted image blank.
     params = [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]
-    photo = Photo("sliver", np.eye(4), pycolmap.Camera(model="OPENCV", width=400, height=300, params=params))
+    photo = RegisteredImage("sliver", np.eye(4), pycolmap.Camera(model="OPENCV", width=400, height=300, params=params))
     white, _ = photo.fit(np.full((300, 400, 3), 255, np.uint8))
     fitted = photo.fit_mask(np.ones((300, 400), bool), 400, 300)
     assert 0 < (~fitted).sum() < 100
@@ -210,7 +210,7 @@ def test_zero_distortion_is_a_plain_pinhole() -> None:
 
     lens = pycolmap.Camera(model="OPENCV", width=40, height=30, params=[30, 31, 18, 16, 0, 0, 0, 0])
     image = np.random.default_rng(0).integers(0, 256, (30, 40, 3)).astype(np.uint8)
-    same, camera = Photo("plain", np.eye(4), lens).fit(image)
+    same, camera = RegisteredImage("plain", np.eye(4), lens).fit(image)
     np.testing.assert_array_equal(same, image)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 31, 18, 16)
 

@@ -15,9 +15,9 @@ from clsplat.cameras.cameras_json import read_cameras
 from clsplat.cameras.path import CameraPath, write_path
 from clsplat.scenes.colmap import read_model
 from clsplat.scenes.export import relative_files, write_colmap, write_transforms
-from clsplat.scenes.posed_images import Posed
-from clsplat.scenes.scene import load_scene, read_posed
-from clsplat.scenes.undistort import Photo, make_lens
+from clsplat.scenes.posed_images import PosedImages
+from clsplat.scenes.scene import load_scene, read_posed_images
+from clsplat.scenes.undistort import RegisteredImage, make_lens
 from clsplat.splats.splats import Splats
 
 # Lenses, and what they are written as: transforms.json knows a few forms only.
@@ -37,15 +37,16 @@ def garden(tmp_path: Path) -> Path:
     return write_garden(tmp_path)
 
 
-def with_lens(garden: Path, model: str) -> Posed:
-    posed = read_posed(garden, None)
+def with_lens(garden: Path, model: str) -> PosedImages:
+    posed = read_posed_images(garden, None)
     photos = [
-        Photo(photo.name, photo.cam_from_world, make_lens(model, 40, 30, LENSES[model])) for photo in posed.photos
+        RegisteredImage(photo.name, photo.cam_from_world, make_lens(model, 40, 30, LENSES[model]))
+        for photo in posed.photos
     ]
-    return Posed(photos, posed.files, posed.points)
+    return PosedImages(photos, posed.files, posed.points)
 
 
-def assert_same(ours: list[Photo], theirs: list[Photo]) -> None:
+def assert_same(ours: list[RegisteredImage], theirs: list[RegisteredImage]) -> None:
     """Poses to 1e-9, and lenses by where they see points."""
     rng = np.random.default_rng(0)
     rays = np.column_stack([rng.uniform(-0.4, 0.4, (30, 2)), np.ones(30)])
@@ -74,8 +75,8 @@ def test_transforms_come_back(garden: Path, model: str) -> None:
     posed = with_lens(garden, model)
     write_transforms(garden / "transforms.json", posed.photos, [f"images/{name}" for name in NAMES], posed.points)
     shutil.rmtree(garden / "sparse")
-    back = read_posed(garden, None)
-    named = [Photo(f"images/{photo.name}", photo.cam_from_world, photo.lens) for photo in posed.photos]
+    back = read_posed_images(garden, None)
+    named = [RegisteredImage(f"images/{photo.name}", photo.cam_from_world, photo.lens) for photo in posed.photos]
     assert_same(named, back.photos)
     np.testing.assert_allclose(back.points.xyz, posed.points.xyz, rtol=1e-6)
     np.testing.assert_array_equal(back.points.rgb, posed.points.rgb)
@@ -83,9 +84,9 @@ def test_transforms_come_back(garden: Path, model: str) -> None:
 
 def test_plain_lenses_are_written_as_such(garden: Path, tmp_path: Path) -> None:
     """3DGS reads PINHOLE only, and transforms.json is read as FULL_OPENCV."""
-    posed = read_posed(garden, None)
+    posed = read_posed_images(garden, None)
     photos = [
-        Photo(p.name, p.cam_from_world, make_lens("FULL_OPENCV", 40, 30, [33, 31, 18.5, 16.25, *[0] * 8]))
+        RegisteredImage(p.name, p.cam_from_world, make_lens("FULL_OPENCV", 40, 30, [33, 31, 18.5, 16.25, *[0] * 8]))
         for p in posed.photos
     ]
     write_colmap(tmp_path / "out", photos, posed.points)
@@ -140,11 +141,11 @@ def test_what_has_no_cameras_or_no_form_is_refused(garden: Path, tmp_path: Path,
     posed = with_lens(garden, "RADIAL")
     write_colmap(garden / "sparse" / "0", posed.photos, posed.points)
     assert "no distorted lenses" in error_of("cameras", garden, tmp_path / "cameras.json")
-    photo = Photo("a.png", np.eye(4), make_lens("FOV", 40, 30, [33.0, 31.0, 18.5, 16.25, 0.9]))
+    photo = RegisteredImage("a.png", np.eye(4), make_lens("FOV", 40, 30, [33.0, 31.0, 18.5, 16.25, 0.9]))
     with pytest.raises(Exception, match="no lens of COLMAP's model FOV"):
         write_transforms(tmp_path / "t.json", [photo], ["a.png"], posed.points)
     six = make_lens("FULL_OPENCV", 40, 30, [33.0, 31.0, 18.5, 16.25, 0, 0, 0, 0, 0, 0.1, 0, 0])
     with pytest.raises(Exception, match="no k4, k5 and k6"):
-        write_transforms(tmp_path / "t.json", [Photo("a.png", np.eye(4), six)], ["a.png"], posed.points)
+        write_transforms(tmp_path / "t.json", [RegisteredImage("a.png", np.eye(4), six)], ["a.png"], posed.points)
     assert not (tmp_path / "t.json").exists()
     assert relative_files([garden / "images" / "a.png"], garden / "out") == ["../images/a.png"]

@@ -12,7 +12,7 @@ from small_scene import HEIGHT, N_VIEWS, NAMES, WIDTH, photo_of, write_garden
 
 from clsplat.errors import InputError
 from clsplat.files.images import read_image, write_png
-from clsplat.files.masks import mask_files, nearest, read_mask
+from clsplat.files.masks import mask_files, read_mask, resize_mask
 from clsplat.scenes.scene import load_scene
 
 
@@ -71,8 +71,8 @@ def test_grey_is_a_choice_of_black_or_white(tmp_path: Path) -> None:
 
 def test_nearest_pixel() -> None:
     mask = np.array([[True, False, False, True]])
-    np.testing.assert_array_equal(nearest(mask, 8, 2), np.tile(np.repeat(mask, 2, axis=1), (2, 1)))
-    np.testing.assert_array_equal(nearest(mask, 2, 1), [[False, True]])
+    np.testing.assert_array_equal(resize_mask(mask, 8, 2), np.tile(np.repeat(mask, 2, axis=1), (2, 1)))
+    np.testing.assert_array_equal(resize_mask(mask, 2, 1), [[False, True]])
 
 
 def test_a_mask_of_white_is_none_and_one_of_black_leaves_the_photo_out(folder: Path) -> None:

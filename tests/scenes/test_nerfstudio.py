@@ -18,7 +18,7 @@ from small_scene import CX, CY, FX, FY, HEIGHT, NAMES, WIDTH, cloud, model_views
 
 from clsplat.errors import InputError
 from clsplat.files.images import write_png
-from clsplat.scenes.nerfstudio import posed_by_transforms
+from clsplat.scenes.nerfstudio import read_transforms
 from clsplat.scenes.scene import load_scene
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -95,11 +95,11 @@ def test_distortion_is_undistorted(folder: Path) -> None:
     """As the same lens of a COLMAP model is."""
     import pycolmap
 
-    from clsplat.scenes.undistort import Photo
+    from clsplat.scenes.undistort import RegisteredImage
 
     scene = load_scene(write(folder, LENS | {"k1": 0.1, "p2": 0.01, "frames": frames()}))
     lens = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=[FX, FY, CX, CY, 0.1, 0, 0, 0.01])
-    image, camera = Photo("a", np.eye(4), lens).fit(photo_of(0))
+    image, camera = RegisteredImage("a", np.eye(4), lens).fit(photo_of(0))
     assert scene.views[0].camera.fx == pytest.approx(camera.fx)
     np.testing.assert_array_equal(scene.views[0].image, image)
     fisheye = load_scene(write(folder, LENS | {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "frames": frames()}))
@@ -232,7 +232,7 @@ def test_damaged_files_are_named(folder: Path, text: str) -> None:
     file = folder / "transforms.json"
     file.write_text(text)
     with pytest.raises(InputError, match=r"transforms\.json: (is no JSON|has no list)"):
-        posed_by_transforms([file])
+        read_transforms([file])
 
 
 @pytest.mark.data
@@ -297,7 +297,7 @@ def test_fuzz_succeeds_or_says_why(folder: Path, data: st.DataObject) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            said = f"{len(posed_by_transforms([file]).photos)} photos"
+            said = f"{len(read_transforms([file]).photos)} photos"
         except InputError as error:
             said = str(error).removeprefix(str(folder))
     assert said.endswith(" photos") or said.startswith("/"), "the file is named"

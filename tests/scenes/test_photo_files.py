@@ -12,16 +12,16 @@ import pytest
 from PIL import Image
 
 from clsplat.errors import InputError
-from clsplat.files.images import photo_facts, read_image, write_photo
+from clsplat.files.images import read_image, read_photo_header, write_photo
 from clsplat.scenes.reconstruct.photo_files import (
     PhotoFile,
-    Prepared,
+    StagedPhoto,
     find_photos,
     fingerprint,
+    group_by_camera,
     is_photographs,
-    prepare,
-    same_camera,
-    unread_kinds,
+    stage_photo,
+    unsupported_photos,
 )
 
 ORIENTATION, MODEL = 0x0112, 0x0110
@@ -43,10 +43,10 @@ def exif(orientation: int, model: str = "") -> Image.Exif:
     return tags
 
 
-def staged(tmp_path: Path, photo: PhotoFile) -> Prepared | str:
+def staged(tmp_path: Path, photo: PhotoFile) -> StagedPhoto | str:
     for part in ("photos", "masks"):
         (tmp_path / "work" / part).mkdir(parents=True, exist_ok=True)
-    return prepare(photo, 0, tmp_path / "work" / "photos", tmp_path / "work" / "masks")
+    return stage_photo(photo, 0, tmp_path / "work" / "photos", tmp_path / "work" / "masks")
 
 
 # --- finding -------------------------------------------------------------------------------
@@ -86,7 +86,7 @@ def test_folders_without_photos(tmp_path: Path) -> None:
     (tmp_path / "IMG_1.HEIC").write_bytes(b"heic")
     with pytest.raises(InputError, match=r"1 file \.heic: convert them to JPEG"):
         find_photos(tmp_path)
-    assert unread_kinds(tmp_path) == "1 file .heic"
+    assert unsupported_photos(tmp_path) == "1 file .heic"
     assert not is_photographs(tmp_path)
 
 
@@ -134,10 +134,10 @@ def test_photos_are_turned_upright(tmp_path: Path, orientation: int) -> None:
     }[orientation]
     file = put(tmp_path / "a.png", np.ascontiguousarray(back(PICTURE)), exif=exif(orientation, "Phone"))
     np.testing.assert_array_equal(read_image(file, upright=True), PICTURE)
-    facts = photo_facts(file)
+    facts = read_photo_header(file)
     assert (facts.width, facts.height, facts.plain, facts.camera) == (20, 12, orientation == 1, ("Phone",))
     ready = staged(tmp_path, PhotoFile("a.png", file))
-    assert isinstance(ready, Prepared)
+    assert isinstance(ready, StagedPhoto)
     with Image.open(tmp_path / "work" / "photos" / ready.staged) as image:
         assert (image.size, image.getexif().get(ORIENTATION, 1), image.getexif()[MODEL]) == ((20, 12), 1, "Phone")
 
@@ -145,7 +145,7 @@ def test_photos_are_turned_upright(tmp_path: Path, orientation: int) -> None:
 def test_plain_photos_are_not_written_anew(tmp_path: Path) -> None:
     file = put(tmp_path / "a.jpg", quality=50)
     ready = staged(tmp_path, PhotoFile("a.jpg", file))
-    assert isinstance(ready, Prepared)
+    assert isinstance(ready, StagedPhoto)
     assert (tmp_path / "work" / "photos" / ready.staged).read_bytes() == file.read_bytes()
 
 
@@ -164,7 +164,7 @@ def png16(pixels: np.ndarray) -> bytes:
 def test_sixteen_bits_become_eight(tmp_path: Path, channels: int) -> None:
     deep = np.random.default_rng(1).integers(0, 1 << 16, (5, 7, channels)).astype(np.uint16)
     (tmp_path / "deep.png").write_bytes(png16(deep))
-    assert not photo_facts(tmp_path / "deep.png").plain
+    assert not read_photo_header(tmp_path / "deep.png").plain
     pixels = read_image(tmp_path / "deep.png").astype(float)
     assert pixels.shape == (5, 7, 4 if channels in (2, 4) else 3)
     expected = deep if channels > 2 else np.repeat(deep[:, :, :1], 3, axis=2)
@@ -178,7 +178,7 @@ def test_other_kinds_are_read(tmp_path: Path, name: str, mode: str) -> None:
     smooth = np.repeat(np.linspace(0, 255, 20)[None, :, None], 12, axis=0).repeat(3, axis=2).astype(np.uint8)
     file = put(tmp_path / name, smooth, mode)
     ready = staged(tmp_path, PhotoFile(name, file))
-    assert isinstance(ready, Prepared)
+    assert isinstance(ready, StagedPhoto)
     pixels = read_image(tmp_path / "work" / "photos" / ready.staged).astype(float)
     with Image.open(file) as image:
         assert np.abs(pixels - np.asarray(image.convert("RGB"))).mean() < 4
@@ -187,7 +187,7 @@ def test_other_kinds_are_read(tmp_path: Path, name: str, mode: str) -> None:
 def test_mpo_gives_its_first_picture(tmp_path: Path) -> None:
     first, second = Image.new("RGB", (20, 12), (200, 10, 10)), Image.new("RGB", (20, 12), (10, 10, 200))
     first.save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[second])
-    assert not photo_facts(tmp_path / "a.jpg").plain
+    assert not read_photo_header(tmp_path / "a.jpg").plain
     assert read_image(tmp_path / "a.jpg")[0, 0, 0] > 190
 
 
@@ -208,7 +208,7 @@ def test_transparency_and_masks_hide_pixels_from_features(tmp_path: Path) -> Non
     file = put(tmp_path / "a.png", np.dstack([PICTURE, alpha]))
     mask = put(tmp_path / "m.png", np.repeat([[0] * 5 + [255] * 15], 12, axis=0).astype(np.uint8))
     ready = staged(tmp_path, PhotoFile("a.png", file, mask))
-    assert isinstance(ready, Prepared)
+    assert isinstance(ready, StagedPhoto)
     handed = read_image(tmp_path / "work" / "masks" / f"{ready.staged}.png")[:, :, 0]
     np.testing.assert_array_equal(handed, np.repeat([[0] * 5 + [255] * 5 + [0] * 10], 12, axis=0))
     wrong = put(tmp_path / "w.png", PICTURE.swapaxes(0, 1))
@@ -225,12 +225,12 @@ def test_photos_of_one_size_and_camera_share_a_lens(tmp_path: Path) -> None:
         put(tmp_path / "d" / "4.jpg", PICTURE[:8], exif=exif(1, "A")),
     ]
     ready = [
-        Prepared(PhotoFile(str(file.relative_to(tmp_path)), file), photo_facts(file), f"{number}.jpg")
+        StagedPhoto(PhotoFile(str(file.relative_to(tmp_path)), file), read_photo_header(file), f"{number}.jpg")
         for number, file in enumerate(files)
     ]
 
     def grouped(mode: str) -> list[list[str]]:
-        return [[photo.staged for photo in group] for group in same_camera(ready, mode)]
+        return [[photo.staged for photo in group] for group in group_by_camera(ready, mode)]
 
     assert grouped("auto") == [["0.jpg", "1.jpg"], ["2.jpg"], ["3.jpg"]]
     assert grouped("per-image") == [["0.jpg"], ["1.jpg"], ["2.jpg"], ["3.jpg"]]

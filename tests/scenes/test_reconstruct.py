@@ -20,8 +20,9 @@ from PIL import Image
 from clsplat.errors import InputError, OutputError
 from clsplat.scenes.colmap import find_model, read_model
 from clsplat.scenes.reconstruct import reconstruct as module
+from clsplat.scenes.reconstruct.options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, ReconstructOptions
 from clsplat.scenes.reconstruct.photo_files import PhotoFile
-from clsplat.scenes.reconstruct.reconstruct import ReconstructOptions, made_from, reconstruct
+from clsplat.scenes.reconstruct.reconstruct import is_made_from, reconstruct
 from clsplat.scenes.reconstruct.sfm_process import Step
 from clsplat.scenes.scene import Scene, load_scene
 
@@ -130,8 +131,8 @@ def test_a_scene_is_not_replaced_unasked(scene: Path, walk: Path, tmp_path: Path
     (tmp_path / "mine" / "work.txt").write_text("hours")
     with pytest.raises(OutputError, match="no scene that was reconstructed"):
         reconstruct(walk, tmp_path / "mine", overwrite=True)
-    assert made_from(scene, walk)
-    assert made_from(tmp_path, walk) is None
+    assert is_made_from(scene, walk)
+    assert is_made_from(tmp_path, walk) is None
 
 
 def test_training_on_photographs_uses_the_scene_again(scene: Path, walk: Path, tmp_path: Path) -> None:
@@ -193,8 +194,8 @@ def test_what_a_killed_run_left_goes_and_another_run_is_kept_out(tmp_path: Path)
     assert not left.exists()
     left.mkdir()
     program = (
-        "import sys; from clsplat.files.lock import sole_writer; from pathlib import Path\n"
-        "with sole_writer(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+        "import sys; from clsplat.files.lock import folder_lock; from pathlib import Path\n"
+        "with folder_lock(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     )
     command = [sys.executable, "-c", program, left]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
@@ -231,7 +232,7 @@ def test_estimate_grows_with_photos_and_their_size(tmp_path: Path) -> None:
     Image.new("L", (400, 300)).save(small)
     Image.new("L", (4000, 3000)).save(large)
     seconds = [
-        module.estimated_seconds([PhotoFile(file.name, file)] * count) for file in (small, large) for count in (20, 140)
+        module.estimate_seconds([PhotoFile(file.name, file)] * count) for file in (small, large) for count in (20, 140)
     ]
     assert seconds[0] < min(seconds[1:3])
     assert seconds[3] > 10 * seconds[2], "all pairs: faster than the photos"
@@ -246,11 +247,11 @@ def test_pairs_of_a_sequence() -> None:
 
 
 def test_warnings_of_photos_that_are_not_placed(tmp_path: Path) -> None:
-    from clsplat.files.images import PhotoFacts
-    from clsplat.scenes.reconstruct.photo_files import Prepared
+    from clsplat.files.images import PhotoHeader
+    from clsplat.scenes.reconstruct.photo_files import StagedPhoto
 
-    facts = PhotoFacts(8, 8, True, (), b"")
-    ready = [Prepared(PhotoFile(f"{n}.jpg", tmp_path), facts, f"{n}.jpg") for n in range(10)]
+    facts = PhotoHeader(8, 8, True, (), b"")
+    ready = [StagedPhoto(PhotoFile(f"{n}.jpg", tmp_path), facts, f"{n}.jpg") for n in range(10)]
     with pytest.warns(UserWarning, match=r"only 7 of 10 photos could be placed; left out are 7\.jpg, 8\.jpg, 9\.jpg\."):
         module._warn_of_rest(tmp_path, ready, ready[:7], {"0": 7, "1": 2})
     with pytest.warns(UserWarning, match=r"fall into 2 parts .* the largest \(8 photos\)"):
@@ -261,9 +262,10 @@ def test_warnings_of_photos_that_are_not_placed(tmp_path: Path) -> None:
 
 
 def test_options(tmp_path: Path) -> None:
-    for name in ("CAMERA_MODELS", "CAMERA_MODES", "MATCHERS"):
-        assert getattr(cli, name) == getattr(module, name)
-    defaults = {param.name: param.default for param in cli.reconstruct_scene.params}
+    params = {param.name: param for param in cli.reconstruct_scene.params}
+    for name, choices in (("camera_model", CAMERA_MODELS), ("camera_mode", CAMERA_MODES), ("matcher", MATCHERS)):
+        assert tuple(params[name].type.choices) == choices
+    defaults = {name: param.default for name, param in params.items()}
     for name, value in vars(ReconstructOptions()).items():
         assert defaults[name] == value
     with pytest.raises(InputError, match="camera_model 'LENS': use one of SIMPLE_PINHOLE"):

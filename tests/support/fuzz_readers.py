@@ -260,7 +260,13 @@ def read_photographs(folder: Path) -> None:
     """As far as a reconstruction goes before it looks for features."""
     import tempfile
 
-    from clsplat.scenes.reconstruct.photo_files import find_photos, fingerprint, is_photographs, prepare, same_camera
+    from clsplat.scenes.reconstruct.photo_files import (
+        find_photos,
+        fingerprint,
+        group_by_camera,
+        is_photographs,
+        stage_photo,
+    )
 
     is_photographs(folder / "photos")
     found = find_photos(folder / "photos")
@@ -268,9 +274,10 @@ def read_photographs(folder: Path) -> None:
     with tempfile.TemporaryDirectory() as work:
         (Path(work) / "photos").mkdir()
         ready = [
-            prepare(photo, number, Path(work) / "photos", Path(work) / "masks") for number, photo in enumerate(found)
+            stage_photo(photo, number, Path(work) / "photos", Path(work) / "masks")
+            for number, photo in enumerate(found)
         ]
-    same_camera([photo for photo in ready if not isinstance(photo, str)], "auto")
+    group_by_camera([photo for photo in ready if not isinstance(photo, str)], "auto")
     for line in ready:
         if isinstance(line, str):  # those are left out, with this line
             raise InputError(line)

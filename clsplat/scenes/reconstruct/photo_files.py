@@ -11,20 +11,18 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from ...cameras.cameras_json import IMAGE_SUFFIXES
 from ...errors import InputError
+from ...files.image_names import IMAGE_SUFFIXES, JPEG_SUFFIXES
 from ...files.images import (
-    JPEG_SUFFIXES,
     ImageU8,
-    PhotoFacts,
-    photo_facts,
+    PhotoHeader,
     read_image,
+    read_photo_header,
     same_aspect,
     write_photo,
     write_png,
 )
-from ...files.masks import FOLDER as MASK_FOLDER
-from ...files.masks import Mask, mask_files, nearest, read_mask
+from ...files.masks import MASK_FOLDER, Mask, mask_files, read_mask, resize_mask
 
 VIDEO_SUFFIXES = frozenset((".mp4", ".m4v", ".mov", ".mkv", ".avi", ".webm", ".mts", ".mpg", ".mpeg"))
 # Photographs of kinds that Pillow does not read.
@@ -42,7 +40,7 @@ class PhotoFile:
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class StagedPhoto:
     """A photograph that was read, as structure from motion gets it: upright, under a plain name.
 
     Parameters
@@ -51,7 +49,7 @@ class Prepared:
     """
 
     source: PhotoFile
-    facts: PhotoFacts
+    facts: PhotoHeader
     staged: str
 
     def pixels(self) -> ImageU8:
@@ -106,7 +104,7 @@ def find_photos(path: Path) -> list[PhotoFile]:
     ]
 
 
-def unread_kinds(path: Path) -> str:
+def unsupported_photos(path: Path) -> str:
     """What a folder holds beside photos that are read: "3 files .heic"; empty where nothing."""
     return _foreign(_home(path)) if path.is_dir() else ""
 
@@ -134,7 +132,7 @@ def fingerprint(path: Path) -> str:
     return digest.hexdigest()
 
 
-def prepare(photo: PhotoFile, number: int, photos: Path, masks: Path) -> Prepared | str:
+def stage_photo(photo: PhotoFile, number: int, photos: Path, masks: Path) -> StagedPhoto | str:
     """Read a photograph whole and put it into the working folder, upright; a mask into `masks`, under COLMAP's name.
 
     Returns
@@ -142,9 +140,9 @@ def prepare(photo: PhotoFile, number: int, photos: Path, masks: Path) -> Prepare
     The photograph, or one line on why it cannot be used.
     """
     try:
-        facts, pixels = photo_facts(photo.file), read_image(photo.file, upright=True)
+        facts, pixels = read_photo_header(photo.file), read_image(photo.file, upright=True)
         staged = f"{number:06}{'.png' if photo.file.suffix.lower() == '.png' and facts.plain else '.jpg'}"
-        prepared = Prepared(photo, facts, staged)
+        prepared = StagedPhoto(photo, facts, staged)
         mask = prepared.mask()
     except InputError as error:
         return str(error)
@@ -160,7 +158,7 @@ def prepare(photo: PhotoFile, number: int, photos: Path, masks: Path) -> Prepare
     return prepared
 
 
-def complete_masks(photos: Sequence[Prepared], masks: Path) -> Path | None:
+def complete_masks(photos: Sequence[StagedPhoto], masks: Path) -> Path | None:
     """A mask for every photo, as COLMAP drops those without where others have one; None where none has."""
     if not any(masks.iterdir()):
         return None
@@ -170,7 +168,7 @@ def complete_masks(photos: Sequence[Prepared], masks: Path) -> Path | None:
     return masks
 
 
-def same_camera(photos: Sequence[Prepared], mode: str) -> list[list[Prepared]]:
+def group_by_camera(photos: Sequence[StagedPhoto], mode: str) -> list[list[StagedPhoto]]:
     """Photos grouped by the camera that they share.
 
     Parameters
@@ -181,7 +179,7 @@ def same_camera(photos: Sequence[Prepared], mode: str) -> list[list[Prepared]]:
     ------
     InputError : "single" or "per-folder", and sizes that differ.
     """
-    groups: dict[object, list[Prepared]] = {}
+    groups: dict[object, list[StagedPhoto]] = {}
     for photo in photos:
         size = photo.facts.width, photo.facts.height
         folder = PurePosixPath(photo.source.name).parent
@@ -244,7 +242,7 @@ def _scene_names(names: list[str]) -> list[str]:
     return renamed
 
 
-def _upright_mask(path: Path, photo: Path, facts: PhotoFacts) -> Mask:
+def _upright_mask(path: Path, photo: Path, facts: PhotoHeader) -> Mask:
     """A mask of the photo as stored or of the upright photo, of its size or a reduction of it, at the upright size."""
     mask = read_mask(path)
     rows, columns = mask.shape
@@ -253,7 +251,7 @@ def _upright_mask(path: Path, photo: Path, facts: PhotoFacts) -> Mask:
             f"{path}: is {columns}x{rows} px, the photo {photo.name} {facts.width}x{facts.height}; "
             "make the mask of the photo's size, upright"
         )
-    return nearest(mask, facts.width, facts.height)
+    return resize_mask(mask, facts.width, facts.height)
 
 
 def _write_mask(folder: Path, staged: str, mask: Mask) -> None:

@@ -14,36 +14,25 @@ from pathlib import Path
 from typing import TypeVar
 
 from ...errors import InputError, OutputError
-from ...files.images import PhotoFacts, photo_facts
+from ...files.images import PhotoHeader, read_photo_header
 from ...files.json_file import read_json, write_json
-from ...files.lock import sole_writer
-from .options import CAMERA_MODELS, CAMERA_MODES, FEWEST, MATCHERS, ReconstructOptions
+from ...files.lock import folder_lock
+from .options import FEWEST, ReconstructOptions
 from .photo_files import (
     PhotoFile,
-    Prepared,
+    StagedPhoto,
     complete_masks,
     find_photos,
     fingerprint,
+    group_by_camera,
     is_video,
-    prepare,
-    same_camera,
-    unread_kinds,
+    stage_photo,
+    unsupported_photos,
 )
 from .sfm_process import Step, Tell, run_sfm
 from .sfm_worker import ENOUGH
 from .undistorted_scene import SparseModel, write_flat_model, write_flat_photo
 from .video_frames import extract_frames
-
-__all__ = [
-    "CAMERA_MODELS",
-    "CAMERA_MODES",
-    "MATCHERS",
-    "ReconstructOptions",
-    "Reconstructed",
-    "estimated_seconds",
-    "made_from",
-    "reconstruct",
-]
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -56,7 +45,7 @@ _LOOP = 10  # every so many-th photo of a sequence is matched with all others of
 
 
 @dataclass(frozen=True)
-class Reconstructed:
+class ReconstructionResult:
     """What came of it: the scene's folder and figures.
 
     Parameters
@@ -81,7 +70,7 @@ def reconstruct(
     options: ReconstructOptions | None = None,
     tell: Tell | None = None,
     overwrite: bool = False,
-) -> Reconstructed:
+) -> ReconstructionResult:
     """Find the poses of photographs and write them as a scene: images/, sparse/0/, masks/ and reconstruct.json.
 
     The scene appears whole or not at all. Images are upright and without distortion (PINHOLE).
@@ -115,7 +104,7 @@ def reconstruct(
             given = find_photos(source)
         mark = fingerprint(source)
         ready = _prepared(given, source, work, say)
-        groups = [[photo.staged for photo in group] for group in same_camera(ready, options.camera_mode)]
+        groups = [[photo.staged for photo in group] for group in group_by_camera(ready, options.camera_mode)]
         pairs = _pairs(len(ready), _sequential(options, source, len(ready)))
         names = [photo.staged for photo in ready]
         (work / "pairs.txt").write_text("".join(f"{names[a]} {names[b]}\n" for a, b in pairs))
@@ -139,7 +128,7 @@ def reconstruct(
         )
         write_flat_model(model, views, work / "scene")
         points = model.points
-        result = Reconstructed(
+        result = ReconstructionResult(
             target,
             len(ready),
             len(registered),
@@ -161,7 +150,7 @@ def reconstruct(
     return result
 
 
-def estimated_seconds(photos: Sequence[PhotoFile], options: ReconstructOptions | None = None) -> float:
+def estimate_seconds(photos: Sequence[PhotoFile], options: ReconstructOptions | None = None) -> float:
     """Roughly how long `reconstruct` will take: from a header, figures of one CPU core, and the number of cores.
 
     Raises
@@ -169,7 +158,7 @@ def estimated_seconds(photos: Sequence[PhotoFile], options: ReconstructOptions |
     InputError : the first photo cannot be read.
     """
     options = options or ReconstructOptions()
-    facts = photo_facts(photos[0].file)
+    facts = read_photo_header(photos[0].file)
     side = _longest_side(facts, options)
     megapixels = facts.width * facts.height * (side / max(facts.width, facts.height)) ** 2 / 1e6
     features = min(1.0, 3.0 * megapixels)  # of the most
@@ -178,7 +167,7 @@ def estimated_seconds(photos: Sequence[PhotoFile], options: ReconstructOptions |
     return (search + 0.2 * pairs * features**2 + 0.5 * len(photos)) / (os.cpu_count() or 1)
 
 
-def made_from(scene: Path, photos: Path) -> bool | None:
+def is_made_from(scene: Path, photos: Path) -> bool | None:
     """Whether the scene was reconstructed from just these photos; None where none is there.
 
     Raises
@@ -206,7 +195,7 @@ def _unfinished(scene: Path) -> Iterator[Path]:
     work = scene.with_name(f".{scene.name}.unfinished")
     try:
         work.mkdir(parents=True, exist_ok=True)
-        with sole_writer(work):
+        with folder_lock(work):
             for left in work.iterdir():
                 shutil.rmtree(left) if left.is_dir() else left.unlink()
             try:
@@ -225,14 +214,16 @@ def _put(finished: Path, scene: Path) -> None:
     finished.rename(scene)
 
 
-def _prepared(given: Sequence[PhotoFile], source: Path, work: Path, say: Tell) -> list[Prepared]:
+def _prepared(given: Sequence[PhotoFile], source: Path, work: Path, say: Tell) -> list[StagedPhoto]:
     for part in ("photos", "masks"):
         (work / part).mkdir()
     jobs = list(enumerate(given))
-    found = list(_each("photos read", lambda job: prepare(job[1], job[0], work / "photos", work / "masks"), jobs, say))
+    found = list(
+        _each("photos read", lambda job: stage_photo(job[1], job[0], work / "photos", work / "masks"), jobs, say)
+    )
     reasons = [result for result in found if isinstance(result, str)]
     ready = [result for result in found if not isinstance(result, str)]
-    foreign = unread_kinds(source)
+    foreign = unsupported_photos(source)
     if foreign:
         warnings.warn(f"left out: {foreign} in {source}; convert to JPEG to use them", stacklevel=3)
     if reasons:
@@ -246,7 +237,7 @@ def _prepared(given: Sequence[PhotoFile], source: Path, work: Path, say: Tell) -
     return ready
 
 
-def _longest_side(facts: PhotoFacts, options: ReconstructOptions) -> int:
+def _longest_side(facts: PhotoHeader, options: ReconstructOptions) -> int:
     """Of the photo as it is searched for features [px]."""
     return min(max(facts.width, facts.height), options.max_size)
 
@@ -268,7 +259,7 @@ def _pairs(photos: int, sequential: bool) -> list[tuple[int, int]]:
 
 
 def _warn_of_rest(
-    source: Path, ready: Sequence[Prepared], registered: Sequence[Prepared], models: dict[str, int]
+    source: Path, ready: Sequence[StagedPhoto], registered: Sequence[StagedPhoto], models: dict[str, int]
 ) -> None:
     placed = {photo.staged for photo in registered}
     rest = [photo.source.name for photo in ready if photo.staged not in placed]

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ...cameras.camera import Camera
 from ...files.images import write_photo, write_png
-from ...files.masks import FOLDER as MASK_FOLDER
-from ..colmap import Points, read_photos, read_points
+from ...files.masks import MASK_FOLDER
+from ..colmap import Points, read_points, read_registered
 from ..colmap_binary import ModelView, write_binary_model
-from ..undistort import Photo, colmap_library
-from .photo_files import Prepared
+from ..undistort import RegisteredImage, colmap_library
+from .photo_files import StagedPhoto
 
 
 class SparseModel:
@@ -27,7 +27,7 @@ class SparseModel:
 
     def __init__(self, folder: Path) -> None:
         self._model = colmap_library().Reconstruction(str(folder))
-        self._photos = {photo.name: photo for photo in read_photos(self._model)}
+        self._photos = {photo.name: photo for photo in read_registered(self._model)}
         self._images = {image.name: image for image in self._model.images.values()}
         self._rows = {number: row for row, number in enumerate(sorted(self._model.points3D))}
 
@@ -46,7 +46,7 @@ class SparseModel:
         """(P,) mean reprojection error of each point [px]."""
         return np.array([self._model.points3D[number].error for number in self._rows])
 
-    def photo(self, name: str) -> Photo:
+    def photo(self, name: str) -> RegisteredImage:
         """A registered photo with its lens."""
         return self._photos[name]
 
@@ -67,7 +67,7 @@ class SparseModel:
         )
 
 
-def write_flat_photo(model: SparseModel, photo: Prepared, scene: Path) -> ModelView:
+def write_flat_photo(model: SparseModel, photo: StagedPhoto, scene: Path) -> ModelView:
     """Undistort a registered photo, and its mask, into the scene's folders.
 
     Raises
