@@ -126,8 +126,6 @@ GROUPS = {
             "skew-normal:position_optimizer=sghmc,noise_lr=0",
             "skew-normal:normalisation=pdf",
             "skew-normal:normalisation=none",
-            "skew-normal:skew_map=linear",
-            "skew-normal-direct:skew_map=radial",
         ),
         (5000,),
     ),

@@ -150,7 +150,7 @@ static inline vec3 unit_direction(constant real *cam, vec3 mean, vreal *inv_norm
 // Global size: splats / LANES.
 kernel void project_splats(
     global const real *restrict geom,
-    global const sh_real *restrict sh,
+    global const real *restrict sh,
     constant real *restrict cam,
     global real *restrict records,
     global uint *restrict depth_key,
@@ -201,7 +201,7 @@ kernel void project_splats(
     const int used = (sh_degree + 1) * (sh_degree + 1);
     vreal rgb[3] = {(vreal)R(0.5), (vreal)R(0.5), (vreal)R(0.5)};
     for (int k = 0; k < used; ++k)
-        for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * sh_load(sh + first + (ulong)(3 * k + c) * capacity);
+        for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * lanes_load(sh + first + (ulong)(3 * k + c) * capacity);
     for (int c = 0; c < 3; ++c) out[2 + c] = max(rgb[c], (vreal)0);
 
     real lane[LANES][RECORD], edge[5][LANES];
@@ -236,7 +236,7 @@ kernel void project_splats(
 // (3DSGS's depth gradient) and 1.
 kernel void project_splats_vjp(
     global const real *restrict geom,
-    global const sh_real *restrict sh,
+    global const real *restrict sh,
     constant real *restrict cam,
     global const real *restrict moments,
     global const real *restrict records,
@@ -326,7 +326,7 @@ kernel void project_splats_vjp(
     }
     for (int k = 0; k < used; ++k) {
         v_basis[k] = zero;
-        for (int c = 0; c < 3; ++c) v_basis[k] += v_rgb[c] * sh_load(sh + first + (ulong)(3 * k + c) * capacity);
+        for (int c = 0; c < 3; ++c) v_basis[k] += v_rgb[c] * lanes_load(sh + first + (ulong)(3 * k + c) * capacity);
     }
     vec3 v_direction = sh_basis_vjp(direction, sh_degree, v_basis);
     v_direction = add3(v_direction, scale3(direction, -dot3(direction, v_direction)));

@@ -9,14 +9,6 @@
 #define BLOCKS_X (TILE / BLOCK_W)
 #define V_RECORD (SHAPE_V + 3)
 
-#if VECS > 32
-#define BITS 64
-typedef ulong block_bits;  // an isect's blocks, where CULLS_BLOCKS
-#else
-#define BITS 32
-typedef uint block_bits;
-#endif
-
 #ifndef SHAPE_PLAIN  // no splat of such a shape is a Gaussian at less cost
 #define shape_is_plain(p) false
 #define shape_alpha_plain(dx, dy, p) ((vreal)0)
@@ -86,7 +78,8 @@ static inline void start_blocks(int tile_x, int tile_y, int width, int height, v
 #define CULLS_BLOCKS (ALONE && LANES > 1)
 #if CULLS_BLOCKS
 
-typedef block_bits block_set;
+#define BITS 32
+typedef uint block_set;
 #define no_blocks_left(set) ((set) == 0)
 #define next_block(set) (BITS - 1 - (int)clz((set) & -(set)))
 #define without_next(set) ((set) & ((set) - 1))
@@ -102,8 +95,7 @@ static inline vreal corners_y(int first) {
 }
 
 static inline block_set blocks_reached(const real *rec, int tile_x, int tile_y) {
-    vmask bits[BITS / 32];
-    for (int word = 0; word < BITS / 32; ++word) bits[word] = lanes_mask(0);
+    vmask bits = lanes_mask(0);
     UNROLL for (int part = 0; part < PARTS; ++part) {
         const int first = part * LANES, top = tile_y + first / BLOCKS_X * BLOCK_H;
         if (PARTS == 1 || (rec[7] >= (real)top && rec[6] < (real)(top + LANES / BLOCKS_X * BLOCK_H))) {
@@ -111,11 +103,10 @@ static inline block_set blocks_reached(const real *rec, int tile_x, int tile_y) 
             const vmask in_box = (x <= (vreal)rec[9]) & (x + (real)(BLOCK_W - 1) >= (vreal)rec[8])
                                  & (y <= (vreal)rec[7]) & (y + (real)(BLOCK_H - 1) >= (vreal)rec[6]);
             const vreal dx = x + R(0.5) * BLOCK_W - rec[0], dy = y + R(0.5) * BLOCK_H - rec[1];
-            bits[first / 32] |= in_box & shape_reaches(dx, dy, rec + HEAD) & lanes_bits(first % 32);
+            bits |= in_box & shape_reaches(dx, dy, rec + HEAD) & lanes_bits(first);
         }
     }
-    block_set reached = 0;
-    for (int word = 0; word < BITS / 32; ++word) reached |= (block_set)(uint)lanes_or(bits[word]) << (32 * word);
+    const block_set reached = (block_set)(uint)lanes_or(bits);
     return reached & (~(block_set)0 >> (BITS - VECS));  // fewer blocks than lanes: the rest lies outside of the tile
 }
 
@@ -158,7 +149,7 @@ kernel void rasterize(
     global real *restrict color,
     global real *restrict transmittance,
     global real *restrict depth,
-    global block_bits *restrict isect_blocks,
+    global uint *restrict isect_blocks,
     int width,
     int height,
     int tiles_x,
@@ -274,7 +265,7 @@ kernel void rasterize_vjp(
     global const real *restrict transmittance,
     global const real *restrict v_color,
     global const real *restrict v_alpha,
-    global const block_bits *restrict isect_blocks,
+    global const uint *restrict isect_blocks,
     global real *restrict isect_grads,
     int width,
     int height,

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import DeviceError
 from .pip_runtime import register_pip_runtime
 
-TILES = (16, 8, 32)  # sides of a tile [px]; the first is what schedules are measured with
+TILE = 16  # side of a tile [px]
 MIB = 1 << 20
 _EAGER_BYTES = 16 * MIB  # buffers from this size on are claimed at once, so that lack of memory shows here
 
@@ -31,7 +31,7 @@ LESS_MEMORY = "use fewer splats (--cap-max), smaller images (-r 2, 4, 8) or anot
 class Schedule:
     """How one tile's pixels are shared out: work-items x vectors per work-item x lanes per vector.
 
-    The product is the tile: 256 for 16x16 px, 64 for 8x8, 1024 for 32x32.
+    The product is the number of pixels of a tile, 256.
     """
 
     group: int
@@ -39,22 +39,12 @@ class Schedule:
     lanes: int
 
     def __post_init__(self) -> None:
-        if min(self.group, self.vecs, self.lanes) < 1 or self.tile not in TILES:
-            raise DeviceError(f"schedule {self}: GROUPxVECSxLANES must multiply to 64, 256 or 1024")
+        if min(self.group, self.vecs, self.lanes) < 1 or self.group * self.vecs * self.lanes != TILE * TILE:
+            raise DeviceError(f"schedule {self}: GROUPxVECSxLANES must multiply to {TILE * TILE}")
         if self.lanes not in (1, 8, 16):
             raise DeviceError(f"schedule {self}: LANES must be 1, 8 or 16 (cl/math/lanes.clh)")
-        if self.group == 1 and self.lanes > 1 and self.vecs > 64:
-            raise DeviceError(
-                f"schedule {self}: a work-item has at most 64 vectors (a bit each, cl/render/rasterize.cl)"
-            )
         if self.group > 1 and self.group % 32:  # sums go by parts of 16; PoCL 3.1 gets groups of 16 wrong
             raise DeviceError(f"schedule {self}: GROUP must be 1 or a multiple of 32 (cl/render/group.clh)")
-
-    @property
-    def tile(self) -> int:
-        """Side of a tile [px]; 0 where the product is none's."""
-        pixels = self.group * self.vecs * self.lanes
-        return next((side for side in TILES if side * side == pixels), 0)
 
     def __str__(self) -> str:
         return f"{self.group}x{self.vecs}x{self.lanes}"

@@ -7,11 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ..device.device import Device, Schedule
+from ..device.device import TILE, Device, Schedule
 from ..device.program import Define, Program, Real, build
 from ..splats.fields import Group, Schema
 from ..splats.shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, shape_named
-from .arithmetic import DEFAULT_ARITHMETIC, Arithmetic
 
 MARGIN_X, MARGIN_Y = 16, 8  # zero margin of every image plane: the SSIM window reaches 5 pixels out
 BATCH = 64
@@ -53,7 +52,6 @@ class KernelBuild:
     alpha_min: float = ALPHA_MIN
     alpha_max: float = ALPHA_MAX
     t_min: float = T_MIN
-    arithmetic: Arithmetic = DEFAULT_ARITHMETIC
     antialiased: bool = False
 
     @cached_property
@@ -64,11 +62,6 @@ class KernelBuild:
     @property
     def dtype(self) -> np.dtype[np.floating]:
         return np.dtype(np.float32 if self.real == "float" else np.float64)
-
-    @property
-    def sh_dtype(self) -> np.dtype[np.floating]:
-        """Of colour on the device."""
-        return np.dtype(np.float16) if self.arithmetic.half_sh else self.dtype
 
     @property
     def record(self) -> int:
@@ -83,11 +76,6 @@ class KernelBuild:
     @property
     def lanes(self) -> int:
         return self.schedule.lanes
-
-    @property
-    def block_bytes(self) -> int:
-        """Of an isect's set of blocks, a bit each (cl/render/rasterize.cl)."""
-        return 8 if self.schedule.vecs > 32 else 4
 
     def raster_program(self, device: Device) -> Program:
         """Projection, rasterisation, and their gradients."""
@@ -112,30 +100,26 @@ class KernelBuild:
         rows: dict[str, Define] = {
             f"ROW_{field.name.upper()}": schema.offset(field.name) for field in schema.group(Group.GEOM)
         }
-        return (
-            rows
-            | self.arithmetic.defines()
-            | {
-                "TILE": self.schedule.tile,
-                "BATCH": BATCH,
-                "MARGIN_X": MARGIN_X,
-                "MARGIN_Y": MARGIN_Y,
-                "GROUP": self.schedule.group,
-                "VECS": self.schedule.vecs,
-                "LANES": self.lanes,
-                "SH_DEGREE": self.sh_degree,
-                "GEOM_ROWS": schema.rows(Group.GEOM),
-                "WITH_DEPTH": int(self.with_depth),
-                "WITH_V_ALPHA": int(self.with_v_alpha),
-                "ANTIALIASED": int(self.antialiased),
-                "NORMALISATION": NORMALISATIONS.index(self.normalisation),
-                "PEAK_STEPS": 3 if self.real == "float" else 4,
-                "SKEW_MAX": SKEW_MAX,
-                "SLANT_MAX": SLANT_MAX,
-                "OPACITY_SIGNED": int(shape_named(self.shape).signed),
-                "LOW_PASS": LOW_PASS,
-                "ALPHA_MIN": self.alpha_min,
-                "ALPHA_MAX": self.alpha_max,
-                "T_MIN": self.t_min,
-            }
-        )
+        return rows | {
+            "TILE": TILE,
+            "BATCH": BATCH,
+            "MARGIN_X": MARGIN_X,
+            "MARGIN_Y": MARGIN_Y,
+            "GROUP": self.schedule.group,
+            "VECS": self.schedule.vecs,
+            "LANES": self.lanes,
+            "SH_DEGREE": self.sh_degree,
+            "GEOM_ROWS": schema.rows(Group.GEOM),
+            "WITH_DEPTH": int(self.with_depth),
+            "WITH_V_ALPHA": int(self.with_v_alpha),
+            "ANTIALIASED": int(self.antialiased),
+            "NORMALISATION": NORMALISATIONS.index(self.normalisation),
+            "PEAK_STEPS": 3 if self.real == "float" else 4,
+            "SKEW_MAX": SKEW_MAX,
+            "SLANT_MAX": SLANT_MAX,
+            "OPACITY_SIGNED": int(shape_named(self.shape).signed),
+            "LOW_PASS": LOW_PASS,
+            "ALPHA_MIN": self.alpha_min,
+            "ALPHA_MAX": self.alpha_max,
+            "T_MIN": self.t_min,
+        }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device.device import TILE
 from ..device.memory import to_host
 from .pipeline import Frame, Pipeline
 
@@ -22,7 +23,7 @@ def pairs_per_pixel(pipeline: Pipeline, frame: Frame) -> NDArray[np.float32]:
     layout, lanes = frame.layout, pipeline.kernels.lanes
     wide = 1 if lanes == 1 else 4  # BLOCK_W and BLOCK_H of cl/math/lanes.clh
     high = lanes // wide
-    blocks_x, blocks_y = layout.tile // wide, layout.tile // high
+    blocks_x, blocks_y = TILE // wide, TILE // high
     by_tile = _counts(pipeline, frame).reshape(layout.tiles_y, layout.tiles_x, blocks_y, blocks_x)
     blocks = by_tile.transpose(0, 2, 1, 3).reshape(layout.tiles_y * blocks_y, layout.tiles_x * blocks_x)
     rows = np.clip(layout.height - high * np.arange(len(blocks)), 1, high)  # of the block within the image
@@ -34,7 +35,7 @@ def pairs_per_pixel(pipeline: Pipeline, frame: Frame) -> NDArray[np.float32]:
 def _counts(pipeline: Pipeline, frame: Frame) -> NDArray[np.int64]:
     """(tiles * blocks of a tile,) useful pairs of each block of pixels (cl/measure/count.cl)."""
     kernels, layout, pool = pipeline.kernels, frame.layout, pipeline.pool
-    n_counts = layout.tiles_x * layout.tiles_y * layout.tile**2 // kernels.lanes
+    n_counts = layout.tiles_x * layout.tiles_y * TILE**2 // kernels.lanes
     counts = pool.get("pair_counts", 4 * n_counts)
     useful = np.zeros(n_counts, np.int64)
     for _, lists in pipeline.bands(frame):

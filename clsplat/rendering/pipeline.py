@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..device.device import TILES, Device
+from ..device.device import TILE, Device
 from ..device.memory import Pool, fill_zero, send_to_device, to_device, to_host
 from ..device.program import lane_group
 from ..splats.color import BLACK, Color
@@ -34,24 +34,23 @@ class ImageLayout:
 
     width: int
     height: int
-    tile: int = TILES[0]
 
     @property
     def tiles_x(self) -> int:
-        return -(-self.width // self.tile)
+        return -(-self.width // TILE)
 
     @property
     def tiles_y(self) -> int:
-        return -(-self.height // self.tile)
+        return -(-self.height // TILE)
 
     @property
     def stride(self) -> int:
         """Pixels from one row to the next."""
-        return self.tiles_x * self.tile + 2 * MARGIN_X
+        return self.tiles_x * TILE + 2 * MARGIN_X
 
     @property
     def rows(self) -> int:
-        return self.tiles_y * self.tile + 2 * MARGIN_Y
+        return self.tiles_y * TILE + 2 * MARGIN_Y
 
     @property
     def plane(self) -> int:
@@ -145,7 +144,7 @@ class Pipeline:
         ------
         DeviceError : more splats over one tile than fit.
         """
-        layout = ImageLayout(camera.width, camera.height, self.kernels.schedule.tile)
+        layout = ImageLayout(camera.width, camera.height)
         degree = self.kernels.sh_degree if sh_degree is None else min(sh_degree, self.kernels.sh_degree)
         bands = self._project(splats, camera, layout, degree)
         self.frame = Frame(layout, degree, splats, bands)
@@ -325,7 +324,7 @@ class Pipeline:
             color=self.image(prefix + "color", layout, 3),
             transmittance=self.image(prefix + "transmittance", layout),
             depth=self.image(prefix + "depth", layout),
-            isect_blocks=pool.get("isect_blocks", self.kernels.block_bytes * band.n_isects),
+            isect_blocks=pool.get("isect_blocks", 4 * band.n_isects),
             width=layout.width,
             height=layout.height,
             tiles_x=layout.tiles_x,

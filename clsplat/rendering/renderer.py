@@ -15,7 +15,6 @@ from ..errors import DeviceError, InputError
 from ..splats.color import BLACK
 from ..splats.fields import Array
 from ..splats.splats import Splats
-from .arithmetic import DEFAULT_ARITHMETIC, Arithmetic
 from .build import ALPHA_MAX, ALPHA_MIN, T_MIN, KernelBuild
 from .overdraw import pairs_per_pixel
 from .pipeline import Frame, Pipeline
@@ -51,7 +50,6 @@ class Renderer:
     precision : "float32" or "float64".
     schedule : how a tile's pixels are shared out; None lets the device choose.
     alpha_min, alpha_max, t_min : blending thresholds; (0, 1, 0) makes the image smooth, for gradient checks.
-    arithmetic : forms of exp and Phi, and how colour is kept: speed against accuracy.
     keep : models that stay on the device, those last rendered.
 
     Raises
@@ -68,7 +66,6 @@ class Renderer:
         alpha_min: float = ALPHA_MIN,
         alpha_max: float = ALPHA_MAX,
         t_min: float = T_MIN,
-        arithmetic: Arithmetic = DEFAULT_ARITHMETIC,
         keep: int = 1,
     ) -> None:
         if precision not in PRECISIONS:
@@ -77,7 +74,7 @@ class Renderer:
         self.precision = precision
         if precision == "float64" and not self.device.has_fp64:
             raise DeviceError(f"device {self.device.info} has no double precision: use float32 or another --device")
-        self.schedule, self.arithmetic = schedule, arithmetic
+        self.schedule = schedule
         self._thresholds = (alpha_min, alpha_max, t_min)
         self._pipelines: dict[KernelBuild, Pipeline] = {}
         self._keep = keep
@@ -159,7 +156,6 @@ class Renderer:
             alpha_min=alpha_min,
             alpha_max=alpha_max,
             t_min=t_min,
-            arithmetic=self.arithmetic,
             antialiased=splats.antialiased,
         ).for_rendering()
         if kernels not in self._pipelines:
@@ -172,7 +168,7 @@ class Renderer:
         if known is None:
             del self._uploaded[: max(len(self._uploaded) + 1 - self._keep, 0)]  # first: memory may be short
             kernels = pipeline.kernels
-            known = (splats, SplatBuffers.of(self.device, splats, kernels.dtype, sh_dtype=kernels.sh_dtype))
+            known = (splats, SplatBuffers.of(self.device, splats, kernels.dtype))
         else:
             self._uploaded.remove(known)
         self._uploaded.append(known)

@@ -15,7 +15,6 @@ from ..splats.harmonics import sh_basis
 from ..splats.splats import Splats
 
 CAPACITY_STEP = 1024  # columns are padded: whole groups of 64 items of 16 lanes stay inside
-HALF_MAX = 65504.0  # largest half-precision number
 COMPACT_ROWS = 6  # of colour: its gradient, and a direction
 
 
@@ -33,17 +32,15 @@ class ParameterBuffers:
         schema: Schema,
         capacity: int,
         dtype: np.dtype[np.floating],
-        sh_dtype: np.dtype[np.floating] | None = None,
     ) -> None:
         self.device, self.schema, self.capacity, self.dtype = device, schema, capacity_for(capacity), dtype
-        self.dtypes = {Group.GEOM: dtype, Group.SH: sh_dtype or dtype}
         self.buffers = {group: device.alloc(self.group_bytes(group)) for group in Group}
         for group, buffer in self.buffers.items():
             fill_zero(device, buffer, self.group_bytes(group))
 
     def group_bytes(self, group: Group) -> int:
         """Size of one of the two buffers."""
-        return self.schema.rows(group) * self.capacity * self.dtypes[group].itemsize
+        return self.schema.rows(group) * self.capacity * self.dtype.itemsize
 
     @property
     def geom(self) -> Any:
@@ -57,12 +54,9 @@ class ParameterBuffers:
         """Public arrays (schema.public_shape) of n <= capacity splats, by field, into the first n columns."""
         for name in arrays:
             field = self.schema[name]
-            dtype = self.dtypes[field.group]
             array = np.asarray(arrays[name], self.dtype)
-            if dtype == np.float16:
-                array = array.clip(-HALF_MAX, HALF_MAX)
             rows = array.reshape(len(array), field.width).T
-            padded = np.zeros((field.width, self.capacity), dtype)
+            padded = np.zeros((field.width, self.capacity), self.dtype)
             padded[:, : rows.shape[1]] = rows
             to_device(self.device, self.buffers[field.group], padded, self._offset_bytes(field.name))
 
@@ -71,13 +65,13 @@ class ParameterBuffers:
         arrays: dict[str, Array] = {}
         for name in names or self.schema.names:
             field = self.schema[name]
-            rows: Array = np.empty((field.width, self.capacity), self.dtypes[field.group])
+            rows: Array = np.empty((field.width, self.capacity), self.dtype)
             to_host(self.device, self.buffers[field.group], rows, self._offset_bytes(name))
             arrays[name] = np.ascontiguousarray(rows[:, :n].T).reshape(public_shape(field, n))
         return arrays
 
     def _offset_bytes(self, name: str) -> int:
-        return self.schema.offset(name) * self.capacity * self.dtypes[self.schema[name].group].itemsize
+        return self.schema.offset(name) * self.capacity * self.dtype.itemsize
 
 
 class SplatBuffers(ParameterBuffers):
@@ -89,9 +83,8 @@ class SplatBuffers(ParameterBuffers):
         schema: Schema,
         capacity: int,
         dtype: np.dtype[np.floating],
-        sh_dtype: np.dtype[np.floating] | None = None,
     ) -> None:
-        super().__init__(device, schema, capacity, dtype, sh_dtype)
+        super().__init__(device, schema, capacity, dtype)
         self.n = 0
 
     @classmethod
@@ -101,10 +94,9 @@ class SplatBuffers(ParameterBuffers):
         splats: Splats,
         dtype: np.dtype[np.floating],
         capacity: int = 0,
-        sh_dtype: np.dtype[np.floating] | None = None,
     ) -> SplatBuffers:
-        """Upload of host splats, with room for `capacity`; colour as `sh_dtype`, if given."""
-        self = cls(device, splats.schema, max(capacity, len(splats)), dtype, sh_dtype)
+        """Upload of host splats, with room for `capacity`."""
+        self = cls(device, splats.schema, max(capacity, len(splats)), dtype)
         self.set(splats.to_numpy())
         return self
 

@@ -102,7 +102,7 @@ def _scene() -> Splats:
 
 def _key(device: Device) -> str:
     info = device.info
-    text = source("render/rasterize.cl", "math/lanes.clh", "render/group.clh", "render/blend.clh")
+    text = source("render/rasterize.cl", "math/lanes.clh", "math/approx.clh", "render/group.clh", "render/blend.clh")
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
     return "|".join((info.platform, info.platform_version, info.name, info.driver, __version__, digest))
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..device.device import TILE
 from ..device.memory import to_host
 from ..device.program import GROUP_ITEMS, lane_group
 from ..rendering.pipeline import ImageLayout, Pipeline
@@ -58,7 +59,7 @@ class ImageLoss:
         counted : fraction of the pixels that are not masked; the others have no error.
         """
         image, kernels = self.pipeline.image, self.kernels
-        strips = -(-layout.tiles_x * layout.tile // (kernels.lanes * loss_strip(kernels)))
+        strips = -(-layout.tiles_x * TILE // (kernels.lanes * loss_strip(kernels)))
         segment = self._rows(strips, layout.height)
         segments = -(-layout.height // segment)
         n_parts = 3 * segments * strips

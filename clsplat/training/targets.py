@@ -65,7 +65,7 @@ class Truths:
     def __init__(
         self, device: Device, kernels: KernelBuild, views: Sequence[View], budget: int, channels: int = _COLOR
     ) -> None:
-        self.device, self.views, self.budget, self.tile = device, views, budget, kernels.schedule.tile
+        self.device, self.views, self.budget = device, views, budget
         self.channels = channels
         self.program = loss_program(device, kernels)
         self.pool = Pool(device)
@@ -92,7 +92,7 @@ class Truths:
         view = self._reduced.get(index)
         if view is None:
             view = self.views[index] if downscale == 1 else reduced(self.views[index], downscale)
-        layout = ImageLayout(view.camera.width, view.camera.height, self.tile)
+        layout = ImageLayout(view.camera.width, view.camera.height)
         nbytes = self.channels * layout.plane
         stays = self._kept_bytes + nbytes <= self.budget
         buffer = self.device.alloc(nbytes) if stays else self.pool.get("truth", nbytes)
@@ -164,7 +164,7 @@ def truth_budget(device: Device) -> int:
     return device.info.global_mem_bytes // 4
 
 
-def truth_bytes(views: Sequence[View], budget: int, tile: int, channels: int = _COLOR) -> int:
+def truth_bytes(views: Sequence[View], budget: int, channels: int = _COLOR) -> int:
     """Most device memory that `Truths` of these views holds, with tiles of this side."""
-    sizes = [channels * ImageLayout(view.camera.width, view.camera.height, tile).plane for view in views]
+    sizes = [channels * ImageLayout(view.camera.width, view.camera.height).plane for view in views]
     return min(sum(sizes), budget) + (_SLOTS + 1) * max(sizes)

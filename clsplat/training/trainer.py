@@ -103,14 +103,14 @@ class Trainer:
             antialiased=config.antialiased,
         )
         largest = max((view.camera for view in scene.train), key=lambda c: c.width * c.height)
-        budget, tile = truth_budget(self.device), self.kernels.schedule.tile
+        budget = truth_budget(self.device)
         channels = truth_channels(scene.train, config.random_background)
-        layout = ImageLayout(largest.width, largest.height, tile)
+        layout = ImageLayout(largest.width, largest.height)
         self.memory = estimate(
             config,
             self.kernels,
             layout,
-            truth_bytes(scene.train, budget, tile, channels)
+            truth_bytes(scene.train, budget, channels)
             + photo_bytes(layout, self.kernels.dtype.itemsize, config, channels),
         )
         check(self.memory, self.device)

@@ -85,7 +85,7 @@ def test_preset_is_resolved_in_config_json(scene: Path, tmp_path: Path) -> None:
         ("3dgs-mcmc", "--shape", "skew-normal", "contradicts shape skew-normal"),
         ("sns", "--alternation", "off", "preset sns has alternation cyclic"),
         ("sns", "--normalisation", "peak", "preset sns has normalisation none"),
-        ("sns", "--skew_map", "radial", "preset sns has skew_map polar"),
+        ("sns", "--skew_map", "coupled", "preset sns has skew_map polar"),
         ("sss", "--position-optimizer", "adam", "preset sss has position_optimizer sghmc-sss"),
     ],
 )

@@ -9,7 +9,7 @@ from reference.scenes import for_shape, random_camera, random_splats
 from reference.skewed import SKEWED
 from rendering.test_footprint import strongly_skewed
 
-from clsplat.device.device import TILES, Device, Schedule
+from clsplat.device.device import TILE, Device, Schedule
 from clsplat.device.memory import to_host
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.pipeline import Pipeline
@@ -44,7 +44,7 @@ def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, sc
     form = Schedule.parse(schedule)
     kernels = KernelBuild(shape, 3, form)
     pipeline = Pipeline(device, kernels)
-    columns, block_height = TILES[0] // 4, form.lanes // 4
+    columns, block_height = TILE // 4, form.lanes // 4
     looked_at = shows = 0
     for seed in range(40):
         case = one_splat(shape, seed, needle=seed % 4 == 0)
@@ -56,10 +56,10 @@ def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, sc
         assert frame.n_isects == (right - left) * (bottom - top)
         number = np.arange(form.vecs)
         bits = (told[:, None] >> number.astype(np.uint32)) & 1
-        seen = np.zeros((frame.layout.tiles_y * TILES[0] // block_height, frame.layout.tiles_x * columns), bool)
+        seen = np.zeros((frame.layout.tiles_y * TILE // block_height, frame.layout.tiles_x * columns), bool)
         for isect in range(frame.n_isects):
             y, x = divmod(isect, right - left)
-            block_y = (top + y) * (TILES[0] // block_height) + number // columns
+            block_y = (top + y) * (TILE // block_height) + number // columns
             seen[block_y, (left + x) * columns + number % columns] = bits[isect] > 0
         alpha = np.zeros((seen.shape[0] * block_height, seen.shape[1] * 4))
         alpha[:HEIGHT, :WIDTH] = case.image.alpha

@@ -20,7 +20,7 @@ from reference.skewed import SKEWED
 from reference.tolerances import IMAGE_FLOAT32, ROUNDING
 
 from clsplat.cameras.camera import Camera
-from clsplat.device.device import TILES, Device, default_schedule
+from clsplat.device.device import TILE, Device, default_schedule
 from clsplat.device.memory import to_host
 from clsplat.rendering.build import ALPHA_MIN, KernelBuild
 from clsplat.rendering.pipeline import Pipeline
@@ -162,14 +162,14 @@ def test_boxes_hold_their_splats_and_little_else(device: Device, shape: str, tur
     slack = 1e-3  # px: float32 rounding of an extent
     assert (rows[:, 0] <= np.ceil(truth[:, 1] - 0.5 + slack)).all()
     assert (rows[:, 1] >= np.floor(truth[:, 3] - 0.5 - slack)).all()
-    first, last = np.ceil(truth[:, :2] - 0.5 + slack) // TILES[0], np.floor(truth[:, 2:] - 0.5 - slack) // TILES[0]
+    first, last = np.ceil(truth[:, :2] - 0.5 + slack) // TILE, np.floor(truth[:, 2:] - 0.5 - slack) // TILE
     some = (np.floor(truth[:, 2:] - 0.5) >= np.ceil(truth[:, :2] - 0.5)).all(1)
     assert (tiles[some, :2] <= first[some]).all()
     assert (tiles[some, 2:] >= last[some] + 1).all()
 
     height, true_height = rows[:, 1] - rows[:, 0] + 1, truth[:, 3] - truth[:, 1]
     area = (tiles[:, 2:] - tiles[:, :2]).prod(1)
-    true_area = (np.floor(truth[:, 2:] / TILES[0]) - np.floor(truth[:, :2] / TILES[0]) + 1).prod(1)
+    true_area = (np.floor(truth[:, 2:] / TILE) - np.floor(truth[:, :2] / TILE) + 1).prod(1)
     if shape == "gaussian":  # exact but for rounding
         assert (height <= true_height + 1.0 + slack).all()
         assert area.sum() <= 1.01 * true_area.sum()

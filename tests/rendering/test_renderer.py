@@ -15,7 +15,7 @@ from reference.scenes import Arrays, random_camera, random_splats
 from reference.tolerances import GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, SAME_FLOAT32, relative_error
 
 from clsplat.cameras.camera import Camera
-from clsplat.device.device import SCHEDULES, TILES, Device, Schedule, default_schedule
+from clsplat.device.device import SCHEDULES, TILE, Device, Schedule, default_schedule
 from clsplat.device.memory import to_device
 from clsplat.errors import InputError
 from clsplat.rendering.build import BATCH, NEAR, KernelBuild
@@ -107,7 +107,7 @@ def thin_cases(shape: str) -> dict[str, Case]:
     """Images of odd sizes and counts of splats about the batch and the lanes; gradients of two fields."""
     fields = ("mean", "log_scale")
     cases = {}
-    for width, height in ((1, 1), (TILES[0], TILES[0]), (TILES[0] + 1, TILES[0] - 1), (200, 5), (5, 130), (33, 64)):
+    for width, height in ((1, 1), (TILE, TILE), (TILE + 1, TILE - 1), (200, 5), (5, 130), (33, 64)):
         camera = random_camera(5, width, height)
         cases[f"{width} x {height}"] = Case(random_splats(5, 12, 3), camera, shape, fields=fields)
     for n in (1, 7, 8, 9, 15, 16, 17, BATCH - 1, BATCH, BATCH + 1, 2 * BATCH + 1):

@@ -73,7 +73,7 @@ kernel void logarithms(global const real *restrict x, global real *restrict out,
 def test_logarithms_in_float32(device: Device, lanes: int) -> None:
     """Relative errors. log(x) near 1 is x - 1 up to rounding; the gap log(1+x) - x/(1+x) is about x^2/2 near 0."""
     x = np.float32(np.concatenate([np.geomspace(1e-30, 1e30, 8000), np.geomspace(0.5, 2.0, 8192)]))
-    program = build_text(device, source("math/lanes.clh") + LOGARITHMS, {"LANES": lanes})
+    program = build_text(device, source("math/lanes.clh", "math/approx.clh") + LOGARITHMS, {"LANES": lanes})
     buffers = [device.alloc(size) for size in (x.nbytes, 3 * x.nbytes)]
     to_device(device, buffers[0], x)
     program.logarithms((len(x) // lanes,), None, x=buffers[0], out=buffers[1], n=len(x))

@@ -92,7 +92,7 @@ def test_what_is_promised_is_enough(device: Device, budget: int) -> None:
     truths = truths_of(device, budget)
     for i in (2, 0, 1, 3):  # the largest first: buffers then need no room to grow
         image_of(truths, truths.get(i, 1))
-    assert truths.nbytes <= truth_bytes(truths.views, budget, truths.tile)
+    assert truths.nbytes <= truth_bytes(truths.views, budget)
     assert truth_budget(device) == device.info.global_mem_bytes // 4
 
 

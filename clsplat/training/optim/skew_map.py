@@ -4,8 +4,6 @@ Kernels and files know only the vector: m in the centred form, the slant eta in 
 r = |s|, n = s / r:
 
     cube-root   m = n SKEW_MAX tanh(r)^(1/3)                  the skewness index is cubic in |m|: linear in r near 0
-    linear      m = n SKEW_MAX tanh(r)
-    radial      eta = n SLANT_MAX tanh(r / SLANT_MAX)
     polar       eta = u/|u| SLANT_MAX tanh(rho / SLANT_MAX)   s = (rho, u): a magnitude and a free direction
     coupled     eta = R' a, a = n SLANT_MAX tanh(r / SLANT_MAX)
 
@@ -33,7 +31,7 @@ from ...splats.quaternions import rotations, rotations_vjp
 from ...splats.shapes import SKEW_MAX, SLANT_MAX
 
 # By the form of the skew (shapes.Shape.skew_form); the first is its default.
-MAPS = {"centred": ("cube-root", "linear"), "direct": ("polar", "radial", "coupled")}
+MAPS = {"centred": ("cube-root",), "direct": ("polar", "coupled")}
 SKEW_MAPS = tuple(name for names in MAPS.values() for name in names)
 R_FLOOR = 1e-6  # skew_map.clh has the same constant
 R_CEILING = 20.0  # cosh(r)^2 stays in float32's range; tanh is 1 long before
