@@ -39,7 +39,6 @@ SHAPES = (
 OPTIONS: dict[str, dict[str, Any]] = {
     "mcmc": {"strategy": "mcmc"},
     "mcmc-two-sided": {"strategy": "mcmc", "shape": "bisected-skew"},
-    "pull": {"strategy": "mcmc", "sampling": "pull", "relocation_limit": 0.05},
     "length-squared": {"strategy": "mcmc", "relocation": "length-squared", "shape": "student-t"},
     "opacity-only": {"strategy": "mcmc", "relocation": "opacity-only"},
     "exposure": {"exposure": True},

@@ -36,7 +36,6 @@ RESOLUTION = {"fox": 2}  # of load_scene; others as they are
 # one experiment when defaults change. Presets bring their own.
 BASE = {
     "strategy": "mcmc",
-    "sampling": "opacity",
     "relocation": "length",
     "growth": 1.05,
     "noise_lr": 5e5,
@@ -78,8 +77,7 @@ def adc(shape: str, *more: str) -> str:
     return ",".join((f"{shape}:{ADC}", *more))
 
 
-PULL = "skew-normal:sampling=pull,opacity_reg=0,scale_reg=0"  # growth by opacity times gradient
-SHORT = {ADC: "adc*", START: "start*", PULL: "skew-normal:pull*"}  # in the tables
+SHORT = {ADC: "adc*", START: "start*"}  # in the tables
 KERNELS = tuple(adc(shape, START) for shape in ("gaussian", "skew-normal", "generalised-exponential"))
 
 GROUPS = {
@@ -148,13 +146,9 @@ GROUPS = {
     "growth": Group(
         (
             "skew-normal",
-            "skew-normal:sampling=pull",
-            PULL,
-            f"{PULL},init_opacity=0.1,init_scale=1",
             "skew-normal:strategy=adc,noise_lr=0,densify_until=0.5",
             adc("skew-normal"),
             "3dgs:shape=skew-normal",
-            "generalised-exponential:sampling=pull",
             "skew-normal:densify_until=0.5",
             "skew-normal:noise_lr=0",
         ),
@@ -169,8 +163,6 @@ GROUPS = {
             adc("skew-normal", "init_opacity=0.5,init_scale=1"),
             adc("skew-normal", START),
             adc("skew-normal", "init_opacity=0.1,init_scale=1"),
-            f"{PULL},{START}",
-            f"{PULL},init_opacity=0.1,init_scale=0.5",
         ),
         (5000, 20000),
         validate=True,
@@ -180,7 +172,6 @@ GROUPS = {
         (
             "skew-normal",
             adc("skew-normal", START),
-            f"{PULL},{START}",
             adc("skew-normal", "init_opacity=0.1,init_scale=0.5"),
             f"skew-normal:strategy=adc,noise_lr=0,densify_until=0.5,{START}",
         ),

@@ -19,7 +19,6 @@ from clsplat.training.config import (
     OPTIMIZERS,
     POSITION_OPTIMIZERS,
     RELOCATIONS,
-    SAMPLINGS,
     STRATEGIES,
     TrainConfig,
 )
@@ -36,7 +35,6 @@ _CHOICES = {
     "skew_map": ("auto", *SKEW_MAPS),
     "strategy": STRATEGIES,
     "optimizer": OPTIMIZERS,
-    "sampling": SAMPLINGS,
     "relocation": RELOCATIONS,
     "position_optimizer": POSITION_OPTIMIZERS,
     "alternation": ALTERNATIONS,

@@ -20,7 +20,6 @@ OPTIMIZERS = ("fused", "numpy")
 POSITION_OPTIMIZERS = ("adam", "sghmc", "sghmc-sss")
 ALTERNATIONS = ("off", "cyclic")
 RELOCATIONS = ("length", "length-squared", "opacity-only")
-SAMPLINGS = ("opacity", "pull")
 # Options that change nothing in the result: runs that differ in these alone are the same run.
 FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
 # What an option is where it is not given: what was best with that strategy on validation views (benchmarks/SYSTEMS.md).
@@ -42,6 +41,7 @@ BY_STRATEGY: dict[str, dict[str, float]] = {
         "init_scale": 0.7,
     },
 }
+REMOVED_OPTIONS = {"sampling": "opacity"}  # options of earlier versions, with the one value that files may still hold
 PUBLISHED_ITERATIONS = 30_000  # that 3DGS's rates are meant for
 
 
@@ -65,8 +65,6 @@ class TrainConfig:
     relocation : what a relocated splat's copies change: "length" (opacity and scale, such that what they absorb along
         a line stays), "length-squared" (SSS as released: the square of that factor), "opacity-only".
     relocation_limit : most splats relocated per action, as a fraction of all (SSS: 0.05); 1: no limit.
-    sampling : what new and relocated splats are drawn by: "opacity" (3DGS-MCMC), or "pull", opacity times the
-        gradient of the screen position (3DGS's criterion), which sends them where the image is still wrong.
     init : "sfm", "random" or a .ply path.
     random_points : points at random beside the scene's, as a fraction of the cap; not given: 0.1 where the scene has
         fewer than that, else none.
@@ -135,7 +133,6 @@ class TrainConfig:
     strategy: str = "adc"
     relocation: str = "length"
     relocation_limit: float = 1.0
-    sampling: str = "opacity"
     init: str = "sfm"
     random_points: float | None = None
     sh_degree: int = 3
@@ -195,7 +192,6 @@ class TrainConfig:
         for name, value in BY_STRATEGY[self.strategy].items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
-        _one_of("sampling", self.sampling, SAMPLINGS)
         _one_of("optimizer", self.optimizer, OPTIMIZERS)
         _one_of("relocation", self.relocation, RELOCATIONS)
         _one_of("position_optimizer", self.position_optimizer, POSITION_OPTIMIZERS)
@@ -289,6 +285,7 @@ class TrainConfig:
         """The config that `to_json` gave; InputError on an unknown key, or a value that is of no such kind."""
         if not isinstance(values, dict):
             raise InputError(f"config: is {kind(values)}; expected an object of options")
+        values = {key: value for key, value in values.items() if (key, value) not in REMOVED_OPTIONS.items()}
         known, hints = {field.name: field for field in dataclasses.fields(cls)}, get_type_hints(cls)
         unknown = sorted(set(values) - set(known))
         if unknown:

@@ -230,14 +230,6 @@ def test_draws_are_in_proportion_to_the_strength() -> None:
     np.testing.assert_allclose(share, np.abs(live), atol=5 * 0.5 / math.sqrt(n_dead))
 
 
-def test_a_pull_sends_copies_where_it_is() -> None:
-    arrays = gaussians(np.zeros(10))
-    pull = np.zeros(10)
-    pull[4] = 3.0
-    plan = plan_relocation(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 20, growth=2, pull=pull)
-    assert (plan.source[10:] == 4).all()
-
-
 @pytest.mark.parametrize("limit", [0.0, 0.05, 0.3, 1.0])
 def test_a_limit_takes_the_weakest_first(limit: float) -> None:
     logit = np.concatenate([np.zeros(50), np.linspace(-6, -12, 50)])

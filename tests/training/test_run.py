@@ -94,10 +94,10 @@ def press_ctrl_c_at_50(progress: Progress) -> None:
     [
         ("fused", {}, 30),
         ("numpy", {}, 30),
-        ("fused", {"sampling": "pull"}, 37),
+        ("fused", {"relocation_limit": 0.05}, 37),
         ("fused", {"strategy": "adc", "densify_until": 0.8, "opacity_reset": 2}, 37),
     ],
-    ids=["fused", "numpy", "pull", "adc"],
+    ids=["fused", "numpy", "relocation limit", "adc"],
 )
 def test_a_crashed_run_resumes_to_the_same_model(
     scene: Scene, uninterrupted: Path, tmp_path: Path, optimizer: str, changes: dict[str, Any], interval: int

@@ -68,17 +68,6 @@ def test_a_kernel_without_peak_one_keeps_its_scale(normalisation: str, scaled: b
     assert ("log_scale" in plan.values) == scaled
 
 
-def test_pull_is_read_only_when_asked_for() -> None:
-    signals = np.zeros((3, N))
-    arrays, _ = action(mcmc())
-    wanted = int(np.flatnonzero(shapes.SKEW_NORMAL.strength(arrays) > 0.005)[7])
-    signals[0, wanted] = 1.0
-    _, plan = action(mcmc(sampling="pull"), signals=signals)
-    assert (plan.source[N:] == wanted).all()
-    _, plan = action(mcmc(sampling="opacity"), signals=signals)
-    assert not (plan.source[N:] == wanted).all()
-
-
 def adc(**options: object) -> TrainConfig:
     return TrainConfig(
         **(

@@ -55,7 +55,6 @@ def plan_relocation(
     growth: float = GROWTH,
     min_opacity: float = MIN_OPACITY,
     rule: str = "length",
-    pull: Array | None = None,
     limit: float = 1.0,
 ) -> Plan:
     """Move dead splats onto live ones and grow towards the cap.
@@ -73,8 +72,6 @@ def plan_relocation(
     min_opacity : splats at or below are dead; floor of the new opacities (of the larger one of two).
     rule : "length" (opacity and scale, above), "length-squared" (Student splatting as released), or "opacity-only"
         (scale kept; Deformable Beta Splatting).
-    pull : (N,) at least 0, how much each splat is wanted elsewhere; copies are then drawn in proportion to
-        strength * pull.
     limit : most dead splats relocated, as a fraction of all: the weakest. Those not finite are relocated in any case.
 
     Raises
@@ -102,9 +99,8 @@ def plan_relocation(
     weakest = np.argsort(strength[dead], kind="stable")[: int(limit * n)]
     moving = np.sort(np.concatenate([np.flatnonzero(~sound), dead[weakest]]))
 
-    drawn = donors[
-        _draw(_weights(strength[donors], None if pull is None else pull[donors]), len(moving) + n_new - n, rng)
-    ]
+    weights = strength[donors] if strength[donors].any() else np.ones(len(donors))
+    drawn = donors[_draw(weights, len(moving) + n_new - n, rng)]
     source = np.arange(n_new, dtype=np.int64)
     source[moving] = drawn[: len(moving)]
     source[n:] = drawn[len(moving) :]
@@ -188,13 +184,6 @@ def _nodes() -> tuple[DoubleArray, DoubleArray]:
     for array in (nodes, weights):
         array.setflags(write=False)
     return nodes, weights
-
-
-def _weights(strength: DoubleArray, pull: Array | None) -> DoubleArray:
-    """What donors are drawn in proportion to; never all 0."""
-    if pull is not None and np.isfinite(pull).all() and (strength * pull).any():
-        strength = strength * pull.astype(np.float64)
-    return strength if strength.any() else np.ones_like(strength)
 
 
 def _draw(weights: DoubleArray, count: int, rng: np.random.Generator) -> NDArray[np.int64]:

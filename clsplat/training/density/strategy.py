@@ -61,7 +61,6 @@ def plan(
             growth=moment.growth,
             limit=config.relocation_limit,
             rule=config.relocation if scaled else "opacity-only",
-            pull=signals[0] if config.sampling == "pull" else None,
         )
     every = reset_interval(config)
     grown = plan_adc(
