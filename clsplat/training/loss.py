@@ -1,4 +1,4 @@
-"""(1 - lambda) L1 + lambda (1 - SSIM) on the device: value, gradient, and the numbers for the log."""
+"""The training loss on the device: (1 - lambda) L1 + lambda (1 - SSIM), its gradient, and the values for the log."""
 
 from __future__ import annotations
 
@@ -14,13 +14,19 @@ from ..device.program import GROUP_ITEMS, lane_group
 from ..rendering.pipeline import ImageLayout, Pipeline
 from .programs import loss_program, loss_strip
 
-_LEAST_ROWS = 32  # of a work-item, which blurs ten rows beyond them
-_ITEMS_PER_UNIT = {"CPU": 6, "GPU": 2048}  # so many that no compute unit of the device waits long for the last
+_MIN_ROWS = 32  # rows of a work-item; it also blurs ten rows outside of them
+_ITEMS_PER_UNIT = {"CPU": 6, "GPU": 2048}  # enough work-items that no compute unit waits long for the last one
 
 
 @dataclass(frozen=True)
 class LossValue:
-    """Means over the pixels that count and channels; `total` is the weighted loss, over all pixels."""
+    """The loss of one image.
+
+    Attributes
+    ----------
+    total : the weighted loss, a mean over all pixels.
+    l1, ssim, mse : means over the pixels that are not masked, and over channels.
+    """
 
     total: float
     l1: float
@@ -33,30 +39,51 @@ class LossValue:
         return -10 * math.log10(max(self.mse, 1e-12))
 
 
+@dataclass(frozen=True)
+class LossResult:
+    """One evaluation of the loss, valid until the next evaluation of the same `ImageLoss`.
+
+    Attributes
+    ----------
+    v_color : buffer with the gradient of the loss with respect to the image.
+    partial : buffer (3, n_parts) with sums of L1, SSIM and squared error.
+    count : pixels times channels.
+    unmasked : fraction of the pixels that are not masked.
+    number : position among the evaluations of its `ImageLoss`.
+    """
+
+    v_color: Any
+    partial: Any
+    n_parts: int
+    count: int
+    unmasked: float
+    number: int
+
+
 class ImageLoss:
-    """Loss of a pipeline's "color" image against a truth.
+    """Loss of a pipeline's "color" image against a target image.
 
     Parameters
     ----------
-    weight : lambda, of 1 - SSIM.
+    weight : lambda, the weight of 1 - SSIM.
     """
 
     def __init__(self, pipeline: Pipeline, weight: float) -> None:
         self.pipeline, self.weight = pipeline, weight
         self.device, self.kernels = pipeline.device, pipeline.kernels
         self.program = loss_program(self.device, self.kernels)
-        # One lane, an item a pixel column: groups that read whole lines of memory.
+        # With one lane, a work-item is a column of pixels. A group then reads whole lines of memory.
         self._group = lane_group(self.device) if self.kernels.lanes > 1 else GROUP_ITEMS
-        self._sums: tuple[Any, int, int, float] | None = None
+        self._evaluations = 0
 
-    def gradient(self, layout: ImageLayout, truth: Any, rendered: Any = None, counted: float = 1.0) -> Any:
-        """Gradient of the loss with respect to "color", as a buffer; the value waits for `value`.
+    def evaluate(self, layout: ImageLayout, target: Any, rendered: Any = None, unmasked: float = 1.0) -> LossResult:
+        """Compute the loss and its gradient with respect to "color"; does not wait for the device.
 
         Parameters
         ----------
-        truth : buffer of bytes [3, rows, stride] in the layout (truths.py).
-        rendered : image in the layout to take in the place of "color".
-        counted : fraction of the pixels that are not masked; the others have no error.
+        target : buffer of bytes [3, rows, stride] in the layout (targets.py).
+        rendered : image in the layout that replaces "color".
+        unmasked : fraction of the pixels that are not masked. Masked pixels must be equal in both images.
         """
         image, kernels = self.pipeline.image, self.kernels
         strips = -(-layout.tiles_x * TILE // (kernels.lanes * loss_strip(kernels)))
@@ -68,7 +95,7 @@ class ImageLoss:
         size, v_color = (-(-strips // group) * group, segments, 3), image("v_color", layout, 3)
         common = {
             "rendered": image("color", layout, 3) if rendered is None else rendered,
-            "truth": truth,
+            "truth": target,
             "v_maps": image("loss_v_maps", layout, 9),
             "width": layout.width,
             "height": layout.height,
@@ -85,20 +112,25 @@ class ImageLoss:
             ssim_scale=self.weight / count,
             **common,
         )
-        self._sums = (partial, n_parts, count, counted)
-        return v_color
+        self._evaluations += 1
+        return LossResult(v_color, partial, n_parts, count, unmasked, self._evaluations)
 
-    def value(self) -> LossValue:
-        """The loss of the last `gradient` call (waits for the device)."""
-        assert self._sums is not None
-        partial, n_parts, count, counted = self._sums
-        parts = to_host(self.device, partial, np.empty((3, n_parts), self.kernels.dtype))
-        l1, ssim, mse = (parts.astype(np.float64).sum(axis=1) / count).tolist()
+    def value(self, result: LossResult) -> LossValue:
+        """Return the values of the latest evaluation; waits for the device.
+
+        Raises
+        ------
+        RuntimeError : a later evaluation has overwritten the result.
+        """
+        if result.number != self._evaluations:
+            raise RuntimeError(f"loss result {result.number} was overwritten by evaluation {self._evaluations}")
+        parts = to_host(self.device, result.partial, np.empty((3, result.n_parts), self.kernels.dtype))
+        l1, ssim, mse = (parts.astype(np.float64).sum(axis=1) / result.count).tolist()
         total = (1 - self.weight) * l1 + self.weight * (1 - ssim)
-        return LossValue(total, l1 / counted, 1 - (1 - ssim) / counted, mse / counted)
+        return LossValue(total, l1 / result.unmasked, 1 - (1 - ssim) / result.unmasked, mse / result.unmasked)
 
     def _rows(self, strips: int, height: int) -> int:
-        """Rows of a work-item: as many as still leave work for the whole device."""
+        """Return the rows of a work-item: as many as possible while every compute unit still has work."""
         info = self.device.info
-        wanted = info.compute_units * _ITEMS_PER_UNIT["CPU" if info.type == "CPU" else "GPU"]
-        return max(-(-height // -(-wanted // (3 * strips))), _LEAST_ROWS)
+        items = info.compute_units * _ITEMS_PER_UNIT["CPU" if info.type == "CPU" else "GPU"]
+        return max(-(-height // -(-items // (3 * strips))), _MIN_ROWS)

@@ -54,8 +54,8 @@ def peak_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024  # bytes there, KiB elsewhere
 
 
-def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, truth_bytes: int) -> Estimate:
-    """Memory at the cap, for the largest image, with `truth_bytes` of images to learn. Splat-tile pairs are a guess."""
+def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, target_bytes: int) -> Estimate:
+    """Memory at the cap, for the largest image, with `target_bytes` of images. Splat-tile pairs are a guess."""
     real, n = kernels.dtype.itemsize, config.cap_max
     rows = {group: kernels.schema.rows(group) for group in Group}
     screen = (kernels.record + kernels.v_record) * real + 4 * _SCREEN_WORDS
@@ -68,7 +68,7 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, tru
     return Estimate(
         n * (splat * real + screen),
         n_isects * isect,
-        _IMAGE_PLANES * layout.plane * real + truth_bytes,
+        _IMAGE_PLANES * layout.plane * real + target_bytes,
         isect,
         max(buffers),
     )

@@ -1,6 +1,7 @@
-"""The training images on the device: 8-bit planes that stay there, as far as they fit a budget.
+"""Target images on the device: the training photos, as 8-bit planes that stay there if they fit a memory budget.
 
-Planes are r, g, b; where any view has a mask or, for random backgrounds, transparency, then also mask and opacity.
+The planes are r, g, b. Two more planes follow if any view has a mask, or transparency with random backgrounds: the mask
+and the opacity.
 """
 
 from __future__ import annotations
@@ -21,45 +22,48 @@ from ..scenes.scene import View
 from .programs import loss_program
 
 _COLOR, _WITH_MASKS = 3, 5  # planes
-_HIDDEN, _COUNTS, _OPAQUE = 0, 255, 255
-_SLOTS = 2  # for bytes on their way: a transfer need not wait for the iteration before
+_MASKED, _UNMASKED, _OPAQUE = 0, 255, 255
+_SLOTS = 2  # buffers for transfers: a transfer does not wait for the iteration before
 
 
 @dataclass(frozen=True)
 class _Upload:
-    """A transfer into one of the slots, still to be unpacked."""
+    """A transfer into one of the slots. Its image is not unpacked yet."""
 
     slot: int
     packed: Any
     event: Any
 
 
-@dataclass
-class Truth:
-    """One image to learn: bytes [channels, rows, stride] with a zero margin, once `upload` is None.
+@dataclass(frozen=True)
+class Target:
+    """One target image. `Targets.planes` returns its pixels.
 
-    index : of the view. counted : fraction of the pixels that no mask hides.
+    Attributes
+    ----------
+    index : index of the view.
+    unmasked : fraction of the pixels that are not masked.
+    buffer : bytes [channels, rows, stride] with a zero margin.
     """
 
     index: int
     camera: Camera
     layout: ImageLayout
-    counted: float
+    unmasked: float
     buffer: Any
-    upload: _Upload | None
 
 
-class Truths:
-    """Views at the size that an iteration asks for.
+class Targets:
+    """Target images of the training views, at the image size of the current stage.
 
-    An image is uploaded when it is first drawn, beside what the device is doing, and stays until the size changes.
-    Those beyond the budget are uploaded whenever they are drawn.
+    An image is uploaded when it is first requested, while the device is busy with the iteration before. It stays until
+    the size changes. Images that do not fit the budget are uploaded each time.
 
     Parameters
     ----------
     views : training views.
     budget : bytes of device memory for images that stay.
-    channels : of `truth_channels`.
+    channels : planes of each image, from `target_channels`.
     """
 
     def __init__(
@@ -70,23 +74,24 @@ class Truths:
         self.program = loss_program(device, kernels)
         self.pool = Pool(device)
         self._downscale = 0
-        self._kept: dict[int, Truth] = {}
+        self._kept: dict[int, Target] = {}
         self._kept_bytes = 0
-        self._reduced: dict[int, View] = {}  # of those that do not stay
-        self._queue: Any = None  # of transfers
+        self._reduced: dict[int, View] = {}  # smaller photos of views whose planes do not stay on the device
+        self._uploads: dict[int, _Upload] = {}  # pending transfers by view
+        self._queue: Any = None  # command queue of the transfers
         self._slot = 0
-        self._unpacked: list[Any] = [None] * _SLOTS  # events after which a slot may be overwritten
+        self._unpacked: list[Any] = [None] * _SLOTS  # events; a slot may be overwritten after its event
 
     @property
     def nbytes(self) -> int:
-        """Bytes of device memory held."""
+        """Bytes of device memory in use."""
         return self._kept_bytes + self.pool.nbytes
 
-    def get(self, index: int, downscale: int) -> Truth:
-        """View `index` at 1/downscale of its size. Starts its upload where it needs one; does not wait for it."""
+    def get(self, index: int, downscale: int) -> Target:
+        """Return view `index` at 1/downscale of its size. If necessary, start its upload; do not wait for it."""
         if downscale != self._downscale:
             self._downscale, self._kept_bytes = downscale, 0
-            self._kept, self._reduced = {}, {}
+            self._kept, self._reduced, self._uploads = {}, {}, {}
         if index in self._kept:
             return self._kept[index]
         view = self._reduced.get(index)
@@ -96,43 +101,44 @@ class Truths:
         nbytes = self.channels * layout.plane
         stays = self._kept_bytes + nbytes <= self.budget
         buffer = self.device.alloc(nbytes) if stays else self.pool.get("truth", nbytes)
-        counted = 1.0 if view.mask is None else float(view.mask.mean())
-        truth = Truth(index, view.camera, layout, counted, buffer, self._start_upload(self._bytes(view)))
+        unmasked = 1.0 if view.mask is None else float(view.mask.mean())
+        target = Target(index, view.camera, layout, unmasked, buffer)
+        self._uploads[index] = self._start_upload(self._bytes(view))
         if stays:
-            self._kept[index] = truth
+            self._kept[index] = target
             self._kept_bytes += nbytes
         elif downscale > 1:
             self._reduced[index] = view
-        return truth
+        return target
 
-    def planes(self, truth: Truth) -> Any:
-        """The truth's buffer; commands that follow on the device's queue find the image in it."""
+    def planes(self, target: Target) -> Any:
+        """Return the buffer of the target. The image is there for all later commands in the device's queue."""
         import pyopencl as cl
 
-        upload, layout = truth.upload, truth.layout
+        layout = target.layout
+        upload = self._uploads.pop(target.index, None)
         if upload is not None:
             cl.enqueue_barrier(self.device.queue, wait_for=[upload.event])
             self._unpacked[upload.slot] = self.program.unpack_image(
                 (layout.stride, layout.rows),
                 (16, 1),
                 bytes=upload.packed,
-                truth=truth.buffer,
+                truth=target.buffer,
                 channels=self.channels,
                 width=layout.width,
                 height=layout.height,
                 plane=layout.plane,
             )
-            truth.upload = None
-        return truth.buffer
+        return target.buffer
 
     def _bytes(self, view: View) -> ImageU8:
-        """(H, W, channels)."""
+        """Return the planes as (H, W, channels)."""
         if self.channels == _COLOR:
             return view.image
         size = view.image.shape[:2]
-        counts = np.full(size, _COUNTS, np.uint8) if view.mask is None else np.where(view.mask, _COUNTS, _HIDDEN)
+        mask = np.full(size, _UNMASKED, np.uint8) if view.mask is None else np.where(view.mask, _UNMASKED, _MASKED)
         opacity = np.full(size, _OPAQUE, np.uint8) if view.alpha is None else view.alpha
-        return np.dstack([view.image, counts.astype(np.uint8), opacity])
+        return np.dstack([view.image, mask.astype(np.uint8), opacity])
 
     def _start_upload(self, image: ImageU8) -> _Upload:
         import pyopencl as cl
@@ -148,23 +154,23 @@ class Truths:
 
 
 def reduced(view: View, downscale: int) -> View:
-    """A view at 1/downscale of its size."""
+    """Return the view at 1/downscale of its size."""
     width, height = max(view.camera.width // downscale, 1), max(view.camera.height // downscale, 1)
     return view.resized(width, height)
 
 
-def truth_channels(views: Sequence[View], with_alpha: bool) -> int:
-    """Planes of each truth, as many as the views need; with_alpha: their transparency is of use."""
+def target_channels(views: Sequence[View], with_alpha: bool) -> int:
+    """Return the number of planes that the views need. with_alpha : the run uses the transparency of the photos."""
     more = any(view.mask is not None or (with_alpha and view.alpha is not None) for view in views)
     return _WITH_MASKS if more else _COLOR
 
 
-def truth_budget(device: Device) -> int:
-    """Bytes that images may keep on a device: a quarter of its memory."""
+def target_budget(device: Device) -> int:
+    """Return the bytes that target images may use on a device: a quarter of its memory."""
     return device.info.global_mem_bytes // 4
 
 
-def truth_bytes(views: Sequence[View], budget: int, channels: int = _COLOR) -> int:
-    """Most device memory that `Truths` of these views holds, with tiles of this side."""
+def target_bytes(views: Sequence[View], budget: int, channels: int = _COLOR) -> int:
+    """Return an upper bound of the device memory of `Targets`."""
     sizes = [channels * ImageLayout(view.camera.width, view.camera.height).plane for view in views]
     return min(sum(sizes), budget) + (_SLOTS + 1) * max(sizes)

@@ -26,8 +26,8 @@ from ..splats.splats import Splats
 from .alternation import active_blocks
 from .checkpoint import Checkpoint
 from .config import TrainConfig
-from .density.strategy import Moment, plan
-from .exposure import PhotoLoss, exposures_json, photo_bytes
+from .density.strategy import StepInfo, next_edit
+from .exposure import ExposureLoss, exposure_bytes, exposures_json
 from .folder import ModelFolder
 from .initialise import initial_splats
 from .interrupt import stoppable
@@ -40,7 +40,7 @@ from .optim.skew_map import SKEW_MAPS
 from .programs import optim_program
 from .rate_limits import check_rates
 from .schedules import exponential_decay, sh_degree_at
-from .targets import Truths, truth_budget, truth_bytes, truth_channels
+from .targets import Targets, target_budget, target_bytes, target_channels
 from .view_sampler import ViewSampler
 
 Visit = Callable[["Trainer", threading.Event], None]
@@ -103,15 +103,15 @@ class Trainer:
             antialiased=config.antialiased,
         )
         largest = max((view.camera for view in scene.train), key=lambda c: c.width * c.height)
-        budget = truth_budget(self.device)
-        channels = truth_channels(scene.train, config.random_background)
+        budget = target_budget(self.device)
+        channels = target_channels(scene.train, config.random_background)
         layout = ImageLayout(largest.width, largest.height)
         self.memory = estimate(
             config,
             self.kernels,
             layout,
-            truth_bytes(scene.train, budget, channels)
-            + photo_bytes(layout, self.kernels.dtype.itemsize, config, channels),
+            target_bytes(scene.train, budget, channels)
+            + exposure_bytes(layout, self.kernels.dtype.itemsize, config, channels),
         )
         check(self.memory, self.device)
         self.rng = np.random.default_rng(config.seed)
@@ -147,11 +147,11 @@ class Trainer:
         self.grads = CompactGradients(self.device, self.splats.schema, capacity, dtype)
         self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config, scene.extent)
         self.loss = ImageLoss(self.pipeline, config.lambda_dssim)
-        self.truths = Truths(self.device, self.kernels, scene.train, budget, channels)
-        self.photos = PhotoLoss(self.loss, self.truths, config, scene.background)
+        self.targets = Targets(self.device, self.kernels, scene.train, budget, channels)
+        self.exposure = ExposureLoss(self.loss, self.targets, config, scene.background)
         if checkpoint is not None:
             state = dict(checkpoint.optimizer)
-            self.photos.load_state(state)
+            self.exposure.load_state(state)
             self.optimizer.load_state(state)
             self.pipeline.write_signals(checkpoint.signals, self.splats.capacity)
         self.optim_program = optim_program(self.device, self.kernels)
@@ -185,7 +185,7 @@ class Trainer:
                 if measured:
                     self.device.queue.finish()  # what is pending is training time
                 if it % LOG_INTERVAL == 0 or ends:
-                    value = self.loss.value()
+                    value = self.loss.value(self.loss_result)
                     self.seconds += time.perf_counter() - start
                     self._report(value, log, since, started)
                 else:
@@ -206,7 +206,7 @@ class Trainer:
                     folder.save(self.snapshot(), it)
                     if config.exposure:
                         names = [view.name for view in self.scene.train]
-                        folder.write_exposures(exposures_json(names, self.photos.exposures()))
+                        folder.write_exposures(exposures_json(names, self.exposure.exposures()))
                 if folder is not None and (
                     ends or (config.checkpoint_interval and it % config.checkpoint_interval == 0)
                 ):
@@ -225,7 +225,7 @@ class Trainer:
             self.iteration,
             self.seconds,
             peak_bytes(),
-            self.pipeline.pool.nbytes + self.truths.nbytes,
+            self.pipeline.pool.nbytes + self.targets.nbytes,
             self.evaluations,
             self.evaluation_seconds,
             None if folder is None else folder.path,
@@ -236,15 +236,15 @@ class Trainer:
         config = self.config
         self.iteration += 1
         it = self.iteration
-        truth = self.truths.get(*self.views.next(it, self.splats.n))
+        target = self.targets.get(*self.views.next(it, self.splats.n))
         degree = sh_degree_at(it, self.sh_interval, config.sh_degree)
         background = config.background
         if config.random_background:
             r, g, b = self.rng.random(3).tolist()
             background = r, g, b
-        frame = self.pipeline.forward(self.splats, truth.camera, background, degree)
-        v_color = self.photos.gradient(truth, background)
-        self.pipeline.backward(frame, v_color, self.grads)
+        frame = self.pipeline.forward(self.splats, target.camera, background, degree)
+        self.loss_result = self.exposure.evaluate(target, background)
+        self.pipeline.backward(frame, self.loss_result.v_color, self.grads)
         mean_lr = self.scene.extent * self.mean_rate(it)
         self.optimizer.step(
             self.grads, mean_lr * config.rate_factor("mean"), degree, it, self.pipeline.pool.get("depth_key_kept", 0)
@@ -267,7 +267,7 @@ class Trainer:
 
     def densify(self) -> None:
         """One action of the strategy."""
-        moment = Moment(self.iteration, self.densify_last, self.growth, self.scene.extent)
+        info = StepInfo(self.iteration, self.densify_last, self.growth, self.scene.extent)
         self.optimizer.settle()
         arrays, signals = self.splats.download(self.splats.n), self.pipeline.read_signals(self.splats.n)
         if self.splats.n and not signals[TIMES_SEEN].any():
@@ -275,11 +275,11 @@ class Trainer:
                 f"iteration {self.iteration}: no image shows any splat (transparent, or outside): "
                 "check what training starts from (init) and the learning rates"
             )
-        planned = plan(self.config, arrays, signals, self.rng, moment)
+        edit = next_edit(self.config, arrays, signals, self.rng, info)
         if self.config.visible_adam:  # splats seen together stay together
-            mean = planned.values.get("mean", arrays["mean"][planned.source])
-            planned = planned.permuted(morton_order(mean), self.splats.n)
-        self.optimizer.apply(planned)
+            mean = edit.values.get("mean", arrays["mean"][edit.source])
+            edit = edit.permuted(morton_order(mean), self.splats.n)
+        self.optimizer.apply(edit)
         self.pipeline.reset_signals()
 
     def snapshot(self) -> Splats:
@@ -304,7 +304,7 @@ class Trainer:
             self.iteration,
             self.config.to_json(),
             self.splats.download(self.splats.n),
-            self.optimizer.state() | self.photos.state(),
+            self.optimizer.state() | self.exposure.state(),
             dict(self.rng.bit_generator.state),
             self.views.queue,
             self.seconds,

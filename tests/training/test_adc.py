@@ -16,26 +16,26 @@ from clsplat.splats.optical_depth import opacity_names
 from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import Shape
 from clsplat.training.density.adc import MIN_OPACITY, RESET_OPACITY, SPLIT_SHRINK, WORLD_SIZE, plan_adc, with_reset
-from clsplat.training.density.edit import Plan
+from clsplat.training.density.edit import DensifyEdit
 
 EXTENT = 2.0
 THRESHOLD = 2e-4
 
 
-def signals_of(gradient: np.ndarray, depth: np.ndarray | None = None, seen: int = 4) -> np.ndarray:
-    """Signals with these means."""
+def stats_of(gradient: np.ndarray, depth: np.ndarray | None = None, seen: int = 4) -> np.ndarray:
+    """Statistics with these means."""
     n = len(gradient)
     rows = [gradient * seen, (np.zeros(n) if depth is None else depth) * seen, np.full(n, seen)]
     return np.array(rows, np.float32)
 
 
-def planned(
-    arrays: Arrays, shape: Shape, signals: np.ndarray, cap: int = 10_000, seed: int = 0, **options: float | None
-) -> Plan:
+def edited(
+    arrays: Arrays, shape: Shape, stats: np.ndarray, cap: int = 10_000, seed: int = 0, **options: float | None
+) -> DensifyEdit:
     return plan_adc(
         arrays,
         shape,
-        signals,
+        stats,
         np.random.default_rng(seed),
         cap,
         **({"extent": EXTENT, "grad_threshold": THRESHOLD} | options),
@@ -64,16 +64,16 @@ def plain(n: int, scale: float, opacity: float = 0.5) -> Arrays:
 def test_laws_of_a_plan(n: int, seed: int, dead: float, spare: int, by_axis: bool, large: bool, shape: Shape) -> None:
     arrays = random_model(shape, n, seed, dead)
     rng = np.random.default_rng(seed)
-    signals = signals_of(*(rng.exponential(scale, n) for scale in (THRESHOLD, 0.1)))
+    stats = stats_of(*(rng.exponential(scale, n) for scale in (THRESHOLD, 0.1)))
     cap = max(1, n + spare)
     options = {"depth_threshold": 0.1 if by_axis else 0.0, "dense_size": 0.02, "prune_large": large}
-    plan = planned(arrays, shape, signals, cap, seed, **options)
-    again = planned(arrays, shape, signals, cap, seed, **options)
-    moved = plan.apply(arrays)
-    n_new = len(plan.source)
+    edit = edited(arrays, shape, stats, cap, seed, **options)
+    again = edited(arrays, shape, stats, cap, seed, **options)
+    moved = edit.apply(arrays)
+    n_new = len(edit.source)
 
     assert 1 <= n_new <= max(cap, n)
-    assert n_new == n + plan.added - plan.removed
+    assert n_new == n + edit.added - edit.removed
     assert all(len(a) == n_new and np.isfinite(a).all() for a in moved.values())
     assert all(np.array_equal(a, again.apply(arrays)[name]) for name, a in moved.items())
     kept = shape.strength(arrays) >= MIN_OPACITY
@@ -82,13 +82,13 @@ def test_laws_of_a_plan(n: int, seed: int, dead: float, spare: int, by_axis: boo
     if kept.any() and not by_axis:  # an opacity beyond a plane may be faint: it goes the next time
         assert (shape.strength(moved) >= MIN_OPACITY * (1 - 1e-6)).all()
     # Survivors first, in order, as they were and with their optimizer state; then new rows, with none.
-    old = np.flatnonzero(~plan.fresh)
+    old = np.flatnonzero(~edit.fresh)
     np.testing.assert_array_equal(old, np.arange(len(old)))
-    assert (np.diff(plan.source[old]) > 0).all()
-    assert plan.state_source is not None
+    assert (np.diff(edit.source[old]) > 0).all()
+    assert edit.state_source is not None
     for name, array in moved.items():
-        np.testing.assert_array_equal(array[old], arrays[name][plan.source[old]])
-        state = plan.apply_state(np.ones_like(arrays[name]), name)
+        np.testing.assert_array_equal(array[old], arrays[name][edit.source[old]])
+        state = edit.apply_state(np.ones_like(arrays[name]), name)
         assert (state[old] == 1).all()
         assert (state[len(old) :] == 0).all()
 
@@ -97,15 +97,15 @@ def test_small_ones_are_cloned_in_place_and_large_ones_split() -> None:
     scale = 0.01 * EXTENT
     for factor, cloned in ((0.9, True), (1.1, False)):
         arrays = plain(3, factor * scale)
-        plan = planned(arrays, shapes.GAUSSIAN, signals_of(np.array([0, 2, 0]) * THRESHOLD))
-        moved = plan.apply(arrays)
+        edit = edited(arrays, shapes.GAUSSIAN, stats_of(np.array([0, 2, 0]) * THRESHOLD))
+        moved = edit.apply(arrays)
         if cloned:
-            assert plan.source.tolist() == [0, 1, 2, 1]
-            assert plan.fresh.tolist() == [False] * 3 + [True]
-            assert all(np.array_equal(moved[name], array[plan.source]) for name, array in arrays.items())
+            assert edit.source.tolist() == [0, 1, 2, 1]
+            assert edit.fresh.tolist() == [False] * 3 + [True]
+            assert all(np.array_equal(moved[name], array[edit.source]) for name, array in arrays.items())
         else:
-            assert plan.source.tolist() == [0, 2, 1, 1]
-            assert plan.fresh.tolist() == [False] * 2 + [True] * 2
+            assert edit.source.tolist() == [0, 2, 1, 1]
+            assert edit.fresh.tolist() == [False] * 2 + [True] * 2
             np.testing.assert_allclose(
                 moved["log_scale"][2:], arrays["log_scale"][:2] - math.log(SPLIT_SHRINK), rtol=1e-6
             )
@@ -114,17 +114,17 @@ def test_small_ones_are_cloned_in_place_and_large_ones_split() -> None:
 
 def test_the_mean_gradient_counts_not_the_sum() -> None:
     arrays = plain(2, 1e-3)
-    signals = signals_of(np.array([0.9, 1.1]) * THRESHOLD, seen=50)
-    assert planned(arrays, shapes.GAUSSIAN, signals).source.tolist() == [0, 1, 1]
-    assert planned(arrays, shapes.GAUSSIAN, np.zeros((3, 2))).source.tolist() == [0, 1]  # never seen
+    stats = stats_of(np.array([0.9, 1.1]) * THRESHOLD, seen=50)
+    assert edited(arrays, shapes.GAUSSIAN, stats).source.tolist() == [0, 1, 1]
+    assert edited(arrays, shapes.GAUSSIAN, np.zeros((3, 2))).source.tolist() == [0, 1]  # never seen
 
 
 def test_halves_are_drawn_from_the_parents_gaussian() -> None:
     arrays = plain(20_000, 0.5)
     arrays["quat"][:] = (0.3, 0.5, -0.7, 0.2)
     arrays["mean"][:] = (1, 2, 3)
-    plan = planned(arrays, shapes.GAUSSIAN, signals_of(np.full(20_000, 1.0)), cap=40_000)
-    drawn = plan.apply(arrays)["mean"].astype(np.float64)
+    edit = edited(arrays, shapes.GAUSSIAN, stats_of(np.full(20_000, 1.0)), cap=40_000)
+    drawn = edit.apply(arrays)["mean"].astype(np.float64)
     assert len(drawn) == 40_000
     r = rotations(arrays["quat"][:1].astype(np.float64))[0]
     sigma = r @ np.diag(np.exp(2.0 * arrays["log_scale"][0])) @ r.T
@@ -138,51 +138,51 @@ def test_pruning_by_opacity_and_after_a_reset_by_size() -> None:
     arrays["opacity_logit"][0] = logit(0.9 * MIN_OPACITY)
     arrays["opacity_logit"][1] = logit(1.1 * MIN_OPACITY)
     arrays["log_scale"][2, 1] = math.log(1.1 * WORLD_SIZE * EXTENT)
-    quiet = signals_of(np.zeros(4))
-    assert planned(arrays, shapes.GAUSSIAN, quiet).source.tolist() == [1, 2, 3]
-    assert planned(arrays, shapes.GAUSSIAN, quiet, prune_large=True).source.tolist() == [1, 3]
+    quiet = stats_of(np.zeros(4))
+    assert edited(arrays, shapes.GAUSSIAN, quiet).source.tolist() == [1, 2, 3]
+    assert edited(arrays, shapes.GAUSSIAN, quiet, prune_large=True).source.tolist() == [1, 3]
     # A too large one whose halves are small enough is split instead, a splat too faint never.
-    loud = signals_of(np.array([1.0, 0.0, 1.0, 0.0]))
-    assert planned(arrays, shapes.GAUSSIAN, loud, prune_large=True).source.tolist() == [1, 3, 2, 2]
+    loud = stats_of(np.array([1.0, 0.0, 1.0, 0.0]))
+    assert edited(arrays, shapes.GAUSSIAN, loud, prune_large=True).source.tolist() == [1, 3, 2, 2]
     arrays["log_scale"][2, 1] += math.log(SPLIT_SHRINK)
-    assert planned(arrays, shapes.GAUSSIAN, loud, prune_large=True).source.tolist() == [1, 3]
+    assert edited(arrays, shapes.GAUSSIAN, loud, prune_large=True).source.tolist() == [1, 3]
 
 
 def test_two_sided_splats_live_by_their_stronger_side_and_signed_ones_by_the_absolute() -> None:
     arrays = random_model(shapes.HALF_GAUSSIAN, 2, 0, dead=0)
     arrays["opacity_logit"][:], arrays["opacity_minus_logit"][:] = -9, (2, -9)
-    assert planned(arrays, shapes.HALF_GAUSSIAN, signals_of(np.zeros(2))).source.tolist() == [0]
+    assert edited(arrays, shapes.HALF_GAUSSIAN, stats_of(np.zeros(2))).source.tolist() == [0]
     arrays = random_model(shapes.STUDENT_T, 2, 0, dead=0)
     arrays["opacity_logit"][:] = (-0.5, -1e-3)
-    assert planned(arrays, shapes.STUDENT_T, signals_of(np.zeros(2))).source.tolist() == [0]
+    assert edited(arrays, shapes.STUDENT_T, stats_of(np.zeros(2))).source.tolist() == [0]
 
 
 @pytest.mark.parametrize("scale", [1e-3, 0.1])
 def test_the_cap_holds_exactly_and_the_largest_gradients_come_first(scale: float) -> None:
     gradient = np.array([3, 9, 5, 0, 7, 2]) * THRESHOLD
     arrays = plain(6, scale)
-    plan = planned(arrays, shapes.GAUSSIAN, signals_of(gradient), cap=8)
-    assert len(plan.source) == 8
-    assert np.flatnonzero(np.bincount(plan.source) == 2).tolist() == [1, 4]
+    edit = edited(arrays, shapes.GAUSSIAN, stats_of(gradient), cap=8)
+    assert len(edit.source) == 8
+    assert np.flatnonzero(np.bincount(edit.source) == 2).tolist() == [1, 4]
     for cap in (1, 6):
-        assert planned(arrays, shapes.GAUSSIAN, signals_of(gradient), cap=cap).source.tolist() == list(range(6))
+        assert edited(arrays, shapes.GAUSSIAN, stats_of(gradient), cap=cap).source.tolist() == list(range(6))
     # Pruning makes room in the same action.
     arrays["opacity_logit"][3] = -9
-    assert len(planned(arrays, shapes.GAUSSIAN, signals_of(gradient), cap=6).source) == 6
+    assert len(edited(arrays, shapes.GAUSSIAN, stats_of(gradient), cap=6).source) == 6
 
 
 def test_what_is_not_finite_goes_and_the_model_is_never_empty() -> None:
     arrays = plain(5, 1e-3, opacity=1e-3)  # all faint
-    assert planned(arrays, shapes.GAUSSIAN, signals_of(np.ones(5))).source.tolist() == list(range(5))
+    assert edited(arrays, shapes.GAUSSIAN, stats_of(np.ones(5))).source.tolist() == list(range(5))
     arrays["sh"][2, 1, 0], arrays["log_scale"][4, 0] = np.nan, np.inf
-    assert planned(arrays, shapes.GAUSSIAN, signals_of(np.ones(5))).source.tolist() == [0, 1, 3]
-    signals = signals_of(np.array([0, np.nan, 0, np.inf, 0]))
-    assert planned(arrays, shapes.GAUSSIAN, signals).source.tolist() == [0, 1, 3]
+    assert edited(arrays, shapes.GAUSSIAN, stats_of(np.ones(5))).source.tolist() == [0, 1, 3]
+    stats = stats_of(np.array([0, np.nan, 0, np.inf, 0]))
+    assert edited(arrays, shapes.GAUSSIAN, stats).source.tolist() == [0, 1, 3]
     arrays["mean"][:] = np.inf
     with pytest.raises(TrainingError, match="no splat has finite parameters"):
-        planned(arrays, shapes.GAUSSIAN, signals)
+        edited(arrays, shapes.GAUSSIAN, stats)
     empty = {name: array[:0] for name, array in plain(1, 1.0).items()}
-    assert len(planned(empty, shapes.GAUSSIAN, np.zeros((3, 0))).source) == 0
+    assert len(edited(empty, shapes.GAUSSIAN, np.zeros((3, 0))).source) == 0
 
 
 @pytest.mark.parametrize(("gradient", "depth"), [(0.0, 2.0), (2.0, 0.0)])
@@ -193,10 +193,10 @@ def test_either_gradient_splits_along_the_longest_axis_and_keeps_mean_and_varian
     arrays = plain(1, scale)
     arrays["quat"][:] = (0.3, 0.5, -0.7, 0.2)
     arrays["mean"][:] = (0.1, 0.2, 0.3)
-    signals = signals_of(np.array([gradient * THRESHOLD]), np.array([depth * 0.1]))
+    stats = stats_of(np.array([gradient * THRESHOLD]), np.array([depth * 0.1]))
     if not gradient:
-        assert planned(arrays, shapes.GAUSSIAN, signals).source.tolist() == [0]  # not looked at
-    moved = planned(arrays, shapes.GAUSSIAN, signals, depth_threshold=0.1).apply(arrays)
+        assert edited(arrays, shapes.GAUSSIAN, stats).source.tolist() == [0]  # not looked at
+    moved = edited(arrays, shapes.GAUSSIAN, stats, depth_threshold=0.1).apply(arrays)
     r = rotations(arrays["quat"].astype(np.float64))[0]
 
     def covariance(log_scale: np.ndarray) -> np.ndarray:
@@ -219,8 +219,8 @@ def test_either_gradient_splits_along_the_longest_axis_and_keeps_mean_and_varian
 def test_halves_of_a_skewed_splat_keep_the_skew_across_the_axis_and_half_of_it_along(shape: Shape) -> None:
     arrays = random_model(shape, 1, 3, dead=0)
     arrays["log_scale"][:] = np.log([0.1, 0.3, 0.2])
-    signals = signals_of(np.ones(1), np.ones(1))
-    moved = planned(arrays, shape, signals, depth_threshold=0.1).apply(arrays)
+    stats = stats_of(np.ones(1), np.ones(1))
+    moved = edited(arrays, shape, stats, depth_threshold=0.1).apply(arrays)
     np.testing.assert_allclose(moved["skew"], arrays["skew"][[0, 0]] * (1, 0.5, 1), rtol=1e-6)
 
 
@@ -236,8 +236,8 @@ def test_the_centroid_of_the_direct_form_stays(depth_threshold: float) -> None:
         local = math.sqrt(2 / math.pi) * np.exp(of["log_scale"]) * delta
         return of["mean"] + np.einsum("nij,nj->ni", rotations(of["quat"].astype(np.float64)), local)
 
-    signals = signals_of(np.ones(20_000), np.ones(20_000))
-    halves = planned(arrays, shape, signals, 40_000, depth_threshold=depth_threshold).apply(arrays)
+    stats = stats_of(np.ones(20_000), np.ones(20_000))
+    halves = edited(arrays, shape, stats, 40_000, depth_threshold=depth_threshold).apply(arrays)
     scale = float(np.exp(arrays["log_scale"].max()))
     shift = np.linalg.norm((centroid(halves).mean(axis=0) - centroid(arrays)[0]) / scale)
     assert shift < (1e-6 if depth_threshold else 5 * 2 / 200)
@@ -245,9 +245,9 @@ def test_the_centroid_of_the_direct_form_stays(depth_threshold: float) -> None:
 
 def test_the_depth_threshold_does_not_depend_on_the_scenes_units() -> None:
     for extent, count in ((0.9, 1), (1.1, 2)):
-        signals = signals_of(np.zeros(1), np.full(1, 0.1))
-        plan = planned(plain(1, 1e-3), shapes.GAUSSIAN, signals, depth_threshold=0.1, extent=extent)
-        assert len(plan.source) == count
+        stats = stats_of(np.zeros(1), np.full(1, 0.1))
+        edit = edited(plain(1, 1e-3), shapes.GAUSSIAN, stats, depth_threshold=0.1, extent=extent)
+        assert len(edit.source) == count
 
 
 def opacities(shape: Shape, arrays: Arrays) -> np.ndarray:
@@ -261,11 +261,11 @@ def test_a_half_beyond_the_plane_takes_that_sides_opacity(facing: float) -> None
     arrays["log_scale"][:] = np.log([0.1, 0.3, 0.2])
     arrays["opacity_logit"][:], arrays["opacity_minus_logit"][:] = 2.0, -1.0
     plus, minus = opacities(shape, arrays)[0]
-    signals = signals_of(np.ones(1), np.ones(1))
+    stats = stats_of(np.ones(1), np.ones(1))
 
     def halves(normal: tuple[float, float, float]) -> np.ndarray:
         arrays["normal"][:] = normal
-        return opacities(shape, planned(arrays, shape, signals, depth_threshold=0.1).apply(arrays))
+        return opacities(shape, edited(arrays, shape, stats, depth_threshold=0.1).apply(arrays))
 
     # The first half lies at +s/2 along y: the plane's + side, where the normal faces it.
     own = [[plus, plus], [minus, minus]]
@@ -281,7 +281,7 @@ def test_a_soft_plane_without_skew_leaves_both_opacities() -> None:
     shape = shapes.BISECTED_SKEW
     arrays = random_model(shape, 1, 0, dead=0)
     arrays["skew"][:] = 0
-    moved = planned(arrays, shape, signals_of(np.ones(1), np.ones(1)), depth_threshold=0.1).apply(arrays)
+    moved = edited(arrays, shape, stats_of(np.ones(1), np.ones(1)), depth_threshold=0.1).apply(arrays)
     np.testing.assert_allclose(opacities(shape, moved), opacities(shape, arrays)[[0, 0]], rtol=1e-6)
 
 
@@ -290,11 +290,11 @@ def test_a_reset_lowers_opacities_and_their_state_only(shape: Shape) -> None:
     arrays = random_model(shape, 200, 0, dead=0.3)
     for name in opacity_names(arrays):
         arrays[name][:2] = (40.0, 1.0)
-    plan = planned(
-        arrays, shape, signals_of(np.linspace(0, 2, 200) * THRESHOLD, np.linspace(0, 1, 200)), depth_threshold=0.5
+    edit = edited(
+        arrays, shape, stats_of(np.linspace(0, 2, 200) * THRESHOLD, np.linspace(0, 1, 200)), depth_threshold=0.5
     )
-    before = plan.apply(arrays)
-    reset = with_reset(plan, arrays, shape)
+    before = edit.apply(arrays)
+    reset = with_reset(edit, arrays, shape)
     after = reset.apply(arrays)
     names = opacity_names(arrays)
     for name, array in after.items():
@@ -307,4 +307,4 @@ def test_a_reset_lowers_opacities_and_their_state_only(shape: Shape) -> None:
     for name in ("mean", *names):
         state = reset.apply_state(np.ones_like(arrays[name]), name)
         assert state.any() == (name == "mean")
-    assert not plan.reset_fields
+    assert not edit.reset_fields

@@ -23,10 +23,10 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
-from clsplat.training.exposure import PhotoLoss, exposures_json
+from clsplat.training.exposure import ExposureLoss, exposures_json
 from clsplat.training.loss import ImageLoss
 from clsplat.training.run import train
-from clsplat.training.targets import Truths, truth_channels
+from clsplat.training.targets import Targets, target_channels
 from clsplat.training.trainer import Trainer
 
 SIZES = [(3, 2), (40, 5), (13, 14), (150, 3)]  # width, height: less than a vector, several items a row
@@ -56,13 +56,13 @@ def views_of(masks: bool, alphas: bool) -> list[View]:
     return views
 
 
-def photo_loss(device: Device, schedule: Schedule, real: Real, views: list[View], exposure: bool) -> PhotoLoss:
+def exposure_loss(device: Device, schedule: Schedule, real: Real, views: list[View], exposure: bool) -> ExposureLoss:
     if real == "double" and not device.has_fp64:
         pytest.skip("no double precision")
     kernels = KernelBuild("gaussian", 0, schedule, real=real)
     config = TrainConfig(exposure=exposure, random_background=True, iterations=100)
-    truths = Truths(device, kernels, views, 10**9, truth_channels(views, with_alpha=True))
-    return PhotoLoss(ImageLoss(Pipeline(device, kernels), 0.2), truths, config, BEHIND)
+    targets = Targets(device, kernels, views, 10**9, target_channels(views, with_alpha=True))
+    return ExposureLoss(ImageLoss(Pipeline(device, kernels), 0.2), targets, config, BEHIND)
 
 
 def wanted_of(
@@ -71,8 +71,8 @@ def wanted_of(
     """The render as the photo, and the photo over the render's background; both (H, W, 3)."""
     shown = color @ exposure[:, :3].T + exposure[:, 3]
     opaque = np.full(view.image.shape[:2], 255, np.uint8)
-    target = np.rint(laid_over(view.image, opaque if view.alpha is None else view.alpha)) / 255
-    return shown if view.mask is None else np.where(view.mask[:, :, None], shown, target), target
+    laid = np.rint(laid_over(view.image, opaque if view.alpha is None else view.alpha)) / 255
+    return shown if view.mask is None else np.where(view.mask[:, :, None], shown, laid), laid
 
 
 def gradient_of(color: NDArray[np.float64], exposure: NDArray[np.float64], view: View) -> NDArray[np.float64]:
@@ -83,8 +83,8 @@ def gradient_of(color: NDArray[np.float64], exposure: NDArray[np.float64], view:
 
 def best_exposure(color: NDArray[np.float64], view: View, pull: float) -> NDArray[np.float64]:
     """(3, 4) of least squares, with rows for the pull to the identity."""
-    target = wanted_of(color, np.eye(3, 4), view)[1]
-    counts = target.max(axis=2) < 0.98
+    laid = wanted_of(color, np.eye(3, 4), view)[1]
+    counts = laid.max(axis=2) < 0.98
     if view.mask is not None:
         counts &= view.mask
     n = counts.sum()
@@ -92,7 +92,7 @@ def best_exposure(color: NDArray[np.float64], view: View, pull: float) -> NDArra
         return np.eye(3, 4)
     weight = np.sqrt(pull * n)
     inputs = np.vstack([np.column_stack([color[counts], np.ones(n)]), weight * np.eye(4)])
-    outputs = np.vstack([target[counts], weight * np.eye(3, 4).T])
+    outputs = np.vstack([laid[counts], weight * np.eye(3, 4).T])
     return np.linalg.lstsq(inputs, outputs, rcond=None)[0].T
 
 
@@ -124,21 +124,22 @@ def test_the_reference_gradient_is_that_of_differences() -> None:
 def test_gradients_and_step_equal_the_reference(
     scheduled: tuple[Device, Schedule], real: Real, tolerance: float, masks: bool, alphas: bool
 ) -> None:
-    """A truth without mask or opacity lies among those with them."""
+    """A target without mask or opacity lies among those with them."""
     views = views_of(masks, alphas)
     device, schedule = scheduled
-    photos = photo_loss(device, schedule, real, views, exposure=True)
-    dtype = photos.kernels.dtype
+    exposure = exposure_loss(device, schedule, real, views, exposure=True)
+    dtype = exposure.kernels.dtype
     exposures = some_exposures(len(views))
-    photos.load_state({"exposure": exposures.reshape(-1, 12)})
-    rate, pull = photos.config.exposure_rate, photos.config.exposure_pull
+    exposure.load_state({"exposure": exposures.reshape(-1, 12)})
+    rate, pull = exposure.config.exposure_rate, exposure.config.exposure_pull
     for iteration, i in enumerate((0, 1, 2, 3, 0), 1):
         view = views[i]
-        truth = photos.truths.get(i, 1)
-        layout = truth.layout
+        target = exposure.targets.get(i, 1)
+        layout = target.layout
         color = np.random.default_rng(iteration).random((*view.image.shape[:2], 3)).astype(np.float32)
-        to_device(device, photos.pipeline.image("color", layout, 3), layout.pack(color, dtype))
-        planes = to_host(device, photos.gradient(truth, NEW), np.empty((3, layout.rows, layout.stride), dtype))
+        to_device(device, exposure.pipeline.image("color", layout, 3), layout.pack(color, dtype))
+        result = exposure.evaluate(target, NEW)
+        planes = to_host(device, result.v_color, np.empty((3, layout.rows, layout.stride), dtype))
         v = gradient_of(color.astype(np.float64), exposures[i], view)
         found = layout.unpack(planes)
         assert relative_error(found, v) < tolerance
@@ -146,24 +147,24 @@ def test_gradients_and_step_equal_the_reference(
         if view.mask is not None:
             assert not found[~view.mask].any()
             assert found[view.mask].any()
-        shown, target = wanted_of(color.astype(np.float64), exposures[i], view)
-        value = photos.loss.value()
-        assert value.total == pytest.approx(reference_loss(shown, target), rel=1e-4)
+        shown, laid = wanted_of(color.astype(np.float64), exposures[i], view)
+        value = exposure.loss.value(result)
+        assert value.total == pytest.approx(reference_loss(shown, laid), rel=1e-4)
         counts = np.ones(shown.shape[:2], bool) if view.mask is None else view.mask
-        assert value.mse == pytest.approx(((shown - target)[counts] ** 2).mean(), rel=1e-4)
+        assert value.mse == pytest.approx(((shown - laid)[counts] ** 2).mean(), rel=1e-4)
         moved = rate * (best_exposure(color.astype(np.float64), view, pull) - exposures[i])
         exposures[i] += moved
         exposures -= moved / len(views)
-        np.testing.assert_allclose(photos.exposures(), exposures, atol=1e-9 if real == "double" else 2e-5)
-    np.testing.assert_allclose(photos.exposures().mean(axis=0), some_exposures(len(views)).mean(axis=0), atol=1e-6)
+        np.testing.assert_allclose(exposure.exposures(), exposures, atol=1e-9 if real == "double" else 2e-5)
+    np.testing.assert_allclose(exposure.exposures().mean(axis=0), some_exposures(len(views)).mean(axis=0), atol=1e-6)
 
 
 def test_without_any_of_it_no_kernel_runs(device: Device) -> None:
-    photos = photo_loss(device, SCHEDULES["cpu16"], "float", views_of(False, False), exposure=False)
-    assert not photos.in_use
-    assert photos.truths.channels == 3
-    np.testing.assert_array_equal(photos.exposures(), np.tile(np.eye(3, 4), (4, 1, 1)))
-    assert photos.state() == {}
+    exposure = exposure_loss(device, SCHEDULES["cpu16"], "float", views_of(False, False), exposure=False)
+    assert not exposure.in_use
+    assert exposure.targets.channels == 3
+    np.testing.assert_array_equal(exposure.exposures(), np.tile(np.eye(3, 4), (4, 1, 1)))
+    assert exposure.state() == {}
 
 
 # --- what is learned -----------------------------------------------------------------------
@@ -189,7 +190,7 @@ def test_exposures_of_photos_are_found(scene: Scene) -> None:
     trainers = [Trainer(changed, replace(CONFIG, exposure=exposure)) for exposure in (False, True)]
     for trainer in trainers:
         trainer.run()
-    learned = trainers[1].photos.exposures()
+    learned = trainers[1].exposure.exposures()
     np.testing.assert_allclose(learned.mean(axis=0), np.eye(3, 4), atol=1e-5)
     grey = 0.4
     of_grey = (grey * learned[:, :, :3].sum(axis=2) + learned[:, :, 3]).mean(axis=1) / grey
@@ -264,7 +265,7 @@ def test_a_resumed_run_has_the_same_exposures(scene: Scene, tmp_path: Path) -> N
     for name, array in whole.splats.arrays.items():
         np.testing.assert_array_equal(array, splats.arrays[name])
     stored = json.loads((tmp_path / "whole" / "exposure.json").read_text())
-    assert stored == exposures_json([view.name for view in scene.train], resumed.photos.exposures())
+    assert stored == exposures_json([view.name for view in scene.train], resumed.exposure.exposures())
 
 
 def test_exposure_json_multiplies_from_the_left() -> None:

@@ -31,7 +31,7 @@ from clsplat.scenes.scene import Scene, View
 from clsplat.splats.morton import morton_order
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
-from clsplat.training.density.edit import Plan
+from clsplat.training.density.edit import DensifyEdit
 from clsplat.training.log import Progress
 from clsplat.training.optim.adam import NumpyAdam
 from clsplat.training.optim.lazy import DRIFT_MEAN, WAITS, Drifts, woken
@@ -94,7 +94,7 @@ def test_lazy_steps_equal_dense_ones(device: Device, options: dict[str, object])
     lazy = {
         name: started(device, replace(config, visible_adam=True, optimizer=name), splats) for name in ("fused", "numpy")
     }
-    rng, plans, waited = np.random.default_rng(8), {13: growing, 25: shrinking}, False
+    rng, edits, waited = np.random.default_rng(8), {13: growing, 25: shrinking}, False
     for iteration in range(1, STEPS + 1):
         n = dense[0].n
         grads, seen, does = gradients(dense[0], rng), some_seen(n, rng), rng.random(2) < (0.06, 0.15)
@@ -102,16 +102,16 @@ def test_lazy_steps_equal_dense_ones(device: Device, options: dict[str, object])
             step(buffers, optimizer, grads, seen, iteration, sh_degree=min(iteration // 12, 2))
             if does[0]:
                 optimizer.settle()
-            if iteration in plans:
+            if iteration in edits:
                 optimizer.settle()
-                optimizer.apply(plans[iteration](buffers.download(n), np.random.default_rng(iteration)))
-        if not (does.any() or iteration in plans or iteration == STEPS):
+                optimizer.apply(edits[iteration](buffers.download(n), np.random.default_rng(iteration)))
+        if not (does.any() or iteration in edits or iteration == STEPS):
             continue
         truth = dense[0].download(dense[0].n)
         for buffers, optimizer in lazy.values():
             stored = buffers.download(buffers.n)
             waits = not all(np.allclose(stored[name], truth[name], 1e-4, 1e-4) for name in truth)
-            assert not (waits and (does[0] or iteration in plans)), "settled"
+            assert not (waits and (does[0] or iteration in edits)), "settled"
             waited |= waits
             assert_near(optimizer.read(), truth)
             assert_near(buffers.download(buffers.n), stored, 0.0)
@@ -188,17 +188,17 @@ def test_a_state_continues_to_the_same_bits(devices: list[Device]) -> None:
             other.load_state({key: array for key, array in state.items() if key != "waiting.last"})
 
 
-@pytest.mark.parametrize("make_plan", [growing, shrinking])
-def test_a_plan_in_another_order_makes_the_same_splats(make_plan: Callable[..., Plan]) -> None:
+@pytest.mark.parametrize("make_edit", [growing, shrinking])
+def test_a_plan_in_another_order_makes_the_same_splats(make_edit: Callable[..., DensifyEdit]) -> None:
     rng = np.random.default_rng(4)
     arrays = some_splats("skew-normal").to_numpy()
-    planned = make_plan(arrays, rng)
-    order = rng.permutation(len(planned.source))
-    permuted, state = planned.permuted(order, 300), rng.standard_normal((300, 4))
-    for name, expected in planned.apply(arrays).items():
+    edited = make_edit(arrays, rng)
+    order = rng.permutation(len(edited.source))
+    permuted, state = edited.permuted(order, 300), rng.standard_normal((300, 4))
+    for name, expected in edited.apply(arrays).items():
         np.testing.assert_array_equal(permuted.apply(arrays)[name], expected[order])
     for name in ("quat", "opacity_logit"):  # the second is reset when it shrinks
-        np.testing.assert_array_equal(permuted.apply_state(state, name), planned.apply_state(state, name)[order])
+        np.testing.assert_array_equal(permuted.apply_state(state, name), edited.apply_state(state, name)[order])
 
 
 # --- in training -----------------------------------------------------------------------------
@@ -233,16 +233,16 @@ def wide(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, TrainConfig]:
 def test_training_steps_what_was_seen_and_settles_before_each_action(
     wide: tuple[Scene, TrainConfig], devices: list[Device], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every splat with a gradient is stepped, others wait, and the strategy plans from settled splats."""
+    """Every splat with a gradient is stepped, others wait, and the strategy edits from settled splats."""
     trainer = Trainer(*wide, device=devices[0])
-    sparse, planned = 0, []
+    sparse, edited = 0, []
 
-    def unchanged(arrays: dict[str, np.ndarray]) -> Plan:
-        planned.append(all(np.array_equal(array, trainer.optimizer.read()[name]) for name, array in arrays.items()))
+    def unchanged(arrays: dict[str, np.ndarray]) -> DensifyEdit:
+        edited.append(all(np.array_equal(array, trainer.optimizer.read()[name]) for name, array in arrays.items()))
         n = len(arrays["mean"])
-        return Plan(np.arange(n), {}, np.zeros(n, bool))
+        return DensifyEdit(np.arange(n), {}, np.zeros(n, bool))
 
-    monkeypatch.setattr("clsplat.training.trainer.plan", lambda config, arrays, *rest: unchanged(arrays))
+    monkeypatch.setattr("clsplat.training.trainer.edit", lambda config, arrays, *rest: unchanged(arrays))
     for _ in range(40):
         before = trainer.splats.download(500)
         trainer.step()
@@ -260,7 +260,7 @@ def test_training_steps_what_was_seen_and_settles_before_each_action(
             assert not (moved & ~stepped).any()
             sparse += not stepped.all()
     assert sparse > 10
-    assert planned == [True, True]
+    assert edited == [True, True]
 
 
 def test_actions_leave_splats_in_morton_order(wide: tuple[Scene, TrainConfig], devices: list[Device]) -> None:

@@ -39,10 +39,11 @@ def compared(
     planes = layout.pack(truth, np.dtype(np.uint8))
     buffer = device.alloc(planes.nbytes)
     to_device(device, buffer, planes)
-    gradient = to_host(device, loss.gradient(layout, buffer), np.empty((3, layout.rows, layout.stride), dtype))
+    result = loss.evaluate(layout, buffer)
+    gradient = to_host(device, result.v_color, np.empty((3, layout.rows, layout.stride), dtype))
     inside = layout.unpack(gradient)
     assert np.abs(gradient).sum() == pytest.approx(np.abs(inside).sum(), rel=1e-6), "not zero outside the image"
-    return loss.value(), inside
+    return loss.value(result), inside
 
 
 def pair(height: int, width: int, noise: float = 0.2) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -103,7 +104,8 @@ def test_strips_change_no_gradient(device: Device, monkeypatch: pytest.MonkeyPat
     color, truth = pair(21, 75)
     whole = compared(loss_of(device), color, truth)
     for strip in (1, 2, 3):
-        monkeypatch.setattr(KernelBuild, "strip", strip)
+        for module in ("loss", "programs"):
+            monkeypatch.setattr(f"clsplat.training.{module}.loss_strip", lambda _, strip=strip: strip)
         value, gradient = compared(loss_of(device), color, truth)
         np.testing.assert_array_equal(gradient, whole[1])
         assert value.total == pytest.approx(whole[0].total, rel=1e-6)

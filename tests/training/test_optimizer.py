@@ -1,4 +1,4 @@
-"""Optimizers: the fused kernels against NumPy step for step, plans, bounded fields, frozen blocks, state."""
+"""Optimizers: the fused kernels against NumPy step for step, edits, bounded fields, frozen blocks, state."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from clsplat.splats.harmonics import sh_basis
 from clsplat.splats.shapes import SHAPES, shape_named
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
-from clsplat.training.density.edit import Plan
+from clsplat.training.density.edit import DensifyEdit
 from clsplat.training.optim.noise import add_noise
 from clsplat.training.optim.optimizer import Optimizer, make_optimizer
 from clsplat.training.optim.regularisers import Penalty
@@ -125,7 +125,7 @@ def step(
     optimizer.step(on_device, MEAN_LR, sh_degree, iteration)
 
 
-def growing(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> Plan:
+def growing(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> DensifyEdit:
     """As a relocation: some rows become copies, 40 are added, states stay where they are."""
     n = len(arrays["mean"])
     source = np.concatenate([np.arange(n), rng.integers(0, n, 40)])
@@ -134,10 +134,10 @@ def growing(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> Plan:
     fresh[rng.integers(0, n, 30)] = True
     fresh[n : n + 20] = True  # the other new rows have no state either
     values = {"opacity_logit": arrays["opacity_logit"][source] - 1, "log_scale": arrays["log_scale"][source] - 0.1}
-    return Plan(source, values, fresh)
+    return DensifyEdit(source, values, fresh)
 
 
-def shrinking(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> Plan:
+def shrinking(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> DensifyEdit:
     """As pruning with a reset: 100 rows go, states move along, some rows are turned or given another skew."""
     n = len(arrays["mean"])
     source = rng.permutation(n)[: n - 100]
@@ -150,7 +150,7 @@ def shrinking(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> Plan:
         moved["skew"][5:9] *= -0.5
         values["skew"] = moved["skew"]
     resets = ("opacity_logit", "mean", "sh", *(("skew",) if "skew" in moved else ()))
-    return Plan(source, values, fresh, state_source=source, reset_fields=resets)
+    return DensifyEdit(source, values, fresh, state_source=source, reset_fields=resets)
 
 
 @pytest.mark.parametrize("options", CASES, ids=words)
@@ -161,15 +161,15 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
     both = {name: started(device, replace(config, optimizer=name), splats) for name in ("fused", "numpy")}
     buffers = both["numpy"][0]
     rng = np.random.default_rng(8)
-    plans = {3: growing, 5: shrinking, 8: growing}
+    edits = {3: growing, 5: shrinking, 8: growing}
     for iteration, degree in enumerate([0] * 3 + [1] * 3 + [2] * 4, start=1):
         start = buffers.download(buffers.n)
         grads = gradients(buffers, rng)
         for target, optimizer in both.values():
             step(target, optimizer, grads, iteration, degree)
-        if iteration in plans:
+        if iteration in edits:
             for target, optimizer in both.values():  # each from its own values: copies must be equal to the bit
-                optimizer.apply(plans[iteration](target.download(target.n), np.random.default_rng(iteration)))
+                optimizer.apply(edits[iteration](target.download(target.n), np.random.default_rng(iteration)))
         else:
             moved = buffers.download(buffers.n)
             blocks = {True: "skew" in moved, False: True}
@@ -192,26 +192,26 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
 
 @pytest.mark.parametrize("name", ["fused", "numpy"])
 def test_a_plan_moves_parameters_and_states(devices: list[Device], name: str) -> None:
-    """Parameters as Plan.apply, states as Plan.apply_state, and s found anew only where the skew is another."""
+    """Parameters equal DensifyEdit.apply, states DensifyEdit.apply_state. s is inverted only if the skew changed."""
     config = config_of(shape="bisected-skew", skew_map="polar", optimizer=name, **SGHMC)
     buffers, optimizer = started(devices[0], config, some_splats(config.shape))
     rng = np.random.default_rng(3)
-    for iteration, make_plan in enumerate((shrinking, growing), start=1):
+    for iteration, make_edit in enumerate((shrinking, growing), start=1):
         step(buffers, optimizer, gradients(buffers, rng), iteration)
         old, state = buffers.download(buffers.n), optimizer.state()
-        plan = make_plan(old, rng)
-        optimizer.apply(plan)
+        edit = make_edit(old, rng)
+        optimizer.apply(edit)
         moved, after = buffers.download(buffers.n), optimizer.state()
-        for field, expected in plan.apply(old).items():
+        for field, expected in edit.apply(old).items():
             np.testing.assert_array_equal(moved[field], expected, err_msg=field)
         for key in state:
             role, _, field = key.partition(".")
             if role in ("first", "second", "momentum"):
-                expected = plan.apply_state(state[key], field or "mean")
+                expected = edit.apply_state(state[key], field or "mean")
                 np.testing.assert_array_equal(after[key], expected, err_msg=key)
-        changed = (moved["skew"] != old["skew"][plan.source]).any(axis=1)
-        assert changed.sum() == (4 if make_plan is shrinking else 0)
-        np.testing.assert_array_equal(after["skew_s"][~changed], state["skew_s"][plan.source][~changed])
+        changed = (moved["skew"] != old["skew"][edit.source]).any(axis=1)
+        assert changed.sum() == (4 if make_edit is shrinking else 0)
+        np.testing.assert_array_equal(after["skew_s"][~changed], state["skew_s"][edit.source][~changed])
         np.testing.assert_allclose(np.linalg.norm(after["skew_s"][changed, 1:], axis=1), 1, rtol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""densify.py: relocation against adaptive quadrature and published numbers, and the laws of a plan, for every shape."""
+"""Relocation against adaptive quadrature and published numbers, and the laws of an edit, for every shape."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clsplat.errors import InputError, TrainingError
 from clsplat.splats import shapes
 from clsplat.splats.optical_depth import opacity_names
 from clsplat.splats.shapes import BETA_BOUNDS, NU_BOUNDS, SKEW_MAX, SLANT_MAX, Shape
-from clsplat.training.density.relocation import MIN_OPACITY, N_MAX, RULES, Plan, plan_relocation, relocation
+from clsplat.training.density.relocation import MIN_OPACITY, N_MAX, RULES, DensifyEdit, plan_relocation, relocation
 
 TWO_SIDED = [s for s in ALL_SHAPES if any(f.name == "opacity_minus_logit" for f in s.fields)]
 
@@ -150,7 +150,7 @@ def test_rows_do_not_mix(shape: Shape) -> None:
             assert raw[name][i] == alone[0][name][0]
 
 
-def equal(a: Plan, b: Plan) -> bool:
+def equal(a: DensifyEdit, b: DensifyEdit) -> bool:
     return (
         np.array_equal(a.source, b.source)
         and np.array_equal(a.fresh, b.fresh)
@@ -171,35 +171,35 @@ def equal(a: Plan, b: Plan) -> bool:
 def test_laws_of_a_plan(n: int, seed: int, dead: float, growth: float, spare: int, rule: str, shape: Shape) -> None:
     arrays = random_model(shape, n, seed, dead)
     cap = max(1, n + spare)
-    plan = plan_relocation(arrays, shape, np.random.default_rng(seed), cap, growth=growth, rule=rule)
+    edit = plan_relocation(arrays, shape, np.random.default_rng(seed), cap, growth=growth, rule=rule)
     alive = shape.strength(arrays) > MIN_OPACITY
-    n_new = len(plan.source)
+    n_new = len(edit.source)
 
     if alive.any():
         assert n_new == max(n, min(cap, math.ceil(growth * n - 1e-6)))
-        assert plan.relocated == np.sum(~alive)
-        assert alive[plan.source].all()
+        assert edit.relocated == np.sum(~alive)
+        assert alive[edit.source].all()
     else:
         assert n_new == n
-        assert plan.relocated == 0
-    assert plan.added == n_new - n
-    assert plan.source.dtype == np.int64
-    assert plan.state_source is None
-    np.testing.assert_array_equal(plan.source[plan.source], plan.source)
-    moved = plan.apply(arrays)
+        assert edit.relocated == 0
+    assert edit.added == n_new - n
+    assert edit.source.dtype == np.int64
+    assert edit.state_source is None
+    np.testing.assert_array_equal(edit.source[edit.source], edit.source)
+    moved = edit.apply(arrays)
     assert all(len(a) == n_new and a.dtype == np.float32 and np.isfinite(a).all() for a in moved.values())
     assert (shape.strength(moved) >= MIN_OPACITY * (1 - 1e-6)).all() or not alive.any()
 
     # Every member of a stack has the same values; their number decides them; the rest is untouched.
-    size = np.bincount(plan.source, minlength=n)[plan.source]
+    size = np.bincount(edit.source, minlength=n)[edit.source]
     names = opacity_names(arrays)
     for name, values in moved.items():
-        np.testing.assert_array_equal(values, values[plan.source])
-        np.testing.assert_array_equal(values[size == 1], arrays[name][plan.source[size == 1]])
+        np.testing.assert_array_equal(values, values[edit.source])
+        np.testing.assert_array_equal(values[size == 1], arrays[name][edit.source[size == 1]])
         if name not in (*names, "log_scale"):
-            np.testing.assert_array_equal(values, arrays[name][plan.source])
+            np.testing.assert_array_equal(values, arrays[name][edit.source])
     stack = size > 1
-    rows = {name: a[plan.source[stack]] for name, a in arrays.items()}
+    rows = {name: a[edit.source[stack]] for name, a in arrays.items()}
     raw, factor = relocation(shape, rows, size[stack], MIN_OPACITY)
     for name in names:
         np.testing.assert_allclose(moved[name][stack], raw[name], rtol=1e-5, atol=1e-5)
@@ -207,8 +207,8 @@ def test_laws_of_a_plan(n: int, seed: int, dead: float, growth: float, spare: in
     np.testing.assert_allclose(moved["log_scale"][stack], expected, rtol=1e-5, atol=1e-5)
 
     # Optimizer state: the live row of each stack and the added rows start afresh, relocated rows keep theirs.
-    np.testing.assert_array_equal(plan.fresh[:n], stack[:n] & (plan.source[:n] == np.arange(n)))
-    assert plan.fresh[n:].all()
+    np.testing.assert_array_equal(edit.fresh[:n], stack[:n] & (edit.source[:n] == np.arange(n)))
+    assert edit.fresh[n:].all()
 
 
 def gaussians(logit: np.ndarray) -> Arrays:
@@ -225,18 +225,18 @@ def test_draws_are_in_proportion_to_the_strength() -> None:
     live = np.array([0.1, -0.2, 0.7])
     arrays = gaussians(np.concatenate([np.arctanh(live), np.zeros(n_dead)]))
     arrays["nu"] = np.full(len(arrays["mean"]), 5.0)
-    plan = plan_relocation(arrays, shapes.STUDENT_T, np.random.default_rng(5), cap=1)
-    share = np.bincount(plan.source[3:], minlength=3) / n_dead
+    edit = plan_relocation(arrays, shapes.STUDENT_T, np.random.default_rng(5), cap=1)
+    share = np.bincount(edit.source[3:], minlength=3) / n_dead
     np.testing.assert_allclose(share, np.abs(live), atol=5 * 0.5 / math.sqrt(n_dead))
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.05, 0.3, 1.0])
 def test_a_limit_takes_the_weakest_first(limit: float) -> None:
     logit = np.concatenate([np.zeros(50), np.linspace(-6, -12, 50)])
-    plan = plan_relocation(gaussians(logit), shapes.GAUSSIAN, np.random.default_rng(0), 100, limit=limit)
+    edit = plan_relocation(gaussians(logit), shapes.GAUSSIAN, np.random.default_rng(0), 100, limit=limit)
     count = min(int(limit * 100), 50)
-    assert plan.relocated == count
-    np.testing.assert_array_equal(np.flatnonzero(plan.source != np.arange(100)), np.arange(100 - count, 100))
+    assert edit.relocated == count
+    np.testing.assert_array_equal(np.flatnonzero(edit.source != np.arange(100)), np.arange(100 - count, 100))
 
 
 def test_one_side_of_a_two_sided_splat_keeps_it_alive_and_the_other_stays_faint() -> None:
@@ -244,17 +244,17 @@ def test_one_side_of_a_two_sided_splat_keeps_it_alive_and_the_other_stays_faint(
     arrays = random_model(shape, 2, 0, dead=0)
     arrays["opacity_logit"][:] = (-20.0, -9.0)
     arrays["opacity_minus_logit"][:] = (1.0, -9.0)
-    plan = plan_relocation(arrays, shape, np.random.default_rng(0), 2)
-    assert plan.source.tolist() == [0, 0]
-    opacity = shape.opacity(plan.values["opacity_logit"].astype(np.float64))
+    edit = plan_relocation(arrays, shape, np.random.default_rng(0), 2)
+    assert edit.source.tolist() == [0, 0]
+    opacity = shape.opacity(edit.values["opacity_logit"].astype(np.float64))
     np.testing.assert_allclose(opacity, math.exp(-20) / 2, rtol=1e-3)
 
 
 def test_same_generator_same_plan_and_another_differs() -> None:
     arrays = random_model(shapes.SKEW_NORMAL, 500, 0)
-    plans = [plan_relocation(arrays, shapes.SKEW_NORMAL, np.random.default_rng(seed), 1000) for seed in (1, 1, 2)]
-    assert equal(plans[0], plans[1])
-    assert not equal(plans[0], plans[2])
+    edits = [plan_relocation(arrays, shapes.SKEW_NORMAL, np.random.default_rng(seed), 1000) for seed in (1, 1, 2)]
+    assert equal(edits[0], edits[1])
+    assert not equal(edits[0], edits[2])
 
 
 @pytest.mark.parametrize("limit", [0.0, 1.0])
@@ -265,19 +265,19 @@ def test_rows_that_are_not_finite_are_relocated_and_start_afresh(bad: float, fie
     arrays = random_model(shape, 40, 0, dead=0)
     rows = [3, 17]
     arrays[field].reshape(40, -1)[rows, -1] = bad
-    plan = plan_relocation(arrays, shape, np.random.default_rng(0), 40, limit=limit)
-    assert plan.relocated == 2
-    assert not np.isin(plan.source, rows).any()
-    assert plan.fresh[rows].all()
-    assert all(np.isfinite(array).all() for array in plan.apply(arrays).values())
+    edit = plan_relocation(arrays, shape, np.random.default_rng(0), 40, limit=limit)
+    assert edit.relocated == 2
+    assert not np.isin(edit.source, rows).any()
+    assert edit.fresh[rows].all()
+    assert all(np.isfinite(array).all() for array in edit.apply(arrays).values())
 
 
 def test_what_is_not_finite_goes_even_where_nothing_is_alive() -> None:
     arrays = gaussians(np.full(20, -9.0))
     arrays["mean"][3] = np.nan
-    plan = plan_relocation(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 40, growth=2)
-    assert (plan.relocated, plan.added) == (1, 0)
-    assert np.isfinite(plan.apply(arrays)["mean"]).all()
+    edit = plan_relocation(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 40, growth=2)
+    assert (edit.relocated, edit.added) == (1, 0)
+    assert np.isfinite(edit.apply(arrays)["mean"]).all()
     arrays["mean"][:] = np.nan
     with pytest.raises(TrainingError, match="no splat has finite parameters"):
         plan_relocation(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 40)
@@ -295,8 +295,8 @@ def test_extreme_opacities(shape: Shape) -> None:
     extreme = np.array([80.0, -80.0, 1e30, -1e30, 0.0], np.float32)
     for name in opacity_names(arrays):
         arrays[name] = extreme
-    plan = plan_relocation(arrays, shape, np.random.default_rng(0), 20, growth=4)
-    assert all(np.isfinite(array).all() for array in plan.apply(arrays).values())
+    edit = plan_relocation(arrays, shape, np.random.default_rng(0), 20, growth=4)
+    assert all(np.isfinite(array).all() for array in edit.apply(arrays).values())
 
 
 BAD_OPTIONS = [{"rule": "area"}, {"growth": 0.9}, {"growth": math.nan}, {"min_opacity": 0}, {"limit": 1.5}]

@@ -169,7 +169,7 @@ def test_models_are_not_overwritten_and_resume_wants_the_same_config(scene: Scen
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ImageLoss, "value", lambda self: LossValue(float("nan"), 0, 0, 0))
+    monkeypatch.setattr(ImageLoss, "value", lambda self, result: LossValue(float("nan"), 0, 0, 0))
     with pytest.raises(TrainingError, match=r"iteration 50: .* learning rates"):
         train(scene, CONFIG, output=tmp_path / "m")
     assert (tmp_path / "m" / "checkpoint.npz").is_file()

@@ -1,4 +1,4 @@
-"""strategy.py: which plan the options ask for, and when."""
+"""strategy.py: which edit the options ask for, and when."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from clsplat.errors import InputError
 from clsplat.splats import shapes
 from clsplat.training.config import BY_STRATEGY, STRATEGIES, TrainConfig
 from clsplat.training.density import strategy
-from clsplat.training.density.edit import Plan
+from clsplat.training.density.edit import DensifyEdit
 from clsplat.training.density.relocation import relocation
-from clsplat.training.density.strategy import Moment
+from clsplat.training.density.strategy import StepInfo
 
 N = 100
 
@@ -24,13 +24,13 @@ def action(
     iteration: int = 100,
     seed: int = 0,
     arrays: Arrays | None = None,
-    signals: np.ndarray | None = None,
-) -> tuple[Arrays, Plan]:
+    stats: np.ndarray | None = None,
+) -> tuple[Arrays, DensifyEdit]:
     shape = shapes.shape_named(config.shape)
     arrays = random_model(shape, N, 1) if arrays is None else arrays
-    signals = np.zeros((3, N)) if signals is None else signals
-    moment = Moment(iteration, int(config.densify_until * config.iterations), 1.5, 1.0)
-    return arrays, strategy.plan(config, arrays, signals, np.random.default_rng(seed), moment)
+    stats = np.zeros((3, N)) if stats is None else stats
+    info = StepInfo(iteration, int(config.densify_until * config.iterations), 1.5, 1.0)
+    return arrays, strategy.next_edit(config, arrays, stats, np.random.default_rng(seed), info)
 
 
 def mcmc(**options: Any) -> TrainConfig:
@@ -39,10 +39,10 @@ def mcmc(**options: Any) -> TrainConfig:
 
 def test_mcmc_relocates_and_grows_by_the_options() -> None:
     config = mcmc(shape="gaussian", cap_max=130, iterations=3000)
-    arrays, plan = action(config)
-    assert len(plan.source) == 130
+    arrays, edit = action(config)
+    assert len(edit.source) == 130
     dead = np.sum(shapes.GAUSSIAN.strength(arrays) <= 0.005)
-    assert plan.relocated == dead > 10
+    assert edit.relocated == dead > 10
     _, few = action(mcmc(shape="gaussian", cap_max=130, relocation_limit=0.05))
     assert few.relocated == 5
     _, flat = action(mcmc(shape="gaussian", cap_max=130, relocation="opacity-only"))
@@ -52,11 +52,11 @@ def test_mcmc_relocates_and_grows_by_the_options() -> None:
 def test_length_squared_is_twice_the_log_factor() -> None:
     shifts = []
     for rule in ("length", "length-squared"):
-        arrays, plan = action(mcmc(shape="gaussian", cap_max=130, relocation=rule))
-        shifts.append(plan.values["log_scale"] - arrays["log_scale"][plan.source])
+        arrays, edit = action(mcmc(shape="gaussian", cap_max=130, relocation=rule))
+        shifts.append(edit.values["log_scale"] - arrays["log_scale"][edit.source])
     assert shifts[0].min() < -0.01
     np.testing.assert_allclose(shifts[1], 2 * shifts[0], atol=1e-5)
-    size = np.bincount(plan.source, minlength=N)
+    size = np.bincount(edit.source, minlength=N)
     row = int(size.argmax())
     _, factor = relocation(shapes.GAUSSIAN, {k: a[row : row + 1] for k, a in arrays.items()}, size[row : row + 1])
     np.testing.assert_allclose(shifts[0][row], np.log(factor[0]), atol=1e-5)
@@ -64,8 +64,8 @@ def test_length_squared_is_twice_the_log_factor() -> None:
 
 @pytest.mark.parametrize(("normalisation", "scaled"), [("peak", True), ("pdf", False), ("none", False)])
 def test_a_kernel_without_peak_one_keeps_its_scale(normalisation: str, scaled: bool) -> None:
-    _, plan = action(mcmc(shape="skew-normal", normalisation=normalisation, cap_max=130))
-    assert ("log_scale" in plan.values) == scaled
+    _, edit = action(mcmc(shape="skew-normal", normalisation=normalisation, cap_max=130))
+    assert ("log_scale" in edit.values) == scaled
 
 
 def adc(**options: object) -> TrainConfig:
@@ -97,16 +97,16 @@ def test_adc_looks_at_sizes_after_the_first_reset() -> None:
 
 def test_adc_hands_on_its_options() -> None:
     arrays = random_model(shapes.GAUSSIAN, N, 1, dead=0)
-    signals = np.zeros((3, N))
-    signals[:3, 5] = (0.1, 1.0, 1.0)
-    assert len(action(adc(), arrays=arrays, signals=signals)[1].source) == N + 1
-    assert len(action(adc(grad_threshold=0.2), arrays=arrays, signals=signals)[1].source) == N
+    stats = np.zeros((3, N))
+    stats[:3, 5] = (0.1, 1.0, 1.0)
+    assert len(action(adc(), arrays=arrays, stats=stats)[1].source) == N + 1
+    assert len(action(adc(grad_threshold=0.2), arrays=arrays, stats=stats)[1].source) == N
     deep = adc(grad_threshold=0.2, depth_threshold=0.5)
-    assert len(action(deep, arrays=arrays, signals=signals)[1].source) == N + 1
-    assert len(action(adc(cap_max=N), arrays=arrays, signals=signals)[1].source) == N
+    assert len(action(deep, arrays=arrays, stats=stats)[1].source) == N + 1
+    assert len(action(adc(cap_max=N), arrays=arrays, stats=stats)[1].source) == N
     size = float(np.exp(arrays["log_scale"][5].max()))
-    assert "log_scale" in action(adc(dense_size=size / 2), arrays=arrays, signals=signals)[1].values
-    cloned = action(adc(dense_size=size * 2), arrays=arrays, signals=signals)[1]
+    assert "log_scale" in action(adc(dense_size=size / 2), arrays=arrays, stats=stats)[1].values
+    cloned = action(adc(dense_size=size * 2), arrays=arrays, stats=stats)[1]
     assert np.array_equal(cloned.apply(arrays)["log_scale"], arrays["log_scale"][cloned.source])
 
 

@@ -16,7 +16,7 @@ from clsplat.files.images import resize_area
 from clsplat.rendering.build import KernelBuild
 from clsplat.scenes.scene import View, load_scene
 from clsplat.training.config import TrainConfig
-from clsplat.training.targets import Truth, Truths, truth_budget, truth_bytes
+from clsplat.training.targets import Target, Targets, target_budget, target_bytes
 from clsplat.training.trainer import Trainer
 
 SIZES = [(40, 30), (17, 65), (64, 48), (40, 30)]  # width and height
@@ -34,14 +34,14 @@ def some_views() -> list[View]:
     ]
 
 
-def truths_of(device: Device, budget: int) -> Truths:
-    return Truths(device, KernelBuild("gaussian", 0, SCHEDULES["cpu16"]), some_views(), budget)
+def targets_of(device: Device, budget: int) -> Targets:
+    return Targets(device, KernelBuild("gaussian", 0, SCHEDULES["cpu16"]), some_views(), budget)
 
 
-def image_of(truths: Truths, truth: Truth) -> NDArray[np.uint8]:
+def image_of(targets: Targets, target: Target) -> NDArray[np.uint8]:
     """(H, W, 3), read back; the margin must be zero."""
-    layout = truth.layout
-    planes = to_host(truths.device, truths.planes(truth), np.empty((3, layout.rows, layout.stride), np.uint8))
+    layout = target.layout
+    planes = to_host(targets.device, targets.planes(target), np.empty((3, layout.rows, layout.stride), np.uint8))
     image = layout.unpack(planes)
     np.testing.assert_array_equal(planes, layout.pack(image, np.dtype(np.uint8)))
     return image
@@ -50,50 +50,50 @@ def image_of(truths: Truths, truth: Truth) -> NDArray[np.uint8]:
 @pytest.mark.parametrize("budget", [10**9, 20_000, 0])
 def test_images_arrive_whatever_stays(device: Device, budget: int) -> None:
     """Twice through all views at each of three sizes; what stays is uploaded once."""
-    truths = truths_of(device, budget)
+    targets = targets_of(device, budget)
     for downscale in (4, 2, 1):
         for again in range(2):
-            for i, view in enumerate(truths.views):
+            for i, view in enumerate(targets.views):
                 with recorded(device) as launches:
-                    truth = truths.get(i, downscale)
-                    image = image_of(truths, truth)
+                    target = targets.get(i, downscale)
+                    image = image_of(targets, target)
                 size = (view.camera.width // downscale, view.camera.height // downscale)
-                assert (truth.camera.width, truth.camera.height) == size
+                assert (target.camera.width, target.camera.height) == size
                 np.testing.assert_array_equal(image, resize_area(view.image, *size))
                 uploads = sum(launch.name == "upload" for launch in launches)
                 if budget != 20_000:
                     assert uploads == int(not (again and budget))
-        assert truths._kept_bytes <= budget
+        assert targets._kept_bytes <= budget
 
 
 def test_part_of_the_images_stays(device: Device) -> None:
     """The first ones drawn, within the budget."""
-    truths = truths_of(device, 20_000)
+    targets = targets_of(device, 20_000)
     for i in range(4):
-        image_of(truths, truths.get(i, 1))
+        image_of(targets, targets.get(i, 1))
     with recorded(device) as launches:
         for i in range(4):
-            image_of(truths, truths.get(i, 1))
+            image_of(targets, targets.get(i, 1))
     assert 0 < sum(launch.name == "upload" for launch in launches) < 4
 
 
 def test_images_of_the_last_size_are_given_back(device: Device) -> None:
-    truths = truths_of(device, 10**9)
+    targets = targets_of(device, 10**9)
     held = []
     for downscale in (1, 4):
         for i in range(4):
-            image_of(truths, truths.get(i, downscale))
-        held.append(truths.nbytes)
+            image_of(targets, targets.get(i, downscale))
+        held.append(targets.nbytes)
     assert held[1] < 0.7 * held[0]
 
 
 @pytest.mark.parametrize("budget", [10**9, 20_000, 0])
 def test_what_is_promised_is_enough(device: Device, budget: int) -> None:
-    truths = truths_of(device, budget)
+    targets = targets_of(device, budget)
     for i in (2, 0, 1, 3):  # the largest first: buffers then need no room to grow
-        image_of(truths, truths.get(i, 1))
-    assert truths.nbytes <= truth_bytes(truths.views, budget)
-    assert truth_budget(device) == device.info.global_mem_bytes // 4
+        image_of(targets, targets.get(i, 1))
+    assert targets.nbytes <= target_bytes(targets.views, budget)
+    assert target_budget(device) == device.info.global_mem_bytes // 4
 
 
 def test_training_does_not_depend_on_what_stays(devices: list[Device], capture_folder: Path) -> None:
@@ -104,7 +104,7 @@ def test_training_does_not_depend_on_what_stays(devices: list[Device], capture_f
     for kept in (True, False):
         trainer = Trainer(scene, config, device=devices[0])
         if not kept:
-            trainer.truths.budget = 0
+            trainer.targets.budget = 0
         models.append(trainer.run().splats)
     for name, array in models[0].arrays.items():
         np.testing.assert_array_equal(array, models[1].arrays[name])

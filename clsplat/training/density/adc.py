@@ -1,4 +1,4 @@
-"""Adaptive density control of 3DGS (Kerbl et al. 2023), and 3DSGS's depth criterion, planned on the host.
+"""Adaptive density control of 3DGS (Kerbl et al. 2023), and 3DSGS's depth criterion, edited on the host.
 
 Splats whose mean screen gradient is high are cloned (small ones: a copy in the same place) or split in two (large
 ones: both halves are drawn from the Gaussian, and smaller by 1.6); faint ones, and later large ones, are pruned. Large
@@ -33,7 +33,7 @@ from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import finite_rows, opacity_names, raw_of_thickness, thickness
 from ...splats.quaternions import rotations
 from ...splats.shapes import Shape
-from .edit import Plan
+from .edit import DensifyEdit
 
 # 3DGS's constants.
 MIN_OPACITY = 0.005  # below: pruned
@@ -47,7 +47,7 @@ Rows = NDArray[np.int64]
 def plan_adc(
     arrays: Mapping[str, Array],
     shape: Shape,
-    signals: Array,
+    stats: Array,
     rng: np.random.Generator,
     cap: int,
     *,
@@ -56,7 +56,7 @@ def plan_adc(
     depth_threshold: float = 0.0,
     dense_size: float = 0.01,
     prune_large: bool = False,
-) -> Plan:
+) -> DensifyEdit:
     """Clone, split and prune.
 
     Each clone and each split adds one splat. Where the cap has no room for all, those with the highest gradient
@@ -66,7 +66,7 @@ def plan_adc(
     Parameters
     ----------
     arrays : all public arrays of the model.
-    signals : (at least 3, N), see cl/render/project.cl: sums of the screen and the depth gradient, times seen.
+    stats : (at least 3, N), see cl/render/project.cl: sums of the screen and the depth gradient, times seen.
     rng : advanced by three normals for each half that is drawn.
     cap : most splats after growth; more than that are kept, not removed.
     extent : of the scene [world units].
@@ -92,7 +92,7 @@ def plan_adc(
     if not keep.any():
         keep = sound
 
-    score = _score(signals, grad_threshold, depth_threshold, extent)
+    score = _score(stats, grad_threshold, depth_threshold, extent)
     splits = (score > 1.0) & splittable & (by_axis | (size > dense_size * extent))
     clones = (score > 1.0) & keep & bright & ~splits
     split, clone = _best(score, splits, clones, keep, cap)
@@ -107,31 +107,31 @@ def plan_adc(
         values[name] = arrays[name][source]
         values[name][len(stay) + len(clone) :] = halves
     fresh = np.arange(len(source)) >= len(stay)
-    return Plan(
+    return DensifyEdit(
         source, values, fresh, state_source=source, added=len(clone) + 2 * len(split), removed=len(keep) - len(stay)
     )
 
 
-def with_reset(plan: Plan, arrays: Mapping[str, Array], shape: Shape) -> Plan:
-    """The plan, then 3DGS's opacity reset: |opacity| at most RESET_OPACITY, and its optimizer state zero."""
+def with_reset(edit: DensifyEdit, arrays: Mapping[str, Array], shape: Shape) -> DensifyEdit:
+    """The edit, then 3DGS's opacity reset: |opacity| at most RESET_OPACITY, and its optimizer state zero."""
     names = opacity_names(arrays)
-    after = {name: plan.values.get(name, arrays[name][plan.source]) for name in names}
+    after = {name: edit.values.get(name, arrays[name][edit.source]) for name in names}
     low = {
         name: raw_of_thickness(
             shape, np.minimum(thickness(shape, after[name]), -math.log1p(-RESET_OPACITY)), after[name]
         )
         for name in names
     }
-    return replace(plan, values=plan.values | low, reset_fields=plan.reset_fields + names)
+    return replace(edit, values=edit.values | low, reset_fields=edit.reset_fields + names)
 
 
-def _score(signals: Array, grad_threshold: float, depth_threshold: float, extent: float) -> DoubleArray:
+def _score(stats: Array, grad_threshold: float, depth_threshold: float, extent: float) -> DoubleArray:
     """(N,) mean gradient over its threshold, the higher of the two; 0 where it is not finite."""
-    seen = np.maximum(signals[2].astype(np.float64), 1.0)
+    seen = np.maximum(stats[2].astype(np.float64), 1.0)
     tiny = np.finfo(np.float64).tiny
-    score: DoubleArray = signals[0] / seen / max(grad_threshold, tiny)
+    score: DoubleArray = stats[0] / seen / max(grad_threshold, tiny)
     if depth_threshold > 0:
-        score = np.fmax(score, signals[1] * extent / seen / depth_threshold)
+        score = np.fmax(score, stats[1] * extent / seen / depth_threshold)
     return np.where(np.isfinite(score), score, 0.0)
 
 

@@ -12,7 +12,7 @@ from ...splats.fields import Array
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class DensifyEdit:
     """The splats after an action, as a gather of the old ones and new values of some fields.
 
     Attributes
@@ -35,8 +35,8 @@ class Plan:
     added: int = 0
     removed: int = 0
 
-    def permuted(self, order: NDArray[np.int64], n_old: int) -> Plan:
-        """The same splats in another order: `order` holds the plan's rows. n_old : splats before the plan."""
+    def permuted(self, order: NDArray[np.int64], n_old: int) -> DensifyEdit:
+        """The same splats in another order: `order` holds the edit's rows. n_old : splats before the edit."""
         states, fresh = self.state_source, self.fresh
         if states is None:
             rows = np.arange(len(self.source))
@@ -45,14 +45,14 @@ class Plan:
         return replace(self, source=self.source[order], values=values, fresh=fresh[order], state_source=states[order])
 
     def apply(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
-        """The parameters after the plan (copies); the device's gather must do the same."""
+        """The parameters after the edit (copies); the device's gather must do the same."""
         moved = {name: array[self.source] for name, array in arrays.items()}
         for name, values in self.values.items():
             moved[name] = values.astype(arrays[name].dtype)
         return moved
 
     def apply_state(self, state: Array, name: str) -> Array:
-        """Optimizer state (N, ...) of one field after the plan (a copy)."""
+        """Optimizer state (N, ...) of one field after the edit (a copy)."""
         n, n_new = len(state), len(self.source)
         if self.state_source is not None:
             moved = state[self.state_source]

@@ -1,4 +1,4 @@
-"""Relocation and growth of 3DGS-MCMC (Kheradmand et al. 2024), for any shape, planned on the host.
+"""Relocation and growth of 3DGS-MCMC (Kheradmand et al. 2024), for any shape, edited on the host.
 
 A live splat of opacity o that is joined by copies of itself, N in all, becomes N splats of opacity o' and
 another scale, such that along a line through it the stack absorbs as much as the one did. With g the profile of the
@@ -26,7 +26,7 @@ from ...errors import InputError, TrainingError
 from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import finite_rows, opacity_names, raw_of_thickness, thickness
 from ...splats.shapes import Shape
-from .edit import Plan
+from .edit import DensifyEdit
 
 # 3DGS-MCMC's constants.
 MIN_OPACITY = 0.005  # at or below: dead, relocated
@@ -56,11 +56,11 @@ def plan_relocation(
     min_opacity: float = MIN_OPACITY,
     rule: str = "length",
     limit: float = 1.0,
-) -> Plan:
+) -> DensifyEdit:
     """Move dead splats onto live ones and grow towards the cap.
 
     Splats with a parameter that is not finite are relocated like dead ones. All copies are drawn at once, with
-    replacement, in proportion to strength (the larger |opacity|). The plan depends on nothing but the arguments and
+    replacement, in proportion to strength (the larger |opacity|). The edit depends on nothing but the arguments and
     the generator's state. Where no splat is alive, nothing grows and the dead stay.
 
     Parameters
@@ -123,7 +123,7 @@ def plan_relocation(
     fresh = np.zeros(n_new, np.bool_)
     fresh[:n] = (copies > 0) | ~sound
     fresh[n:] = True
-    return Plan(source, values, fresh, relocated=len(moving), added=n_new - n)
+    return DensifyEdit(source, values, fresh, relocated=len(moving), added=n_new - n)
 
 
 def relocation(

@@ -1,4 +1,4 @@
-"""What a run's strategy does to the splats at one of its actions: from the options to a plan."""
+"""What a run's strategy does to the splats at one of its actions: from the options to an edit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ...splats.fields import Array
 from ...splats.shapes import shape_named
 from ..config import TrainConfig
 from .adc import plan_adc, with_reset
-from .edit import Plan
+from .edit import DensifyEdit
 from .relocation import plan_relocation
 
 # Opacities are reset this many iterations apart at least, and not earlier, however short the run: their rate does not
@@ -20,7 +20,7 @@ RESET_INTERVAL_MIN = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class StepInfo:
     """Where a run stands when its strategy acts.
 
     Parameters
@@ -35,15 +35,15 @@ class Moment:
     extent: float
 
 
-def plan(
-    config: TrainConfig, arrays: Mapping[str, Array], signals: Array, rng: np.random.Generator, moment: Moment
-) -> Plan:
-    """The plan of one action.
+def next_edit(
+    config: TrainConfig, arrays: Mapping[str, Array], stats: Array, rng: np.random.Generator, info: StepInfo
+) -> DensifyEdit:
+    """The edit of one action.
 
     Parameters
     ----------
-    arrays : all public arrays of the model. signals : (3, N), collected since the last action (cl/render/project.cl).
-    rng : of the run; the plan depends on nothing else that is random.
+    arrays : all public arrays of the model. stats : (3, N), collected since the last action (cl/render/project.cl).
+    rng : of the run; the edit depends on nothing else that is random.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def plan(
             shape,
             rng,
             config.cap_max,
-            growth=moment.growth,
+            growth=info.growth,
             limit=config.relocation_limit,
             rule=config.relocation if scaled else "opacity-only",
         )
@@ -66,16 +66,16 @@ def plan(
     grown = plan_adc(
         arrays,
         shape,
-        signals,
+        stats,
         rng,
         config.cap_max,
-        extent=moment.extent,
+        extent=info.extent,
         grad_threshold=config.grad_threshold,
         depth_threshold=config.depth_threshold,
         dense_size=config.dense_size,
-        prune_large=0 < every < moment.iteration,
+        prune_large=0 < every < info.iteration,
     )
-    return with_reset(grown, arrays, shape) if resets(config, moment) else grown
+    return with_reset(grown, arrays, shape) if resets(config, info) else grown
 
 
 def reset_interval(config: TrainConfig) -> int:
@@ -83,12 +83,12 @@ def reset_interval(config: TrainConfig) -> int:
     return config.opacity_reset and max(config.iterations // config.opacity_reset, RESET_INTERVAL_MIN)
 
 
-def resets(config: TrainConfig, moment: Moment) -> bool:
+def resets(config: TrainConfig, info: StepInfo) -> bool:
     """Whether the action resets opacities: the first at or after a multiple of the interval, but not the last.
 
     3DGS: at 3000, 6000, 9000 and 12 000 of 30 000 iterations, of which 15 000 densify.
     """
     every = reset_interval(config)
-    if not every or moment.iteration >= moment.last:
+    if not every or info.iteration >= info.last:
         return False
-    return moment.iteration // every > (moment.iteration - config.densify_interval) // every
+    return info.iteration // every > (info.iteration - config.densify_interval) // every

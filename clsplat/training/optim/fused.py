@@ -15,7 +15,7 @@ from ...device.program import GROUP_ITEMS, lane_group
 from ...rendering.build import KernelBuild
 from ...rendering.splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers
 from ...splats.fields import Array, Group, Schema, sh_coefficients
-from ..density.edit import Plan
+from ..density.edit import DensifyEdit
 from ..programs import optim_program
 from .adam import BETA1, BETA2
 from .lazy import Steps
@@ -138,16 +138,16 @@ class FusedOptimizer:
         self._settle(settled, None if self.skew is None else self.skew.s.spare, keeps_moments=True)
         return settled.download(settled.n)
 
-    def apply(self, plan: Plan) -> None:
+    def apply(self, edit: DensifyEdit) -> None:
         self.settle()
-        splats, n_old, n_new = self.splats, self.splats.n, len(plan.source)
-        source = self._indices(plan.source)
-        fresh = plan.fresh.copy()
+        splats, n_old, n_new = self.splats, self.splats.n, len(edit.source)
+        source = self._indices(edit.source)
+        fresh = edit.fresh.copy()
         state_source = None
-        if plan.state_source is None:
+        if edit.state_source is None:
             fresh[n_old:] = True  # columns beyond the old count may hold an older state
         else:
-            state_source = self._indices(plan.state_source)
+            state_source = self._indices(edit.state_source)
         fresh_buffer = self.device.alloc(n_new)
         to_device(self.device, fresh_buffer, fresh.astype(np.uint8))
         for group in Group:
@@ -166,8 +166,8 @@ class FusedOptimizer:
                 self._gather_rows(rows_of_state, state_source, n_new)
             self._zero(rows_of_state.buffer, fresh_buffer, n_new, rows_of_state.width)
         splats.n = n_new
-        self._set_values(plan, source)
-        self._reset_fields(plan.reset_fields)
+        self._set_values(edit, source)
+        self._reset_fields(edit.reset_fields)
         if self.waiting is not None:
             self.waiting.none_waits(self._counts)
 
@@ -273,18 +273,18 @@ class FusedOptimizer:
         state = [] if self.skew is None else [self.skew.first, self.skew.second]
         return state if self.momentum is None else [*state, self.momentum]
 
-    def _set_values(self, plan: Plan, source: Any) -> None:
-        """The plan's new values, and the trainable skew where it must follow them."""
+    def _set_values(self, edit: DensifyEdit, source: Any) -> None:
+        """The edit's new values, and the trainable skew where it must follow them."""
         if self.skew is None:
-            self.splats.upload(plan.values)
+            self.splats.upload(edit.values)
             return
         n, names = self.splats.n, ("skew", "quat")
         self._gather_rows(self.skew.s, source, n)
-        if not any(name in plan.values for name in names):
-            self.splats.upload(plan.values)
+        if not any(name in edit.values for name in names):
+            self.splats.upload(edit.values)
             return
         before = self.splats.download(n, names)
-        self.splats.upload(plan.values)
+        self.splats.upload(edit.values)
         self.skew.s.set(self.skew.map.follow(self.skew.s.get(n), before, self.splats.download(n, names)))
 
     def _reset_fields(self, names: tuple[str, ...]) -> None:

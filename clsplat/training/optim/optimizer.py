@@ -11,7 +11,7 @@ from ...rendering.build import KernelBuild
 from ...rendering.splat_buffers import CompactGradients, SplatBuffers
 from ...splats.fields import Array
 from ..config import TrainConfig
-from ..density.edit import Plan
+from ..density.edit import DensifyEdit
 from .fused import FusedOptimizer
 from .reference import HostOptimizer
 from .rules import Rules
@@ -44,8 +44,8 @@ class Optimizer(Protocol):
     def read(self) -> dict[str, Array]:
         """Public arrays of the splats, without anything pending; what is pending stays so."""
 
-    def apply(self, plan: Plan) -> None:
-        """Move, add, remove and reset splats as planned, from what they are once settled."""
+    def apply(self, edit: DensifyEdit) -> None:
+        """Move, add, remove and reset splats as edited, from what they are once settled."""
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything but the buffers' splats, for a checkpoint; the same keys from both optimizers."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...device.memory import to_host
 from ...rendering.splat_buffers import CompactGradients, SplatBuffers
 from ...splats.fields import Array, Field
-from ..density.edit import Plan
+from ..density.edit import DensifyEdit
 from .adam import NumpyAdam
 from .lazy import DRIFT, DRIFT_MEAN, DRIFT_SKEW, Drifts, Steps, ascent, woken
 from .noise import normal3
@@ -90,25 +90,25 @@ class HostOptimizer:
             self._caught_up(params, self.skew_s, slice(None), keeps_moments=True)
         return params
 
-    def apply(self, plan: Plan) -> None:
+    def apply(self, edit: DensifyEdit) -> None:
         self.settle()
         old = self.splats.download(self.splats.n)
-        before, after = {name: array[plan.source] for name, array in old.items()}, plan.apply(old)
+        before, after = {name: array[edit.source] for name, array in old.items()}, edit.apply(old)
         self.splats.set(after)
         if self.rules.map is not None:
-            self.skew_s = self.rules.map.follow(self.skew_s[plan.source], before, after)
+            self.skew_s = self.rules.map.follow(self.skew_s[edit.source], before, after)
         for adam in (self.base, self.skew):
             for moments in (adam.first, adam.second):
-                for name, moment in moments.items():
-                    moments[name] = plan.apply_state(moment, name)
-        self.momentum = plan.apply_state(self.momentum, "mean")
+                for name, info in moments.items():
+                    moments[name] = edit.apply_state(info, name)
+        self.momentum = edit.apply_state(self.momentum, "mean")
         self._none_waits()
 
     def state(self) -> dict[str, NDArray[Any]]:
         state: dict[str, NDArray[Any]] = {"steps": np.array([self.base.step_count, self.skew.step_count])}
         for adam in (self.base, self.skew) if self.rules.map is not None else (self.base,):
-            state |= {f"first.{name}": moment.copy() for name, moment in adam.first.items()}
-            state |= {f"second.{name}": moment.copy() for name, moment in adam.second.items()}
+            state |= {f"first.{name}": info.copy() for name, info in adam.first.items()}
+            state |= {f"second.{name}": info.copy() for name, info in adam.second.items()}
         if self.rules.map is not None:
             state["skew_s"] = self.skew_s.copy()
         if self.rules.sghmc is not None:
