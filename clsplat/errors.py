@@ -1,14 +1,14 @@
-"""Errors a user can mend. Every message is one line: what is wrong, where, and the mend."""
+"""Errors that a user can fix. Each message is one line that says what is wrong, where, and how to fix it."""
 
 from __future__ import annotations
 
 
 class ClsplatError(Exception):
-    """Base of all errors that clsplat raises on purpose; the CLI prints it as one line, exit code 1."""
+    """Base of all errors that clsplat raises on purpose. The command line prints one line and exits with code 1."""
 
 
 class InputError(ClsplatError):
-    """A file, folder or value that clsplat was given cannot be used."""
+    """An input file, folder or value cannot be used."""
 
 
 class OutputError(ClsplatError):
@@ -16,13 +16,13 @@ class OutputError(ClsplatError):
 
 
 class DeviceError(ClsplatError):
-    """No usable OpenCL device, a kernel that does not build, or a device without enough memory."""
+    """An OpenCL device is missing or has too little memory, or a kernel does not build."""
 
 
 class TrainingError(ClsplatError):
-    """Training cannot go on; what was learnt so far is saved."""
+    """Training cannot go on. The model trained so far is saved."""
 
 
-def reason_of(error: Exception, most: int = 200) -> str:
-    """What another library says of an error, in a line of `most` characters at most."""
-    return " ".join(str(error).split())[:most] or type(error).__name__
+def reason_of(error: Exception, max_length: int = 200) -> str:
+    """Return another library's message as one line of at most `max_length` characters."""
+    return " ".join(str(error).split())[:max_length] or type(error).__name__

@@ -18,10 +18,10 @@ import numpy as np
 from ..errors import InputError
 from ..files.atomic import atomic_writer
 from ..files.image_names import bare_name
-from ..files.json_file import kind, matrix, number, read_json, size, value
+from ..files.json_file import describe, get_matrix, get_number, get_size, get_value, read_json
 from .camera import Camera
 
-_MEND = "add it as 3DGS writes it"
+_REMEDY = "add it as 3DGS writes it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +56,12 @@ def read_cameras(path: str | os.PathLike[str]) -> list[NamedCamera]:
 def cameras_of(entries: Any, path: str | os.PathLike[str]) -> list[NamedCamera]:
     """As `read_cameras`, of a list that has been read from `path`; raises InputError."""
     if not isinstance(entries, list):
-        raise InputError(f"{path}: holds {kind(entries)}; expected a list of cameras, as 3DGS writes it")
+        raise InputError(f"{path}: holds {describe(entries)}; expected a list of cameras, as 3DGS writes it")
     named = []
     for index, entry in enumerate(entries):
         place = f"{path}: entry {index}"
         if not isinstance(entry, dict):
-            raise InputError(f"{place}: is {kind(entry)}; expected an object with img_name, width, ...")
+            raise InputError(f"{place}: is {describe(entry)}; expected an object with img_name, width, ...")
         if isinstance(entry.get("img_name"), str):
             place += f" ({ascii(entry['img_name'])[:80]})"
         try:
@@ -100,14 +100,14 @@ def write_cameras(path: str | os.PathLike[str], named: Sequence[NamedCamera]) ->
 
 def _named_camera(entry: dict[str, Any]) -> NamedCamera:
     """One entry; raises InputError naming the key."""
-    name = value(entry, "img_name", _MEND)
+    name = get_value(entry, "img_name", _REMEDY)
     if not isinstance(name, str) or not name:
-        raise InputError(f"key 'img_name' is {kind(name)}; expected a name")
-    width, height = size(entry, "width", _MEND), size(entry, "height", _MEND)
-    fx, fy = number(entry, "fx", _MEND), number(entry, "fy", _MEND)
-    cx = number(entry, "cx", _MEND) if "cx" in entry else width / 2
-    cy = number(entry, "cy", _MEND) if "cy" in entry else height / 2
+        raise InputError(f"key 'img_name' is {describe(name)}; expected a name")
+    width, height = get_size(entry, "width", _REMEDY), get_size(entry, "height", _REMEDY)
+    fx, fy = get_number(entry, "fx", _REMEDY), get_number(entry, "fy", _REMEDY)
+    cx = get_number(entry, "cx", _REMEDY) if "cx" in entry else width / 2
+    cy = get_number(entry, "cy", _REMEDY) if "cy" in entry else height / 2
     cam_from_world = np.zeros((3, 4))
-    cam_from_world[:, :3] = matrix(entry, "rotation", (3, 3), _MEND).T
-    cam_from_world[:, 3] = -cam_from_world[:, :3] @ matrix(entry, "position", (3,), _MEND)
+    cam_from_world[:, :3] = get_matrix(entry, "rotation", (3, 3), _REMEDY).T
+    cam_from_world[:, 3] = -cam_from_world[:, :3] @ get_matrix(entry, "position", (3,), _REMEDY)
     return NamedCamera(name, Camera(width, height, fx, fy, cx, cy, cam_from_world))

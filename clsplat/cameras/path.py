@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
-from ..files.json_file import kind, matrix, number, read_json, size, value
+from ..files.json_file import describe, get_matrix, get_number, get_size, get_value, read_json
 from .camera import Camera
 from .cameras_json import cameras_of
 
 DEFAULT_FPS = 30.0
-_MEND = "add it as nerfstudio's camera_path.json has it"
+_REMEDY = "add it as nerfstudio's camera_path.json has it"
 _PIXELS = ("fl_x", "fl_y", "cx", "cy")
 _CENTRED = 1e-9  # of the image; from where on a principal point is off centre, and a pixel not square
 # OpenGL's axes of a camera in OpenCV's.
@@ -76,15 +76,6 @@ def read_path(path: str | os.PathLike[str]) -> CameraPath:
     InputError : the file cannot be read, or a field is missing or unusable; names file, frame and key.
     """
     return path_of(read_json(path, "a camera_path.json or a cameras.json"), path)
-
-
-def parse_path(text: str | bytes, source: str = "camera path") -> CameraPath:
-    """As `read_path`, from the text of a file; `source` names it in messages. Raises InputError."""
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{source}: is no JSON ({str(error).splitlines()[0]}); choose a camera_path.json") from None
-    return path_of(content, source)
 
 
 def write_path(path: str | os.PathLike[str], camera_path: CameraPath) -> None:
@@ -144,16 +135,16 @@ def path_of(content: Any, source: str | os.PathLike[str]) -> CameraPath:
             raise InputError(f"{source}: holds no cameras; a path needs at least one")
         return CameraPath(tuple(item.camera for item in named))
     if not isinstance(content, dict):
-        raise InputError(f"{source}: holds {kind(content)}; expected a camera_path.json or a cameras.json")
+        raise InputError(f"{source}: holds {describe(content)}; expected a camera_path.json or a cameras.json")
     try:
         model = content.get("camera_type", "perspective")
         if model != "perspective":
             raise InputError(f"key 'camera_type' is {ascii(model)[:40]}; only perspective cameras can be rendered")
-        width, height = size(content, "render_width", _MEND), size(content, "render_height", _MEND)
-        frames = _entries(value(content, "camera_path", _MEND), "camera_path")
+        width, height = get_size(content, "render_width", _REMEDY), get_size(content, "render_height", _REMEDY)
+        frames = _entries(get_value(content, "camera_path", _REMEDY), "camera_path")
         if not frames:
             raise InputError("key 'camera_path' is empty; a path needs at least one frame")
-        fps = number(content, "fps", _MEND) if "fps" in content else _rate(content, len(frames))
+        fps = get_number(content, "fps", _REMEDY) if "fps" in content else _rate(content, len(frames))
         cameras = _cameras(frames, "camera_path", "camera_to_world", width, height)
         keys = _cameras(_entries(content.get("keyframes", []), "keyframes"), "keyframes", "matrix", width, height)
         return CameraPath(cameras, fps, keys, content.get("is_cycle") is True)
@@ -188,7 +179,7 @@ def _rate(content: dict[str, Any], frames: int) -> float:
     """Frames a second where only `seconds` is known, or neither."""
     if "seconds" not in content:
         return DEFAULT_FPS
-    seconds = number(content, "seconds", _MEND)
+    seconds = get_number(content, "seconds", _REMEDY)
     if seconds <= 0:
         raise InputError(f"key 'seconds' is {seconds:g}; it must be above 0")
     return frames / seconds
@@ -216,19 +207,19 @@ def _camera(entry: dict[str, Any], pose_key: str, width: int, height: int) -> Ca
         try:
             entry = entry | {pose_key: json.loads(entry[pose_key])}
         except ValueError:
-            raise InputError(f"key {pose_key!r} is {kind(entry[pose_key])}; expected 16 numbers") from None
-    given = value(entry, pose_key, _MEND)
+            raise InputError(f"key {pose_key!r} is {describe(entry[pose_key])}; expected 16 numbers") from None
+    given = get_value(entry, pose_key, _REMEDY)
     nested = isinstance(given, list) and len(given) == 4
-    pose = matrix(entry, pose_key, (4, 4) if nested else (16,), _MEND).reshape(4, 4)
+    pose = get_matrix(entry, pose_key, (4, 4) if nested else (16,), _REMEDY).reshape(4, 4)
     if np.any(pose[3, :3] != 0.0) and np.all(pose[:3, 3] == 0.0):
         pose = pose.T  # the older viewer's keyframes go column by column
-    fov = number(entry, "fov", _MEND)
+    fov = get_number(entry, "fov", _REMEDY)
     if not 0 < fov < 180:
         raise InputError(f"key 'fov' is {fov:g}; expected degrees between 0 and 180")
     focal = height / (2 * math.tan(math.radians(fov) / 2))
     pixels = (focal, focal, width / 2, height / 2)
     if all(name in entry for name in _PIXELS):
-        pixels = tuple(number(entry, name, _MEND) for name in _PIXELS)  # type: ignore[assignment]
+        pixels = tuple(get_number(entry, name, _REMEDY) for name in _PIXELS)  # type: ignore[assignment]
     try:
         if np.any(pose[3] != [0.0, 0.0, 0.0, 1.0]):
             raise InputError("last row")

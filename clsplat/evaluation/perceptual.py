@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 # The trunk that torchvision fetches for the net "vgg" (its IMAGENET1K_V1); lpips brings what lies on top of it.
 VGG_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 VGG_MEGABYTES = 528
-_line = partial(reason_of, most=160)
+_line = partial(reason_of, max_length=160)
 _LEAST = 32  # px, of VGG's five halvings
 
 

@@ -1,1 +1,1 @@
-"""Files that know no splats."""
+"""Files and formats that do not depend on splats."""

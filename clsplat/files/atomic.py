@@ -1,4 +1,4 @@
-"""Writing files whole: a reader sees the old file or the new one, never half of one."""
+"""Atomic writes: a reader sees the old file or the new one, never a part of one."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import BinaryIO
 
 from ..errors import OutputError
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp(\..*)?")
 
 
 @contextmanager
 def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A binary stream that becomes `path` when the block ends well, and leaves nothing when it does not.
+    """Open a binary stream that becomes `path` if the block succeeds, and leaves no file if it fails.
 
-    Missing parent folders are made.
+    Missing parent folders are created.
 
     Raises
     ------
@@ -32,15 +32,17 @@ def atomic_writer(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """As `atomic_writer`, for what must be given a file's name: one to write to, with the suffix of `path`.
+    """Yield a temporary file name for code that cannot write to a stream; otherwise as `atomic_writer`.
+
+    The temporary name has the suffix of `path`.
 
     Raises
     ------
     OutputError : the folder or the file cannot be written.
     """
     target = Path(path)
-    # Beside the target, because os.replace is atomic within one file system only. Not tempfile: its files are
-    # private to the user (mode 0600), and the mode would stay.
+    # The temporary file lies beside the target because os.replace is atomic only within one file system. The tempfile
+    # module is not used: its files are private to the user (mode 0600), and the target would keep that mode.
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp{target.suffix}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -51,12 +53,12 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or str(error)
-        mend = "free some space, or choose another place" if error.errno in _FULL else "choose another place"
-        raise OutputError(f"{target}: cannot be written ({reason}); {mend}") from error
+        remedy = "free some space, or choose another place" if error.errno in _DISK_FULL else "choose another place"
+        raise OutputError(f"{target}: cannot be written ({reason}); {remedy}") from error
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what processes that were killed have left half written in a folder and below it."""
+    """Delete the half-written files of killed processes in a folder and its subfolders."""
     for path in folder.rglob(".*.tmp*"):
         match = _TEMPORARY.fullmatch(path.name)
         if match and not _is_running(int(match[1])):
@@ -65,7 +67,7 @@ def remove_leftovers(folder: Path) -> None:
 
 def _is_running(process: int) -> bool:
     if os.name == "nt":
-        return True  # os.kill would end it
+        return True  # os.kill would end the process
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):

@@ -1,4 +1,4 @@
-"""A report as one HTML page that needs nothing beside it: charts as inlined SVG, tables, markup of the caller's."""
+"""A report as one HTML page without other files: inlined SVG charts, tables, and the caller's markup."""
 
 from __future__ import annotations
 
@@ -33,12 +33,16 @@ th { vertical-align: bottom; white-space: normal; } th.text, td.text { text-alig
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with what stands below it, in this order.
+    """A heading and its content, in the order of these fields.
 
     Parameters
     ----------
-    text : paragraphs. chart : an SVG file. head, lines : a table. files : links, relative to the page.
-    markup : HTML of the caller's, put in as it is below the table.
+    title : the heading.
+    text : paragraphs.
+    chart : an SVG file.
+    head, lines : a table: its column names and its rows of cells.
+    files : links, relative to the page.
+    markup : HTML that is inserted unchanged below the table.
     """
 
     title: str
@@ -51,15 +55,16 @@ class Section:
 
 
 def write_page(path: Path, title: str, sections: Sequence[Section], style: str = "", script: str = "") -> Path:
-    """Write the page; returns its path.
+    """Write the page and return its path.
 
     Parameters
     ----------
-    style, script : CSS and JavaScript that the sections' markup needs.
+    style, script : CSS and JavaScript for the sections' markup.
 
     Raises
     ------
-    InputError : a chart cannot be read. OutputError : cannot be written.
+    InputError : a chart cannot be read.
+    OutputError : the page cannot be written.
     """
     body = "".join(_section(section, number) for number, section in enumerate(sections, 1))
     page = (
@@ -89,7 +94,7 @@ def _section(section: Section, number: int) -> str:
 
 
 def _inlined(path: Path, title: str, number: int) -> str:
-    """The SVG without its prologue, named for screen readers, with ids of its own among the page's charts."""
+    """Return the SVG without its prologue, with a name for screen readers and ids that are unique on the page."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -119,5 +124,5 @@ def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 
 def escape(text: str) -> str:
-    """Text as it stands in HTML, in attributes too."""
+    """Return text escaped for HTML, attributes included."""
     return html.escape(text)

@@ -1,7 +1,7 @@
-"""Image files: reading, writing PNG, resizing. The only module that knows Pillow.
+"""Image files: reading, writing and resizing. This is the only module that uses Pillow.
 
-Images are stored pixels: an EXIF orientation is not applied, because COLMAP and 3DGS do not apply it and
-camera poses refer to the pixels as stored. Only photos that have no poses yet are read upright.
+Images are read as stored: the EXIF orientation is not applied. COLMAP and 3DGS do not apply it either, and camera poses
+refer to the stored pixels. Only photos without poses are read upright.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-# At the top on purpose: Pillow must be loaded before pycolmap, or writing PNG corrupts the heap.
+# Pillow must be loaded before pycolmap, or writing PNG corrupts the heap. So this import stays at the top.
 from PIL import ExifTags, Image, ImageOps
 
 from ..errors import InputError, OutputError
@@ -23,21 +23,21 @@ from .image_names import JPEG_SUFFIXES
 
 ImageU8 = NDArray[np.uint8]
 
-_PHOTO_QUALITY = 97  # of a JPEG that is made of another: its error stays far below the first one's
+_PHOTO_QUALITY = 97  # of a JPEG made from another JPEG: the second compression adds little error to the first
 _ALPHA_MODES = ("RGBA", "RGBa", "LA", "La", "PA")
 _SIXTEEN_BIT_MODES = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 
 
 @dataclass(frozen=True)
 class PhotoHeader:
-    """What a photo's header says.
+    """The header of a photo.
 
     Parameters
     ----------
-    width, height : upright [px].
-    plain : 8-bit RGB or grey in JPEG or PNG, stored upright: every program reads the same pixels.
-    camera : maker, model and focal lengths by EXIF; photos with equal sizes and cameras have one lens.
-    exif : EXIF without the orientation, for a copy.
+    width, height : size of the upright photo [px].
+    plain : True for 8-bit RGB or grey in JPEG or PNG, stored upright; every program reads such photos alike.
+    camera : maker, model and focal lengths from EXIF; photos with equal sizes and cameras share one lens.
+    exif : EXIF data without the orientation, for a copy of the photo.
     """
 
     width: int
@@ -48,21 +48,21 @@ class PhotoHeader:
 
 
 def read_image(path: str | os.PathLike[str], upright: bool = False) -> ImageU8:
-    """Pixels of an image file.
+    """Return the pixels of an image file.
 
     Grey, palette and CMYK images become RGB; 16-bit grey is rounded to 8 bits, 16-bit colour keeps its high byte.
 
     Parameters
     ----------
-    upright : turn the image as its EXIF orientation says.
+    upright : whether to turn the image by its EXIF orientation.
 
     Returns
     -------
-    (H, W, 3), or (H, W, 4) with straight alpha where the file has transparency; uint8, 0..255.
+    (H, W, 3), or (H, W, 4) with straight alpha if the file has transparency; uint8, 0..255.
 
     Raises
     ------
-    InputError : the file is missing, damaged, or no image of a known kind.
+    InputError : the file is missing, damaged, or not an image of a supported format.
     """
     with _open(path) as stored:
         try:
@@ -79,43 +79,45 @@ def read_image(path: str | os.PathLike[str], upright: bool = False) -> ImageU8:
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """(width, height) [px] from the file's header alone.
+    """Return (width, height) [px], read from the file's header alone.
 
     Raises
     ------
-    InputError : the file is missing or no image of a known kind.
+    InputError : the file is missing or not an image of a supported format.
     """
     with _open(path) as image:
         return image.size
 
 
 def read_photo_header(path: str | os.PathLike[str]) -> PhotoHeader:
-    """Size, kind and camera. The header is enough, but for PNG, where EXIF may stand at the end.
+    """Return a photo's size, format and camera without decoding its pixels.
+
+    Only a PNG is read to its end, because its EXIF data may follow the pixels.
 
     Raises
     ------
-    InputError : the file is missing or no image of a known kind.
+    InputError : the file is missing or not an image of a supported format.
     """
     with _open(path) as image:
-        # Pillow shows 16-bit PNG in colour as RGB: the tile's raw mode tells, as long as nothing is decoded.
+        # Pillow reports 16-bit colour PNG as RGB. Before decoding, the tile's raw mode shows the true depth.
         deep = any(";16" in str(tile[-1]) for tile in getattr(image, "tile", ()))
         try:
             exif = image.getexif()
             orientation = exif.pop(ExifTags.Base.Orientation, 1)
             details = exif.get_ifd(ExifTags.IFD.Exif)
-            named = [
+            camera = [
                 exif.get(ExifTags.Base.Make),
                 exif.get(ExifTags.Base.Model),
                 details.get(ExifTags.Base.FocalLength),
                 details.get(ExifTags.Base.FocalLengthIn35mmFilm),
             ]
-            kept = exif.tobytes()
+            exif_bytes = exif.tobytes()
         except Exception:  # a damaged EXIF block raises nearly anything; the pixels may be sound
-            orientation, named, kept = 1, [], b""
+            orientation, camera, exif_bytes = 1, [], b""
         width, height = image.size[::-1] if orientation in (5, 6, 7, 8) else image.size
         plain = orientation == 1 and image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L") and not deep
         plain = plain and "transparency" not in image.info
-        return PhotoHeader(width, height, plain, tuple(str(value) for value in named if value), kept)
+        return PhotoHeader(width, height, plain, tuple(str(value) for value in camera if value), exif_bytes)
 
 
 def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU8) -> None:
@@ -123,25 +125,25 @@ def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU
 
     Parameters
     ----------
-    array : (H, W), (H, W, 3) or (H, W, 4); uint8, or real numbers that are clipped to 0..1 and rounded.
+    array : (H, W), (H, W, 3) or (H, W, 4), uint8 or real; real numbers are clipped to 0..1 and rounded.
 
     Raises
     ------
-    OutputError : not an image array, NaN in it, or the file cannot be written.
+    OutputError : the array is not an image or contains NaN, or the file cannot be written.
     """
     pixels = np.asarray(array)
     if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,), (4,)) or pixels.size == 0:
-        raise OutputError(f"{path}: shape {pixels.shape} is no image; expected (H, W) or (H, W, 3 or 4)")
+        raise OutputError(f"{path}: shape {pixels.shape} is not an image; expected (H, W) or (H, W, 3 or 4)")
     if pixels.dtype != np.uint8:
         if np.isnan(pixels).any():
-            raise OutputError(f"{path}: the image holds NaN; the render that made it went wrong")
+            raise OutputError(f"{path}: the image contains NaN; the render that made it failed")
         pixels = np.rint(np.clip(pixels, 0.0, 1.0) * 255.0).astype(np.uint8)
     with atomic_writer(path) as stream:
         Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="PNG")
 
 
 def write_photo(path: str | os.PathLike[str], pixels: ImageU8, exif: bytes = b"") -> None:
-    """Write (H, W, 3), or (H, W, 4) as PNG, atomically: JPEG of high quality by the name's ending, else PNG.
+    """Write a photo atomically: (H, W, 3) as JPEG of high quality or PNG by the suffix of `path`, (H, W, 4) as PNG.
 
     Raises
     ------
@@ -156,7 +158,7 @@ def write_photo(path: str | os.PathLike[str], pixels: ImageU8, exif: bytes = b""
 
 
 def encode_jpeg(pixels: ImageU8, quality: int = 88) -> bytes:
-    """(H, W, 3) as a JPEG file with colours at full resolution, for pages that hold their images themselves."""
+    """Return (H, W, 3) as the bytes of a JPEG file with colours at full resolution, for images inside HTML pages."""
     stream = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(
         stream, format="JPEG", quality=quality, subsampling=0, optimize=True
@@ -176,19 +178,23 @@ def write_grey16(path: str | os.PathLike[str], array: NDArray[np.uint16]) -> Non
 
 
 def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether an image of one (width, height) can be another at another scale, each side rounded to whole pixels."""
+    """Whether two sizes (width, height) can be one image at two scales, with each side rounded to whole pixels."""
     return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1]
 
 
 def resize_area(image: ImageU8, width: int, height: int) -> ImageU8:
-    """The image at another size [px], (height, width) or (height, width, 3 or 4); alpha weighs the colours.
+    """Return the image at another size [px].
 
-    Whole-number reductions take the mean of each block of pixels; all other sizes use Pillow's bicubic
-    filter, which widens when it reduces (3DGS's choice).
+    A reduction by whole numbers takes the mean of each block of pixels. Other sizes use Pillow's bicubic filter, as
+    3DGS does; Pillow widens the filter when it reduces an image. Colours are weighted by alpha.
+
+    Parameters
+    ----------
+    image : (H, W), (H, W, 3) or (H, W, 4).
 
     Raises
     ------
-    InputError : a size below 1.
+    InputError : width or height below 1.
     """
     if width < 1 or height < 1:
         raise InputError(f"resize: width x height is {width}x{height}; both must be at least 1")
@@ -212,6 +218,6 @@ def _open(path: str | os.PathLike[str]) -> Image.Image:
 
 def _unreadable(path: str | os.PathLike[str], error: Exception) -> InputError:
     reason = (str(error).splitlines() or [type(error).__name__])[0]
-    if "cannot identify" in reason:  # Pillow's message then repeats the path
-        reason = "not an image of a known kind"
+    if "cannot identify" in reason:  # Pillow's message would repeat the path
+        reason = "not an image of a supported format"
     return InputError(f"{path}: cannot be read as an image ({reason}); replace or remove the file")

@@ -1,4 +1,4 @@
-"""Fields of foreign JSON files, each checked, each complaint naming the key."""
+"""JSON files: reading, writing, and checked access to the fields of files that other programs wrote."""
 
 from __future__ import annotations
 
@@ -15,26 +15,34 @@ from ..errors import InputError
 from .atomic import atomic_writer
 
 
-def read_json(path: str | os.PathLike[str], choose: str) -> Any:
-    """What a JSON file holds. `choose`: the file to give instead, for messages.
+def read_json(path: str | os.PathLike[str], expected: str) -> Any:
+    """Return the content of a JSON file.
+
+    Parameters
+    ----------
+    expected : the kind of file to choose instead, for the error message.
 
     Raises
     ------
-    InputError : the file cannot be read or is no JSON.
+    InputError : the file cannot be read or is not JSON.
     """
     path = Path(path)
     try:
         return json.loads(path.read_bytes())
     except OSError as error:
         reason = error.strerror or str(error)
-        raise InputError(f"{path}: cannot be read ({reason}); check name and rights") from error
+        raise InputError(f"{path}: cannot be read ({reason}); check its name and permissions") from error
     except (ValueError, RecursionError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: is no JSON ({reason}); choose {choose}") from error
+        raise InputError(f"{path}: is not JSON ({str(error).splitlines()[0]}); choose {expected}") from error
 
 
 def read_object(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The JSON object in a file that clsplat wrote; InputError names the file and what is wrong."""
+    """Return the JSON object in a file that clsplat wrote.
+
+    Raises
+    ------
+    InputError : the file cannot be read, is not JSON, or holds something else than an object.
+    """
     values = read_json(path, "the file as clsplat wrote it")
     if not isinstance(values, dict):
         raise InputError(f"{path}: expected a JSON object")
@@ -42,67 +50,67 @@ def read_object(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Indented JSON, written whole or not at all."""
+    """Write indented JSON atomically."""
     with atomic_writer(path) as stream:
         stream.write((json.dumps(values, indent=1) + "\n").encode())
 
 
-def value(entry: dict[str, Any], key: str, mend: str) -> Any:
-    """The value of `key`; raises InputError with the `mend` where it is missing."""
+def get_value(entry: dict[str, Any], key: str, remedy: str) -> Any:
+    """Return the value of `key`; raises InputError with the `remedy` if the key is missing."""
     if key not in entry:
-        raise InputError(f"key {key!r} is missing; {mend}")
+        raise InputError(f"key {key!r} is missing; {remedy}")
     return entry[key]
 
 
-def number(entry: dict[str, Any], key: str, mend: str) -> float:
-    """A finite number; raises InputError."""
-    return _finite(value(entry, key, mend), key)
+def get_number(entry: dict[str, Any], key: str, remedy: str) -> float:
+    """Return the finite number at `key`; raises InputError."""
+    return _finite(get_value(entry, key, remedy), key)
 
 
-def size(entry: dict[str, Any], key: str, mend: str) -> int:
-    """A whole number of pixels, at least 1; raises InputError."""
-    real = number(entry, key, mend)
-    if real < 1 or real != int(real):
-        raise InputError(f"key {key!r} is {real:g}; expected a whole number of pixels, at least 1")
-    return int(real)
+def get_size(entry: dict[str, Any], key: str, remedy: str) -> int:
+    """Return the whole number of pixels at `key`, at least 1; raises InputError."""
+    number = get_number(entry, key, remedy)
+    if number < 1 or number != int(number):
+        raise InputError(f"key {key!r} is {number:g}; expected a whole number of pixels, at least 1")
+    return int(number)
 
 
-def matrix(entry: dict[str, Any], key: str, shape: tuple[int, ...], mend: str) -> NDArray[np.float64]:
-    """Finite numbers in nested lists of exactly `shape`, of one or two dimensions; raises InputError."""
-    given = value(entry, key, mend)
-    rows = given if len(shape) == 2 else [given]
-    right = isinstance(rows, list) and (len(shape) == 1 or len(rows) == shape[0])
-    if not right or not all(isinstance(row, list) and len(row) == shape[-1] for row in rows):
-        form = " x ".join(str(part) for part in shape)
+def get_matrix(entry: dict[str, Any], key: str, shape: tuple[int, ...], remedy: str) -> NDArray[np.float64]:
+    """Return the finite numbers at `key`, nested lists of exactly `shape` (1 or 2 dimensions); raises InputError."""
+    value = get_value(entry, key, remedy)
+    rows = value if len(shape) == 2 else [value]
+    has_rows = isinstance(rows, list) and (len(shape) == 1 or len(rows) == shape[0])
+    if not has_rows or not all(isinstance(row, list) and len(row) == shape[-1] for row in rows):
+        form = " x ".join(str(length) for length in shape)
         raise InputError(f"key {key!r} has the wrong form; expected {form} numbers in lists")
-    return np.array([[_finite(part, key) for part in row] for row in rows]).reshape(shape)
+    return np.array([[_finite(number, key) for number in row] for row in rows]).reshape(shape)
 
 
-def kind(given: object) -> str:
-    """What a JSON value is, in a word."""
-    if given is None or isinstance(given, bool):
-        return json.dumps(given)
-    if isinstance(given, str):
-        return f"the text {ascii(given)[:40]}"
-    if isinstance(given, (list, dict)):
-        return "a list" if isinstance(given, list) else "an object"
+def describe(value: object) -> str:
+    """Describe a JSON value in a few words, for error messages."""
+    if value is None or isinstance(value, bool):
+        return json.dumps(value)
+    if isinstance(value, str):
+        return f"the text {ascii(value)[:40]}"
+    if isinstance(value, (list, dict)):
+        return "a list" if isinstance(value, list) else "an object"
     return "a number"
 
 
-def to_real(given: object) -> float | None:
-    """A JSON number, infinite where it is too large; None of anything else."""
-    if isinstance(given, bool) or not isinstance(given, (int, float)):
+def to_real(value: object) -> float | None:
+    """Return a JSON number as a float, infinite if it is too large; None for any other value."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:
-        return float(given)
+        return float(value)
     except OverflowError:
         return math.inf
 
 
-def _finite(given: object, key: str) -> float:
-    real = to_real(given)
-    if real is None:
-        raise InputError(f"key {key!r} is {kind(given)}; expected a number")
-    if not math.isfinite(real):
+def _finite(value: object, key: str) -> float:
+    number = to_real(value)
+    if number is None:
+        raise InputError(f"key {key!r} is {describe(value)}; expected a number")
+    if not math.isfinite(number):
         raise InputError(f"key {key!r} is not finite; expected a number")
-    return real
+    return number

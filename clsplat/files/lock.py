@@ -1,4 +1,4 @@
-"""One run a folder: two that write into the same one would mix their files."""
+"""A lock on an output folder: two runs that write into the same folder would mix their files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .atomic import remove_leftovers
 
 try:
     import fcntl
-except ImportError:  # Windows: no lock
+except ImportError:  # Windows has no fcntl, so that folders are not locked there
     fcntl = None  # type: ignore[assignment]
 
 _held: set[Path] = set()
@@ -21,19 +21,18 @@ _held: set[Path] = set()
 
 @contextmanager
 def folder_lock(folder: Path | None) -> Iterator[None]:
-    """Keep other runs out of a folder while the block lasts; what a killed one has left half written is removed.
+    """Keep other runs out of a folder while the block lasts, and remove the half-written files of killed runs.
 
-    The lock is the operating system's, on the folder itself: it ends with the process, however that ends. A block
-    within a block of the same process, as of a search that trains, is the same writer. File systems that know no locks
-    have none.
+    The operating system holds the lock, on the folder itself, and releases it when the process ends in any way. Blocks
+    of one process may be nested: a search that trains takes the lock twice. File systems without locks are not locked.
 
     Parameters
     ----------
-    folder : that is there; None: nothing is written.
+    folder : an existing folder; None if nothing will be written.
 
     Raises
     ------
-    OutputError : another run writes into it.
+    OutputError : another run writes into the folder.
     """
     path = None if folder is None else folder.resolve()
     if path is None or path in _held or fcntl is None:
@@ -46,7 +45,7 @@ def folder_lock(folder: Path | None) -> Iterator[None]:
         except OSError as error:
             if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
                 raise OutputError(
-                    f"{folder}: another run writes into it: wait for its end, or choose another folder"
+                    f"{folder}: another run writes into it: wait until it ends, or choose another folder"
                 ) from None
         _held.add(path)
         try:

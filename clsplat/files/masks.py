@@ -1,4 +1,4 @@
-"""Masks beside photos: which pixels count. Black hides, white counts."""
+"""Masks beside photos show which pixels count: white pixels count, black pixels do not."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from .images import read_image
 
 Mask = NDArray[np.bool_]
 
-MASK_FOLDER = "masks"  # inside a scene, unless another is named
-NO_MASKS = "none"  # in the place of a folder
-_COUNTS = 127.5  # from this mean of the channels on
+MASK_FOLDER = "masks"  # default folder of masks inside a scene
+NO_MASKS = "none"  # the user's word for using no masks, in place of a folder's name
+_THRESHOLD = 127.5  # smallest mean of the channels of a pixel that counts
 
 
 def mask_files(folder: Path, names: list[str]) -> dict[str, Path]:
-    """The masks in a folder, by the names of their photos.
+    """Return the mask files in a folder by the names of their photos.
 
-    `sub/a.jpg` is masked by `sub/a.jpg.png` (COLMAP's form), `sub/a.png`, `sub/a.mask.png` or `sub/a.jpg`, whichever
-    is there first.
+    The mask of `sub/a.jpg` is the first existing file of `sub/a.jpg.png` (COLMAP's form), `sub/a.png`,
+    `sub/a.mask.png` and `sub/a.jpg`.
     """
     return {name: file for name in names for file in [_mask_of(folder, name)] if file is not None}
 
@@ -32,20 +32,18 @@ def _mask_of(folder: Path, name: str) -> Path | None:
 
 
 def read_mask(path: Path) -> Mask:
-    """(H, W), True where the photo's pixel counts.
+    """Return a mask, (H, W), True if the photo's pixel counts.
 
     Raises
     ------
-    InputError : the file is no image.
+    InputError : the file cannot be read as an image.
     """
-    counts: Mask = read_image(path)[:, :, :3].mean(axis=2) >= _COUNTS
-    return counts
+    return read_image(path)[:, :, :3].mean(axis=2) >= _THRESHOLD
 
 
 def resize_mask(mask: Mask, width: int, height: int) -> Mask:
-    """The mask at another size [px], each pixel from the nearest one."""
-    rows, columns = mask.shape
-    at_rows = ((np.arange(height) + 0.5) * rows / height).astype(int)
-    at_columns = ((np.arange(width) + 0.5) * columns / width).astype(int)
-    resized: Mask = mask[at_rows[:, None], at_columns]
-    return resized
+    """Return the mask at another size [px]; each pixel takes the value of the nearest old pixel."""
+    old_height, old_width = mask.shape
+    rows = ((np.arange(height) + 0.5) * old_height / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * old_width / width).astype(int)
+    return mask[rows[:, None], columns]

@@ -1,4 +1,4 @@
-"""Video files: H.264 in MP4, frame by frame. The only module that knows imageio."""
+"""Video files: H.264 in MP4, written frame by frame. This is the only module that uses imageio."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ..errors import InputError, OutputError
 from .atomic import atomic_path
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv")
-_QUALITY = "18"  # x264's rate factor: hardly told from the frames
-# Colours by BT.709 and said so, as players otherwise guess by the size of the image.
+_QUALITY = "18"  # x264's constant rate factor: hardly different from the frames by eye
+# Colours follow BT.709, and the file says so. Players would otherwise guess from the size of the image.
 _COLOURS = (
     "scale=out_color_matrix=bt709:out_range=tv,"
     "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv"
@@ -25,23 +25,27 @@ _OUTPUT = ["-crf", _QUALITY, "-vf", _COLOURS, "-movflags", "+faststart"]
 
 
 class VideoWriter:
-    """A video that becomes `path` when the `with` block ends well, and leaves nothing when it does not.
+    """A video that becomes `path` if the `with` block succeeds, and leaves no file if it fails.
 
-    Frames go to the encoder one by one. H.264 in yuv420p wants even sizes: an odd last column or row is repeated.
+    Frames go to the encoder one by one. H.264 in yuv420p needs even sizes, so an odd last column or row is repeated.
 
     Parameters
     ----------
-    path : ends in one of SUFFIXES. fps : frames a second, above 0.
+    path : file to write; its suffix is one of SUFFIXES.
+    fps : frames per second, above 0.
 
     Raises
     ------
-    InputError : another ending, or no encoder installed. OutputError : the file cannot be written.
+    InputError : another suffix, or no encoder is installed.
+    OutputError : the file cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], fps: float) -> None:
         self.path, self.fps = Path(path), float(fps)
         if self.path.suffix.lower() not in SUFFIXES:
-            raise InputError(f"{self.path}: no video of a known kind; end its name in {', '.join(SUFFIXES)}")
+            raise InputError(
+                f"{self.path}: not a supported video format; use one of the suffixes {', '.join(SUFFIXES)}"
+            )
         require_encoder()
         self.frames = 0
         self._writer: Any = None
@@ -57,17 +61,17 @@ class VideoWriter:
         try:
             self._finish(complete=kind is None)
         except OutputError as failure:
-            if kind is None:  # else the first error is the one to tell
+            if kind is None:  # otherwise the first error is raised
                 self._whole.__exit__(OutputError, failure, failure.__traceback__)
                 raise
         self._whole.__exit__(kind, error, trace)
 
     def write(self, frame: NDArray[np.uint8]) -> None:
-        """Add a frame, (H, W, 3) bytes, of the first one's size.
+        """Add a frame, (H, W, 3), of the first frame's size.
 
         Raises
         ------
-        OutputError : another size, or the encoder failed.
+        OutputError : the frame has another size, or the encoder failed.
         """
         height, width = frame.shape[:2]
         if self._writer is None:
@@ -76,7 +80,7 @@ class VideoWriter:
         if (height, width) != self._size:
             raise OutputError(
                 f"{self.path}: frame {self.frames} is {width}x{height} px, the first {self._size[1]}x"
-                f"{self._size[0]}; a video has one size: give --size"
+                f"{self._size[0]}; all frames of a video have one size: set --size"
             )
         even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         try:
@@ -102,7 +106,7 @@ class VideoWriter:
         )
 
     def _finish(self, complete: bool) -> None:
-        """Close the file and count its frames; raises OutputError."""
+        """Close the file and count its frames; raises OutputError if frames are missing."""
         import imageio_ffmpeg
 
         try:
@@ -111,11 +115,11 @@ class VideoWriter:
             if not complete:
                 return
             if not self.frames:
-                raise OutputError(f"{self.path}: has no frames; render at least one")
+                raise OutputError(f"{self.path}: the video has no frames; render at least one")
             written, _ = imageio_ffmpeg.count_frames_and_secs(str(self._temporary))
         except (OSError, RuntimeError) as error:
             raise self._failed(error) from error
-        if written != self.frames:  # the encoder's exit code is not passed on
+        if written != self.frames:  # imageio does not report the encoder's exit code
             raise OutputError(f"{self.path}: holds {written} of {self.frames} frames; check the disk's free space")
 
     def _failed(self, error: Exception) -> OutputError:
@@ -124,7 +128,7 @@ class VideoWriter:
 
 
 def require_encoder() -> None:
-    """Raises InputError where the extra `video` is not installed."""
+    """Check that the extra `video` is installed; raises InputError if not."""
     try:
         import imageio.v2  # noqa: F401
         import imageio_ffmpeg  # noqa: F401

@@ -138,7 +138,7 @@ class _Frame:
         if named is None:
             return None
         if not isinstance(named, str) or not named.isprintable() or not _can_be_name(named):
-            raise InputError(f"{self.place}: mask_path {named!r} is no name of a file; name a mask, or remove it")
+            raise InputError(f"{self.place}: mask_path {named!r} is not the name of a file; name a mask, or remove it")
         return self.document.path.parent / named.replace("\\", "/")
 
     def pose(self) -> NDArray[np.float64]:
@@ -234,7 +234,7 @@ class _Document:
     def photo_file(self, file_path: str, images: str | None = None) -> Path:
         """The photo's file; Blender sets leave the suffix out. Raises InputError where no file can have the name."""
         if not _can_be_name(file_path):
-            raise InputError(f"{self.path}: {ascii(file_path)[:60]} is no name of a photo; name a file beside it")
+            raise InputError(f"{self.path}: {ascii(file_path)[:60]} is not the name of a photo; name a file beside it")
         relative = Path(file_path.replace("\\", "/"))
         if images is not None and not relative.is_absolute():
             relative = Path(images, *relative.parts[1:] if len(relative.parts) > 1 else relative.parts)
@@ -255,7 +255,7 @@ class _Document:
         keys = ("train_filenames", "val_filenames", "test_filenames") if key is None else (key,)
         lists = [self.values.get(key) or [] for key in keys]
         if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
-            raise InputError(f"{self.path}: {' or '.join(keys)} is no list of photos; remove it or name files")
+            raise InputError(f"{self.path}: {' or '.join(keys)} is not a list of photos; remove it or name files")
         names = [name for names in lists for name in names]
         return {self.name_of(self.photo_file(name)) for name in names}
 
@@ -264,7 +264,9 @@ class _Document:
         folder, named = self.path.parent, self.values.get("ply_file_path")
         if isinstance(named, str) and named:
             if not named.isprintable() or not _can_be_name(named):
-                raise InputError(f"{self.path}: ply_file_path {named!r} is no name of a file; name a PLY, or remove it")
+                raise InputError(
+                    f"{self.path}: ply_file_path {named!r} is not the name of a file; name a PLY, or remove it"
+                )
             return read_point_cloud(folder / named)
         if (folder / "points3d.ply").is_file():
             return read_point_cloud(folder / "points3d.ply")

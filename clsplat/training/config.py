@@ -9,7 +9,7 @@ from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from ..errors import InputError
-from ..files.json_file import kind, to_real
+from ..files.json_file import describe, to_real
 from ..splats.color import BLACK, Color
 from ..splats.fields import MAX_SH_DEGREE
 from ..splats.shapes import DEFAULT_SHAPE, check_normalisation, shape_named
@@ -284,7 +284,7 @@ class TrainConfig:
     def from_json(cls, values: dict[str, Any]) -> TrainConfig:
         """The config that `to_json` gave; InputError on an unknown key, or a value that is of no such kind."""
         if not isinstance(values, dict):
-            raise InputError(f"config: is {kind(values)}; expected an object of options")
+            raise InputError(f"config: is {describe(values)}; expected an object of options")
         values = {key: value for key, value in values.items() if (key, value) not in REMOVED_OPTIONS.items()}
         known, hints = {field.name: field for field in dataclasses.fields(cls)}, get_type_hints(cls)
         unknown = sorted(set(values) - set(known))
@@ -293,7 +293,7 @@ class TrainConfig:
         given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         for key, value in given.items():
             if not (_is_a(value, hints[key]) or (value is None and known[key].default is None)):
-                raise InputError(f"config: {key} is {kind(values[key])}; expected {_expected(hints[key])}")
+                raise InputError(f"config: {key} is {describe(values[key])}; expected {_expected(hints[key])}")
         return cls(**given)
 
 

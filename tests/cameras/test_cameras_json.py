@@ -125,10 +125,10 @@ def test_faults_name_entry_and_key(file: Path, changes: dict[str, Any], said: st
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "is no JSON"),
-        ("[{]", "is no JSON"),
-        ("[" * 100_000, "is no JSON"),
-        ("\xff", "is no JSON"),
+        ("", "is not JSON"),
+        ("[{]", "is not JSON"),
+        ("[" * 100_000, "is not JSON"),
+        ("\xff", "is not JSON"),
         ('{"frames": []}', "holds an object; expected a list"),
         ("7", "holds a number"),
         ("[[]]", "entry 0: is a list"),

@@ -1,4 +1,4 @@
-"""Path files: nerfstudio's camera_path.json and our cameras.json, in and out, and their faults by name."""
+"""Path files: nerfstudio's camera_path.json and our cameras.json, written and read, and errors that name the fault."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera, write_cameras
-from clsplat.cameras.path import CameraPath, parse_path, path_text, read_path, write_path
+from clsplat.cameras.path import CameraPath, path_of, path_text, read_path, write_path
 from clsplat.errors import InputError
 
 WIDTH, HEIGHT = 640, 360
@@ -30,14 +30,14 @@ def some_cameras(n: int, off_centre: bool = False) -> tuple[Camera, ...]:
     return tuple(made)
 
 
-def same(left: Camera, right: Camera) -> None:
+def assert_same(left: Camera, right: Camera) -> None:
     for key in ("width", "height", "fx", "fy", "cx", "cy"):
         assert getattr(left, key) == pytest.approx(getattr(right, key), rel=1e-12)
     np.testing.assert_allclose(left.cam_from_world, right.cam_from_world, atol=1e-12)
 
 
 def nerfstudio(**changes: Any) -> dict[str, Any]:
-    """One frame at (1, 2, 3) with OpenGL's axes along the world's: it looks along -z, y up."""
+    """A path of two frames at (1, 2, 3) with OpenGL's axes: the camera looks along -z, and y points up."""
     pose = [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]
     base = {
         "camera_type": "perspective",
@@ -52,16 +52,16 @@ def nerfstudio(**changes: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("off_centre", [False, True])
 def test_round_trip(tmp_path: Path, off_centre: bool) -> None:
-    given = CameraPath(some_cameras(5, off_centre), 24.0, some_cameras(2, off_centre), closed=True)
-    write_path(tmp_path / "deep" / "path.json", given)
-    for read in (read_path(tmp_path / "deep" / "path.json"), parse_path(path_text(given))):
+    original = CameraPath(some_cameras(5, off_centre), 24.0, some_cameras(2, off_centre), closed=True)
+    write_path(tmp_path / "deep" / "path.json", original)
+    for read in (read_path(tmp_path / "deep" / "path.json"), path_of(json.loads(path_text(original)), "text")):
         assert (read.fps, read.closed) == (24.0, True)
-        for left, right in zip(read.cameras + read.keys, given.cameras + given.keys, strict=True):
-            same(left, right)
+        for left, right in zip(read.cameras + read.keys, original.cameras + original.keys, strict=True):
+            assert_same(left, right)
 
 
 def test_nerfstudios_axes_and_vertical_field_of_view() -> None:
-    path = parse_path(json.dumps(nerfstudio()))
+    path = path_of(nerfstudio(), "test")
     camera = path.cameras[0]
     assert (len(path.cameras), path.fps) == (2, 24)
     assert camera.fx == camera.fy == pytest.approx(50)  # 90 degrees over 100 px
@@ -80,14 +80,14 @@ def test_keyframes_of_both_of_nerfstudios_viewers() -> None:
     pose = np.array(nerfstudio()["camera_path"][0]["camera_to_world"], float).reshape(4, 4)
     new = {"matrix": pose.ravel().tolist(), "fov": 90, "aspect": 2}
     old = {"matrix": json.dumps(pose.T.ravel().tolist()), "fov": 90, "aspect": 2}
-    path = parse_path(json.dumps(nerfstudio(keyframes=[new, old])))
+    path = path_of(nerfstudio(keyframes=[new, old]), "test")
     for key in path.keys:
-        same(key, path.cameras[0])
+        assert_same(key, path.cameras[0])
 
 
 def test_rate_from_seconds() -> None:
-    assert parse_path(json.dumps(nerfstudio(fps="absent"))).fps == 1
-    assert parse_path(json.dumps(nerfstudio(fps="absent", seconds="absent"))).fps == 30
+    assert path_of(nerfstudio(fps="absent"), "test").fps == 1
+    assert path_of(nerfstudio(fps="absent", seconds="absent"), "test").fps == 30
 
 
 def test_a_cameras_json_is_a_path(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_a_cameras_json_is_a_path(tmp_path: Path) -> None:
     path = read_path(tmp_path / "cameras.json")
     assert path.seconds == pytest.approx(0.1)
     for left, right in zip(path.cameras, cameras, strict=True):
-        same(left, right)
+        assert_same(left, right)
 
 
 def frame(**changes: Any) -> dict[str, Any]:
@@ -142,17 +142,18 @@ def test_faults_name_file_and_field(tmp_path: Path, content: Any, words: list[st
         assert word in message
 
 
-def test_no_json_and_no_file(tmp_path: Path) -> None:
+def test_a_file_that_is_not_json_and_a_missing_file(tmp_path: Path) -> None:
     (tmp_path / "bad").write_text("{")
-    with pytest.raises(InputError, match="is no JSON"):
+    with pytest.raises(InputError, match="is not JSON"):
         read_path(tmp_path / "bad")
-    with pytest.raises(InputError, match="upload: is no JSON"):
-        parse_path(b"\xff", "upload")
+    (tmp_path / "bytes").write_bytes(b"\xff")
+    with pytest.raises(InputError, match="bytes: is not JSON"):
+        read_path(tmp_path / "bytes")
     with pytest.raises(InputError, match="cannot be read"):
         read_path(tmp_path / "none")
 
 
-def test_frames_of_two_sizes_are_no_camera_path() -> None:
+def test_frames_of_two_sizes_are_refused() -> None:
     first = some_cameras(1)[0]
     with pytest.raises(InputError, match="frame 1 is 64x36"):
         path_text(CameraPath((first, first.resized(64, 36))))

@@ -34,7 +34,7 @@ def test_a_few_options_are_enough(scene: Path, tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("[1]", "expected a JSON object"),
-        ("{", "is no JSON"),
+        ("{", "is not JSON"),
         ('{"colour": 1}', "unknown option 'colour'"),
         ('{"iterations": "many"}', "iterations is the text"),
         ('{"config": 3}', "config: is a number"),

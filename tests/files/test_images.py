@@ -98,7 +98,7 @@ def test_resize_to_nothing_is_refused() -> None:
         resize_area(np.zeros((2, 2, 3), dtype=np.uint8), 0, 3)
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning:PIL")  # Pillow warns of some damage; that is its right
+@pytest.mark.filterwarnings("ignore::UserWarning:PIL")  # Pillow may warn of damage
 @pytest.mark.parametrize("kind", ["png", "jpg", "tiff", "webp", "bmp", "gif"])
 def test_damaged_files_raise_input_error_only(tmp_path: Path, kind: str) -> None:
     rng = np.random.default_rng(3)

@@ -1,4 +1,4 @@
-"""Half-written files of killed processes go; those of living ones, and others' files, stay."""
+"""Half-written files of killed processes are removed; files of running processes and of other programs stay."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ with atomic_writer(Path(sys.argv[1])) as stream:
 """
 
 
-def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+def test_leftovers_of_a_killed_process_are_removed(tmp_path: Path) -> None:
     target = tmp_path / "deep" / "model.ply"
     target.parent.mkdir()
     target.write_bytes(b"old")
     subprocess.run([sys.executable, "-c", KILLED, str(target)], check=False)
     left = [path for path in target.parent.iterdir() if path != target]
     assert len(left) == 1
-    mine = (tmp_path / ".notes.1.tmpfile", tmp_path / ".tmp", tmp_path / f".a.{os.getppid()}.tmp")
-    for path in mine:
+    unrelated = (tmp_path / ".notes.1.tmpfile", tmp_path / ".tmp", tmp_path / f".a.{os.getppid()}.tmp")
+    for path in unrelated:
         path.write_bytes(b"")
     with atomic_path(tmp_path / "living.ply") as temporary:
         temporary.write_bytes(b"half")
@@ -40,4 +40,4 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
             assert temporary.exists()
     assert not left[0].exists()
     assert target.read_bytes() == b"old"
-    assert all(path.exists() for path in mine)
+    assert all(path.exists() for path in unrelated)

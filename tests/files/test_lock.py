@@ -1,4 +1,4 @@
-"""Two runs into one folder: the second is refused, until the first has ended in whatever way."""
+"""Two runs into one folder: the second is refused until the first has ended, in any way."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_another_process_keeps_out_until_it_ends(tmp_path: Path, end: signal.Sig
     process = holder(tmp_path)
     try:
         with pytest.raises(OutputError, match="another run writes into it"), folder_lock(tmp_path):
-            pytest.fail("came in")
+            pytest.fail("entered the locked folder")
     finally:
         process.send_signal(end)
         process.wait(10)
@@ -52,7 +52,7 @@ def test_blocks_within_a_block_are_one_writer(tmp_path: Path) -> None:
     with folder_lock(tmp_path):
         with folder_lock(tmp_path / "."):
             pass
-        assert refused(tmp_path), "the inner end has not let go"
+        assert refused(tmp_path), "the end of the inner block released the lock"
     assert not refused(tmp_path)
     with folder_lock(None):
         pass
@@ -63,8 +63,8 @@ def refused(folder: Path) -> bool:
     return "another run writes into it" in done.stderr
 
 
-def test_a_search_that_goes_on_keeps_its_findings(tmp_path: Path) -> None:
-    """Whoever takes its folder with --overwrite meanwhile is refused before anything is removed."""
+def test_a_running_search_keeps_its_results(tmp_path: Path) -> None:
+    """A second run with --overwrite is refused before it removes anything."""
     (tmp_path / FILE).write_text("{}")
     process = holder(tmp_path)
     try:

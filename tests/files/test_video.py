@@ -1,4 +1,4 @@
-"""Videos, decoded again: frames, size, rate and colours; nothing is left of one that was not finished."""
+"""Videos decoded again: frames, size, rate and colours. An unfinished video leaves no file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ imageio = pytest.importorskip("imageio.v2")
 
 
 def frame(index: int, height: int, width: int) -> np.ndarray:
-    """A bright square that moves to the right over a coloured slope."""
+    """A bright square that moves to the right over a colour gradient."""
     picture = np.empty((height, width, 3), np.uint8)
     picture[:] = np.linspace(40, 200, width)[None, :, None] * [1.0, 0.5, 0.25]
     picture[10:20, 4 * index : 4 * index + 10] = (230, 220, 60)
@@ -23,9 +23,9 @@ def frame(index: int, height: int, width: int) -> np.ndarray:
 
 
 def test_decoded_frames_are_those_written(tmp_path: Path) -> None:
-    given = [frame(index, 48, 80) for index in range(7)]
+    frames = [frame(index, 48, 80) for index in range(7)]
     with VideoWriter(tmp_path / "deep" / "v.mp4", 12.5) as video:
-        for picture in given:
+        for picture in frames:
             video.write(picture)
         assert not (tmp_path / "deep" / "v.mp4").exists()
     with imageio.get_reader(tmp_path / "deep" / "v.mp4") as reader:
@@ -33,14 +33,14 @@ def test_decoded_frames_are_those_written(tmp_path: Path) -> None:
     assert (about["codec"], about["size"], about["fps"]) == ("h264", (80, 48), 12.5)
     assert about["pix_fmt"] == "yuv420p(tv, bt709, progressive)"
     assert len(read) == 7
-    for picture, decoded in zip(given, read, strict=True):
+    for picture, decoded in zip(frames, read, strict=True):
         error = np.abs(picture.astype(int) - decoded)
         assert error.mean() < 3
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["v.mp4"]
 
 
 def test_colours_come_back(tmp_path: Path) -> None:
-    """Those of the file's own word on its colours: BT.601's would be 10 steps away."""
+    """The file states BT.709. A decoder that assumed BT.601 would be 10 steps off."""
     picture = np.empty((48, 80, 3), np.uint8)
     picture[:, :40], picture[:, 40:] = (20, 150, 60), (210, 60, 40)
     with VideoWriter(tmp_path / "v.mp4", 30) as video:
@@ -74,8 +74,8 @@ def test_nothing_is_left_of_an_interrupted_video(tmp_path: Path, error: type[Bas
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("v.mp4", b"old")]
 
 
-def test_faults_are_told(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"v\.avi: no video of a known kind"):
+def test_errors_name_the_fault(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"v\.avi: not a supported video format"):
         VideoWriter(tmp_path / "v.avi", 30)
     with pytest.raises(OutputError, match="no frames"), VideoWriter(tmp_path / "v.mp4", 30):
         pass

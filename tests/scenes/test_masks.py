@@ -130,7 +130,7 @@ def test_mask_path_of_a_frame(tmp_path: Path) -> None:
     view = load_scene(tmp_path, eval=False).views[0]
     assert view.mask is not None
     np.testing.assert_array_equal(view.mask, left_half())
-    bad = {"nowhere.png": "nowhere.png: no such image file", 3: "mask_path 3 is no name of a file"}
+    bad = {"nowhere.png": "nowhere.png: no such image file", 3: "mask_path 3 is not the name of a file"}
     for named, complaint in bad.items():
         (tmp_path / "transforms.json").write_text(json.dumps(document | {"frames": [frame | {"mask_path": named}]}))
         with pytest.raises(InputError, match=complaint):

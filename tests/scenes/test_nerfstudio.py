@@ -203,7 +203,7 @@ def in_frame(**values: Any) -> Callable[[Values], Values]:
         (changed(fl_x=-3), "fl_x is -3; it must be above 0"),
         (changed(fl_x=10**400), "it must be a number"),
         (changed(w=1e9), "w x h is 1000000000 x 30"),
-        (changed(test_filenames=True), "is no list of photos"),
+        (changed(test_filenames=True), "is not a list of photos"),
         (changed(fl_x="wide"), "fl_x is 'wide'; it must be a number"),
         (changed(fl_x=None, fl_y=None, camera_angle_x=4.0), "camera_angle_x is 4; an angle of view is below pi"),
         (changed(w=0), "w x h is 0 x 30"),
@@ -211,7 +211,7 @@ def in_frame(**values: Any) -> Callable[[Values], Values]:
         (changed(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR' has no pinhole image"),
         (changed(ply_file_path="gone.ply"), r"gone\.ply: cannot be read"),
         (changed(ply_file_path="images"), "images: cannot be read"),
-        (changed(test_filenames=[1]), "is no list of photos"),
+        (changed(test_filenames=[1]), "is not a list of photos"),
         (in_frame(transform_matrix=[[1, 2], [3, 4]]), "frame 1: transform_matrix must be 4 x 4"),
         (in_frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "frame 1: transform_matrix has no rotation"),
         (in_frame(transform_matrix=None), "frame 1: transform_matrix must be"),
@@ -231,7 +231,7 @@ def test_faults_are_named(folder: Path, change: Callable[[Values], Values], said
 def test_damaged_files_are_named(folder: Path, text: str) -> None:
     file = folder / "transforms.json"
     file.write_text(text)
-    with pytest.raises(InputError, match=r"transforms\.json: (is no JSON|has no list)"):
+    with pytest.raises(InputError, match=r"transforms\.json: (is not JSON|has no list)"):
         read_transforms([file])
 
 

@@ -100,7 +100,7 @@ def test_options_come_back() -> None:
 @pytest.mark.parametrize(
     ("config", "said"),
     [
-        ("[" * 100_000, "is no JSON"),
+        ("[" * 100_000, "is not JSON"),
         ('{"config": {"background": [0, 0, NaN]}}', "background"),
         ('{"config": {"background": [0, 0, 2]}}', "from 0 to 1"),
         ('{"scene": {"test_names": [3]}}', "must be names"),

@@ -23,7 +23,7 @@ from viewer_client import Client
 from websockets.exceptions import ConnectionClosed
 
 from clsplat.cameras.cameras_json import NamedCamera
-from clsplat.cameras.path import parse_path
+from clsplat.cameras.path import path_of
 from clsplat.errors import OutputError
 from clsplat.splats.splats import Splats
 from clsplat.viewer.camera import Pose, camera_of
@@ -268,7 +268,7 @@ def test_a_path_is_recorded_and_saved(running: Running, tmp_path: Path) -> None:
         started = [m for m in client.received if m["type"] == "FileTransferStartDownload"]
         content = b"".join(bytes(m["content"]) for m in client.received if m["type"] == "FileTransferPart")
     assert started[0]["filename"] == "camera_path.json"
-    path = parse_path(content)
+    path = path_of(json.loads(content), "download")
     assert content == (folder / "camera_path_001.json").read_bytes()
     assert len(path.keys) == 3
     assert np.allclose(path.cameras[-1].position, (2, 0, -3), atol=1e-6)
