@@ -14,7 +14,7 @@ from clsplat.cameras.camera import Camera
 from clsplat.errors import InputError
 from clsplat.rendering.renderer import Rendered, Renderer
 from clsplat.splats.splats import Splats
-from clsplat.splats.transform import joined, placed, similarity
+from clsplat.splats.transform import joined, similarity, transformed
 
 from .lens import moved
 
@@ -103,7 +103,7 @@ class Studio:
         if self._joined is None or self._joined[0] != key:
             for item in objects:
                 placement(item)
-            self._joined = (key, joined([placed(self._read(item), item.matrix) for item in objects]))
+            self._joined = (key, joined([transformed(self._read(item), item.matrix) for item in objects]))
         return self._joined[1]
 
     def _between(self, splats: Splats, camera: Camera, clip: tuple[float, float]) -> Splats:

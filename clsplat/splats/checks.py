@@ -1,4 +1,4 @@
-"""What the arrays of a model must be: the one check that files and `Splats` share."""
+"""Checks of the arrays of a model, shared by files and `Splats`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import numpy as np
 from ..errors import InputError
 from .fields import MAX_SH_DEGREE, Array, Field, Schema, public_shape, sh_coefficients
 
-# A quaternion's (or direction's) squared norm must neither vanish nor overflow in float32 (1.2e-38 to 3.4e38).
+# The squared norm of a quaternion or direction must neither vanish nor overflow in float32 (1.2e-38 to 3.4e38).
 QUAT_NORM_MIN, QUAT_NORM_MAX = 1e-15, 1e15
-# A vector stored at its limit may round up in float32.
-LIMIT_SLACK = 1e-5
+LIMIT_SLACK = 1e-5  # relative; a vector at its limit may round up in float32
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,9 +21,9 @@ class Fault:
 
     Parameters
     ----------
-    index : which splat.
-    component : position within the splat, () where the whole vector is at fault.
-    what : the value and the rule it breaks.
+    index : number of the splat.
+    component : position within the splat, or () if the whole vector is at fault.
+    what : the value and the rule that it breaks.
     """
 
     index: int
@@ -33,11 +32,11 @@ class Fault:
 
 
 def first_fault(field: Field, values: Array) -> Fault | None:
-    """First value of `field` that no model may hold, or None.
+    """Return the first value of `field` that a model must not hold, or None.
 
     Parameters
     ----------
-    values : the field's public array (see `schema.public_shape`).
+    values : the public array of the field (see `fields.public_shape`).
     """
     finite = np.isfinite(values)
     if not finite.all():
@@ -68,18 +67,18 @@ def first_fault(field: Field, values: Array) -> Fault | None:
 
 
 def sh_degree_for(arrays: Mapping[str, Array]) -> int:
-    """The SH degree that `arrays["sh"]` has, or the one nearest below, which `check_arrays` then names."""
+    """Return the SH degree of `arrays["sh"]`, or the next lower one, so that `check_arrays` names the fault."""
     sh = arrays.get("sh")
     coefficients = sh.shape[1] if sh is not None and sh.ndim == 3 else 1
     return max((d for d in range(MAX_SH_DEGREE + 1) if sh_coefficients(d) <= coefficients), default=0)
 
 
 def check_arrays(schema: Schema, arrays: Mapping[str, Array]) -> None:
-    """Check that `arrays` is a whole and usable model of `schema`.
+    """Check that `arrays` is a complete and usable model of `schema`.
 
     Raises
     ------
-    InputError : a field missing or unknown, a shape that does not fit, or an unusable value; it names
+    InputError : a field is missing or unknown, an array has a wrong shape, or a value is unusable. The message names
         field, splat and value.
     """
     unknown = [name for name in arrays if name not in schema]

@@ -1,9 +1,9 @@
-"""`.splat` files, as viewers in the browser read them: 32 bytes a splat, no header, Gaussians of one colour each.
+"""`.splat` files for browser viewers: 32 bytes for each Gaussian of one colour, without a header.
 
     float32 x, y, z     float32 scale x, y, z (linear)     uint8 red, green, blue, opacity     uint8 w, x, y, z
 
-A quaternion's component c is 128 + 128 c, to whole numbers. The most important splats (volume times opacity) come
-first, because viewers show what has arrived.
+A quaternion component c is stored as 128 + 128 c, rounded. The most important splats (volume times opacity) come first,
+because viewers show the splats that have arrived.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from .splats import SH_C0, Splats
 
 RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("quaternion", "u1", 4)])
 
-_LOGIT_MAX = 15.0  # of an opacity of 0 or 255
-_LEAST_SCALE = 1e-30  # some files have zeros
+_LOGIT_MAX = 15.0  # the logit of a stored opacity of 255; its negative is that of 0
+_MIN_SCALE = 1e-30  # some files have zeros
 
 
 def write_splat(path: str | os.PathLike[str], splats: Splats) -> None:
-    """Write Gaussians; their SH bands above 0 are left out.
+    """Write Gaussians without their SH bands above 0.
 
     Raises
     ------
-    InputError : another shape than the Gaussian. OutputError : cannot be written.
+    InputError : the shape is not Gaussian. OutputError : the file cannot be written.
     """
     if splats.shape != GAUSSIAN.name:
         raise InputError(f"{path}: .splat files hold Gaussians, not {splats.shape} splats; convert them first")
@@ -39,11 +39,11 @@ def write_splat(path: str | os.PathLike[str], splats: Splats) -> None:
 
 
 def read_splat(path: str | os.PathLike[str]) -> Splats:
-    """The Gaussians of a file, of SH degree 0.
+    """Read Gaussians of SH degree 0.
 
     Raises
     ------
-    InputError : cannot be read, no whole number of splats, or an unusable value.
+    InputError : the file cannot be read, has a wrong length, or holds an unusable value.
     """
     path = Path(path)
     try:
@@ -52,14 +52,14 @@ def read_splat(path: str | os.PathLike[str]) -> Splats:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check name and rights") from None
     if len(data) % RECORD.itemsize:
         raise InputError(
-            f"{path}: is no .splat file ({len(data)} bytes, no multiple of {RECORD.itemsize}); export it again"
+            f"{path}: is not a .splat file ({len(data)} bytes is not a multiple of {RECORD.itemsize}); export it again"
         )
     table = np.frombuffer(data, RECORD)
-    with np.errstate(all="ignore"):  # what is not finite is found and named by the check
+    with np.errstate(all="ignore"):  # the check finds and names values that are not finite
         logit = np.clip(GAUSSIAN.raw_opacity(table["colour"][:, 3] / 255.0), -_LOGIT_MAX, _LOGIT_MAX)
         arrays = {
             "mean": table["position"],
-            "log_scale": np.log(np.maximum(table["scale"], _LEAST_SCALE)),
+            "log_scale": np.log(np.maximum(table["scale"], _MIN_SCALE)),
             "quat": table["quaternion"] / 128.0 - 1.0,
             "opacity_logit": logit,
             "sh": ((table["colour"][:, :3] / 255.0 - 0.5) / SH_C0)[:, None],
@@ -71,7 +71,7 @@ def read_splat(path: str | os.PathLike[str]) -> Splats:
 
 
 def records(splats: Splats) -> NDArray[np.void]:
-    """(N,) of RECORD, the most important first."""
+    """Return (N,) values of RECORD, the most important splats first."""
     opacity: NDArray[np.float64] = GAUSSIAN.opacity(splats.opacity_logit.astype(np.float64)).astype(np.float64)
     scale = np.exp(np.clip(splats.log_scale.astype(np.float64), -80.0, 80.0))
     quat = splats.quat.astype(np.float64)
@@ -85,5 +85,4 @@ def records(splats: Splats) -> NDArray[np.void]:
 
 
 def _bytes(values: NDArray[np.float64], factor: float) -> NDArray[np.uint8]:
-    rounded: NDArray[np.uint8] = np.clip(np.rint(factor * values), 0, 255).astype(np.uint8)
-    return rounded
+    return np.clip(np.rint(factor * values), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Real spherical harmonics to degree 3 in NumPy, as cl/math/harmonics.clh has them (the basis and signs of 3DGS)."""
+"""Real spherical harmonics up to degree 3 in NumPy, with the basis and signs of 3DGS and cl/math/harmonics.clh."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def sh_basis(direction: NDArray[Any], degree: int) -> NDArray[Any]:
-    """Values of the basis in unit directions (N, 3), to `degree`: (N, (degree + 1)^2), of the same dtype."""
+    """Return the basis (N, (degree + 1)^2) in unit directions (N, 3), with the same dtype."""
     x, y, z = direction.T
     xx, yy, zz = x * x, y * y, z * z
     bands = [

@@ -1,18 +1,18 @@
-"""Splats in an order in which neighbours in space are neighbours in memory: caches of the device like it."""
+"""Morton order: neighbours in space become neighbours in memory, which helps the caches of the device."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-_BITS = 10  # of each axis
+_BITS = 10  # bits for each axis
 
 
 def morton_order(mean: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Indices of points (N, 3) along a Z-order curve (Morton 1966).
+    """Return the indices of points (N, 3) along a Z-order curve (Morton 1966).
 
-    Each axis is cut by rank into 2^10 parts with as many points each, so that far points leave near ones their
-    detail. Ties keep their order.
+    Each axis is divided by rank into 2^10 parts with equal numbers of points. So distant points do not make the grid
+    too coarse for the others. Ties keep their order.
     """
     code = np.zeros(len(mean), np.uint32)
     for axis in range(3):

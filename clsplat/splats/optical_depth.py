@@ -1,6 +1,6 @@
-"""Opacities by their optical thickness -log(1 - |o|): exact for opaque and for nearly transparent splats.
+"""Optical depth -log(1 - |o|) of opacities: exact for opaque and for nearly transparent splats.
 
-A stack of N equal splats is N times as thick as one. A signed opacity keeps its sign throughout.
+The optical depth of a stack of N equal splats is N times that of one. A signed opacity keeps its sign.
 """
 
 from __future__ import annotations
@@ -14,41 +14,37 @@ from numpy.typing import NDArray
 from .fields import Array, DoubleArray
 from .shapes import Shape
 
-THINNEST = 1e-37  # its raw value is finite in float32
-FARTHEST = 1e15  # coordinate; what SGHMC has thrown beyond never comes back, and breaks the bounds of viewers
+MIN_DEPTH = 1e-37  # the smallest optical depth; its raw value is finite in float32
+MAX_COORDINATE = 1e15  # SGHMC can throw a splat farther; it never returns, and viewers cannot bound it
 
 _NAMES = ("opacity_logit", "opacity_minus_logit")
 
 
 def opacity_names(arrays: Mapping[str, Array]) -> tuple[str, ...]:
-    """The opacities that a model has: one, or one for each side of a plane (plus, minus)."""
+    """Return the names of the opacity fields of a model: one, or one for each side of a plane (plus, minus)."""
     return tuple(name for name in _NAMES if name in arrays)
 
 
 def finite_rows(arrays: Mapping[str, Array]) -> NDArray[np.bool_]:
-    """(N,) whether all parameters of a splat are finite, and its position is one that can be squared in float32."""
+    """Return (N,) whether all parameters are finite and the square of the position is finite in float32."""
     finite = np.ones(len(arrays["mean"]), np.bool_)
-    finite &= (np.abs(arrays["mean"]) <= FARTHEST).all(axis=1)  # False for a NaN
+    finite &= (np.abs(arrays["mean"]) <= MAX_COORDINATE).all(axis=1)  # this is False for a NaN
     for array in arrays.values():
         finite &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     return finite
 
 
-def thickness(shape: Shape, raw: Array) -> DoubleArray:
-    """-log(1 - |o|) of the raw values of an opacity."""
+def optical_depth(shape: Shape, raw: Array) -> DoubleArray:
+    """Return -log(1 - |o|) for the raw values of an opacity."""
     wide = raw.astype(np.float64)
-    thick: DoubleArray = (
-        np.logaddexp(0.0, 2.0 * np.abs(wide)) - math.log(2.0) if shape.signed else np.logaddexp(0.0, wide)
-    )
-    return np.maximum(thick, 0.0)
+    depth = np.logaddexp(0.0, 2.0 * np.abs(wide)) - math.log(2.0) if shape.signed else np.logaddexp(0.0, wide)
+    return np.maximum(depth, 0.0)
 
 
-def raw_of_thickness(shape: Shape, thick: DoubleArray, old: Array) -> DoubleArray:
-    """Raw values of |o| = 1 - exp(-thick), with the sign of the raw values `old` where opacities have one."""
-    thick = np.maximum(thick, THINNEST)
-    opacity = -np.expm1(-thick)
+def raw_of_optical_depth(shape: Shape, depth: DoubleArray, old: Array) -> DoubleArray:
+    """Return the raw values of |o| = 1 - exp(-depth); signed opacities get the sign of the raw values `old`."""
+    depth = np.maximum(depth, MIN_DEPTH)
+    opacity = -np.expm1(-depth)
     if shape.signed:  # artanh
-        raw: DoubleArray = np.copysign(0.5 * (np.log1p(opacity) + thick), old)
-        return raw
-    raw = np.log(opacity) + thick
-    return raw
+        return np.copysign(0.5 * (np.log1p(opacity) + depth), old)
+    return np.log(opacity) + depth

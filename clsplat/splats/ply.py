@@ -1,11 +1,11 @@
-"""Splat models as PLY files, in 3DGS's layout, so that every viewer of the field opens them.
+"""Splat models as PLY files in the layout of 3DGS, so that other viewers open them.
 
-Columns in this order, all float32: `x y z`, `nx ny nz` (zeros), `f_dc_0..2`, `f_rest_*` (channel-major: all
-of red, then green, then blue), `opacity` (logit), `scale_0..2` (natural log), `rot_0..3` (w, x, y, z, any
-norm), then the shape's own columns. The header names the kernel:
-`comment clsplat shape=<name> normalisation=<peak|pdf|none>`. Models of antialiased training have
-`comment SplatRenderMode: mip`, as other programs write it. Compact files (ply_compact.py) leave out what no splat uses,
-and have what few splats use in elements after the vertices.
+All columns are float32, in this order: `x y z`, `nx ny nz` (zeros), `f_dc_0..2`, `f_rest_*`, `opacity` (logit),
+`scale_0..2` (natural log), `rot_0..3` (w, x, y, z of any norm), then the columns of the shape. `f_rest_*` has all of
+red, then green, then blue. The header names the kernel:
+`comment clsplat shape=<name> normalisation=<peak|pdf|none>`. Models from antialiased training have
+`comment SplatRenderMode: mip`, which other programs write as well. Compact files (ply_compact.py) leave out unused
+values and store rarely used ones in elements after the vertices.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ from .fields import (
     sh_field,
 )
 from .ply_body import read_body
-from .ply_compact import Table, filled_in, plan_layout, side_fields, side_tables
+from .ply_compact import SideTable, filled_in, plan_layout, side_fields, side_tables
 from .ply_header import REAL_TYPES, Header, read_header
 from .shapes import GAUSSIAN, NORMALISATIONS, SHAPES, Shape, check_normalisation, shape_named
 
 _NORMALS = ("nx", "ny", "nz")
 _COMMENT = "clsplat"
 _ANTIALIASED = "SplatRenderMode: mip"
-_ANTIALIASED_ELSEWHERE = "antialiased 1"  # PostShot's
+_ANTIALIASED_ELSEWHERE = "antialiased 1"  # as PostShot writes it
 _REST_COUNTS = (0, 9, 24, 45)  # f_rest_* of SH degree 0 to 3
 
 
 @dataclass(frozen=True, slots=True)
 class PlyModel:
-    """What a splat PLY file holds.
+    """The content of a splat PLY file.
 
     Parameters
     ----------
     shape, normalisation : names of the kernel and its normalisation. antialiased : see `Splats`.
-    arrays : public arrays by field name; float32, or float64 where every property is `double`.
+    arrays : public arrays by field name; float32, or float64 if every property is `double`.
     """
 
     shape: str
@@ -63,15 +63,15 @@ class PlyModel:
 
 
 def read_ply(path: str | os.PathLike[str]) -> PlyModel:
-    """Read a splat model: binary of either byte order, or ascii; whole or compact; properties found by name.
+    """Read a splat model, whole or compact, from a binary file of either byte order or an ascii file.
 
-    A file without clsplat's comment is the first shape that has just its columns, else Gaussian. A file with it must
-    have all columns of its shape. Normals are ignored.
+    Properties are found by name; normals are ignored. A file with the comment of clsplat must have all columns of its
+    shape. A file without it is read as the first shape that has exactly its columns, else as Gaussians.
 
     Raises
     ------
-    InputError : not a splat file, truncated or too long, a property missing, unknown or not float, or an
-        unusable value; it names file, property and vertex.
+    InputError : the file is not a splat file, or has a wrong length; a property is missing, unknown or not float; or
+        a value is unusable. The message names file, property and vertex.
     """
     path = Path(path)
     try:
@@ -115,21 +115,21 @@ def write_ply(
     Parameters
     ----------
     arrays : every field of the shape, by name, in its public shape.
-    compact : leave out what the splats do not use (ply_compact.py); `read_ply` gives the same splats, with SH up to
-        the highest band in use.
+    compact : leave out the values that the splats do not use (ply_compact.py). `read_ply` then returns the same
+        splats, with SH up to the highest band in use.
 
     Raises
     ------
-    InputError : unknown shape or normalisation, or arrays that are no usable model in float32.
+    InputError : the shape or normalisation is unknown, or the arrays are not a usable model in float32.
     OutputError : the file cannot be written.
     """
     check_normalisation(normalisation)
-    with np.errstate(over="ignore"):  # what overflows is found and named by the check
+    with np.errstate(over="ignore"):  # the check finds and names values that overflow
         single = {name: np.asarray(values).astype(np.float32) for name, values in arrays.items()}
     schema = shape_named(shape).schema(sh_degree_for(single))
     check_arrays(schema, single)
     n = len(single["mean"])
-    tables: list[Table] = []
+    tables: list[SideTable] = []
     if compact:
         layout = plan_layout(schema, single)
         tables = side_tables(schema, single, layout)
@@ -156,16 +156,16 @@ def write_ply(
 
 
 def _file_order(schema: Schema) -> list[str]:
-    """All property names in 3DGS's order, the shape's own last."""
-    own = [f for f in schema if f.group is Group.GEOM and f not in CORE]
+    """Return all property names in the order of 3DGS, those of the shape last."""
+    shape_fields = [f for f in schema if f.group is Group.GEOM and f not in CORE]
     names = [*MEAN.ply, *_NORMALS]
-    for field in (schema["sh"], OPACITY_LOGIT, LOG_SCALE, QUAT, *own):
+    for field in (schema["sh"], OPACITY_LOGIT, LOG_SCALE, QUAT, *shape_fields):
         names += field.ply
     return names
 
 
 def _column(field: Field, component: tuple[int, ...]) -> int:
-    """Place of one component among the field's property names."""
+    """Return the place of one component among the property names of the field."""
     if field.group is not Group.SH:
         return component[0] if component else 0
     k, channel = component
@@ -173,16 +173,16 @@ def _column(field: Field, component: tuple[int, ...]) -> int:
 
 
 def _channel_major(sh: Array) -> Array:
-    """(N, K, 3) to (N, 3 K) in file order: f_dc, then f_rest channel by channel."""
+    """Reorder (N, K, 3) to (N, 3 K) as in the file: f_dc, then f_rest channel by channel."""
     n, k, _ = sh.shape
     return np.concatenate([sh[:, 0], sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (k - 1))], axis=1)
 
 
 def _gather(field: Field, columns: Mapping[str, Array], n: int) -> Array:
-    """The field's public array."""
+    """Return the public array of the field."""
     double = all(values.dtype == np.float64 for values in columns.values())
     dtype = np.dtype(np.float64 if double else np.float32)
-    with np.errstate(over="ignore"):  # what overflows is found and named by the check
+    with np.errstate(over="ignore"):  # the check finds and names values that overflow
         flat = np.stack([columns[name].astype(dtype) for name in field.ply], axis=1)
     if field.group is Group.SH:
         rest = flat[:, 3:].reshape(n, 3, field.width // 3 - 1).transpose(0, 2, 1)
@@ -198,7 +198,7 @@ def _refuse_point_cloud(path: Path, header: Header) -> None:
 
 
 def _kernel(path: Path, header: Header) -> tuple[Shape, str]:
-    """Shape and normalisation, from clsplat's comment or else from the columns present."""
+    """Return shape and normalisation, from the comment of clsplat or else from the columns."""
     for comment in header.comments:
         words = comment.split()
         values = dict(word.split("=", 1) for word in words[1:] if "=" in word)
@@ -211,16 +211,16 @@ def _kernel(path: Path, header: Header) -> tuple[Shape, str]:
             raise InputError(f"{path}: comment {comment[:80]!r}: {error}") from None
     columns = {shape.name: {name for field in shape.fields for name in field.ply} for shape in SHAPES.values()}
     held = [name for element in header.elements for name in element.names]
-    own = set(held) & set().union(*columns.values())  # of any shape
-    if not own:
+    shape_columns = set(held) & set().union(*columns.values())
+    if not shape_columns:
         return GAUSSIAN, NORMALISATIONS[0]
-    # Where none has just these, the one that lacks least: what it lacks is then named.
-    some = [shape for shape in SHAPES.values() if columns[shape.name] & own]
-    return min(some, key=lambda shape: len(columns[shape.name] ^ own)), NORMALISATIONS[0]
+    # If no shape has exactly these columns, the closest one is chosen; the error then names the missing column.
+    candidates = [shape for shape in SHAPES.values() if columns[shape.name] & shape_columns]
+    return min(candidates, key=lambda shape: len(columns[shape.name] ^ shape_columns)), NORMALISATIONS[0]
 
 
 def _schema(path: Path, header: Header, shape: Shape) -> Schema:
-    """Schema of the file's columns; raises InputError where they do not make one."""
+    """Return the schema of the columns; raise InputError if they do not form one."""
     names = set(header.names)
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in _REST_COUNTS:
@@ -231,13 +231,13 @@ def _schema(path: Path, header: Header, shape: Shape) -> Schema:
     needed = set(_file_order(schema)) - set(_NORMALS) - moved
     missing = [name for name in _file_order(schema) if name in needed - names]
     if missing:
-        own = any(missing[0] in field.ply for field in shape.fields)
-        mend = (
+        of_shape = any(missing[0] in field.ply for field in shape.fields)
+        remedy = (
             f"shape {shape.name} has it; export the shape's columns, or name the shape that the file holds"
-            if own
+            if of_shape
             else "export all of 3DGS's properties"
         )
-        raise InputError(f"{path}: property {missing[0]!r} is missing; {mend}")
+        raise InputError(f"{path}: property {missing[0]!r} is missing; {remedy}")
     for kind, name in header.properties:
         if name not in needed and name not in _NORMALS:
             raise InputError(f"{path}: property {name!r} is unknown for shape {shape.name}; remove it")

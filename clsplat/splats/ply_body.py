@@ -1,4 +1,4 @@
-"""The body of a PLY file: columns of numbers, element after element, in any of the three encodings."""
+"""Reader of PLY bodies: columns of numbers for each element, in any of the three encodings."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _CODES = REAL_TYPES | INTEGER_TYPES
 
 
 def read_body(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[str, NDArray[Any]]]:
-    """Columns by name, of each element by name, in their own types and the machine's byte order.
+    """Return, for each element name, its columns by name, in their types and the byte order of the machine.
 
     Parameters
     ----------
-    stream : at the first byte after the header.
+    stream : the file, at the first byte after the header.
 
     Raises
     ------
-    InputError : shorter or longer than the header says, or text that is no number; found before anything as large as
-        the header claims is allocated.
+    InputError : the body is shorter or longer than the header says, or a text is not a number. A wrong length is found
+        before memory for the claimed length is allocated.
     """
     read = _read_ascii if header.encoding == "ascii" else _read_binary
     return read(path, stream, header)
@@ -52,15 +52,15 @@ def _read_binary(path: object, stream: BinaryIO, header: Header) -> dict[str, di
 def _read_ascii(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[str, NDArray[Any]]]:
     expected = sum(element.count * len(element.properties) for element in header.elements)
     text = stream.read()
-    # Every value takes a digit and a separator, so the file's size bounds the count.
+    # Every value takes a digit and a separator, so the file size bounds the count.
     if 2 * expected > len(text) + 1:
         raise _wrong_size(path, header, f"{expected} values", f"{len(text)} bytes", True)
     with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # how NumPy reports text that is no number
+        warnings.simplefilter("error", DeprecationWarning)  # NumPy reports text that is not a number this way
         try:
             values = np.fromstring(text, dtype=np.float64, sep=" ") if text.strip() else np.empty(0)
         except (DeprecationWarning, ValueError):
-            raise InputError(f"{path}: the ascii body holds text that is no number; export again") from None
+            raise InputError(f"{path}: the ascii body holds text that is not a number; export again") from None
     if values.size != expected:
         raise _wrong_size(path, header, f"{expected} values", f"{values.size}", values.size < expected)
     body, at = {}, 0
@@ -76,7 +76,7 @@ def _read_ascii(path: object, stream: BinaryIO, header: Header) -> dict[str, dic
 
 
 def _cast(path: object, element: Element, name: str, values: NDArray[np.float64], code: str) -> NDArray[Any]:
-    """Numbers read from text, in the type that the header gives them."""
+    """Convert numbers read from text to the type that the header states."""
     dtype = np.dtype(code)
     if dtype.kind in "iu":
         info = np.iinfo(dtype)
@@ -87,7 +87,7 @@ def _cast(path: object, element: Element, name: str, values: NDArray[np.float64]
                 f"{path}: element {element.name!r}, row {row}: {name} is {values[row]:g}, expected a "
                 f"whole number from {info.min} to {info.max}; export again"
             )
-    with np.errstate(over="ignore"):  # what overflows is found and named by the check of the model
+    with np.errstate(over="ignore"):  # the check of the model finds and names values that overflow
         return values.astype(dtype)
 
 

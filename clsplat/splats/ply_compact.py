@@ -1,15 +1,15 @@
-"""Splat files without what their splats do not use: how columns are shared out between elements.
+"""Compact splat files: the layout that leaves out unused values.
 
-A compact file is a PLY whose first element, `vertex`, is a usable splat file of fewer columns: no normals, SH up to a
-base degree, and of the shape's own fields those that most splats use. What the other splats have beyond that follows in
-elements of its own, one row for each splat that has it, in rising order:
+A compact file is a PLY file. Its first element, `vertex`, is a usable splat file with fewer columns: no normals, SH up
+to a base degree, and only those fields of the shape that most splats use. Further elements follow. Each has one row
+for each splat that uses its columns, in rising order of the index:
 
-    clsplat_NAME    uint index, and the columns of the shape's own field NAME; splats without a row: its neutral value
-    clsplat_sh_D    uint index, and f_rest_* of the bands above the base; splats without a row: zeros
+    clsplat_NAME    uint index, and the columns of the field NAME; splats without a row have its neutral value
+    clsplat_sh_D    uint index, and f_rest_* of the bands above the base; splats without a row have zeros
 
-`clsplat_sh_D` holds the splats whose highest band is D, with f_rest_* numbered as in a file of degree D. Viewers read
-the first element and pass over the others: they show the base colours, and splats without the fields that moved. The
-highest degree in use is the file's: bands that no splat uses are not kept. All values are float32, bit for bit.
+`clsplat_sh_D` holds the splats whose highest band is D, with f_rest_* numbered as in a file of degree D. Other viewers
+read the first element and skip the rest: they show the base colours, without the moved fields. The degree of the file
+is the highest degree in use; higher bands are not stored. All values are float32 and keep their bits.
 """
 
 from __future__ import annotations
@@ -27,44 +27,44 @@ from .ply_header import SIDE_PREFIX, Header
 
 INDEX = "index"
 _SH = SIDE_PREFIX + "sh_"
-Rows = NDArray[np.int64]
-Table = tuple[str, dict[str, NDArray[Any]]]
+RowIndices = NDArray[np.int64]
+SideTable = tuple[str, dict[str, NDArray[Any]]]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a compact file has what.
+    """The division of a compact file into elements.
 
     Parameters
     ----------
-    degree : the highest SH degree in use. base : the degree that all vertices have.
-    bands : splats whose highest band is D, by D above the base.
-    sparse : splats with another value than the neutral one, by the name of each field that moved.
+    degree : the highest SH degree in use. base : the SH degree of the vertices.
+    bands : for each D above the base, the splats whose highest band is D.
+    sparse : for each moved field, the splats whose value is not neutral.
     """
 
     degree: int
     base: int
-    bands: dict[int, Rows] = field(default_factory=dict)
-    sparse: dict[str, Rows] = field(default_factory=dict)
+    bands: dict[int, RowIndices] = field(default_factory=dict)
+    sparse: dict[str, RowIndices] = field(default_factory=dict)
 
 
 def bands_in_use(sh: Array) -> NDArray[np.int64]:
-    """(N,) highest band of colours (N, K, 3) with a coefficient that is not zero."""
+    """Return for each colour (N, K, 3) the highest band (N,) with a coefficient that is not zero."""
     highest = np.zeros(len(sh), np.int64)
     for band in range(1, MAX_SH_DEGREE + 1):
-        first, past = sh_coefficients(band - 1), sh_coefficients(band)
-        if past <= sh.shape[1]:
-            highest[_nonzero(sh[:, first:past])] = band
+        start, stop = sh_coefficients(band - 1), sh_coefficients(band)
+        if stop <= sh.shape[1]:
+            highest[_nonzero(sh[:, start:stop])] = band
     return highest
 
 
 def in_use(field_: Field, values: Array) -> NDArray[np.bool_]:
-    """(N,) whether a field's value is another than the neutral one."""
+    """Return (N,) whether the value of a field differs from the neutral one."""
     return _nonzero(values.reshape(len(values), field_.width) - np.asarray(field_.neutral, values.dtype))
 
 
 def plan_layout(schema: Schema, arrays: Mapping[str, Array]) -> Layout:
-    """The layout of fewest bytes.
+    """Return the layout that needs the fewest bytes.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def plan_layout(schema: Schema, arrays: Mapping[str, Array]) -> Layout:
     counts = np.bincount(highest, minlength=MAX_SH_DEGREE + 1)
 
     def size(base: int) -> int:
-        """Words of four bytes for colour."""
+        """Return the number of four-byte words for colour."""
         k = sh_coefficients(base)
         return 3 * k * n + sum(
             (1 + 3 * (sh_coefficients(band) - k)) * int(counts[band]) for band in range(base + 1, degree + 1)
@@ -85,21 +85,21 @@ def plan_layout(schema: Schema, arrays: Mapping[str, Array]) -> Layout:
     base = min(range(degree + 1), key=size)
     bands = {band: np.flatnonzero(highest == band) for band in range(base + 1, degree + 1) if counts[band]}
     sparse = {}
-    for own in movable(schema):
-        rows = np.flatnonzero(in_use(own, arrays[own.name]))
-        if (1 + own.width) * len(rows) < own.width * n:
-            sparse[own.name] = rows
+    for candidate in movable(schema):
+        rows = np.flatnonzero(in_use(candidate, arrays[candidate.name]))
+        if (1 + candidate.width) * len(rows) < candidate.width * n:
+            sparse[candidate.name] = rows
     return Layout(degree, base, bands, sparse)
 
 
 def movable(schema: Schema) -> list[Field]:
-    """Own fields that a splat may lack: their neutral value is a constant."""
+    """Return the fields that may be left out for a splat: those whose neutral value is a constant."""
     core = {"mean", "quat", "log_scale", "opacity_logit", "sh"}
     return [f for f in schema if f.name not in core and f.neutral_from is None and not f.nonzero]
 
 
 def layout_bytes(schema: Schema, layout: Layout, n: int) -> int:
-    """Bytes of a compact file of n splats, without its header."""
+    """Return the bytes of a compact file of n splats, without its header."""
     k = sh_coefficients(layout.base)
     words = n * (3 * k + sum(f.width for f in schema if f.name != "sh" and f.name not in layout.sparse))
     words += sum((1 + schema[name].width) * len(rows) for name, rows in layout.sparse.items())
@@ -108,7 +108,7 @@ def layout_bytes(schema: Schema, layout: Layout, n: int) -> int:
 
 
 def rest_columns(band: int, base: int) -> dict[str, tuple[int, int]]:
-    """(coefficient, channel) of each f_rest_* of a file of degree `band`, without those up to `base`."""
+    """Return (coefficient, channel) of each f_rest_* above degree `base` in a file of degree `band`."""
     per_channel = sh_coefficients(band) - 1
     return {
         f"f_rest_{channel * per_channel + k - 1}": (k, channel)
@@ -117,9 +117,9 @@ def rest_columns(band: int, base: int) -> dict[str, tuple[int, int]]:
     }
 
 
-def side_tables(schema: Schema, arrays: Mapping[str, Array], layout: Layout) -> list[Table]:
-    """Names and columns, the index first, of the elements that follow the vertices."""
-    tables: list[Table] = []
+def side_tables(schema: Schema, arrays: Mapping[str, Array], layout: Layout) -> list[SideTable]:
+    """Return name and columns, the index first, of each element that follows the vertices."""
+    tables: list[SideTable] = []
     for name, rows in layout.sparse.items():
         values = arrays[name].reshape(len(arrays[name]), schema[name].width)[rows]
         columns = dict(zip(schema[name].ply, values.T, strict=True))
@@ -132,31 +132,31 @@ def side_tables(schema: Schema, arrays: Mapping[str, Array], layout: Layout) -> 
 
 
 def side_fields(path: object, header: Header, schema: Schema) -> dict[str, Field]:
-    """Fields of the shape that are in elements of their own, by the elements' names.
+    """Return the fields that have an element of their own, by the names of the elements.
 
     Raises
     ------
-    InputError : an element that does not belong to the shape, or whose properties are not what they must be.
+    InputError : an element does not belong to the shape, or has wrong properties.
     """
-    own = {SIDE_PREFIX + field_.name: field_ for field_ in movable(schema)}
+    by_element = {SIDE_PREFIX + field_.name: field_ for field_ in movable(schema)}
     found = {}
     base = schema.sh_degree
     for element in header.elements[1:]:
-        wanted: tuple[str, ...]
-        if element.name in own:
-            found[element.name] = own[element.name]
-            wanted = own[element.name].ply
+        expected: tuple[str, ...]
+        if element.name in by_element:
+            found[element.name] = by_element[element.name]
+            expected = by_element[element.name].ply
         elif element.name in {f"{_SH}{band}" for band in range(base + 1, MAX_SH_DEGREE + 1)}:
-            wanted = tuple(rest_columns(int(element.name[len(_SH) :]), base))
+            expected = tuple(rest_columns(int(element.name[len(_SH) :]), base))
         else:
             raise InputError(
-                f"{path}: element {element.name!r} does not go with this shape and the vertices' SH "
+                f"{path}: element {element.name!r} does not match this shape and the vertices' SH "
                 f"degree {base}; export again"
             )
-        if [*element.properties] != [("uint", INDEX), *(("float", name) for name in wanted)]:
+        if [*element.properties] != [("uint", INDEX), *(("float", name) for name in expected)]:
             raise InputError(
                 f"{path}: element {element.name!r}: its properties must be uint {INDEX} and float "
-                f"{wanted[0]} to {wanted[-1]}; export again"
+                f"{expected[0]} to {expected[-1]}; export again"
             )
     return found
 
@@ -168,15 +168,15 @@ def filled_in(
     schema: Schema,
     arrays: dict[str, Array],
 ) -> dict[str, Array]:
-    """The vertices' arrays, with what the other elements hold.
+    """Return the arrays of the vertices, completed from the other elements.
 
     Parameters
     ----------
-    schema : of the vertices' degree. arrays : public arrays of the vertices; fields that moved are missing.
+    schema : schema at the degree of the vertices. arrays : public arrays of the vertices, without the moved fields.
 
     Raises
     ------
-    InputError : an index out of range, or not rising, or a splat in two elements of bands.
+    InputError : an index is out of range or does not rise, or a splat is in two elements of bands.
     """
     n, base = header.count, schema.sh_degree
     moved = side_fields(path, header, schema)
@@ -191,11 +191,11 @@ def filled_in(
         columns = body[element.name]
         rows = _index(path, element.name, columns[INDEX], n)
         if element.name in moved:
-            own = moved[element.name]
-            values = np.tile(np.asarray(own.neutral, sh.dtype), (n, 1))
-            for component, name in enumerate(own.ply):
+            moved_field = moved[element.name]
+            values = np.tile(np.asarray(moved_field.neutral, sh.dtype), (n, 1))
+            for component, name in enumerate(moved_field.ply):
                 values[rows, component] = columns[name]
-            full[own.name] = values[:, 0] if own.width == 1 else values
+            full[moved_field.name] = values[:, 0] if moved_field.width == 1 else values
             continue
         if taken[rows].any():
             twice = int(rows[taken[rows]][0])
@@ -206,8 +206,8 @@ def filled_in(
     return full | {"sh": sh}
 
 
-def _index(path: object, element: str, index: NDArray[Any], n: int) -> Rows:
-    """An element's index, if it rises and stays below n."""
+def _index(path: object, element: str, index: NDArray[Any], n: int) -> RowIndices:
+    """Return the index of an element if it rises and stays below n; raise InputError otherwise."""
     rows = index.astype(np.int64)
     bad = np.flatnonzero((rows >= n) | (np.diff(rows, prepend=-1) <= 0))
     if bad.size:
@@ -219,6 +219,6 @@ def _index(path: object, element: str, index: NDArray[Any], n: int) -> Rows:
 
 
 def _nonzero(values: Array) -> NDArray[np.bool_]:
-    """(N,) whether any of a row's values is not zero (a negative zero is not, or its bit would be lost)."""
+    """Return (N,) whether a row has a value that is not zero. Negative zeros count, so that their bit is kept."""
     used = (values != 0) | np.signbit(values)
     return np.asarray(used.any(axis=tuple(range(1, used.ndim))))

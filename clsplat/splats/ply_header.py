@@ -1,4 +1,4 @@
-"""The header of a PLY file: parsed strictly, so that a wrong file is named before anything is allocated.
+"""Strict parser of PLY headers: a wrong file gives an error before memory is allocated.
 
 Format: Greg Turk, "The PLY Polygon File Format" (1994).
 """
@@ -26,14 +26,14 @@ INTEGER_TYPES = {
     "int32": "i4",
     "uint32": "u4",
 }
-SIDE_PREFIX = "clsplat_"  # of the names of elements that may follow the vertices (ply_compact.py)
+SIDE_PREFIX = "clsplat_"  # begins the names of elements that may follow the vertices (ply_compact.py)
 _MAX_LINE = 4096
 _MAX_LINES = 4096
 
 
 @dataclass
 class Element:
-    """A table of the body: its rows, and (type, name) of its properties in file order."""
+    """One table of the body: its number of rows, and (type, name) of its properties in file order."""
 
     name: str
     count: int
@@ -46,7 +46,7 @@ class Element:
 
 @dataclass
 class Header:
-    """What a PLY header says: encoding, the element `vertex`, and those of clsplat's that follow it."""
+    """The content of a PLY header: encoding, the element `vertex`, and the elements of clsplat that follow it."""
 
     encoding: str = ""
     elements: list[Element] = field(default_factory=list)
@@ -54,27 +54,27 @@ class Header:
 
     @property
     def count(self) -> int:
-        """Vertices."""
+        """Number of vertices."""
         return self.elements[0].count
 
     @property
     def properties(self) -> list[tuple[str, str]]:
-        """(type, name) of the vertices' properties."""
+        """(type, name) of the properties of a vertex."""
         return self.elements[0].properties
 
     @property
     def names(self) -> list[str]:
-        """Names of the vertices' properties."""
+        """Names of the properties of a vertex."""
         return self.elements[0].names
 
 
 def read_header(path: object, stream: BinaryIO) -> Header:
-    """Header of the PLY file `stream`, which is left at the first byte after it.
+    """Read the header of a PLY file; the stream is left at the first byte of the body.
 
     Raises
     ------
-    InputError : not a PLY file, a line that is no PLY, or anything but one element `vertex` of scalars, which
-        others of clsplat's own may follow; it names the file (`path`) and the line.
+    InputError : the file is not a PLY file, a line is wrong, or the elements are not one `vertex` of scalars and
+        elements of clsplat after it. The message names the file (`path`) and the line.
     """
     if stream.readline(_MAX_LINE).rstrip(b"\r\n") != b"ply":
         raise InputError(f"{path}: not a PLY file (its first line is not 'ply'); choose a splat .ply")
@@ -82,7 +82,7 @@ def read_header(path: object, stream: BinaryIO) -> Header:
     for number in range(2, _MAX_LINES):
         raw = stream.readline(_MAX_LINE)
         if not raw.endswith(b"\n"):
-            raise InputError(f"{path}: header line {number} is cut off; the file is truncated or no PLY")
+            raise InputError(f"{path}: header line {number} is cut off; the file is truncated or not a PLY file")
         line = raw.decode("latin-1").rstrip("\r\n")
         words = line.split()
         keyword = words[0] if words else ""
@@ -102,7 +102,7 @@ def read_header(path: object, stream: BinaryIO) -> Header:
 
 
 def _take(header: Header, keyword: str, words: list[str], line: str) -> None:
-    """Put one header line into `header`; raises InputError without the place."""
+    """Add one header line to `header`; the InputError does not name the line."""
     shown = line[:80].encode("unicode_escape").decode("ascii")
     if keyword == "comment":
         header.comments.append(line.strip()[len("comment") :].strip())
@@ -123,11 +123,11 @@ def _take(header: Header, keyword: str, words: list[str], line: str) -> None:
             raise InputError(f"property {words[2]!r} occurs twice; rename or remove one")
         header.elements[-1].properties.append((words[1], words[2]))
     elif keyword != "obj_info":  # obj_info is a second kind of comment
-        raise InputError(f"{shown!r} is no PLY header line; the header is damaged")
+        raise InputError(f"{shown!r} is not a PLY header line; the header is damaged")
 
 
 def _take_element(header: Header, name: str, count: str) -> None:
-    """Begin an element; raises InputError without the place."""
+    """Begin an element; the InputError does not name the line."""
     side = bool(header.elements) and name.startswith(SIDE_PREFIX)
     if not side and (name != "vertex" or header.elements):
         raise InputError(

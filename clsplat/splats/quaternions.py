@@ -1,4 +1,4 @@
-"""Rotation matrices of quaternions w, x, y, z of any norm above 0, and their gradient."""
+"""Rotation matrices of quaternions w, x, y, z with any norm above 0, and their gradient."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 
 from .fields import Array
 
-NORM_FLOOR = 1e-15  # of |q|; the kernels' too (algebra.clh)
+NORM_FLOOR = 1e-15  # lower bound of |q|, as in cl/math/algebra.clh
 
 
 def rotations(quat: Array) -> Array:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4), of the same dtype."""
+    """Return the rotation matrices (N, 3, 3) of quaternions (N, 4), with the same dtype."""
     w, x, y, z = _unit(quat)[0].T
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -21,7 +21,7 @@ def rotations(quat: Array) -> Array:
 
 
 def rotations_vjp(quat: Array, v: Array) -> Array:
-    """Gradient (N, 4) of the raw quaternions, through the normalisation, given v (N, 3, 3) of the matrices."""
+    """Return the gradient (N, 4) of the raw quaternions, given the gradient v (N, 3, 3) of the matrices."""
     unit, norm = _unit(quat)
     w, x, y, z = unit.T
     sums, gaps = v + v.transpose(0, 2, 1), v - v.transpose(0, 2, 1)
@@ -37,11 +37,10 @@ def rotations_vjp(quat: Array, v: Array) -> Array:
         axis=1,
     )
     along = np.sum(unit * v_unit, axis=1, keepdims=True)
-    gradient: Array = (v_unit - along * unit) / norm
-    return gradient
+    return (v_unit - along * unit) / norm
 
 
 def _unit(quat: Array) -> tuple[Array, Array]:
-    """Normalised quaternions (N, 4) and their norms (N, 1)."""
+    """Return normalised quaternions (N, 4) and the norms (N, 1)."""
     norm = np.maximum(np.linalg.norm(quat, axis=1, keepdims=True), quat.dtype.type(NORM_FLOOR))
     return quat / norm, norm

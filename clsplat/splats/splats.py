@@ -1,4 +1,4 @@
-"""`Splats`: a model on the host, checked and read-only."""
+"""A splat model on the host: checked arrays that cannot be changed."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ from .ply import read_ply, write_ply
 from .shapes import DEFAULT_SHAPE, check_normalisation, shape_named
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
-_MIN_SQUARED_DISTANCE = 1e-7  # 3DGS's floor, for points that coincide
-_MIN_OF_TYPICAL = 1e-2  # where the scene is small: of the median squared distance
-_OPACITIES = (1e-12, 1.0 - 1e-7)  # whose raw values are finite
+_MIN_SQUARED_DISTANCE = 1e-7  # the floor of 3DGS, for points that coincide
+_MIN_OF_TYPICAL = 1e-2  # the floor of small scenes, as a share of the median squared distance
+_OPACITIES = (1e-12, 1.0 - 1e-7)  # the range of opacities with finite raw values
 
 
 class Splats:
-    """N splats of one shape, as stored (before any activation); immutable.
+    """N splats of one shape with their raw parameters (before any activation); immutable.
 
     Parameters
     ----------
     shape : name of the kernel (see `shapes.SHAPES`).
-    arrays : by field name: mean (N, 3) [world units], quat (N, 4) as w, x, y, z of any norm above 0,
-        log_scale (N, 3) natural log of world units, opacity_logit (N,), sh (N, K, 3) with K = 1, 4, 9 or
-        16, and the shape's own, such as skew (N, 3); the shape's own may be left out (neutral). Copied;
-        float32 unless all are float64 arrays.
+    arrays : one array for each field name. The core fields are mean (N, 3) [world units], quat (N, 4), log_scale
+        (N, 3), opacity_logit (N,) and sh (N, K, 3) with K = 1, 4, 9 or 16. Quaternions are w, x, y, z of any norm above
+        0; scales are natural logs of world units. The shape has fields of its own, such as skew (N, 3). Those that are
+        missing get their neutral value.
+        The arrays are copied. They become float32 unless all of them are float64.
     normalisation : "peak", "pdf" or "none".
-    antialiased : whether opacities fall as the low-pass widens small splats, as they did in training.
+    antialiased : whether the opacity of a small splat falls as the low-pass filter widens it, as in training.
 
     Raises
     ------
-    InputError : an unknown name, a shape that does not fit, or an unusable value; names field and splat.
+    InputError : a name is unknown, an array has a wrong shape, or a value is unusable.
     """
 
     __slots__ = ("_antialiased", "_arrays", "_normalisation", "_schema", "_shape")
@@ -54,38 +55,38 @@ class Splats:
         descriptor = shape_named(shape)
         double = all(getattr(values, "dtype", None) == np.float64 for values in arrays.values())
         dtype: np.dtype[Any] = np.dtype(np.float64 if double and arrays else np.float32)
-        own = {name: _real(name, values, dtype) for name, values in arrays.items()}
-        schema = descriptor.schema(sh_degree_for(own))
-        n = len(own["mean"]) if "mean" in own and own["mean"].ndim else 0
+        fields = {name: _real(name, values, dtype) for name, values in arrays.items()}
+        schema = descriptor.schema(sh_degree_for(fields))
+        n = len(fields["mean"]) if "mean" in fields and fields["mean"].ndim else 0
         for field in descriptor.fields:
-            if field.name not in own and field.neutral_from in own:
-                own[field.name] = own[field.neutral_from].copy()
-            elif field.name not in own:
-                own[field.name] = np.tile(np.asarray(field.neutral, dtype=dtype), (n, 1)).reshape(
+            if field.name not in fields and field.neutral_from in fields:
+                fields[field.name] = fields[field.neutral_from].copy()
+            elif field.name not in fields:
+                fields[field.name] = np.tile(np.asarray(field.neutral, dtype=dtype), (n, 1)).reshape(
                     public_shape(field, n)
                 )
-        check_arrays(schema, own)
-        for values in own.values():
+        check_arrays(schema, fields)
+        for values in fields.values():
             values.setflags(write=False)
         self._shape = descriptor.name
         self._normalisation = check_normalisation(normalisation)
         self._antialiased = bool(antialiased)
         self._schema = schema
-        self._arrays = {field.name: own[field.name] for field in schema}
+        self._arrays = {field.name: fields[field.name] for field in schema}
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Splats:
-        """Read a splat PLY; a plain 3DGS file gives Gaussians. Raises InputError (see `ply.read_ply`)."""
+        """Read a splat PLY file; a plain 3DGS file gives Gaussians. Raises InputError (see `ply.read_ply`)."""
         model = read_ply(path)
         return cls(model.shape, model.arrays, model.normalisation, model.antialiased)
 
     def save(self, path: str | os.PathLike[str], compact: bool = False) -> None:
-        """Write a PLY in float32, atomically. Raises OutputError where it cannot be written.
+        """Write a PLY file in float32, atomically. Raises OutputError if the file cannot be written.
 
         Parameters
         ----------
-        compact : leave out what the splats do not use (see ply_compact.py). Files for other programs are best whole:
-            some readers know one element only, and none but clsplat's the columns that moved to others.
+        compact : leave out the values that the splats do not use (see ply_compact.py). Do not set it for other
+            programs: some read only the first element, and no other program reads the columns of the later elements.
         """
         write_ply(path, self._shape, self._normalisation, self._arrays, compact, self._antialiased)
 
@@ -100,19 +101,19 @@ class Splats:
         opacity: float = 0.1,
         scale_factor: float = 1.0,
     ) -> Splats:
-        """3DGS's initialisation: round splats at points, as large as their neighbours are far.
+        """Make round splats at points, as large as the distance to their neighbours (the initialisation of 3DGS).
 
         Parameters
         ----------
         xyz : (N, 3) positions [world units].
         rgb : (N, 3) whole numbers 0..255 or real numbers 0..1.
-        opacity : 0 to 1, exclusive.
-        scale_factor : times the root of the mean squared distance to the 3 nearest other points (fewer
-            where there are fewer; a lone point counts as one world unit from the next).
+        opacity : opacity of every splat, between 0 and 1, exclusive.
+        scale_factor : the standard deviation in units of the root mean square distance to the 3 nearest other points.
+            With fewer than 4 points all others count. The neighbours of a single point are one world unit away.
 
         Raises
         ------
-        InputError : shapes that do not fit, values out of range or not finite.
+        InputError : shapes do not fit, or values are out of range or not finite.
         """
         points = _real("xyz", xyz, np.dtype(np.float64))
         colours = _real("rgb", rgb, np.dtype(np.float64))
@@ -163,7 +164,7 @@ class Splats:
 
     @property
     def schema(self) -> Schema:
-        """The fields that these splats have."""
+        """Fields of these splats."""
         return self._schema
 
     @property
@@ -203,7 +204,7 @@ class Splats:
 
     @property
     def skew(self) -> Array:
-        """(N, 3) skew vectors; zeros for shapes without."""
+        """(N, 3) skew vectors; zeros if the shape has no skew."""
         return self._arrays["skew"] if "skew" in self._arrays else np.zeros_like(self.mean)
 
     def __len__(self) -> int:
@@ -218,19 +219,19 @@ class Splats:
         return {name: values.copy() for name, values in self._arrays.items()}
 
     def with_arrays(self, arrays: Mapping[str, ArrayLike]) -> Splats:
-        """Splats of the same kind with other arrays, any number of them. Raises InputError as `Splats` does."""
+        """Return splats of the same kind with other arrays of any length. Raises InputError as `Splats` does."""
         return Splats(self._shape, arrays, self._normalisation, self._antialiased)
 
     def select(self, indices: ArrayLike) -> Splats:
-        """The splats at `indices` (whole numbers in any order, repeats allowed, or an (N,) boolean mask).
+        """Return the splats at `indices`: whole numbers in any order with repeats, or an (N,) boolean mask.
 
         Raises
         ------
-        InputError : an index out of range, a mask of another length, or neither.
+        InputError : an index is out of range, a mask has another length, or `indices` is neither.
         """
         chosen = np.asarray(indices)
         if chosen.size == 0 and chosen.dtype != np.bool_:
-            chosen = chosen.astype(np.int64)  # an empty list has no type of its own
+            chosen = chosen.astype(np.int64)  # NumPy makes an empty list a float array
         whole = np.issubdtype(chosen.dtype, np.integer)
         if chosen.ndim != 1 or not (whole or chosen.dtype == np.bool_):
             raise InputError("select: give a list of whole numbers or a boolean mask")
@@ -241,11 +242,11 @@ class Splats:
         return self.with_arrays(taken)
 
     def as_shape(self, name: str) -> Splats:
-        """The same splats as another shape: fields it lacks are dropped, fields it adds are neutral.
+        """Return the splats as another shape. Fields that it lacks are dropped; fields that it adds are neutral.
 
         Raises
         ------
-        InputError : an unknown shape, or negative opacities for a shape that has none.
+        InputError : the shape is unknown, or it does not support the negative opacities of these splats.
         """
         source, target = shape_named(self._shape), shape_named(name)
         shared = [field.name for field in target.schema(self.sh_degree) if field in self._schema.fields]
@@ -256,28 +257,28 @@ class Splats:
             negative = int(np.sum(opacity < 0))
             if negative:
                 raise InputError(
-                    f"splats: {negative} of {len(self)} have a negative opacity, which shape {name} has "
-                    "not: remove them or choose another shape"
+                    f"{negative} of {len(self)} splats have negative opacity, which shape {name} does not support; "
+                    "remove them or choose another shape"
                 )
             arrays["opacity_logit"] = target.raw_opacity(np.clip(opacity, *_OPACITIES)).astype(raw.dtype)
         return Splats(name, arrays, self._normalisation, self._antialiased)
 
 
 def _real(name: str, values: ArrayLike, dtype: np.dtype[Any]) -> Array:
-    """An own, contiguous, real copy of `values`."""
+    """Return a contiguous, real copy of `values`."""
     try:
-        given = np.asarray(values)
-        if given.dtype.kind not in "fiub":
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiub":
             raise TypeError
-        with np.errstate(over="ignore"):  # what overflows is found and named by the check
-            return np.array(given, dtype=dtype, order="C")
+        with np.errstate(over="ignore"):  # the check finds and names values that overflow
+            return np.array(array, dtype=dtype, order="C")
     except (TypeError, ValueError):
-        raise InputError(f"splats: {name!r} is no array of real numbers") from None
+        raise InputError(f"splats: {name!r} is not an array of real numbers") from None
 
 
 def _squared_spacing(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Mean squared distance of each point to its 3 nearest others, (N,)."""
-    from scipy.spatial import cKDTree  # a third of a second to import
+    """Return the mean squared distance (N,) of each point to its 3 nearest neighbours."""
+    from scipy.spatial import cKDTree  # lazy: a slow import
 
     n = len(points)
     if n < 2:
@@ -285,5 +286,4 @@ def _squared_spacing(points: NDArray[np.floating]) -> NDArray[np.float64]:
     neighbours = min(3, n - 1)
     # The nearest hit is the point itself (or one that coincides, at the same distance 0).
     distances, _ = cKDTree(points).query(points, k=neighbours + 1, workers=-1)
-    mean: NDArray[np.float64] = np.mean(np.asarray(distances)[:, 1:] ** 2, axis=1)
-    return mean
+    return np.asarray(np.mean(np.asarray(distances)[:, 1:] ** 2, axis=1))

@@ -1,4 +1,4 @@
-"""How much of a model is in use: splats, own fields that are not neutral, colour coefficients by band, bytes."""
+"""Statistics of a model: splats, fields of the shape in use, SH coefficients by band, bytes."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from .splats import Splats
 
 @dataclass(frozen=True)
 class Complexity:
-    """What a model is made of. A real parameter counts as in use where leaving it out would change the splat.
+    """Counts of what a model uses. A parameter is in use if leaving it out would change the splat.
 
     Parameters
     ----------
-    splats : their number.
-    fields : splats whose value of an own field of the shape (skew, beta, nu) is not the neutral one, by field.
-    bands : splats by the highest SH band that is not zero, from 0 to the model's degree.
-    coefficients : SH coefficients in use by band, all three channels.
-    parameters : reals in use. stored : reals that the arrays hold.
-    compact_bytes : of a compact file's body (see ply_compact.py).
+    splats : number of splats.
+    fields : for each field of the shape (skew, beta, nu), the number of splats whose value is not neutral.
+    bands : for each SH band from 0 to the degree of the model, the number of splats whose highest band it is.
+    coefficients : for each band, the SH coefficients in use, over all three channels.
+    parameters : reals in use. stored : reals in the arrays.
+    compact_bytes : bytes of the body of a compact file (see ply_compact.py).
     """
 
     splats: int
@@ -35,16 +35,16 @@ class Complexity:
 
     @property
     def skewed(self) -> int:
-        """Splats with a skew."""
+        """Number of splats with a skew."""
         return self.fields.get("skew", 0)
 
     @property
     def skewed_fraction(self) -> float:
-        """Of all splats; 0 for a model without any."""
+        """Share of the splats that have a skew; 0 for an empty model."""
         return self.skewed / self.splats if self.splats else 0.0
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, as `clsplat info --json` prints them and results.json has them."""
+        """Return plain values, as in `clsplat info --json` and results.json."""
         return {
             "splats": self.splats,
             "skewed": self.skewed,
@@ -59,16 +59,16 @@ class Complexity:
 
 
 def complexity(splats: Splats) -> Complexity:
-    """Count what a model uses."""
+    """Return the statistics of a model."""
     schema, n = splats.schema, len(splats)
     degree = splats.sh_degree
     highest = np.bincount(bands_in_use(splats.sh), minlength=degree + 1)
-    # A band counts whole where the splat has it or a higher one: files and kernels know no holes.
+    # A splat uses every band up to its highest one, because files and kernels have no gaps.
     users = n - np.concatenate([[0], np.cumsum(highest)[:-1]])
     coefficients = tuple(3 * (2 * band + 1) * int(count) for band, count in enumerate(users))
     fields = {field.name: int(np.count_nonzero(in_use(field, splats.arrays[field.name]))) for field in movable(schema)}
-    always = sum(field.width for field in schema if field.name != "sh" and field.name not in fields)
-    parameters = n * always + sum(coefficients) + sum(schema[name].width * count for name, count in fields.items())
+    required = sum(field.width for field in schema if field.name != "sh" and field.name not in fields)
+    parameters = n * required + sum(coefficients) + sum(schema[name].width * count for name, count in fields.items())
     single = {name: values.astype(np.float32) for name, values in splats.arrays.items()}
     return Complexity(
         n,

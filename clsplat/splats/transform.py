@@ -1,4 +1,4 @@
-"""Splats in a common world: turned, scaled alike on all axes, moved, and joined."""
+"""Rotation, uniform scale and translation of splats, and joining of models."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from .fields import Array, DoubleArray, sh_coefficients
 from .harmonics import sh_basis
 from .splats import Splats
 
-_DIRECTIONS = 64  # that a band of harmonics is sampled in; it has 7 functions at most
-_TOLERANCE = 1e-4  # of a matrix that is to be a rotation times a scale; float32 transforms differ by 1e-6
+_DIRECTIONS = 64  # directions in which a band of harmonics is sampled; a band has at most 7 functions
+_TOLERANCE = 1e-4  # deviation of a matrix from a rotation times a scale; float32 transforms deviate by 1e-6
 
 
 def similarity(matrix: ArrayLike) -> tuple[float, DoubleArray, DoubleArray]:
-    """Scale s, rotation R (3, 3) and translation t (3,) of a (4, 4) matrix that is x -> s R x + t.
+    """Return scale s, rotation R (3, 3) and translation t (3,) of a (4, 4) matrix x -> s R x + t.
 
     Raises
     ------
-    InputError : axes scaled differently, sheared, mirrored or without length.
+    InputError : the axes have different scales, are sheared or mirrored, or have no length.
     """
-    given = np.asarray(matrix, np.float64)
-    linear = given[:3, :3]
+    transform = np.asarray(matrix, np.float64)
+    linear = transform[:3, :3]
     lengths = np.linalg.norm(linear, axis=0)
-    if not np.isfinite(given).all() or lengths.min() <= 0:
+    if not np.isfinite(transform).all() or lengths.min() <= 0:
         raise InputError("its transform has no size; set its scale above 0")
     scale = float(np.cbrt(np.prod(lengths)))
     if lengths.max() - lengths.min() > _TOLERANCE * scale:
@@ -39,23 +39,23 @@ def similarity(matrix: ArrayLike) -> tuple[float, DoubleArray, DoubleArray]:
     if np.linalg.det(rotation) < 0:
         raise InputError("its transform is mirrored; splats can only be turned, moved and scaled alike on all axes")
     left, _, right = np.linalg.svd(rotation)
-    return scale, left @ right, given[:3, 3].copy()
+    return scale, left @ right, transform[:3, 3].copy()
 
 
-def placed(splats: Splats, matrix: ArrayLike) -> Splats:
-    """The splats after x -> s R x + t, their colours seen from the turned directions.
+def transformed(splats: Splats, matrix: ArrayLike) -> Splats:
+    """Return the splats after x -> s R x + t; their colours turn with them.
 
-    What a shape adds lies in a splat's own frame, in units of its own size, and stays.
+    The fields of the shape do not change, as they are relative to the frame and the size of each splat.
 
     Raises
     ------
-    InputError : a matrix that is no such map (see `similarity`).
+    InputError : the matrix is not a similarity (see `similarity`).
     """
-    from scipy.spatial.transform import Rotation  # lazy: a third of a second to import
+    from scipy.spatial.transform import Rotation  # lazy: a slow import
 
     scale, rotation, translation = similarity(matrix)
     w, x, y, z = Rotation.from_matrix(rotation).as_quat()[[3, 0, 1, 2]]
-    # The left product with (w, x, y, z), whatever the other's norm.
+    # The product from the left with (w, x, y, z); the other quaternion may have any norm.
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     changed = {
         "mean": scale * splats.mean @ rotation.T + translation,
@@ -69,10 +69,10 @@ def placed(splats: Splats, matrix: ArrayLike) -> Splats:
 
 
 def turned_harmonics(sh: Array, rotation: DoubleArray) -> Array:
-    """Coefficients (N, K, 3) of the same colours in directions turned by `rotation`: c'(R d) = c(d).
+    """Return the coefficients (N, K, 3) of colours turned by `rotation`: c'(R d) = c(d).
 
-    Bands do not mix: each one's matrix is that which maps the band's values in some directions to those in the
-    directions turned back, exact to rounding.
+    Bands do not mix. The matrix of a band maps its values in sampled directions to its values in the directions turned
+    back, exact up to rounding.
     """
     degree = round(sh.shape[1] ** 0.5) - 1
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
@@ -87,11 +87,11 @@ def turned_harmonics(sh: Array, rotation: DoubleArray) -> Array:
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """All splats as one model, of a shape that all of them have an equal in.
+    """Join splats to one model, of a shape to which all of them can be converted.
 
     Raises
     ------
-    InputError : no parts, or shapes or normalisations that have no equal in each other, or only some antialiased.
+    InputError : there are no parts, the shapes or normalisations differ, or only some parts are antialiased.
     """
     if not parts:
         raise InputError("join: no splats")
@@ -108,13 +108,13 @@ def joined(parts: Sequence[Splats]) -> Splats:
     if len(shapes) == 1:
         raise InputError("join: the splats are normalised differently; show one model at a time")
     raise InputError(
-        f"join: splats of shapes {', '.join(shapes)} have no equals in each other; bring them to one "
+        f"join: splats of shapes {', '.join(shapes)} cannot be joined; bring them to one "
         "shape with `clsplat convert`, or show one model at a time"
     )
 
 
 def _stacked(parts: Sequence[Splats]) -> Splats:
-    """Splats of one shape below each other; missing bands of colour are 0."""
+    """Concatenate splats of one shape; missing SH bands are 0."""
     coefficients = max(part.sh.shape[1] for part in parts)
     arrays = {name: np.concatenate([part.arrays[name] for part in parts]) for name in parts[0].arrays if name != "sh"}
     arrays["sh"] = np.concatenate(

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..cameras.camera import Camera
 from ..errors import InputError
-from ..splats.optical_depth import FARTHEST
+from ..splats.optical_depth import MAX_COORDINATE
 from ..splats.quaternions import NORM_FLOOR, rotations
 
 WIDEST = math.radians(170.0)  # vertical field of view; beyond, every splat covers the image
@@ -58,7 +58,7 @@ def camera_of(pose: Pose, longest: int) -> Camera | None:
         position = np.asarray(pose.position, np.float64).reshape(3)
         if not 0.0 < pose.fov <= WIDEST or not NORM_FLOOR < np.linalg.norm(quat) < math.inf:
             return None
-        if not np.abs(position).max() <= FARTHEST:  # also of a NaN
+        if not np.abs(position).max() <= MAX_COORDINATE:  # also of a NaN
             return None
         to_world = rotations(quat)[0]
         focal = 0.5 * height / math.tan(0.5 * pose.fov)

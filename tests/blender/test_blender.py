@@ -19,7 +19,7 @@ import clsplat as package
 from clsplat.cameras.camera import Camera
 from clsplat.errors import InputError
 from clsplat.rendering.renderer import Rendered, Renderer
-from clsplat.splats.transform import joined, placed
+from clsplat.splats.transform import joined, transformed
 
 # --- lens ----------------------------------------------------------------------------------------
 
@@ -122,10 +122,10 @@ def test_the_studio_joins_objects_and_reads_changed_files_again(tmp_path: Path) 
     objects = [Placed("a", tmp_path / "a.ply", np.eye(4)), Placed("b", tmp_path / "b.ply", matrix)]
     studio = Studio()
     renderer = Renderer(studio.renderer.device)
-    expected = renderer.render(joined([first, placed(second, matrix)]), camera)
+    expected = renderer.render(joined([first, transformed(second, matrix)]), camera)
     np.testing.assert_array_equal(studio.render(objects, camera).color, expected.color)
     second.select(range(10)).save(tmp_path / "b.ply")
-    fewer = renderer.render(joined([first, placed(second.select(range(10)), matrix)]), camera)
+    fewer = renderer.render(joined([first, transformed(second.select(range(10)), matrix)]), camera)
     np.testing.assert_array_equal(studio.render(objects, camera).color, fewer.color)
     assert np.abs(fewer.color - expected.color).max() > 0.1
 

@@ -27,7 +27,7 @@ from clsplat.cameras.interpolate import interpolate
 from clsplat.cameras.path import CameraPath, read_path, write_path
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
-from clsplat.splats.transform import joined, placed
+from clsplat.splats.transform import joined, transformed
 
 CHILD = Path(__file__).parents[1] / "support" / "blender_child.py"
 
@@ -140,7 +140,7 @@ def test_a_border_is_the_same_pixels(blender: tuple[Path, dict[str, Any]]) -> No
 
 def test_several_objects_are_one_picture(blender: tuple[Path, dict[str, Any]]) -> None:
     folder, facts = blender
-    both = joined([some_splats(), placed(some_splats(1, "gaussian"), facts["together"]["matrix"])])
+    both = joined([some_splats(), transformed(some_splats(1, "gaussian"), facts["together"]["matrix"])])
     wanted = expected(both, read_cameras(folder / "cameras.json")[0].camera)
     assert np.abs(wanted - expected(some_splats(), read_cameras(folder / "cameras.json")[0].camera)).max() > 30
     assert np.abs(picture(facts["together"]["file"])[..., :3] - wanted).max() <= 1

@@ -258,7 +258,7 @@ def test_normals_may_hold_anything(file: Path) -> None:
         ("property float x", "property uchar x", "'x' has type uchar"),
         ("property float x", "property half x", "unknown type 'half'"),
         ("property float x", "property float y", "'y' occurs twice"),
-        ("property float x", "propertyfloat x", "'propertyfloat x' is no PLY header line"),
+        ("property float x", "propertyfloat x", "'propertyfloat x' is not a PLY header line"),
         ("end_header\n", "", "header"),
         ("element vertex 2", "comment clsplat shape=cube\nelement vertex 2", "unknown shape 'cube'"),
         ("element", "comment clsplat shape=gaussian normalisation=x\nelement", "normalisation 'x'"),
@@ -288,7 +288,7 @@ def test_truncation_is_an_input_error(file: Path, fmt: str) -> None:
 
 def test_ascii_bodies(file: Path) -> None:
     data = save(file, plain(), "ascii").read_bytes()
-    for damaged, said in ((data + b"7\n", "extra data"), (data.replace(b" 101.0 ", b" one "), "no number")):
+    for damaged, said in ((data + b"7\n", "extra data"), (data.replace(b" 101.0 ", b" one "), "not a number")):
         file.write_bytes(damaged)
         with pytest.raises(InputError, match=said):
             read_ply(file)

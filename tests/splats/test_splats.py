@@ -56,7 +56,9 @@ def test_as_shape(model: tuple[str, str, Arrays]) -> None:
     splats = Splats(*[model[i] for i in (0, 2, 1)])
     same(splats.as_shape(splats.shape), splats)
     if SHAPES[splats.shape].signed and (splats.opacity_logit < 0).any():
-        with pytest.raises(InputError, match=r"of \d+ have a negative opacity, which shape gaussian has not"):
+        with pytest.raises(
+            InputError, match=r"of \d+ splats have negative opacity, which shape gaussian does not support"
+        ):
             splats.as_shape("gaussian")
         return
     gaussian = splats.as_shape("gaussian")
@@ -141,8 +143,8 @@ def damaged(name: str, value: object, at: tuple[int, ...] | None = None) -> Arra
         (damaged("sh", np.ones((4, 3))), "'sh' has shape"),
         (damaged("opacity_logit", np.ones((4, 1))), "'opacity_logit' has shape"),
         (damaged("mean", 1.0), "'mean' has shape"),
-        (damaged("mean", ["a"]), "'mean' is no array"),
-        (damaged("mean", [[1], [1, 2]]), "'mean' is no array"),
+        (damaged("mean", ["a"]), "'mean' is not an array"),
+        (damaged("mean", [[1], [1, 2]]), "'mean' is not an array"),
         (damaged("beta", np.ones(4)), "unknown field 'beta'"),
         ({}, "'mean' is missing"),
     ],
@@ -208,7 +210,7 @@ def test_unusable_points_are_named() -> None:
         (lambda: Splats.from_points(xyz, rgb, opacity=1.0), "opacity=1.0"),
         (lambda: Splats.from_points(xyz, rgb, scale_factor=0.0), "scale_factor=0.0"),
         (lambda: Splats.from_points(xyz, rgb, sh_degree=4), "sh_degree is 4"),
-        (lambda: Splats.from_points("a", rgb), "'xyz' is no array"),
+        (lambda: Splats.from_points("a", rgb), "'xyz' is not an array"),
     ):
         with pytest.raises(InputError, match=said):
             call()

@@ -14,7 +14,7 @@ from clsplat.device.device import Device
 from clsplat.errors import InputError
 from clsplat.splats.harmonics import sh_basis
 from clsplat.splats.splats import Splats
-from clsplat.splats.transform import joined, placed, similarity, turned_harmonics
+from clsplat.splats.transform import joined, similarity, transformed, turned_harmonics
 
 
 def matrix(scale: float = 1.7, seed: int = 0) -> np.ndarray:
@@ -59,7 +59,7 @@ def test_images_stay_where_the_camera_goes_along(
     renderer = make_renderer(devices[0], "float32")
     given = matrix()
     before = renderer.render(splats, camera)
-    after = renderer.render(placed(splats, given), along(camera, given))
+    after = renderer.render(transformed(splats, given), along(camera, given))
     assert before.alpha.max() > 0.5
     np.testing.assert_allclose(after.color, before.color, atol=2e-4)
     np.testing.assert_allclose(after.depth, 1.7 * before.depth, rtol=1e-3, atol=1e-3)

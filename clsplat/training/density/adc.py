@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ...errors import TrainingError
 from ...splats.fields import Array, DoubleArray
-from ...splats.optical_depth import finite_rows, opacity_names, raw_of_thickness, thickness
+from ...splats.optical_depth import finite_rows, opacity_names, optical_depth, raw_of_optical_depth
 from ...splats.quaternions import rotations
 from ...splats.shapes import Shape
 from .edit import DensifyEdit
@@ -117,8 +117,8 @@ def with_reset(edit: DensifyEdit, arrays: Mapping[str, Array], shape: Shape) -> 
     names = opacity_names(arrays)
     after = {name: edit.values.get(name, arrays[name][edit.source]) for name in names}
     low = {
-        name: raw_of_thickness(
-            shape, np.minimum(thickness(shape, after[name]), -math.log1p(-RESET_OPACITY)), after[name]
+        name: raw_of_optical_depth(
+            shape, np.minimum(optical_depth(shape, after[name]), -math.log1p(-RESET_OPACITY)), after[name]
         )
         for name in names
     }
@@ -167,10 +167,10 @@ def _halves_along_axis(parents: Mapping[str, Array], shape: Shape) -> dict[str, 
     names = opacity_names(parents)
     if len(names) == 2:
         delta = _delta(parents)[row, axis]
-        thick = [thickness(shape, parents[name]) for name in names]
+        thick = [optical_depth(shape, parents[name]) for name in names]
         beyond = np.where(side * delta > 0, thick[0], thick[1])
         for name, own in zip(names, thick, strict=True):
-            changed[name] = raw_of_thickness(shape, own + delta**2 * (beyond - own), parents[name])
+            changed[name] = raw_of_optical_depth(shape, own + delta**2 * (beyond - own), parents[name])
     return _placed(parents, shape, shift, changed)
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError, TrainingError
 from ...splats.fields import Array, DoubleArray
-from ...splats.optical_depth import finite_rows, opacity_names, raw_of_thickness, thickness
+from ...splats.optical_depth import finite_rows, opacity_names, optical_depth, raw_of_optical_depth
 from ...splats.shapes import Shape
 from .edit import DensifyEdit
 
@@ -141,7 +141,7 @@ def relocation(
     raw : by opacity field, (N,) new raw values. length_factor : (N,).
     """
     names = opacity_names(arrays)
-    old = np.stack([thickness(shape, arrays[name]) for name in names], axis=1)  # (N, S)
+    old = np.stack([optical_depth(shape, arrays[name]) for name in names], axis=1)  # (N, S)
     count = np.minimum(ratio, N_MAX)
     shared = np.maximum(old / count[:, None], 1e-300)
     thickest = shared.max(axis=1, initial=1e-300, keepdims=True)
@@ -151,7 +151,7 @@ def relocation(
         rows = slice(first, first + _CHUNK)
         part = {name: array[rows] for name, array in arrays.items()}
         factor[rows] = _length_factor(shape, part, -np.expm1(-old[rows]), -np.expm1(-shared[rows]), count[rows])
-    raw = {name: raw_of_thickness(shape, shared[:, side], arrays[name]) for side, name in enumerate(names)}
+    raw = {name: raw_of_optical_depth(shape, shared[:, side], arrays[name]) for side, name in enumerate(names)}
     return raw, factor
 
 
