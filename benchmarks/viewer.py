@@ -29,8 +29,6 @@ from typing import Any
 import common
 import numpy as np
 
-from clsplat.splats.color import BLACK
-
 sys.path.insert(0, str(common.ROOT / "tests"))
 
 KEYS, FRAMES = 4, 4000  # training cameras on the path, poses between them
@@ -111,15 +109,14 @@ def path_of(model: Path) -> list[Any]:
 
 def serve(model: Path, device: str | None) -> None:
     """The viewer, with the number of its pose in each picture; ends with its input."""
-    from clsplat_cli.models import load_model
-    from clsplat_cli.view import Viewing, known_cameras
-
     from clsplat.device.device import open_device
+    from clsplat.models.model import load_model
     from clsplat.rendering.tuning import schedule_for
+    from clsplat.viewer.session import ServerOptions, ViewingSession
 
     places = np.array([camera.position for camera in path_of(model)])
     loaded = load_model(model)
-    viewing = Viewing(loaded, None, known_cameras(loaded, None, None, None), BLACK, "127.0.0.1", 0, None, device)
+    viewing = ViewingSession(loaded, options=ServerOptions(port=0), device=device)
     make = viewing.source.picture
 
     def stamped(camera: Any, settings: Any) -> Any:

@@ -188,7 +188,7 @@ def _read(
     scene = load_scene(path, images, -1 if resolution is None else resolution, eval=False)
     if model is None:
         return scene, splats or len(scene.points) or SPLATS
-    from .models import load_model
+    from clsplat.models.model import load_model
 
     loaded = load_model(model).splats
     if not len(loaded):

@@ -8,86 +8,55 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.errors import InputError
-from clsplat.splats.splats import Splats
-from clsplat.splats.stats import complexity
-from clsplat.training.folder import ModelFolder
-
-from .models import load_model
 from .options import PATH, iteration_option
 from .progress import table
 
 if TYPE_CHECKING:
+    from clsplat.models.info import ModelInfo
     from clsplat.scenes.info import LensUse, SceneInfo
 
-_NAMED = 5  # names that are listed, of many
+_NAMED = 5  # names in a list before it is cut
 
 
 @click.command("info")
 @click.argument("paths", nargs=-1, required=True, type=PATH)
 @iteration_option
-@click.option("-i", "--images", metavar="NAME", help="Of a scene: the folder of its photos, such as images_4.")
+@click.option("-i", "--images", metavar="NAME", help="Folder of the photos inside a scene, such as images_4.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, one object for each path.")
 def show_info(paths: tuple[Path, ...], iteration: int | None, images: str | None, as_json: bool) -> None:
-    """Say what PATHS hold: models (folders or PLY files), or scenes.
+    """Show what PATHS hold: models (folders or PLY files), or scenes.
 
-    Of a model the splats, skewed splats, SH coefficients, parameters and bytes; of a scene its photos, lenses, points
-    and test views, without decoding a photo.
+    For a model: its splats, skewed splats, SH coefficients, parameters and bytes. For a scene: its photos, lenses,
+    points and test views, without decoding a photo.
     """
+    from clsplat.models.info import ModelInfo, inspect
+
     for number, path in enumerate(paths):
-        if number and not as_json:
+        found = inspect(path, iteration=iteration, images=images)
+        if as_json:
+            kind = "model" if isinstance(found, ModelInfo) else "scene"
+            click.echo(json.dumps({kind: str(path), **found.to_json()}))
+            continue
+        if number:
             click.echo()
-        if _is_scene(path):
-            _show_scene(path, images, as_json)
-        else:
-            _show_model(path, iteration, as_json)
-
-
-def _is_scene(path: Path) -> bool:
-    from clsplat.scenes.info import is_scene
-    from clsplat.scenes.reconstruct.photo_files import is_photographs
-
-    if path.is_file() or not path.is_dir() or ModelFolder(path).iterations():
-        return path.is_file() and path.suffix == ".json"
-    if is_scene(path):
-        return True
-    if ModelFolder(path).is_used:
-        return False  # a model without a point cloud yet: load_model says so
-    if is_photographs(path):
-        raise InputError(f"{path}: photographs without poses: clsplat reconstruct {path} -o SCENE finds them")
-    raise InputError(f"{path}: neither a model (point_cloud/) nor a scene (sparse/ or transforms.json)")
+        for line in _model_lines(found) if isinstance(found, ModelInfo) else _scene_lines(path, found):
+            click.echo(line)
 
 
 # --- models ------------------------------------------------------------------------------------
 
 
-def _show_model(path: Path, iteration: int | None, as_json: bool) -> None:
-    loaded = load_model(path, iteration)
-    found = described(loaded.splats, loaded.ply)
-    if as_json:
-        click.echo(json.dumps({"model": str(path), **found}))
-        return
-    click.echo(
-        f"{loaded.ply}: {found['splats']} splats, shape {found['shape']}, SH degree {found['sh_degree']}, "
-        f"{'antialiased, ' if found['antialiased'] else ''}{found['bytes'] / 1e6:.2f} MB"
-    )
-    click.echo(table(("", "in use", "of"), rows_of(found)))
+def _model_lines(info: ModelInfo) -> list[str]:
+    found = info.to_json()
+    return [
+        f"{info.model.ply}: {found['splats']} splats, shape {found['shape']}, SH degree {found['sh_degree']}, "
+        f"{'antialiased, ' if found['antialiased'] else ''}{found['bytes'] / 1e6:.2f} MB",
+        table(("", "in use", "of"), model_rows(found)),
+    ]
 
 
-def described(splats: Splats, ply: Path) -> dict[str, Any]:
-    """The model's complexity, and the bytes of its file."""
-    return {
-        "shape": splats.shape,
-        "normalisation": splats.normalisation,
-        "sh_degree": splats.sh_degree,
-        "antialiased": splats.antialiased,
-        "bytes": ply.stat().st_size,
-        **complexity(splats).to_json(),
-    }
-
-
-def rows_of(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Lines of the table: what, how much of it is in use, and out of how much."""
+def model_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Rows of the table: name, number in use, number in all."""
     n = found["splats"]
     rows = [(f"splats with {name}", str(count), str(n)) for name, count in found["fields_in_use"].items()]
     rows += [
@@ -102,22 +71,15 @@ def rows_of(found: dict[str, Any]) -> list[tuple[str, str, str]]:
 # --- scenes ------------------------------------------------------------------------------------
 
 
-def _show_scene(path: Path, images: str | None, as_json: bool) -> None:
-    from clsplat.scenes.info import scene_info
-
-    found = scene_info(path, images)
-    if as_json:
-        click.echo(json.dumps({"scene": str(path), **found.to_json()}))
-        return
-    rows = scene_rows(found)
+def _scene_lines(path: Path, info: SceneInfo) -> list[str]:
+    rows = scene_rows(info)
     width = max(len(name) for name, _ in rows)
-    click.echo(f"{path}: {found.kind}, {found.photos} photos with poses")
-    for name, text in rows:
-        click.echo(f"{name.ljust(width)}  {text}")
+    head = f"{path}: {info.kind}, {info.photos} photos with poses"
+    return [head, *(f"{name.ljust(width)}  {text}" for name, text in rows)]
 
 
 def scene_rows(found: SceneInfo) -> list[tuple[str, str]]:
-    """What, and how much of it."""
+    """Rows of the table: name and contents."""
     rows = [
         (
             "photos",
@@ -126,8 +88,8 @@ def scene_rows(found: SceneInfo) -> list[tuple[str, str]]:
         )
     ]
     if found.placed:
-        placed, given, error = found.placed
-        rows.append(("reconstructed", f"{placed} of {given} photos, {error:.2f} px off"))
+        placed, photos, error = found.placed
+        rows.append(("reconstructed", f"{placed} of {photos} photos, {error:.2f} px off"))
     if found.unreadable:
         rows.append(("unreadable", _named(found.unreadable)))
     rows.append(("without a pose", _named(found.unregistered) if found.unregistered else "none"))

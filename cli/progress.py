@@ -2,32 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Sequence
-from typing import TypeVar
+from collections.abc import Iterable, Sequence
+from types import TracebackType
 
 from clsplat.training.progress import PLAIN_INTERVAL, LiveLine, TrainingDisplay, duration
 
-__all__ = ["TrainingDisplay", "counted", "duration", "table"]
-
-T = TypeVar("T")
+__all__ = ["TrainingDisplay", "ViewCount", "duration", "table"]
 
 
-def counted(items: Sequence[T], label: str, quiet: bool = False) -> Generator[T]:
-    """The items, with a count that goes away at the end; where there is no terminal, a line every ten seconds."""
-    line = LiveLine()
-    begun = line.clock()
-    try:
-        for number, item in enumerate(items, 1):
-            # What is done within the interval needs no line in a log.
-            if not quiet and (line.live or line.clock() - begun >= PLAIN_INTERVAL):
-                line.show(f"{label} {number}/{len(items)}")
-            yield item
-    finally:
-        line.clear()
+class ViewCount:
+    """A `progress` callback that shows how many views are done; a context manager that removes the line at the end.
+
+    Without a terminal it writes a line every PLAIN_INTERVAL seconds.
+
+    Parameters
+    ----------
+    label : word before the count.
+    quiet : show nothing.
+
+    Attributes
+    ----------
+    done, total : numbers of views; 0 before the first view begins.
+    """
+
+    def __init__(self, label: str, quiet: bool = False) -> None:
+        self.label, self.quiet = label, quiet
+        self.done = self.total = 0
+        self._line = LiveLine()
+        self._start = self._line.clock()
+
+    def __enter__(self) -> ViewCount:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.clear()
+
+    def __call__(self, number: int, total: int) -> None:
+        self.done, self.total = number - 1, total
+        # A log needs no line about work that ends within the interval.
+        if not self.quiet and (self._line.live or self._line.clock() - self._start >= PLAIN_INTERVAL):
+            self._line.show(f"{self.label} {number}/{total}")
+
+    def clear(self) -> None:
+        """Remove the line."""
+        self._line.clear()
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Columns under their heads: the first to the left, the others to the right."""
+    """Columns under their heads; the first is aligned to the left, the others to the right."""
     lines = [head, *rows]
     widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
 

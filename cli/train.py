@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     from clsplat.evaluation.evaluate import Evaluation
     from clsplat.scenes.scene import Scene
     from clsplat.training.run import Model
-
-    from .live import LiveView
+    from clsplat.viewer.training_session import TrainingSession
 
 SCENE_KEYS = ("images", "resolution", "masks", "alpha", "test_every", "test_list", "eval")
 INTERRUPTED = 130
@@ -179,7 +178,7 @@ def run_training(
     resume: bool = False,
     overwrite: bool = False,
     quiet: bool = False,
-    live: LiveView | None = None,
+    live: TrainingSession | None = None,
 ) -> Model:
     """Train with a live display, and a page in the browser if `live` is given."""
     from clsplat.training.run import train as train_model
@@ -188,7 +187,7 @@ def run_training(
         return train_model(
             scene,
             config,
-            live.told(display) if live else display,
+            live.progress(display) if live else display,
             output=model_path,
             resume=resume,
             overwrite=overwrite,
@@ -197,10 +196,14 @@ def run_training(
         )
 
 
-def _viewer(scene: Scene, config: TrainConfig, model_path: Path, host: str, port: int, quiet: bool) -> LiveView:
-    from .live import LiveView
+def _viewer(scene: Scene, config: TrainConfig, model_path: Path, host: str, port: int, quiet: bool) -> TrainingSession:
+    from clsplat.viewer.session import ServerOptions
+    from clsplat.viewer.training_session import TrainingSession
 
-    return LiveView(scene, config, model_path, host, port, quiet)
+    session = TrainingSession(scene, config, model_path.resolve().name, ServerOptions(host, port))
+    if not quiet:
+        click.echo(f"training can be watched at {session.url}", err=True)
+    return session
 
 
 def test_metrics(model: Model, scene: Scene) -> Evaluation | None:

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_runner import clsplat, error_of
-from clsplat_cli.models import load_splats
 
 from clsplat.cameras.cameras_json import read_cameras
 from clsplat.evaluation.metrics import psnr
 from clsplat.rendering.renderer import Renderer
+from clsplat.splats.any_file import load_splats
 from clsplat.splats.shapes import GAUSSIAN, SHAPES, SKEW_NORMAL, SKEW_NORMAL_DIRECT
 from clsplat.splats.splats import Splats
 from clsplat.training.folder import ModelFolder

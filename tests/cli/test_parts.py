@@ -8,13 +8,13 @@ import math
 import click
 import numpy as np
 import pytest
-from clsplat_cli.options import Color, Numbers
-from clsplat_cli.outputs import output_stems
+from clsplat_cli.options import ColorType, Numbers
 from clsplat_cli.progress import TrainingDisplay, duration, table
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.orbits import look_at, orbit
 from clsplat.errors import InputError
+from clsplat.rendering.outputs import output_stems
 from clsplat.splats.splats import Splats
 from clsplat.training.log import Progress
 
@@ -81,9 +81,9 @@ def test_stems() -> None:
 
 
 def test_option_types() -> None:
-    assert Color().convert("0, .5,1", None, None) == (0, 0.5, 1)
+    assert ColorType().convert("0, .5,1", None, None) == (0, 0.5, 1)
     assert Numbers().convert("1000, 7000 30000", None, None) == (1000, 7000, 30000)
-    for kind, bad in ((Color(), "1,1,1,1"), (Color(), "-1,0,0"), (Numbers(), "0"), (Numbers(), "")):
+    for kind, bad in ((ColorType(), "1,1,1,1"), (ColorType(), "-1,0,0"), (Numbers(), "0"), (Numbers(), "")):
         with pytest.raises(click.BadParameter):
             kind.convert(bad, None, None)
 

@@ -237,8 +237,8 @@ def test_bad_path_flags_and_files(model: Path, tmp_path: Path) -> None:
     assert "belong to --path interpolate" in error_of("render", model, "--path", "orbit", "--keys", "a", *out, code=2)
     assert "belong to --path" in error_of("render", model, "--frames", "2", *out, code=2)
     assert "-o DIR for images" in error_of("render", model, code=2)
-    assert "no size" in error_of("render", model, "--path", "orbit", "--size", "0x3", *out, code=2)
-    assert "no range" in error_of("render", model, "--depth-range", "3,1", *out, code=2)
+    assert "is not a size" in error_of("render", model, "--path", "orbit", "--size", "0x3", *out, code=2)
+    assert "is not a range" in error_of("render", model, "--depth-range", "3,1", *out, code=2)
     assert "v.avi: no video" in error_of("render", model, "--path", "orbit", "--video", tmp_path / "v.avi")
     assert files(tmp_path) == {"p.json"}
 

@@ -15,20 +15,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_runner import ITERATIONS, N_VIEWS, SHORT, TEST_NAMES, clsplat, error_of
-from clsplat_cli.models import load_model
-from clsplat_cli.view import known_cameras
 from PIL import Image
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera, write_cameras
+from clsplat.models.model import SceneChoice, load_model
 from clsplat.viewer.camera import Pose, camera_of
+from clsplat.viewer.session import known_cameras
 from clsplat.viewer.settings import Settings
 from clsplat.viewer.source import ModelSource
 
 
 def test_a_still_picture_has_the_bytes_of_render(tmp_path: Path, model_folder: Path) -> None:
     model = model_folder
-    position = tuple(known_cameras(load_model(model), None, None, None).test[0].camera.position)
+    position = tuple(known_cameras(load_model(model)).test[0].camera.position)
     camera = camera_of(Pose((0.9, 0.1, -0.3, 0.2), position, 0.9, 130, 70), 1280)
     assert isinstance(camera, Camera)
     write_cameras(tmp_path / "cameras.json", [NamedCamera("browser", camera)])
@@ -41,11 +41,11 @@ def test_a_still_picture_has_the_bytes_of_render(tmp_path: Path, model_folder: P
 def test_cameras_are_split_as_the_run_did(capture_folder: Path, model_folder: Path) -> None:
     model = load_model(model_folder)
     scene = capture_folder
-    for known in (known_cameras(model, None, None, None), known_cameras(model, scene, None, 2)):
+    for known in (known_cameras(model), known_cameras(model, SceneChoice(scene, resolution=2))):
         assert [item.name for item in known.test] == [name.removesuffix(".png") for name in TEST_NAMES]
         assert len(known.train) == N_VIEWS - len(TEST_NAMES)
     ply = load_model(model.ply)
-    assert not known_cameras(ply, None, None, None).by_label
+    assert not known_cameras(ply).by_label
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capture_folder: Path, model_folder: Path) -> None:

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_runner import TEST_NAMES, clsplat, error_of
-from clsplat_cli.eval_pages import ViewRecorder
 from PIL import Image
 
 from clsplat.cameras.camera import Camera
 from clsplat.errors import InputError
 from clsplat.evaluation.report import page as eval_report
 from clsplat.evaluation.report.histogram import BINS, histogram, quantile, shares
-from clsplat.evaluation.report.images import LONGEST, full_scale, map_of, shot_of, veiled
-from clsplat.evaluation.report.page import Measured, write_eval_report
+from clsplat.evaluation.report.images import LONGEST, compare_images, full_scale, map_of, veiled
+from clsplat.evaluation.report.page import ModelReport, write_report
+from clsplat.models.measurements import ViewRecorder
 from clsplat.rendering.colormaps import colour_map
 from clsplat.rendering.renderer import Rendered
 from clsplat.scenes.scene import View
@@ -29,9 +29,9 @@ WIDTH, HEIGHT = 60, 40
 URI = re.compile(r'<img ([^>]*)src="data:image/jpeg;base64,([^"]+)"')
 
 
-def measured(label: str, n: int = 3, error: float = 0.05, mask: bool = False) -> Measured:
+def measured(label: str, n: int = 3, error: float = 0.05, mask: bool = False) -> ModelReport:
     """A model whose view `n - 1` is the worst."""
-    shots, psnr = {}, {}
+    images, psnr = {}, {}
     for index in range(n):
         photo = np.broadcast_to(np.linspace(60, 190, WIDTH) + 3 * index, (3, HEIGHT, WIDTH)).T.astype(np.uint8)
         photo = np.ascontiguousarray(photo.transpose(1, 0, 2))
@@ -39,14 +39,14 @@ def measured(label: str, n: int = 3, error: float = 0.05, mask: bool = False) ->
         hides = np.ones((HEIGHT, WIDTH), bool)
         hides[:, :20] = False
         name = f"<{index}>.jpg"
-        shots[name] = shot_of(photo, color, hides if mask else None)
+        images[name] = compare_images(photo, color, hides if mask else None)
         psnr[name] = 30.0 - index
-    return Measured(
+    return ModelReport(
         label,
         {"splats": "7"},
         [("shape", "round & flat")],
         {"PSNR": psnr, "SSIM": {name: value / 40 for name, value in psnr.items()}},
-        shots,
+        images,
     )
 
 
@@ -64,7 +64,7 @@ def test_shots_count_whole_images_and_only_what_counts() -> None:
     color[:, :600, 0] = 1.5  # beyond white
     mask = np.ones((900, 1200), bool)
     mask[:450] = False
-    shot = shot_of(photo, color, mask)
+    shot = compare_images(photo, color, mask)
     assert shot.size == (LONGEST, 600)
     assert {error: n for error, n in enumerate(shot.counts) if n} == {3: 450 * (1200 * 3 - 600), 155: 450 * 600}
     assert shot.hidden is not None
@@ -80,9 +80,9 @@ def test_scale_is_round_and_leaves_masked_pixels_out() -> None:
     color[:25] = 1.0
     mask = np.ones((50, 50), bool)
     mask[:25] = False
-    assert full_scale([shot_of(photo, color, mask)]) == 0.2
-    assert full_scale([shot_of(photo, color)]) == 1.0
-    assert full_scale([shot_of(photo, color, np.zeros((50, 50), bool))]) == 0.02
+    assert full_scale([compare_images(photo, color, mask)]) == 0.2
+    assert full_scale([compare_images(photo, color)]) == 1.0
+    assert full_scale([compare_images(photo, color, np.zeros((50, 50), bool))]) == 0.02
 
 
 def test_maps_follow_the_colour_map_and_stripe_what_is_hidden() -> None:
@@ -113,7 +113,7 @@ def test_histogram_shares_add_up() -> None:
 
 
 def test_a_page_holds_everything_itself(tmp_path: Path) -> None:
-    path = write_eval_report(tmp_path / "report.html", [measured("one", mask=True)], "3 test views of yard", ["How."])
+    path = write_report(tmp_path / "report.html", [measured("one", mask=True)], "3 test views of yard", ["How."])
     text = path.read_text()
     assert re.findall(r'(?:src|href)="(?!data:|#)', text) == []
     assert "http" not in re.sub(r'base64,[^"]*', "", text)
@@ -135,9 +135,9 @@ def test_a_page_holds_everything_itself(tmp_path: Path) -> None:
 
 def test_images_are_what_they_say(tmp_path: Path) -> None:
     model = measured("one", n=1)
-    text = write_eval_report(tmp_path / "r.html", [model], "1 view", []).read_text()
+    text = write_report(tmp_path / "r.html", [model], "1 view", []).read_text()
     (_, render), (_, photo), (_, error) = images(text)
-    shot = model.shots["<0>.jpg"]
+    shot = model.images["<0>.jpg"]
     assert np.abs(photo.astype(int) - shot.photo).mean() < 2
     assert np.abs(render.astype(int) - shot.render).mean() < 2
     assert full_scale([shot]) == 0.1
@@ -147,21 +147,21 @@ def test_images_are_what_they_say(tmp_path: Path) -> None:
 
 def test_a_page_of_two_models_compares_them(tmp_path: Path) -> None:
     both = [measured("one"), measured("two", error=0.1)]
-    text = write_eval_report(tmp_path / "r.html", both, "3 views", []).read_text()
+    text = write_report(tmp_path / "r.html", both, "3 views", []).read_text()
     assert len(images(text)) == 3 * (2 + 1 + 2), "the photo once"
     assert text.count("<select") == 3 * 2
     assert text.count("<td data-value") == 3 * 2 * 2
     assert text.count("class=best") == 3 * 2 * 2, "equal values are both best"
     other = measured("three", n=2)
     with pytest.raises(InputError, match="three and one were measured on different views"):
-        write_eval_report(tmp_path / "s.html", [both[0], other], "views", [])
+        write_report(tmp_path / "s.html", [both[0], other], "views", [])
 
 
 def test_a_page_is_bounded_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = measured("one", n=40)
-    whole = write_eval_report(tmp_path / "whole.html", [model], "40 views", []).stat().st_size
+    whole = write_report(tmp_path / "whole.html", [model], "40 views", []).stat().st_size
     monkeypatch.setattr(eval_report, "IMAGE_BYTES", 0.5 * whole)
-    path = write_eval_report(tmp_path / "half.html", [model], "40 views", [])
+    path = write_report(tmp_path / "half.html", [model], "40 views", [])
     assert path.stat().st_size < 0.5 * whole + 20_000, "the rest of the page is small"
     text = path.read_text()
     (shown,) = map(int, re.findall(r"(\d+) of 40 views are shown: the 8 worst", text))
@@ -200,7 +200,7 @@ def test_eval_writes_the_page(tmp_path: Path, model_folder: Path) -> None:
 
 
 def test_a_recorder_sees_renders_in_the_photos_exposure() -> None:
-    photo = np.ascontiguousarray(measured("one", n=1).shots["<0>.jpg"].photo[..., [0, 0, 0]])
+    photo = np.ascontiguousarray(measured("one", n=1).images["<0>.jpg"].photo[..., [0, 0, 0]])
     photo[..., 1] //= 2
     photo[:9, :, 2] = 7
     view = View("a.png", Camera(WIDTH, HEIGHT, 50.0, 50.0, 30.0, 20.0, np.eye(4)), photo)
@@ -208,9 +208,9 @@ def test_a_recorder_sees_renders_in_the_photos_exposure() -> None:
     plain, corrected = ViewRecorder(), ViewRecorder(corrected=True)
     plain(view, dark)
     corrected(view, dark)
-    assert plain.shots["a.png"].error.max() > 20
-    assert corrected.shots["a.png"].error.max() <= 1
-    assert np.abs(corrected.shots["a.png"].render.astype(int) - photo).max() <= 1
+    assert plain.images["a.png"].error.max() > 20
+    assert corrected.images["a.png"].error.max() <= 1
+    assert np.abs(corrected.images["a.png"].render.astype(int) - photo).max() <= 1
 
 
 # --- in a browser --------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def test_wipe_choice_and_table_in_a_browser(tmp_path: Path) -> None:
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no Chromium: apt install chromium")
-    path = write_eval_report(tmp_path / "r.html", [measured("one"), measured("two")], "3 views", [])
+    path = write_report(tmp_path / "r.html", [measured("one"), measured("two")], "3 views", [])
     with api.sync_playwright() as play:
         browser = play.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         context = browser.new_context(viewport={"width": 400, "height": 800}, has_touch=True)

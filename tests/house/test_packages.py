@@ -27,6 +27,7 @@ PACKAGES = (
     "evaluation",
     "training",
     "compression",
+    "models",
     "comparison",
     "profiling",
     "viewer",

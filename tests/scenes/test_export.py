@@ -140,7 +140,7 @@ def test_what_has_no_cameras_or_no_form_is_refused(garden: Path, tmp_path: Path,
     assert "has no cameras" in error_of("cameras", ply, tmp_path / "out.json")
     posed = with_lens(garden, "RADIAL")
     write_colmap(garden / "sparse" / "0", posed.photos, posed.points)
-    assert "no distorted lenses" in error_of("cameras", garden, tmp_path / "cameras.json")
+    assert "does not support distorted lenses" in error_of("cameras", garden, tmp_path / "cameras.json")
     photo = RegisteredImage("a.png", np.eye(4), make_lens("FOV", 40, 30, [33.0, 31.0, 18.5, 16.25, 0.9]))
     with pytest.raises(Exception, match="no lens of COLMAP's model FOV"):
         write_transforms(tmp_path / "t.json", [photo], ["a.png"], posed.points)

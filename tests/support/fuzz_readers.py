@@ -183,11 +183,11 @@ def make_model(folder: Path) -> None:
 
 
 def read_model_folder(folder: Path) -> None:
-    from clsplat_cli.models import load_model, recorded_cameras
+    from clsplat.models.model import load_model
 
     loaded = load_model(folder)
     finite(loaded.splats.arrays)
-    recorded_cameras(loaded)
+    loaded.read_cameras()
     assert loaded.test_names is None or all(isinstance(name, str) for name in loaded.test_names)
     assert all(np.isfinite(loaded.background))
 

@@ -16,11 +16,17 @@ from typing import TextIO
 
 import pytest
 from clsplat_cli.main import _show_warning
-from clsplat_cli.progress import counted
+from clsplat_cli.progress import ViewCount
 
 import clsplat
 from clsplat.training.log import Progress
 from clsplat.training.progress import LiveLine, TrainingDisplay, progress_line
+
+
+def count_views(total: int) -> None:
+    with ViewCount("rendering") as count:
+        for number in range(1, total + 1):
+            count(number, total)
 
 
 def at(iteration: int, message: str = "") -> Progress:
@@ -117,10 +123,12 @@ def test_counts_go_away_even_if_the_work_fails(terminal: Terminal, monkeypatch: 
     monkeypatch.setattr(sys, "stderr", terminal.stream)
 
     def work() -> None:
-        for item in counted([1, 2, 3], "rendering"):
-            assert terminal.seen() == [f"rendering {item}/3"]
-            if item == 2:
-                raise ValueError("went wrong")
+        with ViewCount("rendering") as count:
+            for number in range(1, 4):
+                count(number, 3)
+                assert terminal.seen() == [f"rendering {number}/3"]
+                if number == 2:
+                    raise ValueError("went wrong")
 
     with pytest.raises(ValueError, match="went wrong"):
         work()
@@ -140,10 +148,10 @@ def test_a_log_file_gets_whole_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     assert text.splitlines()[-1].startswith("1000/1000 100%  loss 0.1234")
     log = io.StringIO()
     monkeypatch.setattr(sys, "stderr", log)
-    assert list(counted([1, 2, 3], "rendering")) == [1, 2, 3]
+    count_views(3)
     assert log.getvalue() == "", "quick work needs no line"
     monkeypatch.setattr(LiveLine.__init__, "__defaults__", (None, lambda: next(seconds)))
-    assert len(list(counted(range(12), "rendering"))) == 12
+    count_views(12)
     assert all(line.startswith("rendering ") for line in log.getvalue().splitlines())
     assert "\r" not in log.getvalue()
     assert 2 <= log.getvalue().count("\n") <= 12

@@ -46,7 +46,7 @@ class ComparedImage:
         return self.photo.shape[1], self.photo.shape[0]
 
 
-def shot_of(
+def compare_images(
     photo: Picture, color: NDArray[Any], mask: NDArray[np.bool_] | None = None, flip: NDArray[np.float32] | None = None
 ) -> ComparedImage:
     """A view's photo and render for the page.
@@ -71,9 +71,9 @@ def shot_of(
     )
 
 
-def full_scale(shots: list[ComparedImage]) -> float:
+def full_scale(images: list[ComparedImage]) -> float:
     """The error (0..1) at the bright end of all maps: the next round one that 99 % of the pixels stay below."""
-    errors = [shot.error if shot.hidden is None else shot.error[~shot.hidden] for shot in shots]
+    errors = [shot.error if shot.hidden is None else shot.error[~shot.hidden] for shot in images]
     some = np.concatenate([error.ravel()[:: max(error.size // _SAMPLES, 1)] for error in errors])
     most = float(np.quantile(some, _QUANTILE)) / (LEVELS - 1) if len(some) else 0.0
     return next(scale for scale in _FULL_SCALES if scale >= most)

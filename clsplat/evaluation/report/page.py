@@ -24,7 +24,7 @@ _LESS_IS_BETTER = ("LPIPS", "FLIP")
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class ModelReport:
     """A model and what was measured of it.
 
     Parameters
@@ -32,14 +32,14 @@ class Measured:
     label : as in tables. costs : cells of the first table by their headings, beside the metrics' means.
     facts : lines of a table, what and how much.
     per_view : by metric ("PSNR", "SSIM", perhaps "LPIPS", "FLIP"), values by the views' names.
-    shots : by the views' names.
+    images : by the views' names.
     """
 
     label: str
     costs: Mapping[str, str]
     facts: Sequence[tuple[str, str]]
     per_view: Mapping[str, Mapping[str, float]]
-    shots: Mapping[str, ComparedImage]
+    images: Mapping[str, ComparedImage]
 
     def mean(self, metric: str) -> float:
         """Over the views."""
@@ -48,11 +48,11 @@ class Measured:
     @property
     def counts(self) -> NDArray[np.int64]:
         """(LEVELS,) values of all views by their error."""
-        counts: NDArray[np.int64] = np.sum([shot.counts for shot in self.shots.values()], axis=0)
+        counts: NDArray[np.int64] = np.sum([shot.counts for shot in self.images.values()], axis=0)
         return counts
 
 
-def write_eval_report(path: Path, models: Sequence[Measured], what: str, protocol: Sequence[str]) -> Path:
+def write_report(path: Path, models: Sequence[ModelReport], what: str, protocol: Sequence[str]) -> Path:
     """Write the page; returns its path.
 
     Parameters
@@ -64,10 +64,10 @@ def write_eval_report(path: Path, models: Sequence[Measured], what: str, protoco
     ------
     InputError : the models' views are not the same. OutputError : cannot be written.
     """
-    names = list(models[0].shots)
+    names = list(models[0].images)
     for model in models[1:]:
-        if set(model.shots) != set(names) or any(
-            model.shots[name].size != models[0].shots[name].size for name in names
+        if set(model.images) != set(names) or any(
+            model.images[name].size != models[0].images[name].size for name in names
         ):
             raise InputError(
                 f"{path}: {model.label} and {models[0].label} were measured on different views or sizes; "
@@ -75,7 +75,7 @@ def write_eval_report(path: Path, models: Sequence[Measured], what: str, protoco
             )
     psnr = {name: statistics.fmean(model.per_view["PSNR"][name] for model in models) for name in names}
     worst_first = sorted(names, key=lambda name: psnr[name])
-    every = [shot for model in models for shot in model.shots.values()]
+    every = [shot for model in models for shot in model.images.values()]
     full = full_scale(every)
     shown = _views(models, worst_first, full)
     many = len(models) > 1
@@ -119,7 +119,7 @@ def write_eval_report(path: Path, models: Sequence[Measured], what: str, protoco
     return write_page(path, title, sections, STYLE, SCRIPT)
 
 
-def _metrics(models: Sequence[Measured]) -> list[str]:
+def _metrics(models: Sequence[ModelReport]) -> list[str]:
     return [metric for metric in _DIGITS if metric in models[0].per_view]
 
 
@@ -127,25 +127,25 @@ def _number(metric: str, value: float) -> str:
     return f"{value:.{_DIGITS[metric]}f}"
 
 
-def _about_images(shots: Sequence[ComparedImage], shown: int, n: int, full: float) -> list[str]:
+def _about_images(images: Sequence[ComparedImage], shown: int, n: int, full: float) -> list[str]:
     text = ["Drag over an image, or use the arrow keys, to wipe between the render and the photo."]
     text.append(
         f"Error maps: absolute difference, mean of the channels, all on one scale; {full:g} of the full range "
         "and more is brightest."
     )
-    if any(shot.hidden is not None for shot in shots):
+    if any(shot.hidden is not None for shot in images):
         text.append("Masked pixels are striped.")
     if shown < n:
         text.append(
             f"{shown} of {n} views are shown: the {min(_WORST, shown)} worst, and others spread evenly, "
             f"as far as {IMAGE_BYTES / 1e6:g} MB go."
         )
-    if any(max(shot.size) >= LONGEST for shot in shots):
+    if any(max(shot.size) >= LONGEST for shot in images):
         text.append(f"Images are reduced to {LONGEST} pixels at most; numbers are of whole images.")
     return text
 
 
-def _spread(model: Measured) -> str:
+def _spread(model: ModelReport) -> str:
     half, most = quantile(model.counts, 0.5), quantile(model.counts, 0.95)
     return f"{model.label}: half of the values are within {half} of 255 of the photo's, 95 % within {most}."
 
@@ -153,7 +153,7 @@ def _spread(model: Measured) -> str:
 # --- the table of views ------------------------------------------------------------------------
 
 
-def _view_table(models: Sequence[Measured], names: Sequence[str], shown: Mapping[str, str]) -> str:
+def _view_table(models: Sequence[ModelReport], names: Sequence[str], shown: Mapping[str, str]) -> str:
     metrics = _metrics(models)
     columns = [(metric, model) for metric in metrics for model in models]
     heads = [
@@ -185,7 +185,7 @@ def _view_table(models: Sequence[Measured], names: Sequence[str], shown: Mapping
 # --- the images --------------------------------------------------------------------------------
 
 
-def _views(models: Sequence[Measured], worst_first: Sequence[str], full: float) -> dict[str, str]:
+def _views(models: Sequence[ModelReport], worst_first: Sequence[str], full: float) -> dict[str, str]:
     """Markup of as many views as the page has room for, by name, worst first."""
     wanted = [*worst_first[:_WORST], *_spread_evenly(worst_first[_WORST:])]
     stops = colour_stops()
@@ -214,16 +214,16 @@ def _spread_evenly(names: Sequence[str]) -> list[str]:
     return [names[place] for place in dict.fromkeys(order) if place < len(names)]
 
 
-def _view(models: Sequence[Measured], name: str, full: float, stops: str, anchor: str) -> str:
+def _view(models: Sequence[ModelReport], name: str, full: float, stops: str, anchor: str) -> str:
     numbers = "; ".join(
         (f"{model.label}: " if len(models) > 1 else "")
         + ", ".join(f"{metric} {_number(metric, model.per_view[metric][name])}" for metric in _metrics(models))
         for model in models
     )
-    width, height = models[0].shots[name].size
+    width, height = models[0].images[name].size
     parts = [_wipe(models, name)]
     for model in models:
-        shot, of = model.shots[name], f" of {model.label}" if len(models) > 1 else ""
+        shot, of = model.images[name], f" of {model.label}" if len(models) > 1 else ""
         parts.append(_map(data_uri(map_of(shot.error, full, shot.hidden)), f"Error{of}", name, stops, full))
         if shot.flip is not None:
             parts.append(_map(data_uri(map_of(shot.flip, 1.0, shot.hidden)), f"FLIP{of}", name, stops, 1.0))
@@ -233,10 +233,10 @@ def _view(models: Sequence[Measured], name: str, full: float, stops: str, anchor
     )
 
 
-def _wipe(models: Sequence[Measured], name: str) -> str:
-    first = models[0].shots[name]
+def _wipe(models: Sequence[ModelReport], name: str) -> str:
+    first = models[0].images[name]
     width, height = first.size
-    sides = [(model.label if len(models) > 1 else "render", model.shots[name].render) for model in models]
+    sides = [(model.label if len(models) > 1 else "render", model.images[name].render) for model in models]
     images = ""
     for key, (label, picture) in enumerate([*sides, ("photo", first.photo)]):
         side = "over" if key == 0 else "under" if key == len(models) else ""

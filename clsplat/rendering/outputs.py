@@ -1,4 +1,4 @@
-"""What rendered views are written to: images, whose names come from foreign files, and videos."""
+"""Files of rendered views: images of colour, alpha and depth, and videos."""
 
 from __future__ import annotations
 
@@ -6,44 +6,46 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from clsplat.errors import InputError
-from clsplat.files.atomic import atomic_writer
-from clsplat.files.image_names import bare_name
-from clsplat.splats.color import BLACK, Color
+from ..errors import InputError
+from ..files.atomic import atomic_writer
+from ..files.image_names import bare_name
+from ..files.images import write_grey16, write_png
+from ..files.video import VideoWriter
+from ..splats.color import BLACK, Color
+from .colormaps import depth_picture, picture_of
+from .renderer import Rendered
 
-if TYPE_CHECKING:
-    from clsplat.rendering.renderer import Rendered
-
-
+FORMATS = ("png", "npy")
+EXTRAS = ("alpha", "depth")
 _FULL_SCALE = 65535
 
 
 def output_stems(names: Sequence[str], extras: Sequence[str] = (), keep_suffix: bool = False) -> list[str]:
-    """File names without suffix, one for each view: its name less an image's extension, folders kept.
+    """File names without suffix, one for each view. Folders in a view's name are kept.
 
     Parameters
     ----------
-    keep_suffix : keep the extension: an array's file is called exactly `<img_name>.npy`.
-    extras : "alpha" and "depth" where those are written beside.
+    names : of the views; they may come from foreign files.
+    extras : any of EXTRAS, whose files lie beside the colours.
+    keep_suffix : keep the extension of the image, so that an array's file is called `<img_name>.npy`.
 
     Raises
     ------
-    InputError : a name that would leave the output folder, or two views with the same file.
+    InputError : a name would leave the output folder, or two views have the same file.
     """
     stems: list[str] = []
-    taken: dict[str, str] = {}
+    view_of: dict[str, str] = {}
     for name in names:
         stem = _safe(name) if keep_suffix else bare_name(_safe(name))
         for file in (stem, *(f"{stem}_{extra}" for extra in extras)):
-            if file in taken:
+            if file in view_of:
                 raise InputError(
-                    f"views {taken[file]!r} and {name!r} would both be written to {file}: rename one of them"
+                    f"views {view_of[file]!r} and {name!r} would both be written to {file}: rename one of them"
                 )
-            taken[file] = name
+            view_of[file] = name
         stems.append(stem)
     return stems
 
@@ -57,38 +59,47 @@ def _safe(name: str) -> str:
     return str(PurePosixPath(*parts))
 
 
-def beside(video: Path, extra: str) -> Path:
-    """The file of a video's alpha or depth."""
+def extra_video(video: Path, extra: str) -> Path:
+    """The file of a video's alpha or depth, beside the colours."""
     return video.with_name(f"{video.stem}_{extra}{video.suffix}")
 
 
 class ImageWriter:
-    """Writes one view's colour, and alpha and depth if wanted.
+    """Writes each view's colour, and its alpha and depth if they are among the extras.
 
     Parameters
     ----------
-    format : "png" or "npy". extras : any of "alpha", "depth".
-    near_far : depths at the ends of the colour map, for coloured depth PNGs; None: 16 bits of grey.
-    background : behind coloured depth.
+    folder : of the images.
+    format : one of FORMATS.
+    extras : any of EXTRAS.
+    near_far : depths at the two ends of the colour map; None writes depth as 16 bits of grey.
+    background : colour behind coloured depth.
+
+    Attributes
+    ----------
+    depth_scales : by the name of a grey depth PNG, its full scale [world units].
     """
 
     def __init__(
         self,
         folder: Path,
-        format: str,
+        format: str = "png",
         extras: Sequence[str] = (),
         near_far: tuple[float, float] | None = None,
         background: Color = BLACK,
     ) -> None:
         self.folder, self.format, self.extras = folder, format, extras
         self.near_far, self.background = near_far, background
+        self.depth_scales: dict[str, float] = {}
 
-    def write(self, stem: str, image: Rendered) -> str | None:
-        """Write the files; the scale of a grey depth PNG to tell the user, else None."""
-        from clsplat.files.images import write_grey16, write_png
+    def write(self, stem: str, image: Rendered) -> None:
+        """Write the files of one view.
 
+        Raises
+        ------
+        OutputError : a file cannot be written.
+        """
         planes = {"": image.color} | {f"_{name}": getattr(image, name) for name in self.extras}
-        note = None
         for ending, plane in planes.items():
             path = self.folder / f"{stem}{ending}.{self.format}"
             if self.format == "npy":
@@ -97,27 +108,25 @@ class ImageWriter:
             elif ending != "_depth":
                 write_png(path, plane)
             elif self.near_far is not None:
-                from clsplat.rendering.colormaps import depth_picture
-
                 write_png(path, depth_picture(image, self.near_far, self.background))
             else:
                 farthest = float(plane.max()) or 1.0
                 write_grey16(path, np.rint(plane * (_FULL_SCALE / farthest)).astype(np.uint16))
-                note = f"{path.name}: {_FULL_SCALE} = {farthest:.6g} world units"
-        return note
+                self.depth_scales[path.name] = farthest
 
 
 class VideoFiles:
-    """A video of the colours, and beside it `NAME_alpha` and `NAME_depth` if wanted; use as a context manager.
+    """A video of the colours, and beside it `NAME_alpha` and `NAME_depth`; a context manager.
 
     Parameters
     ----------
-    path : of the colours' video. fps : frames a second.
-    extras, near_far, background : as in ImageWriter; the depths need a range.
+    path : file of the colours' video.
+    fps : frames a second.
+    extras, near_far, background : as for `ImageWriter`; depth needs a range.
 
     Raises
     ------
-    InputError : no known kind of video, or the encoder is not installed.
+    InputError : the ending is not known, or the encoder is not installed.
     """
 
     def __init__(
@@ -128,10 +137,8 @@ class VideoFiles:
         near_far: tuple[float, float] | None = None,
         background: Color = BLACK,
     ) -> None:
-        from clsplat.files.video import VideoWriter
-
         self.near_far, self.background = near_far, background
-        paths = {"colour": path} | {extra: beside(path, extra) for extra in extras}
+        paths = {"colour": path} | {extra: extra_video(path, extra) for extra in extras}
         self.writers = {mode: VideoWriter(file, fps) for mode, file in paths.items()}
         self._open = ExitStack()
 
@@ -149,7 +156,5 @@ class VideoFiles:
 
     def write(self, stem: str, image: Rendered) -> None:
         """Add the view to every video."""
-        from clsplat.rendering.colormaps import picture_of
-
         for mode, writer in self.writers.items():
             writer.write(picture_of(image, mode, self.background, self.near_far))

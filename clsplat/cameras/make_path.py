@@ -1,0 +1,132 @@
+"""Camera paths on request: around a scene, between cameras, or from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import InputError
+from ..files.image_names import bare_name
+from ..splats.splats import Splats
+from .camera import Camera
+from .cameras_json import NamedCamera
+from .interpolate import interpolate, resized_by_height
+from .path import DEFAULT_FPS, CameraPath, read_path
+
+AROUND = ("orbit", "ellipse", "spiral")
+BETWEEN = "interpolate"
+FRAMES = 60
+_NAMES_IN_MESSAGE = 8
+
+
+@dataclass(frozen=True)
+class PathRequest:
+    """A path to make.
+
+    Parameters
+    ----------
+    kind : one of AROUND, BETWEEN, or a path file's name.
+    keys : names of the cameras to interpolate between, in this order; None takes all, sorted by name.
+    closed : interpolate back to the first camera.
+    frames, seconds : length of the path, one of them; by default FRAMES, or what the file has.
+    fps : frames a second; by default DEFAULT_FPS, or what the file has.
+    size : (width, height) of the images [px]; the vertical field of view is kept.
+
+    Raises
+    ------
+    InputError : `frames` and `seconds` are both set.
+    """
+
+    kind: str
+    keys: tuple[str, ...] | None = None
+    closed: bool = False
+    frames: int | None = None
+    seconds: float | None = None
+    fps: float | None = None
+    size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.frames is not None and self.seconds is not None:
+            raise InputError("camera path: give frames or seconds, not both")
+
+    def frame_count(self, fps: float) -> int | None:
+        """Number of frames at a rate; None if the request names neither frames nor seconds."""
+        return self.frames if self.seconds is None else max(1, round(self.seconds * fps))
+
+
+def make_path(
+    request: PathRequest, splats: Splats, views: Sequence[NamedCamera] = (), source: str | Path = "cameras"
+) -> CameraPath:
+    """Make the cameras of a path.
+
+    Parameters
+    ----------
+    splats : the model, which a path around a scene without cameras goes around.
+    views : cameras to go around or between.
+    source : where the views come from, for messages.
+
+    Raises
+    ------
+    InputError : the path file is missing or damaged, a key is not among the views, or there are no views to
+        interpolate between.
+    """
+    fps = request.fps or DEFAULT_FPS
+    count = request.frame_count(fps) or FRAMES
+    if request.kind in AROUND:
+        from . import orbits
+
+        cameras = getattr(orbits, request.kind)(splats, [view.camera for view in views], count)
+        path = CameraPath(tuple(cameras), fps, closed=True)
+    elif request.kind == BETWEEN:
+        keys = _chosen(views, source, request.keys)
+        path = CameraPath(tuple(interpolate(keys, count, request.closed)), fps, tuple(keys), request.closed)
+    else:
+        path = _from_file(request)
+    return path if request.size is None else resize_path(path, request.size)
+
+
+def resize_path(path: CameraPath, size: tuple[int, int]) -> CameraPath:
+    """The path at another image size (width, height) [px]."""
+    cameras, keys = (tuple(resized_by_height(camera, *size) for camera in part) for part in (path.cameras, path.keys))
+    return CameraPath(cameras, path.fps, keys, path.closed)
+
+
+def name_frames(path: CameraPath, kind: str) -> list[NamedCamera]:
+    """The path's frames under the names of their images."""
+    stem = kind if kind in AROUND else "frame"
+    digits = max(3, len(str(len(path.cameras) - 1)))
+    return [NamedCamera(f"{stem}_{index:0{digits}}", camera) for index, camera in enumerate(path.cameras)]
+
+
+def _from_file(request: PathRequest) -> CameraPath:
+    if not Path(request.kind).is_file():
+        raise InputError(f"--path {request.kind}: no such file; give one, or {', '.join(AROUND)} or {BETWEEN}")
+    path = read_path(request.kind)
+    fps = request.fps or path.fps
+    count = request.frame_count(fps)
+    if count is None or count == len(path.cameras):
+        return CameraPath(path.cameras, fps, path.keys, path.closed)
+    return CameraPath(tuple(interpolate(path.cameras, count, path.closed, even=True)), fps, path.keys, path.closed)
+
+
+def _chosen(views: Sequence[NamedCamera], source: str | Path, keys: Sequence[str] | None) -> list[Camera]:
+    """The cameras of those names."""
+    if not views:
+        raise InputError(
+            f"{source}: no cameras to interpolate between: give --cameras cameras.json, or a scene with -s"
+        )
+    if keys is None:
+        return [view.camera for view in sorted(views, key=lambda view: view.name)]
+    known = {bare_name(view.name): view.camera for view in views} | {view.name: view.camera for view in views}
+    chosen = []
+    for name in keys:
+        camera = known.get(name) or known.get(bare_name(name))
+        if camera is None:
+            names = sorted(view.name for view in views)
+            more = f", ... ({len(names)} in all)" if len(names) > _NAMES_IN_MESSAGE else ""
+            raise InputError(
+                f"{source}: has no camera {name!r}: choose --keys from {', '.join(names[:_NAMES_IN_MESSAGE])}{more}"
+            )
+        chosen.append(camera)
+    return chosen

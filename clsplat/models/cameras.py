@@ -1,0 +1,142 @@
+"""Cameras and points of a scene or a model as files for other programs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..cameras.cameras_json import NamedCamera, named_cameras, read_cameras, write_cameras
+from ..cameras.path import read_path
+from ..errors import InputError, OutputError
+from ..files.json_file import read_json
+from ..scenes.colmap import Points
+from ..scenes.export import relative_files, write_colmap, write_transforms
+from ..scenes.scene import read_posed_images
+from ..scenes.undistort import RegisteredImage, is_pinhole, make_lens, pinhole_camera
+from ..splats.shapes import shape_named
+from ..splats.splats import SH_C0, Splats
+from .model import load_model
+
+OPAQUE = 0.5  # splats of at least this opacity become points of a model
+_COLMAP_FILES = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True)
+class ExportedCameras:
+    """Numbers of the cameras and points that `export_cameras` wrote."""
+
+    cameras: int
+    points: int
+
+
+def export_cameras(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    form: str | None = None,
+    *,
+    images: str | None = None,
+    iteration: int | None = None,
+    overwrite: bool = False,
+) -> ExportedCameras:
+    """Write the cameras of a scene or a model for another program, with points beside them.
+
+    Cameras of a scene keep their lenses. Cameras of a model are those of its training images: without distortion, at
+    the size that they were reduced to.
+
+    Parameters
+    ----------
+    source : a scene, a model folder, a file of splats, a cameras.json or a camera path.
+    output : a .json file, or the folder of a COLMAP model.
+    form : one of `scenes.options.CAMERA_FORMATS`; by default "cameras" for cameras.json, "transforms" for other .json
+        files, else "colmap".
+    images : folder of the photos inside a scene.
+    iteration : as for `load_model`.
+    overwrite : replace existing files.
+
+    Raises
+    ------
+    InputError : the source has no cameras, or the format does not support a lens.
+    OutputError : a file exists or cannot be written.
+    """
+    source, output = Path(source), Path(output)
+    if form is None:
+        form = "cameras" if output.name == "cameras.json" else "transforms" if output.suffix == ".json" else "colmap"
+    suffix = ".txt" if form == "colmap-text" else ".bin"
+    files = [output / f"{name}{suffix}" for name in _COLMAP_FILES] if form.startswith("colmap") else [output]
+    if any(path.exists() for path in files) and not overwrite:
+        raise OutputError(f"{output}: exists already: use --overwrite or another name")
+    if source.is_dir() and not (source / "point_cloud").is_dir():
+        photos, photo_files, points = _of_scene(source, images)
+    else:
+        photos, points = _of_model(source, iteration)
+        photo_files = [output.parent / "images" / photo.name for photo in photos]
+    if form == "cameras":
+        _write_3dgs(output, photos)
+        return ExportedCameras(len(photos), 0)
+    if form == "transforms":
+        write_transforms(output, photos, relative_files(photo_files, output.parent), points)
+    else:
+        write_colmap(output, photos, points, form == "colmap-text")
+    return ExportedCameras(len(photos), len(points))
+
+
+def _of_scene(scene: Path, images: str | None) -> tuple[list[RegisteredImage], list[Path], Points]:
+    """Photos, their files, and points. If all photos lie in one folder, their names lose it."""
+    posed = read_posed_images(scene, images)
+    folders = {photo.name.partition("/")[0] if "/" in photo.name else None for photo in posed.photos}
+    cut = len(folders.pop() or "") + 1 if len(folders) == 1 and None not in folders else 0
+    return (
+        [replace(photo, name=photo.name[cut:]) for photo in posed.photos],
+        [posed.files[photo.name] for photo in posed.photos],
+        posed.points,
+    )
+
+
+def _of_model(source: Path, iteration: int | None) -> tuple[list[RegisteredImage], Points]:
+    """Photos of a model's or a file's cameras, and a model's opaque splats as points."""
+    if source.is_file() and source.suffix == ".json":
+        named, points = _of_file(source), _points(np.empty((0, 3)), np.empty((0, 3), np.uint8))
+    else:
+        model = load_model(source, iteration)
+        named, points = model.read_cameras(), _opaque_splats(model.splats)
+    if not named:
+        raise InputError(f"{source}: has no cameras: give a scene, a model's folder with cameras.json, or such a file")
+    photos = []
+    for entry in named:
+        camera = entry.camera
+        lens = make_lens("PINHOLE", camera.width, camera.height, [camera.fx, camera.fy, camera.cx, camera.cy])
+        photos.append(RegisteredImage(f"{entry.name}.png", camera.cam_from_world, lens))
+    return photos, points
+
+
+def _of_file(path: Path) -> list[NamedCamera]:
+    if isinstance(read_json(path, "a cameras.json"), list):
+        return read_cameras(path)
+    return [NamedCamera(f"{index:05d}", camera) for index, camera in enumerate(read_path(path).cameras)]
+
+
+def _opaque_splats(splats: Splats) -> Points:
+    opaque = shape_named(splats.shape).strength(splats.arrays) >= OPAQUE
+    rgb = np.rint(255 * np.clip(0.5 + SH_C0 * splats.sh[opaque, 0], 0, 1)).astype(np.uint8)
+    return _points(splats.mean[opaque].astype(np.float64), rgb)
+
+
+def _points(xyz: np.ndarray, rgb: np.ndarray) -> Points:
+    return Points(xyz, rgb, np.zeros(len(rgb), np.int64))
+
+
+def _write_3dgs(output: Path, photos: Sequence[RegisteredImage]) -> None:
+    distorted = [photo for photo in photos if not is_pinhole(photo.lens)]
+    if distorted:
+        raise InputError(
+            f"image {distorted[0].name!r}: 3DGS's cameras.json does not support distorted lenses: "
+            "write transforms or a COLMAP model"
+        )
+    cameras = [
+        pinhole_camera(photo.lens, photo.cam_from_world, photo.lens.width, photo.lens.height) for photo in photos
+    ]
+    write_cameras(output, named_cameras([photo.name for photo in photos], cameras))

@@ -1,0 +1,148 @@
+"""Conversion of a model to another shape or file format, and what that costs in image quality."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..cameras.cameras_json import read_cameras
+from ..errors import InputError, OutputError
+from ..evaluation.evaluate import MAX_PSNR
+from ..evaluation.metrics import psnr
+from ..rendering.renderer import Renderer
+from ..splats.any_file import GAUSSIAN_ENDINGS, PLY_ENDING, check_ending, load_splats, save_splats
+from ..splats.approximate import nearest_gaussians
+from ..splats.convert import convert
+from ..splats.fields import sh_coefficients
+from ..splats.shapes import GAUSSIAN
+from ..splats.splats import Splats
+from .model import LoadedModel, model_at
+
+
+@dataclass(frozen=True)
+class ConvertedModel:
+    """The result of `convert_model`.
+
+    Attributes
+    ----------
+    source : the model before. output : the file that was written.
+    splats : the model after, before the file rounded it.
+    approximate : True if the splats are only the nearest Gaussians.
+    """
+
+    source: LoadedModel
+    output: Path
+    splats: Splats
+    approximate: bool
+
+    @property
+    def removed(self) -> int:
+        """Number of splats left out, because the shape does not support negative opacity."""
+        return len(self.source.splats) - len(self.splats)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the file shows the same images as the model."""
+        same_bands = self.splats.sh_degree >= self.source.splats.sh_degree
+        return not self.approximate and same_bands and self.output.suffix.lower() == PLY_ENDING
+
+
+@dataclass(frozen=True)
+class ConversionCost:
+    """PSNR of the file's images against the model's own: mean and worst [dB] over a number of cameras."""
+
+    mean: float
+    worst: float
+    cameras: int
+
+
+def convert_model(
+    model: str | os.PathLike[str] | LoadedModel,
+    output: str | os.PathLike[str],
+    shape: str | None = None,
+    *,
+    approximate: bool = False,
+    sh_degree: int | None = None,
+    iteration: int | None = None,
+    overwrite: bool = False,
+) -> ConvertedModel:
+    """Write a model as another shape, or in another file format.
+
+    Parameters
+    ----------
+    model : a model folder or a file of splats, or what `load_model` returned.
+    output : a .ply file with all columns, or a .splat or .spz file.
+    shape : the shape to convert to; by default the model's, for .splat and .spz files Gaussian.
+    approximate : take the nearest Gaussian for splats without an equal one, instead of raising.
+    sh_degree : remove the SH bands above, or add bands of zeros.
+    iteration : as for `load_model`.
+    overwrite : replace an existing file.
+
+    Raises
+    ------
+    InputError : splats have no equal in the shape, or the format does not support the shape.
+    OutputError : the file exists, has an unknown ending or cannot be written.
+    """
+    output = Path(output)
+    suffix = check_ending(output)
+    if output.exists() and not overwrite:
+        raise OutputError(f"{output}: exists already: use --overwrite or another name")
+    source = model_at(model, iteration)
+    target = shape or (GAUSSIAN.name if suffix in GAUSSIAN_ENDINGS else source.splats.shape)
+    if suffix in GAUSSIAN_ENDINGS and target != GAUSSIAN.name:
+        raise InputError(f"{output}: {suffix} files hold Gaussians: leave --shape out, or write a .ply")
+    converted, is_nearest = _as_shape(source.splats, target, approximate)
+    if sh_degree is not None:
+        converted = _of_degree(converted, sh_degree)
+    save_splats(output, converted)
+    return ConvertedModel(source, output, converted, is_nearest)
+
+
+def conversion_cost(
+    converted: ConvertedModel, cameras: Path | None = None, device: str | None = None
+) -> ConversionCost | None:
+    """Compare images of the written file with images of the model.
+
+    Parameters
+    ----------
+    cameras : a cameras.json; by default that of the model folder.
+    device : OpenCL device, as for `Renderer`.
+
+    Returns
+    -------
+    The cost, or None if there are no cameras.
+    """
+    source = converted.source
+    named = source.read_cameras() if cameras is None else read_cameras(cameras)
+    if not named:
+        return None
+    written, renderer = load_splats(converted.output), Renderer(device)
+    values = []
+    for entry in named:
+        before, after = (
+            renderer.render(splats, entry.camera, source.background).color for splats in (source.splats, written)
+        )
+        values.append(min(psnr(before, after), MAX_PSNR))
+    return ConversionCost(sum(values) / len(values), min(values), len(values))
+
+
+def _as_shape(splats: Splats, target: str, approximate: bool) -> tuple[Splats, bool]:
+    """The splats as `target`, and whether they are only the nearest Gaussians."""
+    try:
+        return convert(splats, target), False
+    except InputError as error:
+        if target != GAUSSIAN.name:
+            raise
+        if not approximate:
+            raise InputError(f"{error}; or --approximate") from None
+    return nearest_gaussians(splats), True
+
+
+def _of_degree(splats: Splats, degree: int) -> Splats:
+    """The splats with colours cut to an SH degree, or with bands of zeros up to it."""
+    sh = splats.sh[:, : sh_coefficients(degree)]
+    sh = np.pad(sh, ((0, 0), (0, sh_coefficients(degree) - sh.shape[1]), (0, 0)))
+    return splats.with_arrays(splats.to_numpy() | {"sh": sh})

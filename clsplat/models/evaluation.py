@@ -1,0 +1,214 @@
+"""Evaluation of trained models on views of their scenes, with 3DGS's result files and a report."""
+
+from __future__ import annotations
+
+import os
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError, OutputError
+from ..evaluation.evaluate import evaluate as evaluate_views
+from ..evaluation.metrics import DEFAULT_PROTOCOL, MetricProtocol
+from ..evaluation.perceptual import Flip, Lpips
+from ..files.json_file import read_object, write_json
+from ..rendering.outputs import ImageWriter, output_stems
+from ..rendering.renderer import Rendered, Renderer
+from ..rendering.views import ViewProgress
+from ..scenes.scene import View
+from ..splats.color import Color
+from ..splats.stats import complexity
+from .evaluation_report import write_model_report
+from .measurements import ModelEvaluation, ViewRecorder
+from .model import LoadedModel, SceneChoice, load_model, model_at
+
+REPORT = "report.html"
+UNIT_RANGE_PROTOCOL = "3dgs"  # 3DGS's script feeds LPIPS with images in 0..1
+
+
+@dataclass(frozen=True)
+class EvaluationOptions:
+    """What to measure.
+
+    Parameters
+    ----------
+    view_set : "test", "train" or "all" views.
+    protocol : how PSNR and SSIM are computed. If `protocol.corrected`, LPIPS, FLIP and the report's images use
+        colour-corrected renders too.
+    lpips, flip : also measure these; each needs its extra.
+    background : colour 0..1; None takes the model's.
+    scene : replaces parts of the scene's record.
+    report : write a page with the images.
+    scene_name : name of the scene in the report; None takes the scene's own.
+    """
+
+    view_set: str = "test"
+    protocol: MetricProtocol = DEFAULT_PROTOCOL
+    lpips: bool = False
+    flip: bool = False
+    background: Color | None = None
+    scene: SceneChoice = field(default_factory=SceneChoice)
+    report: bool = True
+    scene_name: str | None = None
+
+
+def evaluate(
+    model: str | os.PathLike[str] | LoadedModel,
+    options: EvaluationOptions | None = None,
+    *,
+    iteration: int | None = None,
+    renders: Path | None = None,
+    device: str | None = None,
+    progress: ViewProgress | None = None,
+) -> ModelEvaluation:
+    """Measure a model on its scene's views, and write results.json, per_view.json and report.html into its folder.
+
+    Parameters
+    ----------
+    model : a model folder, or what `load_model` returned for one.
+    options : what to measure; by default PSNR and SSIM of the test views.
+    iteration : as for `load_model`.
+    renders : folder for the rendered images as PNG; None writes none.
+    device : OpenCL device, as for `Renderer`.
+    progress : called as each view begins.
+
+    Raises
+    ------
+    InputError : the model or its scene cannot be read, or the scene has no such views.
+    OutputError : a file cannot be written.
+    """
+    options = options or EvaluationOptions()
+    evaluator = Evaluator(options, Renderer(device))
+    measured = evaluator(model_at(model, iteration), renders, progress)
+    if measured.write_error is not None:
+        raise measured.write_error
+    return measured
+
+
+def evaluate_models(
+    paths: Sequence[Path],
+    options: EvaluationOptions,
+    *,
+    comparison: Path | None = None,
+    iteration: int | None = None,
+    renders: Path | None = None,
+    device: str | None = None,
+    progress: ViewProgress | None = None,
+) -> list[ModelEvaluation]:
+    """Measure several models, each as `evaluate` does.
+
+    A model whose result files cannot be written is measured all the same; see `ModelEvaluation.write_error`.
+
+    Parameters
+    ----------
+    comparison : file of one report that compares the models; it replaces the reports of the models.
+    renders : folder of the images; several models get a folder each inside it.
+    """
+    write = options.report and comparison is None
+    evaluator = Evaluator(options, Renderer(device), write_reports=write)
+    measured = []
+    for path in paths:
+        folder = renders / path.resolve().name if renders is not None and len(paths) > 1 else renders
+        measured.append(evaluator(load_model(path, iteration), folder, progress))
+    if comparison is not None:
+        write_model_report(comparison, measured[-1].scene.name, measured, _labels(paths))
+    return measured
+
+
+class Evaluator:
+    """Measures one model after another on one device.
+
+    Parameters
+    ----------
+    write_reports : write each model's own report if the options ask for one.
+
+    Raises
+    ------
+    InputError : LPIPS or FLIP is not installed.
+    """
+
+    def __init__(self, options: EvaluationOptions, renderer: Renderer, write_reports: bool = True) -> None:
+        self.options, self.renderer, self.write_reports = options, renderer, write_reports and options.report
+        self.lpips = Lpips(unit_range=options.protocol.name == UNIT_RANGE_PROTOCOL) if options.lpips else None
+        self.flip = Flip() if options.flip else None
+
+    def __call__(
+        self, model: LoadedModel, renders: Path | None = None, progress: ViewProgress | None = None
+    ) -> ModelEvaluation:
+        """Measure a model; parameters and errors as for `evaluate`."""
+        if model.folder is None:
+            raise InputError(f"{model.path}: is a file; eval takes model folders (render takes any PLY)")
+        options = self.options
+        scene = model.load_scene(options.scene)
+        views = {"test": scene.test, "train": scene.train, "all": scene.views}[options.view_set]
+        if not views:
+            raise InputError(
+                f"{model.path}: was trained on all views, none is left to test it on: "
+                "train with --eval, or measure training views with --set train"
+            )
+        recorder = ViewRecorder(self.lpips, self.flip, options.report, options.protocol.corrected)
+        writer = None if renders is None else ImageWriter(renders)
+        names, numbers = [view.name for view in views], count(1)
+        stems = dict(zip(names, output_stems(names), strict=True)) if writer else {}
+
+        def on_view(view: View, image: Rendered) -> None:
+            if progress is not None:
+                progress(next(numbers), len(names))
+            if writer is not None:
+                writer.write(stems[view.name], image)
+            recorder(view, image)
+
+        background = model.background if options.background is None else options.background
+        measured = evaluate_views(self.renderer, model.splats, views, background, options.protocol, on_view)
+        per_view = {
+            metric: {name: values[metric] for name, values in measured.per_view.items()} for metric in ("SSIM", "PSNR")
+        } | recorder.per_view
+        result = {
+            "SSIM": measured.ssim,
+            "PSNR": measured.psnr,
+            **{metric: statistics.fmean(values.values()) for metric, values in recorder.per_view.items()},
+            "render_ms": measured.render_ms,
+            "bytes": model.ply.stat().st_size,
+            **complexity(model.splats).to_json(),
+            "shape": model.splats.shape,
+            "normalisation": model.splats.normalisation,
+            "set": options.view_set,
+            "views": len(views),
+            "background": list(background),
+            "device": str(self.renderer.device.info),
+            "protocol": options.protocol.describe() | recorder.describe(),
+        }
+        evaluation = ModelEvaluation(model, scene, result, per_view, recorder.images)
+        ending = "" if options.view_set == "test" else f"_{options.view_set}"
+        try:
+            for stem, entry in (("results", result), ("per_view", per_view)):
+                _add_entry(model.folder.path / f"{stem}{ending}.json", f"ours_{model.iteration}", entry)
+        except OutputError as error:
+            return replace(evaluation, write_error=error)
+        if not self.write_reports:
+            return evaluation
+        file = model.folder.path / f"{Path(REPORT).stem}{ending}.html"
+        return replace(
+            evaluation,
+            report=write_model_report(
+                file, options.scene_name or scene.name, [evaluation], [model.path.resolve().name]
+            ),
+        )
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """Names of the folders, or whole paths if two folders have the same name."""
+    names = [path.resolve().name for path in paths]
+    return names if len(set(names)) == len(names) else [str(path) for path in paths]
+
+
+def _add_entry(path: Path, key: str, entry: dict[str, Any]) -> None:
+    """Add an entry to a JSON object, which may hold those of other iterations."""
+    try:
+        known = read_object(path)
+    except InputError:  # An absent or damaged file loses nothing: it holds only measurements.
+        known = {}
+    write_json(path, known | {key: entry})

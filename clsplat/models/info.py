@@ -1,0 +1,73 @@
+"""Contents of a model or a scene, without rendering or decoding anything."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..scenes.info import SceneInfo, is_scene, scene_info
+from ..scenes.reconstruct.photo_files import is_photographs
+from ..splats.stats import Complexity, complexity
+from ..training.folder import ModelFolder
+from .model import LoadedModel, load_model
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """A model's contents.
+
+    Attributes
+    ----------
+    model : what was loaded. complexity : how much of it is in use.
+    """
+
+    model: LoadedModel
+    complexity: Complexity
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, as `clsplat info --json` prints them."""
+        splats = self.model.splats
+        return {
+            "shape": splats.shape,
+            "normalisation": splats.normalisation,
+            "sh_degree": splats.sh_degree,
+            "antialiased": splats.antialiased,
+            "bytes": self.model.ply.stat().st_size,
+            **self.complexity.to_json(),
+        }
+
+
+def inspect(
+    path: str | os.PathLike[str], *, iteration: int | None = None, images: str | None = None
+) -> ModelInfo | SceneInfo:
+    """Report the contents of a model folder, a file of splats or a scene.
+
+    Parameters
+    ----------
+    iteration : of a model folder, as for `load_model`.
+    images : of a scene, the folder of its photos.
+
+    Raises
+    ------
+    InputError : the path is neither a model nor a scene, or it is damaged.
+    """
+    path = Path(path)
+    if _is_scene(path):
+        return scene_info(path, images)
+    model = load_model(path, iteration)
+    return ModelInfo(model, complexity(model.splats))
+
+
+def _is_scene(path: Path) -> bool:
+    if path.is_file() or not path.is_dir() or ModelFolder(path).iterations():
+        return path.is_file() and path.suffix == ".json"
+    if is_scene(path):
+        return True
+    if ModelFolder(path).is_used:
+        return False  # load_model reports that the model has no point cloud yet
+    if is_photographs(path):
+        raise InputError(f"{path}: photographs without poses: clsplat reconstruct {path} -o SCENE finds them")
+    raise InputError(f"{path}: neither a model (point_cloud/) nor a scene (sparse/ or transforms.json)")

@@ -1,0 +1,94 @@
+"""Measurements of one model, and what is measured of each view besides PSNR and SSIM."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import OutputError
+from ..evaluation.metrics import color_corrected
+from ..evaluation.perceptual import Flip, Lpips
+from ..evaluation.report.images import ComparedImage, compare_images
+from ..rendering.renderer import Rendered
+from ..scenes.scene import Scene, View
+from .model import LoadedModel
+
+
+@dataclass(frozen=True)
+class ModelEvaluation:
+    """Measurements of one model.
+
+    Attributes
+    ----------
+    model : what was measured. scene : whose views.
+    result : the entry of results.json: means of the metrics, render time, bytes, complexity and protocol.
+    per_view : values by metric and view.
+    images : by view, what a report shows; empty without a report.
+    report : file of the model's report, if one was written.
+    write_error : why results.json or per_view.json could not be written; None if they were.
+    """
+
+    model: LoadedModel
+    scene: Scene
+    result: dict[str, Any]
+    per_view: Mapping[str, Mapping[str, float]]
+    images: Mapping[str, ComparedImage]
+    report: Path | None = None
+    write_error: OutputError | None = None
+
+    @property
+    def psnr(self) -> float:
+        """Mean PSNR [dB]."""
+        return float(self.result["PSNR"])
+
+    @property
+    def ssim(self) -> float:
+        """Mean SSIM."""
+        return float(self.result["SSIM"])
+
+
+@dataclass
+class ViewRecorder:
+    """Called with each view and its render: measures LPIPS and FLIP, and keeps the images of the report.
+
+    Parameters
+    ----------
+    lpips, flip : metrics to measure; None measures none.
+    report : keep images.
+    corrected : bring renders into their photos' exposure.
+
+    Attributes
+    ----------
+    per_view : values by metric and view.
+    images : by view.
+    """
+
+    lpips: Lpips | None = None
+    flip: Flip | None = None
+    report: bool = True
+    corrected: bool = False
+    per_view: dict[str, dict[str, float]] = field(default_factory=dict)
+    images: dict[str, ComparedImage] = field(default_factory=dict)
+
+    def __call__(self, view: View, image: Rendered) -> None:
+        color: NDArray[Any] = image.color
+        if self.corrected:
+            color = color_corrected(np.clip(color, 0, 1), view.image / np.float32(255), view.mask)
+        flip_map = None
+        if self.lpips is not None:
+            self.per_view.setdefault("LPIPS", {})[view.name] = self.lpips(color, view.image, view.mask)
+        if self.flip is not None:
+            flip_map = self.flip(color, view.image, view.mask)
+            self.per_view.setdefault("FLIP", {})[view.name] = self.flip.mean(flip_map, view.mask)
+        if self.report:
+            self.images[view.name] = compare_images(view.image, color, view.mask, flip_map)
+
+    def describe(self) -> dict[str, str]:
+        """How LPIPS and FLIP are computed, if they are."""
+        metrics = (("LPIPS", self.lpips), ("FLIP", self.flip))
+        return {name: metric.describe() for name, metric in metrics if metric is not None}

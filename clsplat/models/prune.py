@@ -1,0 +1,103 @@
+"""Pruning of a trained model on the scene that it shows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ..compression.prune import SHARES, Pruned, Validation, prune
+from ..compression.prune_and_refine import trained_rounds
+from ..device.device import open_device
+from ..errors import InputError, OutputError
+from ..rendering.renderer import Renderer
+from ..scenes.split import hold_out
+from ..training.log import Progress
+from .model import LoadedModel, SceneChoice, model_at
+
+TOLERANCE = 0.1  # dB
+
+
+@dataclass(frozen=True)
+class PrunedModel:
+    """The result of `prune_model`.
+
+    Attributes
+    ----------
+    source : the model before. output : the file that was written.
+    pruned : the smaller model, and what it cost.
+    """
+
+    source: LoadedModel
+    output: Path
+    pruned: Pruned
+
+
+def prune_model(
+    model: str | os.PathLike[str] | LoadedModel,
+    output: str | os.PathLike[str],
+    *,
+    tolerance: float = TOLERANCE,
+    iterations: int = 0,
+    compact: bool = True,
+    scene: SceneChoice | None = None,
+    iteration: int | None = None,
+    overwrite: bool = False,
+    device: str | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> PrunedModel:
+    """Write a model without the splats, fields and SH bands that its images do not need.
+
+    Some of the training views are held out to measure the loss; test views are never used.
+
+    Parameters
+    ----------
+    model : a model folder or a file of splats, or what `load_model` returned.
+    output : the PLY file to write.
+    tolerance : PSNR that the held-out views may lose [dB].
+    iterations : length of the training after each round that removes a quarter of the splats; 0 does not train.
+    compact : omit columns that are not in use; False writes all columns of 3DGS.
+    scene : replaces parts of the scene's record. A file needs the scene's path.
+    iteration : as for `load_model`.
+    overwrite : replace an existing file.
+    device : OpenCL device, as for `Renderer`.
+    progress : as for `train`.
+
+    Raises
+    ------
+    InputError : the model is empty, or the model or the scene cannot be read.
+    OutputError : the file exists or cannot be written.
+    """
+    output = Path(output)
+    if output.is_dir():
+        raise OutputError(f"{output}: is a folder: name the PLY file to write")
+    if output.exists() and not overwrite:
+        raise OutputError(f"{output}: exists already: use --overwrite or another name")
+    loaded = model_at(model, iteration)
+    if not len(loaded.splats):
+        raise InputError(f"{loaded.path}: has no splats")
+    pruned = _pruned(loaded, scene, tolerance, iterations, device, progress)
+    pruned.splats.save(output, compact=compact)
+    return PrunedModel(loaded, output, pruned)
+
+
+def _pruned(
+    model: LoadedModel,
+    choice: SceneChoice | None,
+    tolerance: float,
+    iterations: int,
+    device: str | None,
+    progress: Callable[[Progress], None] | None,
+) -> Pruned:
+    scene = model.load_scene(choice)
+    opened = open_device(device)
+    validation = Validation(Renderer(opened), hold_out(scene).test, model.background)
+    if not iterations:
+        return prune(model.splats, scene.train, validation, tolerance)
+    before = validation.psnr(model.splats)
+    floor = before - SHARES["splats"] * tolerance
+    splats = trained_rounds(scene, model.splats, validation, floor, iterations, opened, progress)
+    now = validation.psnr(splats)
+    parts = prune(splats, scene.train, validation, max(now - before + tolerance, 0.0), ("fields", "bands"))
+    return replace(parts, before=before, costs={"splats": before - now, **parts.costs})

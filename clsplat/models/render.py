@@ -1,0 +1,152 @@
+"""Renders of a model: which views, along which path, into which files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ..cameras.cameras_json import NamedCamera, named_cameras, read_cameras, write_cameras
+from ..cameras.interpolate import resized_by_height
+from ..cameras.make_path import PathRequest, make_path, name_frames
+from ..cameras.path import DEFAULT_FPS, CameraPath, write_path
+from ..errors import InputError
+from ..files.video import VideoWriter
+from ..rendering.renderer import Renderer
+from ..rendering.views import RenderOutput, ViewProgress, render_to_files
+from ..splats.color import Color
+from .model import LoadedModel, SceneChoice, in_both_forms, model_at
+
+VIEW_SETS = ("test", "train", "all")
+
+
+@dataclass(frozen=True)
+class ViewChoice:
+    """Views to render.
+
+    Parameters
+    ----------
+    cameras : a cameras.json; None takes the cameras of the scene, or those in the model's folder.
+    scene : a scene whose cameras are rendered.
+    view_set : one of VIEW_SETS; None takes the test views, or all views if there are none.
+    path : a camera path through or around these cameras, instead of the cameras themselves.
+    size : (width, height) of the images [px]; the vertical field of view is kept.
+    """
+
+    cameras: Path | None = None
+    scene: SceneChoice = field(default_factory=SceneChoice)
+    view_set: str | None = None
+    path: PathRequest | None = None
+    size: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class ModelRenders:
+    """The result of `render_views`.
+
+    Attributes
+    ----------
+    views : the cameras by name.
+    fps : frames a second of the path or the video.
+    render_ms : median wall time of a render after the first [ms].
+    depth_scales : see `RenderedViews`.
+    """
+
+    views: list[NamedCamera]
+    fps: float
+    render_ms: float
+    depth_scales: dict[str, float]
+
+
+def render_views(
+    model: str | os.PathLike[str] | LoadedModel,
+    output: RenderOutput,
+    choice: ViewChoice | None = None,
+    *,
+    background: Color | None = None,
+    save_path: Path | None = None,
+    iteration: int | None = None,
+    device: str | None = None,
+    progress: ViewProgress | None = None,
+) -> ModelRenders:
+    """Render views of a model into images, a video, or both.
+
+    Parameters
+    ----------
+    model : a model folder or a file of splats, or what `load_model` returned.
+    output : files to write. Images along a path get a cameras.json beside them.
+    choice : views to render; by default the model's test views.
+    background : colour 0..1; by default the model's.
+    save_path : file for the camera path.
+    iteration : as for `load_model`.
+    device : OpenCL device, as for `Renderer`.
+    progress : called as each view begins.
+
+    Raises
+    ------
+    InputError : the model or the views do not exist, or two views have the same file.
+    OutputError : a file cannot be written.
+    """
+    choice = choice or ViewChoice()
+    if output.video is not None:
+        VideoWriter(output.video, DEFAULT_FPS)  # reports a wrong ending or a missing encoder before the work begins
+    loaded = model_at(model, iteration)
+    views, path = choose_views(loaded, choice)
+    fps = output.fps or (path.fps if path is not None else DEFAULT_FPS)
+    if path is not None and save_path is not None:
+        write_path(save_path, path)
+    rendered = render_to_files(
+        Renderer(device),
+        loaded.splats,
+        views,
+        replace(output, fps=fps),
+        loaded.background if background is None else background,
+        progress,
+    )
+    if path is not None and output.folder is not None:
+        write_cameras(output.folder / "cameras.json", views)
+    return ModelRenders(views, fps, rendered.render_ms, rendered.depth_scales)
+
+
+def choose_views(model: LoadedModel, choice: ViewChoice) -> tuple[list[NamedCamera], CameraPath | None]:
+    """Return the views to render, and the camera path if one was requested.
+
+    Raises
+    ------
+    InputError : there are no such views, or the scene or a file cannot be read.
+    """
+    test_names, source, view_set = model.test_names, model.path, choice.view_set
+    if choice.cameras is not None:
+        views, source, view_set = read_cameras(choice.cameras), choice.cameras, view_set or "all"
+    elif choice.scene:
+        scene = model.load_scene(choice.scene)
+        views = named_cameras(scene.names, scene.cameras)
+        test_names, source = scene.test_names, scene.path
+    else:
+        views = model.read_cameras()
+    if choice.path is not None:
+        request = choice.path if choice.size is None else replace(choice.path, size=choice.size)
+        path = make_path(request, model.splats, views, source)
+        return name_frames(path, request.kind), path
+    views = _select(views, test_names, view_set, source)
+    if choice.size is not None:
+        views = [NamedCamera(view.name, resized_by_height(view.camera, *choice.size)) for view in views]
+    return views, None
+
+
+def _select(
+    views: Sequence[NamedCamera], test_names: frozenset[str] | None, view_set: str | None, source: Path
+) -> list[NamedCamera]:
+    """The test, train or all views; by default the test views, or all if there are none."""
+    if not views:
+        raise InputError(
+            f"{source}: no cameras to render: give --cameras cameras.json, a scene with -s, or --path orbit"
+        )
+    names = in_both_forms(test_names or frozenset())
+    test = [view for view in views if view.name in names]
+    if view_set in (None, "all"):
+        return test if test and view_set is None else list(views)
+    if not test:
+        raise InputError(f"{source}: no test views are known: train with --eval, or use --set all")
+    return test if view_set == "test" else [view for view in views if view.name not in names]
