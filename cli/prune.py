@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 def prune_model(model: Path, output: Path, whole: bool, quiet: bool, **values: Any) -> None:
     """Write MODEL, a folder or any splat PLY, without the splats, skew and SH bands that its images do not need.
 
-    Some training views are held out to measure the loss: their PSNR falls by no more than the tolerance. Test views are never
-    used. A PLY needs the scene, -s; every eighth of its views is then a test view.
+    Some training views are held out to measure the loss: their PSNR falls by no more than the tolerance. Test views
+    are never used. A PLY needs the scene, -s; every eighth of its views is then a test view.
     """
     from clsplat.models.prune import prune_model as prune
 
