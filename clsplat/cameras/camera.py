@@ -1,4 +1,4 @@
-"""A pinhole camera: OpenCV axes (x right, y down, z forward), pixel centres at half-integers."""
+"""Pinhole cameras with OpenCV axes (x right, y down, z forward) and pixel centres at half-integers."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from ..errors import InputError
 
 
 def is_rotation(matrix: NDArray[np.float64]) -> bool:
-    """Whether (3, 3) turns and neither mirrors nor scales, to 1e-3."""
+    """Return whether a (3, 3) matrix is a rotation, without mirroring or scale, to 1e-3."""
     return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(matrix) >= 0)
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Intrinsics in pixels and a world-to-camera pose.
+    """A pinhole camera: intrinsics in pixels and a world-to-camera pose.
 
     Parameters
     ----------
     width, height : image size [px].
     fx, fy, cx, cy : focal lengths and principal point [px].
-    cam_from_world : (4, 4) or (3, 4) rigid transform, world to camera.
+    cam_from_world : (4, 4) or (3, 4) rigid transform from the world to the camera.
 
     Raises
     ------
-    InputError : a size below 1, a focal length not above 0, a non-finite value, or a pose that is not
+    InputError : a size is below 1, a focal length is not above 0, a value is not finite, or the pose is not
         a rotation and a translation.
     """
 
@@ -74,14 +74,13 @@ class Camera:
     @property
     def position(self) -> NDArray[np.float64]:
         """Camera centre in the world, (3,)."""
-        position: NDArray[np.float64] = -self.rotation.T @ self.translation
-        return position
+        return -self.rotation.T @ self.translation
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera for an image of another size (whole field of view kept)."""
+        """Return the same camera for an image of another size; the field of view stays."""
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.cam_from_world)
 
     def posed(self, cam_from_world: ArrayLike) -> Camera:
-        """The same intrinsics at another pose."""
+        """Return a camera with the same intrinsics at another pose."""
         return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, cam_from_world)

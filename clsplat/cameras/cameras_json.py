@@ -1,8 +1,8 @@
-"""`cameras.json`: named cameras in the list that 3DGS writes, with the principal point beside.
+"""`cameras.json`: a list of named cameras as 3DGS writes it, extended by the principal point.
 
-An entry: `{id, img_name, width, height, position [3], rotation [3][3], fy, fx, cx, cy}`; position is the
-camera centre, rotation camera-to-world (OpenCV axes). `cx`, `cy` are clsplat's own and optional: the image
-centre where they are absent, as 3DGS assumes.
+An entry is `{id, img_name, width, height, position [3], rotation [3][3], fy, fx, cx, cy}`. The position is the camera
+centre; the rotation is camera-to-world with OpenCV axes. `cx` and `cy` are optional additions of clsplat. Without them
+the principal point is the image centre, as 3DGS assumes.
 """
 
 from __future__ import annotations
@@ -26,35 +26,39 @@ _REMEDY = "add it as 3DGS writes it"
 
 @dataclass(frozen=True, slots=True)
 class NamedCamera:
-    """A camera and the image it belongs to (`img_name`, without folder)."""
+    """A camera and the name of its image (`img_name`, without folder)."""
 
     name: str
     camera: Camera
 
 
 def img_names(names: Sequence[str]) -> list[str]:
-    """`img_name` of each image file: without its extension, as 3DGS writes it, unless two would be the same."""
+    """Return the `img_name` of each image file.
+
+    Names lose their extensions, as 3DGS writes them, unless two names would then be equal.
+    """
     bare = [bare_name(name) for name in names]
     return bare if len(set(bare)) == len(bare) else list(names)
 
 
 def named_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> list[NamedCamera]:
-    """Cameras of image files, each under its `img_name`."""
+    """Return cameras of image files, each with its `img_name`."""
     return [NamedCamera(name, camera) for name, camera in zip(img_names(names), cameras, strict=True)]
 
 
 def read_cameras(path: str | os.PathLike[str]) -> list[NamedCamera]:
-    """Cameras in file order; keys that clsplat does not know are ignored, `id` too.
+    """Return the cameras of a file in file order. `id` and unknown keys are ignored.
 
     Raises
     ------
-    InputError : no JSON list, or an entry with a key missing or unusable; names file, entry and key.
+    InputError : the file is not a JSON list, or an entry lacks a key or has an unusable value. The message names
+        file, entry and key.
     """
     return cameras_of(read_json(path, "a cameras.json"), path)
 
 
 def cameras_of(entries: Any, path: str | os.PathLike[str]) -> list[NamedCamera]:
-    """As `read_cameras`, of a list that has been read from `path`; raises InputError."""
+    """Return the cameras in a list that was read from `path`; raises InputError as `read_cameras`."""
     if not isinstance(entries, list):
         raise InputError(f"{path}: holds {describe(entries)}; expected a list of cameras, as 3DGS writes it")
     named = []
@@ -72,7 +76,7 @@ def cameras_of(entries: Any, path: str | os.PathLike[str]) -> list[NamedCamera]:
 
 
 def write_cameras(path: str | os.PathLike[str], named: Sequence[NamedCamera]) -> None:
-    """Write cameras in the order given, one line each, atomically; reading gives them back exactly.
+    """Write cameras atomically in their order, one per line. Reading returns exactly the same cameras.
 
     Raises
     ------
@@ -99,7 +103,7 @@ def write_cameras(path: str | os.PathLike[str], named: Sequence[NamedCamera]) ->
 
 
 def _named_camera(entry: dict[str, Any]) -> NamedCamera:
-    """One entry; raises InputError naming the key."""
+    """Return the camera of one entry; raises InputError that names the key."""
     name = get_value(entry, "img_name", _REMEDY)
     if not isinstance(name, str) or not name:
         raise InputError(f"key 'img_name' is {describe(name)}; expected a name")

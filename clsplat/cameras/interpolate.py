@@ -1,4 +1,4 @@
-"""Paths through chosen cameras: smooth in place, direction and lens."""
+"""Camera paths through key cameras, smooth in position, direction and lens."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from ..errors import InputError
 from ..splats.fields import DoubleArray
 from .camera import Camera
 
-# Keys repeated on either side of a closed path: what an end changes in a cubic spline decays by 2 + sqrt(3) a key.
+# Number of keys repeated on either side of a closed path. A cubic spline's end condition decays by 2 + sqrt(3) per key.
 _WRAPPED = 10
-_LEAST_TURN = 0.1  # radians a key, below which turning counts for little in how long a stretch takes
-_LEAST_GAP = 0.05  # of the mean: two equal keys one after the other are a short stop
+_MIN_TURN = 0.1  # radians per key; a smaller mean turn is raised to this, so that small turns hardly change the speed
+_MIN_GAP = 0.05  # smallest duration of a segment over the mean; two equal keys in a row become a short stop
 
 
 def interpolate(keys: Sequence[Camera], frames: int, closed: bool = False, even: bool = False) -> list[Camera]:
-    """`frames` cameras on a smooth path through the keys, the first key first.
+    """Return `frames` cameras on a smooth path through the keys, starting at the first key.
 
-    Positions go by a natural cubic spline (C2), directions by SciPy's spline of rotations (continuous angular
-    acceleration), focal lengths (their logarithms) and principal points by monotone cubics, which do not swing beyond
-    the keys. The speed is about even: a stretch takes as long as it is far and turns. All frames have the first key's
-    size; keys of others keep their vertical field of view.
+    Positions follow a natural cubic spline (C2). Directions follow SciPy's spline of rotations, with continuous angular
+    acceleration. Focal lengths (as logarithms) and principal points follow monotone cubics, which do not overshoot the
+    keys. The speed is nearly constant: the duration of a segment grows with its length and its turn. All frames have
+    the first key's size; keys of other sizes keep their vertical field of view.
 
     Parameters
     ----------
     keys : at least one.
-    closed : go back to the first key after the last; else end at the last.
-    even : every stretch takes the same time, as for frames that are to be fewer or more.
+    closed : whether the path returns to the first key after the last.
+    even : whether every segment takes the same time, for example to change the number of frames of a path.
 
     Raises
     ------
-    InputError : no keys, or frames below 1.
+    InputError : there are no keys, or `frames` is below 1.
     """
-    from scipy.interpolate import CubicSpline, PchipInterpolator  # half a second to import
+    from scipy.interpolate import CubicSpline, PchipInterpolator  # imported late: slow to load
     from scipy.spatial.transform import Rotation, RotationSpline
 
     if not keys or frames < 1:
@@ -54,14 +54,14 @@ def interpolate(keys: Sequence[Camera], frames: int, closed: bool = False, even:
     start, end = times[wrapped], times[wrapped + n - (not closed)]
     at = start + (end - start) * np.arange(frames) / max(frames if closed else frames - 1, 1)
     at = np.minimum(at, end)
-    position: DoubleArray = CubicSpline(times, places, bc_type="natural")(at)
-    rotation: DoubleArray = RotationSpline(times, turns)(at).as_matrix()
-    lens: DoubleArray = PchipInterpolator(times, lenses)(at)
+    position = CubicSpline(times, places, bc_type="natural")(at)
+    rotation = RotationSpline(times, turns)(at).as_matrix()
+    lens = PchipInterpolator(times, lenses)(at)
     return [_camera(first, *frame) for frame in zip(position, rotation, lens, strict=True)]
 
 
 def resized_by_height(camera: Camera, width: int, height: int) -> Camera:
-    """The camera for an image of another size and aspect: the vertical field of view is kept, the middle stays."""
+    """Return the camera for an image of another size and aspect; the vertical field of view and the centre stay."""
     scale = height / camera.height
     return Camera(
         width,
@@ -75,17 +75,17 @@ def resized_by_height(camera: Camera, width: int, height: int) -> Camera:
 
 
 def _gaps(places: DoubleArray, turns: DoubleArray) -> DoubleArray:
-    """How long each stretch between two keys takes: its length and its turn, each over the mean one."""
+    """Return the duration of each segment between two keys: its length plus its turn, each over the mean."""
     moves = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    gaps: DoubleArray = turns / max(float(turns.mean()), _LEAST_TURN)
+    gaps = turns / max(float(turns.mean()), _MIN_TURN)
     if moves.any():
         gaps = gaps + moves / moves.mean()
     mean = float(gaps.mean())
-    return np.maximum(gaps, _LEAST_GAP * mean) if mean > 0 else np.ones(len(gaps))
+    return np.maximum(gaps, _MIN_GAP * mean) if mean > 0 else np.ones(len(gaps))
 
 
 def _camera(pattern: Camera, position: DoubleArray, rotation: DoubleArray, lens: DoubleArray) -> Camera:
-    """A camera of the pattern's size; `rotation` is camera to world."""
+    """Return a camera of the pattern's size; `rotation` is camera-to-world."""
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ position

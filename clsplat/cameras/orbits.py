@@ -1,6 +1,6 @@
-"""Paths that nobody recorded, closed: an orbit, an ellipse through the cameras, a spiral about one of them.
+"""Closed camera paths around a scene: an orbit, an ellipse through the cameras, and a spiral about one of them.
 
-Without cameras they start from a ring of made-up ones, from where nearly all splats are seen, the y axis down.
+Without cameras, a path starts from a ring of default cameras that see nearly all splats, with the y axis down.
 """
 
 from __future__ import annotations
@@ -9,145 +9,147 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..splats.fields import DoubleArray
 from ..splats.splats import Splats
 from .camera import Camera
 
-Vector = NDArray[np.float64]
-
-# Least eigenvalue of the mean of I - d d' below which the optical axes d count as parallel (about 4 degrees).
+# Optical axes d count as parallel if the smallest eigenvalue of the mean of I - d d' is below this (about 4 degrees).
 _PARALLEL = 5e-3
-# Variance of x axes about level, (6 degrees)^2, below which tilting up no further is worth it.
+# Weight of the cameras' mean up direction against levelling: a variance of the x axes about level, (6 degrees)^2.
 _LEVELLING = 1e-2
-# Without cameras: 3DGS worlds come from cameras, whose y axis points down; 60 degrees across, 4:3.
+# Default cameras: 3DGS worlds are camera worlds, whose y axis points down. Images are 60 degrees wide, 4:3.
 _UP = np.array([0.0, -1.0, 0.0])
 _SIZE = (800, 600)
-_FOCAL = 0.87
-_DISTANCE = 2.5  # radii of the splats
-_LIFT = 0.3  # of the distance
-_RING = 8  # made-up cameras
-# The spiral of LLFF (Mildenhall et al. 2019): turns, quantile of the cameras' offsets that gives its radii, and at most
-# so much of the distance to what is seen, for captures that surround it.
+_FOCAL = 0.87  # focal length over the image width
+_DISTANCE = 2.5  # distance over the splats' radius
+_LIFT = 0.3  # height above the centre over the distance
+_N_DEFAULT = 8  # number of default cameras
+# The spiral of LLFF (Mildenhall et al. 2019).
 _SPIRAL_TURNS = 2
-_SPIRAL_QUANTILE = 0.9
-_SPIRAL_SHARE = 0.2
+_SPIRAL_QUANTILE = 0.9  # quantile of the cameras' offsets that becomes the radius
+_SPIRAL_SHARE = 0.2  # largest radius over the distance to the target, for cameras that surround the scene
 
 
 @dataclass(frozen=True)
 class _Capture:
-    """What a path goes around.
+    """The cameras and the frame of reference that a path goes around.
 
     Attributes
     ----------
-    cameras : at least one. pattern : the image of the path's cameras.
-    centres : (N, 3). up : unit. middle : what the cameras look at.
-    across, along : unit, square to `up`: towards the first camera, and a quarter turn on.
+    cameras : at least one.
+    pattern : camera with the path's image size and intrinsics.
+    centres : (N, 3) camera centres.
+    up : unit vector, the cameras' common up direction.
+    middle : point that the cameras look at.
+    across, along : unit vectors perpendicular to `up`: towards the first camera, and a quarter turn further.
     """
 
     cameras: Sequence[Camera]
     pattern: Camera
-    centres: Vector
-    up: Vector
-    middle: Vector
-    across: Vector
-    along: Vector
+    centres: DoubleArray
+    up: DoubleArray
+    middle: DoubleArray
+    across: DoubleArray
+    along: DoubleArray
 
     @property
-    def heights(self) -> Vector:
-        """Of the centres above the middle, (N,)."""
-        heights: Vector = (self.centres - self.middle) @ self.up
-        return heights
+    def heights(self) -> DoubleArray:
+        """Heights of the centres above the middle, (N,)."""
+        return (self.centres - self.middle) @ self.up
 
     @property
-    def level(self) -> Vector:
-        """The centres' offsets from the middle along `across` and `along`, (N, 2)."""
-        level: Vector = (self.centres - self.middle) @ np.stack([self.across, self.along], axis=1)
-        return level
+    def level(self) -> DoubleArray:
+        """Offsets of the centres from the middle along `across` and `along`, (N, 2)."""
+        return (self.centres - self.middle) @ np.stack([self.across, self.along], axis=1)
 
-    def looking(self, places: Vector) -> list[Camera]:
-        """Cameras at the places (M, 3) that look at the middle."""
-        return [self.pattern.posed(look_at(place, self.middle, self.up)) for place in places]
+    def look_from(self, positions: DoubleArray) -> list[Camera]:
+        """Return cameras at the positions (M, 3) that look at the middle."""
+        return [self.pattern.posed(look_at(position, self.middle, self.up)) for position in positions]
 
 
 def orbit(splats: Splats, cameras: Sequence[Camera] = (), frames: int = 60) -> list[Camera]:
-    """A full turn around the middle of the scene, looking at it.
+    """Return cameras on a circle that look at the middle of the scene.
 
-    With cameras: their common up, median distance and median height about the point nearest to all their
-    optical axes; the image of the first. Without: around the median splat.
+    The middle is the point nearest to all optical axes. The circle has the cameras' common up direction, their median
+    distance and their median height. Its images have the size of the first camera. Without cameras, the circle goes
+    around the median splat.
 
     Parameters
     ----------
     splats : at least one.
-    frames : cameras to make, at least 1.
+    cameras : the cameras of the scene.
+    frames : number of cameras to return, at least 1.
 
     Raises
     ------
-    InputError : no splats, or frames below 1.
+    InputError : there are no splats, or `frames` is below 1.
     """
     capture = _capture("orbit", splats, cameras, frames)
     height = float(np.median(capture.heights))
     radius = float(np.median(np.linalg.norm(capture.level, axis=1)))
-    radius = max(radius, 1e-3)  # all cameras straight above the middle
-    turn = _turn(frames)
+    radius = max(radius, 1e-3)  # cameras may all be straight above the middle
+    turn = _angles(frames)
     level = radius * (np.cos(turn)[:, None] * capture.across + np.sin(turn)[:, None] * capture.along)
-    return capture.looking(capture.middle + height * capture.up + level)
+    return capture.look_from(capture.middle + height * capture.up + level)
 
 
 def ellipse(splats: Splats, cameras: Sequence[Camera] = (), frames: int = 60) -> list[Camera]:
-    """A full turn on the ellipse that the cameras stand on, looking at what they look at.
+    """Return cameras on the ellipse that fits the cameras' positions, which look at the middle of the scene.
 
-    Its axes are the principal ones of their offsets from the middle, square to their up; it tilts with their heights.
-    Cameras evenly about an ellipse give that ellipse: half an axis squared is the variance along it. The image is that
-    of the first camera, which the path starts near.
+    The ellipse's axes are the principal axes of the cameras' offsets from the middle, perpendicular to their up
+    direction; the ellipse tilts with their heights. Half the square of a semi-axis is the variance along it, so that
+    cameras spread evenly on an ellipse give that ellipse. The path starts near the first camera and has its image size.
 
-    Parameters, raises: as `orbit`.
+    Parameters and errors are those of `orbit`.
     """
     capture = _capture("ellipse", splats, cameras, frames)
     level = capture.level
     variances, axes = np.linalg.eigh(level.T @ level / len(level))
-    axes[:, 0] = (axes[1, 1], -axes[0, 1])  # a right-handed pair, so that it turns as the orbit does
+    axes[:, 0] = (axes[1, 1], -axes[0, 1])  # a right-handed pair turns in the same direction as the orbit
     halves = np.maximum(np.sqrt(2 * np.maximum(variances, 0.0)), 1e-3)
     parts = level @ axes / halves
-    # Heights as constant + cosine + sine of the place on the ellipse, no further than cameras stood.
+    # The height is a constant plus a cosine and a sine of the angle, within the range of the cameras' heights.
     angles = np.arctan2(parts[:, 1], parts[:, 0])
     waves = np.stack([np.ones(len(angles)), np.cos(angles), np.sin(angles)], axis=1)
     fit = np.linalg.lstsq(waves, capture.heights, rcond=1e-3)[0]
-    turn = angles[0] + _turn(frames)
-    round_ = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    heights = np.clip(fit[0] + round_ @ fit[1:], capture.heights.min(), capture.heights.max())
-    flat = (round_ * halves) @ axes.T @ np.stack([capture.across, capture.along])
-    return capture.looking(capture.middle + heights[:, None] * capture.up + flat)
+    turn = angles[0] + _angles(frames)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    heights = np.clip(fit[0] + circle @ fit[1:], capture.heights.min(), capture.heights.max())
+    flat = (circle * halves) @ axes.T @ np.stack([capture.across, capture.along])
+    return capture.look_from(capture.middle + heights[:, None] * capture.up + flat)
 
 
 def spiral(splats: Splats, cameras: Sequence[Camera] = (), frames: int = 60) -> list[Camera]:
-    """Two turns about the most central camera, once to and fro, looking at one point before it.
+    """Return cameras on a spiral about the most central camera, which look at one point in front of it.
 
-    The path of LLFF, for captures that face one way: radii are the cameras' spread along that camera's axes, at most a
-    fifth of the distance to what is seen.
+    This is the path of LLFF (Mildenhall et al. 2019) for captures that face one way. It turns twice and moves once
+    forwards and back. Its radii are the cameras' spread along the central camera's axes, at most a fifth of the
+    distance to the target.
 
-    Parameters, raises: as `orbit`.
+    Parameters and errors are those of `orbit`.
     """
     capture = _capture("spiral", splats, cameras, frames)
     centres = capture.centres
     others = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     centre = capture.cameras[int(np.argmin(others.sum(axis=1)))]
     ahead = float(centre.rotation[2] @ (capture.middle - centre.position))
-    if ahead <= 0:  # it looks away from what the others see
+    if ahead <= 0:  # the central camera looks away from the middle
         ahead = float(np.linalg.norm(capture.middle - centre.position)) or 1.0
     target = centre.position + ahead * centre.rotation[2]
     offsets = np.abs((centres - centre.position) @ centre.rotation.T)
     radii = np.minimum(np.quantile(offsets, _SPIRAL_QUANTILE, axis=0), _SPIRAL_SHARE * ahead)
-    radii = np.where(radii > 1e-6 * ahead, radii, 0.25 * _SPIRAL_SHARE * ahead)  # one camera, or all in a plane
-    turn = _SPIRAL_TURNS * _turn(frames)
+    # A radius is zero for a single camera, and along one axis if all cameras lie in a plane.
+    radii = np.where(radii > 1e-6 * ahead, radii, 0.25 * _SPIRAL_SHARE * ahead)
+    turn = _SPIRAL_TURNS * _angles(frames)
     local = radii * np.stack([np.cos(turn), np.sin(turn), np.sin(turn / _SPIRAL_TURNS)], axis=1)
     up = -centre.rotation[1]
     return [centre.posed(look_at(place, target, up)) for place in centre.position + local @ centre.rotation]
 
 
-def where_axes_meet(cameras: Sequence[Camera]) -> NDArray[np.float64] | None:
-    """(3,) the point nearest to all optical axes; None where they are parallel."""
+def where_axes_meet(cameras: Sequence[Camera]) -> DoubleArray | None:
+    """Return the point nearest to all optical axes, (3,); None if the axes are parallel."""
     centres = np.array([camera.position for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -157,8 +159,8 @@ def where_axes_meet(cameras: Sequence[Camera]) -> NDArray[np.float64] | None:
     return np.asarray(np.linalg.solve(system, np.einsum("nij,nj->i", across, centres) / len(cameras)), np.float64)
 
 
-def look_at(position: Vector, target: Vector, up: Vector) -> Vector:
-    """(4, 4) cam_from_world of a camera at `position` that sees `target` in its middle, `up` upwards."""
+def look_at(position: DoubleArray, target: DoubleArray, up: DoubleArray) -> DoubleArray:
+    """Return cam_from_world, (4, 4), of a camera at `position` with `target` in its centre and `up` upwards."""
     forward = _unit(target - position, np.array([0.0, 0.0, 1.0]))
     right = _unit(np.cross(forward, up), np.array([1.0, 0.0, 0.0]))
     pose = np.eye(4)
@@ -168,13 +170,13 @@ def look_at(position: Vector, target: Vector, up: Vector) -> Vector:
 
 
 def _capture(name: str, splats: Splats, cameras: Sequence[Camera], frames: int) -> _Capture:
-    """The cameras, or a ring of them around the splats; raises InputError."""
+    """Return the frame of reference of the cameras, or of default cameras around the splats; raises InputError."""
     if frames < 1 or len(splats) == 0:
         raise InputError(f"{name}: {frames} frames around {len(splats)} splats; both must be at least 1")
     means = splats.mean.astype(np.float64)
-    cameras = cameras or _ring(means)
+    cameras = cameras or _default_cameras(means)
     centres = np.array([camera.position for camera in cameras])
-    up, middle = _upwards(cameras), _looked_at(cameras, means)
+    up, middle = _up_direction(cameras), _middle(cameras, means)
     towards = centres[0] - middle
     towards = towards - (towards @ up) * up
     across = _unit(towards, np.cross(up, [1.0, 0.0, 0.0]) + np.cross(up, [0.0, 0.0, 1.0]))
@@ -182,13 +184,13 @@ def _capture(name: str, splats: Splats, cameras: Sequence[Camera], frames: int) 
     return _Capture(cameras, cameras[0], centres, up, middle, across, np.cross(up, across))
 
 
-def _ring(means: Vector) -> list[Camera]:
-    """Cameras around the median splat, from where nearly all are seen."""
+def _default_cameras(means: DoubleArray) -> list[Camera]:
+    """Return default cameras around the median splat that see nearly all splats."""
     width, tall = _SIZE
     middle = np.median(means, axis=0)
     distance = _DISTANCE * float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)) or 1.0
-    turn = _turn(_RING)
-    flat = np.stack([np.sin(turn), np.zeros(_RING), -np.cos(turn)], axis=1)
+    turn = _angles(_N_DEFAULT)
+    flat = np.stack([np.sin(turn), np.zeros(_N_DEFAULT), -np.cos(turn)], axis=1)
     places = middle + distance * (flat + _LIFT * _UP)
     return [
         Camera(width, tall, _FOCAL * width, _FOCAL * width, width / 2, tall / 2, look_at(place, middle, _UP))
@@ -196,22 +198,24 @@ def _ring(means: Vector) -> list[Camera]:
     ]
 
 
-def _turn(frames: int) -> Vector:
-    """Angles of a full turn, the last one short of it."""
-    turn: Vector = 2 * np.pi * np.arange(frames) / frames
-    return turn
+def _angles(frames: int) -> DoubleArray:
+    """Return evenly spaced angles of a full turn, without its end."""
+    return 2 * np.pi * np.arange(frames) / frames
 
 
-def _upwards(cameras: Sequence[Camera]) -> Vector:
-    """The cameras' mean up, pulled square to their x axes: photographers keep horizons level, not cameras."""
+def _up_direction(cameras: Sequence[Camera]) -> DoubleArray:
+    """Return the cameras' mean up direction, moved towards the perpendicular of their x axes.
+
+    Photographers tilt cameras up and down, but they keep the horizon level.
+    """
     mean = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
     right = np.array([camera.rotation[0] for camera in cameras])
-    levelled: Vector = np.linalg.solve(right.T @ right / len(cameras) + _LEVELLING * np.eye(3), mean)
+    levelled = np.linalg.solve(right.T @ right / len(cameras) + _LEVELLING * np.eye(3), mean)
     return _unit(levelled, _UP)
 
 
-def _looked_at(cameras: Sequence[Camera], means: Vector) -> Vector:
-    """The point nearest to all optical axes; where they are parallel, at the splats' median depth."""
+def _middle(cameras: Sequence[Camera], means: DoubleArray) -> DoubleArray:
+    """Return the point nearest to all optical axes; for parallel axes, the point ahead at the splats' median depth."""
     nearest = where_axes_meet(cameras)
     if nearest is not None:
         return nearest
@@ -220,12 +224,10 @@ def _looked_at(cameras: Sequence[Camera], means: Vector) -> Vector:
     forward, centre = _unit(axes.sum(axis=0), axes[0]), centres.mean(axis=0)
     depths = (means - centre) @ forward
     ahead = depths[depths > 0]
-    middle: Vector = centre + forward * (float(np.median(ahead)) if len(ahead) else 1.0)
-    return middle
+    return centre + forward * (float(np.median(ahead)) if len(ahead) else 1.0)
 
 
-def _unit(vector: Vector, otherwise: Vector) -> Vector:
-    """The vector at length 1, or `otherwise` where it has none."""
+def _unit(vector: DoubleArray, fallback: DoubleArray) -> DoubleArray:
+    """Return the vector scaled to length 1, or `fallback` scaled so if the vector is zero."""
     length = float(np.linalg.norm(vector))
-    chosen: Vector = vector / length if length > 1e-9 else otherwise / np.linalg.norm(otherwise)
-    return chosen
+    return vector / length if length > 1e-9 else fallback / np.linalg.norm(fallback)

@@ -1,12 +1,14 @@
-"""Camera paths: frames in order, at a rate, and their files.
+"""Camera paths: frames in order at a frame rate, and their files.
 
 A path file is nerfstudio's `camera_path.json`: an object with `render_width`, `render_height` [px], `fps`, `seconds`
-and a list `camera_path` of frames `{camera_to_world [16, row by row], fov [degrees, vertical], aspect}`; `keyframes`
-are what the frames were interpolated from, `is_cycle` whether the last leads back to the first. Its axes are OpenGL's
-(x right, y up, z back), its pixels square, its principal point the centre of the image; where ours are not, the frame
-has `fl_x`, `fl_y`, `cx`, `cy` [px] beside, which nerfstudio passes over. Positions are in the world of the splats:
-nerfstudio's own paths are in its rescaled world, and fit models that were trained in it. A `cameras.json` is a path
-too, of its cameras in file order.
+and a list `camera_path`. A frame is `{camera_to_world [16, row by row], fov [degrees, vertical], aspect}`. `keyframes`
+holds the cameras that the frames were interpolated from. `is_cycle` says whether the last frame leads to the first.
+
+The axes are OpenGL's (x right, y up, z back), pixels are square, and the principal point is the image centre. Frames of
+other cameras have the additional keys `fl_x`, `fl_y`, `cx`, `cy` [px], which nerfstudio ignores.
+
+Positions are in the world of the splats. Paths from nerfstudio are in its rescaled world, and fit only models that were
+trained in that world. A `cameras.json` can be read as a path of its cameras in file order.
 """
 
 from __future__ import annotations
@@ -30,25 +32,25 @@ from .cameras_json import cameras_of
 DEFAULT_FPS = 30.0
 _REMEDY = "add it as nerfstudio's camera_path.json has it"
 _PIXELS = ("fl_x", "fl_y", "cx", "cy")
-_CENTRED = 1e-9  # of the image; from where on a principal point is off centre, and a pixel not square
-# OpenGL's axes of a camera in OpenCV's.
+_CENTRED = 1e-9  # largest relative difference of a centred principal point and of square pixels
+# Turns OpenCV's camera axes into OpenGL's, and back.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class CameraPath:
-    """Frames in order.
+    """A camera path: frames in order at a frame rate.
 
     Attributes
     ----------
-    cameras : a frame each, at least one.
-    fps : frames a second, above 0.
-    keys : the cameras that the frames were interpolated from; () where there are none.
+    cameras : one camera per frame, at least one.
+    fps : frames per second, above 0.
+    keys : the cameras that the frames were interpolated from; may be empty.
     closed : whether the last frame leads back to the first.
 
     Raises
     ------
-    InputError : no frame, or a rate that is not above 0.
+    InputError : the path has no frame, or the frame rate is not above 0.
     """
 
     cameras: tuple[Camera, ...]
@@ -58,32 +60,33 @@ class CameraPath:
 
     def __post_init__(self) -> None:
         if not self.cameras:
-            raise InputError("camera path: has no frames; it needs at least one")
+            raise InputError("camera path: there are no frames; a path needs at least one")
         if not (math.isfinite(self.fps) and self.fps > 0):
             raise InputError(f"camera path: fps is {self.fps}; it must be above 0")
 
     @property
     def seconds(self) -> float:
-        """How long the path lasts [s]."""
+        """Duration of the path [s]."""
         return len(self.cameras) / self.fps
 
 
 def read_path(path: str | os.PathLike[str]) -> CameraPath:
-    """A camera_path.json, or a cameras.json at the default rate.
+    """Read a camera_path.json, or a cameras.json at the default frame rate.
 
     Raises
     ------
-    InputError : the file cannot be read, or a field is missing or unusable; names file, frame and key.
+    InputError : the file cannot be read, or a key is missing or unusable. The message names file, frame and key.
     """
     return path_of(read_json(path, "a camera_path.json or a cameras.json"), path)
 
 
 def write_path(path: str | os.PathLike[str], camera_path: CameraPath) -> None:
-    """Write a camera_path.json, atomically; reading gives the cameras back to rounding.
+    """Write a camera_path.json atomically. Reading it returns the same cameras up to rounding.
 
     Raises
     ------
-    InputError : frames of different sizes. OutputError : the file cannot be written.
+    InputError : the frames have different sizes.
+    OutputError : the file cannot be written.
     """
     text = path_text(camera_path)
     with atomic_writer(path) as stream:
@@ -91,7 +94,7 @@ def write_path(path: str | os.PathLike[str], camera_path: CameraPath) -> None:
 
 
 def path_text(camera_path: CameraPath) -> str:
-    """The text of the path's camera_path.json; raises InputError for frames of different sizes."""
+    """Return the path as the text of a camera_path.json; raises InputError if frames have different sizes."""
     first = camera_path.cameras[0]
     for index, camera in enumerate(camera_path.cameras):
         if (camera.width, camera.height) != (first.width, first.height):
@@ -128,11 +131,11 @@ def path_text(camera_path: CameraPath) -> str:
 
 
 def path_of(content: Any, source: str | os.PathLike[str]) -> CameraPath:
-    """The path in the content of a JSON file; raises InputError."""
+    """Return the path in the content of a JSON file; raises InputError that begins with `source`."""
     if isinstance(content, list):
         named = cameras_of(content, source)
         if not named:
-            raise InputError(f"{source}: holds no cameras; a path needs at least one")
+            raise InputError(f"{source}: has no cameras; a path needs at least one")
         return CameraPath(tuple(item.camera for item in named))
     if not isinstance(content, dict):
         raise InputError(f"{source}: holds {describe(content)}; expected a camera_path.json or a cameras.json")
@@ -144,7 +147,7 @@ def path_of(content: Any, source: str | os.PathLike[str]) -> CameraPath:
         frames = _entries(get_value(content, "camera_path", _REMEDY), "camera_path")
         if not frames:
             raise InputError("key 'camera_path' is empty; a path needs at least one frame")
-        fps = get_number(content, "fps", _REMEDY) if "fps" in content else _rate(content, len(frames))
+        fps = get_number(content, "fps", _REMEDY) if "fps" in content else _fps_of(content, len(frames))
         cameras = _cameras(frames, "camera_path", "camera_to_world", width, height)
         keys = _cameras(_entries(content.get("keyframes", []), "keyframes"), "keyframes", "matrix", width, height)
         return CameraPath(cameras, fps, keys, content.get("is_cycle") is True)
@@ -153,21 +156,20 @@ def path_of(content: Any, source: str | os.PathLike[str]) -> CameraPath:
 
 
 def pose_of(camera: Camera) -> NDArray[np.float64]:
-    """Camera to world (4, 4) in OpenGL's axes (x right, y up, z back)."""
+    """Return the camera-to-world matrix, (4, 4), with OpenGL's axes (x right, y up, z back)."""
     return opengl_pose(camera.cam_from_world)
 
 
 def opengl_pose(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera to world (4, 4) in OpenGL's axes, of a rigid (4, 4) world to camera in OpenCV's."""
+    """Return camera-to-world with OpenGL's axes for a rigid world-to-camera with OpenCV's axes, (4, 4) each."""
     pose = np.eye(4)
     pose[:3, :3] = cam_from_world[:3, :3].T
     pose[:3, 3] = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
-    posed: NDArray[np.float64] = pose @ _FLIP
-    return posed
+    return pose @ _FLIP
 
 
 def cam_from_world_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """World to camera (4, 4) in OpenCV's axes, of a rigid (4, 4) camera to world in OpenGL's."""
+    """Return world-to-camera with OpenCV's axes for a rigid camera-to-world with OpenGL's axes, (4, 4) each."""
     turned = pose @ _FLIP
     inverse = np.eye(4)
     inverse[:3, :3] = turned[:3, :3].T
@@ -175,8 +177,8 @@ def cam_from_world_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return inverse
 
 
-def _rate(content: dict[str, Any], frames: int) -> float:
-    """Frames a second where only `seconds` is known, or neither."""
+def _fps_of(content: dict[str, Any], frames: int) -> float:
+    """Return the frame rate of a file without `fps`: from `seconds` if present, otherwise the default."""
     if "seconds" not in content:
         return DEFAULT_FPS
     seconds = get_number(content, "seconds", _REMEDY)
@@ -185,10 +187,10 @@ def _rate(content: dict[str, Any], frames: int) -> float:
     return frames / seconds
 
 
-def _entries(given: Any, key: str) -> list[dict[str, Any]]:
-    if not isinstance(given, list) or not all(isinstance(entry, dict) for entry in given):
+def _entries(value: Any, key: str) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
         raise InputError(f"key {key!r} has the wrong form; expected a list of objects")
-    return given
+    return value
 
 
 def _cameras(entries: Sequence[dict[str, Any]], key: str, pose_key: str, width: int, height: int) -> tuple[Camera, ...]:
@@ -202,17 +204,17 @@ def _cameras(entries: Sequence[dict[str, Any]], key: str, pose_key: str, width: 
 
 
 def _camera(entry: dict[str, Any], pose_key: str, width: int, height: int) -> Camera:
-    """One frame or keyframe; raises InputError naming the key."""
-    if isinstance(entry.get(pose_key), str):  # nerfstudio's older viewer: a list as text
+    """Return the camera of one frame or keyframe; raises InputError that names the key."""
+    if isinstance(entry.get(pose_key), str):  # nerfstudio's older viewer writes the list as text
         try:
             entry = entry | {pose_key: json.loads(entry[pose_key])}
         except ValueError:
             raise InputError(f"key {pose_key!r} is {describe(entry[pose_key])}; expected 16 numbers") from None
-    given = get_value(entry, pose_key, _REMEDY)
-    nested = isinstance(given, list) and len(given) == 4
+    numbers = get_value(entry, pose_key, _REMEDY)
+    nested = isinstance(numbers, list) and len(numbers) == 4
     pose = get_matrix(entry, pose_key, (4, 4) if nested else (16,), _REMEDY).reshape(4, 4)
     if np.any(pose[3, :3] != 0.0) and np.all(pose[:3, 3] == 0.0):
-        pose = pose.T  # the older viewer's keyframes go column by column
+        pose = pose.T  # the older viewer writes keyframes column by column
     fov = get_number(entry, "fov", _REMEDY)
     if not 0 < fov < 180:
         raise InputError(f"key 'fov' is {fov:g}; expected degrees between 0 and 180")
@@ -226,23 +228,23 @@ def _camera(entry: dict[str, Any], pose_key: str, width: int, height: int) -> Ca
         return Camera(width, height, *pixels, cam_from_world_of(pose))
     except InputError:
         raise InputError(
-            f"key {pose_key!r} is no rotation and translation; expected a rigid 4 x 4 matrix, row by row"
+            f"key {pose_key!r} is not a rotation and translation; expected a rigid 4 x 4 matrix, row by row"
         ) from None
 
 
 def _fov(camera: Camera) -> float:
-    """Vertical, in degrees, of the image's height at `fy`."""
+    """Return the vertical field of view [degrees]."""
     return math.degrees(2 * math.atan2(camera.height, 2 * camera.fy))
 
 
 def _lens(camera: Camera) -> dict[str, float]:
     lens = {"fov": _fov(camera), "aspect": camera.width / camera.height}
-    off = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5), abs(camera.fx / camera.fy - 1))
-    if off <= _CENTRED:
+    off_centre = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
+    if max(off_centre, abs(camera.fx / camera.fy - 1)) <= _CENTRED:
         return lens
     return lens | dict(zip(_PIXELS, (camera.fx, camera.fy, camera.cx, camera.cy), strict=True))
 
 
 def _listed(entries: Sequence[dict[str, Any]]) -> str:
-    """A JSON list, an entry a line."""
+    """Return entries as a JSON list with one entry per line."""
     return "[" + ",".join("\n  " + json.dumps(entry) for entry in entries) + ("\n]" if entries else "]")

@@ -1,4 +1,4 @@
-"""cameras.json: round trips, 3DGS's conventions, and faults named by entry and key."""
+"""cameras.json: round trips, 3DGS's conventions, and errors that name entry and key."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def entry(**changes: Any) -> dict[str, Any]:
 
 
 @IN_FOLDER
-@given(given_cameras=st.lists(st.tuples(names, cameras()), max_size=4))
-def test_round_trip(file: Path, given_cameras: list[tuple[str, Camera]]) -> None:
-    write_cameras(file, [NamedCamera(name, camera) for name, camera in given_cameras])
+@given(named=st.lists(st.tuples(names, cameras()), max_size=4))
+def test_round_trip(file: Path, named: list[tuple[str, Camera]]) -> None:
+    write_cameras(file, [NamedCamera(name, camera) for name, camera in named])
     read = read_cameras(file)
-    assert [item.name for item in read] == [name for name, _ in given_cameras]
-    for item, (_, camera) in zip(read, given_cameras, strict=True):
+    assert [item.name for item in read] == [name for name, _ in named]
+    for item, (_, camera) in zip(read, named, strict=True):
         for key in ("width", "height", "fx", "fy", "cx", "cy"):
             assert getattr(item.camera, key) == getattr(camera, key)
         np.testing.assert_array_equal(item.camera.rotation, camera.rotation)
@@ -89,7 +89,7 @@ def test_keys_are_3dgs_and_the_principal_point(file: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"fx": "absent"}, "key 'fx' is missing"),
         ({"img_name": "absent"}, "key 'img_name' is missing"),
@@ -114,16 +114,16 @@ def test_keys_are_3dgs_and_the_principal_point(file: Path) -> None:
         ({"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "must be a rotation matrix"),
     ],
 )
-def test_faults_name_entry_and_key(file: Path, changes: dict[str, Any], said: str) -> None:
+def test_faults_name_entry_and_key(file: Path, changes: dict[str, Any], message: str) -> None:
     file.write_text(json.dumps([entry(), entry(**changes)]))
-    with pytest.raises(InputError, match=said) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_cameras(file)
     assert str(caught.value).startswith(f"{file}: entry 1")
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "is not JSON"),
         ("[{]", "is not JSON"),
@@ -134,13 +134,13 @@ def test_faults_name_entry_and_key(file: Path, changes: dict[str, Any], said: st
         ("[[]]", "entry 0: is a list"),
     ],
 )
-def test_other_files_are_refused(file: Path, text: str, said: str) -> None:
+def test_other_files_are_refused(file: Path, text: str, message: str) -> None:
     file.write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         read_cameras(file)
 
 
-def test_places_that_cannot_be_used(file: Path) -> None:
+def test_missing_and_unwritable_files(file: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_cameras(file)
     file.write_text("[]")
@@ -158,7 +158,7 @@ json_values = st.recursive(
 
 @settings(IN_FOLDER, max_examples=100)
 @given(key=st.sampled_from(sorted(entry(cx=1, cy=1))), value=json_values)
-def test_fuzz_succeeds_or_says_why(file: Path, key: str, value: Any) -> None:
+def test_random_values_are_read_or_refused_with_one_line(file: Path, key: str, value: Any) -> None:
     file.write_text(json.dumps([entry(cx=1, cy=1) | {key: value}]))
     message = str(file)
     try:
@@ -169,6 +169,6 @@ def test_fuzz_succeeds_or_says_why(file: Path, key: str, value: Any) -> None:
     assert "\n" not in message
 
 
-def test_image_names_lose_their_extension_unless_that_confuses_them() -> None:
+def test_image_names_lose_their_extension_unless_two_would_be_equal() -> None:
     assert img_names(["a.jpg", "b.c.PNG", "d", ".png"]) == ["a", "b.c", "d", ".png"]
     assert img_names(["a.jpg", "a.png"]) == ["a.jpg", "a.png"]

@@ -1,4 +1,4 @@
-"""Paths between chosen cameras and around a scene: laws of smoothness, and shapes that are known."""
+"""Paths between key cameras and around a scene: laws of smoothness, and paths with a known shape."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def keys(n: int = 5) -> list[Camera]:
     return [facing(rng.normal((4, 0, 1), 1.0), rng.normal(0, 0.3, 3), focal=40 + 10 * i) for i in range(n)]
 
 
-def places(cameras: list[Camera]) -> np.ndarray:
+def positions(cameras: list[Camera]) -> np.ndarray:
     return np.array([camera.position for camera in cameras])
 
 
@@ -43,62 +43,64 @@ def cloud() -> Splats:
 
 
 def test_a_path_begins_and_ends_at_its_keys_and_passes_the_others() -> None:
-    given = keys()
-    path = interpolate(given, 2001)
-    for key, camera in ((given[0], path[0]), (given[-1], path[-1])):
+    key_cameras = keys()
+    path = interpolate(key_cameras, 2001)
+    for key, camera in ((key_cameras[0], path[0]), (key_cameras[-1], path[-1])):
         np.testing.assert_allclose(camera.cam_from_world, key.cam_from_world, atol=1e-9)
         assert camera.fx == pytest.approx(key.fx)
-    for key in given[1:-1]:
-        nearest = path[int(np.argmin(np.linalg.norm(places(path) - key.position, axis=1)))]
+    for key in key_cameras[1:-1]:
+        nearest = path[int(np.argmin(np.linalg.norm(positions(path) - key.position, axis=1)))]
         np.testing.assert_allclose(nearest.position, key.position, atol=5e-3)
         np.testing.assert_allclose(nearest.rotation, key.rotation, atol=5e-3)
         assert nearest.fx == pytest.approx(key.fx, rel=5e-3)
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_places_and_turns_are_smooth_to_the_second_derivative(closed: bool) -> None:
-    """Second differences change by little from frame to frame: no kink in place, direction or speed, and none where a
-    closed path meets itself."""
+def test_positions_and_turns_are_smooth_to_the_second_derivative(closed: bool) -> None:
+    """Second differences change little from frame to frame, also where a closed path meets its start.
+
+    So position, direction and speed have no kink.
+    """
     path = interpolate(keys(), 1500, closed)
     if closed:
         path += path[:4]
-    for steps in (np.diff(places(path), axis=0), turns(path)):
+    for steps in (np.diff(positions(path), axis=0), turns(path)):
         speed = np.abs(steps).max()
         assert np.abs(np.diff(steps, axis=0)).max() < 0.03 * speed
         assert np.abs(np.diff(steps, n=2, axis=0)).max() < 1e-3 * speed
 
 
-def test_a_closed_path_goes_on_to_its_first_key() -> None:
+def test_a_closed_path_returns_to_its_first_key() -> None:
     path = interpolate(keys(), 400, closed=True)
-    step = np.linalg.norm(np.diff(places(path), axis=0), axis=1).max()
+    step = np.linalg.norm(np.diff(positions(path), axis=0), axis=1).max()
     assert 0 < np.linalg.norm(path[-1].position - path[0].position) < 2 * step
 
 
-def test_focal_lengths_do_not_swing_beyond_the_keys() -> None:
-    given = [facing((4, y, 1), focal=focal) for y, focal in ((0, 40), (1, 40), (2, 90), (3, 90))]
-    focal = [camera.fx for camera in interpolate(given, 300)]
+def test_focal_lengths_do_not_overshoot_the_keys() -> None:
+    key_cameras = [facing((4, y, 1), focal=focal) for y, focal in ((0, 40), (1, 40), (2, 90), (3, 90))]
+    focal = [camera.fx for camera in interpolate(key_cameras, 300)]
     assert min(focal) > 40 - 1e-9
     assert max(focal) < 90 + 1e-9
 
 
-def test_speed_is_about_even_whatever_the_keys_distances() -> None:
-    given = [facing((4, y, 1), (0, y, 1)) for y in (0, 0.1, 2, 2.2, 6)]
-    steps = np.linalg.norm(np.diff(places(interpolate(given, 200)), axis=0), axis=1)
+def test_speed_is_nearly_constant_for_keys_at_any_distances() -> None:
+    key_cameras = [facing((4, y, 1), (0, y, 1)) for y in (0, 0.1, 2, 2.2, 6)]
+    steps = np.linalg.norm(np.diff(positions(interpolate(key_cameras, 200)), axis=0), axis=1)
     assert steps.max() < 2.5 * np.median(steps)
 
 
-def test_two_keys_are_a_straight_line_and_one_stands_still() -> None:
+def test_two_keys_give_a_straight_line_and_one_key_a_still_camera() -> None:
     two = keys(2)
-    path = places(interpolate(two, 5))
+    path = positions(interpolate(two, 5))
     np.testing.assert_allclose(path, np.linspace(two[0].position, two[1].position, 5), atol=1e-12)
     for camera in interpolate(two[:1], 3):
         np.testing.assert_array_equal(camera.cam_from_world, two[0].cam_from_world)
 
 
-def test_equal_keys_one_after_the_other_are_a_short_stop() -> None:
+def test_equal_keys_in_a_row_are_a_short_stop() -> None:
     first, second = keys(2)
     path = interpolate([first, first, second], 50)
-    assert np.isfinite(places(path)).all()
+    assert np.isfinite(positions(path)).all()
     np.testing.assert_allclose(path[-1].position, second.position, atol=1e-9)
     for camera in interpolate([first, first], 4):
         np.testing.assert_allclose(camera.cam_from_world, first.cam_from_world, atol=1e-12)
@@ -111,7 +113,7 @@ def test_keys_of_other_sizes_keep_their_vertical_field_of_view() -> None:
     assert {(camera.width, camera.height) for camera in interpolate([*keys(2), wide], 4)} == {(60, 40)}
 
 
-def test_too_few() -> None:
+def test_no_keys_and_no_frames_are_refused() -> None:
     for bad in (([], 3), (keys(2), 0)):
         with pytest.raises(InputError, match="at least 1"):
             interpolate(*bad)
@@ -120,14 +122,14 @@ def test_too_few() -> None:
 # --- around ------------------------------------------------------------------------------------
 
 
-def test_an_ellipse_of_cameras_gives_itself() -> None:
-    """Axes 4 and 2, turned by 0.5, tilted: its heights run with the long axis."""
+def test_cameras_on_an_ellipse_give_that_ellipse() -> None:
+    """The ellipse has semi-axes 4 and 2, is turned by 0.5, and rises along its long axis."""
     angles = 2 * np.pi * np.arange(24) / 24 + 0.1
     x, y = 4 * np.cos(angles), 2 * np.sin(angles)
     flat = np.stack([x * math.cos(0.5) - y * math.sin(0.5), x * math.sin(0.5) + y * math.cos(0.5)], axis=1)
     ring = [facing((*place, 1 + 0.25 * a)) for place, a in zip(flat, x, strict=True)]
-    made = places(ellipse(cloud(), ring, 24))
-    distance = np.linalg.norm(made[:, None] - places(ring)[None], axis=2).min(axis=1)
+    made = positions(ellipse(cloud(), ring, 24))
+    distance = np.linalg.norm(made[:, None] - positions(ring)[None], axis=2).min(axis=1)
     assert distance.max() < 0.05
     for camera in ellipse(cloud(), ring, 5):
         ahead = camera.rotation @ (np.zeros(3) - camera.position)
@@ -138,12 +140,12 @@ def test_an_ellipse_of_cameras_gives_itself() -> None:
 def test_a_spiral_stays_near_the_central_camera_and_looks_at_one_point() -> None:
     row = [facing((x, -5, z), (x, 0, z)) for x in (-0.5, -0.2, 0, 0.2, 0.5) for z in (-0.3, 0, 0.3)]
     made = spiral(cloud(), row, 40)
-    offsets = np.abs(places(made) - (0, -5, 0)).max(axis=0)
+    offsets = np.abs(positions(made) - (0, -5, 0)).max(axis=0)
     np.testing.assert_allclose(offsets[[0, 2]], [0.5, 0.3], rtol=0.05)
     assert offsets[1] < 1.01
     lines = np.array([camera.rotation[2] for camera in made])
     across = np.eye(3) - lines[:, :, None] * lines[:, None, :]
-    target = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, places(made)))
+    target = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, positions(made)))
     for camera in made:
         ahead = camera.rotation @ (target - camera.position)
         np.testing.assert_allclose(ahead[:2] / ahead[2], 0, atol=1e-6)
@@ -153,7 +155,7 @@ def test_a_spiral_stays_near_the_central_camera_and_looks_at_one_point() -> None
 def test_paths_close_and_need_no_cameras(path: object) -> None:
     splats = cloud()
     made = path(splats, (), 60)  # type: ignore[operator]
-    steps = np.linalg.norm(np.diff(places([*made, made[0]]), axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(positions([*made, made[0]]), axis=0), axis=1)
     assert steps.max() < 3 * np.median(steps)
     for camera in made[::15]:
         local = splats.mean @ camera.rotation.T + camera.translation
@@ -171,4 +173,4 @@ def test_paths_close_and_need_no_cameras(path: object) -> None:
 def test_one_camera_or_two_are_enough(path: object, n: int) -> None:
     made = path(cloud(), [facing((4, 0, 1)), facing((0, 4, 1))][:n], 7)  # type: ignore[operator]
     assert len(made) == 7
-    assert np.isfinite(places(made)).all()
+    assert np.isfinite(positions(made)).all()

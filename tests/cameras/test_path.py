@@ -76,7 +76,7 @@ def test_nerfstudios_axes_and_vertical_field_of_view() -> None:
     }
 
 
-def test_keyframes_of_both_of_nerfstudios_viewers() -> None:
+def test_keyframes_of_both_viewers_of_nerfstudio() -> None:
     pose = np.array(nerfstudio()["camera_path"][0]["camera_to_world"], float).reshape(4, 4)
     new = {"matrix": pose.ravel().tolist(), "fov": 90, "aspect": 2}
     old = {"matrix": json.dumps(pose.T.ravel().tolist()), "fov": 90, "aspect": 2}
@@ -131,7 +131,7 @@ def frame(**changes: Any) -> dict[str, Any]:
         (7, ["a number"]),
     ],
 )
-def test_faults_name_file_and_field(tmp_path: Path, content: Any, words: list[str]) -> None:
+def test_errors_name_file_and_field(tmp_path: Path, content: Any, words: list[str]) -> None:
     file = tmp_path / "path.json"
     file.write_text(json.dumps(content))
     with pytest.raises(InputError) as caught:
