@@ -11,7 +11,7 @@ from clsplat.compression.rules import TOLERANCE, BudgetOptions
 from clsplat.compression.state import FILE, BudgetState
 from clsplat.errors import InputError, OutputError
 from clsplat.files.lock import folder_lock
-from clsplat.training.config import TrainConfig
+from clsplat.training.config import TrainConfig, read_options
 
 from .options import Decibels, F
 from .progress import TrainingDisplay
@@ -85,7 +85,7 @@ def stored_search(folder: Path) -> tuple[dict[str, Any], BudgetOptions, dict[str
     state = BudgetState(folder)
     state.load()
     try:
-        config = TrainConfig.from_json(state.values["config"])
+        TrainConfig.from_json(state.values["config"])
         options = BudgetOptions(**state.values["options"])
         scene = dict(state.values["scene"])
         scene["path"] = str(scene["path"])
@@ -93,7 +93,7 @@ def stored_search(folder: Path) -> tuple[dict[str, Any], BudgetOptions, dict[str
         raise InputError(f"{state.path}: damaged ({error}): start again with --overwrite") from None
     if "final" in state.values:
         raise InputError(f"{folder}: the search is finished: nothing to resume")
-    return {name: getattr(config, name) for name in state.values["config"]}, options, scene
+    return read_options(state.values["config"]), options, scene
 
 
 def run_search(

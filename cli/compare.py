@@ -15,7 +15,7 @@ from clsplat.training.presets import PRESETS
 from .options import (
     PATH,
     Numbers,
-    SpacedLists,
+    TrainingCommand,
     config_options,
     config_values,
     hiding_options,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 
-@click.command("compare", cls=SpacedLists)
+@click.command("compare", cls=TrainingCommand)
 @click.argument("scenes", nargs=-1, required=True, type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, metavar="DIR", help="Folder of the runs and the table.")
 @click.option(

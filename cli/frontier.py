@@ -14,7 +14,7 @@ from .compare import flat, options_and_scenes, say_run
 from .options import (
     PATH,
     Numbers,
-    SpacedLists,
+    TrainingCommand,
     config_options,
     hiding_options,
     photo_options,
@@ -30,7 +30,7 @@ CAPS = (1000, 2500, 5000, 10_000)
 SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 
 
-@click.command("frontier", cls=SpacedLists)
+@click.command("frontier", cls=TrainingCommand)
 @click.argument("scenes", nargs=-1, type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, metavar="DIR", help="Folder of the runs, charts and page.")
 @click.option(

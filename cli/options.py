@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import inspect
 import re
 from collections.abc import Callable
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,36 +12,14 @@ import click
 
 from clsplat.scenes.options import ALPHA_USES
 from clsplat.splats.color import Color
-from clsplat.splats.shapes import NORMALISATIONS, SHAPES
-from clsplat.training.config import (
-    ALTERNATIONS,
-    OPTIMIZERS,
-    POSITION_OPTIMIZERS,
-    RELOCATIONS,
-    STRATEGIES,
-    TrainConfig,
-)
-from clsplat.training.optim.skew_map import SKEW_MAPS
+from clsplat.training.config import OPTIONS, SECTIONS
+from clsplat.training.options.density import STRATEGIES
+from clsplat.training.options.option import Option, option_table
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 PATH = click.Path(path_type=Path)
 SETS = ("test", "train", "all")
-
-_CHOICES = {
-    "shape": tuple(SHAPES),
-    "normalisation": NORMALISATIONS,
-    "skew_map": ("auto", *SKEW_MAPS),
-    "strategy": STRATEGIES,
-    "optimizer": OPTIMIZERS,
-    "relocation": RELOCATIONS,
-    "position_optimizer": POSITION_OPTIMIZERS,
-    "alternation": ALTERNATIONS,
-}
-_ALIASES = {"iterations": ("--steps",)}
-_METAVARS = {"init": "sfm|random|FILE.ply"}
-# Shared with other commands, or with a form of their own.
-_OWN = ("background", "device", "save_iterations", "test_iterations")
 
 
 class ColorType(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
@@ -98,8 +75,29 @@ class Decibels(click.ParamType):  # type: ignore[type-arg]
         return float(match[1])
 
 
-class SpacedLists(click.Command):
-    """A command that also takes 3DGS's form of a list, `--save_iterations 1000 2000`."""
+class ConfigOption(click.Option):
+    """A training option, which `--help` lists in its section."""
+
+    def __init__(self, *args: Any, section: str, **extra: Any) -> None:
+        super().__init__(*args, **extra)
+        self.section = section
+
+
+class TrainingCommand(click.Command):
+    """A command with training options: `--help` shows them in sections, and lists may have 3DGS's form.
+
+    3DGS's form of a list has spaces: `--save_iterations 1000 2000`.
+    """
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            if record := param.get_help_record(ctx):
+                section = param.section if isinstance(param, ConfigOption) else "Options"
+                sections.setdefault(section, []).append(record)
+        for section, records in sections.items():
+            with formatter.section(section):
+                formatter.write_dl(records)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         lists = {name for param in self.params if isinstance(param.type, Numbers) for name in param.opts}
@@ -127,12 +125,11 @@ set_option = click.option(
 )
 
 
-def background_options(function: F) -> F:
-    """`--background R,G,B` and `-w`; read them with `background_of`."""
-    function = click.option(
-        "--background", type=ColorType(), metavar="R,G,B", help="Colour behind the splats, each 0 to 1."
-    )(function)
-    return click.option("-w", "--white-background", is_flag=True, help="The same as --background 1,1,1.")(function)
+def background_options(function: F, **extra: Any) -> F:
+    """Add `--background R,G,B` and `-w`; read them with `background_of`. `extra`: more arguments of `click.option`."""
+    help_text = "Colour behind the splats, each part 0 to 1."
+    white = click.option("-w", "--white-background", is_flag=True, help="The same as --background 1,1,1.", **extra)
+    return click.option("--background", type=ColorType(), metavar="R,G,B", help=help_text, **extra)(white(function))
 
 
 def background_of(background: Color | None, white: bool) -> Color | None:
@@ -193,40 +190,30 @@ def split_options(function: F) -> F:
 
 
 def config_options(*without: str) -> Callable[[F], F]:
-    """One option for each field of TrainConfig but those in `without`; `config_values` reads them."""
-    help_of, types = _field_help(), TrainConfig.option_types()
+    """Add a flag for each training option except those in `without`; `config_values` reads them."""
 
     def decorate(function: F) -> F:
-        for name in ("test_iterations", "save_iterations"):
-            if name not in without:
-                function = click.option(_flag(name), name, type=Numbers(), multiple=True, help=help_of.get(name))(
-                    function
-                )
-        function = background_options(device_option(function))
-        for field in reversed(dataclasses.fields(TrainConfig)):
-            if field.name not in (*_OWN, *without):
-                function = _field_option(field, types[field.name], help_of.get(field.name))(function)
+        for section, known_options in reversed(SECTIONS.items()):
+            for known in reversed(known_options):
+                if known.name == "background":
+                    function = background_options(function, cls=ConfigOption, section=section)
+                elif known.name not in without:
+                    function = _flag_of(known, section)(function)
         return function
 
     return decorate
 
 
 def config_values(ctx: click.Context, values: dict[str, Any]) -> dict[str, Any]:
-    """TrainConfig's arguments that the user gave on the command line; takes them out of `values`."""
+    """Take the training options that stand on the command line out of `values` and return them by name."""
     background = background_of(values.pop("background"), values.pop("white_background"))
-    device = values.pop("device")
-    lists = {
-        name: sorted({n for group in values.pop(name, ()) for n in group})
-        for name in ("save_iterations", "test_iterations")
-    }
-    given = {
-        field.name: values.pop(field.name)
-        for field in dataclasses.fields(TrainConfig)
-        if field.name in values and is_given(ctx, field.name)
-    }
-    given |= {name: tuple(numbers) for name, numbers in lists.items() if numbers}
-    own = {"background": background, "device": device}
-    return given | {name: value for name, value in own.items() if value is not None}
+    chosen = {name: values.pop(name) for name in OPTIONS if name in values and is_given(ctx, name)}
+    for name in OPTIONS:
+        values.pop(name, None)
+    for name in ("save_iterations", "test_iterations"):
+        if name in chosen:
+            chosen[name] = tuple(sorted({number for group in chosen[name] for number in group}))
+    return chosen if background is None else chosen | {"background": background}
 
 
 def is_given(ctx: click.Context, name: str) -> bool:
@@ -234,32 +221,22 @@ def is_given(ctx: click.Context, name: str) -> bool:
     return ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
 
 
-def _field_option(field: dataclasses.Field[Any], kind: Any, text: str | None) -> Callable[[F], F]:
-    flag, default = _flag(field.name), field.default
-    if kind is bool:
-        return click.option(f"{flag}/--no-{flag[2:]}", field.name, default=default, show_default=True, help=text)
-    type_: Any = click.Choice(_CHOICES[field.name]) if field.name in _CHOICES else kind
-    return click.option(
-        flag,
-        *_ALIASES.get(field.name, ()),
-        field.name,
-        type=type_,
-        default=default,
-        show_default=default is not None,
-        metavar=_METAVARS.get(field.name),
-        help=text,
-    )
+def _flag_of(known: Option, section: str) -> Callable[[F], F]:
+    """Return the decorator that adds the flag of a training option."""
+    flag = "--" + known.name.replace("_", "-")
+    extra: dict[str, Any] = {"cls": ConfigOption, "section": section, "help": known.help}
+    if known.value_type is bool:
+        return click.option(f"{flag}/--no-{flag[2:]}", known.name, default=known.default, show_default=True, **extra)
+    if known.value_type == tuple[int, ...]:
+        return click.option(flag, known.name, type=Numbers(), multiple=True, **extra)
+    if known.default is MISSING:
+        extra["help"] += f"  [default: {_strategy_defaults(known.name)}]"
+    else:
+        extra |= {"default": known.default, "show_default": known.default is not None}
+    value_type: Any = click.Choice(known.choices) if known.choices else known.value_type
+    return click.option(flag, *known.aliases, known.name, type=value_type, metavar=known.metavar, **extra)
 
 
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
-
-
-def _field_help() -> dict[str, str]:
-    """Field to its text in TrainConfig's docstring, entries of the form "name, name : text"."""
-    texts: dict[str, str] = {}
-    entry = r"^(\w[\w, ]*) : (.*(?:\n[ ]+.*)*)"
-    for match in re.finditer(entry, inspect.cleandoc(TrainConfig.__doc__ or ""), re.M):
-        text = " ".join(match[2].replace("`", "").split())
-        texts |= {name.strip(): text[:1].upper() + text[1:] for name in match[1].split(",")}
-    return texts
+def _strategy_defaults(name: str) -> str:
+    """Return the defaults of an option that differ between the strategies, as text."""
+    return ", ".join(f"{option_table(group)[name].default:g} with {strategy}" for strategy, group in STRATEGIES.items())

@@ -11,14 +11,14 @@ import click
 from clsplat.errors import InputError, OutputError
 from clsplat.files.json_file import read_object
 from clsplat.splats.color import Color
-from clsplat.training.config import TrainConfig
+from clsplat.training.config import TrainConfig, read_options
 from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
 
 from .budget import budget_options, forget_search, is_search, options_of, run_search, stored_search
 from .options import (
     PATH,
-    SpacedLists,
+    TrainingCommand,
     config_options,
     config_values,
     hiding_options,
@@ -42,7 +42,7 @@ SCENE_KEYS = ("images", "resolution", "masks", "alpha", "test_every", "test_list
 INTERRUPTED = 130
 
 
-@click.command(cls=SpacedLists)
+@click.command(cls=TrainingCommand)
 @click.argument("scene", required=False, type=PATH)
 @click.option(
     "-m",
@@ -243,8 +243,8 @@ def _options_in(file: Path) -> dict[str, Any]:
     values = read_object(file)
     values = values.get("config", values)
     try:
-        config = TrainConfig.from_json(values)
-        return {name: getattr(config, name) for name in values}
+        TrainConfig.from_json(values)
+        return read_options(values)
     except (AttributeError, TypeError, ValueError) as error:
         raise InputError(
             f'{file}: not options of a run ({error}): give a config.json, or an object such as {{"iterations": 2000}}'
@@ -259,9 +259,9 @@ def _stored_run(folder: ModelFolder) -> tuple[dict[str, Any], dict[str, Any]]:
         raise InputError(f"{folder.path}: no checkpoint to resume from: start with --overwrite")
     stored = folder.read_config()
     try:
-        config = TrainConfig.from_json(stored["config"])
+        TrainConfig.from_json(stored["config"])
         scene = dict(stored["scene"])
         scene["path"] = str(scene["path"])
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{folder.config_path}: damaged ({error}): start again with --overwrite") from None
-    return {name: getattr(config, name) for name in stored["config"]}, scene
+    return read_options(stored["config"]), scene

@@ -231,8 +231,8 @@ class Trainings:
                     config.shape,
                     config.cap_max,
                     SH_DEGREE,
-                    opacity=config.init_opacity,
-                    scale_factor=config.init_scale,
+                    opacity=config.density.init_opacity,
+                    scale_factor=config.density.init_scale,
                 )
                 file = Path(folder) / "start.ply"
                 hazard.start(first).save(file)

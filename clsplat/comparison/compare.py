@@ -9,7 +9,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -238,7 +238,7 @@ def train_and_measure(
         "protocol": DEFAULT_PROTOCOL.describe(),
     }
     along = curve_iterations(config.iterations, curve)
-    trainer = Trainer(scene, replace(config, test_iterations=along), progress=progress, device=device)
+    trainer = Trainer(scene, config.replace(test_iterations=along), progress=progress, device=device)
     record["schedule"] = str(trainer.kernels.schedule)
     try:
         model = trainer.run()

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from ..errors import InputError
 from ..splats.shapes import SHAPES
-from ..training.config import TrainConfig
+from ..training.config import OPTIONS, TrainConfig
 from ..training.presets import PRESETS, with_preset
 
 DEFAULT = "default"
@@ -55,9 +54,12 @@ class Method:
         else:
             values = shared if self.base == DEFAULT else shared | {"shape": self.base}
         try:
-            return TrainConfig(**(values | dict(self.changes) | {"cap_max": cap, "seed": seed}))
+            config = TrainConfig(**(values | dict(self.changes) | {"cap_max": cap, "seed": seed}))
         except InputError as error:
             raise InputError(f"system {self.label}: {error}") from None
+        for key in config.without_effect(self.changes):
+            raise InputError(f"system {self.label}: {key} has no effect with strategy {config.strategy}: leave it out")
+        return config
 
 
 def parse_methods(text: str) -> list[Method]:
@@ -107,9 +109,9 @@ def _change(name: str, change: str) -> tuple[str, Any]:
         raise InputError(f"system {name}: {change!r} is no key=value, such as strategy=mcmc")
     if key in SHARED:
         raise InputError(f"system {name}: {key} is the same for all systems of a comparison: give it as a flag")
-    if key not in {field.name for field in dataclasses.fields(TrainConfig)}:
+    if key not in OPTIONS:
         raise InputError(f"system {name}: unknown option {key!r}: the options of `clsplat train` can be changed")
-    kind = TrainConfig.option_types()[key]
+    kind = OPTIONS[key].value_type
     try:  # all kinds but str, bool, int and float are of SHARED
         return key, _WORDS[text.lower()] if kind is bool else kind(text)
     except (KeyError, ValueError):

@@ -7,7 +7,6 @@ rounds: of fox's 32 000 splats (1000 iterations, 31.16 dB on validation views) 1
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -130,16 +129,15 @@ def without_messages(progress: Callable[[Progress], None] | None) -> Callable[[P
 def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Path, rate: float = 1.0) -> TrainConfig:
     """Options that train `splats`, saved in `start`, on: full images, all bands, no strategy, no noise."""
     changes: dict[str, Any] = {}
-    short = dataclasses.replace(config, iterations=iterations)
+    short = config.replace(iterations=iterations)
     for option, field in _RATES.items():
-        value = getattr(config, option)
+        value = getattr(config.optim, option)
         if value is None and field in splats.schema:
             value = splats.schema[field].lr
         if value is not None:
             changes[option] = rate * value * config.rate_factor(field) / short.rate_factor(field)
-    last = config.position_lr_final * config.rate_factor("mean") / short.rate_factor("mean")
-    return dataclasses.replace(
-        short,
+    last = config.optim.position_lr_final * config.rate_factor("mean") / short.rate_factor("mean")
+    return short.replace(
         shape=splats.shape,
         normalisation=splats.normalisation,
         antialiased=splats.antialiased,
@@ -155,9 +153,9 @@ def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Pat
         alternation="off",
         save_iterations=(),
         test_iterations=(),
-        opacity_lr=rate * config.opacity_lr,
-        feature_lr=rate * config.feature_lr,
-        position_lr_init=min(_WARM * last, config.position_lr_init),
+        opacity_lr=rate * config.optim.opacity_lr,
+        feature_lr=rate * config.optim.feature_lr,
+        position_lr_init=min(_WARM * last, config.optim.position_lr_init),
         position_lr_final=last,
         **changes,
     )

@@ -17,7 +17,6 @@ A target of PSNR or bytes replaces the tolerance as what ends the rounds. Finish
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import statistics
 import time
@@ -160,7 +159,7 @@ class _Search:
                 stage()
         if "refit" not in values:
             resume = self.folder.checkpoint_path.is_file()
-            config = dataclasses.replace(self.config, cap_max=values["knee"])
+            config = self.config.replace(cap_max=values["knee"])
             self.say(f"refit: all {len(self.scene.train)} training views, at most {values['knee']} splats")
             model = train(
                 self.scene,
@@ -180,7 +179,7 @@ class _Search:
     def grow(self) -> None:
         """Short runs at rising caps."""
         iterations = max(self.config.iterations // GROWTH_PART, 1)
-        interval = max(self.config.densify_interval // GROWTH_PART, 1)
+        interval = max(self.config.density.densify_interval // GROWTH_PART, 1)
         rows: list[ModelRow] = self.state.values.get("growth", [])
         for cap in growth_caps(self.config.cap_max):
             if any(row["cap"] == cap for row in rows):
@@ -188,8 +187,7 @@ class _Search:
             if growth_is_over(rows, self.options):
                 break
             self.say(f"growth: at most {cap} splats, {iterations} iterations")
-            config = dataclasses.replace(
-                self.config,
+            config = self.config.replace(
                 cap_max=cap,
                 iterations=iterations,
                 densify_interval=interval,
@@ -223,9 +221,7 @@ class _Search:
                 f"held out: at most {cap} splats, {len(self.split.train)} training views, "
                 f"{len(self.split.test)} validation views"
             )
-            splats, seconds = self.run_of(
-                dataclasses.replace(self.config, cap_max=cap, save_iterations=(), test_iterations=())
-            )
+            splats, seconds = self.run_of(self.config.replace(cap_max=cap, save_iterations=(), test_iterations=()))
             self.state.save(f"whole_{cap}", splats)
             rows = [*rows, {"cap": cap, **self.row(splats, seconds)}]
             self.state.put("whole", rows)

@@ -124,7 +124,7 @@ def measure_training(trainer: Trainer, limits: Limits, iterations: int) -> Repor
     start = time.perf_counter()
     trainer.densify()
     trainer.device.queue.finish()
-    action_ms = 1e3 * (time.perf_counter() - start) / trainer.config.densify_interval
+    action_ms = 1e3 * (time.perf_counter() - start) / trainer.config.density.densify_interval
     wall_ms = measured.wall_ms + action_ms
     stages = [dataclasses.replace(stage, share=stage.ms / wall_ms) for stage in measured.stages]
     stages.insert(-1, StageTime("strategy", action_ms, action_ms / wall_ms))

@@ -27,8 +27,10 @@ def active_blocks(iteration: int, config: TrainConfig) -> Blocks:
     `alternation_warmup * iterations`. Then each cycle of `alternation_cycle` iterations gives its first
     `alternation_split` to the base and the rest to the skew.
     """
-    since = iteration - 1 - int(config.alternation_warmup * config.iterations)
-    if config.alternation == "off" or since < 0 or shape_named(config.shape).skew_form is None:
+    since = iteration - 1 - int(config.phases.alternation_warmup * config.iterations)
+    if config.phases.alternation == "off" or since < 0 or shape_named(config.shape).skew_form is None:
         return Blocks(True, True)
-    base = since % config.alternation_cycle < round(config.alternation_split * config.alternation_cycle)
+    base = since % config.phases.alternation_cycle < round(
+        config.phases.alternation_split * config.phases.alternation_cycle
+    )
     return Blocks(base, not base)

@@ -40,7 +40,7 @@ class ExposureLoss:
     def __init__(self, loss: ImageLoss, targets: Targets, config: TrainConfig, background: Color) -> None:
         self.loss, self.targets, self.config, self.background = loss, targets, config, background
         self.device, self.pipeline, self.kernels = loss.device, loss.pipeline, loss.kernels
-        self.learns = config.exposure
+        self.learns = config.appearance.exposure
         self.in_use = needs_exposure(config, targets.channels)
         if not self.in_use:
             return
@@ -99,8 +99,8 @@ class ExposureLoss:
                 parts=parts,
                 view=target.index,
                 views=len(self.targets.views),
-                rate=self.config.exposure_rate,
-                pull=self.config.exposure_pull,
+                rate=self.config.appearance.exposure_rate,
+                pull=self.config.appearance.exposure_pull,
             )
         return result
 
@@ -136,7 +136,7 @@ class ExposureLoss:
 
 def needs_exposure(config: TrainConfig, channels: int) -> bool:
     """Whether a run with targets of `channels` planes needs the kernels of exposure, masks and transparency."""
-    return config.exposure or channels > 3
+    return config.appearance.exposure or channels > 3
 
 
 def exposure_bytes(layout: ImageLayout, itemsize: int, config: TrainConfig, channels: int) -> int:

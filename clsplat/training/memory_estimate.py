@@ -61,8 +61,8 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, tar
     screen = (kernels.record + kernels.v_record) * real + 4 * _SCREEN_WORDS
     isect = isect_bytes(kernels)
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
-    extra = 6 * SkewMap(config.map).width if config.map else 0  # s, moments, and a spare of each
-    extra += 0 if config.position_optimizer == "adam" else 6  # momentum
+    extra = 6 * SkewMap(config.skew_map).width if config.skew_map else 0  # s, moments, and a spare of each
+    extra += 0 if config.sghmc.position_optimizer == "adam" else 6  # momentum
     buffers = [rows[Group.SH] * n * real, 9 * layout.plane * real]
     splat = _ROLES * rows[Group.GEOM] + (_ROLES - 1) * rows[Group.SH] + COMPACT_ROWS + extra
     return Estimate(

@@ -8,11 +8,9 @@ began to lose more than half a decibel (benchmarks/STABILITY.md).
 from __future__ import annotations
 
 import math
-from dataclasses import fields
-from typing import Any
 
 from ..errors import InputError
-from .config import TrainConfig
+from .config import OPTIONS, TrainConfig
 
 # By option: the field whose rates grow in short runs with it, and the most that a step may be.
 LIMITS = {
@@ -30,9 +28,8 @@ def check_rates(config: TrainConfig) -> None:
 
     The default rates always pass, in runs of a few iterations too.
     """
-    defaults: dict[str, Any] = {field.name: field.default for field in fields(TrainConfig)}
     for name, (grows_with, limit) in LIMITS.items():
-        rate, default = float(getattr(config, name)), float(defaults[name])
+        rate, default = float(getattr(config.optim, name)), float(OPTIONS[name].default)
         factor = config.rate_factor(grows_with)
         most = max(limit / factor, default)
         if rate > most:

@@ -37,6 +37,7 @@ from .memory_estimate import check, estimate, peak_bytes, room_for_isects
 from .optim.noise import noise_amount, noise_reach
 from .optim.optimizer import make_optimizer
 from .optim.skew_map import SKEW_MAPS
+from .options.density import Mcmc
 from .programs import optim_program
 from .rate_limits import check_rates
 from .schedules import exponential_decay, sh_degree_at
@@ -99,7 +100,7 @@ class Trainer:
             config.sh_degree,
             schedule,
             config.normalisation,
-            skew_map=config.map or SKEW_MAPS[0],
+            skew_map=config.skew_map or SKEW_MAPS[0],
             antialiased=config.antialiased,
         )
         largest = max((view.camera for view in scene.train), key=lambda c: c.width * c.height)
@@ -122,13 +123,13 @@ class Trainer:
                 config.shape,
                 config.cap_max,
                 config.sh_degree,
-                config.init,
+                config.start.init,
                 config.seed,
                 normalisation=config.normalisation,
                 antialiased=config.antialiased,
-                random_share=config.random_points,
-                opacity=config.init_opacity,
-                scale_factor=config.init_scale,
+                random_share=config.start.random_points,
+                opacity=config.density.init_opacity,
+                scale_factor=config.density.init_scale,
             )
             first = start.to_numpy()
         else:
@@ -146,7 +147,7 @@ class Trainer:
         self.splats.set(first)
         self.grads = CompactGradients(self.device, self.splats.schema, capacity, dtype)
         self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config, scene.extent)
-        self.loss = ImageLoss(self.pipeline, config.lambda_dssim)
+        self.loss = ImageLoss(self.pipeline, config.loss.lambda_dssim)
         self.targets = Targets(self.device, self.kernels, scene.train, budget, channels)
         self.exposure = ExposureLoss(self.loss, self.targets, config, scene.background)
         if checkpoint is not None:
@@ -160,7 +161,11 @@ class Trainer:
         self.evaluation_seconds: dict[int, float] = {}
         self.n_first = checkpoint.n_first if checkpoint else n_first
         self.views = ViewSampler(
-            scene.train, config.iterations, config.coarse_to_fine, self.rng, checkpoint.queue if checkpoint else []
+            scene.train,
+            config.iterations,
+            config.schedule.coarse_to_fine,
+            self.rng,
+            checkpoint.queue if checkpoint else [],
         )
         self._plan_schedules()
 
@@ -181,7 +186,7 @@ class Trainer:
                 self.step()
                 it = self.iteration
                 ends = it == config.iterations
-                measured = it in config.test_iterations and bool(self.scene.test)
+                measured = it in config.output.test_iterations and bool(self.scene.test)
                 if measured:
                     self.device.queue.finish()  # what is pending is training time
                 if it % LOG_INTERVAL == 0 or ends:
@@ -202,13 +207,13 @@ class Trainer:
                             "splats": self.splats.n,
                         }
                     )
-                if folder is not None and (it in config.save_iterations or ends):
+                if folder is not None and (it in config.output.save_iterations or ends):
                     folder.save(self.snapshot(), it)
-                    if config.exposure:
+                    if config.appearance.exposure:
                         names = [view.name for view in self.scene.train]
                         folder.write_exposures(exposures_json(names, self.exposure.exposures()))
                 if folder is not None and (
-                    ends or (config.checkpoint_interval and it % config.checkpoint_interval == 0)
+                    ends or (config.output.checkpoint_interval and it % config.output.checkpoint_interval == 0)
                 ):
                     log.flush()
                     self.checkpoint().save(folder.checkpoint_path)
@@ -249,9 +254,9 @@ class Trainer:
         self.optimizer.step(
             self.grads, mean_lr * config.rate_factor("mean"), degree, it, self.pipeline.pool.get("depth_key_kept", 0)
         )
-        if self.densify_first <= it <= self.densify_last and it % config.densify_interval == 0:
+        if self.densify_first <= it <= self.densify_last and it % config.density.densify_interval == 0:
             self.densify()
-        if config.noise_lr and active_blocks(it, config).base:
+        if config.density.noise_lr and active_blocks(it, config).base:
             self.optim_program.mcmc_noise.over(
                 -(-self.splats.n // self.kernels.lanes),
                 self.pipeline.group,
@@ -261,7 +266,7 @@ class Trainer:
                 seed_lo=config.seed & 0xFFFFFFFF,
                 seed_hi=config.seed >> 32,
                 iteration=it,
-                amount=noise_amount(config.noise_lr, mean_lr, self.scene.extent),
+                amount=noise_amount(config.density.noise_lr, mean_lr, self.scene.extent),
                 reach=noise_reach(self.scene.extent),
             )
 
@@ -276,7 +281,7 @@ class Trainer:
                 "check what training starts from (init) and the learning rates"
             )
         edit = next_edit(self.config, arrays, signals, self.rng, info)
-        if self.config.visible_adam:  # splats seen together stay together
+        if self.config.optim.visible_adam:  # splats seen together stay together
             mean = edit.values.get("mean", arrays["mean"][edit.source])
             edit = edit.permuted(morton_order(mean), self.splats.n)
         self.optimizer.apply(edit)
@@ -320,10 +325,10 @@ class Trainer:
     def _plan_schedules(self) -> None:
         config = self.config
         steps = config.iterations
-        self.mean_rate = exponential_decay(config.position_lr_init, config.position_lr_final, steps)
-        self.sh_interval = config.sh_interval or max(1, min(1000, steps // 10))
-        self.densify_first = max(int(config.densify_from * steps), 1)
-        self.densify_last = int(config.densify_until * steps)
+        self.mean_rate = exponential_decay(config.optim.position_lr_init, config.optim.position_lr_final, steps)
+        self.sh_interval = config.schedule.sh_interval or max(1, min(1000, steps // 10))
+        self.densify_first = max(int(config.density.densify_from * steps), 1)
+        self.densify_last = int(config.density.densify_until * steps)
         self.growth = growth_factor(config, self.n_first, self.densify_last - self.densify_first)
 
     def _report(self, value: LossValue, log: RunLog, since: int, started: float) -> None:
@@ -359,6 +364,8 @@ class Trainer:
 
 
 def growth_factor(config: TrainConfig, n_first: int, window: int) -> float:
-    """Growth of the count per action: `config.growth`, or what reaches the cap halfway through the window."""
-    actions = max(window // config.densify_interval // 2, 1)
-    return float(max(config.growth, (config.cap_max / n_first) ** (1 / actions)))
+    """Growth of the count per action: the option `growth`, or what reaches the cap halfway through the window."""
+    if not isinstance(config.density, Mcmc):
+        return 1.0
+    actions = max(window // config.density.densify_interval // 2, 1)
+    return float(max(config.density.growth, (config.cap_max / n_first) ** (1 / actions)))

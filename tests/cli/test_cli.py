@@ -75,12 +75,10 @@ def test_every_option_of_the_config_is_a_flag_with_help() -> None:
     from clsplat_cli.train import train
 
     options = {param.name: param for param in train.params if isinstance(param, click.Option)}
-    from dataclasses import fields
+    from clsplat.training.config import OPTIONS
 
-    from clsplat.training.config import TrainConfig
-
-    for field in fields(TrainConfig):
-        assert options[field.name].help, field.name
+    for name in OPTIONS:
+        assert options[name].help, name
 
 
 # --- train -------------------------------------------------------------------------------------

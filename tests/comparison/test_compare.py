@@ -135,7 +135,7 @@ def test_all_systems_caps_and_seeds_are_run_systems_innermost(scene: Scene, coun
 
 
 def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp_path: Path) -> None:
-    systems = parse_methods("gaussian,default,gaussian:growth=1.1")
+    systems = parse_methods("gaussian,default,gaussian:dense_size=0.02")
 
     def interrupt(run: Run, record: Record | None) -> None:
         if run.number == 3:
@@ -150,7 +150,7 @@ def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp
     (tmp_path / "runs.jsonl").write_text(whole[:-20])
     records = compare([scene], systems, tmp_path, [CAP], [0], SHORT)
     assert len(counted) == 4
-    assert [record["system"] for record in records] == ["gaussian", "default", "gaussian:growth=1.1"]
+    assert [record["system"] for record in records] == ["gaussian", "default", "gaussian:dense_size=0.02"]
     compare([scene], systems, tmp_path, [CAP], [0], SHORT)
     assert len(counted) == 4
 
@@ -218,18 +218,18 @@ def test_failed_runs_are_told_and_the_comparison_goes_on(
     run = Trainer.run
 
     def fail(self: Trainer) -> object:
-        if self.config.growth == 2:
+        if self.config.density.dense_size == 2:
             raise TrainingError("iteration 7: the loss is not finite")
         return run(self)
 
     monkeypatch.setattr(Trainer, "run", fail)
-    records = compare([scene], parse_methods("gaussian:growth=2,gaussian"), tmp_path, [30], [0], SHORT)
+    records = compare([scene], parse_methods("gaussian:dense_size=2,gaussian"), tmp_path, [30], [0], SHORT)
     assert [record["failed"] for record in records] == ["iteration 7: the loss is not finite", None]
     assert not records[0]["finite"]
     bad, good = summarise(records)
     assert cells(bad)[5] == "failed"
     assert float(cells(good)[5]) > 5
-    said = "failed: gaussian:growth=2 on yard 48x36 at cap 30, seed 0: iteration 7: the loss is not finite"
+    said = "failed: gaussian:dense_size=2 on yard 48x36 at cap 30, seed 0: iteration 7: the loss is not finite"
     assert said in notes(records, [bad, good])
     assert said in (tmp_path / "table.md").read_text()
 
@@ -259,10 +259,10 @@ def test_mean_and_half_spread() -> None:
 
 
 def test_equal_names_with_other_options_are_told_apart() -> None:
-    records = [recorded(TrainConfig(growth=growth, seed=seed), "a") for growth in (1.05, 1.1) for seed in (0, 1)]
-    records.append(recorded(TrainConfig(growth=1.2), "b"))
-    records.append(recorded(TrainConfig(growth=1.2, cap_max=7), "a"))
-    assert [row["system"] for row in summarise(records)] == ["a", "a [growth=1.05]", "a [growth=1.1]", "b"]
+    records = [recorded(TrainConfig(dense_size=size, seed=seed), "a") for size in (0.02, 0.03) for seed in (0, 1)]
+    records.append(recorded(TrainConfig(dense_size=0.04), "b"))
+    records.append(recorded(TrainConfig(dense_size=0.04, cap_max=7), "a"))
+    assert [row["system"] for row in summarise(records)] == ["a", "a [dense_size=0.02]", "a [dense_size=0.03]", "b"]
     longer = [recorded(TrainConfig(iterations=n), "a") for n in (10, 20)]
     assert [(row["system"], row["iterations"]) for row in summarise(longer)] == [("a", 10), ("a", 20)]
 

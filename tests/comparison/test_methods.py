@@ -19,21 +19,21 @@ def test_presets_shapes_and_the_default() -> None:
 
 
 def test_changes_follow_a_colon_and_go_on_after_commas() -> None:
-    text = "3dgs:strategy=mcmc,opacity-lr=1e-3,coarse_to_fine=off,gaussian,default:growth=2"
+    text = "3dgs:strategy=mcmc,opacity-lr=1e-3,coarse_to_fine=off,gaussian,default:dense_size=2"
     first, second, third = parse_methods(text)
     assert first.label == "3dgs:strategy=mcmc,opacity_lr=1e-3,coarse_to_fine=off"
     config = first.config(9, 0)
-    assert (config.strategy, config.opacity_lr, config.coarse_to_fine) == ("mcmc", 1e-3, False)
-    assert config.grad_threshold == preset("3dgs")["grad_threshold"]
+    assert (config.strategy, config.optim.opacity_lr, config.schedule.coarse_to_fine) == ("mcmc", 1e-3, False)
+    assert config.density.init_opacity == preset("3dgs")["init_opacity"]
     assert (second.label, dict(second.changes)) == ("gaussian", {})
-    assert third.config(9, 0).growth == 2.0
+    assert third.config(9, 0).density.dense_size == 2.0
 
 
 def test_common_options_hold_for_all_but_changes_win() -> None:
     common = {"iterations": 11, "opacity_lr": 0.5, "strategy": "adc"}
     plain, changed = parse_methods("3dgs,3dgs:opacity_lr=0.25")
-    assert plain.config(1, 0, common).opacity_lr == 0.5
-    assert changed.config(1, 0, common).opacity_lr == 0.25
+    assert plain.config(1, 0, common).optim.opacity_lr == 0.5
+    assert changed.config(1, 0, common).optim.opacity_lr == 0.25
     assert changed.config(1, 0, common).iterations == 11
     # A change of what a preset is stands in its name; a common option does not.
     (other,) = parse_methods("3dgs:strategy=mcmc")
@@ -72,3 +72,9 @@ def test_options_that_do_not_fit_name_the_system() -> None:
     for key in ("shape", "cap_max", "seed"):
         with pytest.raises(InputError, match=f"{key} is set for each run"):
             parse_methods("default")[0].config(1, 0, {key: 1})
+
+
+def test_an_option_of_the_other_strategy_is_refused() -> None:
+    (method,) = parse_methods("gaussian:strategy=adc,growth=2")
+    with pytest.raises(InputError, match="growth has no effect with strategy adc"):
+        method.config(5, 1)

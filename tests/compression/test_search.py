@@ -119,19 +119,19 @@ def test_fine_tuning_goes_on_at_the_runs_last_rates() -> None:
     config = TrainConfig(iterations=2000)
     splats = Splats.from_points(np.eye(3), np.full((3, 3), 0.5), sh_degree=1)
     short = fine_tuning(config, splats, 200, Path("start.ply"), rate=0.5)
-    assert (short.iterations, short.cap_max, short.sh_degree, short.init) == (200, 3, 1, "start.ply")
-    assert short.position_lr_final * short.rate_factor("mean") == pytest.approx(
-        config.position_lr_final * config.rate_factor("mean")
+    assert (short.iterations, short.cap_max, short.sh_degree, short.start.init) == (200, 3, 1, "start.ply")
+    assert short.optim.position_lr_final * short.rate_factor("mean") == pytest.approx(
+        config.optim.position_lr_final * config.rate_factor("mean")
     )
-    assert short.scaling_lr * short.rate_factor("log_scale") == pytest.approx(
-        0.5 * config.scaling_lr * config.rate_factor("log_scale")
+    assert short.optim.scaling_lr * short.rate_factor("log_scale") == pytest.approx(
+        0.5 * config.optim.scaling_lr * config.rate_factor("log_scale")
     )
-    assert short.skew_lr is not None
-    assert short.skew_lr * short.rate_factor("skew") == pytest.approx(
+    assert short.optim.skew_lr is not None
+    assert short.optim.skew_lr * short.rate_factor("skew") == pytest.approx(
         0.5 * splats.schema["skew"].lr * config.rate_factor("skew")
     )
-    assert short.opacity_lr == 0.5 * config.opacity_lr
-    assert short.densify_until == short.noise_lr == 0
+    assert short.optim.opacity_lr == 0.5 * config.optim.opacity_lr
+    assert short.density.densify_until == short.density.noise_lr == 0
 
 
 # --- whole searches ----------------------------------------------------------------------------

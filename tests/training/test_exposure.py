@@ -131,7 +131,7 @@ def test_gradients_and_step_equal_the_reference(
     dtype = exposure.kernels.dtype
     exposures = some_exposures(len(views))
     exposure.load_state({"exposure": exposures.reshape(-1, 12)})
-    rate, pull = exposure.config.exposure_rate, exposure.config.exposure_pull
+    rate, pull = exposure.config.appearance.exposure_rate, exposure.config.appearance.exposure_pull
     for iteration, i in enumerate((0, 1, 2, 3, 0), 1):
         view = views[i]
         target = exposure.targets.get(i, 1)

@@ -90,7 +90,9 @@ def config_of(**options: object) -> TrainConfig:
 
 
 def kernels_of(device: Device, config: TrainConfig, sh_degree: int = 2) -> KernelBuild:
-    return KernelBuild(config.shape, sh_degree, default_schedule(device.cl_device), skew_map=config.map or SKEW_MAPS[0])
+    return KernelBuild(
+        config.shape, sh_degree, default_schedule(device.cl_device), skew_map=config.skew_map or SKEW_MAPS[0]
+    )
 
 
 def started(device: Device, config: TrainConfig, splats: Splats) -> tuple[SplatBuffers, Optimizer]:
@@ -173,11 +175,11 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
         else:
             moved = buffers.download(buffers.n)
             blocks = {True: "skew" in moved, False: True}
-            if config.alternation == "cyclic" and iteration > 2:
+            if config.phases.alternation == "cyclic" and iteration > 2:
                 skew_turn = (iteration - 3) % 3 >= 2
                 blocks = {True: skew_turn, False: not skew_turn}
             for name in moved:
-                turns = name == "skew" and config.map == "coupled"  # moves with the rotation, too
+                turns = name == "skew" and config.skew_map == "coupled"  # moves with the rotation, too
                 assert np.any(moved[name] != start[name]) == (blocks[name == "skew"] or turns), name
     fused, numpy = (target.download(target.n) for target, _ in both.values())
     for name, expected in numpy.items():

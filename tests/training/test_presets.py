@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 
 from clsplat.errors import InputError
 from clsplat.splats import shapes
 from clsplat.splats.shapes import SHAPES, Shape
-from clsplat.training.config import TrainConfig
+from clsplat.training.config import OPTIONS, TrainConfig
 from clsplat.training.optim.skew_map import map_named
 from clsplat.training.presets import IDENTITY, PRESETS, preset, with_preset
 
@@ -67,7 +65,7 @@ def test_presets_are_the_seven_systems_with_their_kernels() -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_is_a_config(name: str) -> None:
     values = preset(name)
-    assert values.keys() <= {field.name for field in dataclasses.fields(TrainConfig)}
+    assert values.keys() <= OPTIONS.keys()
     shape = described(values["shape"])
     if "skew_map" in values:
         assert map_named(values["skew_map"], shape.skew_form) == values["skew_map"]

@@ -19,7 +19,7 @@ def test_defaults_and_presets_pass(iterations: int) -> None:
 
 @pytest.mark.parametrize("name", LIMITS)
 def test_a_hundred_times_the_rate_is_refused_with_what_would_do(name: str) -> None:
-    rate = 100 * getattr(TrainConfig(), name)
+    rate = 100 * getattr(TrainConfig().optim, name)
     if name == "position_lr_final":  # 100 times is the rate at the start
         rate *= 100
     with pytest.raises(InputError, match=rf"^{name} .* of 200 iterations .*: use at most [\d.e-]+$") as caught:

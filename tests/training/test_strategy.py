@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from model_arrays import Arrays, random_model
 
-from clsplat.errors import InputError
 from clsplat.splats import shapes
-from clsplat.training.config import BY_STRATEGY, STRATEGIES, TrainConfig
+from clsplat.training.config import TrainConfig
 from clsplat.training.density import strategy
 from clsplat.training.density.edit import DensifyEdit
 from clsplat.training.density.relocation import relocation
@@ -29,7 +28,7 @@ def action(
     shape = shapes.shape_named(config.shape)
     arrays = random_model(shape, N, 1) if arrays is None else arrays
     stats = np.zeros((3, N)) if stats is None else stats
-    info = StepInfo(iteration, int(config.densify_until * config.iterations), 1.5, 1.0)
+    info = StepInfo(iteration, int(config.density.densify_until * config.iterations), 1.5, 1.0)
     return arrays, strategy.next_edit(config, arrays, stats, np.random.default_rng(seed), info)
 
 
@@ -113,14 +112,3 @@ def test_adc_hands_on_its_options() -> None:
 def test_short_runs_leave_opacities_the_time_to_recover() -> None:
     config = adc(iterations=4000, densify_until=0.9)
     assert [it for it in range(100, 3601, 100) if action(config, it)[1].reset_fields] == [1000, 2000, 3000]
-
-
-@pytest.mark.parametrize("name", STRATEGIES)
-def test_options_that_are_not_given_are_the_strategys_own(name: str) -> None:
-    config = TrainConfig(strategy=name, noise_lr=7.0)
-    assert config == TrainConfig.from_json(config.to_json())
-    own = BY_STRATEGY[name] | {"noise_lr": 7.0}
-    assert {key: getattr(config, key) for key in own} == own
-    assert TrainConfig() == TrainConfig(strategy=TrainConfig().strategy, **BY_STRATEGY[TrainConfig().strategy])
-    with pytest.raises(InputError, match="opacity_reg -1: must be at least 0"):
-        TrainConfig(strategy=name, opacity_reg=-1)

@@ -10,6 +10,7 @@ import numpy as np
 from ...splats.fields import Array
 from ...splats.shapes import shape_named
 from ..config import TrainConfig
+from ..options.density import Adc, Mcmc
 from .adc import plan_adc, with_reset
 from .edit import DensifyEdit
 from .relocation import plan_relocation
@@ -49,8 +50,8 @@ def next_edit(
     ------
     TrainingError : no splat is finite.
     """
-    shape = shape_named(config.shape)
-    if config.strategy == "mcmc":
+    shape, density = shape_named(config.shape), config.density
+    if isinstance(density, Mcmc):
         # The profile has peak 1; without that the length factor would be another one for each view.
         scaled = config.normalisation == "peak" or not shape.normalised
         return plan_relocation(
@@ -59,10 +60,10 @@ def next_edit(
             rng,
             config.cap_max,
             growth=info.growth,
-            limit=config.relocation_limit,
-            rule=config.relocation if scaled else "opacity-only",
+            limit=density.relocation_limit,
+            rule=density.relocation if scaled else "opacity-only",
         )
-    every = reset_interval(config)
+    every = reset_interval(density, config.iterations)
     grown = plan_adc(
         arrays,
         shape,
@@ -70,25 +71,25 @@ def next_edit(
         rng,
         config.cap_max,
         extent=info.extent,
-        grad_threshold=config.grad_threshold,
-        depth_threshold=config.depth_threshold,
-        dense_size=config.dense_size,
+        grad_threshold=density.grad_threshold,
+        depth_threshold=density.depth_threshold,
+        dense_size=density.dense_size,
         prune_large=0 < every < info.iteration,
     )
-    return with_reset(grown, arrays, shape) if resets(config, info) else grown
+    return with_reset(grown, arrays, shape) if resets(density, config.iterations, info) else grown
 
 
-def reset_interval(config: TrainConfig) -> int:
+def reset_interval(density: Adc, iterations: int) -> int:
     """Iterations from one opacity reset to the next; 0: there is none."""
-    return config.opacity_reset and max(config.iterations // config.opacity_reset, RESET_INTERVAL_MIN)
+    return density.opacity_reset and max(iterations // density.opacity_reset, RESET_INTERVAL_MIN)
 
 
-def resets(config: TrainConfig, info: StepInfo) -> bool:
+def resets(density: Adc, iterations: int, info: StepInfo) -> bool:
     """Whether the action resets opacities: the first at or after a multiple of the interval, but not the last.
 
     3DGS: at 3000, 6000, 9000 and 12 000 of 30 000 iterations, of which 15 000 densify.
     """
-    every = reset_interval(config)
+    every = reset_interval(density, iterations)
     if not every or info.iteration >= info.last:
         return False
-    return info.iteration // every > (info.iteration - config.densify_interval) // every
+    return info.iteration // every > (info.iteration - density.densify_interval) // every

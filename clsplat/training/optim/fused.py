@@ -80,7 +80,7 @@ class FusedOptimizer:
         self._rates = device.alloc(table.nbytes)
         to_device(device, self._rates, table)
         self._sh_rates = rules.sh_rates(schema.rows(Group.SH), dtype)
-        self.waiting = Waiting(splats, kernels) if rules.config.visible_adam else None
+        self.waiting = Waiting(splats, kernels) if rules.config.optim.visible_adam else None
         self._lazy_from = _NO_PART if self.waiting is None else 0 if rules.geometry_waits else _PARTS
 
     def step(

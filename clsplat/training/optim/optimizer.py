@@ -59,6 +59,6 @@ def make_optimizer(
 ) -> Optimizer:
     """The optimizer that the config names; `extent` of the scene [world units]."""
     rules = Rules(config, extent)
-    if config.optimizer == "fused":
+    if config.optim.optimizer == "fused":
         return FusedOptimizer(device, kernels, splats, rules)
     return HostOptimizer(splats, rules, kernels.lanes)

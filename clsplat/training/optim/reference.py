@@ -51,7 +51,7 @@ class HostOptimizer:
         params, gradients = self.splats.download(n), grads.written_out(n)
         geometry: Rows = slice(None)  # the splats that step
         colour: Rows = slice(None)
-        if self.rules.config.visible_adam:
+        if self.rules.config.optim.visible_adam:
             vectors = woken(self._seen(depth_key), self.last, self._counts, self.lanes)
             colour = np.flatnonzero(np.repeat(vectors, self.lanes)[:n])
             geometry = colour if self.rules.geometry_waits else geometry
@@ -78,7 +78,7 @@ class HostOptimizer:
         self.drifts.advance(blocks, self._counts, mean_lr)
 
     def settle(self) -> None:
-        if self.rules.config.visible_adam:
+        if self.rules.config.optim.visible_adam:
             params = self.splats.download(self.splats.n)
             self.skew_s = self._caught_up(params, self.skew_s, slice(None))
             self.splats.set(params)
@@ -86,7 +86,7 @@ class HostOptimizer:
 
     def read(self) -> dict[str, Array]:
         params = self.splats.download(self.splats.n)
-        if self.rules.config.visible_adam:
+        if self.rules.config.optim.visible_adam:
             self._caught_up(params, self.skew_s, slice(None), keeps_moments=True)
         return params
 
@@ -113,7 +113,7 @@ class HostOptimizer:
             state["skew_s"] = self.skew_s.copy()
         if self.rules.sghmc is not None:
             state["momentum"] = self.momentum.copy()
-        if self.rules.config.visible_adam:
+        if self.rules.config.optim.visible_adam:
             state |= {"waiting.last": self.last.astype(np.uint32), "waiting.drifts": self.drifts.sums.copy()}
         return state
 
@@ -127,7 +127,7 @@ class HostOptimizer:
             self.skew_s = state["skew_s"].copy()
         if self.rules.sghmc is not None:
             self.momentum = state["momentum"].copy()
-        if self.rules.config.visible_adam:
+        if self.rules.config.optim.visible_adam:
             self.last, self.drifts.sums = state["waiting.last"].astype(np.int64), state["waiting.drifts"].copy()
 
     @property

@@ -39,18 +39,18 @@ class Rules:
         """Adam's rate per field; the mean's changes with the iteration and is given at each step."""
         config = self.config
         rates = {
-            "quat": config.rotation_lr,
-            "log_scale": config.scaling_lr,
-            "opacity_logit": config.opacity_lr,
-            "opacity_minus_logit": config.opacity_lr,
-            "sh": config.feature_lr,
-            "normal": config.normal_lr,
-            "beta": config.beta_lr,
-            "nu": config.nu_lr,
+            "quat": config.optim.rotation_lr,
+            "log_scale": config.optim.scaling_lr,
+            "opacity_logit": config.optim.opacity_lr,
+            "opacity_minus_logit": config.optim.opacity_lr,
+            "sh": config.optim.feature_lr,
+            "normal": config.optim.normal_lr,
+            "beta": config.optim.beta_lr,
+            "nu": config.optim.nu_lr,
         }
         for field in self.shape.fields:
             if field.name == "skew":
-                rates["skew"] = field.lr if config.skew_lr is None else config.skew_lr
+                rates["skew"] = field.lr if config.optim.skew_lr is None else config.optim.skew_lr
         return {name: rate * config.rate_factor(name) for name, rate in rates.items()}
 
     def sh_rates(self, rows: int, dtype: np.dtype[np.floating]) -> Array:
@@ -66,26 +66,26 @@ class Rules:
         they would outweigh the images.
         """
         config = self.config
-        scale = config.scale_reg * min(PUBLISHED_EXTENT / self.extent, 1.0)
-        return Penalty(config.opacity_reg / n, scale / (3 * n), config.bisect_reg / n)
+        scale = config.density.scale_reg * min(PUBLISHED_EXTENT / self.extent, 1.0)
+        return Penalty(config.density.opacity_reg / n, scale / (3 * n), config.loss.bisect_reg / n)
 
     @cached_property
     def map(self) -> SkewMap | None:
         """The map of the trainable skew, where the shape has one."""
-        return SkewMap(self.config.map) if self.config.map else None
+        return SkewMap(self.config.skew_map) if self.config.skew_map else None
 
     @cached_property
     def sghmc(self) -> Sghmc | None:
         """How positions move, unless by Adam."""
         config = self.config
-        if config.position_optimizer == "adam":
+        if config.sghmc.position_optimizer == "adam":
             return None
         return Sghmc(
-            config.position_optimizer == "sghmc-sss",
+            config.sghmc.position_optimizer == "sghmc-sss",
             self.extent,
-            config.sghmc_friction,
-            config.sghmc_burn_in_friction,
-            int(config.sghmc_burn_in * config.iterations),
+            config.sghmc.sghmc_friction,
+            config.sghmc.sghmc_burn_in_friction,
+            int(config.sghmc.sghmc_burn_in * config.iterations),
         )
 
     def coefficients(self, sghmc: Sghmc, iteration: int, mean_lr: float) -> Coefficients:
@@ -106,13 +106,13 @@ class Rules:
     def geometry_waits(self) -> bool:
         """Whether with `visible_adam` geometry waits as colour does: nothing else moves splats, or looks at them."""
         config = self.config
-        pulled = config.opacity_reg or config.scale_reg or config.bisect_reg
-        return not (pulled or config.noise_lr or self.sghmc)
+        pulled = config.density.opacity_reg or config.density.scale_reg or config.loss.bisect_reg
+        return not (pulled or config.density.noise_lr or self.sghmc)
 
     def check_state(self, state: Mapping[str, NDArray[Any]], schema: Schema) -> None:
         """Raises InputError naming an entry that an optimizer's state lacks, or has and should not."""
         wanted = {"steps"} | {f"{role}.{name}" for role in ("first", "second") for name in schema.names}
         wanted |= ({"skew_s"} if self.map else set()) | ({"momentum"} if self.sghmc else set())
-        wanted |= {"waiting.last", "waiting.drifts"} if self.config.visible_adam else set()
+        wanted |= {"waiting.last", "waiting.drifts"} if self.config.optim.visible_adam else set()
         if odd := sorted(wanted ^ set(state)):
             raise InputError(f"optimizer state: missing or unknown entry {odd[0]!r}: start without --resume")

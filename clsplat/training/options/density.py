@@ -1,0 +1,102 @@
+"""Options of the two densification strategies. The defaults of a strategy are the defaults of its class.
+
+The defaults were the best ones on validation views (benchmarks/SYSTEMS.md), if they differ from the papers'.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from .option import OptionGroup, option
+
+RELOCATIONS = ("length", "length-squared", "opacity-only")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensityConfig(OptionGroup):
+    """Options that both strategies have. Some defaults differ between the strategies: see `Adc` and `Mcmc`."""
+
+    title: ClassVar[str] = "Densification"
+    strategy: ClassVar[str]
+
+    densify_from: float = option(0.05, help="Start of densification, as a fraction of the run.")
+    densify_until: float = option(help="End of densification, as a fraction of the run.")
+    densify_interval: int = option(100, help="Iterations between two densification steps.", at_least=1)
+    init_opacity: float = option(help="Opacity of splats that are created from points.", above=0, below=1)
+    init_scale: float = option(
+        help="Scale of splats that are created from points, as a factor of the mean distance to three neighbours.",
+        above=0,
+    )
+    opacity_reg: float = option(help="Weight of the mean opacity in the loss.", at_least=0)
+    scale_reg: float = option(help="Weight of the mean scale in the loss.", at_least=0)
+    noise_lr: float = option(
+        help="Strength of the random motion of positions, as a factor of their learning rate.", at_least=0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adc(DensityConfig):
+    """Adaptive density control of 3DGS: clone, split and prune splats, and reset opacities."""
+
+    title: ClassVar[str] = "Densification with strategy adc"
+    strategy: ClassVar[str] = "adc"
+
+    densify_until: float = 0.5
+    init_opacity: float = 0.2
+    init_scale: float = 0.7
+    opacity_reg: float = 0.0
+    scale_reg: float = 0.0
+    noise_lr: float = 0.0
+    grad_threshold: float = option(
+        2e-4,
+        help="Splats are cloned or split if the mean gradient of their screen position is above this value.",
+        at_least=0,
+    )
+    depth_threshold: float = option(
+        0.0,
+        help="The same threshold for the gradient along the viewing ray, times the scene extent (3DSGS). 0: not used.",
+        at_least=0,
+    )
+    dense_size: float = option(
+        0.01, help="Splats larger than this fraction of the scene extent are split, others are cloned.", at_least=0
+    )
+    opacity_reset: int = option(
+        0,
+        help="Number of opacity resets in a run of full length (3DGS: 10), at least 1000 iterations apart. 0: none.",
+        at_least=0,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mcmc(DensityConfig):
+    """Strategy of 3DGS-MCMC: relocate dead splats, grow to the cap, and add noise to positions."""
+
+    title: ClassVar[str] = "Densification with strategy mcmc"
+    strategy: ClassVar[str] = "mcmc"
+
+    densify_until: float = 0.8
+    init_opacity: float = 0.5
+    init_scale: float = 0.5
+    opacity_reg: float = 0.001
+    scale_reg: float = 0.001
+    noise_lr: float = 5e5
+    growth: float = option(
+        1.05, help="Growth factor of the number of splats per densification step; larger if the cap is far away."
+    )
+    relocation: str = option(
+        "length",
+        help="What relocation changes in the copies of a splat. length: opacity and scale, so that the absorption "
+        "along a line is kept. length-squared: the square of that scale factor (SSS). opacity-only: not the scale.",
+        choices=RELOCATIONS,
+    )
+    relocation_limit: float = option(
+        1.0,
+        help="Largest fraction of the splats that is relocated in one step (SSS: 0.05). 1: no limit.",
+        at_least=0,
+        at_most=1,
+    )
+
+
+STRATEGIES: dict[str, type[Adc] | type[Mcmc]] = {"mcmc": Mcmc, "adc": Adc}
+DEFAULT_STRATEGY = Adc.strategy

@@ -1,0 +1,104 @@
+"""`TrainConfig`: groups and flat options are the same, defaults of strategies, ranges, and files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import pytest
+
+from clsplat.errors import InputError
+from clsplat.training.config import GROUPS, OPTIONS, TrainConfig
+from clsplat.training.options.density import STRATEGIES, Adc, DensityConfig, Mcmc
+from clsplat.training.options.groups import OptimConfig
+from clsplat.training.options.option import Range, option_table
+
+
+def test_groups_and_flat_options_make_the_same_config() -> None:
+    grouped = TrainConfig(cap_max=7, density=Mcmc(growth=1.1), optim=OptimConfig(opacity_lr=0.1))
+    assert grouped == TrainConfig(cap_max=7, strategy="mcmc", growth=1.1, opacity_lr=0.1)
+    assert (grouped.strategy, grouped.density.init_opacity) == ("mcmc", Mcmc().init_opacity)
+    assert grouped.replace(opacity_lr=0.05) == TrainConfig(cap_max=7, density=Mcmc(growth=1.1))
+    assert dataclasses.replace(grouped, density=Adc()) == TrainConfig(cap_max=7, opacity_lr=0.1)
+    with pytest.raises(TypeError, match="no option 'colour'"):
+        TrainConfig(colour=1)
+
+
+def test_every_option_is_in_one_group_and_has_help() -> None:
+    groups = [DensityConfig, *GROUPS.values()]
+    names = [name for group in groups for name in option_table(group)]
+    assert len(names) == len(set(names))
+    assert not set(names) & {field.name for field in dataclasses.fields(TrainConfig)}
+    assert TrainConfig().to_json().keys() == OPTIONS.keys()
+    for known in OPTIONS.values():
+        assert known.help.endswith("."), known.name
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_a_strategy_has_defaults_of_its_own(strategy: str) -> None:
+    config = TrainConfig(strategy=strategy, noise_lr=7.0)
+    assert config.density == STRATEGIES[strategy](noise_lr=7.0)
+    assert config == TrainConfig.from_json(config.to_json())
+    assert config == TrainConfig.from_json({"strategy": strategy, "noise_lr": 7.0, "opacity_reg": None})
+    with pytest.raises(InputError, match="opacity_reg -1: must be at least 0"):
+        TrainConfig(strategy=strategy, opacity_reg=-1)
+
+
+def test_the_strategies_differ_in_defaults_of_shared_options() -> None:
+    for name, known in option_table(DensityConfig).items():
+        differ = getattr(Adc(), name) != getattr(Mcmc(), name)
+        assert differ == (known.default is dataclasses.MISSING), name
+
+
+def test_another_strategy_keeps_the_options_that_both_have() -> None:
+    config = TrainConfig(strategy="mcmc", growth=1.2, opacity_reg=0.02)
+    changed = config.replace(strategy="adc", densify_until=0.0)
+    assert changed.density == Adc(**{name: getattr(config.density, name) for name in SHARED} | {"densify_until": 0.0})
+    assert changed.density.opacity_reg == 0.02
+
+
+SHARED = tuple(option_table(DensityConfig))
+
+
+def test_options_of_the_other_strategy_have_no_effect() -> None:
+    config = TrainConfig(strategy="adc", growth=1.2)
+    assert config == TrainConfig(strategy="adc")
+    assert config.to_json()["growth"] == Mcmc().growth
+    assert config.without_effect(["growth", "grad_threshold", "opacity_reg", "iterations"]) == ["growth"]
+    assert TrainConfig(strategy="mcmc").without_effect(["growth", "grad_threshold"]) == ["grad_threshold"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"strategy": "hope"}, "strategy 'hope': choose one of mcmc, adc"),
+        ({"optimizer": "lucky"}, "optimizer 'lucky': choose one of fused, numpy"),
+        ({"iterations": 0}, "iterations 0: must be at least 1"),
+        ({"sh_degree": 4}, "sh_degree 4: must be 0 to 3"),
+        ({"lambda_dssim": 1.5}, "lambda_dssim 1.5: must be 0 to 1"),
+        ({"position_lr_final": 0}, "position_lr_final 0: must be above 0"),
+        ({"init_opacity": 1.0}, "init_opacity 1.0: must be above 0 and below 1"),
+        ({"init_scale": float("nan")}, "init_scale nan: must be above 0"),
+        ({"skew_lr": -1.0}, "skew_lr -1.0: must be at least 0"),
+        ({"seed": 2**64}, f"seed {2**64}: must be at least 0 and below {2**64}"),
+        ({"background": (0, 0, 2)}, r"background \(0, 0, 2\): expected R,G,B, each 0 to 1"),
+        ({"shape": "gaussian", "skew_map": "oblique"}, "skew_map 'oblique': choose one of auto, "),
+        ({"shape": "skew-normal", "skew_map": "polar"}, "skew_map 'polar' for the centred form"),
+    ],
+)
+def test_a_value_out_of_range_is_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        TrainConfig(**options)
+    assert "\n" not in str(caught.value)
+
+
+def test_ranges() -> None:
+    assert [Range(above=0, below=1).allows(x) for x in (0, 0.5, 1, float("nan"))] == [False, True, False, False]
+    assert [Range(at_least=0, at_most=1).allows(x) for x in (-1, 0, 1, 2)] == [False, True, True, False]
+
+
+def test_a_file_of_another_order_of_keys_is_the_same_config() -> None:
+    config = TrainConfig(strategy="mcmc", growth=1.3, save_iterations=(3, 4))
+    stored = json.loads(json.dumps(config.to_json(), sort_keys=True))
+    assert TrainConfig.from_json(stored) == config
