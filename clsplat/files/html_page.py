@@ -49,10 +49,11 @@ def write_page(path: Path, title: str, sections: Sequence[Section], style: str =
     OutputError : the page cannot be written.
     """
     body = "".join(_section(section, number) for number, section in enumerate(sections, 1))
+    style = package_text(__package__, "page.css") + style
     page = (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
-        f"<style>\n{package_text(__package__, 'page.css')}{style}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n{body}"
+        f"<style>\n{style}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n{body}"
         + (f"<script>\n{script}</script>\n" if script else "")
         + "</body>\n</html>\n"
     )
