@@ -288,14 +288,14 @@ def watch_training(scene: str, args: argparse.Namespace) -> None:
     from clsplat.scenes.scene import load_scene
     from clsplat.training.config import TrainConfig
     from clsplat.training.run import train
+    from clsplat.viewer.initial_view import initial_view
     from clsplat.viewer.server import Server
-    from clsplat.viewer.start import start_of
     from clsplat.viewer.training import TrainingView
 
     loaded = load_scene(common.data_folder() / scene, resolution=SCENES.get(scene, -1), eval=True)
     config = TrainConfig(iterations=args.iterations, cap_max=args.cap_max, device=args.device)
     view = TrainingView(config)
-    server = Server(view.viewer, start_of(loaded.points.xyz, [item.camera for item in loaded.train]), port=0)
+    server = Server(view.viewer, initial_view(loaded.points.xyz, [item.camera for item in loaded.train]), port=0)
     watcher = subprocess.Popen(
         [sys.executable, __file__, "--watch", str(server.port)],
         stdin=subprocess.PIPE,

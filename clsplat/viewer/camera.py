@@ -1,4 +1,4 @@
-"""Cameras of browsers as ours, and how large their pictures are while they move."""
+"""Cameras of browsers, and the resolution of their frames while they move."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from ..errors import InputError
 from ..splats.optical_depth import MAX_COORDINATE
 from ..splats.quaternions import NORM_FLOOR, rotations
 
-WIDEST = math.radians(170.0)  # vertical field of view; beyond, every splat covers the image
-LARGEST_WINDOW = 16384  # px
+MAX_FOV = math.radians(170.0)  # largest vertical field of view; beyond it every splat covers the image
+MAX_WINDOW = 16384  # px
 
-_STEP = 2.0**-0.25  # of the scale while moving: each step down halves the pixels of two steps before
-_STEPS = 16  # down to a sixteenth of the size
+_STEP = 2.0**-0.25  # one step of the scale; two steps halve the number of pixels
+_STEPS = 16  # the smallest frame has a sixteenth of the size
 
 
 @dataclass(frozen=True)
 class Pose:
-    """What a browser tells of its camera (OpenCV axes, camera to world); nothing of it is checked.
+    """The camera that a browser reports (OpenCV axes, camera to world), unchecked.
 
     Attributes
     ----------
     wxyz, position : rotation as a quaternion, and the centre.
-    fov : vertical [radians]. width, height : of its window [px].
+    fov : vertical field of view [radians]. width, height : size of the window [px].
     """
 
     wxyz: Sequence[float]
@@ -38,9 +38,9 @@ class Pose:
 
 
 def window_of(pose: Pose, longest: int) -> tuple[int, int]:
-    """(width, height) of a picture for the pose's window, no longer than `longest` px; 1 x 1 where it has none."""
+    """Return (width, height) of a frame for the window, at most `longest` px; 1 x 1 if the window is unusable."""
     try:
-        width, height = (min(max(int(side), 1), LARGEST_WINDOW) for side in (pose.width, pose.height))
+        width, height = (min(max(int(side), 1), MAX_WINDOW) for side in (pose.width, pose.height))
     except (TypeError, ValueError, OverflowError):
         return 1, 1
     scale = min(1.0, longest / max(width, height))
@@ -48,17 +48,17 @@ def window_of(pose: Pose, longest: int) -> tuple[int, int]:
 
 
 def camera_of(pose: Pose, longest: int) -> Camera | None:
-    """The camera for a picture no longer than `longest` px; None where the pose is none that can be looked from.
+    """Return the camera of a frame of at most `longest` px, or None if the pose is unusable.
 
-    The picture has the window's whole field of view, also where its sides are rounded.
+    The frame has the whole field of view of the window, also if its sides are rounded.
     """
     try:
-        width, height = window_of(pose, LARGEST_WINDOW)
+        width, height = window_of(pose, MAX_WINDOW)
         quat = np.asarray(pose.wxyz, np.float64).reshape(1, 4)
         position = np.asarray(pose.position, np.float64).reshape(3)
-        if not 0.0 < pose.fov <= WIDEST or not NORM_FLOOR < np.linalg.norm(quat) < math.inf:
+        if not 0.0 < pose.fov <= MAX_FOV or not NORM_FLOOR < np.linalg.norm(quat) < math.inf:
             return None
-        if not np.abs(position).max() <= MAX_COORDINATE:  # also of a NaN
+        if not np.abs(position).max() <= MAX_COORDINATE:  # this is False for a NaN
             return None
         to_world = rotations(quat)[0]
         focal = 0.5 * height / math.tan(0.5 * pose.fov)
@@ -69,27 +69,28 @@ def camera_of(pose: Pose, longest: int) -> Camera | None:
         return None
 
 
-class Pace:
-    """How much smaller pictures are made while the camera moves, so that they keep coming.
+class AdaptiveResolution:
+    """The scale of frames of a moving camera, so that each takes at most a given time.
 
     Parameters
     ----------
-    seconds : that a picture may take.
+    seconds : time allowed for a frame.
     """
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
-        self.step = 4  # half the size to begin with: the first picture tells
+        self.step = 4  # the first frame has half the size
 
     @property
     def scale(self) -> float:
-        """Of a moving picture's sides."""
+        """Factor for the sides of a moving frame."""
         return _STEP**self.step
 
-    def took(self, seconds: float) -> None:
-        """Told of the time that a picture at the present scale took.
+    def update(self, seconds: float) -> None:
+        """Adapt the scale to the time that a frame took.
 
-        Down at once by as many steps as the time asks for, were it all pixels; up by one where there is room for it.
+        The scale falls at once by the steps that the excess needs if time is proportional to pixels. It rises by one
+        step at a time.
         """
         over = seconds / self.seconds
         if over > 1.0:

@@ -1,4 +1,4 @@
-"""What one browser shows beside the picture: settings, cameras to jump to, a path to record."""
+"""The panel of one browser: settings, cameras to jump to, a path to record."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from ..cameras.cameras_json import NamedCamera
 from ..cameras.path import CameraPath
 from ..errors import ClsplatError
 from .camera import Pose, camera_of
-from .recording import FILE_NAME, LONGEST, Recording
-from .settings import LARGEST, SMALLEST
-from .start import Known, fov_of
+from .initial_view import SceneCameras, vertical_fov
+from .recording import FILE_NAME, MAX_SECONDS, Recording
+from .settings import MAX_SIZE, MIN_SIZE
 from .viewer import Viewer, ViewerImage
 
-QUALITY, MOVING_QUALITY = 95, 80  # of JPEG
+QUALITY, MOVING_QUALITY = 95, 80  # JPEG quality of still and of moving frames
 _STATUS_INTERVAL = 0.5  # seconds between changes of the status line while moving
 _TRAIN, _TEST = (110, 170, 255), (255, 160, 60)
-_NOWHERE = "–"
+_NO_CAMERA = "–"
 _MODES = {"colour": "Colour", "depth": "Depth", "alpha": "Alpha", "splats": "Splats a pixel", "skew": "Skew magnitude"}
 
 
 class Page:
-    """One browser.
+    """The panel of one browser.
 
     Parameters
     ----------
-    reload : reads the model's file again and says what came of it; None: there is no file.
-    folder : where paths may be saved; None: they can only be downloaded.
+    reload : reads the model file again and returns a status text, or None if there is no file.
+    folder : folder for saved paths, or None if paths can only be downloaded.
     """
 
     def __init__(
         self,
         client: viser.ClientHandle,
         viewer: Viewer,
-        known: Known,
+        known: SceneCameras,
         reload: Callable[[], str] | None = None,
         folder: Path | None = None,
     ) -> None:
@@ -52,7 +52,7 @@ class Page:
         self._recording = Recording()
         self._playing: threading.Event | None = None
         self._rates: list[float] = []
-        self._told = 0.0
+        self._status_time = 0.0
         self._frusta: list[viser.CameraFrustumHandle] = []
         self._status = client.gui.add_markdown("")
         self._add_settings()
@@ -64,33 +64,33 @@ class Page:
         client.camera.on_update(self._on_camera)
 
     def close(self) -> None:
-        """The browser has gone."""
+        """Remove the client after the browser has gone."""
         self.viewer.leave(self.client.client_id)
         self._stop()
 
-    def send(self, shot: ViewerImage) -> None:
-        """Show a picture; called by the thread that makes them."""
+    def send(self, frame: ViewerImage) -> None:
+        """Show a frame; the serving thread calls this."""
         self.client.scene.set_background_image(
-            shot.picture, format="jpeg", jpeg_quality=QUALITY if shot.still else MOVING_QUALITY
+            frame.picture, format="jpeg", jpeg_quality=QUALITY if frame.still else MOVING_QUALITY
         )
         self.client.flush()
         now = time.monotonic()
         self._rates = [*(moment for moment in self._rates if now - moment < 1.0), now]
-        if shot.still or shot.message or now - self._told > _STATUS_INTERVAL:
-            self._told = now
-            height, width = shot.picture.shape[:2]
-            rate = "" if shot.still else f", {len(self._rates)} a second"
-            self.say(
-                shot.message
-                or f"{self.viewer.source.n_splats} splats, {width} × {height} px, {1e3 * shot.seconds:.0f} ms{rate}"
+        if frame.still or frame.message or now - self._status_time > _STATUS_INTERVAL:
+            self._status_time = now
+            height, width = frame.picture.shape[:2]
+            rate = "" if frame.still else f", {len(self._rates)} a second"
+            self.set_status(
+                frame.message
+                or f"{self.viewer.source.n_splats} splats, {width} × {height} px, {1e3 * frame.seconds:.0f} ms{rate}"
             )
 
-    def say(self, text: str) -> None:
-        """The line on top of the panel."""
+    def set_status(self, text: str) -> None:
+        """Set the status line at the top of the panel."""
         self._status.content = plain(text)
 
     def model_changed(self) -> None:
-        """There are other splats now."""
+        """Adapt the slider of splats to the new model."""
         n = self.viewer.source.n_splats
         everything = self._cap.value >= self._cap.max
         self._cap.max, self._cap.step = max(n, 1), _step(n)
@@ -102,18 +102,18 @@ class Page:
         chosen = viewer.settings_of(self.client.client_id)
         with gui.add_folder("View"):
             labels = {label: mode for mode, label in _MODES.items() if mode in source.modes}
-            mode = gui.add_dropdown("Show", tuple(labels), hint="What the picture shows of the splats")
+            mode = gui.add_dropdown("Show", tuple(labels), hint="The property of the splats that is shown")
             mode.on_update(lambda _: self._choose("mode", labels.get(mode.value)))
             r, g, b = (round(255 * part) for part in chosen.background)
             ground = gui.add_rgb("Background", (r, g, b))
             ground.on_update(lambda _: self._choose("background", ground.value))
             size = gui.add_slider(
                 "Resolution",
-                SMALLEST,
-                LARGEST,
+                MIN_SIZE,
+                MAX_SIZE,
                 64,
                 chosen.size,
-                hint="Longest side of a still picture, in pixels; moving ones adapt",
+                hint="Longest side of a still frame in pixels; moving frames adapt",
             )
             size.on_update(lambda _: self._choose("size", size.value))
             if source.sh_degree:
@@ -123,7 +123,13 @@ class Page:
                 degree.on_update(lambda _: self._choose("sh_degree", degree.value))
             n = max(source.n_splats, 1)
             self._cap: Any = gui.add_slider(
-                "Splats", 0, n, _step(n), n, hint="How many: those first that cover most", visible=source.partial
+                "Splats",
+                0,
+                n,
+                _step(n),
+                n,
+                hint="Number of splats shown; those that cover most come first",
+                visible=source.partial,
             )
             self._cap.on_update(lambda _: self._choose("cap", self._cap.value))
             if self._reload is not None:
@@ -134,10 +140,10 @@ class Page:
         gui = self.client.gui
         with gui.add_folder("Cameras"):
             shown = gui.add_checkbox(
-                "Show cameras", False, hint="Blue: trained on; orange: held out. Click the lines of one to jump to it"
+                "Show cameras", False, hint="Blue: training; orange: test. Click a camera to jump to it"
             )
             shown.on_update(lambda _: self._show_cameras(shown.value))
-            jump = gui.add_dropdown("Jump to", (_NOWHERE, *self._cameras))
+            jump = gui.add_dropdown("Jump to", (_NO_CAMERA, *self._cameras))
             jump.on_update(lambda _: self._jump(self._cameras.get(jump.value)))
 
     def _add_path(self) -> None:
@@ -167,7 +173,9 @@ class Page:
             )
             download.on_click(lambda _: self._try(self._download))
             if self._folder is not None:
-                save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY, hint="Into the folder given at the start")
+                save = gui.add_button(
+                    "Save", icon=viser.Icon.DEVICE_FLOPPY, hint="Into the folder that the command names"
+                )
                 save.on_click(lambda _: self._try(self._save))
 
     async def _on_camera(self, camera: viser.CameraHandle) -> None:
@@ -183,10 +191,10 @@ class Page:
 
     def _do_reload(self) -> None:
         assert self._reload is not None
-        self.say(self._reload())
+        self.set_status(self._reload())
 
     def _show_cameras(self, shown: bool) -> None:
-        """Frusta are made when first wanted."""
+        """Show or hide the cameras; they are made when they are first shown."""
         if shown and not self._frusta:
             for kind, items, colour in (("train", self.known.train, _TRAIN), ("test", self.known.test, _TEST)):
                 self._frusta += [
@@ -200,7 +208,7 @@ class Page:
         aspect = (camera.width / camera.fx) / (camera.height / camera.fy)
         frustum = self.client.scene.add_camera_frustum(
             name,
-            fov_of(camera),
+            vertical_fov(camera),
             aspect,
             scale=self.known.size,
             thickness=1.5,
@@ -213,7 +221,7 @@ class Page:
         return frustum
 
     def _jump(self, camera: Camera | None) -> None:
-        """Look from a camera, with all of its image in the window."""
+        """Move to a camera, with its whole image in the window."""
         if camera is None:
             return
         eye = self.client.camera
@@ -222,19 +230,19 @@ class Page:
             with self.client.atomic():
                 eye.wxyz = _wxyz(camera)
                 eye.position = camera.position
-                eye.fov = fov_of(camera, aspect if math.isfinite(aspect) and aspect > 0 else None)
-        except ValueError as error:  # a browser whose own camera is nowhere
-            self.say(f"cannot go there: {error}")
+                eye.fov = vertical_fov(camera, aspect if math.isfinite(aspect) and aspect > 0 else None)
+        except ValueError as error:  # the browser has reported an unusable camera
+            self.set_status(f"cannot go there: {error}")
         self.client.flush()
 
     def _add_key(self) -> None:
-        camera = camera_of(_pose(self.client.camera), LARGEST)
+        camera = camera_of(_pose(self.client.camera), MAX_SIZE)
         if camera is not None:
             self._recording.add(camera)
 
     def _pace(self, seconds: Any) -> None:
         if math.isfinite(seconds):
-            self._recording.seconds = min(max(float(seconds), 0.1), LONGEST)
+            self._recording.seconds = min(max(float(seconds), 0.1), MAX_SECONDS)
 
     def _play(self) -> None:
         self._stop()
@@ -258,18 +266,18 @@ class Page:
 
     def _save(self) -> None:
         assert self._folder is not None
-        self.say(f"saved as {self._recording.save(self._folder).name}")
+        self.set_status(f"saved as {self._recording.save(self._folder).name}")
 
     def _try(self, action: Callable[[], object]) -> None:
-        """Do something; what a user can mend is said."""
+        """Run an action and show the message of an error that a user can fix."""
         try:
             action()
         except ClsplatError as error:
-            self.say(str(error))
+            self.set_status(str(error))
 
 
 def plain(text: str) -> str:
-    """Text that the panel shows as it is: no markup is read in it."""
+    """Escape a text, so that the panel shows it without markup."""
     return "".join("\\" + char if char in r"\`*_{}[]()<>#+-!|~$&" else char for char in text.replace("\n", " "))
 
 
@@ -278,10 +286,10 @@ def _pose(camera: viser.CameraHandle) -> Pose:
 
 
 def _wxyz(camera: Camera) -> Any:
-    """Camera to world, as viser has rotations."""
+    """Return the camera-to-world rotation as viser expects it."""
     return transforms.SO3.from_matrix(camera.rotation.T).wxyz
 
 
 def _step(n: int) -> int:
-    """Of a slider to n, about two hundred of them."""
+    """Return the step of a slider from 0 to n with about two hundred steps."""
     return max(n // 200, 1)

@@ -1,4 +1,4 @@
-"""The viewer's server: a page for each browser. Only this module and `viewer_page` know viser."""
+"""The web server of the viewer: a panel for each browser. Only this module and `page` import viser."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from pathlib import Path
 import viser
 
 from ..errors import OutputError
+from .initial_view import InitialView, SceneCameras, Vector
 from .page import Page, plain
-from .start import Known, Start, Vector
 from .viewer import Viewer
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
 _BRAND = (17, 137, 151)
-NOTHING = Known()
-_LAST_WORDS = 0.1  # seconds
+NO_CAMERAS = SceneCameras()
+_FLUSH_TIME = 0.1  # seconds for the last messages before the server stops
 
 
 class Server:
-    """Pages for browsers at an address; open as soon as it is made.
+    """A running web server.
 
     Parameters
     ----------
-    host, port : where it listens; port 0 is any free one.
-    title : of the panel.
-    start : where browsers begin.
-    reload : reads the model again and says what came of it; None: there is no file.
-    folder : where paths may be saved; None: nowhere, they can only be downloaded.
+    host, port : address of the server; port 0 chooses a free one.
+    title : title of the panel.
+    start : the first view of a browser.
+    reload : reads the model file again and returns a status text, or None if there is no file.
+    folder : folder for saved paths, or None if paths can only be downloaded.
 
     Raises
     ------
-    OutputError : the address cannot be listened at.
+    OutputError : the server cannot listen on the address.
     """
 
     def __init__(
         self,
         viewer: Viewer,
-        start: Start,
-        known: Known = NOTHING,
+        start: InitialView,
+        known: SceneCameras = NO_CAMERAS,
         *,
         host: str = DEFAULT_HOST,
         port: int = DEFAULT_PORT,
@@ -70,12 +70,15 @@ class Server:
 
     @property
     def url(self) -> str:
-        """Where to look."""
+        """Address for a browser."""
         host = "localhost" if self.host in ("0.0.0.0", "::", "") else self.host
         return f"http://[{host}]:{self.port}" if ":" in host else f"http://{host}:{self.port}"
 
     def add_training(self, toggle: Callable[[], bool]) -> None:
-        """A line about a run and a button that pauses it, for all browsers; `toggle` says whether the run now waits."""
+        """Add the status line of a run and a pause button for all browsers.
+
+        `toggle` pauses or resumes the run and returns whether it is paused now.
+        """
         with self.server.gui.add_folder("Training", order=-1.0):
             label = self.server.gui.add_markdown("")
             button = self.server.gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
@@ -87,29 +90,29 @@ class Server:
             button.label = "Resume" if paused else "Pause"
             button.icon = viser.Icon.PLAYER_PLAY if paused else viser.Icon.PLAYER_PAUSE
 
-    def tell_training(self, text: str) -> None:
-        """The line about the run."""
+    def set_training_status(self, text: str) -> None:
+        """Set the status line of the run."""
         if self._panel is not None:
             self._panel[0].content = plain(text)
 
-    def say(self, text: str) -> None:
-        """The line on top of every page."""
+    def set_status(self, text: str) -> None:
+        """Set the status line of every browser."""
         for page in self._all():
-            page.say(text)
+            page.set_status(text)
 
     def model_changed(self) -> None:
-        """There are other splats: new pictures for all."""
+        """Adapt all browsers to a new model and request new frames."""
         for page in self._all():
             page.model_changed()
         self.viewer.refresh()
 
     def close(self) -> None:
-        """Hang up, once what was said last has gone out."""
+        """Stop the server after the last messages are sent."""
         for page in self._all():
             page.close()
             page.client.flush()
-        time.sleep(_LAST_WORDS if self._pages else 0.0)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser says that it has stopped
+        time.sleep(_FLUSH_TIME if self._pages else 0.0)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it has stopped
             self.server.stop()
 
     def _all(self) -> list[Page]:
@@ -120,7 +123,7 @@ class Server:
         page = Page(client, self.viewer, self._known, self._reload, self._folder)
         with self._lock:
             self._pages[client.client_id] = page
-        if client.client_id not in self.server.get_clients():  # gone while its page was made
+        if client.client_id not in self.server.get_clients():  # the browser left before its panel was complete
             self._disconnect(client)
 
     def _disconnect(self, client: viser.ClientHandle) -> None:
@@ -131,14 +134,14 @@ class Server:
 
 
 class _Private(viser.ViserServer):
-    """A browser may ask viser to make the page public through a relay; this server does not."""
+    """A viser server without the relay that would make the page public at the request of a browser."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
 
 
 def _opened(host: str, port: int) -> viser.ViserServer:
-    """A server at exactly this address: viser alone would take the next free port."""
+    """Open a server at exactly this address; viser alone would take the next free port."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.socket(family) as probe:
@@ -146,24 +149,24 @@ def _opened(host: str, port: int) -> viser.ViserServer:
             probe.bind((host, port))
     except (OSError, OverflowError) as error:
         raise _refusal(host, port, getattr(error, "strerror", None) or str(error)) from None
-    # Noise of connections that end badly; what matters is said in the page.
+    # Broken connections log noise; the panel shows what matters.
     for name in ("websockets", "websockets.server"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     for message in ("Queued a .* on a closed connection", r"\[viser\]"):
         warnings.filterwarnings("ignore", message=message)
-    with contextlib.redirect_stdout(io.StringIO()):  # viser's own greeting
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a greeting
         server = _Private(host, port, verbose=False)
-    if port and server.get_port() != port:  # taken in between
+    if port and server.get_port() != port:  # another program took the port in between
         server.stop()
         raise _refusal(host, port, "taken by another program")
-    # A browser's message that makes no sense ends with itself, without a traceback.
+    # A malformed message of a browser is dropped without a traceback.
     loop = server.get_event_loop()
     loop.call_soon_threadsafe(loop.set_exception_handler, lambda *_: None)
     return server
 
 
 def _refusal(host: str, port: int, reason: str) -> OutputError:
-    return OutputError(f"{host}:{port}: cannot be listened at ({reason}); choose another --port or --host")
+    return OutputError(f"{host}:{port}: cannot listen on this address ({reason}); choose another --port or --host")
 
 
 def _triple(values: Vector) -> tuple[float, float, float]:

@@ -18,9 +18,9 @@ from ..errors import ClsplatError, InputError
 from ..models.model import LoadedModel, SceneChoice, in_both_forms
 from ..splats.color import Color
 from ..training.folder import ModelFolder
+from .initial_view import SceneCameras, initial_view
 from .settings import Settings
-from .source import ModelSource, Watch
-from .start import Known, start_of
+from .source import ModelSource, ModelWatcher
 from .viewer import Viewer
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class ViewingSession:
     def __init__(
         self,
         model: LoadedModel,
-        known: Known | None = None,
+        known: SceneCameras | None = None,
         background: Color | None = None,
         options: ServerOptions | None = None,
         iteration: int | None = None,
@@ -79,14 +79,14 @@ class ViewingSession:
         known, options = known or known_cameras(model), options or ServerOptions()
         cameras = [item.camera for item in (*known.train, *known.test)]
         self.source = ModelSource(model.splats, device)
-        self.watch = Watch(_finder(model.path, iteration))
+        self.watch = ModelWatcher(_finder(model.path, iteration))
         settings = Settings(background=model.background if background is None else background)
         self.viewer = Viewer(self.source, settings)
         # This picture builds the kernels before a client waits for them, and raises the device's errors here.
         self.source.picture(Camera(64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4)), settings)
         self.server: Server = Server(
             self.viewer,
-            start_of(model.splats.mean, cameras),
+            initial_view(model.splats.mean, cameras),
             known,
             host=options.host,
             port=options.port,
@@ -110,7 +110,7 @@ class ViewingSession:
             with self._lock:
                 splats = self.watch.poll()
         except ClsplatError as error:
-            self.server.say(_kept(error))
+            self.server.set_status(_kept(error))
             return
         if splats is not None:
             self.source.show(splats)
@@ -135,7 +135,7 @@ class ViewingSession:
             self._worker.join(5.0)
 
 
-def known_cameras(model: LoadedModel, scene: SceneChoice | None = None) -> Known:
+def known_cameras(model: LoadedModel, scene: SceneChoice | None = None) -> SceneCameras:
     """Cameras of the scene that is chosen, else those in the model folder; a file alone has none."""
     if scene:
         loaded = model.load_scene(scene)
@@ -143,7 +143,7 @@ def known_cameras(model: LoadedModel, scene: SceneChoice | None = None) -> Known
     else:
         cameras, test_names = model.read_cameras(), model.test_names or frozenset()
     test = in_both_forms(test_names)
-    return Known(
+    return SceneCameras(
         tuple(item for item in cameras if item.name not in test), tuple(item for item in cameras if item.name in test)
     )
 
@@ -162,4 +162,4 @@ def _finder(path: Path, iteration: int | None) -> Callable[[], Path]:
 
 
 def _kept(error: ClsplatError) -> str:
-    return f"{str(error).rstrip('.')}; the model of before is shown"
+    return f"{str(error).rstrip('.')}; the previous model stays"

@@ -1,4 +1,4 @@
-"""What one looker-on has chosen to see. Values come from a browser: only what can be used is taken."""
+"""Settings of one client. Values come from a browser, so only usable ones are accepted."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Any, NoReturn
 
 from ..splats.color import BLACK, Color
 
-SMALLEST, LARGEST = 64, 4096  # longest side of a picture [px]
+MIN_SIZE, MAX_SIZE = 64, 4096  # longest side of a picture [px]
 DEFAULT_SIZE = 1920
 
 
 @dataclass(frozen=True)
 class Settings:
-    """A looker-on's choices.
+    """The choices of a client.
 
     Attributes
     ----------
-    mode : one of `display.MODES`.
-    background : 0 to 1 each.
-    size : longest side of a still picture [px]; a smaller window has smaller pictures.
-    sh_degree : highest band of colour shown; None: all.
-    cap : splats shown, those first that cover most; None: all.
+    mode : one of `colormaps.MODES`.
+    background : colour, 0 to 1 for each channel.
+    size : longest side of a still frame [px]; a smaller window has smaller frames.
+    sh_degree : highest SH band that is shown, or None for all.
+    cap : number of splats that are shown, or None for all. Those that cover most are shown first.
     """
 
     mode: str = "colour"
@@ -33,18 +33,18 @@ class Settings:
     cap: int | None = None
 
     def changed(self, name: str, value: Any, modes: tuple[str, ...]) -> Settings:
-        """With a browser's value for one of the attributes; the same settings where it is unusable.
+        """Return the settings with one value of a browser; the same settings if the value is unusable.
 
         Parameters
         ----------
-        value : of any kind; background as bytes. modes : that may be chosen.
+        value : an object of any kind; a background is three bytes. modes : the allowed modes.
         """
         checks: dict[str, Callable[[Any], Any]] = {
-            "mode": lambda given: given if given in modes else _unusable(),
+            "mode": lambda mode: mode if mode in modes else _unusable(),
             "background": _rgb,
-            "size": lambda given: _whole(given, SMALLEST, LARGEST),
-            "sh_degree": lambda given: _whole(given, 0, 3),
-            "cap": lambda given: _whole(given, 0, 1 << 31),
+            "size": lambda size: _whole(size, MIN_SIZE, MAX_SIZE),
+            "sh_degree": lambda degree: _whole(degree, 0, 3),
+            "cap": lambda cap: _whole(cap, 0, 1 << 31),
         }
         try:
             return replace(self, **{name: checks[name](value)})
@@ -52,18 +52,18 @@ class Settings:
             return self
 
 
-def _rgb(given: Any) -> Color:
-    r, g, b = (float(part) / 255.0 for part in given)
+def _rgb(value: Any) -> Color:
+    r, g, b = (float(part) / 255.0 for part in value)
     if not all(0.0 <= part <= 1.0 for part in (r, g, b)):
         _unusable()
     return r, g, b
 
 
-def _whole(given: Any, least: int, most: int) -> int:
-    """The nearest whole number within bounds."""
-    if isinstance(given, (str, bytes)) or not math.isfinite(given):
+def _whole(value: Any, low: int, high: int) -> int:
+    """Return the nearest whole number within bounds."""
+    if isinstance(value, (str, bytes)) or not math.isfinite(value):
         _unusable()
-    return int(min(max(round(given), least), most))
+    return int(min(max(round(value), low), high))
 
 
 def _unusable() -> NoReturn:

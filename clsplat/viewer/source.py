@@ -1,4 +1,4 @@
-"""What is looked at: a model file that is read again when it changes, as splats on the device."""
+"""Sources of frames: a model on the device, and a watcher that reads its file again when it changes."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from ..splats.shapes import shape_named
 from ..splats.splats import Splats
 from .settings import Settings
 
-KEPT = 4  # models on the device at once: looker-ons with other caps, or at the skew
+KEPT = 4  # models on the device at once: parts for clients with another cap or mode
 
 
 class Source(Protocol):
-    """Something that pictures can be made of.
+    """A source of frames.
 
     Attributes
     ----------
-    modes : of `display.MODES`. partial : whether fewer splats than all can be shown.
+    modes : modes from `colormaps.MODES`. partial : whether a part of the splats can be shown.
     """
 
     @property
@@ -43,7 +43,7 @@ class Source(Protocol):
     def partial(self) -> bool: ...
 
     def picture(self, camera: Camera, settings: Settings) -> Picture:
-        """What the camera sees, as large as it says."""
+        """Return the view of a camera, in the size of its image."""
 
 
 class ModelSource:
@@ -51,7 +51,7 @@ class ModelSource:
 
     Parameters
     ----------
-    splats : shown first. keep : models on the device at once.
+    splats : the first model. keep : number of models that stay on the device.
     """
 
     modes = MODES
@@ -59,13 +59,13 @@ class ModelSource:
 
     def __init__(self, splats: Splats, device: str | None = None, keep: int = KEPT) -> None:
         self.renderer = Renderer(device, keep=keep)
-        self._rendering = threading.Lock()  # a renderer is of one thread at a time
+        self._rendering = threading.Lock()  # only one thread at a time may use a renderer
         self._keep = keep
         self.show(splats)
 
     def show(self, splats: Splats) -> None:
-        """Show another model from the next picture on; any thread may call this."""
-        # One assignment: a picture in the making sees the old model or the new one.
+        """Show another model from the next frame on; any thread may call this."""
+        # One assignment: a frame in progress sees either the old model or the new one.
         self._shown = _Shown(splats, self._keep)
 
     @property
@@ -81,7 +81,7 @@ class ModelSource:
         return self.splats.sh_degree
 
     def picture(self, camera: Camera, settings: Settings) -> Picture:
-        """What the camera sees; at full settings the bytes of `clsplat render`."""
+        """Return the view of a camera; with full settings it has the bytes of `clsplat render`."""
         with self._rendering:
             splats = self._shown.part(settings.cap, settings.mode)
             return picture(
@@ -90,7 +90,7 @@ class ModelSource:
 
 
 class _Shown:
-    """A model and the parts of it that were asked for last."""
+    """A model and its most recently requested parts."""
 
     def __init__(self, splats: Splats, keep: int) -> None:
         self.splats, self._keep = splats, keep
@@ -98,7 +98,7 @@ class _Shown:
         self._parts: dict[tuple[int, bool], Splats] = {}
 
     def part(self, cap: int | None, mode: str) -> Splats:
-        """At most `cap` splats, those first that cover most, in the order of the file; coloured for the mode."""
+        """Return the `cap` splats that cover most, in the order of the file, coloured for the mode."""
         n = len(self.splats) if cap is None else min(cap, len(self.splats))
         skew = mode == "skew"
         if n == len(self.splats) and not skew:
@@ -116,19 +116,19 @@ class _Shown:
 
 
 def coverage(splats: Splats) -> NDArray[np.float64]:
-    """(N,) opacity times the area of the two longest axes: how much a splat covers, from the average side."""
+    """Return (N,) opacity times the area of the two longest axes, an estimate of how much a splat covers."""
     strength = shape_named(splats.shape).strength(splats.arrays)
     longest = np.sort(splats.log_scale.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
-    covered: NDArray[np.float64] = strength * np.exp(np.clip(longest, -200.0, 200.0))
-    return covered
+    return np.asarray(strength * np.exp(np.clip(longest, -200.0, 200.0)), np.float64)
 
 
-class Watch:
-    """A model's file, looked at now and then: read again once it has changed and is whole.
+class ModelWatcher:
+    """A model file that is polled and read again after a change, once it is complete.
 
     Parameters
     ----------
-    find : the file to show now (of a model folder: the last iteration's); raises InputError where there is none.
+    find : returns the file to show now, such as the last iteration of a model folder. It raises InputError if there is
+        no such file.
     """
 
     def __init__(self, find: Callable[[], Path]) -> None:
@@ -137,29 +137,29 @@ class Watch:
         self._read = self._seen = _stamp(self.path)
 
     def poll(self) -> Splats | None:
-        """The new model, or None: nothing new, or the file is still being written.
+        """Return the new model, or None if the file has not changed or is still being written.
 
         Raises
         ------
-        InputError : the new file cannot be used; said once for each state of the file.
+        InputError : the new file is unusable; raised once for each state of the file.
         """
         path = self._find()
         stamp = _stamp(path)
-        # A file is read once it has stayed the same from one look to the next.
+        # A file is read once it has stayed the same between two polls.
         settled, self._seen = stamp == self._seen, stamp
         if not settled or stamp == self._read:
             return None
         return self._load(path, stamp)
 
     def reload(self) -> Splats:
-        """The model as it is in the file now. Raises InputError."""
+        """Return the model in the file now. Raises InputError."""
         path = self._find()
         return self._load(path, _stamp(path))
 
     def _load(self, path: Path, stamp: tuple[object, ...]) -> Splats:
         self._read = self._seen = stamp
         if len(stamp) == 1:
-            raise InputError(f"{path}: is not there any more")
+            raise InputError(f"{path}: does not exist any more")
         try:
             splats = Splats.load(path)
         except ClsplatError:
@@ -171,7 +171,7 @@ class Watch:
 
 
 def _stamp(path: Path) -> tuple[object, ...]:
-    """What changes when a file does; (path,) where there is none."""
+    """Return values that change with the file; (path,) if it does not exist."""
     try:
         status = os.stat(path)
     except OSError:

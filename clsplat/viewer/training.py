@@ -1,4 +1,4 @@
-"""Looking at a run: pictures of the splats as they are, made between iterations within a share of the time."""
+"""View of a training run: frames between iterations, within a share of the time."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from ..training.log import Progress
 from ..training.schedules import sh_degree_at
 from ..training.trainer import Trainer
 from .settings import Settings
-from .viewer import SECONDS, Viewer
+from .viewer import FRAME_TIME, Viewer
 
-SHARE = 0.015  # of the time, that pictures may take from a run; what browsers say takes another hundredth or two
-QUICK = 0.025  # seconds for a picture of a moving camera: so they come at least now and then
-_MOST_CREDIT = 0.2  # seconds of pictures at once, saved for when a camera moves
-_REFRESH = 2.0  # seconds between pictures of a camera that is still
-_PAUSE_STEP = 0.1  # seconds in which Ctrl-C is seen while paused
+SHARE = 0.015  # share of the run time for frames; messages of browsers take one or two hundredths more
+TRAINING_FRAME_TIME = 0.025  # seconds for a frame of a moving camera, short so that frames still arrive
+_MAX_CREDIT = 0.2  # seconds of frames that are saved up for a moving camera
+_REFRESH = 2.0  # seconds between frames of a still camera
+_PAUSE_STEP = 0.1  # seconds between checks for Ctrl-C during a pause
 
 
 class TrainingSource:
-    """The splats of a run, on the device as training has left them. Of the trainer's thread alone."""
+    """The splats of a run as they are on the device. Only the thread of the trainer may use this."""
 
     modes = MODES
-    partial = False  # the strategy orders them
+    partial = False  # a part would need a copy of the splats
 
     def __init__(self, config: TrainConfig) -> None:
         self._config = config
@@ -39,7 +39,7 @@ class TrainingSource:
         self._pipeline: Pipeline | None = None
 
     def attach(self, trainer: Trainer) -> None:
-        """Look at this run; builds the kernels. Buffers are its own, so the run's bits stay what they are."""
+        """Attach to a run and build the kernels. The buffers are separate, so that the run keeps its bits."""
         if trainer is not self._trainer:
             self._trainer = trainer
             self._pipeline = Pipeline(trainer.device, trainer.kernels.for_rendering(), trainer.pipeline.max_isects)
@@ -53,7 +53,7 @@ class TrainingSource:
         return self._config.sh_degree
 
     def picture(self, camera: Camera, settings: Settings) -> Picture:
-        """What the camera sees of the run. Raises InputError before the first iteration."""
+        """Return the view of a camera. Raises InputError before the first iteration."""
         trainer, pipeline = self._trainer, self._pipeline
         if trainer is None or pipeline is None:
             raise InputError("training has not begun yet")
@@ -70,55 +70,55 @@ class TrainingSource:
 
 
 class TrainingView:
-    """Those who look at a run: what they see, and whether the run waits for them.
+    """The viewer of a run, and its pause button.
 
     Parameters
     ----------
-    share : of the time, that pictures may take while the run goes on.
+    share : share of the run time that frames may take.
     """
 
     def __init__(self, config: TrainConfig, share: float = SHARE, clock: Callable[[], float] = time.monotonic) -> None:
         self.source = TrainingSource(config)
-        self.viewer = Viewer(self.source, Settings(background=config.background), QUICK, clock)
+        self.viewer = Viewer(self.source, Settings(background=config.background), TRAINING_FRAME_TIME, clock)
         self._share, self._clock = share, clock
         self._paused = threading.Event()
         self._credit, self._left, self._refreshed, self._cost = 0.0, math.inf, -math.inf, 0.0
 
     def toggle(self) -> bool:
-        """Pause the run, or let it go on; whether it now waits."""
+        """Pause or resume the run; return whether it is paused now."""
         if self._paused.is_set():
             self._paused.clear()
-            self.viewer.hurry(QUICK)
+            self.viewer.set_frame_time(TRAINING_FRAME_TIME)
         else:
             self._paused.set()
-            self.viewer.hurry(SECONDS)
+            self.viewer.set_frame_time(FRAME_TIME)
         return self._paused.is_set()
 
     def visit(self, trainer: Trainer, stop: threading.Event) -> None:
-        """Between two iterations: a picture, if one is wanted and there is time for it; while paused all of them."""
+        """Serve a frame between two iterations if one is due and there is time; during a pause serve all of them."""
         self.source.attach(trainer)
         now = self._clock()
-        self._credit = min(self._credit + self._share * max(now - self._left, 0.0), _MOST_CREDIT)
+        self._credit = min(self._credit + self._share * max(now - self._left, 0.0), _MAX_CREDIT)
         if self._credit > 0.0:
             due = now - self._refreshed > _REFRESH and self._credit >= self._cost
             fresh = due and self.viewer.count > 0
             if fresh:
                 self._refreshed = now
                 self.viewer.refresh()
-            if self.viewer.wishes.waiting:
-                trainer.device.queue.finish()  # what the iteration still has to do is training time
+            if self.viewer.queue.has_due:
+                trainer.device.queue.finish()  # pending work of the iteration counts as training time
                 start = self._clock()
                 self.viewer.serve()
                 spent = self._clock() - start
                 self._credit -= spent
-                self._cost = min(spent, _MOST_CREDIT) if fresh else self._cost
+                self._cost = min(spent, _MAX_CREDIT) if fresh else self._cost
         while self._paused.is_set() and not stop.is_set():
             self.viewer.serve(_PAUSE_STEP)
         self._left = self._clock()
 
 
 def run_line(progress: Progress) -> str:
-    """How a run is doing, in a line; its message where it has one."""
+    """Return the status of a run in one line, or its message if it has one."""
     if progress.message:
         return progress.message
     done = "finished" if progress.iteration >= progress.iterations else f"{progress.per_second:.1f} a second"

@@ -11,8 +11,8 @@ from ..scenes.scene import Scene
 from ..training.config import TrainConfig
 from ..training.log import Progress
 from ..training.trainer import Visit
+from .initial_view import SceneCameras, initial_view
 from .session import ServerOptions, require_viser
-from .start import Known, start_of
 from .training import TrainingView, run_line
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class TrainingSession:
         from .server import Server
 
         options = options or ServerOptions()
-        known = Known(
+        known = SceneCameras(
             tuple(NamedCamera(view.name, view.camera) for view in scene.train),
             tuple(NamedCamera(view.name, view.camera) for view in scene.test),
         )
@@ -48,7 +48,7 @@ class TrainingSession:
         self.visit: Visit = self._training.visit
         self._server: Server = Server(
             self._training.viewer,
-            start_of(scene.points.xyz, cameras),
+            initial_view(scene.points.xyz, cameras),
             known,
             host=options.host,
             port=options.port,
@@ -63,7 +63,7 @@ class TrainingSession:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._server.say("the run has ended: clsplat view shows its model")
+        self._server.set_status("the run has ended: clsplat view shows its model")
         self._training.viewer.close()
         self._server.close()
 
@@ -72,6 +72,6 @@ class TrainingSession:
 
         def report(progress: Progress) -> None:
             display(progress)
-            self._server.tell_training(run_line(progress))
+            self._server.set_training_status(run_line(progress))
 
         return report

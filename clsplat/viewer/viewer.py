@@ -1,6 +1,7 @@
-"""Pictures for looker-ons: one at a time, the newest wish of each, small while the camera moves and full when still.
+"""Frames for viewer clients, one at a time, the latest request of each first.
 
-Nothing here knows browsers: who looks on is a number and a function that takes pictures.
+The resolution is low while a camera moves and full when it rests. This module is independent of the web server: a
+client is a number and a function that receives frames.
 """
 
 from __future__ import annotations
@@ -16,23 +17,24 @@ import numpy as np
 
 from ..errors import ClsplatError
 from ..rendering.colormaps import Picture, to_bytes
-from .camera import Pace, Pose, camera_of, window_of
-from .render_queue import Wishes
+from .camera import AdaptiveResolution, Pose, camera_of, window_of
+from .render_queue import RenderQueue
 from .settings import Settings
 from .source import Source
 
-REST = 0.15  # seconds without a move after which a camera is still
-_ROUNDING = 1e-3  # seconds, so that a picture that waits for rest finds it
-SECONDS = 1.0 / 16.0  # that a picture of a moving camera may take: leaves a margin to 10 a second
+REST = 0.15  # seconds without a move after which a camera counts as still
+_ROUNDING = 1e-3  # seconds; the frame at rest must not come just before the rest begins
+FRAME_TIME = 1.0 / 16.0  # seconds for a frame of a moving camera
 
 
 @dataclass(frozen=True)
 class ViewerImage:
-    """A picture made for a looker-on.
+    """A frame for one client.
 
     Attributes
     ----------
-    still : full size, as nothing moved. seconds : that making it took. message : what went wrong, or "".
+    still : whether the camera rests, so that the frame has full size. seconds : time that the frame took.
+    message : the fault if the frame could not be rendered, or "".
     """
 
     picture: Picture
@@ -42,129 +44,129 @@ class ViewerImage:
 
 
 @dataclass
-class Looker:
-    """One who looks on."""
+class ViewerClient:
+    """State of one client."""
 
     send: Callable[[ViewerImage], None]
     settings: Settings
     pose: Pose | None = None
     moved: float = -math.inf
-    pace: Pace = field(default_factory=lambda: Pace(SECONDS))
+    resolution: AdaptiveResolution = field(default_factory=lambda: AdaptiveResolution(FRAME_TIME))
 
 
 class Viewer:
-    """All who look on at one source.
+    """All clients of one source.
 
     Parameters
     ----------
-    settings : of those who have chosen nothing yet. seconds : that a picture of a moving camera may take.
+    settings : settings of new clients. seconds : time allowed for a frame of a moving camera.
     """
 
     def __init__(
         self,
         source: Source,
         settings: Settings | None = None,
-        seconds: float = SECONDS,
+        seconds: float = FRAME_TIME,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.source = source
         self.settings = settings or Settings()
         self.seconds = seconds
-        self.wishes = Wishes(clock)
+        self.queue = RenderQueue(clock)
         self._clock = clock
-        self._lookers: dict[int, Looker] = {}
+        self._clients: dict[int, ViewerClient] = {}
         self._lock = threading.Lock()
 
-    def join(self, who: int, send: Callable[[ViewerImage], None]) -> None:
-        """Somebody looks on from now; `send` is called by the thread that serves."""
+    def join(self, client_id: int, send: Callable[[ViewerImage], None]) -> None:
+        """Add a client. The serving thread calls `send` with each frame."""
         with self._lock:
-            self._lookers[who] = Looker(send, self.settings, pace=Pace(self.seconds))
+            self._clients[client_id] = ViewerClient(send, self.settings, resolution=AdaptiveResolution(self.seconds))
 
-    def leave(self, who: int) -> None:
-        """Somebody has gone; nothing is sent any more."""
+    def leave(self, client_id: int) -> None:
+        """Remove a client and its request."""
         with self._lock:
-            self._lookers.pop(who, None)
-        self.wishes.drop(who)
+            self._clients.pop(client_id, None)
+        self.queue.cancel(client_id)
 
-    def move(self, who: int, pose: Pose) -> None:
-        """A camera is elsewhere."""
-        self._change(who, pose=pose)
+    def move(self, client_id: int, pose: Pose) -> None:
+        """Move the camera of a client."""
+        self._change(client_id, pose=pose)
 
-    def choose(self, who: int, name: str, value: Any) -> None:
-        """A setting is wanted otherwise; unusable values change nothing."""
-        looker = self._lookers.get(who)
-        if looker is not None:
-            self._change(who, settings=looker.settings.changed(name, value, self.source.modes))
+    def choose(self, client_id: int, name: str, value: Any) -> None:
+        """Change a setting of a client; unusable values change nothing."""
+        client = self._clients.get(client_id)
+        if client is not None:
+            self._change(client_id, settings=client.settings.changed(name, value, self.source.modes))
 
-    def hurry(self, seconds: float) -> None:
-        """Pictures of moving cameras may take this long from now on."""
+    def set_frame_time(self, seconds: float) -> None:
+        """Set the time allowed for a frame of a moving camera."""
         with self._lock:
             self.seconds = seconds
-            for looker in self._lookers.values():
-                looker.pace.seconds = seconds
+            for client in self._clients.values():
+                client.resolution.seconds = seconds
 
     def refresh(self) -> None:
-        """What is looked at has changed: all get a new picture."""
-        for who in list(self._lookers):
-            self.wishes.ask(who)
+        """Request a new frame for all clients, because the source has changed."""
+        for client_id in list(self._clients):
+            self.queue.request(client_id)
 
-    def settings_of(self, who: int) -> Settings:
-        """What somebody has chosen."""
-        looker = self._lookers.get(who)
-        return looker.settings if looker else self.settings
+    def settings_of(self, client_id: int) -> Settings:
+        """Return the settings of a client."""
+        client = self._clients.get(client_id)
+        return client.settings if client else self.settings
 
     @property
     def count(self) -> int:
-        """How many look on."""
-        return len(self._lookers)
+        """Number of clients."""
+        return len(self._clients)
 
     def serve(self, timeout: float = 0.0) -> bool:
-        """Make and send one picture; False when none was wanted within `timeout` seconds."""
-        who = self.wishes.take(timeout)
-        looker = None if who is None else self._lookers.get(who)
-        if who is None or looker is None or looker.pose is None:
+        """Render and send one frame; return False if no request came within `timeout` seconds."""
+        client_id = self.queue.next_client(timeout)
+        client = None if client_id is None else self._clients.get(client_id)
+        if client_id is None or client is None or client.pose is None:
             return False
-        pose, settings = looker.pose, looker.settings
+        pose, settings = client.pose, client.settings
         start = self._clock()
-        resting = start - looker.moved
+        resting = start - client.moved
         still = resting >= REST
-        size = settings.size if still else max(round(looker.pace.scale * max(window_of(pose, settings.size))), 1)
-        shot = self._shot(pose, settings, size, still, start)
+        size = settings.size if still else max(round(client.resolution.scale * max(window_of(pose, settings.size))), 1)
+        frame = self._render(pose, settings, size, still, start)
         try:
-            looker.send(shot)
-        except Exception:  # whatever a connection that has gone may raise
-            self.leave(who)
+            client.send(frame)
+        except Exception:  # a closed connection may raise anything
+            self.leave(client_id)
             return True
         if not still:
-            looker.pace.took((self._clock() - start) * self._moving(start))
-            self.wishes.ask(who, max(looker.moved + REST + _ROUNDING - self._clock(), 0.0))
+            client.resolution.update((self._clock() - start) * self._moving(start))
+            self.queue.request(client_id, max(client.moved + REST + _ROUNDING - self._clock(), 0.0))
         return True
 
     def run(self) -> None:
-        """Serve until `close`; for a thread of its own."""
-        while not self.wishes.closed:
+        """Serve until `close`, in a thread of its own."""
+        while not self.queue.closed:
             self.serve(1.0)
 
     def close(self) -> None:
-        """Make no more pictures."""
-        self.wishes.close()
+        """Stop serving."""
+        self.queue.close()
 
-    def _change(self, who: int, **values: Any) -> None:
+    def _change(self, client_id: int, **values: Any) -> None:
         with self._lock:
-            looker = self._lookers.get(who)
-            if looker is None:
+            client = self._clients.get(client_id)
+            if client is None:
                 return
             for name, value in values.items():
-                setattr(looker, name, value)
-            looker.moved = self._clock()
-        self.wishes.ask(who)
+                setattr(client, name, value)
+            client.moved = self._clock()
+        self.queue.request(client_id)
 
     def _moving(self, now: float) -> int:
-        """How many cameras move: they share the time."""
-        return max(sum(now - looker.moved < REST for looker in list(self._lookers.values())), 1)
+        """Return the number of moving cameras, which share the time, but at least 1."""
+        return max(sum(now - client.moved < REST for client in list(self._clients.values())), 1)
 
-    def _shot(self, pose: Pose, settings: Settings, size: int, still: bool, start: float) -> ViewerImage:
-        """A picture, whatever comes; blank where there is nothing to see from the pose."""
+    def _render(self, pose: Pose, settings: Settings, size: int, still: bool, start: float) -> ViewerImage:
+        """Render a frame; return a blank one with a message if that fails."""
         message = ""
         try:
             camera = camera_of(pose, size)
@@ -172,12 +174,12 @@ class Viewer:
                 return ViewerImage(self.source.picture(camera, settings), still, self._clock() - start)
         except ClsplatError as error:
             message = str(error)
-        except Exception as error:  # a driver's, for one: the server goes on
+        except Exception as error:  # such as a fault of the driver; the server must go on
             message = f"no picture: {type(error).__name__}: {error}".split("\n")[0]
         return ViewerImage(blank(pose, size, settings), still, self._clock() - start, message)
 
 
 def blank(pose: Pose, size: int, settings: Settings) -> Picture:
-    """A picture of the background alone."""
+    """Return a picture of the background."""
     width, height = window_of(pose, size)
     return to_bytes(np.broadcast_to(np.asarray(settings.background), (height, width, 3)))

@@ -58,9 +58,9 @@ def test_bad_input_is_one_line(tmp_path: Path, capture_folder: Path, model_folde
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        assert f"127.0.0.1:{port}: cannot be listened at" in error_of("view", model, "--port", port)
+        assert f"127.0.0.1:{port}: cannot listen on this address" in error_of("view", model, "--port", port)
         refused = error_of("train", scene, "-m", tmp_path / "run", "--view", "--port", port, *SHORT)
-        assert f"127.0.0.1:{port}: cannot be listened at" in refused
+        assert f"127.0.0.1:{port}: cannot listen on this address" in refused
         assert not (tmp_path / "run").exists()
     assert "--view shows one run" in error_of("train", scene, "--view", "--budget", "auto", code=2)
 
@@ -121,7 +121,7 @@ def test_view_shows_a_file_that_changes_and_ends_with_ctrl_c(viewing: tuple[Comm
         client.look((0, 0, -3))
         first = client.still()
         ply.write_bytes(whole[:-100])
-        client.until("of before is shown")
+        client.until("the previous model stays")
         client.look((0, 0, -3))
         assert np.abs(client.still().astype(int) - first).mean() < 2.0
         some.save(ply)

@@ -30,8 +30,8 @@ FOLDERS = (
 MAX_WORDS = 25  # of a sentence
 # Words that the first texts of this project used in a sense of their own, and what to write instead.
 PRIVATE = {
-    r"\bis no (?!longer|more|need|fault|test)\w+": "is not a ...",
-    r"\bis none\b|\bare none\b|\bhas none\b|\bhave none\b": "there is no ..., does not have ...",
+    r"(?<!there )\bis no (?!longer|more|need)\w+": "is not a ...",
+    r"(?<!there )\b(?:is|are) none\b|\bhas none\b|\bhave none\b": "there is no ..., does not have ...",
     r"\bmend(s|ed|ing)?\b": "fix",
     r"\blook(s|ing|er|ers)?[- ]ons?\b": "watch, client",
     r"\bof which\b": "two sentences",

@@ -20,10 +20,10 @@ from playwright.sync_api import Page, sync_playwright
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
 from clsplat.splats.splats import SH_C0, Splats
+from clsplat.viewer.initial_view import SceneCameras, initial_view
 from clsplat.viewer.server import Server
 from clsplat.viewer.settings import Settings
 from clsplat.viewer.source import ModelSource
-from clsplat.viewer.start import Known, start_of
 from clsplat.viewer.viewer import Viewer
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -36,7 +36,7 @@ FRONT = Camera(WIDTH, HEIGHT, 500.0, 500.0, WIDTH / 2, HEIGHT / 2, np.eye(4))
 
 
 def wall() -> Splats:
-    """A wall of coloured splats four units ahead: red on the left, green on the right, brighter downwards."""
+    """Return a wall of splats four units ahead: red on the left, green on the right, brighter downwards."""
     y, x = np.mgrid[-1.5:1.5:25j, -2.0:2.0:33j]
     n = x.size
     colour = np.stack([x < 0, x >= 0, np.zeros_like(x)], axis=-1).reshape(n, 3) * (0.6 + 0.25 * y.reshape(n, 1))
@@ -57,8 +57,8 @@ def server() -> Iterator[Server]:
     source = ModelSource(wall())
     viewer = Viewer(source, Settings(background=(0.0, 0.0, 1.0)))
     aside = FRONT.posed([[0.0, 0.0, 1.0, -4.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 4.0]])
-    known = Known((NamedCamera("front", FRONT),), (NamedCamera("aside", aside),))
-    running = Server(viewer, start_of(wall().mean, [FRONT]), known, port=0)
+    known = SceneCameras((NamedCamera("front", FRONT),), (NamedCamera("aside", aside),))
+    running = Server(viewer, initial_view(wall().mean, [FRONT]), known, port=0)
     worker = threading.Thread(target=viewer.run)
     worker.start()
     yield running
@@ -78,7 +78,7 @@ def page(server: Server) -> Iterator[Page]:
 
 
 def shot(page: Page) -> NDArray[np.uint8]:
-    """What of the window no panel covers (on the right) and no warning (above)."""
+    """Return the part of the window that neither the panel (right) nor a warning (above) covers."""
     return free(np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")))
 
 
@@ -87,12 +87,12 @@ def free(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def like(shown: NDArray[np.uint8], picture: NDArray[np.uint8]) -> bool:
-    """The same picture, but for a browser's resampling and JPEG."""
+    """Whether two pictures are equal up to the resampling and JPEG of a browser."""
     return bool(np.abs(shown - free(picture)).mean() < 3.0)
 
 
 def wait_for(page: Page, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The window once it shows a picture."""
+    """Wait until the window shows a picture and return it."""
     for _ in range(100):
         if like(shown := shot(page), picture):
             return shown

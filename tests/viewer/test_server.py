@@ -1,4 +1,4 @@
-"""The viewer's server with real connections: its address, several browsers, lines that break, senseless messages."""
+"""The web server with real connections: its address, several browsers, broken connections, malformed messages."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from clsplat.cameras.path import path_of
 from clsplat.errors import OutputError
 from clsplat.splats.splats import Splats
 from clsplat.viewer.camera import Pose, camera_of
+from clsplat.viewer.initial_view import SceneCameras, initial_view
 from clsplat.viewer.page import plain
 from clsplat.viewer.server import Server
 from clsplat.viewer.settings import Settings
 from clsplat.viewer.source import ModelSource
-from clsplat.viewer.start import Known, start_of
 from clsplat.viewer.viewer import Viewer
 
-# The server silences these warnings of viser's, but pytest has its own filters.
+# The server silences these warnings of viser, but pytest has its own filters.
 pytestmark = [pytest.mark.filterwarnings("ignore:Queued a"), pytest.mark.filterwarnings(r"ignore:\[viser\]")]
 
 LABELS = ("Show", "Background", "Jump to", "Seconds a key")
@@ -46,7 +46,7 @@ def model(n: int = 40) -> Splats:
 
 
 class Running:
-    """A server with its thread."""
+    """A server and the thread that serves it."""
 
     def __init__(self, folder: Path) -> None:
         self.source = ModelSource(model())
@@ -55,8 +55,8 @@ class Running:
         self.reloads = 0
         self.server = Server(
             self.viewer,
-            start_of(model().mean, [item.camera for item in cameras]),
-            Known(tuple(cameras[:2]), tuple(cameras[2:])),
+            initial_view(model().mean, [item.camera for item in cameras]),
+            SceneCameras(tuple(cameras[:2]), tuple(cameras[2:])),
             port=0,
             reload=self.reload,
             folder=folder,
@@ -88,12 +88,12 @@ def expected(settings: Settings, position: tuple[float, float, float] = (0, 0, -
 
 
 def close_to(shown: np.ndarray, picture: np.ndarray) -> bool:
-    """Equal but for JPEG's losses."""
+    """Whether two pictures are equal up to the losses of JPEG."""
     return shown.shape == picture.shape and bool(np.abs(shown.astype(int) - picture).mean() < 4.0)
 
 
 def shows(client: Client, picture: np.ndarray) -> bool:
-    """Whether a browser gets this picture before long."""
+    """Whether a browser soon gets this picture."""
     end = time.monotonic() + 10.0
     while not (client.pictures and close_to(client.last(), picture)):
         if time.monotonic() > end:
@@ -103,20 +103,20 @@ def shows(client: Client, picture: np.ndarray) -> bool:
 
 
 def test_a_busy_port_is_one_line(running: Running) -> None:
-    refused = r"127\.0\.0\.1:\d+: cannot be listened at \(.*in use\); choose another --port"
+    refused = r"127\.0\.0\.1:\d+: cannot listen on this address \(.*in use\); choose another --port"
     with pytest.raises(OutputError, match=refused):
-        Server(Viewer(running.source), start_of(model().mean, []), port=running.server.port)
-    with socket.socket() as other:  # of another program, which listens elsewhere too
+        Server(Viewer(running.source), initial_view(model().mean, []), port=running.server.port)
+    with socket.socket() as other:  # another program that listens on the port
         other.bind(("0.0.0.0", 0))
         other.listen()
-        with pytest.raises(OutputError, match="cannot be listened at"):
-            Server(Viewer(running.source), start_of(model().mean, []), port=other.getsockname()[1])
+        with pytest.raises(OutputError, match="cannot listen on this address"):
+            Server(Viewer(running.source), initial_view(model().mean, []), port=other.getsockname()[1])
 
 
 @pytest.mark.parametrize("host", ["256.1.1.1", "192.0.2.1", "no.such.host.invalid"])
 def test_an_address_that_is_not_ours_is_one_line(running: Running, host: str) -> None:
-    with pytest.raises(OutputError, match="cannot be listened at"):
-        Server(Viewer(running.source), start_of(model().mean, []), host=host, port=0)
+    with pytest.raises(OutputError, match="cannot listen on this address"):
+        Server(Viewer(running.source), initial_view(model().mean, []), host=host, port=0)
 
 
 def test_a_browser_sees_the_render(running: Running) -> None:
@@ -177,7 +177,7 @@ SENSELESS = [
 
 
 def test_senseless_messages_change_nothing(running: Running, capfd: pytest.CaptureFixture[str]) -> None:
-    """At worst the connection that sent one ends."""
+    """A malformed message ends at most the connection that sent it."""
     for message in SENSELESS:
         with Client(running.server.port) as client:
             client.look()

@@ -1,4 +1,4 @@
-"""Looking at a run: the same bits as unseen, its share of the time, pause and Ctrl-C; the line about it."""
+"""The viewer of a run: the run keeps its bits and its time; pause, Ctrl-C and the status line."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_what_is_seen_is_the_run(scene: Scene) -> None:
 
 
 def test_pictures_take_no_more_than_their_share() -> None:
-    """Time passes by a clock of the test: 10 ms an iteration, 30 ms a picture."""
+    """The clock of the test advances 10 ms for an iteration and 30 ms for a frame."""
     now = [0.0]
     spent = [0.0]
     view = TrainingView(CONFIG, clock=lambda: now[0])

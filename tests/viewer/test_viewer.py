@@ -1,4 +1,4 @@
-"""Pictures for looker-ons: whose turn it is, how large, of what; absurd cameras and failures give blank ones."""
+"""Frames for clients: order, size and content; unusable cameras and failures give blank frames."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from clsplat.errors import DeviceError, InputError
 from clsplat.rendering.colormaps import MODES, Picture, to_bytes
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
-from clsplat.viewer.camera import WIDEST, Pace, Pose, camera_of, window_of
-from clsplat.viewer.recording import MOST_KEYS, Recording
-from clsplat.viewer.render_queue import Wishes
-from clsplat.viewer.settings import LARGEST, SMALLEST, Settings
-from clsplat.viewer.source import ModelSource, Watch, coverage
-from clsplat.viewer.start import Known, fov_of, start_of
+from clsplat.viewer.camera import MAX_FOV, AdaptiveResolution, Pose, camera_of, window_of
+from clsplat.viewer.initial_view import SceneCameras, initial_view, vertical_fov
+from clsplat.viewer.recording import MAX_KEYS, Recording
+from clsplat.viewer.render_queue import RenderQueue
+from clsplat.viewer.settings import MAX_SIZE, MIN_SIZE, Settings
+from clsplat.viewer.source import ModelSource, ModelWatcher, coverage
 from clsplat.viewer.viewer import REST, Viewer, ViewerImage
 
 AHEAD = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 1.0, 96, 64)
@@ -34,7 +34,7 @@ def model(n: int = 40, seed: int = 3) -> Splats:
 
 
 class Clock:
-    """Time that passes when told."""
+    """A clock that the test sets."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -44,60 +44,60 @@ class Clock:
 
 
 class Plain:
-    """A source that takes a time and remembers what it was asked for."""
+    """A source that takes some time and records its calls."""
 
     modes, partial, n_splats, sh_degree = MODES, True, 7, 2
 
     def __init__(self, clock: Clock, seconds: float = 0.0, error: Exception | None = None) -> None:
-        self.asked: list[tuple[Camera, Settings]] = []
+        self.calls: list[tuple[Camera, Settings]] = []
         self.clock, self.seconds, self.error = clock, seconds, error
 
     def picture(self, camera: Camera, settings: Settings) -> Picture:
-        self.asked.append((camera, settings))
+        self.calls.append((camera, settings))
         self.clock.now += self.seconds * camera.width * camera.height / (96 * 64)
         if self.error:
             raise self.error
         return np.zeros((camera.height, camera.width, 3), np.uint8)
 
 
-# --- whose turn ------------------------------------------------------------------------------
+# --- the queue ------------------------------------------------------------------------------
 
 
-def test_everybody_gets_as_many_pictures_however_often_they_ask() -> None:
-    wishes, served = Wishes(Clock()), []
+def test_all_clients_get_equal_numbers_of_frames() -> None:
+    queue, served = RenderQueue(Clock()), []
     for _ in range(6):
-        wishes.ask(1)
-        wishes.ask(1)
-        wishes.ask(2)
-        wishes.ask(3)
-        served.append(wishes.take(0.0))
+        queue.request(1)
+        queue.request(1)
+        queue.request(2)
+        queue.request(3)
+        served.append(queue.next_client(0.0))
     assert served == [1, 2, 3, 1, 2, 3]
 
 
-def test_a_wish_for_later_waits_and_an_earlier_one_takes_its_place() -> None:
+def test_a_delayed_request_waits_and_an_earlier_one_replaces_it() -> None:
     clock = Clock()
-    wishes = Wishes(clock)
-    wishes.ask(1, delay=1.0)
-    assert not wishes.waiting
-    assert wishes.take(0.0) is None
+    queue = RenderQueue(clock)
+    queue.request(1, delay=1.0)
+    assert not queue.has_due
+    assert queue.next_client(0.0) is None
     clock.now = 1.0
-    assert wishes.waiting
-    assert wishes.take(0.0) == 1
-    assert wishes.take(0.0) is None
-    wishes.ask(1, delay=5.0)
-    wishes.ask(1)
-    assert wishes.take(0.0) == 1
-    assert wishes.take(0.0) is None, "one wish, not two"
+    assert queue.has_due
+    assert queue.next_client(0.0) == 1
+    assert queue.next_client(0.0) is None
+    queue.request(1, delay=5.0)
+    queue.request(1)
+    assert queue.next_client(0.0) == 1
+    assert queue.next_client(0.0) is None, "one request, not two"
 
 
-def test_who_has_gone_gets_nothing_and_closing_wakes_the_server() -> None:
-    wishes = Wishes()
-    wishes.ask(1)
-    wishes.drop(1)
-    assert wishes.take(0.0) is None
-    waiting = threading.Thread(target=wishes.take, args=(60.0,))
+def test_a_cancelled_request_is_not_served_and_close_wakes_the_server() -> None:
+    queue = RenderQueue()
+    queue.request(1)
+    queue.cancel(1)
+    assert queue.next_client(0.0) is None
+    waiting = threading.Thread(target=queue.next_client, args=(60.0,))
     waiting.start()
-    wishes.close()
+    queue.close()
     waiting.join(5.0)
     assert not waiting.is_alive()
 
@@ -105,14 +105,14 @@ def test_who_has_gone_gets_nothing_and_closing_wakes_the_server() -> None:
 # --- cameras ---------------------------------------------------------------------------------
 
 
-def test_a_browsers_camera_is_ours() -> None:
+def test_the_camera_of_a_browser_is_converted() -> None:
     camera = camera_of(Pose((2.0, 0.0, 2.0, 0.0), (1.0, 2.0, 3.0), math.radians(90), 200, 100), 1000)
     assert camera is not None
     assert (camera.width, camera.height, camera.cx, camera.cy) == (200, 100, 100, 50)
     assert camera.fx == pytest.approx(50)
     assert camera.fy == pytest.approx(50)
     assert np.allclose(camera.position, (1, 2, 3))
-    # A quarter turn about y: what lies along +x is ahead.
+    # After a quarter turn about y the camera looks along +x.
     assert np.allclose(camera.rotation[2], (1, 0, 0))
 
 
@@ -135,7 +135,7 @@ NONE: list[object] = [
     Pose((1, math.inf, 0, 0), (0, 0, 0), 1.0, 96, 64),
     Pose((1, 0, 0, 0), (0, 0, 0), math.nan, 96, 64),
     Pose((1, 0, 0, 0), (0, 0, 0), 0.0, 96, 64),
-    Pose((1, 0, 0, 0), (0, 0, 0), 1.01 * WIDEST, 96, 64),
+    Pose((1, 0, 0, 0), (0, 0, 0), 1.01 * MAX_FOV, 96, 64),
     Pose((1, 0, 0, 0), (0, 0, 0), -1.0, 96, 64),
     Pose((1, 0, 0, 0), (0, 0, 0), 1e300, 96, 64),
     Pose("nonsense", None, "wide", 96, 64),  # type: ignore[arg-type]
@@ -155,15 +155,15 @@ def test_absurd_windows_have_a_size(size: tuple[int, int]) -> None:
 
 
 def test_moving_pictures_get_smaller_until_they_come_in_time() -> None:
-    """A model of a machine: a fixed time and a time a pixel."""
+    """The time of a frame is a constant plus a time for each pixel."""
     for fixed, full in ((0.0, 0.01), (0.005, 0.3), (0.02, 5.0)):
-        pace, times = Pace(0.05), []
+        resolution, times = AdaptiveResolution(0.05), []
         for _ in range(48):
-            times.append(fixed + full * pace.scale**2)
-            pace.took(times[-1])
+            times.append(fixed + full * resolution.scale**2)
+            resolution.update(times[-1])
         steady = times[-8:]
         assert max(steady) <= 0.06, (fixed, full)
-        assert pace.scale == 1.0 or min(steady) > 0.02, (fixed, full)
+        assert resolution.scale == 1.0 or min(steady) > 0.02, (fixed, full)
 
 
 # --- settings --------------------------------------------------------------------------------
@@ -175,8 +175,8 @@ def test_moving_pictures_get_smaller_until_they_come_in_time() -> None:
         ("mode", "depth", "depth"),
         ("background", (255, 0, 51), (1.0, 0.0, 0.2)),
         ("size", 640, 640),
-        ("size", 1, SMALLEST),
-        ("size", 10**12, LARGEST),
+        ("size", 1, MIN_SIZE),
+        ("size", 10**12, MAX_SIZE),
         ("sh_degree", 1.0, 1),
         ("sh_degree", -4, 0),
         ("cap", 10, 10),
@@ -241,10 +241,10 @@ def test_only_the_newest_camera_is_shown() -> None:
         viewer.move(1, Pose((1, 0, 0, 0), (step, 0, 0), 1.0, 96, 64))
     assert viewer.serve()
     assert not viewer.serve()
-    assert [camera.position[0] for camera, _ in source.asked] == [4.0]
+    assert [camera.position[0] for camera, _ in source.calls] == [4.0]
 
 
-def test_everybody_has_settings_of_their_own() -> None:
+def test_each_client_has_its_own_settings() -> None:
     clock = Clock()
     source = Plain(clock)
     viewer = Viewer(source, Settings(background=BACKGROUND), clock=clock)
@@ -253,10 +253,10 @@ def test_everybody_has_settings_of_their_own() -> None:
         viewer.move(who, AHEAD)
     viewer.choose(1, "mode", "depth")
     viewer.choose(2, "mode", "nonsense")
-    viewer.choose(3, "mode", "depth")  # nobody
+    viewer.choose(3, "mode", "depth")  # no such client
     assert viewer.serve()
     assert viewer.serve()
-    assert [(settings.mode, settings.background) for _, settings in source.asked] == [
+    assert [(settings.mode, settings.background) for _, settings in source.calls] == [
         ("depth", BACKGROUND),
         ("colour", BACKGROUND),
     ]
@@ -285,7 +285,7 @@ def test_absurd_cameras_see_a_blank_picture(pose: Pose) -> None:
     assert (shots[0].picture == to_bytes(np.array(BACKGROUND))).all()
 
 
-def test_a_line_that_breaks_ends_with_itself() -> None:
+def test_a_broken_connection_does_not_disturb_others() -> None:
     clock = Clock()
     viewer, shots = Viewer(Plain(clock), clock=clock), list[ViewerImage]()
 
@@ -325,7 +325,7 @@ def source() -> ModelSource:
 
 @pytest.mark.parametrize("position", [(0.0, 0.0, -3.0), (0.0, 0.0, 50.0), (9e14, 0.0, 0.0)])
 def test_a_full_picture_is_the_render(source: ModelSource, position: tuple[float, float, float]) -> None:
-    """Before the splats, with nothing ahead, and as far away as may be."""
+    """The camera is before the splats, sees none, or is as far away as allowed."""
     camera = camera_of(Pose((1, 0, 0, 0), position, 1.0, 96, 64), 1000)
     assert camera is not None
     shown = source.picture(camera, Settings(background=BACKGROUND))
@@ -392,7 +392,7 @@ def test_another_model_is_shown_from_the_next_picture_on(source: ModelSource) ->
 def test_a_file_is_read_again_once_it_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "model.ply"
     model(10).save(path)
-    watch = Watch(lambda: path)
+    watch = ModelWatcher(lambda: path)
     assert watch.poll() is None
     model(20).save(path)
     assert watch.poll() is None, "it may still be growing"
@@ -406,7 +406,7 @@ def test_a_broken_file_is_said_once_and_mended_by_the_next(tmp_path: Path) -> No
     path = tmp_path / "model.ply"
     model(10).save(path)
     whole = path.read_bytes()
-    watch = Watch(lambda: path)
+    watch = ModelWatcher(lambda: path)
     path.write_bytes(whole[:-50])
     watch.poll()
     with pytest.raises(InputError, match=r"model\.ply"):
@@ -414,9 +414,9 @@ def test_a_broken_file_is_said_once_and_mended_by_the_next(tmp_path: Path) -> No
     assert watch.poll() is None
     path.unlink()
     watch.poll()
-    with pytest.raises(InputError, match="not there any more"):
+    with pytest.raises(InputError, match="does not exist any more"):
         watch.poll()
-    with pytest.raises(InputError, match="not there any more"):
+    with pytest.raises(InputError, match="does not exist any more"):
         watch.reload()
     model(12).save(path)
     watch.poll()
@@ -430,7 +430,7 @@ def test_a_later_file_takes_over(tmp_path: Path) -> None:
     for n in (10, 20):
         model(n).save(tmp_path / f"{n}.ply")
     names = ["10.ply"]
-    watch = Watch(lambda: tmp_path / names[-1])
+    watch = ModelWatcher(lambda: tmp_path / names[-1])
     names.append("20.ply")
     watch.poll()
     splats = watch.poll()
@@ -439,12 +439,12 @@ def test_a_later_file_takes_over(tmp_path: Path) -> None:
     assert watch.path.name == "20.ply"
 
 
-# --- where it begins, and paths --------------------------------------------------------------
+# --- the first view, and paths --------------------------------------------------------------
 
 
 def test_it_begins_at_the_first_camera() -> None:
     cameras = [random_camera(seed) for seed in range(3)]
-    start = start_of(np.zeros((5, 3)), cameras)
+    start = initial_view(np.zeros((5, 3)), cameras)
     assert np.allclose(start.position, cameras[0].position)
     ahead = start.look_at - start.position
     assert np.allclose(ahead / np.linalg.norm(ahead), cameras[0].rotation[2])
@@ -453,21 +453,21 @@ def test_it_begins_at_the_first_camera() -> None:
 
 @pytest.mark.parametrize("means", [np.zeros((0, 3)), np.zeros((1, 3)), np.full((4, 3), 7.0), model().mean])
 def test_without_cameras_it_looks_at_the_splats(means: np.ndarray) -> None:
-    start = start_of(means, [])
+    start = initial_view(means, [])
     assert np.linalg.norm(start.look_at - start.position) > 0.5
     assert start.look_at == pytest.approx(np.median(means, axis=0) if len(means) else np.zeros(3))
 
 
 def test_a_jump_shows_all_of_an_image() -> None:
     camera = Camera(200, 100, 100.0, 100.0, 100.0, 50.0, np.eye(4))
-    assert fov_of(camera, 4.0) == pytest.approx(2 * math.atan(0.5))
-    square = fov_of(camera, 1.0)
+    assert vertical_fov(camera, 4.0) == pytest.approx(2 * math.atan(0.5))
+    square = vertical_fov(camera, 1.0)
     assert math.tan(square / 2) == pytest.approx(1.0), "a narrower window has to see higher, to see as wide"
 
 
 def test_labels_of_cameras_differ() -> None:
     camera = random_camera()
-    known = Known((NamedCamera("a", camera), NamedCamera("a", camera)), (NamedCamera("a", camera),))
+    known = SceneCameras((NamedCamera("a", camera), NamedCamera("a", camera)), (NamedCamera("a", camera),))
     assert len(known.by_label) == 3
     assert known.size > 0
 
@@ -493,6 +493,6 @@ def test_a_recorded_path_goes_through_its_keys(tmp_path: Path) -> None:
 
 def test_a_path_has_an_end() -> None:
     recording = Recording()
-    recording.keys = [random_camera()] * MOST_KEYS
+    recording.keys = [random_camera()] * MAX_KEYS
     with pytest.raises(InputError, match="keys already"):
         recording.add(random_camera())
