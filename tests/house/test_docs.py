@@ -1,8 +1,8 @@
-"""The documents keep their word: their commands and Python run, links lead somewhere, messages are in the source.
+"""Documents are right: their commands and Python run, their links work, and the messages they quote are in the source.
 
-Each `clsplat` command of a code block runs by itself in a folder with stand-ins for what it names (SCENE, MODEL, ...),
-with few iterations and splats (`shortened`). Other commands are checked for what they name; why they are not run stands
-in `NOT_RUN`. A command that is neither fails.
+Each `clsplat` command of a code block runs alone, in a folder with stand-ins for the names in it (SCENE, MODEL, ...).
+`shortened` gives it few iterations and splats. Other commands are checked for the files and options that they name;
+`NOT_RUN` has the reason why each is not run. A command that is neither run nor in `NOT_RUN` fails.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import click
+import draw_imports
 import numpy as np
 import pytest
 from cli_runner import run
@@ -37,19 +38,21 @@ INDENTED = re.compile(r"^    ((?:clsplat|python|pytest|pip) .*)$", re.M)
 # Commands that are not run here: pattern, why.
 NOT_RUN = (
     (r"python3 -m venv|(\.venv/bin/)?pip install", "installs from the network; the extras it names are checked"),
-    (r"(\.venv/bin/)?pytest|\.venv/bin/(ruff|mypy)|\.ci/run", "the checks themselves; files they name are checked"),
+    (r"(\.venv/bin/)?pytest|\.venv/bin/(ruff|clang-format|mypy)|\.ci/run", "the checks; files they name are checked"),
+    (r"python tests/support/english\.py", "a check of every text"),
     (r"python benchmarks/", "hours; test_benchmarks.py runs small ones; script and options are checked"),
     (r"python docs/api\.py", "test_docstrings_are_rendered runs it"),
-    (r"\.venv/bin/clsplat devices", "measures schedules; test_device.py and test_cli.py run it"),
-    (r"clsplat view |clsplat train .*--view", "serves until it is stopped; test_cli_view.py runs it"),
+    (r"python docs/draw_imports\.py", "test_the_drawing_is_up_to_date makes the drawing"),
+    (r"\.venv/bin/clsplat devices", "measures schedules; tests/device/test_device.py and tests/cli/test_cli.py run it"),
+    (r"clsplat view |clsplat train .*--view", "serves until it is stopped; tests/cli/test_view.py runs it"),
 )
-# Minutes, or one more of a kind of which another is run.
+# Commands that take minutes, or that resemble a command that is run.
 SLOW = re.compile(
     r"clsplat (demo|compare|frontier|bench|reconstruct|prune)|--(budget|target-psnr|video|config|report)"
     r"|PHOTOS|-r 2|\.splat|gaussians\.ply|-direct"
 )
 REAL_PHOTOS = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data") / "sceaux_castle"
-# What every training command gets that does not say otherwise, and the values that stand in for those it has.
+# Options that every training command gets, in the place of its own values.
 FEW = {"--iterations": "8", "--cap-max": "60", "--seeds": "0", "--seed": "1"}
 
 
@@ -58,7 +61,7 @@ def blocks(text: str, language: str) -> list[str]:
 
 
 def commands() -> dict[str, str]:
-    """All commands of code blocks, without comments, with the page that has them."""
+    """Return all commands of code blocks, without comments, each with its page."""
     found: dict[str, str] = {}
     for page, text in TEXTS.items():
         lines = [line for body in blocks(text, "sh") for line in body.splitlines()]
@@ -81,7 +84,7 @@ RUN = [command for command in COMMANDS_SEEN if reason_not_run(command) is None]
 
 
 def shortened(command: str) -> list[str]:
-    """Its arguments with few iterations, splats, seeds and images."""
+    """Return the arguments of a command with few iterations, splats, seeds and images."""
     words = shlex.split(command.removeprefix(".venv/bin/"))[1:]
     for place, word in enumerate(words[:-1]):
         words[place + 1] = FEW.get(word, words[place + 1])
@@ -99,7 +102,7 @@ def shortened(command: str) -> list[str]:
 
 
 def stand_ins(folder: Path, words: list[str], capture: Path, model: Path) -> None:
-    """What the words name: a scene, photographs, models."""
+    """Make the scene, photos and models that a command names."""
     makes = {"train": "-m", "reconstruct": "-o"}.get(words[0]) if "--resume" not in words else None
     target = next((after for word, after in pairwise(words) if word == makes), None)
     for name in ("SCENE", "MODEL", "OTHER", "SMALL"):
@@ -132,16 +135,16 @@ def test_commands_run(
     monkeypatch.chdir(tmp_path)
     before = set(tmp_path.rglob("*"))
     result = run(*words)
-    if "PHOTOS" in words and not REAL_PHOTOS.is_dir():  # those of the capture are too small to fit together
+    if "PHOTOS" in words and not REAL_PHOTOS.is_dir():  # photos of the demo scene are too small to match
         assert result.exit_code == 1
         assert "so none has a pose" in result.stderr
         return
     assert result.exit_code == 0, f"{COMMANDS_SEEN[command]}: {command}\n{result.output}"
-    assert result.stdout or set(tmp_path.rglob("*")) - before, "nothing was said and nothing written"
+    assert result.stdout or set(tmp_path.rglob("*")) - before, "no output and no file"
 
 
 @pytest.mark.parametrize("command", sorted(set(COMMANDS_SEEN) - set(RUN)))
-def test_what_other_commands_name_is_there(command: str) -> None:
+def test_other_commands_name_existing_files_and_options(command: str) -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for named in re.findall(r"(?:clsplat|\.)\[([\w,-]+)\]", command):
         assert set(named.split(",")) <= set(extras)
@@ -156,7 +159,7 @@ def test_what_other_commands_name_is_there(command: str) -> None:
 
 
 def options_of(name: str) -> set[str]:
-    """All options of a command, and those of the group."""
+    """Return all options of a command, and those of the group."""
     command = main.get_command(click.Context(main), name)
     assert command is not None
     return {option for param in (*command.params, *main.params) for option in (*param.opts, *param.secondary_opts)}
@@ -189,7 +192,7 @@ def test_every_command_is_in_the_guide() -> None:
 
 @pytest.mark.parametrize("page", [page for page, text in TEXTS.items() if blocks(text, "python")])
 def test_python_runs(page: str, tmp_path: Path, capture_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All Python of a page as one program, where the demo was made."""
+    """All Python of a page runs as one program, in the folder of the demo."""
     shutil.copytree(capture_folder, tmp_path / "out" / "scene")
     monkeypatch.chdir(tmp_path)
     source = "\n".join(blocks(TEXTS[page], "python"))
@@ -197,7 +200,33 @@ def test_python_runs(page: str, tmp_path: Path, capture_folder: Path, monkeypatc
     exec(compile(source, page, "exec"), {"__name__": "__main__"})
 
 
-def test_links_lead_somewhere() -> None:
+def test_readme_stays_short() -> None:
+    assert len(TEXTS["README.md"].splitlines()) <= 150
+
+
+def test_evidence_is_there() -> None:
+    """Each test file of the table "Evidence" exists, and so does each module and kernel that ARCHITECTURE.md names."""
+    text = TEXTS["ARCHITECTURE.md"]
+    evidence = text[text.index("## Evidence") :]
+    files = re.findall(r"`(\w+/test_\w+\.py)`", evidence)
+    assert len(files) > 40
+    assert [file for file in files if not (ROOT / "tests" / file).exists()] == []
+    for page in ("ARCHITECTURE.md", "CONTRIBUTING.md", "docs/kernels.md", "docs/decisions.md"):
+        for named in re.findall(r"`((?:clsplat|cl|cli|blender|tests|benchmarks|docs)/(?!test_)[\w/.]+)`", TEXTS[page]):
+            assert "NAME" in named or (ROOT / named).exists(), f"{page}: {named}"
+
+
+def test_no_import_points_upward_in_the_drawing() -> None:
+    heights = draw_imports.positions()
+    upward = [arrow for arrow in draw_imports.arrows() if heights[arrow.source] >= heights[arrow.target]]
+    assert upward == []
+
+
+def test_the_drawing_is_up_to_date() -> None:
+    assert draw_imports.DRAWING.read_text() == draw_imports.draw(), "run: python docs/draw_imports.py"
+
+
+def test_links_work() -> None:
     for page, text in TEXTS.items():
         for target in re.findall(r"\]\(([^)#\s]*)(?:#[^)]*)?\)", text):
             if target and not re.match(r"https?:", target):
@@ -212,7 +241,7 @@ def test_links_lead_somewhere() -> None:
 
 
 def source_texts() -> list[str]:
-    """Text constants of the source, with a NUL where a value is filled in."""
+    """Return the text constants of the source, with a NUL for each value that is filled in."""
     found = []
     for path in [file for folder in ("clsplat", "cli", "blender") for file in (ROOT / folder).rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
@@ -226,7 +255,7 @@ def source_texts() -> list[str]:
 
 
 def test_messages_are_those_of_the_source() -> None:
-    """Tables headed "message" quote what clsplat says; `...`, N, M, WxH and numbers stand for what is filled in."""
+    """Tables headed "message" quote messages of clsplat; `...`, N, M, WxH and numbers stand for values."""
     texts = source_texts()
     quoted = 0
     for page, text in TEXTS.items():
@@ -250,7 +279,7 @@ def test_docstrings_are_rendered(tmp_path: Path) -> None:
     for name in clsplat.__all__:
         assert f'id="{name}"' in text
     assert "<li><strong>target_psnr</strong>: on validation views, instead" in text
-    assert "-----" not in text, "a section that was not understood"
+    assert "-----" not in text, "a section that docs/api.py did not parse"
 
 
 def test_docstrings_without_pdoc(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from draw_imports import imports_of, modules, package_line, package_of
 
 from clsplat.splats.shapes import SHAPES
 
@@ -60,13 +61,6 @@ SHAPE_NAMES_IN = {
 COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.S)
 
 
-def modules() -> dict[str, Path]:
-    """Each module of the library by its dotted name below `clsplat`."""
-    folder = ROOT / "clsplat"
-    paths = sorted(folder.rglob("*.py"))
-    return {".".join(path.relative_to(folder).with_suffix("").parts): path for path in paths}
-
-
 def kernel_sources() -> dict[str, str]:
     """Sources below cl/ by name, without comments."""
     folder = ROOT / "cl"
@@ -75,20 +69,6 @@ def kernel_sources() -> dict[str, str]:
         for path in sorted(folder.rglob("*.cl*"))
         if path.suffix in (".cl", ".clh")
     }
-
-
-def imports_of(name: str, path: Path) -> set[str]:
-    """Modules of the library that a module imports, lazily or not."""
-    known, found = modules(), set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            base = name.split(".")[: -node.level]
-            target = ".".join([*base, *(node.module or "").split(".")]).strip(".")
-            found |= {target} if target in known else {f"{target}.{a.name}".strip(".") for a in node.names}
-        elif isinstance(node, ast.ImportFrom | ast.Import):
-            named = [node.module or ""] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names]
-            assert not any(n.split(".")[0].startswith("clsplat") for n in named), f"{name}: import relatively"
-    return found
 
 
 def foreign_imports(tree: ast.AST) -> set[str]:
@@ -116,12 +96,12 @@ def code_strings(tree: ast.AST) -> Iterator[str]:
             yield node.value
 
 
-def package_of(name: str) -> str:
-    return name.split(".")[0]
-
-
 def test_every_package_has_its_place_in_the_line() -> None:
     assert {package_of(name) for name in modules()} == {*PACKAGES, "__init__"}
+
+
+def test_the_line_of_the_documents_is_the_line_of_the_test() -> None:
+    assert tuple(package_line()) == PACKAGES
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -1,9 +1,11 @@
-/* Looks of a report: its table, the wipe between two images, error maps and the histogram. */
+"""Looks and behaviour of a page of measurements: sorting its table, and wiping between two images."""
+
+STYLE = """
 h3 { font-size: 1rem; margin: 1.6rem 0 .3rem; overflow-wrap: anywhere; } h3 small { font-weight: normal; }
 th button { font: inherit; color: inherit; background: none; border: 0; padding: 0; cursor: pointer; }
-th button::after { content: " \2195"; opacity: .65; }
-th[aria-sort=ascending] button::after { content: " \2191"; opacity: 1; }
-th[aria-sort=descending] button::after { content: " \2193"; opacity: 1; }
+th button::after { content: " \\2195"; opacity: .65; }
+th[aria-sort=ascending] button::after { content: " \\2191"; opacity: 1; }
+th[aria-sort=descending] button::after { content: " \\2193"; opacity: 1; }
 td.best { font-weight: 600; }
 .images { display: grid; gap: .8rem; grid-template-columns: repeat(auto-fit, minmax(min(19rem, 100%), 1fr)); }
 .images figure { margin: 0; padding: 0; border: 0; background: none; min-width: 0;
@@ -32,3 +34,36 @@ figcaption select { font: inherit; max-width: 45%; }
 .histogram figcaption { color: #262626; } .histogram span { margin-right: 1rem; white-space: nowrap; }
 .histogram i { display: inline-block; width: .8rem; height: .8rem; margin-right: .35rem; vertical-align: -.05rem; }
 tbody th { font-weight: normal; } td.text { white-space: normal; overflow-wrap: anywhere; }
+"""
+
+# The wipe's handle is a range input over the image: mouse, touch and keyboard come with it.
+SCRIPT = """
+"use strict";
+for (const wipe of document.querySelectorAll(".wipe")) {
+  const slider = wipe.querySelector("input");
+  slider.addEventListener("input", () => wipe.style.setProperty("--at", slider.value + "%"));
+}
+for (const choice of document.querySelectorAll("figcaption select")) {
+  choice.addEventListener("change", () => {
+    const figure = choice.closest("figure");
+    const [left, right] = [...figure.querySelectorAll("select")].map((one) => one.value);
+    for (const image of figure.querySelectorAll(".wipe img")) {
+      image.classList.toggle("over", image.dataset.key === left);
+      image.classList.toggle("under", image.dataset.key === right);
+      image.classList.toggle("both", left === right);
+    }
+  });
+}
+for (const table of document.querySelectorAll("table.sortable")) {
+  const heads = [...table.tHead.rows[0].cells];
+  heads.forEach((head, column) => head.querySelector("button").addEventListener("click", () => {
+    const rising = head.getAttribute("aria-sort") !== "ascending";
+    heads.forEach((other) => other.removeAttribute("aria-sort"));
+    head.setAttribute("aria-sort", rising ? "ascending" : "descending");
+    const key = (row) => row.cells[column].dataset.value ?? row.cells[column].textContent;
+    const order = (a, b) => column ? key(a) - key(b) : key(a).localeCompare(key(b), undefined, {numeric: true});
+    const rows = [...table.tBodies[0].rows].sort((a, b) => (rising ? 1 : -1) * order(a, b));
+    table.tBodies[0].append(...rows);
+  }));
+}
+"""
