@@ -15,9 +15,10 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import common
 
@@ -62,9 +63,16 @@ class Group(NamedTuple):
     def contestants(self) -> list[Method]:
         """The systems, shapes with the options of BASE."""
         return [
-            replace(system, changes=BASE | dict(system.changes)) if system.base in SHAPES else system
+            replace(system, changes=_with_base(system.changes)) if system.base in SHAPES else system
             for system in parse_methods(",".join(self.systems))
         ]
+
+
+def _with_base(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the changes of a system together with BASE, without the options that its strategy does not have."""
+    options = BASE | dict(changes)
+    unused = TrainConfig(strategy=options["strategy"]).without_effect(options)
+    return {name: value for name, value in options.items() if name not in unused}
 
 
 # Growth by gradient instead of BASE's by opacity.

@@ -13,6 +13,7 @@ from clsplat.errors import InputError, OutputError
 from clsplat.files.lock import folder_lock
 from clsplat.training.config import TrainConfig, read_options
 
+from .main import INTERRUPTED
 from .options import Decibels, F
 from .progress import TrainingDisplay
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from clsplat.compression.search import Budgeted
     from clsplat.scenes.scene import Scene
 
-INTERRUPTED = 130
 KEYS = ("budget", "budget_tolerance", "target_psnr", "max_bytes")
 
 

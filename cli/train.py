@@ -16,6 +16,7 @@ from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
 
 from .budget import budget_options, forget_search, is_search, options_of, run_search, stored_search
+from .main import INTERRUPTED
 from .options import (
     PATH,
     TrainingCommand,
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from clsplat.viewer.training_session import TrainingSession
 
 SCENE_KEYS = ("images", "resolution", "masks", "alpha", "test_every", "test_list", "eval")
-INTERRUPTED = 130
 
 
 @click.command(cls=TrainingCommand)

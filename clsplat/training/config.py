@@ -49,7 +49,7 @@ class TrainConfig:
 
     Raises
     ------
-    InputError : a value is out of range. TypeError : there is no such option.
+    InputError : a value is out of range. TypeError : an unknown option.
     """
 
     shape: str = option(DEFAULT_SHAPE, help="Splat kernel.", choices=tuple(SHAPES))

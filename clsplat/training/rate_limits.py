@@ -1,8 +1,8 @@
-"""Learning rates that no training survives: refused before it starts.
+"""Upper limits of learning rates: a rate that no training survives is refused before the run starts.
 
-Adam's step is about its rate, whatever the gradient, so a rate has a size of its own: a fraction of the scene, a
-factor of scale, an angle. The limits are where runs on a capture (200 iterations, 64 px) and on fox (300, -r 4)
-began to lose more than half a decibel (benchmarks/STABILITY.md).
+The size of Adam's step is about its rate and does not depend on the gradient. So each rate has a size that one can
+judge: a fraction of the scene, a factor of the scale, an angle. benchmarks/STABILITY.md has the measurements behind
+the limits.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 from ..errors import InputError
 from .config import OPTIONS, TrainConfig
 
-# By option: the field whose rates grow in short runs with it, and the most that a step may be.
+# By option: the field whose `rate_factor` applies, and the largest step per iteration.
 LIMITS = {
     "position_lr_init": ("mean", 0.03),  # scene extents
     "position_lr_final": ("mean", 0.03),
@@ -24,17 +24,19 @@ LIMITS = {
 
 
 def check_rates(config: TrainConfig) -> None:
-    """Raise InputError naming the first rate that is too high for the length of the run.
+    """Check the learning rates for the length of the run. The default rates always pass, also in very short runs.
 
-    The default rates always pass, in runs of a few iterations too.
+    Raises
+    ------
+    InputError : names the first rate that is too high, and the highest usable one.
     """
-    for name, (grows_with, limit) in LIMITS.items():
+    for name, (field, limit) in LIMITS.items():
         rate, default = float(getattr(config.optim, name)), float(OPTIONS[name].default)
-        factor = config.rate_factor(grows_with)
-        most = max(limit / factor, default)
-        if rate > most:
-            digit = 10.0 ** (math.floor(math.log10(most)) - 1)
-            usable = digit * math.floor(most / digit)  # rounded down: it must pass
+        factor = config.rate_factor(field)
+        highest = max(limit / factor, default)
+        if rate > highest:
+            digit = 10.0 ** (math.floor(math.log10(highest)) - 1)
+            usable = digit * math.floor(highest / digit)  # rounded down, so that it passes
             raise InputError(
                 f"{name} {rate:g}: each of {config.iterations} iterations would take steps of "
                 f"{rate * factor:.2g}, and training falls apart above {limit:g}: use at most {usable:.2g}"
