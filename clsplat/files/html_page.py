@@ -6,29 +6,11 @@ import html
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 
 from ..errors import InputError
 from .atomic import atomic_writer
-
-_STYLE = """
-:root { color-scheme: light dark; }
-body { margin: 2rem auto; max-width: 960px; padding: 0 1rem; line-height: 1.45;
-       font-family: system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: #262626; background: #fff; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin: 2.2rem 0 .4rem; }
-p { margin: .4rem 0; max-width: 46rem; }
-figure { margin: .8rem 0; padding: .5rem; background: #fff; border: 1px solid #e0e0e0; border-radius: 6px; }
-figure svg { display: block; width: 100%; height: auto; }
-.table { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; margin: .6rem 0; }
-th, td { padding: .25rem .5rem; text-align: right; border-bottom: 1px solid #d9d9d9; white-space: nowrap; }
-th { vertical-align: bottom; white-space: normal; } th.text, td.text { text-align: left; }
-.files { font-size: .85rem; } a { color: #0072b2; }
-@media (prefers-color-scheme: dark) {
-  body { color: #e6e6e6; background: #161616; } th, td { border-color: #404040; } a { color: #56b4e9; }
-  figure { border-color: #404040; }
-}
-"""
 
 
 @dataclass(frozen=True)
@@ -67,11 +49,12 @@ def write_page(path: Path, title: str, sections: Sequence[Section], style: str =
     OutputError : the page cannot be written.
     """
     body = "".join(_section(section, number) for number, section in enumerate(sections, 1))
+    style = package_text(__package__, "page.css") + style
     page = (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
-        f"<style>{_STYLE}{style}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n{body}"
-        + (f"<script>{script}</script>\n" if script else "")
+        f"<style>\n{style}</style>\n</head>\n<body>\n<h1>{escape(title)}</h1>\n{body}"
+        + (f"<script>\n{script}</script>\n" if script else "")
         + "</body>\n</html>\n"
     )
     with atomic_writer(path) as stream:
@@ -121,6 +104,11 @@ def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
     body = "".join(row("td", line) for line in lines)
     return f'<div class="table"><table>\n{row("th", head)}{body}</table></div>\n'
+
+
+def package_text(package: str, name: str) -> str:
+    """Return the text of a file that lies among a package's modules."""
+    return files(package).joinpath(name).read_text("utf-8")
 
 
 def escape(text: str) -> str:

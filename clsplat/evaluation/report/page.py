@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...files.html_page import Section, escape, write_page
+from ...files.html_page import Section, escape, package_text, write_page
 from .histogram import histogram, quantile
 from .images import LONGEST, ComparedImage, colour_stops, data_uri, full_scale, map_of, veiled
-from .script import SCRIPT, STYLE
 
 IMAGE_BYTES = 16_000_000  # of all images of a page, about; at least one view is shown
 _WORST = 8  # views with the lowest PSNR are shown first, others are spread evenly
@@ -116,7 +115,8 @@ def write_report(path: Path, models: Sequence[ModelReport], what: str, protocol:
         ),
         *(Section(model.label if many else "Model", lines=model.facts, head=("", "")) for model in models),
     ]
-    return write_page(path, title, sections, STYLE, SCRIPT)
+    style, script = (package_text(__package__, f"report.{kind}") for kind in ("css", "js"))
+    return write_page(path, title, sections, style, script)
 
 
 def _metrics(models: Sequence[ModelReport]) -> list[str]:
