@@ -29,7 +29,8 @@ from typing import Any
 import common
 import numpy as np
 
-from clsplat.device.device import Device, Schedule, open_device
+from clsplat.device.device import Device, open_device
+from clsplat.device.schedule import Schedule
 from clsplat.device.trace import recorded
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer

@@ -47,7 +47,8 @@ def main() -> None:
 
 def run(name: str, shape: str, args: argparse.Namespace) -> dict[str, Any]:
     """The line of a scene and shape."""
-    from clsplat.device.device import Schedule, open_device
+    from clsplat.device.device import open_device
+    from clsplat.device.schedule import Schedule
     from clsplat.profiling.bench import bench_trainer
     from clsplat.rendering.tuning import SCHEDULE_VARIABLE
     from clsplat.scenes.random_scene import synthetic_scene

@@ -63,7 +63,7 @@ def main() -> None:
     devices = [first] + [
         open_device(info.index)
         for info in list_devices()
-        if info.ailment is None and info.platform != "Oclgrind" and info.index != first.info.index
+        if info.fault is None and info.platform != "Oclgrind" and info.index != first.info.index
     ]
     done = {tuple(row[key] for key in KEY) for row in common.read(args.out)}
     for kind in args.kinds:

@@ -119,10 +119,10 @@ def measure(trainer: Any, iterations: int) -> dict[str, Any]:
     for iteration in range(2, iterations + 1):
         start = time.perf_counter()
         if iteration % LOOK_EVERY:
-            trainer.step()
+            frame = trainer.step()
         else:
             with recorded(trainer.device) as launches:
-                trainer.step()
+                frame = trainer.step()
             queue.finish()
             ms = {"step": 0.0, "strategy": 0.0, "device": 0.0}
             for stage, launch in by_stage(launches):
@@ -134,9 +134,9 @@ def measure(trainer: Any, iterations: int) -> dict[str, Any]:
             queue.finish()
         seconds += time.perf_counter() - start
         if iteration % LOOK_EVERY == 0:
-            n = trainer.splats.n
+            n = frame.n_splats
             keys = np.full(-(-n // lanes) * lanes, 0xFFFFFFFF, np.uint32)
-            to_host(trainer.device, trainer.pipeline.pool.get("depth_key_kept", 0), keys[:n])
+            to_host(trainer.device, frame.projected.depth_key, keys[:n])
             visible = keys != 0xFFFFFFFF
             splats_seen.append(visible.sum() / n)
             seen.append(visible.reshape(-1, lanes).any(axis=1).mean())

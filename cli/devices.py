@@ -88,8 +88,9 @@ def hints(platforms: set[str], has_gpu: bool, root: Path = Path("/")) -> list[st
 
 def _try(info: DeviceInfo) -> dict[str, str]:
     """Schedule and smoke test of one device; DeviceError where it does not work."""
-    from clsplat.device.device import SCHEDULES, open_device
+    from clsplat.device.device import open_device
     from clsplat.device.program import smoke_test
+    from clsplat.device.schedule import SCHEDULES
     from clsplat.rendering.tuning import schedule_for
 
     device = open_device(info.index)

@@ -109,7 +109,7 @@ def _known_failure(error: Exception) -> str | None:
     cl = sys.modules.get("pyopencl")  # without it no error can be OpenCL's
     if cl is None or not isinstance(error, cl.Error):
         return None
-    from clsplat.device.device import first_line, is_out_of_memory
+    from clsplat.device.opencl import first_line, is_out_of_memory
 
     if is_out_of_memory(error):
         return "device out of memory: lower --cap-max, use smaller images (-r 2, 4, 8), or another --device"

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 from cli_runner import HEIGHT, N_VIEWS, SHORT, WIDTH, clsplat
 
-from clsplat.device.device import SCHEDULES, Device, Schedule, default_schedule, list_devices, open_device
+from clsplat.device.device import Device, list_devices, open_device
 from clsplat.device.program import OPTIONS_VARIABLE
+from clsplat.device.schedule import SCHEDULES, Schedule, default_schedule
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.demo.scene import write_capture
 from clsplat.scenes.scene import Scene, load_scene
@@ -20,7 +21,7 @@ from clsplat.scenes.scene import Scene, load_scene
 MakeRenderer = Callable[..., Renderer]
 
 # A checker that claims to be a device is too slow for these tests and has one of its own (test_oclgrind.py).
-USABLE = [info for info in list_devices() if info.ailment is None and info.platform != "Oclgrind"]
+USABLE = [info for info in list_devices() if info.fault is None and info.platform != "Oclgrind"]
 DEFAULT = open_device().info.index if USABLE else ""
 USABLE.sort(key=lambda info: info.index != DEFAULT)
 
@@ -85,7 +86,7 @@ def make_renderer() -> MakeRenderer:
     ) -> Renderer:
         if precision == "float64" and not device.has_fp64:
             pytest.skip(f"{device.info} has no double precision")
-        schedule = schedule or default_schedule(device.cl_device)
+        schedule = schedule or default_schedule(device.info)
         key = (device, precision, schedule, tuple(sorted(thresholds.items())))
         if key not in kept:
             kept[key] = Renderer(device, precision, schedule=schedule, **thresholds)

@@ -36,21 +36,21 @@ def capacity_row(hazard: str, shape: str, device: Device, smoke: bool = False) -
     v_color = np.random.default_rng(1).normal(size=(side, side, 3))
     renderer = Renderer(device)
     got = gradients(renderer, splats, camera, v_color)
-    (line,) = renderer._pipelines.values()
-    assert line.frame is not None
-    n_isects = line.frame.n_isects
-    nbytes = n_isects * line.kernels.v_record * line.kernels.dtype.itemsize
+    assert renderer._last is not None
+    line, frame = renderer._last
+    kernels, n_isects, n_bands = line.kernels, frame.n_isects, len(frame.bands)
+    nbytes = n_isects * kernels.v_record * kernels.dtype.itemsize
     found: dict[str, Any] = {
         "isects": n_isects,
         "record_bytes": nbytes,
-        "bytes": n_isects * isect_bytes(line.kernels),
-        "bands": len(line.frame.bands),
+        "bytes": n_isects * isect_bytes(kernels),
+        "bands": n_bands,
         "message": "",
         "finite": all(bool(np.isfinite(grad).all()) for grad in got.values()),
     }
-    del line, renderer
+    del line, frame, renderer
     if band:
-        with mock.patch.object(pipeline, "most_isects", return_value=band):
+        with mock.patch.object(pipeline, "isect_limit", return_value=band):
             other = gradients(Renderer(device), splats, camera, v_color)
         error = max(float(np.abs(got[name] - other[name]).max()) for name in got)
         return found | {"gradient_error": error, "verdict": "survives" if error == 0 and found["finite"] else "fails"}

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.device.device import Device, Schedule
+from clsplat.device.device import Device
+from clsplat.device.schedule import Schedule
 from clsplat.errors import ClsplatError
 from clsplat.rendering.build import ALPHA_MAX, ALPHA_MIN, T_MIN
 from clsplat.rendering.renderer import Rendered, Renderer

@@ -1,96 +1,161 @@
-"""Device memory: a pool of named buffers that only grow, and copies between host and device."""
+"""Device memory: buffers that grow and are reused, and copies between host and device."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from .device import Device
+from .opencl import Buffer, Event
+
+_GROWTH = 1.5  # size of a buffer that had to grow, in sizes that were needed
+
+
+class GrowingBuffer:
+    """Device memory for rows of one type. It grows with what it has to hold and is reused otherwise.
+
+    Parameters
+    ----------
+    dtype : type of an element.
+    width : elements of a row.
+    """
+
+    def __init__(self, device: Device, dtype: DTypeLike, width: int = 1) -> None:
+        self.device, self.dtype, self.width = device, np.dtype(dtype), width
+        self.nbytes = 0
+        self._buffer: Buffer | None = None
+
+    def reserve(self, rows: int) -> Buffer:
+        """Return the buffer with room for `rows` rows. Growing it loses its contents.
+
+        Raises
+        ------
+        DeviceError : the device does not have the memory.
+        """
+        needed = self._bytes_of(rows)
+        if self._buffer is None or self.nbytes < needed:
+            size = needed
+            if self._buffer is not None:
+                size = min(int(_GROWTH * needed), max(self.device.info.max_alloc_bytes, needed))
+            self._buffer, self.nbytes = None, 0  # released first: memory may be short
+            self._buffer = self.device.alloc(size)
+            self.nbytes = size
+        return self._buffer
+
+    @property
+    def buffer(self) -> Buffer:
+        """The buffer as `reserve` last returned it. Raises RuntimeError if nothing was reserved."""
+        if self._buffer is None:
+            raise RuntimeError("the buffer has no memory yet: call `reserve` first")
+        return self._buffer
+
+    def zeros(self, rows: int) -> Buffer:
+        """Return the buffer with its first `rows` rows set to zero."""
+        buffer = self.reserve(rows)
+        fill_zero(self.device, buffer, self._bytes_of(rows))
+        return buffer
+
+    def read(self, rows: int) -> NDArray[Any]:
+        """Return the first rows: (rows,), or (rows, width) if a row has several elements."""
+        if self.nbytes < self._bytes_of(rows):
+            raise RuntimeError(f"a buffer of {self.nbytes} bytes does not hold {rows} rows")
+        shape = (rows,) if self.width == 1 else (rows, self.width)
+        return to_host(self.device, self.buffer, np.empty(shape, self.dtype))
+
+    def _bytes_of(self, rows: int) -> int:
+        return int(rows) * self.width * self.dtype.itemsize
 
 
 class Pool:
-    """Buffers by name. A larger request replaces the buffer, half as large again; contents are then lost."""
+    """The growing buffers of one owner, and their total size."""
 
     def __init__(self, device: Device) -> None:
         self.device = device
-        self._buffers: dict[str, Any] = {}
-        self._bytes: dict[str, int] = {}
+        self._buffers: list[GrowingBuffer] = []
 
-    def get(self, name: str, nbytes: int) -> Any:
-        """Buffer of at least `nbytes`; raises DeviceError when the device has no room for it."""
-        if self._bytes.get(name, -1) < nbytes:
-            first = name not in self._bytes
-            self._buffers.pop(name, None)
-            most = max(self.device.info.max_alloc_bytes, int(nbytes))
-            size = int(nbytes) if first else min(int(1.5 * nbytes), most)
-            self._bytes[name] = 0
-            self._buffers[name] = self.device.alloc(size)
-            self._bytes[name] = size
-        return self._buffers[name]
-
-    def zeroed(self, name: str, nbytes: int) -> Any:
-        """As `get`, set to zero up to `nbytes`."""
-        buffer = self.get(name, nbytes)
-        fill_zero(self.device, buffer, nbytes)
+    def buffer(self, dtype: DTypeLike, width: int = 1) -> GrowingBuffer:
+        """Return a new, empty buffer for rows of `width` elements."""
+        buffer = GrowingBuffer(self.device, dtype, width)
+        self._buffers.append(buffer)
         return buffer
 
     @property
     def nbytes(self) -> int:
-        """Bytes held."""
-        return sum(self._bytes.values())
+        """Bytes of device memory held."""
+        return sum(buffer.nbytes for buffer in self._buffers)
 
 
-def fill_zero(device: Device, buffer: Any, nbytes: int) -> None:
-    """Zero the first `nbytes` (a multiple of 4) of a buffer."""
-    import pyopencl as cl
+class UploadQueue:
+    """Uploads that run beside the commands of the device's queue."""
 
+    def __init__(self, device: Device) -> None:
+        import pyopencl as cl
+
+        self._device = device
+        self._queue = cl.CommandQueue(device.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+
+    def send(self, buffer: Buffer, array: NDArray[Any], after: Event | None = None) -> Event:
+        """Start to copy an array into a buffer, once the event `after` is complete. Keep the returned event."""
+        event = _enqueue_upload(self._device, self._queue, buffer, array, after)
+        self._queue.flush()
+        return event
+
+    def wait_on_device(self, event: Event) -> None:
+        """Let later commands of the device's queue wait for an upload; the host does not wait."""
+        cl: Any = _pyopencl()
+        cl.enqueue_barrier(self._device.queue, wait_for=[event])
+
+
+def fill_zero(device: Device, buffer: Buffer, nbytes: int) -> None:
+    """Set the first `nbytes` bytes (a multiple of 4) of a buffer to zero."""
     if nbytes:
-        event = cl.enqueue_fill_buffer(device.queue, buffer, np.zeros(1, np.uint32), 0, nbytes)
+        event = _pyopencl().enqueue_fill_buffer(device.queue, buffer, np.zeros(1, np.uint32), 0, nbytes)
         device.observe("fill", (nbytes,), event)
 
 
-def copy(device: Device, source: Any, target: Any, nbytes: int) -> None:
-    """Copy the first `nbytes` of a buffer to another."""
-    import pyopencl as cl
-
+def copy(device: Device, source: Buffer, target: Buffer, nbytes: int) -> None:
+    """Copy the first `nbytes` bytes of a buffer to another."""
     if nbytes:
-        device.observe("copy", (nbytes,), cl.enqueue_copy(device.queue, target, source, byte_count=nbytes))
+        event = _pyopencl().enqueue_copy(device.queue, target, source, byte_count=nbytes)
+        device.observe("copy", (nbytes,), event)
 
 
-def send_to_device(device: Device, buffer: Any, array: NDArray[Any], queue: Any = None, after: Any = None) -> Any:
-    """Copy an array into a buffer without waiting, on the device's or another queue, after an event if one is given.
+def send_to_device(device: Device, buffer: Buffer, array: NDArray[Any]) -> Event:
+    """Start to copy an array into a buffer, without waiting.
 
-    Keep what is returned until the copy is done: letting go waits.
+    Keep the returned event until the copy is complete: its destructor waits.
     """
-    import pyopencl as cl
+    return _enqueue_upload(device, device.queue, buffer, array, None)
 
-    event = cl.enqueue_copy(
-        queue or device.queue,
-        buffer,
-        np.ascontiguousarray(array),
-        is_blocking=False,
-        wait_for=None if after is None else [after],
-    )
+
+def to_device(device: Device, buffer: Buffer, array: NDArray[Any], offset: int = 0) -> None:
+    """Copy an array into a buffer at `offset` bytes, and wait."""
+    if array.size:
+        source = np.ascontiguousarray(array)
+        event = _pyopencl().enqueue_copy(device.queue, buffer, source, dst_offset=offset)
+        device.observe("upload", (array.nbytes,), event)
+
+
+def to_host(device: Device, buffer: Buffer, array: NDArray[Any], offset: int = 0) -> NDArray[Any]:
+    """Fill an array from a buffer, starting at `offset` bytes, and return the array."""
+    if array.size:
+        event = _pyopencl().enqueue_copy(device.queue, array, buffer, src_offset=offset)
+        device.observe("download", (array.nbytes,), event)
+    return array
+
+
+def _enqueue_upload(device: Device, queue: Any, buffer: Buffer, array: NDArray[Any], after: Event | None) -> Event:
+    wait_for = None if after is None else [after]
+    source = np.ascontiguousarray(array)
+    event: Event = _pyopencl().enqueue_copy(queue, buffer, source, is_blocking=False, wait_for=wait_for)
     device.observe("upload", (array.nbytes,), event)
     return event
 
 
-def to_device(device: Device, buffer: Any, array: NDArray[Any], offset: int = 0) -> None:
-    """Copy an array into a buffer, at `offset` bytes; returns when it is there."""
-    import pyopencl as cl
+def _pyopencl() -> Any:
+    """The library, without its own types: `Buffer` and `Event` stand for them here."""
+    import pyopencl
 
-    if array.size:
-        event = cl.enqueue_copy(device.queue, buffer, np.ascontiguousarray(array), dst_offset=offset)
-        device.observe("upload", (array.nbytes,), event)
-
-
-def to_host(device: Device, buffer: Any, array: NDArray[Any], offset: int = 0) -> NDArray[Any]:
-    """Fill `array` from a buffer, from `offset` bytes on; returns it."""
-    import pyopencl as cl
-
-    if array.size:
-        event = cl.enqueue_copy(device.queue, array, buffer, src_offset=offset)
-        device.observe("download", (array.nbytes,), event)
-    return array
+    return pyopencl

@@ -1,8 +1,8 @@
 """OpenCL programs from the package's sources, and kernels whose arguments are bound by name.
 
-Sources are joined here, with `#line`, and never `#include` one another: so every cache sees the whole text,
-and errors name the file. Signatures are read from that text (signatures.py). Between processes a program is kept by its
-driver or by binaries.py, never by pyopencl's cache.
+Sources are joined here, with `#line`, and never `#include` one another. So every cache sees the whole text, and errors
+name the file. Signatures are read from that text (kernel_args.py). Between processes a program is kept by its driver or
+by program_cache.py, never by pyopencl's cache.
 """
 
 from __future__ import annotations
@@ -16,28 +16,33 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import DeviceError
-from .device import BROKEN_POCL, LESS_MEMORY, Device, first_line, is_out_of_memory
+from .device import BROKEN_POCL, LESS_MEMORY, Device
 from .kernel_args import Parameter, parse_signatures
 from .kernel_args import Real as Real  # of this module's interface
+from .memory import to_device, to_host
+from .opencl import Event, KernelArgument, elapsed_ms, first_line, is_out_of_memory
 from .program_cache import binary_path, load_binary, store_binary
+
+if TYPE_CHECKING:
+    import pyopencl
 
 Define = int | float | str
 
 OPTIONS = ("-cl-std=CL1.2", "-cl-mad-enable")  # never fast-relaxed-math: infinities and NaN have meaning
-OPTIONS_VARIABLE = "CLSPLAT_BUILD_OPTIONS"  # more, from outside: -Werror in tests, -O0 under Oclgrind
+OPTIONS_VARIABLE = "CLSPLAT_BUILD_OPTIONS"  # further options from the environment: -Werror in tests
 
-SMOKE_TOLERANCE = 1e-5  # relative: OpenCL allows exp 3 ulp and erfc 16 ulp of float32 (6e-8 each)
+SMOKE_TOLERANCE = 1e-5  # relative; OpenCL allows an error of 16 ulp in erfc, 6e-8 each
 
-GROUP_ITEMS = 64
+GROUP_ITEMS = 64  # of kernels with one work-item per splat or isect
 
 
 def source(*names: str) -> str:
-    """Text of source files ("render/rasterize.cl", "shape/gaussian.clh") joined in order, each after its `#line`."""
+    """Return the text of source files such as "render/rasterize.cl", joined in order, each after its `#line`."""
     return "".join(f'#line 1 "{name}"\n{_read(name)}\n' for name in names)
 
 
@@ -47,13 +52,13 @@ def build(
     defines: Mapping[str, Define] | None = None,
     real: Real = "float",
 ) -> Program:
-    """Program from source files, built once per device, files, defines and `real`.
+    """Return the program of source files; it is built once for each device, files, defines and `real`.
 
     Parameters
     ----------
-    files : names as for `source`, lower ones first.
+    files : names as for `source`; a file stands after those that it uses.
     defines : become `#define` lines before the text; floats become literals of type `real`.
-    real : arithmetic; REAL_DOUBLE is defined as 0 or 1.
+    real : type of the kernels' real numbers; REAL_DOUBLE is defined as 0 or 1.
 
     Raises
     ------
@@ -63,12 +68,11 @@ def build(
     key = (files, tuple(sorted(defines.items())), real, os.environ.get(OPTIONS_VARIABLE, ""))
     if key not in device.programs:
         device.programs[key] = build_text(device, source(*files), defines, real)
-    program: Program = device.programs[key]
-    return program
+    return device.programs[key]
 
 
 def build_text(device: Device, text: str, defines: Mapping[str, Define] | None = None, real: Real = "float") -> Program:
-    """Program from OpenCL C text, not kept in `device`; otherwise as `build`."""
+    """Return the program of OpenCL C text, without caching it in `device`; otherwise like `build`."""
     import pyopencl as cl
 
     if real == "double" and not device.has_fp64:
@@ -78,7 +82,7 @@ def build_text(device: Device, text: str, defines: Mapping[str, Define] | None =
     options = [*OPTIONS, *os.environ.get(OPTIONS_VARIABLE, "").split()]
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", cl.CompilerWarning)  # some compilers report every success
+            warnings.simplefilter("ignore", cl.CompilerWarning)  # some compilers warn at every success
             built = _compiled(device, "\n".join([*lines, text]), options)
     except cl.Error as error:
         raise _build_error(device, error, defines or {}, real) from None
@@ -86,17 +90,17 @@ def build_text(device: Device, text: str, defines: Mapping[str, Define] | None =
 
 
 def lane_group(device: Device) -> int:
-    """Group size for kernels whose work-items are vectors of splats.
+    """Return the group size for kernels whose work-items are vectors of splats.
 
-    PoCL stacks up the private arrays of all work-items of a group: groups of one where lanes do the work.
+    A CPU gets groups of one: its lanes do the work, and PoCL adds up the private arrays of all items of a group.
     """
     return 1 if device.info.type == "CPU" else GROUP_ITEMS
 
 
 class Program:
-    """A built program; `program["name"]` or `program.name` is a Kernel, made once."""
+    """A built program. `program["name"]` and `program.name` return a Kernel, the same one each time."""
 
-    def __init__(self, device: Device, built: Any, signatures: dict[str, tuple[Parameter, ...]]) -> None:
+    def __init__(self, device: Device, built: pyopencl.Program, signatures: dict[str, tuple[Parameter, ...]]) -> None:
         self.device = device
         self.signatures = signatures
         self._built = built
@@ -119,13 +123,13 @@ class Program:
 
 
 class Kernel:
-    """One kernel, called as `kernel(global_size, local_size, name=value, ...)`; returns the pyopencl event.
+    """A kernel, called as `kernel(global_size, local_size, name=value, ...)`.
 
-    Values: a pyopencl buffer for `global` pointers, a number for scalars, bytes for `local` pointers.
-    Not thread-safe, as OpenCL's kernel objects are not.
+    Values are buffers for `global` pointers, numbers for scalars and sizes in bytes for `local` pointers.
+    Kernels are not thread-safe, because OpenCL's kernel objects are not.
     """
 
-    def __init__(self, device: Device, built: Any, name: str, parameters: tuple[Parameter, ...]) -> None:
+    def __init__(self, device: Device, built: pyopencl.Program, name: str, parameters: tuple[Parameter, ...]) -> None:
         import pyopencl as cl
 
         self.name = name
@@ -138,13 +142,17 @@ class Kernel:
         self._names = tuple(p.name for p in parameters)
         self._local = tuple(i for i, p in enumerate(parameters) if p.kind == "local")
         self._kernel.set_scalar_arg_dtypes([p.dtype for p in parameters])
-        self._local_memory: Callable[[int], Any] = cl.LocalMemory
-        self._enqueue = cl.enqueue_nd_range_kernel
-        self._marker = cl.enqueue_marker
+        self._local_memory: Callable[[Any], Any] = cl.LocalMemory
+        self._enqueue: Callable[..., Any] = cl.enqueue_nd_range_kernel
+        self._marker: Callable[..., Any] = cl.enqueue_marker
         self._cl_error: type[Exception] = cl.Error
 
-    def __call__(self, global_size: tuple[int, ...], local_size: tuple[int, ...] | None, /, **args: Any) -> Any:
-        """Enqueue on the device's queue. An empty global size runs nothing (OpenCL 1.2 would refuse it).
+    def __call__(
+        self, global_size: tuple[int, ...], local_size: tuple[int, ...] | None, /, **args: KernelArgument
+    ) -> Event:
+        """Enqueue the kernel on the device's queue and return its event.
+
+        With an empty global size nothing runs; OpenCL 1.2 itself would refuse it.
 
         Raises
         ------
@@ -152,7 +160,7 @@ class Kernel:
         DeviceError : the device refused the launch.
         """
         try:
-            values = [args[name] for name in self._names]
+            values: list[Any] = [args[name] for name in self._names]
         except KeyError:
             values = []
         if len(values) != len(self._names) or len(args) != len(values):
@@ -163,39 +171,39 @@ class Kernel:
             return self._marker(self._queue)
         try:
             self._kernel.set_args(*values)
-        except Exception as error:  # pyopencl's and struct's own kinds, some of them bare RuntimeErrors
+        except Exception as error:  # of pyopencl and struct; some are bare RuntimeErrors
             raise TypeError(f"kernel {self.name}: {first_line(error)}, parameters {self._names}") from error
         try:
             event = self._enqueue(self._queue, self._kernel, global_size, local_size)
         except self._cl_error as error:
-            mend = f": {LESS_MEMORY}" if is_out_of_memory(error) else f", sizes {global_size} {local_size}"
-            raise DeviceError(f"kernel {self.name} on {self._device.info}: {first_line(error)}{mend}") from error
+            remedy = f": {LESS_MEMORY}" if is_out_of_memory(error) else f", sizes {global_size} {local_size}"
+            raise DeviceError(f"kernel {self.name} on {self._device.info}: {first_line(error)}{remedy}") from error
         self._device.observe(self.name, global_size, event)
         return event
 
-    def over(self, n: int, group: int = GROUP_ITEMS, /, **args: Any) -> Any:
-        """Enqueue at least `n` work-items in groups of `group`; the kernel must ignore those from n on.
+    def over(self, n: int, group: int = GROUP_ITEMS, /, **args: KernelArgument) -> Event:
+        """Enqueue at least `n` work-items in whole groups; the kernel must ignore the items from n on.
 
-        A fixed group size matters: PoCL compiles a kernel anew for each size that it picks itself.
+        The group size is fixed, because PoCL compiles a kernel again for each size that it chooses itself.
         """
         return self(((n + group - 1) // group * group,), (group,), **args)
 
-    def _mismatch(self, given: set[str]) -> str:
-        missing = [name for name in self._names if name not in given]
-        unknown = sorted(given - set(self._names))
+    def _mismatch(self, names: set[str]) -> str:
+        missing = [name for name in self._names if name not in names]
+        unknown = sorted(names - set(self._names))
         return f"kernel {self.name}: missing arguments {missing}, unknown arguments {unknown}"
 
 
 def smoke_test(device: Device) -> tuple[float, float]:
-    """Build and run a tiny kernel and check its numbers.
+    """Build and run a small kernel and check its numbers.
 
     Returns
     -------
-    build_ms, run_ms : wall time of the build (drivers may have it cached), device time of the kernel.
+    build_ms, run_ms : wall time of the build (the driver may have cached it), and device time of the kernel.
 
     Raises
     ------
-    DeviceError : it does not build or run, or the numbers are wrong.
+    DeviceError : the kernel does not build or run, or its numbers are wrong.
     """
     import pyopencl as cl
 
@@ -203,15 +211,14 @@ def smoke_test(device: Device) -> tuple[float, float]:
     kernel = build(device, ("measure/smoke.cl",))["smoke"]
     build_ms = 1e3 * (time.perf_counter() - start)
     x = np.linspace(-3, 3, 1000, dtype=np.float32)
-    given, result = device.alloc(x.nbytes), device.alloc(x.nbytes)
-    computed = np.empty_like(x)
+    source_buffer, result = device.alloc(x.nbytes), device.alloc(x.nbytes)
     try:
-        cl.enqueue_copy(device.queue, given, x)
-        event = kernel((1024,), None, x=given, y=result, n=x.size)
-        cl.enqueue_copy(device.queue, computed, result)
-        run_ms = 1e-6 * (event.profile.end - event.profile.start)
+        to_device(device, source_buffer, x)
+        event = kernel((1024,), None, x=source_buffer, y=result, n=x.size)
+        computed = to_host(device, result, np.empty_like(x))
+        run_ms = elapsed_ms(event)
     except cl.Error as error:
-        raise DeviceError(f"device {device.info} runs no kernel: {first_line(error)}: update its driver") from None
+        raise DeviceError(f"device {device.info} cannot run kernels: {first_line(error)}: update its driver") from None
     expected = np.array([math.exp(-v * v) + math.erfc(v) for v in x.tolist()])
     worst = float(np.max(np.abs(computed - expected) / expected))
     if not worst < SMOKE_TOLERANCE:
@@ -219,16 +226,16 @@ def smoke_test(device: Device) -> tuple[float, float]:
     return build_ms, run_ms
 
 
-def _compiled(device: Device, text: str, options: list[str]) -> Any:
-    """A built pyopencl program, from its kept binary where there is a good one; cl.Error when it does not build."""
+def _compiled(device: Device, text: str, options: list[str]) -> pyopencl.Program:
+    """Return a built pyopencl program, from a cached binary if there is a good one; cl.Error if it does not build."""
     import pyopencl as cl
 
     path = binary_path(device.info, text, [*options, os.environ.get("PYOPENCL_BUILD_OPTIONS", "")])
     binary = None if path is None else load_binary(path)
     if binary is not None:
-        with suppress(cl.Error):  # a binary that the driver does not take after all
+        with suppress(cl.Error):  # the driver may refuse the binary
             return cl.Program(device.context, [device.cl_device], [binary]).build(options)
-    # False, which its annotation lacks, turns pyopencl's cache off.
+    # False turns pyopencl's cache off; its annotation does not list this value.
     built = cl.Program(device.context, text).build(options, cache_dir=False)  # type: ignore[arg-type]
     if path is not None:
         store_binary(path, built.get_info(cl.program_info.BINARIES)[0])
@@ -244,7 +251,7 @@ def _read(name: str) -> str:
 
 
 def _literal(name: str, value: Define, real: Real) -> str:
-    """A define's value as OpenCL C text."""
+    """Return the value of a define as OpenCL C text."""
     if isinstance(value, str):
         return value
     if isinstance(value, (int, np.integer)):
@@ -261,5 +268,5 @@ def _build_error(device: Device, error: Exception, defines: Mapping[str, Define]
         return DeviceError(f"device {device.info}: {BROKEN_POCL}")
     lines = [line.strip() for line in log.splitlines()]
     reason = next((line for line in lines if re.search(r"\berror\b\s*:", line, re.I)), first_line(error))
-    given = " ".join(f"{name}={value}" for name, value in defines.items())
-    return DeviceError(f"kernels do not build on {device.info}: {reason} (real={real} {given})")
+    values = " ".join(f"{name}={value}" for name, value in defines.items())
+    return DeviceError(f"kernels do not build on {device.info}: {reason} (real={real} {values})")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 from .device import Device
+from .opencl import Event, elapsed_ms
 
 TRANSFERS = ("upload", "download", "fill", "copy")  # the commands that are no kernels
 
@@ -18,12 +18,12 @@ class Launch:
 
     name: str
     size: tuple[int, ...]
-    event: Any
+    event: Event
 
     @property
     def ms(self) -> float:
         """Time on the device [ms]; the command must have ended."""
-        return 1e-6 * float(self.event.profile.end - self.event.profile.start)
+        return elapsed_ms(self.event)
 
 
 @contextmanager
@@ -32,7 +32,7 @@ def recorded(device: Device) -> Iterator[list[Launch]]:
     launches: list[Launch] = []
     outer = device.observer
 
-    def note(name: str, size: tuple[int, ...], event: Any) -> None:
+    def note(name: str, size: tuple[int, ...], event: Event) -> None:
         launches.append(Launch(name, size, event))
         if outer is not None:
             outer(name, size, event)

@@ -15,6 +15,7 @@ from typing import Any
 from ..device.device import Device
 from ..device.trace import recorded
 from ..errors import InputError
+from ..rendering.frame import Frame
 from ..rendering.overdraw import count_pairs
 from ..rendering.pipeline import Pipeline
 from ..scenes.scene import Scene
@@ -135,8 +136,8 @@ def measure_render(trainer: Trainer, limits: Limits, iterations: int) -> Report:
     """Time `iterations` images of the run's splats, left on the device."""
     cameras = itertools.cycle(view.camera for view in trainer.scene.train)
 
-    def render() -> None:
-        trainer.pipeline.forward(trainer.splats, next(cameras), trainer.config.background)
+    def render() -> Frame:
+        return trainer.pipeline.forward(trainer.splats, next(cameras), trainer.config.background)
 
     return _measure("render", trainer, render, limits, iterations)
 
@@ -150,7 +151,7 @@ class _Iteration:
     sizes: Sizes
 
 
-def _measure(task: str, trainer: Trainer, run: Callable[[], None], limits: Limits, iterations: int) -> Report:
+def _measure(task: str, trainer: Trainer, run: Callable[[], Frame], limits: Limits, iterations: int) -> Report:
     if not 1 <= iterations <= MOST_ITERATIONS:
         raise InputError(f"{iterations} iterations: must be 1 to {MOST_ITERATIONS}")
     done = [_timed(trainer.pipeline, run) for _ in range(WARM_UP + iterations)][WARM_UP:]
@@ -170,23 +171,21 @@ def _measure(task: str, trainer: Trainer, run: Callable[[], None], limits: Limit
     return Report(task, trainer.config.shape, largest.width, largest.height, iterations, sizes, wall_ms, tuple(stages))
 
 
-def _timed(pipeline: Pipeline, run: Callable[[], None]) -> _Iteration:
+def _timed(pipeline: Pipeline, run: Callable[[], Frame]) -> _Iteration:
     queue = pipeline.device.queue
     queue.finish()
     with recorded(pipeline.device) as launches:
         start = time.perf_counter()
-        run()
+        frame = run()
         queue.finish()
         wall_ms = 1e3 * (time.perf_counter() - start)
     stage_ms: dict[str, float] = {}
     for stage, launch in by_stage(launches):
         stage_ms[stage] = stage_ms.get(stage, 0.0) + launch.ms
     stage_ms[HOST] = max(wall_ms - sum(stage_ms.values()), 0.0)
-    frame = pipeline.frame
-    assert frame is not None
     layout = frame.layout
     sizes = Sizes(
-        frame.splats.n, frame.n_isects, layout.width * layout.height, count_pairs(pipeline, frame), frame.sh_degree
+        frame.n_splats, frame.n_isects, layout.width * layout.height, count_pairs(pipeline, frame), frame.sh_degree
     )
     return _Iteration(wall_ms, stage_ms, sizes)
 

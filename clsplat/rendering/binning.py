@@ -1,74 +1,75 @@
-"""From projected splats to the isects of each tile, front to back: in one band of tiles or in several.
+"""From projected splats to the isects of each tile, front to back, for one band of tiles at a time.
 
-Reads the pool's "depth_key_kept" [n] and "tile_rect" [n]. Both binners give the same numbers: CPUs cut the work into a
-few chunks and count by tile; the others take a work-item a splat, and sort.
+Two binners give the same numbers. The one for CPUs cuts the work into a few chunks and counts by tile. The other one
+takes a work-item for each splat, and sorts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..device.device import Device
-from ..device.memory import Pool, copy, to_host
+from ..device.memory import Pool, copy
+from ..device.opencl import Buffer
 from ..device.program import build
 from ..errors import DeviceError
-from .radix_sort import Sorter
+from .frame import Band, ProjectedSplats, TileLists
+from .radix_sort import Sorter, SortPairs
 
-MAX_ISECTS = 2**31 - 1  # of a band: ids are 32 bits
+MAX_ISECTS = 2**31 - 1  # of a band: ids have 32 bits
 BUCKET_BITS = 11  # of a depth key, that choose its bucket
-_SPLATS_PER_CHUNK = 2048  # at least, so that counters are few beside splats
-_CHUNKS_PER_UNIT = 4  # at most: near splats have more tiles, so equal chunks take unequal time
-
-
-@dataclass(frozen=True)
-class Band:
-    """Tiles `first` to `past` (past the end) in row-major order, and their isects."""
-
-    first: int
-    past: int
-    n_isects: int
+_MIN_CHUNK = 2048  # splats of a chunk, so that there are few counters for each splat
+_CHUNKS_PER_UNIT = 4  # at most; near splats have more tiles, so equal chunks take unequal time
 
 
 class Binner(Protocol):
-    """`order`, then `begin`, then the others, `list_isects` for bands that have no tile in common."""
+    """Lists the isects of an image.
 
-    def order(self, n: int) -> None:
-        """Sort the n splats by depth, equal depths by index."""
+    Call `order` for a camera, then `begin` for an image, then the other two. `list_isects` takes bands that have no
+    tile in common.
+    """
 
-    def begin(self, n: int, tiles_x: int, tiles_y: int) -> None:
-        """Start on an image of so many tiles."""
+    def order(self, splats: ProjectedSplats) -> None:
+        """Sort splats by depth; splats of equal depth by index."""
 
-    def count(self, first: int, past: int) -> int:
-        """Isects of the tiles from `first` to `past`; waits for the device."""
+    def begin(self, tiles_x: int, tiles_y: int) -> None:
+        """Start an image of this number of tiles."""
 
-    def list_isects(self, band: Band) -> Any:
-        """Lists [n_isects] of isect ids by tile, and the pool's "tile_ranges" of the band's tiles (only those),
-        "isect_splat" and "splat_isects" to go with them.
-        """
+    def count(self, first: int, end: int) -> int:
+        """Return the number of isects of the tiles from `first` to `end` (exclusive); waits for the device."""
+
+    def list_isects(self, band: Band) -> TileLists:
+        """List the isects of a band. The next call overwrites the lists."""
 
 
 def make_binner(device: Device, pool: Pool) -> Binner:
-    """The one for this kind of device."""
-    return ChunkBinner(device, pool) if device.info.type == "CPU" else GroupBinner(device, pool)
+    """Return the binner for this kind of device."""
+    return ChunkBinner(pool) if device.info.type == "CPU" else GroupBinner(pool)
 
 
-def cut(count: Callable[[int, int], int], tiles_x: int, tiles_y: int, limit: int) -> tuple[Band, ...]:
-    """Bands of at most `limit` isects, in order: all tiles, or halves of whole rows, or halves of a row.
+def cut_bands(count: Callable[[int, int], int], tiles_x: int, tiles_y: int, limit: int) -> tuple[Band, ...]:
+    """Cut an image into bands of at most `limit` isects, in order.
+
+    Tiles are halved until they fit: first by whole rows, then within a row.
+
+    Parameters
+    ----------
+    count : returns the number of isects of the tiles from its first argument to its second (exclusive).
 
     Raises
     ------
-    DeviceError : one tile alone has more.
+    DeviceError : one tile alone has more isects.
     """
 
-    def halved(first: int, past: int) -> tuple[Band, ...]:
-        n_isects, n_tiles = count(first, past), past - first
+    def halved(first: int, end: int) -> tuple[Band, ...]:
+        n_isects, n_tiles = count(first, end), end - first
         if n_isects <= limit:
-            return (Band(first, past, n_isects),)
+            return (Band(first, end, n_isects),)
         if n_tiles == 1:
             raise DeviceError(
                 f"{n_isects} splats over one tile, and buffers for {limit} at most: "
@@ -76,175 +77,218 @@ def cut(count: Callable[[int, int], int], tiles_x: int, tiles_y: int, limit: int
             )
         unit = tiles_x if n_tiles > tiles_x else 1
         middle = first + n_tiles // unit // 2 * unit
-        return halved(first, middle) + halved(middle, past)
+        return halved(first, middle) + halved(middle, end)
 
     return halved(0, tiles_x * tiles_y)
 
 
+@dataclass(frozen=True)
+class _Image:
+    """Sizes of the image that a binner works on; `chunks` of splats with `cells` counters each."""
+
+    tiles_x: int
+    n_tiles: int
+    chunks: int = 0
+    cells: int = 0
+
+
 class ChunkBinner:
-    """For CPUs (cl/render/order.cl, and the second half of cl/render/bin.cl)."""
+    """The binner for CPUs (cl/render/order.cl, and the second half of cl/render/bin.cl)."""
 
-    def __init__(self, device: Device, pool: Pool) -> None:
-        self.device, self.pool, self.units = device, pool, max(device.info.compute_units, 1)
-        self.program = build(device, ("render/order.cl", "render/bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
-        self._image: tuple[int, int, int, int] = (0, 0, 0, 0)  # chunks, cells of a chunk, tiles a row, tiles
-        self._totals: NDArray[np.int64] | None = None  # isects before each tile, once they were asked for
+    def __init__(self, pool: Pool) -> None:
+        self.units = max(pool.device.info.compute_units, 1)
+        self.program = build(pool.device, ("render/order.cl", "render/bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
+        # Order by depth.
+        self._span, self._bucket_counts = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 1 << BUCKET_BITS)
+        self._bucket_starts, self._n_visible = pool.buffer(np.uint32), pool.buffer(np.uint32)
+        self._pairs, self._spare_pairs = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 2)
+        self.depth_order = pool.buffer(np.uint32)
+        # Counts by tile.
+        self._ranked_rect, self._tile_counts = pool.buffer(np.uint16, 4), pool.buffer(np.uint32)
+        self._tile_totals = pool.buffer(np.uint32)
+        # Lists.
+        self._ranges, self._splat_isects = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 2)
+        self._isects, self._isect_splat = pool.buffer(np.uint32), pool.buffer(np.uint32)
+        self._splats: ProjectedSplats
+        self._image: _Image
+        self._isects_before: NDArray[np.int64] | None = None  # each tile of the image
 
-    def order(self, n: int) -> None:
-        pool, program = self.pool, self.program
-        keys, buckets = pool.get("depth_key_kept", 0), 1 << BUCKET_BITS
-        chunks = min(-(-n // _SPLATS_PER_CHUNK), self.units)
+    def order(self, splats: ProjectedSplats) -> None:
+        program, n = self.program, splats.n
+        self._splats = splats
+        chunks = min(-(-n // _MIN_CHUNK), self.units)
         split = {"n_splats": n, "run": -(-n // chunks)}
-        span, counts = pool.get("depth_span", 8 * chunks), pool.get("bucket_counts", 4 * chunks * buckets)
-        starts, pairs = pool.get("bucket_starts", 4 * (buckets + 1)), pool.get("depth_pairs", 8 * n)
+        span, counts = self._span.reserve(chunks), self._bucket_counts.reserve(chunks)
+        starts, pairs = self._bucket_starts.reserve((1 << BUCKET_BITS) + 1), self._pairs.reserve(splats.capacity)
         program.depth_span.over(
-            chunks, 1, depth_key=keys, span=span, splat_isects=pool.get("splat_isects", 8 * n), **split
+            chunks,
+            1,
+            depth_key=splats.depth_key,
+            span=span,
+            splat_isects=self._splat_isects.reserve(splats.capacity),
+            **split,
         )
-        program.depth_histogram.over(chunks, 1, depth_key=keys, span=span, counts=counts, n_chunks=chunks, **split)
+        program.depth_histogram.over(
+            chunks, 1, depth_key=splats.depth_key, span=span, counts=counts, n_chunks=chunks, **split
+        )
         program.depth_scatter.over(
             chunks,
             1,
-            depth_key=keys,
+            depth_key=splats.depth_key,
             span=span,
             counts=counts,
             pairs=pairs,
             bucket_starts=starts,
-            n_visible=pool.get("n_visible", 4),
+            n_visible=self._n_visible.reserve(1),
             n_chunks=chunks,
             **split,
         )
         program.depth_buckets.over(
-            min(-(-n // _SPLATS_PER_CHUNK), _CHUNKS_PER_UNIT * self.units),
+            min(-(-n // _MIN_CHUNK), _CHUNKS_PER_UNIT * self.units),
             1,
             bucket_starts=starts,
             span=span,
             pairs=pairs,
-            spare=pool.get("depth_spare", 8 * n),
-            depth_order=pool.get("depth_order", 4 * n),
+            spare=self._spare_pairs.reserve(splats.capacity),
+            depth_order=self.depth_order.reserve(splats.capacity),
             n_chunks=chunks,
         )
 
-    def begin(self, n: int, tiles_x: int, tiles_y: int) -> None:
-        pool, tiles, cells = self.pool, tiles_x * tiles_y, (tiles_x + 1) * (tiles_y + 1)
-        # Splats enough for the chunk's counters, a chunk for each unit in any case.
-        most = max(min(_CHUNKS_PER_UNIT * self.units, 4 * n // cells), self.units)
-        chunks = min(most, -(-n // _SPLATS_PER_CHUNK))
-        counts = pool.get("tile_counts", 4 * chunks * cells)
+    def begin(self, tiles_x: int, tiles_y: int) -> None:
+        splats, n_tiles, cells = self._splats, tiles_x * tiles_y, (tiles_x + 1) * (tiles_y + 1)
+        # A chunk has at least a quarter as many splats as counters, but each unit gets a chunk in any case.
+        chunks = max(min(_CHUNKS_PER_UNIT * self.units, 4 * splats.n // cells), self.units)
+        chunks = min(chunks, -(-splats.n // _MIN_CHUNK))
+        counts = self._tile_counts.reserve(chunks * cells)
         self.program.count_tiles.over(
             chunks,
             1,
-            order=pool.get("depth_order", 0),
-            n_visible=pool.get("n_visible", 0),
-            tile_rect=pool.get("tile_rect", 0),
-            ranked_rect=pool.get("ranked_rect", 8 * n),
+            order=self.depth_order.buffer,
+            n_visible=self._n_visible.buffer,
+            tile_rect=splats.tile_rect,
+            ranked_rect=self._ranked_rect.reserve(splats.capacity),
             counts=counts,
             tiles_x=tiles_x,
             tiles_y=tiles_y,
         )
-        parts = min(self.units, -(-chunks * tiles // _SPLATS_PER_CHUNK))
+        parts = min(self.units, -(-chunks * n_tiles // _MIN_CHUNK))
         self.program.total_tiles.over(
             parts,
             1,
             counts=counts,
-            totals=pool.get("tile_totals", 4 * tiles),
+            totals=self._tile_totals.reserve(n_tiles),
             n_chunks=chunks,
             cells=cells,
-            n_tiles=tiles,
-            run=-(-tiles // parts),
+            n_tiles=n_tiles,
+            run=-(-n_tiles // parts),
         )
-        self._image, self._totals = (chunks, cells, tiles_x, tiles), None
+        self._image, self._isects_before = _Image(tiles_x, n_tiles, chunks, cells), None
 
-    def count(self, first: int, past: int) -> int:
-        if self._totals is None:
-            tiles = self._image[3]
-            totals = to_host(self.device, self.pool.get("tile_totals", 0), np.empty(tiles, np.uint32))
-            self._totals = np.concatenate([[0], np.cumsum(totals, dtype=np.int64)])
-        return int(self._totals[past] - self._totals[first])
+    def count(self, first: int, end: int) -> int:
+        if self._isects_before is None:
+            totals = self._tile_totals.read(self._image.n_tiles)
+            self._isects_before = np.concatenate([[0], np.cumsum(totals, dtype=np.int64)])
+        return int(self._isects_before[end] - self._isects_before[first])
 
-    def list_isects(self, band: Band) -> Any:
-        pool, (chunks, cells, tiles_x, tiles) = self.pool, self._image
-        lists = pool.get("lists", 4 * band.n_isects)
+    def list_isects(self, band: Band) -> TileLists:
+        image = self._image
+        whole = (band.first, band.end) == (0, image.n_tiles)  # the kernel writes the ranges of the band's tiles only
+        lists = TileLists(
+            ranges=self._ranges.reserve(image.n_tiles) if whole else self._ranges.zeros(image.n_tiles),
+            isects=self._isects.reserve(band.n_isects),
+            isect_splat=self._isect_splat.reserve(band.n_isects),
+            splat_isects=self._splat_isects.buffer,
+        )
         self.program.list_isects.over(
-            chunks,
+            image.chunks,
             1,
-            order=pool.get("depth_order", 0),
-            n_visible=pool.get("n_visible", 0),
-            ranked_rect=pool.get("ranked_rect", 0),
-            totals=pool.get("tile_totals", 0),
-            counts=pool.get("tile_counts", 0),
-            tile_ranges=pool.get("tile_ranges", 8 * tiles),
-            splat_isects=pool.get("splat_isects", 0),
-            isect_splat=pool.get("isect_splat", 4 * band.n_isects),
-            lists=lists,
-            cells=cells,
+            order=self.depth_order.buffer,
+            n_visible=self._n_visible.buffer,
+            ranked_rect=self._ranked_rect.buffer,
+            totals=self._tile_totals.buffer,
+            counts=self._tile_counts.buffer,
+            tile_ranges=lists.ranges,
+            splat_isects=lists.splat_isects,
+            isect_splat=lists.isect_splat,
+            lists=lists.isects,
+            cells=image.cells,
             first_tile=band.first,
-            past_tile=band.past,
-            tiles_x=tiles_x,
+            past_tile=band.end,
+            tiles_x=image.tiles_x,
         )
         return lists
 
 
 class GroupBinner:
-    """For devices of many work-items (cl/render/sort.cl, and the first half of cl/render/bin.cl)."""
+    """The binner for devices with many work-items (cl/render/sort.cl, and the first half of cl/render/bin.cl)."""
 
-    def __init__(self, device: Device, pool: Pool) -> None:
-        self.device, self.pool = device, pool
-        self.sorter = Sorter(device, pool)
-        self.program = build(device, ("render/bin.cl",))
-        self._n, self._tiles_x, self._tiles = 0, 0, 0
-        self._order: Any = None
-        self._counted: tuple[int, int] | None = None  # the tiles whose counts are in the buffers
+    def __init__(self, pool: Pool) -> None:
+        self.device = pool.device
+        self.sorter = Sorter(pool)
+        self.program = build(pool.device, ("render/bin.cl",))
+        self._by_depth, self._by_tile = SortPairs(pool), SortPairs(pool)
+        self._counts, self._offsets, self._n_isects = (pool.buffer(t) for t in (np.uint32, np.uint32, np.uint64))
+        self._ranges, self._splat_isects = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 2)
+        self._isect_splat = pool.buffer(np.uint32)
+        self._splats: ProjectedSplats
+        self._image: _Image
+        self._order: Buffer
+        self._counted: tuple[int, int] | None = None  # tiles whose counts are in the buffers
 
-    def order(self, n: int) -> None:
-        pool = self.pool
-        copy(self.device, pool.get("depth_key_kept", 0), pool.get("depth_key", 4 * n), 4 * n)
-        self.sorter.iota(pool.get("depth_order", 4 * n), n)
-        self._order = self.sorter.sort("depth_key", "depth_order", n, 32)[1]
+    def order(self, splats: ProjectedSplats) -> None:
+        self._splats, pairs = splats, self._by_depth
+        for memory in (pairs.keys, pairs.values, pairs.spare_keys, pairs.spare_values):
+            memory.reserve(splats.capacity)
+        copy(self.device, splats.depth_key, pairs.keys.reserve(splats.n), 4 * splats.n)
+        self.sorter.iota(pairs.values.reserve(splats.n), splats.n)
+        self._order = self.sorter.sort(pairs, splats.n, 32)[1]
 
-    def begin(self, n: int, tiles_x: int, tiles_y: int) -> None:
-        self._n, self._tiles_x, self._tiles, self._counted = n, tiles_x, tiles_x * tiles_y, None
+    def begin(self, tiles_x: int, tiles_y: int) -> None:
+        self._image, self._counted = _Image(tiles_x, tiles_x * tiles_y), None
 
-    def count(self, first: int, past: int) -> int:
-        self._count(first, past)
-        return int(to_host(self.device, self.pool.get("n_isects", 0), np.empty(1, np.uint64))[0])
+    def count(self, first: int, end: int) -> int:
+        self._count(first, end)
+        return int(self._n_isects.read(1)[0])
 
-    def list_isects(self, band: Band) -> Any:
-        pool, n, n_isects = self.pool, self._n, band.n_isects
-        if self._counted != (band.first, band.past):
-            self._count(band.first, band.past)
+    def list_isects(self, band: Band) -> TileLists:
+        splats, image, n_isects = self._splats, self._image, band.n_isects
+        if self._counted != (band.first, band.end):
+            self._count(band.first, band.end)
+        ids = self._by_tile.values.reserve(n_isects)
+        splat_isects, isect_splat = self._splat_isects.reserve(splats.capacity), self._isect_splat.reserve(n_isects)
         self.program.emit_isects.over(
-            n,
+            splats.n,
             order=self._order,
-            tile_rect=pool.get("tile_rect", 0),
-            offsets=pool.get("isect_offsets", 0),
-            splat_isects=pool.get("splat_isects", 8 * n),
-            isect_tile=pool.get("isect_tile", 4 * n_isects),
-            isect_id=pool.get("isect_id", 4 * n_isects),
-            isect_splat=pool.get("isect_splat", 4 * n_isects),
-            n_splats=n,
+            tile_rect=splats.tile_rect,
+            offsets=self._offsets.buffer,
+            splat_isects=splat_isects,
+            isect_tile=self._by_tile.keys.reserve(n_isects),
+            isect_id=ids,
+            isect_splat=isect_splat,
+            n_splats=splats.n,
             first_tile=band.first,
-            past_tile=band.past,
-            tiles_x=self._tiles_x,
+            past_tile=band.end,
+            tiles_x=image.tiles_x,
         )
-        ranges, lists = pool.zeroed("tile_ranges", 8 * self._tiles), pool.get("isect_id", 0)
+        ranges = self._ranges.zeros(image.n_tiles)
         if n_isects:
-            bits = max((self._tiles - 1).bit_length(), 1)
-            tiles, lists = self.sorter.sort("isect_tile", "isect_id", n_isects, bits)
+            bits = max((image.n_tiles - 1).bit_length(), 1)
+            tiles, ids = self.sorter.sort(self._by_tile, n_isects, bits)
             self.program.find_tile_ranges.over(n_isects, sorted_tile=tiles, tile_ranges=ranges, n_isects=n_isects)
-        return lists
+        return TileLists(ranges, ids, isect_splat, splat_isects)
 
-    def _count(self, first: int, past: int) -> None:
-        pool, n = self.pool, self._n
-        counts, offsets = pool.get("isect_counts", 4 * n), pool.get("isect_offsets", 4 * n)
+    def _count(self, first: int, end: int) -> None:
+        splats = self._splats
+        counts, offsets = self._counts.reserve(splats.capacity), self._offsets.reserve(splats.capacity)
         self.program.count_isects.over(
-            n,
+            splats.n,
             order=self._order,
-            tile_rect=pool.get("tile_rect", 0),
+            tile_rect=splats.tile_rect,
             counts=counts,
-            n_splats=n,
+            n_splats=splats.n,
             first_tile=first,
-            past_tile=past,
-            tiles_x=self._tiles_x,
+            past_tile=end,
+            tiles_x=self._image.tiles_x,
         )
-        self.sorter.scan(counts, offsets, n, pool.get("n_isects", 8))
-        self._counted = (first, past)
+        self.sorter.scan(counts, offsets, splats.n, self._n_isects.reserve(1))
+        self._counted = (first, end)

@@ -7,8 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from ..device.device import TILE, Device, Schedule
+from ..device.device import Device
 from ..device.program import Define, Program, Real, build
+from ..device.schedule import TILE, Schedule
 from ..splats.fields import Group, Schema
 from ..splats.shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, shape_named
 

@@ -1,69 +1,81 @@
-"""Stable radix sort of (key, value) pairs and exclusive scan, on devices of many work-items (order.cl: CPUs)."""
+"""Stable radix sort of pairs and exclusive scan, for devices with many work-items (CPUs use cl/render/order.cl)."""
 
 from __future__ import annotations
 
-from typing import Any
+import numpy as np
 
-from ..device.device import Device
 from ..device.memory import Pool
+from ..device.opencl import Buffer
 from ..device.program import GROUP_ITEMS, build
 
-DIGIT_BITS = 4  # that one pass of the sort looks at
-_MOST_ITEMS = 256  # of a group
+DIGIT_BITS = 4  # sorted by one pass
+_MAX_GROUP = 256
 _SORT_RUN, _SCAN_RUN = 16, 64  # values of a work-item
 
 
 def radix_passes(key_bits: int) -> int:
-    """Passes over all pairs that a sort by `key_bits` bits takes."""
+    """Return the number of passes over all pairs in a sort by `key_bits` bits."""
     return -(-key_bits // DIGIT_BITS)
+
+
+class SortPairs:
+    """Memory for pairs of uint32. Each array has a spare, because a pass reads one and writes the other."""
+
+    def __init__(self, pool: Pool) -> None:
+        self.keys, self.values = pool.buffer(np.uint32), pool.buffer(np.uint32)
+        self.spare_keys, self.spare_values = pool.buffer(np.uint32), pool.buffer(np.uint32)
 
 
 class Sorter:
     """Sorts and scans uint32 buffers."""
 
-    def __init__(self, device: Device, pool: Pool) -> None:
-        self.group, self.pool = min(_MOST_ITEMS, device.info.max_group), pool
+    def __init__(self, pool: Pool) -> None:
+        device = pool.device
+        self.group = min(_MAX_GROUP, device.info.max_group)
         self.program = build(device, ("render/sort.cl",), {"SORT_GROUP": self.group, "RADIX_BITS": DIGIT_BITS})
+        self._scan_sums = pool.buffer(np.uint64)
+        self._counts, self._starts, self._total = (pool.buffer(t) for t in (np.uint32, np.uint32, np.uint64))
 
-    def scan(self, values: Any, scanned: Any, n: int, total: Any) -> None:
-        """scanned = exclusive scan of n values (two distinct buffers), modulo 2^32; total[0] = their sum, uint64."""
-        n_runs = -(-max(n, 1) // (_SCAN_RUN * GROUP_ITEMS)) * GROUP_ITEMS  # whole groups: those past n sum nothing
-        sums = self.pool.get("scan_sums", 8 * n_runs)
+    def scan(self, values: Buffer, scanned: Buffer, n: int, total: Buffer) -> None:
+        """Write the exclusive scan of n values, modulo 2^32, into another buffer, and their sum (uint64) to `total`."""
+        # Whole groups: the items beyond n sum nothing.
+        n_runs = -(-max(n, 1) // (_SCAN_RUN * GROUP_ITEMS)) * GROUP_ITEMS
+        sums = self._scan_sums.reserve(n_runs)
         self.program.scan_sums.over(n_runs, values=values, sums=sums, n=n, run=_SCAN_RUN)
         self.program.scan_spine((self.group,), (self.group,), sums=sums, total=total, n=n_runs)
         self.program.scan_apply.over(n_runs, values=values, sums=sums, scanned=scanned, n=n, run=_SCAN_RUN)
 
-    def sort(self, keys: str, values: str, n: int, key_bits: int) -> tuple[Any, Any]:
-        """Sort n pairs held in the pool's buffers `keys` and `values` by the low `key_bits` bits.
+    def sort(self, pairs: SortPairs, n: int, key_bits: int) -> tuple[Buffer, Buffer]:
+        """Sort the first n pairs by the low `key_bits` bits of their keys.
 
-        Returns the buffers with the result (those, or their pair); contents of the others are lost.
+        Returns
+        -------
+        keys, values : the sorted arrays. The other two buffers of `pairs` are overwritten.
         """
-        pool = self.pool
-        here = (pool.get(keys, 4 * n), pool.get(values, 4 * n))
-        there = (pool.get(keys + "_pair", 4 * n), pool.get(values + "_pair", 4 * n))
+        source = pairs.keys.reserve(n), pairs.values.reserve(n)
+        target = pairs.spare_keys.reserve(n), pairs.spare_values.reserve(n)
         n_blocks = max(-(-n // (_SORT_RUN * self.group)), 1)
         n_counts = n_blocks << DIGIT_BITS
-        counts, starts = pool.get("radix_counts", 4 * n_counts), pool.get("radix_starts", 4 * n_counts)
-        total = pool.get("radix_total", 8)
+        counts, starts, total = self._counts.reserve(n_counts), self._starts.reserve(n_counts), self._total.reserve(1)
         size, local = (n_blocks * self.group,), (self.group,)
         for shift in range(0, key_bits, DIGIT_BITS):
-            self.program.radix_histogram(size, local, keys=here[0], counts=counts, n=n, run=_SORT_RUN, shift=shift)
+            self.program.radix_histogram(size, local, keys=source[0], counts=counts, n=n, run=_SORT_RUN, shift=shift)
             self.scan(counts, starts, n_counts, total)
             self.program.radix_scatter(
                 size,
                 local,
-                keys=here[0],
-                values=here[1],
+                keys=source[0],
+                values=source[1],
                 starts=starts,
-                keys_out=there[0],
-                values_out=there[1],
+                keys_out=target[0],
+                values_out=target[1],
                 n=n,
                 run=_SORT_RUN,
                 shift=shift,
             )
-            here, there = there, here
-        return here
+            source, target = target, source
+        return source
 
-    def iota(self, values: Any, n: int) -> None:
-        """values[i] = i."""
+    def iota(self, values: Buffer, n: int) -> None:
+        """Set values[i] = i."""
         self.program.fill_iota.over(n, values=values, n=n)

@@ -8,16 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..cameras.camera import Camera
-from ..device.device import Device, Schedule, open_device
-from ..device.memory import to_device
+from ..device.device import Device, open_device
+from ..device.memory import Pool
 from ..device.program import Real
+from ..device.schedule import Schedule
 from ..errors import DeviceError, InputError
 from ..splats.color import BLACK
 from ..splats.fields import Array
 from ..splats.splats import Splats
 from .build import ALPHA_MAX, ALPHA_MIN, T_MIN, KernelBuild
+from .frame import DeviceImage, Frame
 from .overdraw import pairs_per_pixel
-from .pipeline import Frame, Pipeline
+from .pipeline import Pipeline
 from .splat_buffers import ParameterBuffers, SplatBuffers
 from .tuning import schedule_for
 
@@ -78,7 +80,9 @@ class Renderer:
         self._thresholds = (alpha_min, alpha_max, t_min)
         self._pipelines: dict[KernelBuild, Pipeline] = {}
         self._keep = keep
-        self._uploaded: list[tuple[Splats, SplatBuffers]] = []  # the last rendered last
+        self._uploaded: list[tuple[Splats, SplatBuffers]] = []  # in order of the last render
+        pool, dtype = Pool(self.device), np.dtype(precision)
+        self._v_color, self._v_alpha = DeviceImage(pool, dtype, 3), DeviceImage(pool, dtype, 1)
         self._last: tuple[Pipeline, Frame] | None = None
 
     def render(
@@ -98,7 +102,7 @@ class Renderer:
         buffers = self._upload(splats, pipeline)
         frame = pipeline.forward(buffers, camera, (float(rgb[0]), float(rgb[1]), float(rgb[2])), sh_degree)
         self._last = (pipeline, frame)
-        return read_frame(pipeline, frame)
+        return read_frame(frame)
 
     def count_splats(self) -> NDArray[np.float32]:
         """(H, W) splats that each pixel of the last render takes in (see `pairs.pairs_per_pixel`).
@@ -131,16 +135,13 @@ class Renderer:
             raise InputError("backward: render an image first")
         pipeline, frame = self._last
         size = (frame.layout.height, frame.layout.width)
-        given_color = _image("v_color", v_color, (*size, 3))
-        given_alpha = np.zeros(size) if v_alpha is None else _image("v_alpha", v_alpha, size)
-        buffers = {}
-        for name, array in (("v_color", given_color), ("v_alpha", given_alpha)):
-            planes = frame.layout.pack(array, pipeline.kernels.dtype)
-            buffers[name] = pipeline.image(name, frame.layout, len(planes))
-            to_device(self.device, buffers[name], planes)
+        color = self._v_color.write(frame.layout, _checked("v_color", v_color, (*size, 3)))
+        alpha = self._v_alpha.write(
+            frame.layout, np.zeros(size) if v_alpha is None else _checked("v_alpha", v_alpha, size)
+        )
         splats = frame.splats
         grads = ParameterBuffers(self.device, splats.schema, splats.capacity, splats.dtype)
-        pipeline.backward(frame, buffers["v_color"], grads, buffers["v_alpha"])
+        pipeline.backward(frame, color, grads, alpha)
         return grads.download(splats.n)
 
     def _pipeline(self, splats: Splats) -> Pipeline:
@@ -175,14 +176,16 @@ class Renderer:
         return known[1]
 
 
-def read_frame(pipeline: Pipeline, frame: Frame) -> Rendered:
-    """The images of a pipeline's last frame, on the host."""
-    alpha = 1 - pipeline.read_image("transmittance", frame.layout)[..., 0]
-    depth = pipeline.read_image("depth", frame.layout)[..., 0]
-    return Rendered(pipeline.read_image("color", frame.layout), alpha, depth)
+def read_frame(frame: Frame) -> Rendered:
+    """Copy the images of a frame to the host. The frame's kernels must be built with depth."""
+    images = frame.images
+    if images.depth is None:
+        raise ValueError("the frame has no depth: build its kernels `for_rendering`")
+    alpha = 1 - images.transmittance.read()[..., 0]
+    return Rendered(images.color.read(), alpha, images.depth.read()[..., 0])
 
 
-def _image(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _checked(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
     array = np.asarray(values, np.float64)
     if array.shape != shape:
         raise InputError(f"{name}: shape {array.shape}, expected {shape}, that of the rendered image")

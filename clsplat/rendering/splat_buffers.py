@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from ..device.device import Device
-from ..device.memory import fill_zero, to_device, to_host
+from ..device.memory import Pool, fill_zero, to_device, to_host
+from ..device.opencl import Buffer
 from ..splats.fields import Array, Group, Schema, public_shape
 from ..splats.harmonics import sh_basis
 from ..splats.splats import Splats
@@ -43,11 +43,11 @@ class ParameterBuffers:
         return self.schema.rows(group) * self.capacity * self.dtype.itemsize
 
     @property
-    def geom(self) -> Any:
+    def geom(self) -> Buffer:
         return self.buffers[Group.GEOM]
 
     @property
-    def sh(self) -> Any:
+    def sh(self) -> Buffer:
         return self.buffers[Group.SH]
 
     def upload(self, arrays: Mapping[str, Array]) -> None:
@@ -124,3 +124,44 @@ class CompactGradients(ParameterBuffers):
         arrays = self.download(n)
         v_rgb, direction = arrays["sh"][:, :1], arrays["sh"][:, 1]
         return arrays | {"sh": sh_basis(direction, self.sh_degree)[:, :, None] * v_rgb}
+
+
+class SplatStatistics:
+    """Statistics of every splat's gradients over the images since `reset` (rows: cl/render/project.cl).
+
+    Densification reads them: sums of the screen gradient and of the depth gradient, and the number of images in which
+    the splat was visible.
+    """
+
+    ROWS = 3
+    TIMES_SEEN = 2  # row
+
+    def __init__(self, pool: Pool, dtype: np.dtype[np.floating]) -> None:
+        self.device, self.dtype = pool.device, dtype
+        self._rows = pool.buffer(dtype, self.ROWS)
+        self._capacity = 0
+
+    def reserve(self, capacity: int) -> Buffer:
+        """Return the buffer [3, capacity]. Another capacity than before resets the statistics."""
+        if capacity == self._capacity:
+            return self._rows.buffer
+        self._capacity = capacity
+        return self._rows.zeros(capacity)
+
+    def reset(self) -> None:
+        """Set all statistics to zero."""
+        if self._capacity:
+            self._rows.zeros(self._capacity)
+
+    def read(self, n: int) -> Array:
+        """Return the statistics (3, n) of the first n splats."""
+        if not self._capacity:
+            return np.zeros((self.ROWS, n), self.dtype)
+        rows = np.empty((self.ROWS, self._capacity), self.dtype)
+        return np.ascontiguousarray(to_host(self.device, self._rows.buffer, rows)[:, :n])
+
+    def write(self, statistics: Array, capacity: int) -> None:
+        """Continue from statistics (3, n)."""
+        rows = np.zeros((self.ROWS, capacity), self.dtype)
+        rows[:, : statistics.shape[1]] = statistics
+        to_device(self.device, self.reserve(capacity), rows)

@@ -17,9 +17,11 @@ import numpy as np
 
 from .._version import __version__
 from ..cameras.camera import Camera
-from ..device.device import SCHEDULES, Device, Schedule, default_schedule
+from ..device.device import Device
 from ..device.program import source
 from ..device.program_cache import cache_folder
+from ..device.schedule import SCHEDULES, Schedule, default_schedule
+from ..device.trace import recorded
 from ..errors import ClsplatError, OutputError
 from ..files.atomic import atomic_writer
 from ..splats.splats import Splats
@@ -29,6 +31,7 @@ from .splat_buffers import ParameterBuffers, SplatBuffers
 
 SCHEDULE_VARIABLE = "CLSPLAT_SCHEDULE"
 _CANDIDATES = {"CPU": ("cpu16", "cpu8", "gpu256"), "other": ("gpu256", "gpu64")}
+_TIMED = ("rasterize", "rasterize_vjp")
 _SIDE, _SPLATS, _REPEATS = 256, 3000, 5
 
 _chosen: dict[str, Schedule] = {}
@@ -49,7 +52,7 @@ def schedule_for(device: Device) -> Schedule:
         cached = _read_cache().get(key)
         if cached is None:
             times = measure(device)
-            fallback = str(default_schedule(device.cl_device))
+            fallback = str(default_schedule(device.info))
             cached = min(times, key=times.__getitem__) if times else fallback
             _write_cache(key, cached)
         _chosen[key] = Schedule.parse(cached)
@@ -78,10 +81,11 @@ def _measure_one(device: Device, schedule: Schedule) -> float:
     camera = Camera(_SIDE, _SIDE, 0.9 * _SIDE, 0.9 * _SIDE, _SIDE / 2, _SIDE / 2, pose)
     times = []
     for _ in range(_REPEATS + 1):
-        frame = pipeline.forward(splats, camera)
-        pipeline.backward(frame, pipeline.image("color", frame.layout, 3), grads)
-        events = pipeline.raster_events()
-        times.append(sum(1e-6 * float(event.profile.end - event.profile.start) for event in events))
+        with recorded(device) as launches:
+            frame = pipeline.forward(splats, camera)
+            pipeline.backward(frame, frame.images.color.buffer, grads)
+            device.queue.finish()
+        times.append(sum(launch.ms for launch in launches if launch.name in _TIMED))
     return statistics.median(times[1:])
 
 

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device.memory import to_device, to_host
+from ..device.opencl import Buffer, KernelArgument
 from ..device.program import lane_group
 from ..errors import InputError
-from ..rendering.pipeline import ImageLayout
+from ..rendering.frame import DeviceImage, ImageLayout
 from ..splats.color import Color
 from .config import TrainConfig
 from .loss import ImageLoss, LossResult
@@ -39,7 +40,7 @@ class ExposureLoss:
 
     def __init__(self, loss: ImageLoss, targets: Targets, config: TrainConfig, background: Color) -> None:
         self.loss, self.targets, self.config, self.background = loss, targets, config, background
-        self.device, self.pipeline, self.kernels = loss.device, loss.pipeline, loss.kernels
+        self.device, self.kernels = loss.device, loss.kernels
         self.learns = config.appearance.exposure
         self.in_use = needs_exposure(config, targets.channels)
         if not self.in_use:
@@ -48,23 +49,25 @@ class ExposureLoss:
         self._rows = np.tile(_IDENTITY.ravel(), (len(targets.views), 1)).astype(self.kernels.dtype)
         self._exposures = self.device.alloc(self._rows.nbytes)
         to_device(self.device, self._exposures, self._rows)
+        self._photo = DeviceImage(loss.pool, self.kernels.dtype, 3)
+        self._laid_over = DeviceImage(loss.pool, np.dtype(np.uint8), 3)
+        self._partial = loss.pool.buffer(self.kernels.dtype, _SUMS)
 
-    def evaluate(self, target: Target, background: Color) -> LossResult:
-        """Compute the loss of the pipeline's "color", rendered over `background`, and step the photo's exposure."""
+    def evaluate(self, target: Target, rendered: Buffer, background: Color) -> LossResult:
+        """Compute the loss of an image, rendered over `background`, and step the photo's exposure."""
         planes = self.targets.planes(target)
         if not self.in_use:
-            return self.loss.evaluate(target.layout, planes)
+            return self.loss.evaluate(target.layout, rendered, planes)
         layout, channels = target.layout, self.targets.channels
-        pool, image = self.pipeline.pool, self.pipeline.image
-        photo, laid_over = image("photo", layout, 3), planes
-        if channels > 3:  # the photo over the new background: bytes with a zero margin
-            laid_over = image("photo_target", layout, -(-3 // self.kernels.dtype.itemsize))
+        photo, laid_over = self._photo.reserve(layout), planes
+        if channels > 3:  # the photo over the new background
+            laid_over = self._laid_over.reserve(layout)
         items = -(-layout.width // (self.kernels.lanes * EXPOSURE_VECS))
         group = min(lane_group(self.device), items)
         size = -(-items // group) * group, layout.height
         shift = [255.0 * (new - old) for new, old in zip(background, self.background, strict=True)]
-        common = {
-            "color": image("color", layout, 3),
+        common: dict[str, KernelArgument] = {
+            "color": rendered,
             "truth": planes,
             "exposures": self._exposures,
             "view": target.index,
@@ -84,9 +87,9 @@ class ExposureLoss:
             shift_b=shift[2],
             **common,
         )
-        result = self.loss.evaluate(layout, laid_over, photo, target.unmasked)
+        result = self.loss.evaluate(layout, photo, laid_over, target.unmasked)
         parts = items * layout.height
-        partial = pool.get("exposure_partial", _SUMS * parts * self.kernels.dtype.itemsize)
+        partial = self._partial.reserve(parts)
         self.program.photo_of_render_vjp(
             size, (group, 1), v=result.v_color, target=laid_over, partial=partial, **common
         )

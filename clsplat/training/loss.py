@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ..device.device import TILE
-from ..device.memory import to_host
+from ..device.memory import Pool, to_host
+from ..device.opencl import Buffer, KernelArgument
 from ..device.program import GROUP_ITEMS, lane_group
-from ..rendering.pipeline import ImageLayout, Pipeline
+from ..device.schedule import TILE
+from ..rendering.build import KernelBuild
+from ..rendering.frame import DeviceImage, ImageLayout
 from .programs import loss_program, loss_strip
 
 _MIN_ROWS = 32  # rows of a work-item; it also blurs ten rows outside of them
@@ -52,8 +53,8 @@ class LossResult:
     number : position among the evaluations of its `ImageLoss`.
     """
 
-    v_color: Any
-    partial: Any
+    v_color: Buffer
+    partial: Buffer
     n_parts: int
     count: int
     unmasked: float
@@ -61,42 +62,44 @@ class LossResult:
 
 
 class ImageLoss:
-    """Loss of a pipeline's "color" image against a target image.
+    """Loss of rendered images against target images.
 
     Parameters
     ----------
+    pool : owner of the device memory.
     weight : lambda, the weight of 1 - SSIM.
     """
 
-    def __init__(self, pipeline: Pipeline, weight: float) -> None:
-        self.pipeline, self.weight = pipeline, weight
-        self.device, self.kernels = pipeline.device, pipeline.kernels
+    def __init__(self, pool: Pool, kernels: KernelBuild, weight: float) -> None:
+        self.device, self.pool, self.kernels, self.weight = pool.device, pool, kernels, weight
         self.program = loss_program(self.device, self.kernels)
         # With one lane, a work-item is a column of pixels. A group then reads whole lines of memory.
         self._group = lane_group(self.device) if self.kernels.lanes > 1 else GROUP_ITEMS
+        self._v_color, self._v_maps = DeviceImage(pool, kernels.dtype, 3), DeviceImage(pool, kernels.dtype, 9)
+        self._partial = pool.buffer(kernels.dtype, 3)
         self._evaluations = 0
 
-    def evaluate(self, layout: ImageLayout, target: Any, rendered: Any = None, unmasked: float = 1.0) -> LossResult:
-        """Compute the loss and its gradient with respect to "color"; does not wait for the device.
+    def evaluate(self, layout: ImageLayout, rendered: Buffer, target: Buffer, unmasked: float = 1.0) -> LossResult:
+        """Compute the loss and its gradient with respect to the image; does not wait for the device.
 
         Parameters
         ----------
+        rendered : image of 3 planes in the layout.
         target : buffer of bytes [3, rows, stride] in the layout (targets.py).
-        rendered : image in the layout that replaces "color".
         unmasked : fraction of the pixels that are not masked. Masked pixels must be equal in both images.
         """
-        image, kernels = self.pipeline.image, self.kernels
+        kernels = self.kernels
         strips = -(-layout.tiles_x * TILE // (kernels.lanes * loss_strip(kernels)))
         segment = self._rows(strips, layout.height)
         segments = -(-layout.height // segment)
         n_parts = 3 * segments * strips
-        partial = self.pipeline.pool.get("loss_partial", 3 * n_parts * kernels.dtype.itemsize)
+        partial = self._partial.reserve(n_parts)
         group, count = self._group, 3 * layout.width * layout.height
-        size, v_color = (-(-strips // group) * group, segments, 3), image("v_color", layout, 3)
-        common = {
-            "rendered": image("color", layout, 3) if rendered is None else rendered,
+        size, v_color = (-(-strips // group) * group, segments, 3), self._v_color.reserve(layout)
+        common: dict[str, KernelArgument] = {
+            "rendered": rendered,
             "truth": target,
-            "v_maps": image("loss_v_maps", layout, 9),
+            "v_maps": self._v_maps.reserve(layout),
             "width": layout.width,
             "height": layout.height,
             "stride": layout.stride,

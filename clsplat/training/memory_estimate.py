@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from ..device.device import Device
 from ..errors import DeviceError
 from ..rendering.build import KernelBuild
-from ..rendering.pipeline import ImageLayout, isect_bytes
+from ..rendering.frame import ImageLayout
+from ..rendering.pipeline import isect_bytes
 from ..rendering.splat_buffers import COMPACT_ROWS
 from ..splats.fields import Group
 from .config import TrainConfig

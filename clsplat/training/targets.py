@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ..cameras.camera import Camera
 from ..device.device import Device
-from ..device.memory import Pool, send_to_device
+from ..device.memory import Pool, UploadQueue
+from ..device.opencl import Buffer, Event
 from ..files.images import ImageU8
 from ..rendering.build import KernelBuild
-from ..rendering.pipeline import ImageLayout
+from ..rendering.frame import ImageLayout
 from ..scenes.scene import View
 from .programs import loss_program
 
@@ -31,8 +31,8 @@ class _Upload:
     """A transfer into one of the slots. Its image is not unpacked yet."""
 
     slot: int
-    packed: Any
-    event: Any
+    packed: Buffer
+    event: Event
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Target:
     camera: Camera
     layout: ImageLayout
     unmasked: float
-    buffer: Any
+    buffer: Buffer
 
 
 class Targets:
@@ -78,9 +78,11 @@ class Targets:
         self._kept_bytes = 0
         self._reduced: dict[int, View] = {}  # smaller photos of views whose planes do not stay on the device
         self._uploads: dict[int, _Upload] = {}  # pending transfers by view
-        self._queue: Any = None  # command queue of the transfers
+        self._visitor = self.pool.buffer(np.uint8)  # the planes of an image that does not stay
+        self._queue = UploadQueue(device)
+        self._slots = [self.pool.buffer(np.uint8) for _ in range(_SLOTS)]
         self._slot = 0
-        self._unpacked: list[Any] = [None] * _SLOTS  # events; a slot may be overwritten after its event
+        self._unpacked: list[Event | None] = [None] * _SLOTS  # a slot may be overwritten after its event
 
     @property
     def nbytes(self) -> int:
@@ -100,7 +102,7 @@ class Targets:
         layout = ImageLayout(view.camera.width, view.camera.height)
         nbytes = self.channels * layout.plane
         stays = self._kept_bytes + nbytes <= self.budget
-        buffer = self.device.alloc(nbytes) if stays else self.pool.get("truth", nbytes)
+        buffer = self.device.alloc(nbytes) if stays else self._visitor.reserve(nbytes)
         unmasked = 1.0 if view.mask is None else float(view.mask.mean())
         target = Target(index, view.camera, layout, unmasked, buffer)
         self._uploads[index] = self._start_upload(self._bytes(view))
@@ -111,14 +113,12 @@ class Targets:
             self._reduced[index] = view
         return target
 
-    def planes(self, target: Target) -> Any:
+    def planes(self, target: Target) -> Buffer:
         """Return the buffer of the target. The image is there for all later commands in the device's queue."""
-        import pyopencl as cl
-
         layout = target.layout
         upload = self._uploads.pop(target.index, None)
         if upload is not None:
-            cl.enqueue_barrier(self.device.queue, wait_for=[upload.event])
+            self._queue.wait_on_device(upload.event)
             self._unpacked[upload.slot] = self.program.unpack_image(
                 (layout.stride, layout.rows),
                 (16, 1),
@@ -141,16 +141,9 @@ class Targets:
         return np.dstack([view.image, mask.astype(np.uint8), opacity])
 
     def _start_upload(self, image: ImageU8) -> _Upload:
-        import pyopencl as cl
-
-        if self._queue is None:
-            profiling = cl.command_queue_properties.PROFILING_ENABLE
-            self._queue = cl.CommandQueue(self.device.context, properties=profiling)
         slot = self._slot = (self._slot + 1) % _SLOTS
-        packed = self.pool.get(f"bytes{slot}", image.nbytes)
-        event = send_to_device(self.device, packed, image, self._queue, self._unpacked[slot])
-        self._queue.flush()
-        return _Upload(slot, packed, event)
+        packed = self._slots[slot].reserve(image.nbytes)
+        return _Upload(slot, packed, self._queue.send(packed, image, self._unpacked[slot]))
 
 
 def reduced(view: View, downscale: int) -> View:

@@ -11,13 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ..device.device import Device, Schedule, open_device
+from ..device.device import Device, open_device
+from ..device.schedule import Schedule
 from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..rendering.build import KernelBuild
-from ..rendering.pipeline import TIMES_SEEN, ImageLayout, Pipeline, most_isects
+from ..rendering.frame import Frame, ImageLayout
+from ..rendering.pipeline import Pipeline, isect_limit
 from ..rendering.renderer import Renderer
-from ..rendering.splat_buffers import CompactGradients, SplatBuffers
+from ..rendering.splat_buffers import CompactGradients, SplatBuffers, SplatStatistics
 from ..rendering.tuning import schedule_for
 from ..scenes.scene import Scene, View
 from ..splats.morton import morton_order
@@ -141,20 +143,20 @@ class Trainer:
         n_first = len(first["mean"])
         capacity = max(config.cap_max, n_first)
         dtype = self.kernels.dtype
-        most = min(most_isects(self.device, self.kernels), room_for_isects(self.memory, self.device))
-        self.pipeline = Pipeline(self.device, self.kernels, most)
+        max_isects = min(isect_limit(self.device, self.kernels), room_for_isects(self.memory, self.device))
+        self.pipeline = Pipeline(self.device, self.kernels, max_isects)
         self.splats = SplatBuffers(self.device, self.kernels.schema, capacity, dtype)
         self.splats.set(first)
         self.grads = CompactGradients(self.device, self.splats.schema, capacity, dtype)
         self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config, scene.extent)
-        self.loss = ImageLoss(self.pipeline, config.loss.lambda_dssim)
+        self.loss = ImageLoss(self.pipeline.pool, self.kernels, config.loss.lambda_dssim)
         self.targets = Targets(self.device, self.kernels, scene.train, budget, channels)
         self.exposure = ExposureLoss(self.loss, self.targets, config, scene.background)
         if checkpoint is not None:
             state = dict(checkpoint.optimizer)
             self.exposure.load_state(state)
             self.optimizer.load_state(state)
-            self.pipeline.write_signals(checkpoint.signals, self.splats.capacity)
+            self.pipeline.statistics.write(checkpoint.signals, self.splats.capacity)
         self.optim_program = optim_program(self.device, self.kernels)
         self.renderer = Renderer(self.device)
         self.evaluations: dict[int, Evaluation] = {}
@@ -236,8 +238,8 @@ class Trainer:
             None if folder is None else folder.path,
         )
 
-    def step(self) -> None:
-        """One iteration: one image, one optimizer step, and what the strategy does after it."""
+    def step(self) -> Frame:
+        """Do one iteration: one image, one optimizer step, and the strategy's action if it is due. Return the frame."""
         config = self.config
         self.iteration += 1
         it = self.iteration
@@ -248,12 +250,10 @@ class Trainer:
             r, g, b = self.rng.random(3).tolist()
             background = r, g, b
         frame = self.pipeline.forward(self.splats, target.camera, background, degree)
-        self.loss_result = self.exposure.evaluate(target, background)
+        self.loss_result = self.exposure.evaluate(target, frame.images.color.buffer, background)
         self.pipeline.backward(frame, self.loss_result.v_color, self.grads)
         mean_lr = self.scene.extent * self.mean_rate(it)
-        self.optimizer.step(
-            self.grads, mean_lr * config.rate_factor("mean"), degree, it, self.pipeline.pool.get("depth_key_kept", 0)
-        )
+        self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it, frame.projected.depth_key)
         if self.densify_first <= it <= self.densify_last and it % config.density.densify_interval == 0:
             self.densify()
         if config.density.noise_lr and active_blocks(it, config).base:
@@ -269,13 +269,14 @@ class Trainer:
                 amount=noise_amount(config.density.noise_lr, mean_lr, self.scene.extent),
                 reach=noise_reach(self.scene.extent),
             )
+        return frame
 
     def densify(self) -> None:
         """One action of the strategy."""
         info = StepInfo(self.iteration, self.densify_last, self.growth, self.scene.extent)
         self.optimizer.settle()
-        arrays, signals = self.splats.download(self.splats.n), self.pipeline.read_signals(self.splats.n)
-        if self.splats.n and not signals[TIMES_SEEN].any():
+        arrays, signals = self.splats.download(self.splats.n), self.pipeline.statistics.read(self.splats.n)
+        if self.splats.n and not signals[SplatStatistics.TIMES_SEEN].any():
             raise TrainingError(
                 f"iteration {self.iteration}: no image shows any splat (transparent, or outside): "
                 "check what training starts from (init) and the learning rates"
@@ -285,7 +286,7 @@ class Trainer:
             mean = edit.values.get("mean", arrays["mean"][edit.source])
             edit = edit.permuted(morton_order(mean), self.splats.n)
         self.optimizer.apply(edit)
-        self.pipeline.reset_signals()
+        self.pipeline.statistics.reset()
 
     def snapshot(self) -> Splats:
         """The splats as they are now, on the host, without those that are not finite."""
@@ -315,7 +316,7 @@ class Trainer:
             self.seconds,
             str(self.kernels.schedule),
             self.n_first,
-            self.pipeline.read_signals(self.splats.n),
+            self.pipeline.statistics.read(self.splats.n),
         )
 
     def evaluate(self, views: list[View]) -> Evaluation:

@@ -64,7 +64,7 @@ class TrainingSource:
         if settings.sh_degree is not None:
             degree = min(degree, settings.sh_degree)
         frame = pipeline.forward(trainer.splats, camera, settings.background, degree)
-        image = read_frame(pipeline, frame)
+        image = read_frame(frame)
         counts = pairs_per_pixel(pipeline, frame) if settings.mode == "splats" else None
         return picture_of(image, settings.mode, settings.background, counts=counts)
 

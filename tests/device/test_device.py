@@ -14,15 +14,8 @@ from clsplat_cli import devices as devices_cli
 
 from clsplat.device import device as device_module
 from clsplat.device import pip_runtime as runtime
-from clsplat.device.device import (
-    SCHEDULES,
-    Device,
-    DeviceInfo,
-    Schedule,
-    default_schedule,
-    list_devices,
-    open_device,
-)
+from clsplat.device.device import Device, DeviceInfo, list_devices, open_device
+from clsplat.device.schedule import SCHEDULES, Schedule, default_schedule
 from clsplat.errors import DeviceError
 from clsplat.rendering.tuning import schedule_for
 
@@ -86,18 +79,13 @@ def test_bad_schedule_is_refused_in_one_line(text):
 
 
 def test_default_schedule_follows_the_kind_and_the_group_limit():
-    class Fake:
-        def __init__(self, kind, max_group):
-            self.type, self.max_work_group_size = kind, max_group
-
-    assert default_schedule(Fake(cl.device_type.CPU, 4096)) == SCHEDULES["cpu16"]
-    assert default_schedule(Fake(cl.device_type.GPU, 1024)) == SCHEDULES["gpu256"]
-    assert default_schedule(Fake(cl.device_type.GPU, 128)) == SCHEDULES["gpu64"]
+    for kind, max_group, name in (("CPU", 4096, "cpu16"), ("GPU", 1024, "gpu256"), ("GPU", 128, "gpu64")):
+        assert default_schedule(dataclasses.replace(INFO, type=kind, max_group=max_group)) == SCHEDULES[name]
 
 
 def test_listed_devices_open_by_index():
     for info in list_devices():
-        if info.ailment is None:
+        if info.fault is None:
             assert open_device(info.index).info == info
 
 

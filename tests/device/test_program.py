@@ -48,7 +48,7 @@ EMPTY = "kernel void nothing(int n) { }"
 
 
 def usable() -> list[str]:
-    return [info.index for info in list_devices() if info.ailment is None]
+    return [info.index for info in list_devices() if info.fault is None]
 
 
 @pytest.fixture(scope="module", params=usable())

@@ -15,7 +15,7 @@ from clsplat.device.device import list_devices
 from clsplat.device.program import OPTIONS_VARIABLE
 from clsplat.device.program_cache import SELF_CACHING
 
-USABLE = [info for info in list_devices() if info.ailment is None and info.platform != "Oclgrind"]
+USABLE = [info for info in list_devices() if info.fault is None and info.platform != "Oclgrind"]
 PROCESSES = 4
 
 # Prints the digest of a small image.
@@ -23,7 +23,7 @@ CHILD = """
 import hashlib, sys
 import numpy as np
 from clsplat.cameras.camera import Camera
-from clsplat.device.device import SCHEDULES
+from clsplat.device.schedule import SCHEDULES
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
 rng = np.random.default_rng(0)

@@ -38,7 +38,7 @@ LAST = ("comparison", "profiling", "viewer")
 
 # Libraries that only these modules import.
 OWNERS = {
-    "pyopencl": {"device.device", "device.memory", "device.program", "training.targets"},
+    "pyopencl": {"device.device", "device.memory", "device.opencl", "device.program"},
     "pycolmap": {"scenes.undistort"},
     "PIL": {"files.images"},
     "matplotlib": {"evaluation.chart_style"},

@@ -11,8 +11,9 @@ from kernel_checks import Case
 from reference.renderer import alpha_maps, prepared, project, visible_order
 from reference.scenes import random_camera, random_splats
 
-from clsplat.device.device import SCHEDULES, Device
+from clsplat.device.device import Device
 from clsplat.device.program import parse_signatures, source
+from clsplat.device.schedule import SCHEDULES
 from clsplat.device.trace import Launch
 from clsplat.errors import InputError
 from clsplat.profiling.bench import Report, bench_trainer, measure_render, measure_training

@@ -13,13 +13,15 @@ from reference.scenes import for_shape, random_camera, random_splats
 from reference.tolerances import relative_error
 from small_scene import write_garden
 
-from clsplat.device.device import SCHEDULES, Device, open_device
+from clsplat.device.device import Device, open_device
 from clsplat.device.memory import Pool, to_device, to_host
+from clsplat.device.schedule import SCHEDULES
 from clsplat.errors import DeviceError
-from clsplat.rendering.binning import MAX_ISECTS, Band, ChunkBinner, GroupBinner, cut
+from clsplat.rendering.binning import MAX_ISECTS, Band, ChunkBinner, GroupBinner, cut_bands
 from clsplat.rendering.build import KernelBuild
+from clsplat.rendering.frame import DeviceImage, Frame, ProjectedSplats
 from clsplat.rendering.overdraw import count_pairs
-from clsplat.rendering.pipeline import Pipeline, most_isects
+from clsplat.rendering.pipeline import Pipeline, isect_limit
 from clsplat.rendering.splat_buffers import ParameterBuffers, SplatBuffers
 from clsplat.scenes.scene import load_scene
 from clsplat.splats.splats import Splats
@@ -39,15 +41,15 @@ POCL = "Portable Computing Language"
 Arrays = dict[str, NDArray[Any]]
 
 
-def told(device: Device, kind: str) -> Device:
+def as_kind(device: Device, kind: str) -> Device:
     """The device once more, said to be of this kind."""
     other = open_device(device.info.index)
     other.info = replace(other.info, type=kind)
     return other
 
 
-def rendered(device: Device, shape: str, schedule: str, max_isects: int | None) -> tuple[Pipeline, Arrays]:
-    """Images and gradients of a random scene under random weights; images are read after the gradient."""
+def rendered(device: Device, shape: str, schedule: str, max_isects: int | None) -> tuple[Pipeline, Frame, Arrays]:
+    """Frame, images and gradients of a random scene under random weights; images are read after the gradient."""
     arrays = for_shape(random_splats(4, N, 1), shape)
     splats = Splats(shape, {name: value.astype(np.float32) for name, value in arrays.items()})
     kernels = KernelBuild(shape, 1, SCHEDULES[schedule]).for_rendering()
@@ -55,13 +57,11 @@ def rendered(device: Device, shape: str, schedule: str, max_isects: int | None) 
     buffers = SplatBuffers.of(device, splats, kernels.dtype)
     frame = pipeline.forward(buffers, random_camera(4, WIDTH, HEIGHT), (0.2, 0.5, 0.9))
     rng, layout = np.random.default_rng(0), frame.layout
-    weights = {"v_color": rng.normal(size=(HEIGHT, WIDTH, 3)), "v_alpha": rng.normal(size=(HEIGHT, WIDTH))}
-    for name, values in weights.items():
-        planes = layout.pack(values, kernels.dtype)
-        to_device(device, pipeline.image(name, layout, len(planes)), planes)
+    v_color = DeviceImage(pipeline.pool, kernels.dtype, 3).write(layout, rng.normal(size=(HEIGHT, WIDTH, 3)))
+    v_alpha = DeviceImage(pipeline.pool, kernels.dtype, 1).write(layout, rng.normal(size=(HEIGHT, WIDTH)))
     grads = ParameterBuffers(device, splats.schema, N, kernels.dtype)
-    pipeline.backward(frame, pipeline.pool.get("v_color", 0), grads, pipeline.pool.get("v_alpha", 0))
-    return pipeline, grads.download(N) | {name: pipeline.read_image(name, layout) for name in IMAGES}
+    pipeline.backward(frame, v_color, grads, v_alpha)
+    return pipeline, frame, grads.download(N) | {name: getattr(frame.images, name).read() for name in IMAGES}
 
 
 def assert_same(got: Arrays, want: Arrays, tolerance: float = 0.0) -> None:
@@ -83,33 +83,31 @@ def assert_same(got: Arrays, want: Arrays, tolerance: float = 0.0) -> None:
     ],
 )
 def test_bands_give_what_one_band_gives(device: Device, kind: str, shape: str, schedule: str) -> None:
-    device = told(device, kind)
-    whole, want = rendered(device, shape, schedule, None)
-    assert whole.frame is not None
-    assert len(whole.frame.bands) == 1
-    most = max(whole.binner.count(tile, tile + 1) for tile in range(35))
-    pairs = count_pairs(whole, whole.frame)
-    for limit in (whole.frame.n_isects - 1, whole.frame.n_isects // 4, most):
-        pipeline, got = rendered(device, shape, schedule, limit)
-        frame = pipeline.frame
-        assert frame is not None
+    device = as_kind(device, kind)
+    whole, frame_of_one, want = rendered(device, shape, schedule, None)
+    n_isects = frame_of_one.n_isects
+    assert len(frame_of_one.bands) == 1
+    fullest = max(whole.binner.count(tile, tile + 1) for tile in range(35))
+    pairs = count_pairs(whole, frame_of_one)
+    for limit in (n_isects - 1, n_isects // 4, fullest):
+        pipeline, frame, got = rendered(device, shape, schedule, limit)
         assert len(frame.bands) > 1
-        whole_rows = all((band.past - band.first) % 7 == 0 for band in frame.bands)
-        assert whole_rows or limit < whole.frame.n_isects - 1
-        assert limit > most or not whole_rows
-        assert frame.n_isects == whole.frame.n_isects
+        whole_rows = all((band.end - band.first) % 7 == 0 for band in frame.bands)
+        assert whole_rows or limit < n_isects - 1
+        assert limit > fullest or not whole_rows
+        assert frame.n_isects == n_isects
         assert max(band.n_isects for band in frame.bands) <= limit
         assert_same(got, want, 0.0 if device.info.platform == POCL else REGROUPED)
         assert count_pairs(pipeline, frame) == pairs
-    with pytest.raises(DeviceError, match=rf"{most} splats over one tile, and buffers for {most - 1} at most"):
-        rendered(device, shape, schedule, most - 1)
+    with pytest.raises(DeviceError, match=rf"{fullest} splats over one tile, and buffers for {fullest - 1} at most"):
+        rendered(device, shape, schedule, fullest - 1)
 
 
 def test_both_binners_give_the_same(device: Device) -> None:
     """In groups of another size a compiler may add in another order, too."""
     assert_same(
-        rendered(told(device, "GPU"), "gaussian", "cpu16", None)[1],
-        rendered(told(device, "CPU"), "gaussian", "cpu16", None)[1],
+        rendered(as_kind(device, "GPU"), "gaussian", "cpu16", None)[2],
+        rendered(as_kind(device, "CPU"), "gaussian", "cpu16", None)[2],
         0.0 if device.info.platform == POCL else REGROUPED,
     )
 
@@ -124,31 +122,30 @@ def test_training_in_bands_has_the_same_bits(devices: list[Device], tmp_path: Pa
     for limit in (MAX_ISECTS, 100):
         trainer = Trainer(scene, config, device=device)
         trainer.pipeline.max_isects = limit
-        trained.append(trainer.run().splats.to_numpy())
-        frame = trainer.pipeline.frame
-        assert frame is not None
+        for _ in range(config.iterations):
+            frame = trainer.step()
         assert (len(frame.bands) > 1) == (limit == 100)
+        trained.append(trainer.snapshot().to_numpy())
     assert_same(*trained)
 
 
 def test_cutting_halves_rows_first() -> None:
     tiles = np.full(12, 10)  # 4 x 3
     tiles[5] = 30
-    bands = cut(lambda first, past: int(tiles[first:past].sum()), 4, 3, 40)
+    bands = cut_bands(lambda first, past: int(tiles[first:past].sum()), 4, 3, 40)
     assert bands == (Band(0, 4, 40), Band(4, 6, 40), Band(6, 8, 20), Band(8, 12, 40))
-    assert cut(lambda first, past: 0, 4, 3, 40) == (Band(0, 12, 0),)
+    assert cut_bands(lambda first, past: 0, 4, 3, 40) == (Band(0, 12, 0),)
     with pytest.raises(DeviceError, match="30 splats over one tile"):
-        cut(lambda first, past: int(tiles[first:past].sum()), 4, 3, 29)
+        cut_bands(lambda first, past: int(tiles[first:past].sum()), 4, 3, 29)
 
 
 @pytest.mark.parametrize("n", [1, 300, 2049, 40_000])
 @pytest.mark.parametrize("kind", ["CPU", "GPU"])
 def test_binning_is_that_of_numpy(device: Device, kind: str, n: int) -> None:
     """Depths all over and the same for many, culled splats, rectangles up to the whole image; all tiles and a band."""
-    device = told(device, kind)
+    device = as_kind(device, kind)
     tiles_x, tiles_y, rng = 9, 6, np.random.default_rng(n)
-    pool = Pool(device)
-    binner = (ChunkBinner if kind == "CPU" else GroupBinner)(device, pool)
+    binner = (ChunkBinner if kind == "CPU" else GroupBinner)(Pool(device))
     size = np.array([tiles_x, tiles_y])
     low = rng.integers(0, size, (n, 2))
     rect = np.concatenate([low, np.minimum(low + rng.integers(1, 8, (n, 2)) ** 2 // 9 + 1, size)], 1).astype(np.int32)
@@ -157,76 +154,85 @@ def test_binning_is_that_of_numpy(device: Device, kind: str, n: int) -> None:
         keys[rng.random(n) < 0.2] = CULLED
         keys[np.isinf(depth)] = CULLED
         rect[keys == CULLED] = 0
-        for name, host in (("depth_key_kept", keys), ("tile_rect", rect)):
-            to_device(device, pool.get(name, host.nbytes), host)
-        binner.order(n)
-        for first, past in ((0, 54), (13, 31), (20, 21)):
-            binner.begin(n, tiles_x, tiles_y)
-            check_band(binner, pool, keys, rect, first, past, tiles_x)
+        binner.order(projected(device, keys, rect))
+        for first, end in ((0, 54), (13, 31), (20, 21)):
+            binner.begin(tiles_x, tiles_y)
+            check_band(device, binner, keys, rect, first, end, tiles_x)
+
+
+def projected(device: Device, keys: NDArray[np.uint32], rect: NDArray[np.int32]) -> ProjectedSplats:
+    """Splats of these depth keys and tile rectangles; camera and records are not used by binners."""
+    unused, depth_key, tile_rect = (device.alloc(nbytes) for nbytes in (4, keys.nbytes, rect.nbytes))
+    to_device(device, depth_key, keys)
+    to_device(device, tile_rect, rect)
+    return ProjectedSplats(len(keys), len(keys), unused, unused, depth_key, tile_rect)
 
 
 def check_band(
+    device: Device,
     binner: ChunkBinner | GroupBinner,
-    pool: Pool,
     keys: NDArray[np.uint32],
     rect: NDArray[np.int32],
     first: int,
-    past: int,
+    end: int,
     tiles_x: int,
 ) -> None:
     """Splats of each tile front to back, and each splat's ids in order of its tiles."""
     order = np.argsort(keys, kind="stable")
-    tiles = np.arange(first, past)
+    tiles = np.arange(first, end)
     x, y = tiles % tiles_x, tiles // tiles_x
     x0, y0, x1, y1 = rect[order].T[:, :, None]
     inside = (x0 <= x) & (x < x1) & (y0 <= y) & (y < y1)  # [rank, tile]
     ids = np.cumsum(inside).reshape(inside.shape) - 1
     total = int(inside.sum())
-    binner_count = binner.count(first, past)
+    binner_count = binner.count(first, end)
     assert binner_count == total
-    lists = to_host(pool.device, binner.list_isects(Band(first, past, total)), np.empty(total, np.uint32))
-    ranges = to_host(pool.device, pool.get("tile_ranges", 0), np.empty((54, 2), np.uint32))[first:past]
-    splat_of = to_host(pool.device, pool.get("isect_splat", 0), np.empty(total, np.uint32))
-    own = to_host(pool.device, pool.get("splat_isects", 0), np.empty((len(keys), 2), np.uint32))
+    lists = binner.list_isects(Band(first, end, total))
+    isects = to_host(device, lists.isects, np.empty(total, np.uint32))
+    ranges = to_host(device, lists.ranges, np.empty((54, 2), np.uint32))
+    splat_of = to_host(device, lists.isect_splat, np.empty(total, np.uint32))
+    splat_isects = to_host(device, lists.splat_isects, np.empty((len(keys), 2), np.uint32))
+    outside = np.ones(54, bool)
+    outside[first:end] = False
+    assert not (ranges[outside, 1] - ranges[outside, 0]).any()
+    ranges = ranges[first:end]
     assert np.array_equal(ranges[:, 1] - ranges[:, 0], inside.sum(0))
-    for tile in range(past - first):
-        assert np.array_equal(lists[slice(*ranges[tile])], ids[inside[:, tile], tile])
+    for tile in range(end - first):
+        assert np.array_equal(isects[slice(*ranges[tile])], ids[inside[:, tile], tile])
     assert np.array_equal(splat_of, order[np.nonzero(inside)[0]])
-    assert np.array_equal(own[order, 1] - own[order, 0], inside.sum(1))
+    assert np.array_equal(splat_isects[order, 1] - splat_isects[order, 0], inside.sum(1))
     starts = np.cumsum(inside.sum(1)) - inside.sum(1)
     some = inside.any(1)
-    assert np.array_equal(own[order, 0][some], starts[some])
+    assert np.array_equal(splat_isects[order, 0][some], starts[some])
 
 
 def test_counts_beyond_32_bits(device: Device) -> None:
     """70 000 splats over all of 65 536 tiles: more than 2^32 isects are counted, not wrapped."""
     n, side = 70_000, 256
     for kind, binner_of in (("CPU", ChunkBinner), ("GPU", GroupBinner)):
-        other = told(device, kind)
-        pool = Pool(other)
-        binner = binner_of(other, pool)
-        to_device(other, pool.get("depth_key_kept", 4 * n), np.ones(n, np.uint32))
-        to_device(other, pool.get("tile_rect", 16 * n), np.tile(np.int32([0, 0, side, side]), (n, 1)))
-        binner.order(n)
-        binner.begin(n, side, side)
+        other = as_kind(device, kind)
+        binner = binner_of(Pool(other))
+        rect = np.tile(np.array([0, 0, side, side], np.int32), (n, 1))
+        binner.order(projected(other, np.ones(n, np.uint32), rect))
+        binner.begin(side, side)
         assert binner.count(0, side * side) == n * side * side
         assert binner.count(5, 7) == 2 * n
 
 
 def test_the_limit_follows_the_device(devices: list[Device]) -> None:
     kernels = KernelBuild("gaussian", 0, SCHEDULES["cpu16"])
-    device = told(devices[0], "CPU")
+    device = as_kind(devices[0], "CPU")
     device.info = replace(device.info, max_alloc_bytes=36_000, global_mem_bytes=1 << 40)
-    assert most_isects(device, kernels) == 1000
+    assert isect_limit(device, kernels) == 1000
     device.info = replace(device.info, max_alloc_bytes=1 << 40, global_mem_bytes=180_000)
-    assert most_isects(device, kernels) == 1000
+    assert isect_limit(device, kernels) == 1000
     device.info = replace(device.info, global_mem_bytes=1 << 50)
-    assert most_isects(device, kernels) == MAX_ISECTS
+    assert isect_limit(device, kernels) == MAX_ISECTS
 
 
 def test_isects_alone_refuse_no_run(devices: list[Device]) -> None:
     """1000 MB of them are cut into bands where splats and images leave 300 MB, not where they leave 60."""
-    device, needed = told(devices[0], "CPU"), Estimate(500 * 10**6, 10**9, 200 * 10**6, 60, 10**6)
+    device, needed = as_kind(devices[0], "CPU"), Estimate(500 * 10**6, 10**9, 200 * 10**6, 60, 10**6)
     device.info = replace(device.info, max_alloc_bytes=1 << 30, global_mem_bytes=10**9)
     check(needed, device)
     assert room_for_isects(needed, device) == 300 * 10**6 * 2 // 180

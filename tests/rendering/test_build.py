@@ -9,8 +9,9 @@ from importlib.resources import files
 import pytest
 from kernel_checks import KERNELS
 
-from clsplat.device.device import SCHEDULES, Device
+from clsplat.device.device import Device
 from clsplat.device.program import build
+from clsplat.device.schedule import SCHEDULES
 from clsplat.profiling.roofline import CHAINS, limits_program
 from clsplat.rendering.binning import BUCKET_BITS
 from clsplat.rendering.build import KernelBuild

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from reference.scenes import for_shape, random_camera, random_splats, slant_of
 
 from clsplat.cameras.camera import Camera
-from clsplat.device.device import SCHEDULES, Device
+from clsplat.device.device import Device
+from clsplat.device.schedule import SCHEDULES
 from clsplat.device.trace import recorded
 from clsplat.errors import InputError
 from clsplat.rendering.colormaps import (

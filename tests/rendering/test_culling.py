@@ -9,8 +9,9 @@ from reference.scenes import for_shape, random_camera, random_splats
 from reference.skewed import SKEWED
 from rendering.test_footprint import strongly_skewed
 
-from clsplat.device.device import TILE, Device, Schedule
+from clsplat.device.device import Device
 from clsplat.device.memory import to_host
+from clsplat.device.schedule import TILE, Schedule
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.splat_buffers import SplatBuffers
@@ -51,8 +52,8 @@ def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, sc
         frame = pipeline.forward(SplatBuffers.of(device, case.splats, kernels.dtype), case.camera)
         if not frame.n_isects:
             continue
-        told = to_host(device, pipeline.pool.get("isect_blocks", 0), np.empty(frame.n_isects, np.uint32))
-        left, top, right, bottom = to_host(device, pipeline.pool.get("tile_rect", 0), np.empty(4, np.int32)).tolist()
+        told = to_host(device, pipeline.isect_blocks.buffer, np.empty(frame.n_isects, np.uint32))
+        left, top, right, bottom = to_host(device, frame.projected.tile_rect, np.empty(4, np.int32)).tolist()
         assert frame.n_isects == (right - left) * (bottom - top)
         number = np.arange(form.vecs)
         bits = (told[:, None] >> number.astype(np.uint32)) & 1

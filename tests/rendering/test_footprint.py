@@ -20,8 +20,9 @@ from reference.skewed import SKEWED
 from reference.tolerances import IMAGE_FLOAT32, ROUNDING
 
 from clsplat.cameras.camera import Camera
-from clsplat.device.device import TILE, Device, default_schedule
+from clsplat.device.device import Device
 from clsplat.device.memory import to_host
+from clsplat.device.schedule import TILE, default_schedule
 from clsplat.rendering.build import ALPHA_MIN, KernelBuild
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.splat_buffers import SplatBuffers
@@ -122,14 +123,13 @@ def kernel_boxes(
     device: Device, shape: str, arrays: Arrays, camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """First and last pixel row of each splat (N, 2), and its tiles (N, 4): first x, y, past-the-end x, y."""
-    kernels = KernelBuild(shape, 3, default_schedule(device.cl_device)).for_rendering()
+    kernels = KernelBuild(shape, 3, default_schedule(device.info)).for_rendering()
     pipeline = Pipeline(device, kernels)
     values = {name: value.astype(np.float32) for name, value in arrays.items()}
     splats = SplatBuffers.of(device, Splats(shape, values), kernels.dtype)
-    pipeline.forward(splats, camera)
-    pool, n = pipeline.pool, splats.n
-    records = to_host(device, pool.get("records", 0), np.empty((n, kernels.record), np.float32))
-    tiles = to_host(device, pool.get("tile_rect", 0), np.empty((n, 4), np.int32))
+    projected, n = pipeline.forward(splats, camera).projected, splats.n
+    records = to_host(device, projected.records, np.empty((n, kernels.record), np.float32))
+    tiles = to_host(device, projected.tile_rect, np.empty((n, 4), np.int32))
     return records[:, 6:8].astype(np.float64), tiles.astype(np.float64)
 
 

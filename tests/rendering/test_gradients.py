@@ -20,7 +20,8 @@ from reference.scenes import random_camera, random_splats
 from reference.tolerances import DIFFERENCES, relative_error
 
 from clsplat.cameras.camera import Camera
-from clsplat.device.device import SCHEDULES, Device
+from clsplat.device.device import Device
+from clsplat.device.schedule import SCHEDULES
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats

@@ -7,9 +7,10 @@ import pytest
 from reference.formulas import sh_basis as reference_basis
 from reference.scenes import for_shape, random_camera, random_splats
 
-from clsplat.device.device import Device, default_schedule
-from clsplat.device.memory import to_device
+from clsplat.device.device import Device
+from clsplat.device.schedule import default_schedule
 from clsplat.rendering.build import KernelBuild
+from clsplat.rendering.frame import DeviceImage
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers
 from clsplat.splats.harmonics import sh_basis
@@ -32,16 +33,15 @@ def test_written_out_they_are_the_backward_s_own(device: Device, degree: int) ->
     unseen = np.r_[:4, 32:64]
     arrays["mean"][unseen] += 100
     splats = Splats("gaussian", for_shape(arrays, "gaussian"))
-    kernels = KernelBuild("gaussian", 3, default_schedule(device.cl_device))
+    kernels = KernelBuild("gaussian", 3, default_schedule(device.info))
     pipeline = Pipeline(device, kernels)
     buffers = SplatBuffers.of(device, splats, kernels.dtype)
     whole, compact = (
         kind(device, splats.schema, buffers.capacity, buffers.dtype) for kind in (ParameterBuffers, CompactGradients)
     )
     frame = pipeline.forward(buffers, random_camera(), sh_degree=degree)
-    v_color = pipeline.image("v_color", frame.layout, 3)
-    given = np.random.default_rng(4).standard_normal((frame.layout.height, frame.layout.width, 3))
-    to_device(device, v_color, frame.layout.pack(given, kernels.dtype))
+    weights = np.random.default_rng(4).standard_normal((frame.layout.height, frame.layout.width, 3))
+    v_color = DeviceImage(pipeline.pool, kernels.dtype, 3).write(frame.layout, weights)
     for grads in (whole, compact):
         grads.upload({name: np.ones_like(array) for name, array in grads.download(buffers.n).items()})
         pipeline.backward(frame, v_color, grads)

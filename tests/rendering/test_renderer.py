@@ -15,10 +15,11 @@ from reference.scenes import Arrays, random_camera, random_splats
 from reference.tolerances import GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, SAME_FLOAT32, relative_error
 
 from clsplat.cameras.camera import Camera
-from clsplat.device.device import SCHEDULES, TILE, Device, Schedule, default_schedule
-from clsplat.device.memory import to_device
+from clsplat.device.device import Device
+from clsplat.device.schedule import SCHEDULES, TILE, Schedule, default_schedule
 from clsplat.errors import InputError
 from clsplat.rendering.build import BATCH, NEAR, KernelBuild
+from clsplat.rendering.frame import DeviceImage
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.renderer import Renderer
 from clsplat.rendering.splat_buffers import ParameterBuffers, SplatBuffers
@@ -278,17 +279,16 @@ def test_not_a_number_is_refused_before_it_reaches_a_device() -> None:
 def test_fewer_sh_bands_in_use(device: Device, degree: int) -> None:
     """Kernels built for degree 3 that use the lower bands only, as training does; other rows stay zero."""
     case = cloud(SKEWED)
-    pipeline = Pipeline(device, KernelBuild(SKEWED, 3, default_schedule(device.cl_device)).for_rendering())
+    pipeline = Pipeline(device, KernelBuild(SKEWED, 3, default_schedule(device.info)).for_rendering())
     splats = SplatBuffers.of(device, case.splats, pipeline.kernels.dtype)
     frame = pipeline.forward(splats, case.camera, BACKGROUND, degree)
     options = {"shape": SKEWED, "background": BACKGROUND, "sh_degree": degree}
     image = render_reference(case.values, case.camera, **options)
-    color = pipeline.read_image("color", frame.layout)
+    color = frame.images.color.read()
     assert np.abs(color - image.color)[case.decided].max() < IMAGE_FLOAT32
 
-    planes = frame.layout.pack(case.weights[0], pipeline.kernels.dtype)
-    v_color, v_alpha = (pipeline.image(name, frame.layout, 3) for name in ("v_color", "v_alpha"))
-    to_device(device, v_color, planes)
+    v_color = DeviceImage(pipeline.pool, pipeline.kernels.dtype, 3).write(frame.layout, case.weights[0])
+    v_alpha = DeviceImage(pipeline.pool, pipeline.kernels.dtype, 1).reserve(frame.layout)
     grads = ParameterBuffers(device, splats.schema, splats.n, pipeline.kernels.dtype)
     pipeline.backward(frame, v_color, grads, v_alpha)
     got, bands = grads.download(splats.n), (degree + 1) ** 2

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clsplat.device.device import Device, default_schedule
+from clsplat.device.device import Device
+from clsplat.device.schedule import default_schedule
 from clsplat.errors import InputError
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.overdraw import count_pairs
@@ -39,7 +40,7 @@ def test_equal_arguments_give_equal_bits() -> None:
 def test_useful_pairs_a_pixel_stay_the_same(devices: list[Device]) -> None:
     """Four times the splats: within a quarter, as chance and the cutoff's mix differ."""
     device = devices[0]
-    kernels = KernelBuild("gaussian", 0, default_schedule(device.cl_device))
+    kernels = KernelBuild("gaussian", 0, default_schedule(device.info))
     pipeline, pairs = Pipeline(device, kernels), []
     for n in (1000, 4000):
         scene, splats = synthetic_scene(n, 160, 120, "gaussian", sh_degree=0)

@@ -164,7 +164,7 @@ def make_checkpoint(folder: Path) -> None:
 
 def read_checkpoint(folder: Path) -> None:
     """As far as resuming goes before it asks for a device."""
-    from clsplat.device.device import Schedule
+    from clsplat.device.schedule import Schedule
     from clsplat.training.folder import ModelFolder
     from clsplat.training.run import _fitting_checkpoint
 

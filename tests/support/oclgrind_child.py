@@ -16,10 +16,11 @@ import numpy as np
 import pyopencl as cl
 from reference.scenes import for_shape, random_camera, random_splats
 
-from clsplat.device.device import Device, Schedule, buffers, open_device, program
-from clsplat.rendering import binning, pipeline
-from clsplat.rendering import radix_sort as sort
-from clsplat.rendering import renderer as render
+from clsplat.device import memory, program
+from clsplat.device.device import Device, open_device
+from clsplat.device.schedule import Schedule
+from clsplat.rendering import binning, frame, pipeline, radix_sort, splat_buffers
+from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.splats.splats import Splats
 
@@ -129,7 +130,7 @@ def make_traceable(device: Device) -> None:
     def send_to_device(device: Device, buffer: Any, array: Any) -> None:
         to_device(device, buffer, array)
 
-    for module in (buffers, pipeline, render):
+    for module in (memory, frame, pipeline, splat_buffers):
         for replaced in (fill_zero, to_device, send_to_device):
             if hasattr(module, replaced.__name__):
                 setattr(module, replaced.__name__, replaced)
@@ -155,7 +156,7 @@ def render_and_back(device: Device, shapes: tuple[str, ...], schedules: tuple[st
         fields = {name: value.astype(np.float32) for name, value in for_shape(arrays, shape).items()}
         splats = Splats(shape, fields)
         for schedule in schedules:
-            renderer = render.Renderer(device, schedule=Schedule.parse(schedule))
+            renderer = Renderer(device, schedule=Schedule.parse(schedule))
             image = renderer.render(splats, camera)
             gradients = renderer.backward(v_color, v_alpha)
             assert np.abs(image.alpha).mean() > 0.05
@@ -167,7 +168,7 @@ def render_hazards(device: Device, mode: str) -> None:
     sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
     from hazards import crafted
 
-    renderer = render.Renderer(device, schedule=Schedule.parse("1x16x16"))
+    renderer = Renderer(device, schedule=Schedule.parse("1x16x16"))
     for name in HAZARDS:
         for shape in ("gaussian", "skew-normal-direct"):
             arrays = crafted.STATIC[name](SHAPES[shape])
@@ -181,20 +182,21 @@ def sort_and_scan(device: Device, mode: str) -> None:
     """The sorter, over a block boundary; the order by depth of few work-items, over one of chunks and small buckets."""
     rng = np.random.default_rng(0)
     for n in (300, 4100):
-        pool = buffers.Pool(device)
-        sorter = sort.Sorter(device, pool)
+        pool = memory.Pool(device)
+        sorter, pairs = radix_sort.Sorter(pool), radix_sort.SortPairs(pool)
         keys = rng.integers(0, 50, n, np.uint32)
-        buffers.to_device(device, pool.get("keys", 4 * n), keys)
-        sorter.iota(pool.get("values", 4 * n), n)
-        _, order = sorter.sort("keys", "values", n, 6)
-        got = buffers.to_host(device, order, np.empty(n, np.uint32))
+        memory.to_device(device, pairs.keys.reserve(n), keys)
+        sorter.iota(pairs.values.reserve(n), n)
+        _, order = sorter.sort(pairs, n, 6)
+        got = memory.to_host(device, order, np.empty(n, np.uint32))
         assert np.array_equal(got, np.argsort(keys, kind="stable"))
     n = 4100
-    pool = buffers.Pool(device)
     keys = rng.choice(rng.integers(0, 2**31, 60, np.uint32), n)
-    buffers.to_device(device, pool.get("depth_key_kept", 4 * n), keys)
-    binning.ChunkBinner(device, pool).order(n)
-    got = buffers.to_host(device, pool.get("depth_order", 0), np.empty(n, np.uint32))
+    depth_key, unused = device.alloc(keys.nbytes), device.alloc(4)
+    memory.to_device(device, depth_key, keys)
+    binner = binning.ChunkBinner(memory.Pool(device))
+    binner.order(frame.ProjectedSplats(n, n, unused, unused, depth_key, unused))
+    got = binner.depth_order.read(n)
     assert np.array_equal(got, np.argsort(keys, kind="stable"))
 
 

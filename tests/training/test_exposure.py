@@ -14,11 +14,12 @@ from reference.loss import reference_loss, reference_loss_gradient
 from reference.tolerances import ROUNDING, relative_error
 
 from clsplat.cameras.camera import Camera
-from clsplat.device.device import SCHEDULES, Device, Schedule
-from clsplat.device.memory import to_device, to_host
+from clsplat.device.device import Device
+from clsplat.device.memory import Pool, to_host
 from clsplat.device.program import Real
+from clsplat.device.schedule import SCHEDULES, Schedule
 from clsplat.rendering.build import KernelBuild
-from clsplat.rendering.pipeline import Pipeline
+from clsplat.rendering.frame import DeviceImage
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.checkpoint import Checkpoint
@@ -62,7 +63,7 @@ def exposure_loss(device: Device, schedule: Schedule, real: Real, views: list[Vi
     kernels = KernelBuild("gaussian", 0, schedule, real=real)
     config = TrainConfig(exposure=exposure, random_background=True, iterations=100)
     targets = Targets(device, kernels, views, 10**9, target_channels(views, with_alpha=True))
-    return ExposureLoss(ImageLoss(Pipeline(device, kernels), 0.2), targets, config, BEHIND)
+    return ExposureLoss(ImageLoss(Pool(device), kernels, 0.2), targets, config, BEHIND)
 
 
 def wanted_of(
@@ -137,8 +138,8 @@ def test_gradients_and_step_equal_the_reference(
         target = exposure.targets.get(i, 1)
         layout = target.layout
         color = np.random.default_rng(iteration).random((*view.image.shape[:2], 3)).astype(np.float32)
-        to_device(device, exposure.pipeline.image("color", layout, 3), layout.pack(color, dtype))
-        result = exposure.evaluate(target, NEW)
+        rendered = DeviceImage(exposure.loss.pool, dtype, 3).write(layout, color)
+        result = exposure.evaluate(target, rendered, NEW)
         planes = to_host(device, result.v_color, np.empty((3, layout.rows, layout.stride), dtype))
         v = gradient_of(color.astype(np.float64), exposures[i], view)
         found = layout.unpack(planes)

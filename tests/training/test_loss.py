@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from reference.loss import reference_loss, reference_loss_gradient
 from reference.tolerances import ROUNDING, relative_error
 
-from clsplat.device.device import SCHEDULES, Device, Schedule
-from clsplat.device.memory import to_device, to_host
+from clsplat.device.device import Device
+from clsplat.device.memory import Pool, to_device, to_host
 from clsplat.device.program import Real
+from clsplat.device.schedule import SCHEDULES, Schedule
 from clsplat.rendering.build import KernelBuild
-from clsplat.rendering.pipeline import ImageLayout, Pipeline
+from clsplat.rendering.frame import DeviceImage, ImageLayout
 from clsplat.training.loss import ImageLoss, LossValue
 
 # Height and width: below the window, beside a tile and a strip of vectors, several segments of rows.
@@ -26,7 +27,7 @@ def loss_of(
 ) -> ImageLoss:
     if real == "double" and not device.has_fp64:
         pytest.skip("no double precision")
-    return ImageLoss(Pipeline(device, KernelBuild("gaussian", 0, schedule, real=real)), weight)
+    return ImageLoss(Pool(device), KernelBuild("gaussian", 0, schedule, real=real), weight)
 
 
 def compared(
@@ -35,11 +36,11 @@ def compared(
     """Value, and gradient (H, W, 3), of an image against a truth."""
     device, dtype = loss.device, loss.kernels.dtype
     layout = ImageLayout(truth.shape[1], truth.shape[0])
-    to_device(device, loss.pipeline.image("color", layout, 3), layout.pack(color, dtype))
+    rendered = DeviceImage(loss.pool, dtype, 3).write(layout, color)
     planes = layout.pack(truth, np.dtype(np.uint8))
     buffer = device.alloc(planes.nbytes)
     to_device(device, buffer, planes)
-    result = loss.evaluate(layout, buffer)
+    result = loss.evaluate(layout, rendered, buffer)
     gradient = to_host(device, result.v_color, np.empty((3, layout.rows, layout.stride), dtype))
     inside = layout.unpack(gradient)
     assert np.abs(gradient).sum() == pytest.approx(np.abs(inside).sum(), rel=1e-6), "not zero outside the image"

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clsplat.device.device import Device, default_schedule
+from clsplat.device.device import Device
+from clsplat.device.schedule import default_schedule
 from clsplat.errors import InputError
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.splat_buffers import CompactGradients, SplatBuffers
@@ -90,9 +91,7 @@ def config_of(**options: object) -> TrainConfig:
 
 
 def kernels_of(device: Device, config: TrainConfig, sh_degree: int = 2) -> KernelBuild:
-    return KernelBuild(
-        config.shape, sh_degree, default_schedule(device.cl_device), skew_map=config.skew_map or SKEW_MAPS[0]
-    )
+    return KernelBuild(config.shape, sh_degree, default_schedule(device.info), skew_map=config.skew_map or SKEW_MAPS[0])
 
 
 def started(device: Device, config: TrainConfig, splats: Splats) -> tuple[SplatBuffers, Optimizer]:

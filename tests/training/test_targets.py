@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 import clsplat
-from clsplat.device.device import SCHEDULES, Device
+from clsplat.device.device import Device
 from clsplat.device.memory import to_host
+from clsplat.device.schedule import SCHEDULES
 from clsplat.device.trace import recorded
 from clsplat.files.images import resize_area
 from clsplat.rendering.build import KernelBuild

@@ -1,0 +1,72 @@
+"""Schedules: how the pixels of a tile are distributed over the work-items of a device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..errors import DeviceError
+from .device import DeviceInfo
+
+TILE = 16  # side of a tile [px]
+_LANES = (1, 8, 16)  # widths that cl/math/lanes.clh implements
+_GROUP_STEP = 32  # sums are taken over parts of 16 items, and PoCL 3.1 miscompiles groups of 16
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """Work-items x vectors of each work-item x lanes of each vector, for one tile.
+
+    The product is the number of pixels of a tile, 256.
+
+    Raises
+    ------
+    DeviceError : no kernel implements this combination.
+    """
+
+    group: int
+    vecs: int
+    lanes: int
+
+    def __post_init__(self) -> None:
+        if min(self.group, self.vecs, self.lanes) < 1 or self.group * self.vecs * self.lanes != TILE * TILE:
+            raise DeviceError(f"schedule {self}: GROUPxVECSxLANES must multiply to {TILE * TILE}")
+        if self.lanes not in _LANES:
+            raise DeviceError(f"schedule {self}: LANES must be 1, 8 or 16")
+        if self.group > 1 and self.group % _GROUP_STEP:
+            raise DeviceError(f"schedule {self}: GROUP must be 1 or a multiple of {_GROUP_STEP}")
+
+    def __str__(self) -> str:
+        return f"{self.group}x{self.vecs}x{self.lanes}"
+
+    @classmethod
+    def parse(cls, text: str) -> Schedule:
+        """Return the schedule for a name of `SCHEDULES` or a text "GROUPxVECSxLANES".
+
+        Raises
+        ------
+        DeviceError : the text is neither.
+        """
+        if text in SCHEDULES:
+            return SCHEDULES[text]
+        try:
+            group, vecs, lanes = (int(part) for part in text.lower().split("x"))
+        except ValueError:
+            names = ", ".join(SCHEDULES)
+            raise DeviceError(f"schedule {text!r}: expected one of {names} or a form such as 1x16x16") from None
+        return cls(group, vecs, lanes)
+
+
+SCHEDULES = {
+    "cpu16": Schedule(1, 16, 16),
+    "cpu8": Schedule(1, 32, 8),
+    "scalar": Schedule(1, 256, 1),
+    "gpu256": Schedule(256, 1, 1),
+    "gpu64": Schedule(64, 4, 1),
+}
+
+
+def default_schedule(info: DeviceInfo) -> Schedule:
+    """Return the schedule of an unmeasured device: wide lanes on CPUs, one pixel per work-item on others."""
+    if info.type == "CPU":
+        return SCHEDULES["cpu16"]
+    return SCHEDULES["gpu256"] if info.max_group >= SCHEDULES["gpu256"].group else SCHEDULES["gpu64"]
