@@ -1,6 +1,7 @@
 """The Blender add-on: splats as objects, rendered by clsplat.
 
-`lens.py` and `pictures.py` know no `bpy`; everything that does is imported when Blender registers the add-on.
+`lens.py` and `pictures.py` do not import `bpy`. The other modules do, so they are imported when Blender registers the
+add-on.
 """
 
 from __future__ import annotations

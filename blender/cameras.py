@@ -1,7 +1,7 @@
-"""Cameras and paths: cameras.json and nerfstudio's camera_path.json, in and out.
+"""Import and export of cameras.json and of nerfstudio's camera_path.json.
 
-Files are in the world of the splats, so cameras are placed by the object of splats that is active, if one is: they
-become its children, and are written as it sees them.
+The files are in the world of the splats. Imported cameras become children of the active object of splats, if there is
+one. Exported cameras are written relative to it.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from clsplat.cameras.camera import Camera
     from clsplat.cameras.path import CameraPath
 
-_CLIP = (0.01, 1e5)  # world units; clsplat's own near plane, and beyond any sky
+_CLIP = (0.01, 1e5)  # world units; from the near plane of clsplat to beyond any sky
 _FILTER = bpy.props.StringProperty(default="*.json", options={"HIDDEN"})
 
 
 def add_camera(context: Any, camera: Camera, name: str, parent: Any = None) -> Any:
-    """A camera object with the lens and pose of a pinhole."""
+    """Add a camera object with the lens and pose of a pinhole."""
     item = bpy.data.objects.new(name, bpy.data.cameras.new(name))
     item.parent = parent
     item.rotation_mode = "QUATERNION"
@@ -45,12 +45,12 @@ def set_camera(item: Any, camera: Camera) -> None:
     data.lens, data.shift_x, data.shift_y = lens.lens, lens.shift_x, lens.shift_y
     before = item.rotation_quaternion.copy()
     item.matrix_basis = Matrix(matrix_world_of(camera).tolist())
-    if before.dot(item.rotation_quaternion) < 0:  # the same turn; keys would go the long way round
+    if before.dot(item.rotation_quaternion) < 0:  # both signs are the same rotation; animation must take the short way
         item.rotation_quaternion.negate()
 
 
 def set_output(scene: Any, camera: Camera) -> None:
-    """Size and pixel aspect of a pinhole as the scene's output."""
+    """Set the output size and pixel aspect of the scene to those of a pinhole."""
     from .lens import lens_of
 
     _, (aspect_x, aspect_y) = lens_of(camera)
@@ -60,7 +60,7 @@ def set_output(scene: Any, camera: Camera) -> None:
 
 
 def add_path(context: Any, path: CameraPath, name: str, parent: Any = None) -> Any:
-    """One animated camera, a key a frame; sets the scene's frames, rate, size and camera."""
+    """Add an animated camera with a key for each frame; set the frames, rate, size and camera of the scene."""
     scene = context.scene
     item = add_camera(context, path.cameras[0], name, parent)
     for index, camera in enumerate(path.cameras):
@@ -80,11 +80,11 @@ def add_path(context: Any, path: CameraPath, name: str, parent: Any = None) -> A
 
 
 def camera_at(context: Any, item: Any, parent: Any = None) -> Camera:
-    """The pinhole of a camera object at the scene's frame, in the world of `parent`'s splats.
+    """Return the pinhole of a camera object at the current frame, in the world of the splats of `parent`.
 
     Raises
     ------
-    clsplat.InputError : not a perspective camera, or a parent whose transform splats cannot follow.
+    clsplat.InputError : the camera is not a perspective camera, or the transform of the parent is not a similarity.
     """
     import numpy as np
 
@@ -111,7 +111,7 @@ def camera_at(context: Any, item: Any, parent: Any = None) -> Camera:
 
 
 def splats_of(context: Any) -> Any:
-    """The object of splats that files refer to: the active one, or the only one; None where there is none."""
+    """Return the object of splats that files refer to: the active one, or the only one, or None."""
     active = context.view_layer.objects.active
     if active is not None and active.clsplat_ply:
         return active
@@ -129,7 +129,9 @@ class ImportCameras(bpy.types.Operator, ImportHelper):  # type: ignore[misc]
     filename_ext = ".json"
     filter_glob: _FILTER  # type: ignore[valid-type]
     animated: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="As Animation", default=False, description="Make one animated camera of a cameras.json, a frame each"
+        name="As Animation",
+        default=False,
+        description="Make one animated camera from a cameras.json, with one frame for each camera",
     )
 
     @reported
@@ -169,8 +171,8 @@ class ExportCameras(bpy.types.Operator, ExportHelper):  # type: ignore[misc]
     content: bpy.props.EnumProperty(  # type: ignore[valid-type]
         name="Content",
         items=[
-            ("PATH", "Animation (camera_path.json)", "The scene's camera, frame by frame, as nerfstudio has it"),
-            ("CAMERAS", "Cameras (cameras.json)", "The selected cameras, or all, at this frame, as 3DGS has them"),
+            ("PATH", "Animation (camera_path.json)", "The camera of the scene in every frame, for nerfstudio"),
+            ("CAMERAS", "Cameras (cameras.json)", "The selected cameras, or all, at this frame, for 3DGS"),
         ],
     )
 
@@ -196,7 +198,7 @@ class ExportCameras(bpy.types.Operator, ExportHelper):  # type: ignore[misc]
 
 
 def write_path_of(context: Any, file: Path, parent: Any = None) -> None:
-    """The scene's camera over the scene's frames as camera_path.json; the scene's frame stays what it was."""
+    """Write the camera of the scene over all frames as camera_path.json; the current frame is restored."""
     from clsplat.cameras.path import CameraPath, write_path
 
     scene = context.scene

@@ -1,4 +1,4 @@
-"""Splats and Blender's own picture in one image: two scenes, and nodes that put the nearer over the farther."""
+"""Composite of splats and meshes: two scenes, and nodes that put the nearer image over the farther."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from .engine import IDNAME
 from .errors import reported
 
 _SUFFIX = " splats"
-_NEW = bpy.app.version >= (5, 0, 0)  # the compositor's nodes are a group, and partly the shaders'
+_NEW = bpy.app.version >= (5, 0, 0)  # the compositor is a node group and shares nodes with shaders
 
 
 def composite(scene: Any, engine: str) -> Any:
     """Render `scene`'s meshes with `engine`, its splats with clsplat, and combine both pixel by pixel.
 
-    The splats are rendered in a second scene of the same objects and camera. Each pixel shows the nearer of the two
-    over the farther one, by depth and alpha; where splats lie before and behind a surface in one pixel, their mean
-    depth decides for all of them. Both films become transparent, so that edges are smooth: the world still lights the
-    meshes, and is not seen. Again after objects were added: the second scene is made anew.
+    The splats are rendered in a second scene with the same objects and camera. Each pixel shows the nearer of the two
+    images over the farther one, by depth and alpha. If a pixel has splats before and behind a surface, their mean depth
+    decides. Both films become transparent, so that edges are smooth. The world still lights the meshes but is not
+    visible. Another call makes the second scene anew, with objects that were added.
 
     Returns
     -------
@@ -39,12 +39,12 @@ def composite(scene: Any, engine: str) -> Any:
         layer.use_pass_z = True
     scene.render.engine = engine
     tree, sink = _tree(scene)
-    ours, theirs = _layers(tree, splats, 0), _layers(tree, scene, -300)
+    of_splats, of_meshes = _layers(tree, splats, 0), _layers(tree, scene, -300)
     nearer = tree.nodes.new(_named("ShaderNodeMath", "CompositorNodeMath"))
     nearer.operation, nearer.location = "LESS_THAN", (300, -300)
-    tree.links.new(ours.outputs["Depth"], nearer.inputs[0])
-    tree.links.new(theirs.outputs["Depth"], nearer.inputs[1])
-    before, behind = _over(tree, theirs, ours, 100), _over(tree, ours, theirs, -100)
+    tree.links.new(of_splats.outputs["Depth"], nearer.inputs[0])
+    tree.links.new(of_meshes.outputs["Depth"], nearer.inputs[1])
+    before, behind = _over(tree, of_meshes, of_splats, 100), _over(tree, of_splats, of_meshes, -100)
     mix = tree.nodes.new(_named("ShaderNodeMix", "CompositorNodeMixRGB"))
     mix.location = (700, 0)
     if mix.bl_idname == "ShaderNodeMix":
@@ -65,7 +65,7 @@ def composite(scene: Any, engine: str) -> Any:
 
 
 def _use_nodes(scene: Any, tree: Any) -> None:
-    """Give the scene a compositing tree, or none."""
+    """Set or remove the compositing tree of the scene."""
     if _NEW:
         scene.compositing_node_group = tree
     else:
@@ -73,7 +73,7 @@ def _use_nodes(scene: Any, tree: Any) -> None:
 
 
 def _tree(scene: Any) -> tuple[Any, Any]:
-    """An empty compositing tree of the scene, and the socket that its image goes into."""
+    """Return an empty compositing tree of the scene, and the socket of its output image."""
     if _NEW:
         tree = bpy.data.node_groups.new(f"{scene.name} clsplat", "CompositorNodeTree")
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
@@ -95,7 +95,7 @@ def _layers(tree: Any, scene: Any, height: int) -> Any:
 
 
 def _over(tree: Any, background: Any, foreground: Any, height: int) -> Any:
-    """A node with one image over another."""
+    """Return a node that puts one image over another."""
     node = tree.nodes.new("CompositorNodeAlphaOver")
     node.location = (300, height)
     images = [socket for socket in node.inputs if socket.type == "RGBA"]
@@ -105,12 +105,12 @@ def _over(tree: Any, background: Any, foreground: Any, height: int) -> Any:
 
 
 def _named(*kinds: str) -> str:
-    """The kind of node that this Blender has in its compositor."""
+    """Return the kind of node that this version of Blender has."""
     return kinds[0] if _NEW else kinds[1]
 
 
 class Composite(bpy.types.Operator):  # type: ignore[misc]
-    """Render meshes with one of Blender's engines, and put splats before and behind them by depth"""
+    """Render meshes with an engine of Blender, and put splats before and behind them by depth"""
 
     bl_idname = "clsplat.composite"
     bl_label = "Composite With Meshes"
@@ -128,7 +128,7 @@ class Composite(bpy.types.Operator):  # type: ignore[misc]
     @reported
     def execute(self, context: Any) -> set[str]:
         splats = composite(context.scene, self.engine)
-        self.report({"INFO"}, f"the scene {splats.name} renders the splats, the compositor puts both together")
+        self.report({"INFO"}, f"the scene {splats.name} renders the splats; the compositor combines both")
         return {"FINISHED"}
 
 

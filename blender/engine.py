@@ -1,4 +1,4 @@
-"""clsplat as a render engine: F12 and animations, and the viewport."""
+"""clsplat as a render engine of Blender, for images, animations and the viewport."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from .pictures import Placed, Studio
 
 IDNAME = "CLSPLAT"
-_MOVING_SECONDS = 0.08  # for a frame of the viewport while the view moves
+_MOVING_SECONDS = 0.08  # time for a frame of the viewport while the view moves
 _studios: dict[str, Studio] = {}
 
 
 def studio() -> Studio:
-    """The renderer of the device chosen in the preferences, kept between frames."""
+    """Return the renderer of the device from the preferences; it is kept between frames."""
     from .pictures import Studio
 
     device = chosen_device()
@@ -30,18 +30,18 @@ def studio() -> Studio:
 
 
 def chosen_device() -> str:
-    """The preferences' device; "" for the best one."""
+    """Return the device from the preferences; "" means the best one."""
     addon = bpy.context.preferences.addons.get(__package__)
     return addon.preferences.device if addon is not None and addon.preferences else ""
 
 
 def forget() -> None:
-    """Let go of the device and of all splats read."""
+    """Release the device and all splats."""
     _studios.clear()
 
 
 def objects_of(depsgraph: Any) -> list[Placed]:
-    """The splats that the depsgraph shows, instances too."""
+    """Return the visible objects of splats in the depsgraph, with instances."""
     import numpy as np
 
     from .pictures import Placed
@@ -61,33 +61,33 @@ def objects_of(depsgraph: Any) -> list[Placed]:
 
 
 def is_linear(scene: Any) -> bool:
-    """Whether the view turns light into display values; Raw shows values as they are."""
+    """Whether the view transform converts light to display values; Raw does not."""
     return bool(scene.view_settings.view_transform != "Raw")
 
 
 class ClsplatRenderEngine(bpy.types.RenderEngine):  # type: ignore[misc]
-    """Splats, and nothing else, from Blender's camera."""
+    """Engine that renders only splats, from the camera of Blender."""
 
     bl_idname = IDNAME
     bl_label = "clsplat"
     bl_use_preview = False
     bl_use_postprocess = True
     bl_use_shading_nodes_custom = False
-    bl_use_eevee_viewport = True  # the viewport's Material Preview shows the meshes
+    bl_use_eevee_viewport = True  # Material Preview of the viewport shows the meshes
 
-    # An instance's own once set; not in __init__, whose arguments differ between versions of Blender.
+    # Defaults of the instance. They are not set in __init__, because its arguments differ between versions of Blender.
     _drawn: Any = None  # texture of the viewport
-    _view: Any = None  # what it shows
-    _speed = 5e-7  # seconds a pixel, of the last frame
+    _view: Any = None  # the view that the texture shows
+    _speed = 5e-7  # seconds for a pixel of the last frame
 
     def update_render_passes(self, scene: Any = None, renderlayer: Any = None) -> None:
-        """The passes that the compositor offers."""
+        """Register the passes for the compositor."""
         self.register_pass(scene, renderlayer, "Combined", 4, "RGBA", "COLOR")
         if renderlayer.use_pass_z:
             self.register_pass(scene, renderlayer, "Depth", 1, "Z", "VALUE")
 
     def render(self, depsgraph: Any) -> None:
-        """One frame of one view layer."""
+        """Render one frame of one view layer."""
         try:
             self._render(depsgraph)
         except Exception as error:
@@ -104,7 +104,7 @@ class ClsplatRenderEngine(bpy.types.RenderEngine):  # type: ignore[misc]
 
         objects = objects_of(depsgraph)
         for item in objects:
-            placement(item)  # before the camera's, which may be a child of the object at fault
+            placement(item)  # before the camera, which may be a child of a faulty object
         scene = depsgraph.scene
         camera = self.camera_override or scene.camera
         if camera is None:
@@ -116,7 +116,9 @@ class ClsplatRenderEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         image = studio().render(objects, pinhole, clip)
         background = None if scene.render.film_transparent else tuple(scene.clsplat_background)
         pixels = combined(image, background, is_linear(scene))
-        left, bottom, right, top = raster.pixels  # of a whole image: what a splat looks like depends on its size
+        left, bottom, right, top = (
+            raster.pixels
+        )  # the whole image is rendered, because the look of a splat depends on its size
         result = self.begin_result(0, 0, right - left, top - bottom, layer=depsgraph.view_layer_eval.name)
         layer = result.layers[0]
         layer.passes["Combined"].rect.foreach_set(pixels[bottom:top, left:right].ravel())
@@ -125,12 +127,12 @@ class ClsplatRenderEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         self.end_result(result)
 
     def view_update(self, context: Any, depsgraph: Any) -> None:
-        """Something in the scene has changed: draw anew."""
+        """Draw again, because the scene has changed."""
         self._view = None
         self.tag_redraw()
 
     def view_draw(self, context: Any, depsgraph: Any) -> None:
-        """Draw the viewport: coarse while the view moves, then in full."""
+        """Draw the viewport, at low resolution while the view moves."""
         try:
             self._draw(context, depsgraph)
         except Exception as error:
@@ -174,7 +176,7 @@ class ClsplatRenderEngine(bpy.types.RenderEngine):  # type: ignore[misc]
 
 
 def lens_values(data: Any) -> Any:
-    """The `Lens` of a Blender camera's data."""
+    """Return the `Lens` of Blender camera data."""
     from .lens import Lens
 
     return Lens(
@@ -183,7 +185,7 @@ def lens_values(data: Any) -> Any:
 
 
 def raster_of(settings: Any, width: int = 0, height: int = 0) -> Any:
-    """The `Raster` of Blender's output settings; `width` and `height` [px] replace theirs."""
+    """Return the `Raster` of the output settings of Blender; `width` and `height` [px] replace its size."""
     from .lens import Raster
 
     border = None

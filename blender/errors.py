@@ -1,4 +1,4 @@
-"""From what goes wrong to one line in Blender's report area."""
+"""Conversion of errors to one line in the report area of Blender."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MISSING = "clsplat is not installed in Blender's Python: see the preferences of 
 
 
 def message_of(error: Exception) -> str | None:
-    """What to tell the user, or None for a fault of the add-on's own."""
+    """Return the message for the user, or None for a fault of the add-on."""
     if isinstance(error, ImportError):
         return MISSING if (error.name or "").split(".")[0] == "clsplat" else f"{MISSING} ({error.name} is missing)"
     from clsplat.errors import ClsplatError
@@ -21,10 +21,10 @@ def message_of(error: Exception) -> str | None:
 
 
 def reported(execute: Callable[[Any, Any], set[str]]) -> Callable[[Any, Any], set[str]]:
-    """An operator's `execute` that reports what the user can mend, and cancels, instead of raising."""
+    """Wrap `execute` of an operator: it reports an error that the user can fix and cancels, instead of raising."""
 
     @functools.wraps(execute)
-    def wrapped(self: Any, context: Any) -> set[str]:  # Blender counts the arguments
+    def wrapped(self: Any, context: Any) -> set[str]:  # Blender checks the number of arguments
         try:
             return execute(self, context)
         except Exception as error:

@@ -1,9 +1,9 @@
-"""Blender's camera values and clsplat's pinhole, exactly, either way. Knows no `bpy`.
+"""Exact conversion between camera values of Blender and the pinhole of clsplat, without `bpy`.
 
-Blender measures a camera in the sensor's millimetres and in shares of one side of the image, the *fitted* one: the
-width for HORIZONTAL, the height for VERTICAL, for AUTO whichever shows more of the world. AUTO takes the sensor's width
-for either. With pixels of aspect a = pixel_aspect_y / pixel_aspect_x, in widths of a pixel the image is `width` by
-`a height`; so with `fitted` = width or a height
+Blender measures a camera in millimetres of the sensor and in shares of one side of the image, the *fitted* one. This is
+the width for HORIZONTAL, the height for VERTICAL, and for AUTO the side that shows more of the world. AUTO always uses
+the sensor width. Pixels have the aspect a = pixel_aspect_y / pixel_aspect_x. So the image is `width` by `a height` in
+widths of a pixel. With `fitted` = width or a height:
 
     fx = lens / sensor * fitted        cx = width / 2 - shift_x fitted
     fy = fx / a                        cy = height / 2 + shift_y fitted / a
@@ -21,19 +21,19 @@ from clsplat.cameras.camera import Camera
 from clsplat.cameras.path import cam_from_world_of, pose_of
 from clsplat.errors import InputError
 
-SENSOR = 36.0  # Blender's own sensor width [mm]
+SENSOR = 36.0  # default sensor width of Blender [mm]
 _KINDS = {"ORTHO": "orthographic", "PANO": "panoramic", "CUSTOM": "custom"}
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Values of a Blender camera, under Blender's names.
+    """Values of a Blender camera with the names that Blender uses.
 
     Attributes
     ----------
-    lens, sensor_width, sensor_height : [mm]. sensor_fit : "AUTO", "HORIZONTAL" or "VERTICAL".
-    shift_x, shift_y : shares of the fitted side, right and up.
-    type : "PERSP" or another, which is refused.
+    lens, sensor_width, sensor_height : focal length and sensor [mm]. sensor_fit : "AUTO", "HORIZONTAL" or "VERTICAL".
+    shift_x, shift_y : shift to the right and up, as shares of the fitted side.
+    type : "PERSP"; other types are refused.
     """
 
     lens: float = 50.0
@@ -47,11 +47,11 @@ class Lens:
 
 @dataclass(frozen=True)
 class Raster:
-    """Size of the image [px] and aspect of its pixels, as in Blender's output settings.
+    """Size of the image [px] and aspect of its pixels, as in the output settings of Blender.
 
     Attributes
     ----------
-    border : left, bottom, right, top as shares of the image, or None: the part that is to be seen.
+    border : the visible part as left, bottom, right, top in shares of the image, or None for all.
     """
 
     width: int
@@ -69,7 +69,7 @@ class Raster:
         pixel_aspect_y: float = 1.0,
         border: tuple[float, float, float, float] | None = None,
     ) -> Raster:
-        """From Blender's settings; sizes are cut off to whole pixels, as Blender does."""
+        """Return the raster of the settings; sizes are rounded down, as Blender does."""
         return Raster(
             max(1, resolution_x * percentage // 100),
             max(1, resolution_y * percentage // 100),
@@ -80,7 +80,7 @@ class Raster:
 
     @property
     def pixels(self) -> tuple[int, int, int, int]:
-        """Left, bottom, right and top of the part that is to be seen, from below [px]."""
+        """Left, bottom, right and top of the visible part, counted from below [px]."""
         if self.border is None:
             return 0, 0, self.width, self.height
         left, bottom, right, top = self.border
@@ -88,7 +88,7 @@ class Raster:
 
 
 def camera_of(lens: Lens, raster: Raster, matrix_world: ArrayLike, name: str = "camera") -> Camera:
-    """The pinhole of a Blender camera, for the whole image.
+    """Return the pinhole of a Blender camera for the whole image.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def camera_of(lens: Lens, raster: Raster, matrix_world: ArrayLike, name: str = "
 
 
 def camera_of_matrices(view: ArrayLike, projection: ArrayLike, width: int, height: int) -> Camera:
-    """The pinhole of a viewport: world to view (4, 4), and OpenGL's projection (4, 4).
+    """Return the pinhole of a viewport from world to view (4, 4) and the projection of OpenGL (4, 4).
 
     Raises
     ------
@@ -142,7 +142,7 @@ def camera_of_matrices(view: ArrayLike, projection: ArrayLike, width: int, heigh
 
 
 def lens_of(camera: Camera) -> tuple[Lens, tuple[float, float]]:
-    """Blender's values of a pinhole, fitted to the width, and the pixel aspects x and y (the smaller is 1)."""
+    """Return the Blender values of a pinhole, fitted to the width, and the pixel aspects x and y (the smaller is 1)."""
     aspect = camera.fx / camera.fy
     if math.isclose(aspect, 1.0, rel_tol=1e-6):
         aspect = 1.0
@@ -158,12 +158,12 @@ def lens_of(camera: Camera) -> tuple[Lens, tuple[float, float]]:
 
 
 def matrix_world_of(camera: Camera) -> NDArray[np.float64]:
-    """Camera to world (4, 4) in Blender's axes."""
+    """Return the camera-to-world matrix (4, 4) with the axes of Blender."""
     return pose_of(camera)
 
 
 def moved(camera: Camera, scale: float, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Camera:
-    """The camera that sees x as `camera` sees s R x + t; its depths are those of `camera` over s."""
+    """Return the camera that sees x as `camera` sees s R x + t; its depths are those of `camera` divided by s."""
     pose = np.eye(4)
     pose[:3, :3] = camera.rotation @ rotation
     pose[:3, 3] = (camera.rotation @ translation + camera.translation) / scale

@@ -1,4 +1,4 @@
-"""Panels and preferences."""
+"""Panels and preferences of the add-on."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from .engine import IDNAME
 
 
 class Preferences(bpy.types.AddonPreferences):  # type: ignore[misc]
-    """Where clsplat comes from, and which device it runs on."""
+    """The source of clsplat, and its device."""
 
     bl_idname = __package__
 
     device: bpy.props.StringProperty(  # type: ignore[valid-type]
         name="Device",
-        description='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name; empty: the best',
+        description='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name; empty for the best',
     )
 
     def draw(self, context: Any) -> None:
@@ -35,7 +35,7 @@ class Preferences(bpy.types.AddonPreferences):  # type: ignore[misc]
 
 
 class RenderPanel(bpy.types.Panel):  # type: ignore[misc]
-    """What the engine shows behind the splats."""
+    """Panel for the background behind the splats."""
 
     bl_idname = "RENDER_PT_clsplat"
     bl_label = "clsplat"
@@ -58,7 +58,7 @@ class RenderPanel(bpy.types.Panel):  # type: ignore[misc]
 
 
 class ObjectPanel(bpy.types.Panel):  # type: ignore[misc]
-    """The PLY that an object shows."""
+    """Panel for the PLY file of an object."""
 
     bl_idname = "OBJECT_PT_clsplat"
     bl_label = "Splats"

@@ -1,4 +1,4 @@
-"""What Blender's render result is made of: splats of several objects in one image, in Blender's colours. No `bpy`."""
+"""Render passes for Blender: splats of several objects in one image, in the colours of Blender, without `bpy`."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from .lens import moved
 
 Pixels = NDArray[np.float32]
 
-NOTHING = 1e10  # Blender's depth where nothing is
-_SEEN = 1 / 255  # alpha from which a pixel has a depth
+NOTHING = 1e10  # the depth of empty pixels in Blender
+_VISIBLE = 1 / 255  # the least alpha of a pixel with a depth
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """An object of splats: its name, its PLY, and its (4, 4) matrix to world."""
+    """An object of splats: its name, its PLY file, and its matrix to the world (4, 4)."""
 
     name: str
     ply: Path
@@ -34,40 +34,39 @@ class Placed:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Equal for the same file, unchanged, at the same place."""
+        """Key that is equal for an unchanged file at the same place."""
         status = self.ply.stat()
         return (str(self.ply), status.st_mtime_ns, status.st_size, self.matrix.tobytes())
 
 
 class Studio:
-    """Renders objects of splats, and keeps what it has read and joined until it changes.
+    """Renderer of objects of splats; it keeps models until their files or places change.
 
     Parameters
     ----------
-    device : as `clsplat.Renderer` takes it.
+    device : device name for `clsplat.Renderer`.
     """
 
     def __init__(self, device: str | None = None) -> None:
         self.renderer = Renderer(device)
-        self._lock = Lock()  # Blender renders in a thread of its own while the viewport draws
+        self._lock = Lock()  # Blender renders in another thread while the viewport draws
         self._files: dict[tuple[object, ...], Splats] = {}
         self._joined: tuple[tuple[object, ...], Splats] | None = None
         self._clipped: tuple[Splats, bytes, Splats] | None = None
 
     def render(self, objects: Sequence[Placed], camera: Camera, clip: tuple[float, float] = (0.0, np.inf)) -> Rendered:
-        """The objects' splats before black; depths in world units.
+        """Render the splats of all objects before black; depths are in world units.
 
-        One object is seen by a camera that is moved instead, which leaves its splats, and the image's bits, as
-        `clsplat render` has them.
+        For a single object the camera is moved instead of the splats. The image then has the bits of `clsplat render`.
 
         Parameters
         ----------
-        clip : nearest and farthest depth of a splat's centre that is shown [world units].
+        clip : nearest and farthest depth of the centres of visible splats [world units].
 
         Raises
         ------
-        InputError : a PLY that cannot be read, a transform that splats cannot follow, or shapes that do not mix; names
-            the object.
+        InputError : a PLY file cannot be read, a transform is not a similarity, or shapes cannot be joined. The message
+            names the object.
         """
         with self._lock:
             return self._render(objects, camera, clip)
@@ -107,7 +106,7 @@ class Studio:
         return self._joined[1]
 
     def _between(self, splats: Splats, camera: Camera, clip: tuple[float, float]) -> Splats:
-        """Those whose centres lie between the clip distances; the same object while they stay the same."""
+        """Return the splats with centres between the clip distances; the same object as long as they do not change."""
         depth = splats.mean @ camera.rotation[2].astype(np.float32) + np.float32(camera.translation[2])
         inside = (depth >= clip[0]) & (depth <= clip[1])
         if inside.all():
@@ -119,8 +118,7 @@ class Studio:
 
 
 def placement(item: Placed) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """An object's scale, rotation and translation; raises InputError, naming it, for a transform that splats cannot
-    follow."""
+    """Return scale, rotation and translation of an object; raise InputError with its name if it is not a similarity."""
     try:
         return similarity(item.matrix)
     except InputError as error:
@@ -128,22 +126,21 @@ def placement(item: Placed) -> tuple[float, NDArray[np.float64], NDArray[np.floa
 
 
 def to_linear(encoded: Pixels) -> Pixels:
-    """sRGB's curve undone (IEC 61966-2-1): display values to light."""
+    """Convert display values to light: the inverse of the sRGB curve (IEC 61966-2-1)."""
     low, high = encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4
-    linear: Pixels = np.where(encoded <= 0.04045, low, high).astype(np.float32)
-    return linear
+    return np.where(encoded <= 0.04045, low, high).astype(np.float32)
 
 
 def combined(image: Rendered, background: Sequence[float] | None, linear: bool = True) -> Pixels:
-    """Blender's Combined pass (H, W, 4): premultiplied, from the bottom row up.
+    """Return the Combined pass of Blender (H, W, 4): premultiplied, from the bottom row up.
 
-    Splats are learnt from photos, so their colours and their blending are those of display values. Blender's are
-    light; its Standard view turns them back into the same bytes.
+    Splats are trained on photographs, so their colours and blending are those of display values. Blender expects light;
+    its Standard view transform converts it back to the same bytes.
 
     Parameters
     ----------
-    image : before black. background : display values of what lies behind; None: transparent.
-    linear : turn display values into light; not where Blender's view shows values as they are (Raw).
+    image : render before black. background : display values behind the splats, or None for a transparent image.
+    linear : convert display values to light. Leave it out for the view transform Raw, which shows values unchanged.
     """
     cover = np.clip(image.alpha, 0.0, 1.0)[..., None].astype(np.float32)
     colour = image.color.astype(np.float32)
@@ -158,8 +155,10 @@ def combined(image: Rendered, background: Sequence[float] | None, linear: bool =
 
 
 def depths(image: Rendered) -> Pixels:
-    """Blender's Depth pass (H, W): mean depth along the view axis, `NOTHING` where nothing is seen; from the bottom row
-    up."""
-    solid = image.alpha >= _SEEN
+    """Return the Depth pass of Blender (H, W): mean depth along the view axis, from the bottom row up.
+
+    Empty pixels have the depth `NOTHING`.
+    """
+    solid = image.alpha >= _VISIBLE
     mean = np.divide(image.depth, image.alpha, out=np.full(image.depth.shape, NOTHING, image.depth.dtype), where=solid)
     return np.ascontiguousarray(mean[::-1], np.float32)

@@ -1,4 +1,4 @@
-"""What Blender gets to know: classes, properties, menu entries, and which of its panels suit the engine."""
+"""Registration of classes, properties, menu entries, and of the panels of Blender that suit the engine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from . import cameras, composite, engine, panels, splat_object
 
 CLASSES = (*splat_object.CLASSES, *cameras.CLASSES, *composite.CLASSES, *panels.CLASSES, engine.ClsplatRenderEngine)
 
-# Blender's panels for engines of its own that mean nothing here.
+# Panels of Blender that have no effect on this engine.
 _FOREIGN = (
     "VIEWLAYER_PT_filter",
     "VIEWLAYER_PT_layer_passes",
@@ -23,15 +23,17 @@ _FOREIGN = (
 
 
 def register() -> None:
-    """Register everything; a second time is an error of Blender's."""
+    """Register everything; Blender raises an error if this is repeated."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Object.clsplat_ply = bpy.props.StringProperty(
-        name="Splats", description="PLY of the splats that are rendered at this object's place", subtype="FILE_PATH"
+        name="Splats",
+        description="PLY file of the splats that are rendered at the place of this object",
+        subtype="FILE_PATH",
     )
     bpy.types.Scene.clsplat_background = bpy.props.FloatVectorProperty(
         name="Background",
-        description="Display colour behind the splats where the film is not transparent",
+        description="Display colour behind the splats if the film is not transparent",
         subtype="COLOR_GAMMA",
         size=3,
         min=0.0,
@@ -46,7 +48,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take everything back."""
+    """Unregister everything."""
     bpy.types.TOPBAR_MT_file_export.remove(cameras.draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(cameras.draw_import)
     bpy.types.TOPBAR_MT_file_import.remove(splat_object.draw_import)
@@ -60,7 +62,7 @@ def unregister() -> None:
 
 
 def _suiting_panels() -> list[Any]:
-    """Panels of output, camera and film that Blender shows for its simple engines."""
+    """Return the panels of output, camera and film that Blender shows for simple engines."""
     return [
         panel
         for panel in bpy.types.Panel.__subclasses__()

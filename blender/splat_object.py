@@ -1,4 +1,4 @@
-"""A splat PLY as an object: points to see and select, and the file's name to render from."""
+"""A splat PLY file as an object: points to see and select, and the file name to render from."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from bpy_extras.io_utils import ImportHelper
 
 from .errors import reported
 
-_UPRIGHT = (-math.pi / 2, 0.0, 0.0)  # 3DGS worlds come from cameras, whose y axis points down
+_UPRIGHT = (-math.pi / 2, 0.0, 0.0)  # the y axis of a 3DGS world points down, as that of a camera
 
 
 def add_splats(context: Any, path: Path, upright: bool = True, points: int = 100_000) -> Any:
-    """An object of the PLY, in the active collection, selected and active.
+    """Add an object for a PLY file to the active collection, and make it selected and active.
 
-    Its mesh has a point for each splat, evenly thinned out where there are more than `points`, with the attributes
-    `color`, `opacity`, `scale` (standard deviations), `rotation` and `splat` (its number in the file).
+    Its mesh has a point for each splat, or an even selection of at most `points`. Points have the attributes `color`,
+    `opacity`, `scale` (standard deviations), `rotation` and `splat` (its number in the file).
 
     Raises
     ------
-    clsplat.InputError : no splat PLY.
+    clsplat.InputError : the file is not a splat PLY file.
     """
     import numpy as np
 
@@ -63,7 +63,7 @@ def add_splats(context: Any, path: Path, upright: bool = True, points: int = 100
 
 
 class ImportSplats(bpy.types.Operator, ImportHelper):  # type: ignore[misc]
-    """Import Gaussian or skew-normal splats (3DGS's or clsplat's PLY)"""
+    """Import Gaussian or skew-normal splats (PLY files of 3DGS or clsplat)"""
 
     bl_idname = "clsplat.import_splats"
     bl_label = "Import Splats"
@@ -72,18 +72,20 @@ class ImportSplats(bpy.types.Operator, ImportHelper):  # type: ignore[misc]
     filename_ext = ".ply"
     filter_glob: bpy.props.StringProperty(default="*.ply", options={"HIDDEN"})  # type: ignore[valid-type]
     upright: bpy.props.BoolProperty(  # type: ignore[valid-type]
-        name="Upright", default=True, description="Turn the file's downward y axis to Blender's downward z axis"
+        name="Upright",
+        default=True,
+        description="Turn the y axis of the file, which points down, to the downward z axis of Blender",
     )
     points: bpy.props.IntProperty(  # type: ignore[valid-type]
         name="Points",
         default=100_000,
         min=1,
-        description="At most so many points stand for the splats in the viewport; all splats are rendered",
+        description="Largest number of points that show the splats in the viewport; all splats are rendered",
     )
     use_engine: bpy.props.BoolProperty(  # type: ignore[valid-type]
         name="Render with clsplat",
         default=True,
-        description="Make clsplat the scene's render engine, with the view transform Standard, which shows the "
+        description="Make clsplat the render engine of the scene, with the view transform Standard, which shows the "
         "splats' own colours",
     )
 

@@ -1,4 +1,4 @@
-"""The Blender add-on without Blender: its camera, its colours, its zip. With one: test_blender_real.py."""
+"""The Blender add-on without Blender: camera, colours and zip file. test_blender_real.py uses a real Blender."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_combined_is_premultiplied_and_bottom_up() -> None:
 
 
 def test_the_studio_shows_one_object_as_it_is(tmp_path: Path) -> None:
-    """One object has the bits of `render`, also where it is turned and scaled and the camera goes along."""
+    """A single object has the bits of `render`, also if object and camera are turned and scaled together."""
     splats, camera = some_splats(), facing(0.4)
     splats.save(tmp_path / "a.ply")
     studio = Studio()

@@ -33,7 +33,7 @@ CHILD = Path(__file__).parents[1] / "support" / "blender_child.py"
 
 
 def blenders_python() -> str | None:
-    """A Python that has bpy."""
+    """Return a Python with bpy, or None."""
     python = os.environ.get("CLSPLAT_BLENDER_PYTHON", sys.executable)
     asking = "import importlib.util, sys; sys.exit(importlib.util.find_spec('bpy') is None)"
     found = subprocess.run([python, "-c", asking], check=False, capture_output=True)
@@ -42,7 +42,7 @@ def blenders_python() -> str | None:
 
 @pytest.fixture(scope="module")
 def blender(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The child's folder, and what it found."""
+    """The folder and the results of the child process."""
     python = blenders_python()
     if python is None:
         pytest.skip("bpy is not installed: pip install bpy==5.0.* for Python 3.11, or set CLSPLAT_BLENDER_PYTHON")
@@ -80,7 +80,7 @@ def picture(path: Path | str) -> np.ndarray:
 
 
 def expected(splats: Splats, camera: Camera, background: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
-    """As `clsplat render` writes it."""
+    """Return the image as `clsplat render` writes it."""
     return np.rint(255 * np.clip(Renderer().render(splats, camera, background).color, 0, 1)).astype(int)
 
 
@@ -103,8 +103,7 @@ def test_a_ply_becomes_points_with_attributes(blender: tuple[Path, dict[str, Any
 
 
 def test_blenders_frames_are_those_of_clsplat_render(blender: tuple[Path, dict[str, Any]]) -> None:
-    """Within one step of 255, through Blender's light and back: cameras with and without shift, an upright object, and
-    one that is turned, scaled and moved with its cameras."""
+    """Frames agree to one step of 255 for shifted cameras, upright objects and moved objects."""
     folder, facts = blender
     files, splats = facts["frames"]["files"], some_splats()
     named = {each.name: each.camera for each in read_cameras(folder / "cameras.json")}
@@ -165,7 +164,7 @@ def test_paths_come_in_as_animations_and_go_out_again(blender: tuple[Path, dict[
 
 
 def test_lenses_agree_with_blenders_own_projection(blender: tuple[Path, dict[str, Any]]) -> None:
-    """Every sensor fit, portrait and landscape, shift and pixel aspect: points land where Blender puts them."""
+    """Points are projected as in Blender for every sensor fit, orientation, shift and pixel aspect."""
     points = np.random.default_rng(4).normal(size=(20, 3)) * (1, 1, 0.3) - (0, 0, 5)
     for case in blender[1]["projections"]["cases"]:
         lens, (width, height, aspect_x, aspect_y) = case["lens"], case["raster"]
@@ -198,19 +197,19 @@ def test_faults_stand_in_the_report_area(blender: tuple[Path, dict[str, Any]]) -
 
 
 def mean_depth(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Of the splats by pixel, and where they are opaque."""
+    """Return the depth of each pixel, and whether it is opaque."""
     image = Renderer().render(some_splats(), camera)
     return image.depth / np.maximum(image.alpha, 1e-6), image.alpha > 0.98
 
 
 def plane_depth(camera: Camera) -> float:
-    """A depth with as many opaque pixels of the left half before it as behind."""
+    """Return the median depth of the opaque pixels of the left half."""
     depth, opaque = mean_depth(camera)
     return float(np.median(depth[:, : WIDTH // 2][opaque[:, : WIDTH // 2]]))
 
 
 def test_meshes_and_splats_hide_each_other(blender: tuple[Path, dict[str, Any]]) -> None:
-    """The left half of the image has a green plane: splats before it are seen, those behind are not."""
+    """A green plane fills the left half of the image and hides the splats behind it, but not those before it."""
     folder, facts = blender
     got = picture(facts["composited"]["file"])[..., :3]
     camera = read_cameras(folder / "cameras.json")[0].camera
@@ -226,8 +225,7 @@ def test_meshes_and_splats_hide_each_other(blender: tuple[Path, dict[str, Any]])
 
 
 def test_the_viewport_shows_the_splats_coarsely_while_moving_then_in_full(blender: tuple[Path, dict[str, Any]]) -> None:
-    """The engine's own drawing into Blender's offscreen buffer, read back: light, in 16-bit reals, which Blender
-    turns into display values when the region is done."""
+    """The engine draws into an offscreen buffer of Blender, as light in 16-bit reals."""
     folder, _ = blender
     done = child(blenders_python() or "", folder, "viewport")
     if not (folder / "viewport.json").exists():
@@ -243,7 +241,7 @@ def test_the_viewport_shows_the_splats_coarsely_while_moving_then_in_full(blende
 
 
 def aside(camera: Camera, step: float) -> Camera:
-    """The camera, seeing everything a step further to the right."""
+    """Return the camera moved by one step to the left."""
     pose = camera.cam_from_world.copy()
     pose[0, 3] += step
     return camera.posed(pose)

@@ -32,7 +32,7 @@ Facts = dict[str, Any]
 
 
 def scene() -> Any:
-    """A fresh file with the engine chosen and nothing in it."""
+    """Start an empty file with the engine chosen."""
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
     made = bpy.context.scene
     made.render.engine = "CLSPLAT"
@@ -44,7 +44,7 @@ def scene() -> Any:
 
 
 def rendered(name: str, **extra: Any) -> str:
-    """The file of a frame, or the message of Blender's report area."""
+    """Return the file of a frame, or the message in the report area of Blender."""
     file = FOLDER / f"{name}.png"
     bpy.context.scene.render.filepath = str(file)
     try:
@@ -55,7 +55,7 @@ def rendered(name: str, **extra: Any) -> str:
 
 
 def reported(operator: Callable[..., Any], **values: Any) -> str:
-    """An operator's message, or its result."""
+    """Return the message or the result of an operator."""
     try:
         return str(operator(**values))
     except RuntimeError as error:
@@ -102,7 +102,7 @@ def imported() -> Facts:
 
 
 def frames() -> Facts:
-    """Each camera of cameras.json, without and with a transform that the cameras share as children."""
+    """Render each camera of cameras.json, without and with a transform of the common parent."""
     made = scene()
     item = splats()
     cameras()
@@ -130,7 +130,7 @@ def frames() -> Facts:
 
 
 def together() -> Facts:
-    """Two objects, one of them turned, scaled and moved."""
+    """Render two objects; one of them is turned, scaled and moved."""
     scene()
     splats(upright=False)
     other = splats("other.ply", upright=False)
@@ -165,7 +165,7 @@ def animation() -> Facts:
 
 
 def projections() -> Facts:
-    """Points through Blender's own projection matrix, for lenses of all kinds."""
+    """Project points with the matrix of Blender, for all kinds of lenses."""
     made, rng, cases = scene(), np.random.default_rng(0), []
     data = bpy.data.cameras.new("c")
     item = bpy.data.objects.new("c", data)
@@ -239,7 +239,7 @@ def clipped() -> Facts:
 
 
 def composited() -> Facts:
-    """A plane through the middle of the splats, square to the view, that covers the left half of the image."""
+    """Composite a plane through the middle of the splats that covers the left half of the image."""
     made = scene()
     splats(upright=False)
     camera = cameras()

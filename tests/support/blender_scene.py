@@ -1,4 +1,4 @@
-"""The scene of the tests of Blender: cameras around a cloud of splats."""
+"""Scene for the Blender tests: cameras around a cloud of splats."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def facing(angle: float, distance: float = 4.0, off: tuple[float, float] = (0.0,
 
 
 def some_splats(seed: int = 0, shape: str = "skew-normal") -> Splats:
-    """A cloud of every colour, with bands of colour and, where the shape has it, skew."""
+    """Return a cloud in all colours with SH bands, and with skew if the shape has one."""
     rng = np.random.default_rng(seed)
     start = Splats.from_points(rng.normal(0, 0.5, (300, 3)), rng.random((300, 3)), shape, 2, opacity=0.7)
     arrays = start.to_numpy()
@@ -33,5 +33,5 @@ def some_splats(seed: int = 0, shape: str = "skew-normal") -> Splats:
 
 
 def encoded(linear: np.ndarray) -> np.ndarray:
-    """Light to sRGB's display values."""
+    """Convert light to sRGB display values."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
