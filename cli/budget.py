@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from clsplat.compression.rules import TOLERANCE, BudgetOptions
-from clsplat.compression.state import FILE, BudgetState
-from clsplat.errors import InputError, OutputError
-from clsplat.files.lock import folder_lock
-from clsplat.training.config import TrainConfig, read_options
+from clsplat.errors import OutputError
+from clsplat.training.config import TrainConfig
 
 from .main import INTERRUPTED
 from .options import Decibels, F
@@ -66,43 +64,12 @@ def options_of(values: dict[str, Any]) -> BudgetOptions | None:
     return BudgetOptions(TOLERANCE if tolerance is None else tolerance, given["target_psnr"], given["max_bytes"])
 
 
-def is_search(folder: Path) -> bool:
-    """Whether a search has left its findings in a folder."""
-    return (folder / FILE).is_file()
-
-
-def forget_search(folder: Path) -> None:
-    """Before another run takes the folder: what a search left there is not of it. OutputError while it is going on."""
-    if is_search(folder):
-        with folder_lock(folder):
-            BudgetState(folder).remove()
-
-
-def stored_search(folder: Path) -> tuple[dict[str, Any], BudgetOptions, dict[str, Any]] | None:
-    """Options of the run, of the search, and the scene, where a search is to be resumed."""
-    if not is_search(folder):
-        return None
-    state = BudgetState(folder)
-    state.load()
-    try:
-        TrainConfig.from_json(state.values["config"])
-        options = BudgetOptions(**state.values["options"])
-        scene = dict(state.values["scene"])
-        scene["path"] = str(scene["path"])
-    except (InputError, KeyError, TypeError) as error:
-        raise InputError(f"{state.path}: damaged ({error}): start again with --overwrite") from None
-    if "final" in state.values:
-        raise InputError(f"{folder}: the search is finished: nothing to resume")
-    return read_options(state.values["config"]), options, scene
-
-
 def run_search(
     ctx: click.Context,
     scene: Scene,
     config: TrainConfig,
     options: BudgetOptions,
     model_path: Path,
-    record: dict[str, Any],
     resume: bool,
     overwrite: bool,
     quiet: bool,
@@ -114,7 +81,7 @@ def run_search(
     try:
         with TrainingDisplay(quiet) as display:
             result = train_budget(
-                scene, config, options, display, output=model_path, resume=resume, overwrite=overwrite, extra=record
+                scene, config, options, display, output=model_path, resume=resume, overwrite=overwrite
             )
     except KeyboardInterrupt:
         _say_stopped(ctx, model_path)

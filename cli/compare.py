@@ -9,8 +9,10 @@ import click
 
 from clsplat.comparison.methods import DEFAULT, parse_methods
 from clsplat.errors import InputError
+from clsplat.scenes.options import READING_OPTIONS
 from clsplat.splats.color import BLACK
 from clsplat.training.presets import PRESETS
+from clsplat.training.stored_run import load_recorded_scene
 
 from .options import (
     PATH,
@@ -25,7 +27,6 @@ from .options import (
     split_options,
 )
 from .progress import TrainingDisplay, duration, table
-from .train import SCENE_KEYS, read_scene
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -99,13 +100,13 @@ def options_and_scenes(
 ) -> tuple[dict[str, Any], Iterator[Scene]]:
     """Options of training that stand on the command line, and the scenes, each read when it is asked for."""
     common = config_values(ctx, values)
-    reading = {key: values[key] for key in SCENE_KEYS if key in values and is_given(ctx, key)} | {"eval": True}
+    reading = {key: values[key] for key in READING_OPTIONS if key in values and is_given(ctx, key)} | {"eval": True}
     names = [path.resolve().name for path in paths]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two scenes are called {name}: rename one of the folders")
     background = common.get("background", BLACK)
-    return common, (read_scene(path, reading, background)[0] for path in paths)
+    return common, (load_recorded_scene(path, reading, background) for path in paths)
 
 
 def flat(groups: tuple[tuple[int, ...], ...]) -> list[int]:

@@ -14,7 +14,7 @@ from clsplat.training.folder import ModelFolder
 from .evaluate import describe
 from .options import PATH, device_option, overwrite_option, quiet_option
 from .progress import ViewCount, duration
-from .train import read_scene, run_training, say_stopped
+from .train import run_training, say_stopped
 
 # Small enough for two CPU cores in minutes.
 ITERATIONS, CAP = 1500, 6000
@@ -49,6 +49,7 @@ def demo(
     from clsplat.models.evaluation import EvaluationOptions, evaluate
     from clsplat.rendering.outputs import output_stems
     from clsplat.scenes.demo.make import make_demo_scene
+    from clsplat.scenes.scene import load_scene
 
     start = time.perf_counter()
     folder, renders = ModelFolder(out / "model"), out / "renders"
@@ -61,8 +62,8 @@ def demo(
         )
         click.echo(message, err=True)
     config = TrainConfig(iterations=iterations, cap_max=cap_max, device=device)
-    scene, record = read_scene(make_demo_scene(out / "scene", width, views), {"eval": True}, config.background)
-    model = run_training(scene, config, folder.path, record, overwrite=overwrite, quiet=quiet)
+    scene = load_scene(make_demo_scene(out / "scene", width, views), background=config.background)
+    model = run_training(scene, config, folder.path, overwrite=overwrite, quiet=quiet)
     if not model.finished:
         say_stopped(ctx, model)
     with ViewCount("measuring", quiet) as progress:

@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
+from clsplat.compression.state import is_search, remove_search
 from clsplat.errors import InputError, OutputError
-from clsplat.files.json_file import read_object
-from clsplat.splats.color import Color
-from clsplat.training.config import TrainConfig, read_options
+from clsplat.models.resume import find_unfinished
+from clsplat.scenes.options import READING_OPTIONS
+from clsplat.training.config import TrainConfig
 from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
+from clsplat.training.stored_run import load_recorded_scene, read_options_file
 
-from .budget import budget_options, forget_search, is_search, options_of, run_search, stored_search
+from .budget import budget_options, options_of, run_search
 from .main import INTERRUPTED
 from .options import (
     PATH,
@@ -38,8 +40,6 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
     from clsplat.training.run import Model
     from clsplat.viewer.training_session import TrainingSession
-
-SCENE_KEYS = ("images", "resolution", "masks", "alpha", "test_every", "test_list", "eval")
 
 
 @click.command(cls=TrainingCommand)
@@ -112,10 +112,10 @@ def train(
         raise click.UsageError("--view shows one run: leave out --budget, or look at the result with clsplat view")
     options = config_values(ctx, values)
     if config_file is not None:
-        options = _options_in(config_file) | options
+        options = read_options_file(config_file) | options
     if preset is not None:
         options = with_preset(preset, options)
-    reading = {key: values[key] for key in SCENE_KEYS if is_given(ctx, key)}
+    reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
     if path is None and not (resume and model_path):
         raise click.UsageError("give the scene's folder")
     if model_path is None:
@@ -123,15 +123,11 @@ def train(
         model_path = Path("output") / (path.stem if is_video(path) else path.resolve().name)
     folder = ModelFolder(model_path)
     if resume:
-        stored = stored_search(model_path)
-        if search is not None and stored is None:
+        stored = find_unfinished(model_path)
+        if search is not None and stored.search is None:
             raise InputError(f"{model_path}: no search to resume from: start without --resume")
-        if stored is not None:
-            stored_config, search, stored_scene = stored[0], search or stored[1], stored[2]
-        else:
-            stored_config, stored_scene = _stored_run(folder)
-        options, reading = stored_config | options, stored_scene | reading
-        path = path or Path(reading["path"])
+        options, reading = stored.run.options | options, stored.run.scene | reading
+        path, search = path or stored.run.scene_path, search or stored.search
     elif (folder.is_used or is_search(model_path)) and not overwrite:
         # train() says so too, but only after the scene is read.
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
@@ -139,42 +135,27 @@ def train(
     config = TrainConfig(**options)
     if is_photographs(path):
         path = scene_of_photos(path, model_path, overwrite, quiet)
-    loaded, record = read_scene(path, reading, config.background)
+    loaded = load_recorded_scene(path, reading, config.background)
     if search is not None:
         if view:
             raise click.UsageError(f"{model_path} is a search of many runs: resume it without --view")
-        run_search(ctx, loaded, config, search, model_path, record, resume, overwrite, quiet)
+        run_search(ctx, loaded, config, search, model_path, resume, overwrite, quiet)
         return
     with _viewer(loaded, config, model_path, host, port, quiet) if view else nullcontext() as live:
-        forget_search(model_path)
-        model = run_training(loaded, config, model_path, record, resume, overwrite, quiet, live)
+        remove_search(model_path)
+        model = run_training(loaded, config, model_path, resume, overwrite, quiet, live)
     if not model.finished:
         say_stopped(ctx, model)
     if not quiet:
-        report(model, test_metrics(model, loaded))
+        from clsplat.training.run import evaluate_test_views
 
-
-def read_scene(path: Path, reading: dict[str, Any], background: Color) -> tuple[Scene, dict[str, Any]]:
-    """The scene, and what config.json shall say of how it was read.
-
-    reading : any of SCENE_KEYS; the others take load_scene's defaults, without test views.
-    """
-    from clsplat.scenes.scene import load_scene
-
-    arguments = {key: reading[key] for key in SCENE_KEYS if reading.get(key) is not None}
-    arguments["eval"] = bool(arguments.get("eval") or "test_every" in arguments or "test_list" in arguments)
-    scene = load_scene(path, background=background, **arguments)
-    record = {key: arguments.get(key) for key in SCENE_KEYS}
-    if record["test_list"] is not None:
-        record["test_list"] = str(Path(record["test_list"]).resolve())
-    return scene, record
+        report(model, evaluate_test_views(model, loaded))
 
 
 def run_training(
     scene: Scene,
     config: TrainConfig,
     model_path: Path,
-    record: dict[str, Any],
     resume: bool = False,
     overwrite: bool = False,
     quiet: bool = False,
@@ -191,7 +172,6 @@ def run_training(
             output=model_path,
             resume=resume,
             overwrite=overwrite,
-            extra=record,
             visit=live.visit if live else None,
         )
 
@@ -204,16 +184,6 @@ def _viewer(scene: Scene, config: TrainConfig, model_path: Path, host: str, port
     if not quiet:
         click.echo(f"training can be watched at {session.url}", err=True)
     return session
-
-
-def test_metrics(model: Model, scene: Scene) -> Evaluation | None:
-    """Metrics of the finished model on the views held out; None where there are none."""
-    if not scene.test or model.iteration in model.evaluations:
-        return model.evaluations.get(model.iteration)
-    from clsplat.evaluation.evaluate import evaluate
-    from clsplat.rendering.renderer import Renderer
-
-    return evaluate(Renderer(model.config.device), model.splats, scene.test, model.config.background)
 
 
 def say_stopped(ctx: click.Context, model: Model) -> NoReturn:
@@ -236,32 +206,3 @@ def report(model: Model, metrics: Evaluation | None) -> None:
     )
     if metrics is not None:
         click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
-
-
-def _options_in(file: Path) -> dict[str, Any]:
-    """TrainConfig's arguments that a JSON file has."""
-    values = read_object(file)
-    values = values.get("config", values)
-    try:
-        TrainConfig.from_json(values)
-        return read_options(values)
-    except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(
-            f'{file}: not options of a run ({error}): give a config.json, or an object such as {{"iterations": 2000}}'
-        ) from None
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from None
-
-
-def _stored_run(folder: ModelFolder) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Options and scene of the run in the folder."""
-    if not folder.checkpoint_path.is_file():
-        raise InputError(f"{folder.path}: no checkpoint to resume from: start with --overwrite")
-    stored = folder.read_config()
-    try:
-        TrainConfig.from_json(stored["config"])
-        scene = dict(stored["scene"])
-        scene["path"] = str(scene["path"])
-    except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{folder.config_path}: damaged ({error}): start again with --overwrite") from None
-    return read_options(stored["config"]), scene

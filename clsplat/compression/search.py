@@ -34,7 +34,7 @@ from ..scenes.split import hold_out
 from ..splats.splats import Splats
 from ..splats.stats import complexity
 from ..training.config import TrainConfig
-from ..training.folder import ModelFolder
+from ..training.folder import ModelFolder, scene_record
 from ..training.log import Progress
 from ..training.run import train
 from ..training.trainer import Trainer
@@ -97,7 +97,6 @@ def train_budget(
     output: str | Path,
     resume: bool = False,
     overwrite: bool = False,
-    extra: dict[str, Any] | None = None,
 ) -> Budgeted:
     """Learn the smallest model that a scene needs.
 
@@ -105,7 +104,7 @@ def train_budget(
     ----------
     config : of a whole run; its `cap_max` is the largest cap that is tried. progress : as `train`'s.
     output : model folder: besides what `train` writes, budget.json, and the small model as its last point cloud.
-    resume : go on after the last stage that is done; the options must be the same. overwrite, extra : as `train`'s.
+    resume : go on after the last stage that is done; the options must be the same. overwrite : as `train`'s.
 
     Raises
     ------
@@ -124,9 +123,8 @@ def train_budget(
     with folder_lock(folder.path):
         if not resume:
             folder.clear()
-            record = {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names)}
-            state.begin(config, options, record | (extra or {}))
-        return _Search(scene, config, options, progress, state, folder, extra or {}).run()
+            state.begin(config, options, scene_record(scene))
+        return _Search(scene, config, options, progress, state, folder).run()
 
 
 class _Search:
@@ -140,10 +138,9 @@ class _Search:
         progress: ProgressCallback | None,
         state: BudgetState,
         folder: ModelFolder,
-        extra: dict[str, Any],
     ) -> None:
         self.scene, self.config, self.options, self.progress = scene, config, options, progress
-        self.state, self.folder, self.extra = state, folder, extra
+        self.state, self.folder = state, folder
         self.split = hold_out(scene)
         self.device: Device = open_device(config.device)
         self.renderer = Renderer(self.device)
@@ -168,7 +165,6 @@ class _Search:
                 output=self.folder.path,
                 resume=resume,
                 overwrite=not resume,
-                extra=self.extra,
             )
             if not model.finished:
                 return Budgeted(model.splats, self.folder.path, False, values)

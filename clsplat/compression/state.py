@@ -10,8 +10,10 @@ from typing import Any
 
 from ..errors import InputError
 from ..files.json_file import read_object, write_json
+from ..files.lock import folder_lock
 from ..splats.splats import Splats
 from ..training.config import FREE_OPTIONS, TrainConfig
+from ..training.stored_run import DAMAGE, StoredRun
 from .rules import BudgetOptions
 
 FILE, FOLDER = "budget.json", "budget"
@@ -77,3 +79,40 @@ class BudgetState:
     def end(self) -> None:
         """The stages' models are no longer needed."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def is_search(output: Path) -> bool:
+    """Whether a model folder holds a search, finished or not."""
+    return (output / FILE).is_file()
+
+
+def stored_search(output: Path) -> tuple[StoredRun, BudgetOptions] | None:
+    """Return the options of a search that can be resumed; None if the folder does not hold a search.
+
+    Raises
+    ------
+    InputError : budget.json is damaged, or the search is finished.
+    """
+    if not is_search(output):
+        return None
+    state = BudgetState(output)
+    state.load()
+    try:
+        stored, options = StoredRun.from_json(state.values), BudgetOptions(**state.values["options"])
+    except DAMAGE as error:
+        raise InputError(f"{state.path}: damaged ({error}): start again with --overwrite") from None
+    if "final" in state.values:
+        raise InputError(f"{output}: the search is finished: nothing to resume")
+    return stored, options
+
+
+def remove_search(output: Path) -> None:
+    """Remove a search before another run uses its folder.
+
+    Raises
+    ------
+    OutputError : the search is running.
+    """
+    if is_search(output):
+        with folder_lock(output):
+            BudgetState(output).remove()

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import warnings
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -72,6 +75,7 @@ class Scene:
     points : may be empty.
     test_names : names of the views held out for evaluation.
     background : colour 0..1 that photos with transparency lie over.
+    reading : arguments of `load_scene` that read the scene, which a run records; None stands for a default.
     """
 
     name: str
@@ -80,6 +84,7 @@ class Scene:
     points: Points
     test_names: frozenset[str] = frozenset()
     background: Color = BLACK
+    reading: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -182,7 +187,23 @@ def load_scene(
         posed.points,
         test_names & {view.name for view in views},
         background,
+        _reading(
+            images=images,
+            resolution=resolution,
+            masks=masks,
+            alpha=alpha,
+            test_every=test_every,
+            test_list=None if test_list is None else str(Path(test_list).resolve()),
+            eval=eval,
+        ),
     )
+
+
+def _reading(*, eval: bool, **arguments: Any) -> dict[str, Any]:
+    """A record of `load_scene`'s arguments: None for those that have their defaults, and always `eval`."""
+    parameters = inspect.signature(load_scene).parameters
+    record = {name: None if value == parameters[name].default else value for name, value in arguments.items()}
+    return record | {"eval": bool(eval)}
 
 
 def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, Path]:

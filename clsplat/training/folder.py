@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..cameras.cameras_json import NamedCamera, write_cameras
 from ..errors import InputError, OutputError
 from ..files.json_file import read_object, write_json
 from ..splats.splats import Splats
 
+if TYPE_CHECKING:
+    from ..scenes.scene import Scene
+
 _ITERATION = re.compile(r"iteration_(\d+)")
+
+
+def scene_record(scene: Scene) -> dict[str, Any]:
+    """Values by which a run's scene can be read again: its path, its test views and `load_scene`'s arguments."""
+    return {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names), **scene.reading}
 
 
 class ModelFolder:
@@ -95,6 +103,10 @@ class ModelFolder:
             ply.unlink()
             if not any(ply.parent.iterdir()):
                 ply.parent.rmdir()
+
+    def write_run(self, config: dict[str, Any], scene: Scene) -> None:
+        """Write config.json: the run's options and the record of its scene."""
+        self.write_config({"config": config, "scene": scene_record(scene)})
 
     def write_config(self, values: dict[str, Any]) -> None:
         """The run's options and scene."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from ..cameras.cameras_json import named_cameras
 from ..errors import InputError, OutputError
+from ..evaluation.evaluate import Evaluation, evaluate
 from ..files.lock import folder_lock
+from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
 from .checkpoint import Checkpoint
 from .config import FREE_OPTIONS, TrainConfig
@@ -27,7 +28,6 @@ def train(
     output: str | Path | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    extra: dict[str, Any] | None = None,
     visit: Visit | None = None,
 ) -> Model:
     """Learn a splat model of a scene's training views.
@@ -39,7 +39,6 @@ def train(
     resume : go on from the folder's checkpoint; the config must be the same but for `iterations`-independent
         options such as `device`.
     overwrite : allow replacing a model in `output`.
-    extra : more keys for config.json's "scene" (how it was read), beside its path and test views.
     visit : see `Trainer.run`.
 
     Raises
@@ -62,11 +61,22 @@ def train(
         if folder is not None:
             if checkpoint is None:
                 folder.clear()
-            record = {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names)}
-            folder.write_config({"config": config.to_json(), "scene": record | (extra or {})})
+            folder.write_run(config.to_json(), scene)
             views = [*scene.test, *scene.train]
             folder.write_cameras(named_cameras([view.name for view in views], [view.camera for view in views]))
         return trainer.run(folder, visit)
+
+
+def evaluate_test_views(model: Model, scene: Scene) -> Evaluation | None:
+    """Measure a model on the test views, unless its run has done so at the end.
+
+    Returns
+    -------
+    The metrics, or None if the scene has no test views.
+    """
+    if not scene.test or model.iteration in model.evaluations:
+        return model.evaluations.get(model.iteration)
+    return evaluate(Renderer(model.config.device), model.splats, scene.test, model.config.background)
 
 
 def _fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:

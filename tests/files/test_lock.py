@@ -9,9 +9,8 @@ import time
 from pathlib import Path
 
 import pytest
-from clsplat_cli.budget import forget_search
 
-from clsplat.compression.state import FILE
+from clsplat.compression.state import FILE, remove_search
 from clsplat.errors import OutputError
 from clsplat.files.lock import folder_lock
 
@@ -69,10 +68,10 @@ def test_a_running_search_keeps_its_results(tmp_path: Path) -> None:
     process = holder(tmp_path)
     try:
         with pytest.raises(OutputError, match="another run writes into it"):
-            forget_search(tmp_path)
+            remove_search(tmp_path)
         assert (tmp_path / FILE).exists()
     finally:
         process.kill()
         process.wait(10)
-    forget_search(tmp_path)
+    remove_search(tmp_path)
     assert not (tmp_path / FILE).exists()

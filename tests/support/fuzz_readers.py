@@ -143,9 +143,9 @@ def make_path(folder: Path) -> None:
 
 
 def read_config(folder: Path) -> None:
-    from clsplat_cli.train import _options_in
+    from clsplat.training.stored_run import read_options_file
 
-    TrainConfig(**_options_in(folder / "config.json"))
+    TrainConfig(**read_options_file(folder / "config.json"))
 
 
 def make_config(folder: Path) -> None:
@@ -206,11 +206,11 @@ def make_search(folder: Path) -> None:
 
 
 def read_search(folder: Path) -> None:
-    from clsplat_cli.budget import stored_search
+    from clsplat.compression.state import stored_search
 
     found = stored_search(folder)
     if found is not None:
-        TrainConfig(**found[0])
+        TrainConfig(**found[0].options)
 
 
 def make_images(folder: Path) -> None:

@@ -1,0 +1,71 @@
+"""Resuming of an interrupted run or search, from what its folder holds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..compression.rules import BudgetOptions
+from ..compression.state import stored_search
+from ..training.config import TrainConfig
+from ..training.log import Progress
+from ..training.stored_run import StoredRun, load_recorded_scene, stored_run
+
+if TYPE_CHECKING:
+    from ..compression.search import Budgeted
+    from ..training.trainer import Model
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """A run or a search that can be resumed. `search` is None for a run."""
+
+    run: StoredRun
+    search: BudgetOptions | None = None
+
+
+def find_unfinished(path: str | os.PathLike[str]) -> Unfinished:
+    """Return what a model folder holds to resume.
+
+    Raises
+    ------
+    InputError : there is neither a checkpoint nor an unfinished search, or a file is damaged.
+    """
+    search = stored_search(Path(path))
+    return Unfinished(stored_run(path)) if search is None else Unfinished(*search)
+
+
+def resume(
+    path: str | os.PathLike[str],
+    *,
+    scene: str | os.PathLike[str] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    **options: Any,
+) -> Model | Budgeted:
+    """Continue the run or the search in a model folder to its end, with the options and the scene of its start.
+
+    Parameters
+    ----------
+    path : the model folder.
+    scene : the scene's folder; by default where it was.
+    progress : as for `train`.
+    options : arguments of TrainConfig to change. Only those without an effect on the result may change, such as
+        `device`.
+
+    Raises
+    ------
+    InputError : there is nothing to resume, or an option must not change.
+    Others as for `train`.
+    """
+    from ..compression.search import train_budget
+    from ..training.run import train
+
+    stored = find_unfinished(path)
+    config = TrainConfig(**(stored.run.options | options))
+    loaded = load_recorded_scene(scene or stored.run.scene_path, stored.run.scene, config.background)
+    if stored.search is not None:
+        return train_budget(loaded, config, stored.search, progress, output=Path(path), resume=True)
+    return train(loaded, config, progress, output=Path(path), resume=True)
