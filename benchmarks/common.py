@@ -1,27 +1,77 @@
-"""What every benchmark writes beside its numbers, and JSON lines that can be resumed."""
+"""What the benchmarks share: command lines, real scenes, files of finished runs, tables."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
 import subprocess
+import sys
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from clsplat.comparison.compare import Run
+from clsplat.comparison.table import Record, markdown_table
 from clsplat.device.device import Device
+from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.split import hold_out
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
+CLSPLAT = [sys.executable, "-c", "from clsplat_cli.main import main; main()"]  # the command line, for subprocesses
+REDUCTION = {"fox": 2}  # `resolution` of load_scene; the other scenes are read as they are
+
+
+def parser(
+    doc: str | None, out: Path | None = None, *, device: bool = True, table: bool = True, smoke: bool = True
+) -> argparse.ArgumentParser:
+    """Return a parser with the flags that most benchmarks have.
+
+    Parameters
+    ----------
+    doc : text of --help, usually the module's docstring.
+    out : default of --out; None: no such flag.
+    device, table, smoke : whether to add --device, --table and --smoke.
+    """
+    result = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if device:
+        result.add_argument("--device", help="OpenCL device, as for clsplat; default: the best")
+    if out is not None:
+        result.add_argument("--out", type=Path, default=out, help="where the results are written")
+    if table:
+        result.add_argument("--table", action="store_true", help="print the results in --out and run nothing")
+    if smoke:
+        result.add_argument("--smoke", action="store_true", help="a tiny case, for tests")
+    return result
+
+
+def use_test_helpers() -> None:
+    """Let a benchmark import the packages `reference` and the modules of tests/support."""
+    sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "support")]
 
 
 def data_folder() -> Path:
-    """Folder of the real scenes: CLSPLAT_DATA, or shared/data beside the repository."""
+    """Return the folder of the real scenes: CLSPLAT_DATA, or shared/data beside the repository."""
     return Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data")
 
 
+def real_scene(name: str, resolution: int | None = None, *, validate: bool = False) -> Scene:
+    """Read a scene of the data folder, with every 8th view as a test view.
+
+    Parameters
+    ----------
+    resolution : as of `load_scene`; None: the size at which benchmarks train this scene.
+    validate : replace the test views by held-out training views, so that choices can be made on them.
+    """
+    resolution = REDUCTION.get(name, -1) if resolution is None else resolution
+    scene = load_scene(data_folder() / name, resolution=resolution, eval=True)
+    return hold_out(scene) if validate else scene
+
+
 def commit() -> str:
-    """Short hash of the code measured, with "+" when the kernels or the library differ from it."""
+    """Return the short hash of the measured code, with "+" if the kernels or the library differ from it."""
 
     def git(*args: str) -> str:
         return subprocess.run(["git", *args], cwd=ROOT, capture_output=True, text=True).stdout.strip()
@@ -30,7 +80,7 @@ def commit() -> str:
 
 
 def environment(device: Device, schedule: object) -> dict[str, Any]:
-    """Device, driver, schedule, commit and cores."""
+    """Return device, driver, schedule, commit and cores: where a result was measured."""
     info = device.info
     return {
         "device": info.name,
@@ -43,13 +93,69 @@ def environment(device: Device, schedule: object) -> dict[str, Any]:
     }
 
 
-def append(path: Path, row: dict[str, Any]) -> None:
-    """One JSON line more."""
+def append(path: Path, row: Mapping[str, Any]) -> None:
+    """Add one JSON line to a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as stream:
         stream.write(json.dumps(row) + "\n")
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """All JSON lines; none when the file is missing."""
+    """Return all JSON lines of a file; no line if the file is missing."""
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+class Runs:
+    """Finished runs in a file of JSON lines. A benchmark that was killed skips them when it is started again.
+
+    Parameters
+    ----------
+    path : the file; it is read again for each question, so that two processes may share it.
+    key : names of the values that identify a run.
+    """
+
+    def __init__(self, path: Path, key: Sequence[str]) -> None:
+        self.path, self.key = path, tuple(key)
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """All runs in the file."""
+        return read(self.path)
+
+    def identity(self, row: Mapping[str, Any]) -> tuple[Any, ...]:
+        """Return the values of the key."""
+        return tuple(row[name] for name in self.key)
+
+    def __contains__(self, row: Mapping[str, Any]) -> bool:
+        """Whether the file has a run with the same values of the key."""
+        identity = self.identity(row)
+        return any(self.identity(other) == identity for other in self.rows)
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Append a finished run."""
+        append(self.path, row)
+
+
+def groups(rows: Iterable[dict[str, Any]], *names: str) -> dict[tuple[Any, ...], list[dict[str, Any]]]:
+    """Collect rows that agree in the named values, in the order of their first rows."""
+    found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[name] for name in names), []).append(row)
+    return found
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]], right: Collection[str] = ()) -> str:
+    """Return a Markdown table.
+
+    Parameters
+    ----------
+    head : titles of the columns. rows : cells, converted by `str`. right : titles of right-aligned columns.
+    """
+    return markdown_table(head, [[str(cell) for cell in row] for row in rows], right)
+
+
+def print_run(run: Run, record: Record | None) -> None:
+    """Print one line after each run of a comparison; a callback for `compare`."""
+    if record is not None:
+        result = record["failed"] or f"{record['psnr']:.3f} dB, {record['splats']} splats, {record['seconds']:.1f} s"
+        print(f"{run}: {result}", file=sys.stderr, flush=True)

@@ -1,20 +1,18 @@
-"""Systems, shapes and parameterisations against each other in one engine: the tables behind SYSTEMS.md.
+"""Methods, shapes and parameterisations against each other in one engine: the tables of SYSTEMS.md.
 
     python benchmarks/systems.py fox kitchen --groups presets forms [--caps 5000] [--seeds 0 1 2] [--device 0:0]
-    python benchmarks/systems.py fox kitchen --validate      # groups for choices: no test view is looked at
-    python benchmarks/systems.py --table                  # print what is there, run nothing
-    python benchmarks/systems.py --page [--validate]      # likewise, the tables of SYSTEMS.md: by question
+    python benchmarks/systems.py fox kitchen --validate      # groups for choices, on held-out training views
+    python benchmarks/systems.py --table                     # print all runs, run nothing
+    python benchmarks/systems.py --page [--validate]         # print the tables of SYSTEMS.md, by question
 
-One folder a scene under benchmarks/results/systems (runs.jsonl, table.md, results.json; see `clsplat compare`). A
-run that is there already is not done again: kill and restart at will, add seeds, caps or groups later. Two scenes may
-run in two processes. Fox is read at half size: what the seconds allow.
+Each scene has a folder under benchmarks/results/systems (runs.jsonl, table.md, results.json; see `clsplat compare`).
+A finished run is not repeated: kill and restart at will, add seeds, caps or groups later. Two scenes may run in two
+processes. Fox is read at half size to save time.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -22,19 +20,16 @@ from typing import Any, NamedTuple
 
 import common
 
-from clsplat.comparison.compare import RUNS, Run, compare
+from clsplat.comparison.compare import RUNS, compare
 from clsplat.comparison.methods import Method, parse_methods
 from clsplat.comparison.table import Record, markdown
-from clsplat.scenes.scene import Scene, load_scene
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.config import TrainConfig
 
 OUT = common.RESULTS / "systems"
-RESOLUTION = {"fox": 2}  # of load_scene; others as they are
 
-
-# What shapes are trained with: the defaults of the day on which these tables were begun, written out so that they stay
-# one experiment when defaults change. Presets bring their own.
+# Training options of the shapes: the defaults of the day on which these tables were begun. They are written out so that
+# the tables stay one experiment when defaults change. Presets bring their own options.
 BASE = {
     "strategy": "mcmc",
     "relocation": "length",
@@ -53,18 +48,21 @@ BASE = {
 
 
 class Group(NamedTuple):
-    """Systems that answer one question, the caps to ask it at, and on which views: defaults hang on some answers."""
+    """Methods that answer one question, their caps, and the views to measure on.
 
-    systems: tuple[str, ...]
+    `validate`: measure on held-out training views, because a default depends on the answer.
+    """
+
+    methods: tuple[str, ...]
     caps: tuple[int, ...]
     iterations: int = 1000
     validate: bool = False
 
     def contestants(self) -> list[Method]:
-        """The systems, shapes with the options of BASE."""
+        """Return the methods; shapes get the options of BASE."""
         return [
-            replace(system, changes=_with_base(system.changes)) if system.base in SHAPES else system
-            for system in parse_methods(",".join(self.systems))
+            replace(method, changes=_with_base(method.changes)) if method.base in SHAPES else method
+            for method in parse_methods(",".join(self.methods))
         ]
 
 
@@ -81,7 +79,7 @@ START = "init_opacity=0.2,init_scale=0.7"
 
 
 def adc(shape: str, *more: str) -> str:
-    """A shape with growth by gradient and more options."""
+    """Return a shape with growth by gradient and more options."""
     return ",".join((f"{shape}:{ADC}", *more))
 
 
@@ -89,10 +87,10 @@ SHORT = {ADC: "adc*", START: "start*"}  # in the tables
 KERNELS = tuple(adc(shape, START) for shape in ("gaussian", "skew-normal", "generalised-exponential"))
 
 GROUPS = {
-    # every published system as published, and clsplat's default
+    # every published method as published, and clsplat's default
     "presets": Group(("default", "3dgs", "3dgs-mcmc", "ges", "3d-hgs", "sss", "sns", "3dsgs"), (5000, 20000)),
-    # one optimizer; the skew's form and its training: SNS's four ablation rows (vanilla, decomposition, alternation,
-    # both) and the centred form with and without alternation
+    # one optimizer; the form of the skew and its training: the four ablation rows of SNS (vanilla, decomposition,
+    # alternation, both) and the centred form with and without alternation
     "forms": Group(
         (
             "skew-normal",
@@ -135,7 +133,7 @@ GROUPS = {
         ),
         (5000,),
     ),
-    # which start and which strategy
+    # start and strategy
     "strategies": Group(
         (
             "skew-normal",
@@ -150,7 +148,7 @@ GROUPS = {
         (5000, 20000),
         validate=True,
     ),
-    # what makes the difference between the two strategies, with and without room to grow
+    # the cause of the difference between the two strategies, with and without room to grow
     "growth": Group(
         (
             "skew-normal",
@@ -163,7 +161,7 @@ GROUPS = {
         (5000, 20000),
         validate=True,
     ),
-    # which start goes with which strategy
+    # the best start for each strategy
     "starts": Group(
         (
             adc("skew-normal"),
@@ -190,7 +188,7 @@ GROUPS = {
     "kernels-long": Group(
         ("skew-normal", *KERNELS, *(f"{kernel},opacity_reset=0" for kernel in KERNELS)), (20000,), 3000, validate=True
     ),
-    # whether three times the iterations say the same
+    # whether three times the iterations give the same order
     "long": Group(
         (
             "skew-normal",
@@ -206,128 +204,109 @@ GROUPS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, OUT, smoke=False)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--groups", nargs="+", choices=tuple(GROUPS), help="not given: all for these views")
-    parser.add_argument("--caps", nargs="+", type=int, help="only these of the groups' caps; others where none is one")
+    parser.add_argument("--groups", nargs="+", choices=tuple(GROUPS), help="default: all groups for these views")
+    parser.add_argument("--caps", nargs="+", type=int, help="only these caps of a group; new caps if it has none of them")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--iterations", type=int, help="instead of the groups' own")
-    parser.add_argument("--device")
-    parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--validate", action="store_true", help="hold out training views; test views are not looked at")
-    parser.add_argument("--table", action="store_true")
-    parser.add_argument("--page", action="store_true")
+    parser.add_argument("--iterations", type=int, help="instead of those of the group")
+    parser.add_argument("--validate", action="store_true", help="measure on held-out training views, never on test views")
+    parser.add_argument("--page", action="store_true", help="print the tables of SYSTEMS.md")
     args = parser.parse_args()
     if args.validate:
         args.out = args.out.with_name(args.out.name + "-validation")
     if args.page:
         print(page(args.out, args.validate))
         return
-    for name in args.scenes if not args.table else ():
-        scene = load_scene(common.data_folder() / name, resolution=RESOLUTION.get(name, -1), eval=True)
-        if args.validate:
-            scene = validation(scene)
-        asked = args.groups or [group for group in GROUPS if GROUPS[group].validate == args.validate]
-        for group in (GROUPS[group] for group in asked):
+    names = args.groups or [name for name, group in GROUPS.items() if group.validate == args.validate]
+    for scene_name in args.scenes if not args.table else ():
+        scene = common.real_scene(scene_name, validate=args.validate)
+        for group in (GROUPS[name] for name in names):
             caps = [cap for cap in group.caps if args.caps is None or cap in args.caps] or args.caps or []
-            common_options = {"iterations": args.iterations or group.iterations, "device": args.device}
             compare(
                 [scene],
                 group.contestants(),
-                args.out / name,
+                args.out / scene_name,
                 caps,
                 args.seeds,
-                common_options,
+                {"iterations": args.iterations or group.iterations, "device": args.device},
                 extra={"commit": common.commit()},
-                on_run=say,
+                on_run=common.print_run,
             )
     for path in sorted(args.out.glob(f"*/{RUNS}")):
         print(markdown(common.read(path)))
 
 
-def validation(scene: Scene) -> Scene:
-    """The scene without its test views, and every 7th training view held out instead."""
-    return replace(scene, views=scene.train, test_names=frozenset(view.name for view in scene.train[3::7]))
-
-
 def page(folder: Path, validate: bool) -> str:
-    """The tables by question: for each group and cap the scenes side by side, and the difference to the first system.
+    """Return the tables by question: for each group and cap, the scenes side by side.
 
-    A system's mean ± half the spread is over the seeds it has; the difference over those that both have, seed by seed.
+    Each method has its mean ± half the spread over its seeds, and the difference to the first method of the group, over
+    the seeds that both have.
     """
     scenes = {path.parent.name: common.read(path) for path in sorted(folder.glob(f"*/{RUNS}"))}
-    lines = []
+    tables = []
     for name, group in GROUPS.items():
         for cap in group.caps if group.validate == validate else ():
-            by = {
-                (scene, system.label): own_runs(records, system, cap, group.iterations)
+            runs = {
+                (scene, method.label): runs_by_seed(records, method, cap, group.iterations)
                 for scene, records in scenes.items()
-                for system in group.contestants()
+                for method in group.contestants()
             }
-            if not any(len(seeds) for (_, system), seeds in by.items() if system != group.systems[0]):
+            base, *others = group.methods
+            if not any(runs[scene, method] for scene in scenes for method in others):
                 continue
-            lines += [
-                f"**{name}, {cap} splats, {group.iterations} iterations**",
-                "",
-                "| system | "
-                + " | ".join(f"{scene}: PSNR | to {short(group.systems[0])} | SSIM | CPU s | seeds" for scene in scenes)
-                + " |",
-                "|---|" + "---:|" * 5 * len(scenes),
+            head = ["system"]
+            for scene in scenes:
+                head += [f"{scene}: PSNR", f"to {short(base)}", "SSIM", "CPU s", "seeds"]
+            rows = [
+                [short(method), *(cell for scene in scenes for cell in cells(runs[scene, method], runs[scene, base]))]
+                for method in group.methods
             ]
-            for system in group.systems:
-                cells = [cell for scene in scenes for cell in row(by[scene, system], by[scene, group.systems[0]])]
-                lines.append(f"| {short(system)} | " + " | ".join(cells) + " |")
-            lines.append("")
-    return "\n".join(lines)
+            title = f"**{name}, {cap} splats, {group.iterations} iterations**"
+            tables.append(f"{title}\n\n{common.table(head, rows, right=head[1:])}\n")
+    return "\n".join(tables)
 
 
 def short(label: str) -> str:
-    """A system's label without the options that many have."""
+    """Return a method's label with short names for the options that many methods share."""
     for options, name in SHORT.items():
         label = label.replace(options, name)
     return label
 
 
-def own_runs(records: list[Record], system: Method, cap: int, iterations: int) -> dict[int, Record]:
-    """A system's runs by seed: those made with the options it has now."""
+def runs_by_seed(records: list[Record], method: Method, cap: int, iterations: int) -> dict[int, Record]:
+    """Return the runs of a method by seed; runs that had other options are left out."""
 
     def same(record: Record) -> bool:
         options = replace(TrainConfig.from_json(record["config"]), device=None)
-        return options == system.config(cap, options.seed, {"iterations": iterations})
+        return options == method.config(cap, options.seed, {"iterations": iterations})
 
     return {
         record["config"]["seed"]: record
         for record in records
-        if record["system"] == system.label and record["config"]["cap_max"] == cap and same(record)
+        if record["system"] == method.label and record["config"]["cap_max"] == cap and same(record)
     }
 
 
-def row(own: dict[int, Record], base: dict[int, Record]) -> list[str]:
-    """Cells of one system on one scene."""
-    done = [record for record in own.values() if not record["failed"]]
-    if not done:
-        return ["failed" if own else "", "", "", "", str(len(own) or "")]
-    psnr = [record["psnr"] for record in done]
-    pairs = [
-        own[seed]["psnr"] - base[seed]["psnr"]
-        for seed in own
-        if seed in base and own is not base and not own[seed]["failed"] and not base[seed]["failed"]
+def cells(runs: dict[int, Record], base: dict[int, Record]) -> list[str]:
+    """Return the cells of one method on one scene."""
+    finished = {seed: record for seed, record in runs.items() if not record["failed"]}
+    if not finished:
+        return ["failed" if runs else "", "", "", "", str(len(runs) or "")]
+    psnr = [record["psnr"] for record in finished.values()]
+    gains = [
+        record["psnr"] - base[seed]["psnr"]
+        for seed, record in finished.items()
+        if runs is not base and seed in base and not base[seed]["failed"]
     ]
-    to_base = f"{min(pairs):+.2f} to {max(pairs):+.2f}" if len(pairs) > 1 else "".join(f"{d:+.2f}" for d in pairs)
+    to_base = f"{min(gains):+.2f} to {max(gains):+.2f}" if len(gains) > 1 else "".join(f"{d:+.2f}" for d in gains)
     return [
         f"{statistics.fmean(psnr):.2f} ± {(max(psnr) - min(psnr)) / 2:.2f}" if len(psnr) > 1 else f"{psnr[0]:.2f}",
         to_base,
-        f"{statistics.fmean(record['ssim'] for record in done):.4f}",
-        f"{statistics.fmean(record['cpu_seconds'] for record in done):.0f}",
-        str(len(done)),
+        f"{statistics.fmean(record['ssim'] for record in finished.values()):.4f}",
+        f"{statistics.fmean(record['cpu_seconds'] for record in finished.values()):.0f}",
+        str(len(finished)),
     ]
-
-
-def say(run: Run, record: Record | None) -> None:
-    """Progress, a line a run."""
-    if record is not None:
-        result = record["failed"] or f"{record['psnr']:.3f} dB, {record['cpu_seconds']:.0f} CPU s"
-        print(f"{run}: {result}", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 Record = dict[str, Any]  # a line of runs.jsonl
@@ -137,11 +137,17 @@ def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
 
 
 def markdown(records: Sequence[Record]) -> str:
-    """The whole table, with its notes."""
+    """Return the whole table as Markdown, with its notes."""
     rows = summarise(records)
-    lines = [" | ".join(HEAD), " | ".join("---" if title in ("scene", "system") else "---:" for title in HEAD)]
-    lines += [" | ".join(cells(row)) for row in rows]
-    return "".join(f"| {line} |\n" for line in lines) + "\n" + "".join(f"- {note}\n" for note in notes(records, rows))
+    numbers = [title for title in HEAD if title not in ("scene", "system")]
+    lines = markdown_table(HEAD, [cells(row) for row in rows], numbers)
+    return f"{lines}\n\n" + "".join(f"- {note}\n" for note in notes(records, rows))
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Collection[str] = ()) -> str:
+    """Return a Markdown table without a line break at its end; `right` names the right-aligned columns."""
+    rules = ["---:" if title in right else "---" for title in head]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, rules, *rows))
 
 
 def _group_key(record: Record) -> str:
