@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from clsplat.comparison.compare import Run
+from clsplat.comparison.runs import Run
 from clsplat.comparison.table import Record, markdown_table
 from clsplat.device.device import Device
 from clsplat.scenes.scene import Scene, load_scene

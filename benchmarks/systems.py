@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 
 import common
 
-from clsplat.comparison.compare import RUNS, compare
+from clsplat.comparison.compare import compare
 from clsplat.comparison.methods import Method, parse_methods
+from clsplat.comparison.runs import RUNS
 from clsplat.comparison.table import Record, markdown
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.config import TrainConfig
@@ -207,10 +208,14 @@ def main() -> None:
     parser = common.parser(__doc__, OUT, smoke=False)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--groups", nargs="+", choices=tuple(GROUPS), help="default: all groups for these views")
-    parser.add_argument("--caps", nargs="+", type=int, help="only these caps of a group; new caps if it has none of them")
+    parser.add_argument(
+        "--caps", nargs="+", type=int, help="only these caps of a group; new caps if it has none of them"
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--iterations", type=int, help="instead of those of the group")
-    parser.add_argument("--validate", action="store_true", help="measure on held-out training views, never on test views")
+    parser.add_argument(
+        "--validate", action="store_true", help="measure on held-out training views, never on test views"
+    )
     parser.add_argument("--page", action="store_true", help="print the tables of SYSTEMS.md")
     args = parser.parse_args()
     if args.validate:

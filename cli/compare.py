@@ -31,7 +31,7 @@ from .progress import TrainingDisplay, duration, table
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from clsplat.comparison.compare import Run
+    from clsplat.comparison.runs import Run
     from clsplat.comparison.table import Record
     from clsplat.scenes.scene import Scene
 

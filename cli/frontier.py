@@ -98,7 +98,8 @@ def draw_frontier(
     Writes DIR/report.html, DIR/charts (PNG, SVG, and their data as CSV and JSON) and what `clsplat compare` writes.
     Runs that are there are not done again; after Ctrl-C the charts show what is there, and the same command goes on.
     """
-    from clsplat.comparison.sweep import distinct, read_runs, sweep, write_report
+    from clsplat.comparison.runs import distinct, read_runs
+    from clsplat.comparison.sweep import sweep, write_report
 
     if charts_only == bool(scenes):
         raise click.UsageError("give scenes, or --charts-only to draw the runs that are there")

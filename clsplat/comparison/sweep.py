@@ -13,8 +13,9 @@ from ..files.html_page import Section, write_page
 from ..scenes.scene import Scene
 from ..training.log import Progress
 from .charts import arithmetic_chart, seeds_chart
-from .compare import RUNS, Run, compare, parse_runs, run_key
+from .compare import compare
 from .methods import Method
+from .runs import RUNS, Run, distinct, read_runs
 from .sweep_charts import equal_chart, size_chart, time_chart
 from .sweep_rows import (
     ChartRow,
@@ -115,30 +116,6 @@ def sweep(
     finally:
         if (Path(output) / RUNS).exists():
             write_report(output, [*read_runs(output), *more], reference=systems[0].label)
-
-
-def read_runs(path: str | Path) -> list[Record]:
-    """The records of a runs.jsonl, or of the one in a folder.
-
-    Raises
-    ------
-    InputError : there is none, or it cannot be read.
-    """
-    file = Path(path)
-    file = file / RUNS if file.is_dir() else file
-    try:
-        return parse_runs(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{file}: cannot be read ({reason}): give the folder of a comparison, or its {RUNS}") from None
-
-
-def distinct(records: Sequence[Record]) -> list[Record]:
-    """The records without those of runs that stand there already."""
-    kept: dict[str, Record] = {}
-    for record in records:
-        kept.setdefault(run_key(record), record)
-    return list(kept.values())
 
 
 def write_report(

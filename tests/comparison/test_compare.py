@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from clsplat.comparison import compare as module
-from clsplat.comparison.compare import Run, compare, curve_iterations, digest, scene_identity
+from clsplat.comparison.compare import compare
+from clsplat.comparison.measure import curve_iterations, digest
 from clsplat.comparison.methods import parse_methods
+from clsplat.comparison.runs import Run, scene_identity
 from clsplat.comparison.table import HEAD, MEASURED, Record, cells, markdown, notes, repeats, summarise
 from clsplat.errors import InputError, TrainingError
 from clsplat.evaluation.evaluate import evaluate

@@ -12,7 +12,8 @@ from sweep_records import curve_points, run_record, seed_records, sweep_records
 
 from clsplat.comparison import compare as compare_module
 from clsplat.comparison.methods import parse_methods
-from clsplat.comparison.sweep import read_runs, sweep, write_report
+from clsplat.comparison.runs import read_runs
+from clsplat.comparison.sweep import sweep, write_report
 from clsplat.comparison.sweep_rows import (
     auto_rows,
     curve_rows,

@@ -1,0 +1,156 @@
+"""runs.jsonl: the finished runs of a comparison, one line each."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError, OutputError
+from ..files.atomic import atomic_writer
+from ..scenes.scene import Scene
+from ..training.config import FREE_OPTIONS, TrainConfig
+from .table import MEASURED, Record
+
+RUNS = "runs.jsonl"
+# Keys that every line must have.
+_KEYS = {
+    "scene",
+    "system",
+    "config",
+    "failed",
+    "finite",
+    "cap_held",
+    "device",
+    "driver",
+    "schedule",
+    "version",
+    "protocol",
+    *MEASURED,
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run of a comparison: the `number`th of `total` on its scene; `repeat`s of a run are 1, 2, ..."""
+
+    scene: str
+    system: str
+    config: TrainConfig
+    number: int
+    total: int
+    repeat: int = 0
+
+    def __str__(self) -> str:
+        config = self.config
+        again = f" repeat {self.repeat}" if self.repeat else ""
+        return f"[{self.number}/{self.total}] {self.scene} {self.system} cap {config.cap_max} seed {config.seed}{again}"
+
+    @property
+    def stem(self) -> str:
+        """Name of the run's files: system, cap, seed and repeat."""
+        again = f"-repeat{self.repeat}" if self.repeat else ""
+        return re.sub(r"[^\w.=,-]", "_", f"{self.system}-cap{self.config.cap_max}-seed{self.config.seed}{again}")
+
+
+class RunFile:
+    """The finished runs of a folder: each run is appended to runs.jsonl, and a repeated run replaces its line.
+
+    Raises
+    ------
+    OutputError : the folder or the file cannot be used.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / RUNS
+        text = ""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if self.path.exists():
+                text = self.path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise OutputError(f"{self.path}: cannot be used ({reason}): choose another folder") from None
+        self.records = parse_runs(text)
+        self._separator = "" if not text or text.endswith("\n") else "\n"
+
+    def find(self, scene: Mapping[str, Any], system: str, config: TrainConfig, repeat: int = 0) -> Record | None:
+        """Return the record of a run; None if the run is not finished."""
+        key = run_key({"scene": scene, "system": system, "config": config.to_json(), "repeat": repeat})
+        return next((record for record in self.records if run_key(record) == key), None)
+
+    def add(self, record: Record) -> None:
+        """Append a record, or replace the record of the same run; raises OutputError if it cannot be written."""
+        record = json.loads(json.dumps(record))
+        for place, other in enumerate(self.records):
+            if run_key(other) == run_key(record):
+                self.records[place] = record
+                with atomic_writer(self.path) as whole:
+                    whole.write("".join(json.dumps(line) + "\n" for line in self.records).encode())
+                self._separator = ""
+                return
+        try:
+            with self.path.open("a", encoding="utf-8") as stream:
+                stream.write(self._separator + json.dumps(record) + "\n")
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written ({error.strerror or error}): free some space") from None
+        self._separator = ""
+        self.records.append(record)
+
+
+def parse_runs(text: str) -> list[Record]:
+    """Return the records of a runs.jsonl. A line that a crash cut short is left out, so that its run is repeated."""
+    records = []
+    for line in text.splitlines():
+        try:
+            record = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(record, dict) and record.keys() >= _KEYS:
+            records.append(record)
+    return records
+
+
+def read_runs(path: str | Path) -> list[Record]:
+    """Return the records of a runs.jsonl, or of the one in a folder.
+
+    Raises
+    ------
+    InputError : the file is missing or cannot be read.
+    """
+    file = Path(path)
+    file = file / RUNS if file.is_dir() else file
+    try:
+        return parse_runs(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{file}: cannot be read ({reason}): give the folder of a comparison, or its {RUNS}") from None
+
+
+def distinct(records: Sequence[Record]) -> list[Record]:
+    """Return the records without later records of the same run."""
+    kept: dict[str, Record] = {}
+    for record in records:
+        kept.setdefault(run_key(record), record)
+    return list(kept.values())
+
+
+def run_key(record: Mapping[str, Any]) -> str:
+    """Return what identifies a run: scene, system, the options that change the result, and the number of the repeat."""
+    options = {key: value for key, value in record["config"].items() if key not in FREE_OPTIONS}
+    return json.dumps([record["scene"], record["system"], options, record.get("repeat", 0)], sort_keys=True)
+
+
+def scene_identity(scene: Scene) -> dict[str, Any]:
+    """Return what identifies a scene as it was read: name, size of the first view, numbers of views."""
+    camera = scene.views[0].camera
+    return {
+        "name": scene.name,
+        "width": camera.width,
+        "height": camera.height,
+        "train": len(scene.train),
+        "test": len(scene.test),
+    }
