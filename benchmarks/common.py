@@ -20,6 +20,7 @@ from clsplat.scenes.split import hold_out
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
+TEST_HELPERS = [str(ROOT / "tests"), str(ROOT / "tests" / "support")]  # for sys.path: the reference and the helpers
 CLSPLAT = [sys.executable, "-c", "from clsplat_cli.main import main; main()"]  # the command line, for subprocesses
 REDUCTION = {"fox": 2}  # `resolution` of load_scene; the other scenes are read as they are
 
@@ -45,11 +46,6 @@ def parser(
     if smoke:
         result.add_argument("--smoke", action="store_true", help="a tiny case, for tests")
     return result
-
-
-def use_test_helpers() -> None:
-    """Let a benchmark import the packages `reference` and the modules of tests/support."""
-    sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "support")]
 
 
 def data_folder() -> Path:

@@ -5,11 +5,9 @@ python benchmarks/demo.py [--device 0:0] [--out benchmarks/results/demo.jsonl]
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -20,17 +18,14 @@ from clsplat.device.device import open_device
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", help="as for clsplat")
-    parser.add_argument("--out", type=Path, default=common.RESULTS / "demo.jsonl")
-    args = parser.parse_args()
+    args = common.parser(__doc__, common.RESULTS / "demo.jsonl", table=False, smoke=False).parse_args()
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        # PoCL's, Intel's and pyopencl's caches all start empty.
+        # The caches of PoCL, Intel and pyopencl all start empty.
         fresh = {"POCL_CACHE_DIR": root / "pocl", "XDG_CACHE_HOME": root / "cache", "HOME": root / "home"}
         (root / "home").mkdir()
         environment = os.environ | {key: str(value) for key, value in fresh.items()}
-        command = [str(Path(sys.executable).with_name("clsplat")), "demo", str(root / "out"), "--quiet"]
+        command = [*common.CLSPLAT, "demo", str(root / "out"), "--quiet"]
         command += ["--device", args.device] if args.device else []
         start = time.perf_counter()
         subprocess.run(command, env=environment, check=True)

@@ -1,37 +1,34 @@
 """Damaged files for every reader, thousands of each; a JSON line a reader.
 
     python benchmarks/fuzz.py [--inputs 5000] [--seed 0] [--readers ply colmap-bin]
-    python benchmarks/fuzz.py --table                         # print what is there, run nothing
+    python benchmarks/fuzz.py --table                         # print the finished campaigns, run nothing
 
-What is damaged, and what counts as a fault, stands in tests/support/fuzzing.py. `faults` has each one's input, so that
-`python tests/support/fuzzing.py fuzz_readers READER INPUT INPUT+1 SEED` repeats it.
+tests/support/fuzzing.py defines how files are damaged and what counts as a fault. `faults` holds the input of each
+fault, so that `python tests/support/fuzzing.py fuzz_readers READER INPUT INPUT+1 SEED` repeats it.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections import Counter
-from pathlib import Path
 
 import common
 
-sys.path.insert(0, str(common.ROOT / "tests"))
+sys.path.extend(common.TEST_HELPERS)
 
 from fuzz_readers import READERS
 from fuzzing import campaign
 
-KEPT = 20  # faults of a reader that are written out; their number is whole
+KEPT = 20  # faults of a reader whose inputs are written; all of them are counted
+COLUMNS = ("reader", "seed", "inputs", "refused", "faults", "commit")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, common.RESULTS / "fuzz.jsonl", device=False, smoke=False)
     parser.add_argument("--inputs", type=int, default=5000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--readers", nargs="+", choices=list(READERS), default=list(READERS))
-    parser.add_argument("--out", type=Path, default=common.RESULTS / "fuzz.jsonl")
-    parser.add_argument("--table", action="store_true")
     args = parser.parse_args()
     for reader in () if args.table else args.readers:
         start = time.perf_counter()
@@ -51,12 +48,7 @@ def main() -> None:
         )
         for fault, times in Counter(fault["fault"] for fault in result.faults).most_common(5):
             print(f"{reader}: {times} x {fault}")
-    print(f"{'reader':14} {'seed':>6} {'inputs':>8} {'refused':>8} {'faults':>7}  commit")
-    for row in common.read(args.out):
-        print(
-            f"{row['reader']:14} {row['seed']:6d} {row['inputs']:8d} {row['refused']:8d} {row['faults']:7d}  "
-            f"{row['commit']}"
-        )
+    print(common.table(COLUMNS, [[row[name] for name in COLUMNS] for row in common.read(args.out)]))
 
 
 if __name__ == "__main__":

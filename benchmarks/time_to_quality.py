@@ -2,82 +2,73 @@
 
     python benchmarks/time_to_quality.py [--scenes fox kitchen] [--device 0:0] [--iterations 3000] [--every 50]
         [--cap 20000] [--seeds 0] [--options "" coarse_to_fine=false "lambda_dssim=0,growth=1.1"] [--validate]
-    python benchmarks/time_to_quality.py --table              # print what is there, run nothing
+    python benchmarks/time_to_quality.py --table              # print the finished runs, run nothing
     python benchmarks/time_to_quality.py --smoke --scenes NAME --out FILE
 
-A report, from which nothing is chosen: with --validate every 7th training view is held out instead of the test views,
-and choices are made from those runs alone. Seconds are wall time of training, without the evaluations and with programs
-built; CPU seconds, of all cores, likewise. Each of --options is a run by itself: options of TrainConfig with commas
-between, "" for none. A run that is there for this commit, device and schedule is skipped. `load` is the machine's
+Nothing is chosen from runs on test views. With --validate every 7th training view is held out instead, and choices are
+made from those runs alone. Seconds are wall time of training, without the evaluations and with programs already built.
+CPU seconds count all cores in the same way. Each of --options is one run: options of TrainConfig with commas between
+them, "" for the defaults. A finished run of this commit, device and schedule is skipped. `load` is the machine's
 one-minute load at the start.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import common
-from systems import validation
 
 LEVELS_DB = (20, 22, 24, 26)
-RESOLUTION = {"fox": 2}  # of load_scene; others as they are
 KEY = ("scene", "views", "options", "cap", "iterations", "seed", "platform", "schedule", "commit")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, common.RESULTS / "time_to_quality.jsonl")
     parser.add_argument("--scenes", nargs="+", default=["fox", "kitchen", "sceaux_castle"])
     parser.add_argument("--options", nargs="+", default=[""])
     parser.add_argument("--cap", type=int, default=20_000)
     parser.add_argument("--iterations", type=int, default=3000)
     parser.add_argument("--every", type=int, default=50, help="iterations from one evaluation to the next")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--device")
-    parser.add_argument("--out", type=Path, default=common.RESULTS / "time_to_quality.jsonl")
-    parser.add_argument("--validate", action="store_true")
-    parser.add_argument("--table", action="store_true")
-    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--validate", action="store_true", help="measure on held-out training views")
     args = parser.parse_args()
     if args.smoke:
         args.cap, args.iterations, args.every = 60, 4, 2
-    for name in args.scenes if not args.table else ():
-        for seed in args.seeds:
-            for options in args.options:
-                run(name, options, seed, args)
-    print_table(common.read(args.out))
+    runs = common.Runs(args.out, KEY)
+    if not args.table:
+        for name, seed, options in itertools.product(args.scenes, args.seeds, args.options):
+            train(runs, name, options, seed, args)
+    print_table(runs.rows)
 
 
-def run(name: str, options: str, seed: int, args: argparse.Namespace) -> None:
-    """One training; appends its line."""
+def train(runs: common.Runs, name: str, options: str, seed: int, args: argparse.Namespace) -> None:
+    """Train once and append the line, unless the run is finished."""
     from clsplat.comparison.methods import parse_methods
     from clsplat.device.device import open_device
     from clsplat.rendering.tuning import schedule_for
-    from clsplat.scenes.scene import load_scene
     from clsplat.training.trainer import Trainer
 
     device, load = open_device(args.device), os.getloadavg()[0]
-    environment = common.environment(device, schedule_for(device))
-    key = {
+    case = {
         "scene": name,
         "views": "validation" if args.validate else "test",
         "options": options,
         "cap": args.cap,
         "iterations": args.iterations,
         "seed": seed,
-    } | {k: environment[k] for k in KEY if k in environment}
-    if any(all(row[k] == value for k, value in key.items()) for row in common.read(args.out)):
+        **common.environment(device, schedule_for(device)),
+    }
+    if case in runs:
         return
-    (system,) = parse_methods(f"default:{options}" if options else "default")
-    config = system.config(args.cap, seed, {"iterations": args.iterations})
-    scene = load_scene(common.data_folder() / name, resolution=RESOLUTION.get(name, -1), eval=True)
-    if args.validate:
-        scene = validation(scene)
-    Trainer(scene, replace(config, iterations=1), device=device).run()  # builds
+    (method,) = parse_methods(f"default:{options}" if options else "default")
+    config = method.config(args.cap, seed, {"iterations": args.iterations})
+    scene = common.real_scene(name, validate=args.validate)
+    Trainer(scene, replace(config, iterations=1), device=device).run()  # builds the programs
     trainer = Trainer(scene, config, device=device)
     seconds = cpu = 0.0
     along = []
@@ -87,23 +78,20 @@ def run(name: str, options: str, seed: int, args: argparse.Namespace) -> None:
             trainer.step()
         device.queue.finish()
         seconds, cpu = seconds + time.perf_counter() - start, cpu + time.process_time() - cpu_start
-        along.append(
-            [
-                trainer.iteration,
-                round(seconds, 3),
-                round(cpu, 3),
-                trainer.splats.n,
-                round(trainer.evaluate(scene.test).psnr, 3),
-            ]
-        )
-    common.append(args.out, key | environment | {"load": load, "along": along})
+        psnr = trainer.evaluate(scene.test).psnr
+        along.append([trainer.iteration, round(seconds, 3), round(cpu, 3), trainer.splats.n, round(psnr, 3)])
+    runs.add(case | {"load": load, "along": along})
     print(f"{name} {options} seed {seed}: {along[-1][-1]:.2f} dB after {seconds:.1f} s", flush=True)
 
 
 def reached(along: list[list[float]], level: float, column: int) -> float | None:
-    """When the quality first was at `level`, between two evaluations by their line; column: 1 seconds, 2 CPU seconds.
+    """Return when the quality first reached `level`, interpolated between two evaluations; None if it did not.
 
-    Before the first evaluation: the time of that one, as the quality at the start is not known.
+    The quality at the start is not known, so a level reached by the first evaluation has the time of that one.
+
+    Parameters
+    ----------
+    column : 1 for seconds, 2 for CPU seconds.
     """
     before = None
     for point in along:
@@ -117,42 +105,17 @@ def reached(along: list[list[float]], level: float, column: int) -> float | None
 
 
 def print_table(rows: list[dict[str, Any]]) -> None:
-    """A line a run."""
-    titles = [
-        "scene",
-        "views",
-        "options",
-        "seed",
-        "platform",
-        "commit",
-        "load",
-        *(f"s to {db} dB" for db in LEVELS_DB),
-        "iterations",
-        "seconds",
-        "CPU s",
-        "splats",
-        "PSNR [dB]",
-    ]
-    print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
+    """Print a line for each run."""
+    head = ["scene", "views", "options", "seed", "platform", "commit", "load"]
+    head += [*(f"s to {db} dB" for db in LEVELS_DB), "iterations", "seconds", "CPU s", "splats", "PSNR [dB]"]
+    lines = []
     for row in rows:
         iterations, seconds, cpu, splats, psnr = row["along"][-1]
         times = [reached(row["along"], level, 1) for level in LEVELS_DB]
-        cells = [
-            row["scene"],
-            row["views"],
-            row["options"] or "default",
-            row["seed"],
-            row["platform"].split()[0],
-            row["commit"],
-            f"{row['load']:.1f}",
-            *("" if at is None else f"{at:.1f}" for at in times),
-            iterations,
-            f"{seconds:.1f}",
-            f"{cpu:.1f}",
-            splats,
-            f"{psnr:.2f}",
-        ]
-        print("| " + " | ".join(map(str, cells)) + " |")
+        line = [row["scene"], row["views"], row["options"] or "default", row["seed"], row["platform"].split()[0]]
+        line += [row["commit"], f"{row['load']:.1f}", *("" if at is None else f"{at:.1f}" for at in times)]
+        lines.append([*line, iterations, f"{seconds:.1f}", f"{cpu:.1f}", splats, f"{psnr:.2f}"])
+    print(common.table(head, lines))
 
 
 if __name__ == "__main__":

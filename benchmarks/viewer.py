@@ -29,7 +29,7 @@ from typing import Any
 import common
 import numpy as np
 
-sys.path.insert(0, str(common.ROOT / "tests"))
+sys.path.extend(common.TEST_HELPERS)
 
 KEYS, FRAMES = 4, 4000  # training cameras on the path, poses between them
 POSE_SECONDS = 0.016

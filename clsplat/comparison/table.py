@@ -123,6 +123,12 @@ def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
             for row in again
             if not row["same"]
         ]
+    single = [record["system"] for record in records if record.get("renders_per_view") == 1]
+    if single:
+        said.append(
+            f"render time of {', '.join(dict.fromkeys(single))}: one render of each view, not the fastest of several, "
+            "so it is a little longer"
+        )
     by_key: tuple[tuple[str, Callable[[Record], Any]], ...] = (
         ("device", lambda record: f"{record['device']} ({record['driver']})"),
         ("schedule", lambda record: record["schedule"]),

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import USABLE, MakeRenderer, on_place
-from kernel_checks import BACKGROUND, KERNELS, SMOOTH, Arrays, Case
+from kernel_checks import BACKGROUND, KERNELS, SMOOTH, Arrays, Case, differences
 from reference.formulas import SKEW_MAX
 from reference.renderer import FIELDS
 from reference.scenes import random_camera, random_splats
@@ -22,13 +22,8 @@ from reference.tolerances import DIFFERENCES, relative_error
 from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device
 from clsplat.device.schedule import SCHEDULES
-from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
-
-STEP = 1e-3  # with the five-point rule: truncation STEP^4 f'''''/30, rounding 1e-16 |f| / STEP
-FIVE_POINTS = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
-TWO_POINTS = ((1, 0.5), (-1, -0.5))  # exact where the image is linear: in the colour
 
 # Schedules differ in the raster only, normalisations in the projection only: not all of their products, and
 # normalisations on the first device only.
@@ -45,21 +40,6 @@ def awkward_splats(camera: Camera) -> Arrays:
     arrays["skew"][2] *= 1.01 * SKEW_MAX / np.linalg.norm(arrays["skew"][2])
     arrays["sh"][3, 0, 1] = -5.0
     return arrays
-
-
-def differences(renderer: Renderer, case: Case, field: str) -> np.ndarray:
-    """Central differences of the loss for every entry of a field."""
-    v_color, v_alpha = case.weights
-    gradient = np.zeros_like(case.values[field])
-    for index in np.ndindex(gradient.shape):
-        for multiple, factor in TWO_POINTS if field == "sh" else FIVE_POINTS:
-            bumped = case.values[field].copy()
-            bumped[index] += multiple * STEP
-            splats = case.splats.with_arrays({**case.values, field: bumped})
-            image = renderer.render(splats, case.camera, BACKGROUND)
-            loss = (v_color * image.color).sum() + (v_alpha * image.alpha).sum()
-            gradient[index] += factor * loss / STEP
-    return gradient
 
 
 @pytest.mark.parametrize(("place", "shape", "normalisation", "schedule"), BUILDS)

@@ -37,6 +37,10 @@ KERNELS = [
 BACKGROUND = (0.2, 0.5, 0.9)
 SMOOTH = {"alpha_min": 0.0, "alpha_max": 1.0, "t_min": 0.0}
 
+STEP = 1e-3  # with the five-point rule: truncation STEP^4 f'''''/30, rounding 1e-16 |f| / STEP
+FIVE_POINTS = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
+TWO_POINTS = ((1, 0.5), (-1, -0.5))  # exact where the image is linear: in the colour
+
 
 @dataclass(frozen=True, eq=False)
 class Case:
@@ -148,3 +152,18 @@ class Case:
             assert np.isfinite(ours).all(), name
             error = float(np.abs(ours - reference)[self.decided].max(initial=0.0)) / scale
             assert error <= tolerance, f"{name}: off by {error:.1e}"
+
+
+def differences(renderer: render.Renderer, case: Case, field: str) -> np.ndarray:
+    """Return central differences of the loss for every entry of a field."""
+    v_color, v_alpha = case.weights
+    gradient = np.zeros_like(case.values[field])
+    for index in np.ndindex(gradient.shape):
+        for multiple, factor in TWO_POINTS if field == "sh" else FIVE_POINTS:
+            bumped = case.values[field].copy()
+            bumped[index] += multiple * STEP
+            splats = case.splats.with_arrays({**case.values, field: bumped})
+            image = renderer.render(splats, case.camera, BACKGROUND)
+            loss = (v_color * image.color).sum() + (v_alpha * image.alpha).sum()
+            gradient[index] += factor * loss / STEP
+    return gradient
