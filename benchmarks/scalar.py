@@ -1,13 +1,12 @@
 """Vectors against scalars: training steps of one source in two schedules, one work-item a tile and one a pixel.
 
     python benchmarks/scalar.py [--device 0:0] [--scenes kitchen] [--splats 20000] [--iterations 20]
-    python benchmarks/scalar.py --table                       # print what is there, run nothing
+    python benchmarks/scalar.py --table                       # print the finished runs, run nothing
     python benchmarks/scalar.py --smoke --out FILE            # some seconds, for tests
 
-`256x1x1` has a work-item for every pixel and nothing of a vector's width in its text: what a compiler makes of the
-plain form. Both runs take their steps in turn, over the same views, from a scene's points at full size; times are
-medians, of the device's own clock but for the whole step, which is wall time. A JSON line each, with the ratio of other
-to first.
+`256x1x1` has a work-item for every pixel and no vector types in its source: it shows what a compiler makes of the plain
+form. Both runs step in turn, over the same views, from a scene's points at full size. Times are medians of the device's
+clock, but the whole step is wall time. Each run is a JSON line with the ratio of the second schedule to the first.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import argparse
 import os
 import statistics
 import time
-from pathlib import Path
 from typing import Any
 
 import common
@@ -26,16 +24,12 @@ RASTER = ("rasterize", "rasterize_vjp")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=["kitchen"], help="of the data folder, or `synthetic`")
+    parser = common.parser(__doc__, common.RESULTS / "scalar.jsonl")
+    parser.add_argument("--scenes", nargs="+", default=["kitchen"], help="scenes of the data folder, or `synthetic`")
     parser.add_argument("--shapes", nargs="+", default=["gaussian", "skew-normal"])
     parser.add_argument("--splats", type=int, default=20_000)
     parser.add_argument("--schedules", nargs=2, default=["cpu16", "gpu256"])
     parser.add_argument("--iterations", type=int, default=20)
-    parser.add_argument("--device")
-    parser.add_argument("--out", type=Path, default=common.RESULTS / "scalar.jsonl")
-    parser.add_argument("--table", action="store_true")
-    parser.add_argument("--smoke", action="store_true")
     args = parser.parse_args()
     if args.smoke:
         args.scenes, args.shapes, args.splats, args.iterations = ["synthetic"], ["gaussian"], 100, 2
@@ -46,7 +40,7 @@ def main() -> None:
 
 
 def run(name: str, shape: str, args: argparse.Namespace) -> dict[str, Any]:
-    """The line of a scene and shape."""
+    """Return the line of a scene and shape."""
     from clsplat.device.device import open_device
     from clsplat.device.schedule import Schedule
     from clsplat.profiling.bench import bench_trainer
@@ -64,13 +58,13 @@ def run(name: str, shape: str, args: argparse.Namespace) -> dict[str, Any]:
     for schedule in schedules:
         os.environ[SCHEDULE_VARIABLE] = schedule
         trainers[schedule] = bench_trainer(scene, device, shape, start)
-    done: dict[str, list[dict[str, float]]] = {schedule: [] for schedule in schedules}
+    steps: dict[str, list[dict[str, float]]] = {schedule: [] for schedule in schedules}
     for _ in range(WARM_UP + args.iterations):
         for schedule, trainer in trainers.items():
-            done[schedule].append(timed_step(trainer))
+            steps[schedule].append(timed_step(trainer))
     times = {
         schedule: {stage: statistics.median(one[stage] for one in each[WARM_UP:]) for stage in (*RASTER, "step")}
-        for schedule, each in done.items()
+        for schedule, each in steps.items()
     }
     camera = scene.cameras[0]
     return common.environment(device, schedules[0]) | {
@@ -88,7 +82,7 @@ def run(name: str, shape: str, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def timed_step(trainer: Any) -> dict[str, float]:
-    """Milliseconds of one training step: of the rasteriser's two stages on the device, and of the whole step."""
+    """Return the milliseconds of a training step: both raster stages on the device, and the whole step."""
     from clsplat.device.trace import recorded
 
     trainer.device.queue.finish()
@@ -101,44 +95,24 @@ def timed_step(trainer: Any) -> dict[str, float]:
 
 
 def raster(times: dict[str, float]) -> float:
+    """Return the time of both raster stages."""
     return sum(times[stage] for stage in RASTER)
 
 
 def print_table(rows: list[dict[str, Any]]) -> None:
-    """A line a case: both schedules' times, and how many times longer the other takes."""
-    titles = [
-        "scene",
-        "splats",
-        "shape",
-        "platform",
-        "schedules",
-        "load",
-        "rasterize [ms]",
-        "rasterize_vjp [ms]",
-        "both: ratio",
-        "step [ms]",
-        "step: ratio",
-    ]
-    print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
+    """Print a line for each case: the times of both schedules and their ratios."""
+    head = ["scene", "splats", "shape", "platform", "schedules", "load"]
+    head += ["rasterize [ms]", "rasterize_vjp [ms]", "both: ratio", "step [ms]", "step: ratio"]
+    lines = []
     for row in rows:
         pair = (row["schedule"], row["other"])
         forward, backward, step = (
             " / ".join(f"{row['ms'][schedule][stage]:.1f}" for schedule in pair) for stage in (*RASTER, "step")
         )
-        cells = [
-            f"{row['scene']} {row['width']}x{row['height']}",
-            row["splats"],
-            row["shape"],
-            row["platform"].split()[0],
-            " / ".join(pair),
-            f"{row['load']:.1f}",
-            forward,
-            backward,
-            f"{row['raster_ratio']:.1f}",
-            step,
-            f"{row['step_ratio']:.1f}",
-        ]
-        print("| " + " | ".join(map(str, cells)) + " |")
+        line = [f"{row['scene']} {row['width']}x{row['height']}", row["splats"], row["shape"]]
+        line += [row["platform"].split()[0], " / ".join(pair), f"{row['load']:.1f}", forward, backward]
+        lines.append([*line, f"{row['raster_ratio']:.1f}", step, f"{row['step_ratio']:.1f}"])
+    print(common.table(head, lines))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """Wall time of whole processes: `clsplat --help`, and `clsplat render` of one view; a JSON line a case.
 
     python benchmarks/startup.py [--device 0:0] [--runs 5] [--splats 20000 --width 640 --height 480]
-    python benchmarks/startup.py --table                      # print what is there, run nothing
+    python benchmarks/startup.py --table                      # print the finished runs, run nothing
     python benchmarks/startup.py --smoke --out FILE           # a few seconds, for tests
 
-A render is of a synthetic model, in three states of the caches: `warm` (an earlier process has built everything),
-`cold` (empty folders, the schedule known) and `first` (empty folders and no schedule: the first command after
-installing, which measures the device, too). Caches are clsplat's, PoCL's and CUDA's, in folders of this script's own.
+A render is of a synthetic model, in three states of the caches. `warm`: an earlier process has built everything.
+`cold`: empty folders, the schedule known. `first`: empty folders and no schedule, as for the first command after
+installing, which also measures the device. Caches are those of clsplat, PoCL and CUDA, in folders of this script.
 Times are medians.
 """
 
@@ -30,17 +30,13 @@ SMOKE = {"runs": 1, "splats": 50, "width": 32, "height": 16, "shapes": ["gaussia
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device")
+    parser = common.parser(__doc__, common.RESULTS / "startup.jsonl")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--splats", type=int, default=20_000)
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=480)
     parser.add_argument("--shapes", nargs="+", default=["gaussian", "skew-normal"])
     parser.add_argument("--states", nargs="+", choices=STATES, default=STATES)
-    parser.add_argument("--out", type=Path, default=common.RESULTS / "startup.jsonl")
-    parser.add_argument("--table", action="store_true")
-    parser.add_argument("--smoke", action="store_true")
     args = parser.parse_args()
     if args.smoke:
         vars(args).update(SMOKE)
@@ -51,7 +47,7 @@ def main() -> None:
 
 
 def measure(args: argparse.Namespace, folder: Path) -> None:
-    """All cases, each a line of the file."""
+    """Measure all cases and append a line for each."""
     from clsplat.cameras.cameras_json import NamedCamera, write_cameras
     from clsplat.device.device import open_device
     from clsplat.rendering.tuning import schedule_for
@@ -60,7 +56,7 @@ def measure(args: argparse.Namespace, folder: Path) -> None:
     device = open_device(args.device)
     schedule = schedule_for(device)
     row = common.environment(device, schedule) | {"runs": args.runs, "load": os.getloadavg()[0]}
-    command = [sys.executable, "-c", "from clsplat_cli.main import main; main()"]
+    command = common.CLSPLAT
     append(args.out, row | {"task": "--help", "caches": ""}, [seconds([*command, "--help"]) for _ in range(args.runs)])
     for shape in args.shapes:
         scene, splats = synthetic_scene(args.splats, args.width, args.height, shape)
@@ -91,11 +87,11 @@ def measure(args: argparse.Namespace, folder: Path) -> None:
                 seconds(render, caches(folder / "caches", state, str(schedule), index))
                 for index in range(args.runs + (state == "warm"))
             ]
-            append(args.out, case | {"caches": state}, times[-args.runs :])  # the first warm one made them warm
+            append(args.out, case | {"caches": state}, times[-args.runs :])  # the first warm run only fills the caches
 
 
 def caches(folder: Path, state: str, schedule: str, index: int) -> dict[str, str]:
-    """Environment variables of the `index`th run in a state; its folders are made, and emptied where it wants that."""
+    """Return the environment variables of the `index`th run in a state; its folders are made, and emptied if needed."""
     if state != "warm" or index == 0:
         shutil.rmtree(folder, ignore_errors=True)
     names = ("XDG_CACHE_HOME", "LOCALAPPDATA", "POCL_CACHE_DIR", "CUDA_CACHE_PATH")
@@ -105,36 +101,29 @@ def caches(folder: Path, state: str, schedule: str, index: int) -> dict[str, str
 
 
 def seconds(command: list[str], variables: dict[str, str] | None = None) -> float:
-    """Wall time of a process, which must end well."""
+    """Return the wall time of a process, which must succeed."""
     start = time.perf_counter()
     subprocess.run(command, env=os.environ | (variables or {}), check=True, stdout=subprocess.DEVNULL)
     return time.perf_counter() - start
 
 
 def append(out: Path, row: dict[str, Any], times: list[float]) -> None:
-    """The line of a case."""
+    """Append the line of a case."""
     row |= {"seconds": statistics.median(times), "fastest": min(times), "slowest": max(times)}
     common.append(out, row)
     print(row["task"], row.get("shape", ""), row["caches"], f"{row['seconds']:.2f} s", file=sys.stderr, flush=True)
 
 
 def print_table(rows: list[dict[str, Any]]) -> None:
-    """A line a case."""
-    titles = ["task", "model", "caches", "device", "commit", "load", "runs", "median [s]", "from", "to"]
-    print("| " + " | ".join(titles) + " |\n|" + "---|" * len(titles))
+    """Print a line for each case."""
+    head = ["task", "model", "caches", "device", "commit", "load", "runs", "median [s]", "from", "to"]
+    lines = []
     for row in rows:
         model = f"{row['splats']} {row['shape']}, {row['width']}x{row['height']}" if "shape" in row else ""
-        cells = [
-            row["task"],
-            model,
-            row["caches"],
-            row["platform"].split()[0] if model else "",
-            row["commit"],
-            f"{row['load']:.1f}",
-            row["runs"],
-            *(f"{row[name]:.2f}" for name in ("seconds", "fastest", "slowest")),
-        ]
-        print("| " + " | ".join(map(str, cells)) + " |")
+        line = [row["task"], model, row["caches"], row["platform"].split()[0] if model else "", row["commit"]]
+        line += [f"{row['load']:.1f}", row["runs"]]
+        lines.append([*line, *(f"{row[name]:.2f}" for name in ("seconds", "fastest", "slowest"))])
+    print(common.table(head, lines))
 
 
 if __name__ == "__main__":

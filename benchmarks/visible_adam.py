@@ -167,14 +167,14 @@ def wide_scene(n: int, shape: str, size: tuple[int, int]) -> Any:
 
 def print_table(rows: list[dict[str, Any]]) -> None:
     """Print a line for each case: means over its seeds."""
-    head = ["scene", "splats", "shape", "options", "platform", "seeds", "splats seen", "vectors seen"]
+    head = ["scene", "splats", "shape", "options", "platform", "load", "seeds", "splats seen", "vectors seen"]
     head += ["step [ms]", "device [ms]", "wall [ms]", "PSNR [dB]"]
     lines = []
     for runs in common.groups(rows, *CASE).values():
         last = runs[-1]
         mean = {name: statistics.mean(run[name] for run in runs) for name in MEASURED}
         line = [last["scene"], last.get("end", last["splats"]), last["shape"], last["options"]]
-        line += [last["platform"].split()[0], len(runs)]
+        line += [last["platform"].split()[0], f"{statistics.mean(run['load'] for run in runs):.1f}", len(runs)]
         line += [f"{mean['splats_seen']:.0%}", f"{mean['vectors_seen']:.0%}", f"{mean['step_ms']:.2f}"]
         line += [f"{mean['device_ms']:.1f}", f"{mean['wall_ms']:.1f}"]
         lines.append([*line, ", ".join(f"{run['psnr']:.3f}" for run in runs if "psnr" in run)])
