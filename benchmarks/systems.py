@@ -283,7 +283,7 @@ def runs_by_seed(records: list[Record], method: Method, cap: int, iterations: in
     """Return the runs of a method by seed; runs that had other options are left out."""
 
     def same(record: Record) -> bool:
-        options = replace(TrainConfig.from_json(record["config"]), device=None)
+        options = TrainConfig.from_json(record["config"]).replace(device=None)
         return options == method.config(cap, options.seed, {"iterations": iterations})
 
     return {

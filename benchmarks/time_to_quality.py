@@ -18,7 +18,6 @@ import argparse
 import itertools
 import os
 import time
-from dataclasses import replace
 from typing import Any
 
 import common
@@ -68,7 +67,7 @@ def train(runs: common.Runs, name: str, options: str, seed: int, args: argparse.
     (method,) = parse_methods(f"default:{options}" if options else "default")
     config = method.config(args.cap, seed, {"iterations": args.iterations})
     scene = common.real_scene(name, validate=args.validate)
-    Trainer(scene, replace(config, iterations=1), device=device).run()  # builds the programs
+    Trainer(scene, config.replace(iterations=1), device=device).run()  # builds the programs
     trainer = Trainer(scene, config, device=device)
     seconds = cpu = 0.0
     along = []

@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -220,7 +220,7 @@ class Trainings:
             )
         )
         device = self.other if hazard.other_device and self.other is not None else self.device
-        config = replace(config, device=device.info.index)
+        config = config.replace(device=device.info.index)
         found: dict[str, Any] = {"message": "", "psnr": {}, "diverged_at": None}
         start = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder, build_options(hazard.build):

@@ -10,7 +10,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from ..device.device import Device
 from ..rendering.renderer import Renderer
@@ -19,20 +18,13 @@ from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from ..training.config import TrainConfig
 from ..training.log import Progress
+from ..training.optim.rules import field_rate, rate_option
 from ..training.trainer import Trainer
 from .importance import measure_importance
 from .prune import Validation, splat_scores, strongest
 
 KEPT = 0.75  # of the splats, by a round
 SETTLING = 0.3  # rate of a last part without removal: 0.2 dB better than at full rate (fox, 13 500 and 5700 splats)
-_RATES = {
-    "scaling_lr": "log_scale",
-    "rotation_lr": "quat",
-    "normal_lr": "normal",
-    "beta_lr": "beta",
-    "nu_lr": "nu",
-    "skew_lr": "skew",
-}  # options by the field whose rate they are
 _WARM = 10.0  # positions' first rate over their last: removing splats leaves gaps to be closed
 
 
@@ -128,14 +120,16 @@ def without_messages(progress: Callable[[Progress], None] | None) -> Callable[[P
 
 def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Path, rate: float = 1.0) -> TrainConfig:
     """Options that train `splats`, saved in `start`, on: full images, all bands, no strategy, no noise."""
-    changes: dict[str, Any] = {}
     short = config.replace(iterations=iterations)
-    for option, field in _RATES.items():
-        value = getattr(config.optim, option)
-        if value is None and field in splats.schema:
-            value = splats.schema[field].lr
-        if value is not None:
-            changes[option] = rate * value * config.rate_factor(field) / short.rate_factor(field)
+    # Rates of short runs are larger: the short run gets options that lead to the rates of the long one.
+    rates = {
+        rate_option(field): rate
+        * field_rate(config, field)
+        * config.rate_factor(field.name)
+        / short.rate_factor(field.name)
+        for field in splats.schema
+        if field.name != "mean"
+    }
     last = config.optim.position_lr_final * config.rate_factor("mean") / short.rate_factor("mean")
     return short.replace(
         shape=splats.shape,
@@ -153,9 +147,7 @@ def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Pat
         alternation="off",
         save_iterations=(),
         test_iterations=(),
-        opacity_lr=rate * config.optim.opacity_lr,
-        feature_lr=rate * config.optim.feature_lr,
         position_lr_init=min(_WARM * last, config.optim.position_lr_init),
         position_lr_final=last,
-        **changes,
+        **rates,
     )

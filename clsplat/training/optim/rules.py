@@ -23,6 +23,27 @@ from .skew_map import SkewMap
 SH_REST_FACTOR = 1.0 / 20.0  # 3DGS: bands above the constant learn 20 times slower
 
 
+# Options that hold the rates of the core fields, of colour and of the second opacity.
+_RATE_OPTIONS = {
+    "quat": "rotation_lr",
+    "log_scale": "scaling_lr",
+    "opacity_logit": "opacity_lr",
+    "opacity_minus_logit": "opacity_lr",
+    "sh": "feature_lr",
+}
+
+
+def rate_option(field: Field) -> str:
+    """Return the name of the option with a field's learning rate; a shape's field NAME has the option NAME_lr."""
+    return _RATE_OPTIONS.get(field.name, f"{field.name}_lr")
+
+
+def field_rate(config: TrainConfig, field: Field) -> float:
+    """Return the learning rate of a field: its option, or the rate in its descriptor if the option is not set."""
+    value: float | None = getattr(config.optim, rate_option(field))
+    return field.lr if value is None else value
+
+
 @dataclass(frozen=True)
 class Rules:
     """The config as the optimizers read it; `extent` of the scene [world units]."""
@@ -36,22 +57,9 @@ class Rules:
 
     @cached_property
     def rates(self) -> dict[str, float]:
-        """Adam's rate per field; the mean's changes with the iteration and is given at each step."""
-        config = self.config
-        rates = {
-            "quat": config.optim.rotation_lr,
-            "log_scale": config.optim.scaling_lr,
-            "opacity_logit": config.optim.opacity_lr,
-            "opacity_minus_logit": config.optim.opacity_lr,
-            "sh": config.optim.feature_lr,
-            "normal": config.optim.normal_lr,
-            "beta": config.optim.beta_lr,
-            "nu": config.optim.nu_lr,
-        }
-        for field in self.shape.fields:
-            if field.name == "skew":
-                rates["skew"] = field.lr if config.optim.skew_lr is None else config.optim.skew_lr
-        return {name: rate * config.rate_factor(name) for name, rate in rates.items()}
+        """Adam's rate of each field but the mean, whose rate changes with the iteration and is passed to each step."""
+        fields = [field for field in self.shape.schema(0) if field.name != "mean"]
+        return {field.name: field_rate(self.config, field) * self.config.rate_factor(field.name) for field in fields}
 
     def sh_rates(self, rows: int, dtype: np.dtype[np.floating]) -> Array:
         """Rate per row of colour, of which the first three are the constant band."""
