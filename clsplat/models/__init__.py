@@ -1,1 +1,1 @@
-"""What one does with a trained model: load, render, evaluate, convert, prune and export it."""
+"""Trained models: load, render, measure, convert, prune."""
