@@ -10,18 +10,21 @@ from ..errors import DeviceError
 from ..rendering.build import KernelBuild
 from ..rendering.frame import ImageLayout
 from ..rendering.pipeline import isect_bytes
-from ..rendering.splat_buffers import COMPACT_ROWS
+from ..rendering.splat_buffers import COMPACT_ROWS, capacity_for
 from ..splats.fields import Group
 from .config import TrainConfig
 from .optim.skew_map import SkewMap
 
 _ROLES = 5  # value, gradient, two moments, and the copy that relocation swaps with; of colour the gradient is compact
-_IMAGE_PLANES = 3 + 1 + 9 + 3  # colour, T, gradients of SSIM's maps, v_color
+# Colour and transmittance, both once more for bands, gradients of SSIM's maps, v_color.
+_IMAGE_PLANES = 4 + 4 + 9 + 3
 # Splat-tile pairs of an image: about 100 a tile, however few the splats, and 4 more a splat. At the end of runs on
 # three real scenes of 400-px photos with 5 000 and 20 000 splats there were 0.5 to 0.8 times as many.
 _ISECTS_PER_TILE, _ISECTS_PER_SPLAT = 100, 4
 _LEAST_ISECTS = 1 << 20  # that there must be room for: images with more are cut into bands
-_SCREEN_WORDS = 16  # keys, orders, rectangles, counts and offsets of a splat
+# Words of a splat: key, order, two rectangles (6), two pairs (4), range of isects (2), statistics (3), tile counts (4).
+_SCREEN_WORDS = 21
+_WAITING_WORDS = 4  # of a splat with `visible_adam`, if a vector is one splat
 
 
 @dataclass(frozen=True)
@@ -57,9 +60,11 @@ def peak_bytes() -> int:
 
 def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, target_bytes: int) -> Estimate:
     """Memory at the cap, for the largest image, with `target_bytes` of images. Splat-tile pairs are a guess."""
-    real, n = kernels.dtype.itemsize, config.cap_max
+    real, n = kernels.dtype.itemsize, capacity_for(config.cap_max)
     rows = {group: kernels.schema.rows(group) for group in Group}
-    screen = (kernels.record + kernels.v_record) * real + 4 * _SCREEN_WORDS
+    screen = (kernels.record + kernels.v_record) * real + 4 * (
+        _SCREEN_WORDS + _WAITING_WORDS * config.optim.visible_adam
+    )
     isect = isect_bytes(kernels)
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
     extra = 6 * SkewMap(config.skew_map).width if config.skew_map else 0  # s, moments, and a spare of each

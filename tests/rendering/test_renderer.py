@@ -275,6 +275,25 @@ def test_not_a_number_is_refused_before_it_reaches_a_device() -> None:
 # ---- the public face ---------------------------------------------------------------------------------------
 
 
+def test_an_overwritten_frame_raises(device: Device) -> None:
+    """Two frames share their buffers: the first one must not give the second one's images or gradients."""
+    case = cloud(SKEWED)
+    pipeline = Pipeline(device, KernelBuild(SKEWED, 3, default_schedule(device.info)).for_rendering())
+    splats = SplatBuffers.of(device, case.splats, pipeline.kernels.dtype)
+    first = pipeline.forward(splats, case.camera)
+    color = first.images.color.buffer
+    pipeline.forward(splats, case.camera)
+    grads = ParameterBuffers(device, splats.schema, splats.n, pipeline.kernels.dtype)
+    for use in (
+        lambda: first.images,
+        lambda: first.projected,
+        lambda: next(pipeline.bands(first)),
+        lambda: pipeline.backward(first, color, grads),
+    ):
+        with pytest.raises(RuntimeError, match="the frame is overwritten"):
+            use()
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_fewer_sh_bands_in_use(device: Device, degree: int) -> None:
     """Kernels built for degree 3 that use the lower bands only, as training does; other rows stay zero."""

@@ -1,0 +1,59 @@
+"""Buffers that grow: contents, sizes, reuse, and errors instead of silent allocations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.device.device import Device
+from clsplat.device.memory import Pool, UploadQueue, to_device, to_host
+
+
+def test_a_buffer_is_reused_until_it_is_too_small(device: Device) -> None:
+    pool = Pool(device)
+    memory = pool.buffer(np.uint32, 3)
+    first = memory.reserve(10)
+    assert memory.nbytes == pool.nbytes == first.size == 120
+    assert memory.reserve(4) is first
+    assert memory.buffer is first
+    grown = memory.reserve(20)
+    assert grown is not first
+    assert memory.nbytes == grown.size == 360  # half as large again
+    assert memory.reserve(30) is grown
+
+
+def test_a_buffer_does_not_grow_beyond_the_largest_allocation(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "info", replace(device.info, max_alloc_bytes=4 * 25))
+    memory = Pool(device).buffer(np.uint32)
+    memory.reserve(1)
+    assert memory.reserve(20).size == 4 * 25
+
+
+def test_rows_are_read_back(device: Device) -> None:
+    memory = Pool(device).buffer(np.float32, 2)
+    rows = np.arange(12, dtype=np.float32).reshape(6, 2)
+    to_device(device, memory.reserve(6), rows)
+    np.testing.assert_array_equal(memory.read(4), rows[:4])
+    memory.zeros(3)
+    np.testing.assert_array_equal(memory.read(6), np.where(np.arange(6)[:, None] < 3, 0, rows))
+
+
+def test_reading_what_was_never_reserved_is_an_error(device: Device) -> None:
+    memory = Pool(device).buffer(np.float32)
+    with pytest.raises(RuntimeError, match="no memory yet"):
+        _ = memory.buffer
+    memory.reserve(2)
+    with pytest.raises(RuntimeError, match="does not hold 3 rows"):
+        memory.read(3)
+
+
+def test_uploads_beside_the_device_s_queue(device: Device) -> None:
+    """A later command of the device's queue finds the array; a second upload waits for an event."""
+    queue, values = UploadQueue(device), np.arange(1000, dtype=np.int32)
+    buffer = device.alloc(values.nbytes)
+    first = queue.send(buffer, values)
+    second = queue.send(buffer, values[::-1], after=first)
+    queue.wait_on_device(second)
+    np.testing.assert_array_equal(to_host(device, buffer, np.empty_like(values)), values[::-1])
