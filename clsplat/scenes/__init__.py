@@ -1,1 +1,1 @@
-"""Photographs with poses."""
+"""Scenes: photos with camera poses and points."""

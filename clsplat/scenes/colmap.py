@@ -1,4 +1,4 @@
-"""COLMAP models through pycolmap: poses, lenses and points."""
+"""COLMAP models, read through pycolmap: poses, lenses and points."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Points:
 
     Parameters
     ----------
-    xyz : (P, 3) float64, world positions.
-    rgb : (P, 3) uint8.
+    xyz : (P, 3) float64, positions in the world.
+    rgb : (P, 3) uint8, colours.
     track_length : (P,) int64, number of images that observe each point.
     """
 
@@ -40,14 +40,16 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class SparseReconstruction:
-    """A sparse model: registered photos sorted by name, and points."""
+    """A COLMAP model: registered photos sorted by name, and points."""
 
     photos: list[RegisteredImage]
     points: Points
 
 
 def find_model(scene: Path) -> Path:
-    """The model folder of a scene: `sparse` itself if it holds one, else the largest of `sparse/*`.
+    """Return the folder of a scene's COLMAP model.
+
+    Among `sparse` and `sparse/*`, this is the model with the most registered images.
 
     Raises
     ------
@@ -65,18 +67,18 @@ def find_model(scene: Path) -> Path:
     models = [folder for folder in candidates if _suffix(folder)]
     if not models:
         raise InputError(
-            f"{sparse}: no COLMAP model (cameras and images, .bin or .txt) in it or below; "
+            f"{sparse}: no COLMAP model (cameras and images, .bin or .txt) in this folder or below; "
             "run COLMAP's mapper, or copy the missing files"
         )
-    return max(models, key=count_registered)  # the first of equals
+    return max(models, key=count_registered)  # max takes the first of equal models
 
 
 def read_model(folder: Path) -> SparseReconstruction:
-    """Read a binary or text model; missing points give an empty cloud.
+    """Read a binary or text model. A missing file of points gives an empty point cloud.
 
     Raises
     ------
-    InputError : missing, truncated or damaged files, or no registered image.
+    InputError : a file is missing, truncated or damaged, or the model has no registered image.
     """
     suffix = _suffix(folder)
     if not suffix:
@@ -90,7 +92,7 @@ def read_model(folder: Path) -> SparseReconstruction:
         photos, points = read_registered(reconstruction), read_points(reconstruction)
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
         raise InputError(
-            f"{folder}: COLMAP's reader refuses the model ({reason_of(error)}); the files are "
+            f"{folder}: COLMAP cannot read the model ({reason_of(error)}); the files are "
             "damaged or do not belong together: copy or rebuild them"
         ) from None
     if not photos:
@@ -104,7 +106,7 @@ def read_model(folder: Path) -> SparseReconstruction:
 
 
 def _suffix(folder: Path) -> str:
-    """ ".bin" or ".txt" as pycolmap will choose, "" where the folder holds no model."""
+    """Return the suffix of the model's files as pycolmap chooses it, ".bin" or ".txt", or "" without a model."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{stem}{suffix}").is_file() for stem in _FILES[:2]):
             return suffix
@@ -113,7 +115,10 @@ def _suffix(folder: Path) -> str:
 
 @contextmanager
 def _complete(folder: Path, suffix: str) -> Iterator[Path]:
-    """The folder itself, or, as the library insists on a points file, a copy with an empty one."""
+    """Yield the model's folder, or a copy with an empty points3D file if this file is missing.
+
+    pycolmap refuses a model without that file.
+    """
     if (folder / f"points3D{suffix}").is_file():
         yield folder
         return
@@ -126,12 +131,12 @@ def _complete(folder: Path, suffix: str) -> Iterator[Path]:
 
 
 def read_registered(reconstruction: Any) -> list[RegisteredImage]:
-    """Registered photos of a pycolmap.Reconstruction, sorted by name."""
+    """Return the registered photos of a pycolmap.Reconstruction, sorted by name."""
     photos = []
     for image_id in reconstruction.reg_image_ids():
         image = reconstruction.images[image_id]
         pose = image.cam_from_world
-        pose = pose() if callable(pose) else pose  # an attribute before pycolmap 3.12
+        pose = pose() if callable(pose) else pose  # before pycolmap 3.12 this is an attribute
         photos.append(
             RegisteredImage(
                 image.name, np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]]), reconstruction.cameras[image.camera_id]
@@ -141,10 +146,10 @@ def read_registered(reconstruction: Any) -> list[RegisteredImage]:
 
 
 def read_points(reconstruction: Any) -> Points:
-    """Points of a pycolmap.Reconstruction, by rising id."""
-    found = reconstruction.points3D
-    xyz, rgb = np.empty((len(found), 3)), np.empty((len(found), 3), np.uint8)
-    track_length = np.empty(len(found), np.int64)
-    for row, (_, point) in enumerate(sorted(found.items(), key=lambda item: item[0])):
+    """Return the points of a pycolmap.Reconstruction, sorted by id."""
+    points = reconstruction.points3D
+    xyz, rgb = np.empty((len(points), 3)), np.empty((len(points), 3), np.uint8)
+    track_length = np.empty(len(points), np.int64)
+    for row, (_, point) in enumerate(sorted(points.items(), key=lambda item: item[0])):
         xyz[row], rgb[row], track_length[row] = point.xyz, point.color, point.track.length()
     return Points(xyz, rgb, track_length)

@@ -1,9 +1,8 @@
-"""COLMAP's binary model files: checked before a library reads them, and written for our own captures.
+"""COLMAP's binary model files: checked before pycolmap reads them, and written for scenes that clsplat makes.
 
-The layout is that of COLMAP's documentation (https://colmap.github.io/format.html, "Binary File Format"),
-little endian: a 64-bit count, then the records one after another. Reading such a file trustingly can loop for
-ever on a lying count, and a truncated one can load as a wrong model without a word; `check_binary_model`
-walks every record first.
+The layout follows COLMAP's documentation (https://colmap.github.io/format.html, "Binary File Format"). A file is little
+endian: a 64-bit count, then the records one after another. A reader without checks can loop for ever on a wrong count,
+and can load a truncated file as a wrong model without an error. `check_binary_model` checks every record first.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..files.atomic import atomic_writer
 
-# Number of parameters by COLMAP's camera model id (https://colmap.github.io/cameras.html), SIMPLE_PINHOLE to
-# EQUIRECTANGULAR.
+# Number of parameters of each camera model, by COLMAP's model id (https://colmap.github.io/cameras.html), from
+# SIMPLE_PINHOLE to EQUIRECTANGULAR.
 _MODEL_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
-_PINHOLE = 1
+_PINHOLE = 1  # COLMAP's model id of PINHOLE
 
 
 class _Cursor:
-    """Reads records from a mapped file; running past its end is an InputError that names the file."""
+    """A reader of records in a mapped file; it raises InputError with the file's name at the file's end."""
 
     def __init__(self, path: Path, data: mmap.mmap) -> None:
         self.path, self.data, self.at = path, data, 0
@@ -38,7 +37,7 @@ class _Cursor:
         return layout.unpack_from(self.data, start)
 
     def skip(self, size: int) -> int:
-        """Step over `size` bytes; returns where they began."""
+        """Skip `size` bytes and return the position of the first."""
         start = self.at
         if start + size > len(self.data):
             raise InputError(
@@ -49,7 +48,7 @@ class _Cursor:
         return start
 
     def text(self) -> str:
-        """A name that ends in a NUL byte."""
+        """Read a name that ends with a NUL byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise InputError(
@@ -69,7 +68,7 @@ _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
 _IMAGE = struct.Struct("<I4d3dI")  # id, quaternion wxyz, translation, camera id; then the name
 _POINT = struct.Struct("<Q3d3BdQ")  # id, xyz, rgb, error, track length; then the track
-_RIG = struct.Struct("<II")  # id, sensors; then the reference sensor and the others
+_RIG = struct.Struct("<II")  # id, number of sensors; then the reference sensor and the others
 _SENSOR = struct.Struct("<iI")
 _FLAG = struct.Struct("<B")
 _FRAME = struct.Struct("<II7dI")  # id, rig id, pose, number of data ids
@@ -103,7 +102,7 @@ def _walk_rig(cursor: _Cursor) -> None:
     sensors = int(cursor.take(_RIG)[1])
     for index in range(sensors):
         cursor.skip(_SENSOR.size)
-        if index and cursor.take(_FLAG)[0]:  # the first one is the reference and carries no pose
+        if index and cursor.take(_FLAG)[0]:  # the first sensor is the reference and has no pose
             cursor.skip(_POSE_BYTES)
 
 
@@ -121,7 +120,7 @@ _WALKERS: dict[str, Callable[[_Cursor], None]] = {
 
 
 def _check_file(path: Path) -> int:
-    """Walk one file; returns its number of records."""
+    """Check every record of one file and return their number."""
     walk = _WALKERS[path.name]
     size = path.stat().st_size
     if size < _COUNT.size:
@@ -129,7 +128,7 @@ def _check_file(path: Path) -> int:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         cursor = _Cursor(path, data)
         count = int(cursor.take(_COUNT)[0])
-        for _ in range(count):  # a lying count ends at the end of the file
+        for _ in range(count):  # a wrong count ends at the end of the file
             walk(cursor)
         if cursor.at != size:
             raise InputError(
@@ -139,15 +138,15 @@ def _check_file(path: Path) -> int:
 
 
 def check_binary_model(folder: Path) -> None:
-    """Walk every record of a binary model's files, so that a damaged one is refused before it is read.
+    """Check every record of a binary model's files, so that a damaged file is refused before pycolmap reads it.
 
     Parameters
     ----------
-    folder : a folder with cameras.bin, images.bin and, where present, points3D.bin, rigs.bin, frames.bin.
+    folder : folder with cameras.bin, images.bin and possibly points3D.bin, rigs.bin and frames.bin.
 
     Raises
     ------
-    InputError : a file that ends early, has bytes left over, or holds a camera that cannot be.
+    InputError : a file ends early, has bytes left over, or contains an impossible camera.
     """
     for name in _WALKERS:
         path = folder / name
@@ -156,7 +155,10 @@ def check_binary_model(folder: Path) -> None:
 
 
 def count_registered(folder: Path) -> int:
-    """How many images the model in a folder registers, from images.bin's count or images.txt's lines."""
+    """Return the number of registered images of the model in a folder.
+
+    The number is the count in images.bin, or follows from the lines of images.txt.
+    """
     binary = folder / "images.bin"
     if binary.is_file():
         with binary.open("rb") as file:
@@ -168,7 +170,7 @@ def count_registered(folder: Path) -> int:
 
 @dataclass(frozen=True, eq=False)
 class ModelView:
-    """One registered image to write: its name, its camera and what it observes.
+    """A registered image to write: its name, camera and observations.
 
     Parameters
     ----------
@@ -176,9 +178,9 @@ class ModelView:
     size : (width, height) [px].
     intrinsics : (fx, fy, cx, cy) [px], or the parameters of another model.
     cam_from_world : (4, 4) world-to-camera pose.
-    pixels : (M, 2) observations [px], pixel centres at half-integers.
-    point_index : (M,) index into the model's points of each observation.
-    model : COLMAP's id of the camera model; PINHOLE.
+    pixels : (M, 2) observations [px], with pixel centres at half-integers.
+    point_index : (M,) index of each observation's point among the model's points.
+    model : COLMAP's id of the camera model, PINHOLE by default.
     """
 
     name: str
@@ -197,15 +199,19 @@ def write_binary_model(
     rgb: NDArray[np.uint8],
     error: NDArray[np.float64] | None = None,
 ) -> None:
-    """Write cameras.bin, images.bin and points3D.bin; tracks follow from the views' observations.
+    """Write cameras.bin, images.bin and points3D.bin. Tracks follow from the views' observations.
 
     Parameters
     ----------
-    folder : made when absent.
-    views : the registered images; each gets its own id from 1 on, equal cameras share one.
+    folder : created if it does not exist.
+    views : registered images; they get the ids 1, 2, ..., and equal cameras share one camera id.
     xyz : (P, 3) positions in the world.
     rgb : (P, 3) colours.
-    error : (P,) mean reprojection error of each point [px]; 0 where it is not given.
+    error : (P,) mean reprojection error of each point [px], 0 by default.
+
+    Raises
+    ------
+    OutputError : a file cannot be written.
     """
     from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,7 @@
-"""Cameras and points for other programs: a COLMAP model, or nerfstudio's and instant-ngp's transforms.json.
+"""Cameras and points for other programs: a COLMAP model, or transforms.json of nerfstudio and instant-ngp.
 
-COLMAP's text files as its documentation has them (https://colmap.github.io/format.html); the binary ones are written by
-colmap_files.py. Points get no tracks: only the reconstruction itself knows who saw them.
+COLMAP's text files follow its documentation (https://colmap.github.io/format.html); colmap_binary.py writes the binary
+files. Points are written without tracks.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from .colmap_binary import ModelView, write_binary_model
 from .point_cloud import write_point_cloud
 from .undistort import Lens, RegisteredImage, make_lens
 
-POINTS_FILE = "sparse_pc.ply"  # nerfstudio's name
-# Parameters of COLMAP's models by their keys in transforms.json; "f" is both focal lengths.
+POINTS_FILE = "sparse_pc.ply"  # nerfstudio's file name
+# Keys of transforms.json for the parameters of each COLMAP model; "f" stands for both focal lengths.
 _KEYS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
@@ -34,19 +34,23 @@ _KEYS = {
     "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
 _FISHEYE = "OPENCV_FISHEYE"
-_DENOMINATOR = ("k4", "k5", "k6")  # of FULL_OPENCV, which readers of transforms.json do not know
+_DENOMINATOR = ("k4", "k5", "k6")  # parameters of FULL_OPENCV that readers of transforms.json do not support
 
 
 def write_transforms(path: Path, photos: Sequence[RegisteredImage], files: Sequence[str], points: Points) -> None:
-    """Write cameras, each with its lens, and the points beside them.
+    """Write a transforms.json with poses and lenses, and the points as a PLY file beside it.
 
     Parameters
     ----------
-    files : where each photo is, as `file_path` shall say, relative to the file's folder.
+    path : the transforms.json to write.
+    photos : registered images.
+    files : `file_path` of each photo, relative to the folder of `path`.
+    points : point cloud; not written if empty.
 
     Raises
     ------
-    InputError : a lens that the format has no keys for. OutputError : cannot be written.
+    InputError : the format has no keys for a lens.
+    OutputError : a file cannot be written.
     """
     frames = []
     for photo, file in zip(photos, files, strict=True):
@@ -56,7 +60,7 @@ def write_transforms(path: Path, photos: Sequence[RegisteredImage], files: Seque
     if len(points):
         write_point_cloud(path.parent / POINTS_FILE, points)
         head["ply_file_path"] = POINTS_FILE
-    # What all frames say is said once, above them.
+    # Values that all frames share are written once, above the frames.
     shared = {
         key: value
         for key, value in (frames[0] if frames else {}).items()
@@ -73,11 +77,18 @@ def write_transforms(path: Path, photos: Sequence[RegisteredImage], files: Seque
 
 
 def write_colmap(folder: Path, photos: Sequence[RegisteredImage], points: Points, text: bool = False) -> None:
-    """Write cameras, images and points3D, .bin or .txt, into a folder, which is made when absent.
+    """Write a COLMAP model: cameras, images and points3D, as .bin or .txt files.
+
+    Parameters
+    ----------
+    folder : created if it does not exist.
+    photos : registered images.
+    points : point cloud, written without tracks.
+    text : whether to write text files.
 
     Raises
     ------
-    OutputError : cannot be written.
+    OutputError : a file cannot be written.
     """
     views, names = [], {}
     for photo in photos:
@@ -101,19 +112,19 @@ def write_colmap(folder: Path, photos: Sequence[RegisteredImage], points: Points
 
 
 def relative_files(files: Sequence[Path], folder: Path) -> list[str]:
-    """Paths of files as seen from a folder, `/` between names; of those on another drive, the whole path."""
+    """Return paths relative to a folder, with `/` between names; absolute paths for files on another drive."""
 
-    def seen(file: Path) -> str:
+    def relative(file: Path) -> str:
         try:
             return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
         except ValueError:
             return file.resolve().as_posix()
 
-    return [seen(file) for file in files]
+    return [relative(file) for file in files]
 
 
 def _plainest(lens: Lens) -> Lens:
-    """The same lens in the model of fewest parameters: many programs know PINHOLE and OPENCV only."""
+    """Return the lens in the model with the fewest parameters. Many programs support only PINHOLE and OPENCV."""
     for longer, model, kept in (("FULL_OPENCV", "OPENCV", 8), ("OPENCV", "PINHOLE", 4)):
         if lens.model.name == longer and not np.any(lens.params[kept:]):
             lens = make_lens(model, lens.width, lens.height, list(lens.params[:kept]))
@@ -121,18 +132,18 @@ def _plainest(lens: Lens) -> Lens:
 
 
 def _lens_keys(photo: RegisteredImage) -> dict[str, Any]:
-    """A lens as transforms.json has it; raises InputError."""
+    """Return the keys of a lens in transforms.json; raises InputError for unsupported lenses."""
     lens = _plainest(photo.lens)
     model = str(lens.model.name)
     if model not in _KEYS:
         raise InputError(
-            f"image {photo.name!r}: transforms.json has no lens of COLMAP's model {model}: undistort the "
+            f"image {photo.name!r}: transforms.json does not support COLMAP's lens model {model}: undistort the "
             "photos first, or write a COLMAP model"
         )
     values = dict(zip(_KEYS[model], map(float, lens.params), strict=True))
     if any(values.pop(key, 0.0) for key in _DENOMINATOR if model != _FISHEYE):
         raise InputError(
-            f"image {photo.name!r}: transforms.json has no k4, k5 and k6 of a perspective lens: undistort "
+            f"image {photo.name!r}: transforms.json does not support k4, k5 and k6 of a perspective lens: undistort "
             "the photos first, or write a COLMAP model"
         )
     if "f" in values:
@@ -142,7 +153,7 @@ def _lens_keys(photo: RegisteredImage) -> dict[str, Any]:
 
 
 def _write_text(folder: Path, views: Sequence[ModelView], names: dict[int, str], points: Points) -> None:
-    from scipy.spatial.transform import Rotation  # lazy: a third of a second to import
+    from scipy.spatial.transform import Rotation  # imported late: slow to load
 
     cameras: dict[tuple[Any, ...], int] = {}
     images = []
@@ -162,5 +173,5 @@ def _write_text(folder: Path, views: Sequence[ModelView], names: dict[int, str],
 
 
 def _line(*values: object) -> str:
-    """Values in a line; `str` gives a float's shortest form that reads back as the same."""
+    """Return values as one line. `str` writes the shortest form of a float that reads back as the same float."""
     return " ".join(map(str, values))

@@ -1,4 +1,4 @@
-"""What a scene holds, from its files' headers alone: no photo is decoded."""
+"""Contents of a scene, read from the headers of its files without decoding a photo."""
 
 from __future__ import annotations
 
@@ -22,18 +22,21 @@ from .reconstruct.reconstruct import RECORD
 from .scene import find_masks, read_posed_images, select_test_names
 from .undistort import is_pinhole
 
-_DIGITS = 6  # significant ones of a focal length, by which lenses are told apart
+_DIGITS = 6  # significant digits of a focal length; lenses that agree to these digits count as one
 
 
 @dataclass(frozen=True)
 class LensUse:
-    """Photos taken through one lens.
+    """A lens and the number of its photos.
 
     Parameters
     ----------
-    model : COLMAP's name. pinhole : whether its photos need no undistortion. width, height : of its images [px].
+    model : COLMAP's name of the lens model.
+    pinhole : whether its photos need no undistortion.
+    width, height : size of its photos [px].
     focal : horizontal focal length [px].
-    field_of_view : horizontal [degrees], as of a pinhole. photos : how many.
+    field_of_view : horizontal field of view of a pinhole with this focal length [degrees].
+    photos : number of photos.
     """
 
     model: str
@@ -47,17 +50,23 @@ class LensUse:
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """A scene's contents.
+    """Contents of a scene.
 
     Parameters
     ----------
-    kind : "COLMAP" or the name of the transforms file.
-    photos : with poses. unregistered : photos in the same folder that the scene knows no pose of.
-    unreadable : photos that are no images. sizes : photos by (width, height) as stored [px], most frequent first.
-    photo_bytes : of the posed photos' files. lenses : most used first.
-    points : in the cloud. track_mean, track_median : photos that see a point; 0 where the files do not say.
-    test : names of the test views. masked : photos with a mask.
-    placed : of a scene that `reconstruct` made: photos placed, photos given, mean reprojection error [px]; else None.
+    kind : "COLMAP" or the names of the transforms files.
+    photos : number of photos with poses.
+    unregistered : names of photos in the same folder without a pose.
+    unreadable : names of photos that cannot be read.
+    sizes : number of photos by (width, height) as stored [px], the most frequent size first.
+    photo_bytes : total size of the posed photos' files.
+    lenses : lenses, the most used first.
+    points : number of points.
+    track_mean, track_median : number of photos that see a point; 0 without points.
+    test : names of the test views.
+    masked : number of photos with a mask.
+    placed : photos with a pose, all photos and mean reprojection error [px] of a scene that `reconstruct` made;
+        None for other scenes.
     """
 
     kind: str
@@ -75,7 +84,7 @@ class SceneInfo:
     placed: tuple[int, int, float] | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, as `clsplat info --json` prints them."""
+        """Return plain values, as `clsplat info --json` prints them."""
         return {
             "kind": self.kind,
             "photos": self.photos,
@@ -94,16 +103,16 @@ class SceneInfo:
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a path looks like a scene: a folder with a COLMAP model or transforms, or a transforms file."""
+    """Return whether a path looks like a scene: a folder with `sparse` or a transforms file, or such a file."""
     return path.suffix == ".json" if path.is_file() else (path / "sparse").is_dir() or bool(find_transforms(path))
 
 
 def scene_info(path: str | os.PathLike[str], images: str | None = None, test_every: int = 8) -> SceneInfo:
-    """Look into a scene; parameters as of `load_scene`.
+    """Return the contents of a scene; parameters as of `load_scene`.
 
     Raises
     ------
-    InputError : a missing folder or photo, or a damaged model.
+    InputError : a folder or photo is missing, or the model is damaged.
     """
     root = Path(path)
     posed = read_posed_images(root, images)
@@ -135,7 +144,7 @@ def scene_info(path: str | os.PathLike[str], images: str | None = None, test_eve
 
 
 def _unregistered(posed: PosedImages, masks: Iterable[Path]) -> tuple[str, ...]:
-    """Photos beside the posed ones, by their paths below the folder that holds them all."""
+    """Return photos without a pose, as paths relative to the common folder of all posed photos."""
     files = {file.resolve() for file in posed.files.values()}
     known = files | {file.resolve() for file in masks}
     folder = Path(os.path.commonpath([file.parent for file in files]))
@@ -148,8 +157,8 @@ def _placed(root: Path) -> tuple[int, int, float] | None:
         return None
     record = read_json(root / RECORD, "a scene of clsplat reconstruct")
     values = record if isinstance(record, dict) else {}
-    found = [to_real(values.get(key)) for key in ("registered", "photos", "error")]
-    registered, photos, error = (value if value is not None and math.isfinite(value) else -1.0 for value in found)
+    numbers = [to_real(values.get(key)) for key in ("registered", "photos", "error")]
+    registered, photos, error = (value if value is not None and math.isfinite(value) else -1.0 for value in numbers)
     if min(registered, photos, error) < 0:
         raise InputError(f"{root / RECORD}: registered, photos and error must be numbers; remove the file")
     return int(registered), int(photos), error
@@ -159,7 +168,7 @@ def _lenses(posed: PosedImages) -> tuple[LensUse, ...]:
     uses: Counter[LensUse] = Counter()
     for photo in posed.photos:
         lens = photo.lens
-        focal = float(f"{lens.params[0]:.{_DIGITS}g}")  # of every model that an image can be made of
+        focal = float(f"{lens.params[0]:.{_DIGITS}g}")  # every supported model has it first
         if not 0.0 < focal < math.inf:
             raise InputError(f"image {photo.name!r}: its camera has a focal length of {focal:g} px; rebuild the model")
         angle = math.degrees(2.0 * math.atan(lens.width / (2.0 * focal)))

@@ -1,10 +1,12 @@
-"""Posed photos from `transforms.json`: NeRF's Blender sets, instant-ngp and nerfstudio.
+"""Scenes in `transforms.json` files, as of NeRF's Blender sets, instant-ngp and nerfstudio.
 
-A frame has `file_path` and `transform_matrix`, camera-to-world with OpenGL's axes (x right, y up, z backwards). Lens
-keys stand beside the frames for all of them, or in a frame for itself: `w`, `h`, `fl_x`, `fl_y`, `cx`, `cy` [px],
-`camera_angle_x`, `camera_angle_y` [rad] instead of focal lengths, `k1` ... `k4`, `p1`, `p2`, `camera_model`,
-`is_fisheye`. The world is the file's own: nerfstudio's `applied_transform` and `applied_scale` are in the poses
-already, and are put on points only where these come from the COLMAP model that the poses were made from.
+A frame has a `file_path` and a `transform_matrix`, camera-to-world with OpenGL's axes (x right, y up, z backwards).
+Lens keys are in the frame, or beside the list of frames for all of them: `w`, `h`, `fl_x`, `fl_y`, `cx`, `cy` [px],
+`k1` ... `k4`, `p1`, `p2`, `camera_model` and `is_fisheye`. The angles of view `camera_angle_x` and `camera_angle_y`
+[rad] can replace focal lengths.
+
+The world is that of the poses, which include nerfstudio's `applied_transform` and `applied_scale`. Points are moved by
+these two only if they come from the COLMAP model behind the poses.
 """
 
 from __future__ import annotations
@@ -35,19 +37,19 @@ FILE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
-_MAX_SIDE = 1 << 20  # of an image [px]
-_LONGEST_NAME, _LONGEST_PATH = 240, 2000  # bytes; file systems take 255 and 4096
-_LARGEST = 1e30  # of a number; float32 holds it
-_COLMAP = ("colmap/sparse/0", "sparse/0")  # nerfstudio's place for the model, and COLMAP's own
+_MAX_SIDE = 1 << 20  # largest side of an image [px]
+_MAX_NAME, _MAX_PATH = 240, 2000  # longest names and paths [bytes]; file systems allow 255 and 4096
+_MAX_NUMBER = 1e30  # numbers are smaller than this, so that float32 can store them
+_COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0")  # where nerfstudio and COLMAP put a COLMAP model
 _SUFFIXES = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
 
 
 def find_transforms(path: Path) -> list[Path]:
-    """The transforms files of a scene: those of training and test, or the one; none where it has none.
+    """Return the transforms files of a scene: the training and test files, the single file, or an empty list.
 
     Parameters
     ----------
-    path : the scene's folder, or a file. Beside `transforms_train.json` `transforms_test.json` is taken along.
+    path : the scene's folder or a transforms file. `transforms_train.json` includes `transforms_test.json` beside it.
     """
     if path.is_file():
         return find_transforms(path.parent) if path.name == TRAIN else [path]
@@ -58,20 +60,21 @@ def find_transforms(path: Path) -> list[Path]:
 
 
 def read_transforms(files: list[Path], images: str | None = None) -> PosedImages:
-    """Posed photos of transforms files.
+    """Read the photos with poses of transforms files.
 
     Parameters
     ----------
-    files : of `find_transforms`. images : folder that takes the place of the first one in each `file_path`.
+    files : result of `find_transforms`.
+    images : folder of photos that replaces the first folder of each `file_path`.
 
     Warns
     -----
-    UserWarning : frames whose photos are not there; they are left out.
+    UserWarning : photos of some frames are missing; these frames are left out.
 
     Raises
     ------
-    InputError : damaged or without frames, a key missing or unusable, no photo there, or points that cannot be read;
-        names file, frame and key.
+    InputError : a file is damaged or has no frames, a key is missing or unusable, no photo exists, or the points
+        cannot be read. The message names file, frame and key.
     """
     documents = [_Document.read(file) for file in files]
     frames = [frame for document in documents for frame in document.frames(images)]
@@ -84,17 +87,17 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
     missing = [name for name in photos if name not in kept]
     if not kept:
         raise InputError(
-            f"{files[0]}: none of its {len(photos)} photos is there, such as {missing[0]!r}; "
+            f"{files[0]}: none of its {len(photos)} photos exists, for example {missing[0]!r}; "
             "copy them beside it, or name their folder"
         )
     if missing:
         warnings.warn(
-            f"{files[0]}: {len(missing)} of {len(photos)} frames name photos that are not there, such as "
+            f"{files[0]}: {len(missing)} of {len(photos)} frames name photos that do not exist, for example "
             f"{missing[0]!r}; they are left out",
             stacklevel=3,
         )
     test_names = _held_out(documents, kept)
-    used = set().union(*(document.listed() or kept for document in documents))
+    used = set().union(*(document.listed_names() or kept for document in documents))
     kept = {name: frame for name, frame in kept.items() if name in used}
     return PosedImages(
         [frame.photo() for frame in kept.values()],
@@ -106,45 +109,44 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
 
 
 def _held_out(documents: list[_Document], kept: dict[str, _Frame]) -> frozenset[str] | None:
-    """Names of the test views, where the files say."""
+    """Return the names of the test views that the files hold out; None if they hold none out."""
     if len(documents) == 2:
         return frozenset(name for name, frame in kept.items() if frame.document is documents[1])
     for key in ("test_filenames", "val_filenames"):
-        if documents[0].listed(key):
-            return frozenset(documents[0].listed(key) & set(kept))
+        if documents[0].listed_names(key):
+            return frozenset(documents[0].listed_names(key) & set(kept))
     return None
 
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """A frame: the photo's name and file, and where it stands."""
+    """A frame of a transforms file, with its photo's name and file."""
 
     document: _Document
-    number: int
+    index: int
     values: dict[str, Any]
     name: str
     file: Path
 
     @property
     def place(self) -> str:
-        return f"{self.document.path}: frame {self.number}"
+        return f"{self.document.path}: frame {self.index}"
 
     def photo(self) -> RegisteredImage:
         return RegisteredImage(self.name, self.pose(), self.lens())
 
     def mask_file(self) -> Path | None:
-        """nerfstudio's mask_path."""
-        named = self.values.get("mask_path")
-        if named is None:
+        """Return the mask file named by nerfstudio's `mask_path`, or None."""
+        mask = self.values.get("mask_path")
+        if mask is None:
             return None
-        if not isinstance(named, str) or not named.isprintable() or not _can_be_name(named):
-            raise InputError(f"{self.place}: mask_path {named!r} is not the name of a file; name a mask, or remove it")
-        return self.document.path.parent / named.replace("\\", "/")
+        if not isinstance(mask, str) or not mask.isprintable() or not _can_be_name(mask):
+            raise InputError(f"{self.place}: mask_path {mask!r} is not the name of a file; name a mask, or remove it")
+        return self.document.path.parent / mask.replace("\\", "/")
 
     def pose(self) -> NDArray[np.float64]:
-        """(4, 4) world-to-camera, OpenCV's axes."""
-        given = self.values.get("transform_matrix")
-        matrix = _matrix(given)
+        """Return the world-to-camera matrix, (4, 4), with OpenCV's axes."""
+        matrix = _matrix(self.values.get("transform_matrix"))
         if matrix is None:
             raise InputError(f"{self.place}: transform_matrix must be 4 x 4 finite numbers; write the poses again")
         if not is_rotation(matrix[:3, :3]):
@@ -155,17 +157,17 @@ class _Frame:
         return cam_from_world_of(matrix)
 
     def lens(self) -> Lens:
-        """The lens, of the size that the file gives, or the photo has."""
+        """Return the lens, with the size in the file, or else the photo's size."""
         size = image_size(self.file)
-        width, height = int(self.number_of("w", size[0])), int(self.number_of("h", size[1]))
+        width, height = int(self.number("w", size[0])), int(self.number("h", size[1]))
         if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
             raise InputError(f"{self.place}: w x h is {width} x {height}; both must be 1 to {_MAX_SIDE}")
         fx = self.focal("fl_x", "camera_angle_x", width)
         fy = self.focal("fl_y", "camera_angle_y", height, fx)
         if fx is None or fy is None:
             raise InputError(f"{self.place}: has neither fl_x nor camera_angle_x; add the focal length")
-        core = [fx, fy, self.number_of("cx", width / 2), self.number_of("cy", height / 2)]
-        k1, k2, k3, k4, p1, p2 = (self.number_of(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+        core = [fx, fy, self.number("cx", width / 2), self.number("cy", height / 2)]
+        k1, k2, k3, k4, p1, p2 = (self.number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
         model = str(self.value("camera_model") or "OPENCV").upper()
         if model in _FISHEYE or self.value("is_fisheye"):
             return make_lens("OPENCV_FISHEYE", width, height, [*core, k1, k2, k3, k4])
@@ -179,33 +181,33 @@ class _Frame:
         return make_lens("FULL_OPENCV", width, height, [*core, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0])
 
     def focal(self, key: str, angle: str, size: int, default: float | None = None) -> float | None:
-        """Focal length [px] from its own key, or an angle of view."""
+        """Return the focal length [px] at `key`, or from the angle of view at `angle`, or the default."""
         if self.value(key) is not None:
             return self.positive(key)
         if self.value(angle) is None:
             return default
-        whole = self.positive(angle)
-        if whole >= math.pi:
-            raise InputError(f"{self.place}: {angle} is {whole:g}; an angle of view is below pi")
-        return 0.5 * size / math.tan(0.5 * whole)
+        field_of_view = self.positive(angle)
+        if field_of_view >= math.pi:
+            raise InputError(f"{self.place}: {angle} is {field_of_view:g}; an angle of view is below pi")
+        return 0.5 * size / math.tan(0.5 * field_of_view)
 
     def positive(self, key: str) -> float:
-        value = self.number_of(key, 0.0)
+        value = self.number(key, 0.0)
         if value <= 0:
             raise InputError(f"{self.place}: {key} is {value:g}; it must be above 0")
         return value
 
-    def number_of(self, key: str, default: float) -> float:
+    def number(self, key: str, default: float) -> float:
         value = self.value(key)
         if value is None:
             return default
         real = to_real(value)
-        if real is None or not abs(real) < _LARGEST:
+        if real is None or not abs(real) < _MAX_NUMBER:
             raise InputError(f"{self.place}: {key} is {str(value)[:40]!r}; it must be a number")
         return real
 
     def value(self, key: str) -> Any:
-        """The frame's own value, else that of all frames."""
+        """Return the frame's value of `key`, or else the value for all frames."""
         return self.values.get(key, self.document.values.get(key))
 
 
@@ -224,7 +226,7 @@ class _Document:
         return _Document(path, values)
 
     def frames(self, images: str | None) -> Iterator[_Frame]:
-        """All frames, also those whose photos are not there."""
+        """Yield all frames, including frames without an existing photo."""
         for number, values in enumerate(self.values["frames"]):
             if not isinstance(values, dict) or not isinstance(values.get("file_path"), str) or not values["file_path"]:
                 raise InputError(f"{self.path}: frame {number}: has no file_path; name its photo")
@@ -232,7 +234,7 @@ class _Document:
             yield _Frame(self, number, values, self.name_of(file), file)
 
     def photo_file(self, file_path: str, images: str | None = None) -> Path:
-        """The photo's file; Blender sets leave the suffix out. Raises InputError where no file can have the name."""
+        """Return the photo's file; Blender sets omit the suffix. Raises InputError if no file can have the name."""
         if not _can_be_name(file_path):
             raise InputError(f"{self.path}: {ascii(file_path)[:60]} is not the name of a photo; name a file beside it")
         relative = Path(file_path.replace("\\", "/"))
@@ -245,13 +247,13 @@ class _Document:
         return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
 
     def name_of(self, file: Path) -> str:
-        """A photo's name: its path below the scene's folder, `/` between folders; elsewhere its file name."""
-        # Without "..", which can lead out of the folder: images are written under these names.
+        """Return a photo's name: its path below the scene's folder with `/` between folders, or else its file name."""
+        # Paths lose "..", which could lead out of the folder, because renders are written under these names.
         folder, plain = (Path(os.path.normpath(path)) for path in (self.path.parent, file))
         return plain.relative_to(folder).as_posix() if plain.is_relative_to(folder) else plain.name
 
-    def listed(self, key: str | None = None) -> set[str]:
-        """Names in nerfstudio's list `key`, or in all of its lists."""
+    def listed_names(self, key: str | None = None) -> set[str]:
+        """Return the photo names in nerfstudio's list `key`, or in all of its lists."""
         keys = ("train_filenames", "val_filenames", "test_filenames") if key is None else (key,)
         lists = [self.values.get(key) or [] for key in keys]
         if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
@@ -260,47 +262,46 @@ class _Document:
         return {self.name_of(self.photo_file(name)) for name in names}
 
     def points(self) -> Points:
-        """The file's points, those of the COLMAP model behind it, or none."""
-        folder, named = self.path.parent, self.values.get("ply_file_path")
-        if isinstance(named, str) and named:
-            if not named.isprintable() or not _can_be_name(named):
+        """Return the file's points, or the points of the COLMAP model behind it, or an empty point cloud."""
+        folder, ply = self.path.parent, self.values.get("ply_file_path")
+        if isinstance(ply, str) and ply:
+            if not ply.isprintable() or not _can_be_name(ply):
                 raise InputError(
-                    f"{self.path}: ply_file_path {named!r} is not the name of a file; name a PLY, or remove it"
+                    f"{self.path}: ply_file_path {ply!r} is not the name of a file; name a PLY, or remove it"
                 )
-            return read_point_cloud(folder / named)
+            return read_point_cloud(folder / ply)
         if (folder / "points3d.ply").is_file():
             return read_point_cloud(folder / "points3d.ply")
-        for place in _COLMAP if "applied_transform" in self.values else ():
+        for place in _COLMAP_FOLDERS if "applied_transform" in self.values else ():
             if (folder / place).is_dir():
-                found = read_model(folder / place).points
-                return Points(self.applied(found.xyz), found.rgb, found.track_length)
+                points = read_model(folder / place).points
+                return Points(self.apply_transform(points.xyz), points.rgb, points.track_length)
         return Points(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.int64))
 
-    def applied(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points of the COLMAP model, moved as its poses were."""
+    def apply_transform(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points of the COLMAP model in the world of the poses."""
         matrix = _matrix(self.values["applied_transform"])
         scale = to_real(self.values.get("applied_scale", 1.0))
-        if matrix is None or scale is None or not 0 < scale < _LARGEST:
+        if matrix is None or scale is None or not 0 < scale < _MAX_NUMBER:
             raise InputError(f"{self.path}: applied_transform must be 3 x 4 numbers and applied_scale above 0")
-        moved: NDArray[np.float64] = scale * (xyz @ matrix[:3, :3].T + matrix[:3, 3])
-        return moved
+        return scale * (xyz @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 def _can_be_name(text: str) -> bool:
-    """Whether a file can have this path, with a suffix added."""
+    """Return whether a file can have this path, with a suffix added."""
     path = PurePosixPath(text.replace("\\", "/"))
     try:
         parts = [len(os.fsencode(part)) for part in path.parts]
-        short = max(parts, default=0) <= _LONGEST_NAME and sum(parts) <= _LONGEST_PATH
+        short = max(parts, default=0) <= _MAX_NAME and sum(parts) <= _MAX_PATH
         return short and bool(path.name) and "\0" not in text
-    except UnicodeEncodeError:  # half of a surrogate pair
+    except UnicodeEncodeError:  # the text contains half of a surrogate pair
         return False
 
 
-def _matrix(given: Any) -> NDArray[np.float64] | None:
-    """(4, 4) of a nested list of 4 x 4 or 3 x 4 finite numbers, else None."""
+def _matrix(value: Any) -> NDArray[np.float64] | None:
+    """Return nested lists of 4 x 4 or 3 x 4 finite numbers as a (4, 4) matrix; None for other values."""
     try:
-        matrix = np.array(given, dtype=np.float64)
+        matrix = np.array(value, dtype=np.float64)
     except (OverflowError, TypeError, ValueError):
         return None
     if matrix.shape == (3, 4):

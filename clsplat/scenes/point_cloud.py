@@ -1,4 +1,4 @@
-"""A coloured point cloud in a PLY file, as nerfstudio (`ply_file_path`) and 3DGS (`points3d.ply`) keep it."""
+"""Coloured point clouds in PLY files, as nerfstudio (`ply_file_path`) and 3DGS (`points3d.ply`) store them."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from ..splats.ply_body import read_body
 from ..splats.ply_header import read_header
 from .colmap import Points
 
-_GREY = 128
+_GREY = 128  # colour of points in files without colours
 
 
 def read_point_cloud(path: str | os.PathLike[str]) -> Points:
-    """Points from x, y, z and, where they are there, red, green, blue (0 to 255); grey without.
+    """Read points from the properties x, y, z and red, green, blue (0 to 255). Points without colours are grey.
 
     Returns
     -------
-    Points with tracks of length 1: the file does not say who saw them.
+    Points with tracks of length 1, because the file does not contain tracks.
 
     Raises
     ------
-    InputError : missing, damaged, no position, or a position that is not finite.
+    InputError : the file is missing or damaged, or a position is missing or not finite.
     """
     path = Path(path)
     try:
@@ -49,7 +49,7 @@ def read_point_cloud(path: str | os.PathLike[str]) -> Points:
 
 
 def write_point_cloud(path: str | os.PathLike[str], points: Points) -> None:
-    """Write positions (float32) and colours, binary; raises OutputError."""
+    """Write positions (float32) and colours to a binary PLY file; raises OutputError."""
     columns = [("float", name) for name in "xyz"] + [("uchar", name) for name in ("red", "green", "blue")]
     head = [
         "ply",

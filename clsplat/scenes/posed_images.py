@@ -1,4 +1,4 @@
-"""Photos with poses, before they are decoded: what every kind of scene is read into. COLMAP's kind is here."""
+"""Photos with poses before decoding, the common form of all kinds of scenes, and the reader of COLMAP scenes."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from ..files.image_names import IMAGE_SUFFIXES
 from .colmap import Points, find_model, read_model
 from .undistort import RegisteredImage
 
-_FEW_REGISTERED = 0.8
+_FEW_REGISTERED = 0.8  # share of registered photos below which a warning is issued
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImages:
-    """Posed photos and points.
+    """Photos with poses, and points.
 
     Parameters
     ----------
-    photos : sorted by name.
-    files : where each photo is, by name.
-    points : may be empty.
-    test_names : photos that the files themselves hold out for evaluation; None where they do not say.
-    masks : files of masks that the files name, by their photos' names.
+    photos : registered images, sorted by name.
+    files : file of each photo, by name.
+    points : point cloud, may be empty.
+    test_names : names of the photos that the scene's files hold out for evaluation; None if they do not specify any.
+    masks : mask files named in the scene's files, by photo name.
     """
 
     photos: list[RegisteredImage]
@@ -40,10 +40,11 @@ class PosedImages:
 
 
 def read_colmap(root: Path, images: str | None) -> PosedImages:
-    """A folder with photos and a COLMAP model in `sparse`.
+    """Read a folder with photos and a COLMAP model in `sparse`.
 
     Parameters
     ----------
+    root : the scene's folder.
     images : folder of the photos inside it; "images" by default.
 
     Warns
@@ -52,7 +53,7 @@ def read_colmap(root: Path, images: str | None) -> PosedImages:
 
     Raises
     ------
-    InputError : a missing folder or photo, or a damaged model.
+    InputError : a folder or photo is missing, or the model is damaged.
     """
     model = read_model(find_model(root))
     folder = _photo_folder(root, images or "images")
@@ -66,7 +67,7 @@ def _photo_folder(root: Path, images: str) -> Path:
     if not folder.is_dir():
         others = ", ".join(sorted(other.name for other in root.glob("images*") if other.is_dir()))
         raise InputError(
-            f"{folder}: no such folder of photos; "
+            f"{folder}: there is no such folder of photos; "
             + (f"choose one of: {others}" if others else "put the photos there, or name their folder")
         )
     return folder

@@ -1,4 +1,4 @@
-"""Splats and views of any number and size, for timing: no photos needed, and nothing to learn."""
+"""Random splats and views of any number and size, for measurements of speed without photos."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from .colmap import Points
 from .demo.scene import RING_RADIUS, RING_TARGET, ring_cameras
 from .scene import Scene, View
 
-OVERDRAW = 24.0  # ellipses of the median size that would cover a pixel; the near and the large ones double it
-_BALL = 0.6 * RING_RADIUS  # radius of the ball they fill [world units]: more than the views see at their sides
-_CUTOFF = 2.6  # standard deviations from the middle of a typical splat to where alpha falls to 1/255
-_SPREAD = 0.4  # of log scales
-_MOST_SKEWED = 0.97  # part of a bounded vector's limit; the median is 0.82 of it, as after short trainings
+OVERDRAW = 24.0  # number of ellipses over a pixel if all splats had the median size; the real number is about twice
+_BALL = 0.6 * RING_RADIUS  # radius of the ball of splats [world units]; it extends beyond the sides of the images
+_CUTOFF = 2.6  # standard deviations from the centre of a typical splat to where alpha falls to 1/255
+_SPREAD = 0.4  # standard deviation of the log scales
+_MAX_SKEW = 0.97  # largest length of a bounded vector over its limit; the median is 0.82, as after short trainings
 
 
 def synthetic_scene(
@@ -32,21 +32,25 @@ def synthetic_scene(
     n_views: int = 6,
     seed: int = 0,
 ) -> tuple[Scene, Splats]:
-    """A ball of `n` random splats in a ring of cameras, and smooth images to compare with.
+    """Return views of a ball of `n` random splats from a ring of cameras, and the splats.
 
-    Sizes fall as 1/sqrt(n), so that the splats over a pixel, and with them the useful pairs of an image, stay nearly
-    the same: some 40 a pixel, and up to 60 where there are three splats a pixel and the low-pass widens them. Opacities
-    are of every height, most of them low or high as in trained models; skew and the like are as different. Equal
+    The views' images are smooth waves to compare renders with. Sizes fall as 1/sqrt(n), so that the number of splats
+    over a pixel hardly depends on `n`; it grows if splats are so small that the low-pass filter widens them. Opacities
+    have all values, and are mostly low or high, as in trained models. Parameters such as the skew vary as much. Equal
     arguments give equal bits.
 
     Parameters
     ----------
-    width, height : of the images [px], at least 16.
-    n_views : cameras, at least 2; half of them on the upper ring.
+    n : number of splats, at least 1.
+    width, height : size of the images [px], at least 16.
+    shape : name of the splats' shape.
+    sh_degree : degree of the spherical harmonics.
+    n_views : number of cameras, at least 2; half of them on the upper ring.
+    seed : seed of the random numbers.
 
     Raises
     ------
-    InputError : no splat, smaller images, fewer views, or an unknown shape.
+    InputError : there are too few splats, pixels or views, or the shape is unknown.
     """
     if n < 1 or min(width, height) < 16 or n_views < 2:
         raise InputError(
@@ -79,17 +83,16 @@ def _splats(n: int, shape: Shape, sh_degree: int, rng: np.random.Generator) -> S
         "sh": sh,
     }
     for field in shape.fields:
-        arrays[field.name] = _own(field, n, arrays, rng)
+        arrays[field.name] = _shape_values(field, n, arrays, rng)
     return Splats(shape.name, {name: values.astype(np.float32, copy=False) for name, values in arrays.items()})
 
 
-def _own(field: Field, n: int, arrays: dict[str, Array], rng: np.random.Generator) -> Array:
-    """Values of one of the shape's own fields, away from where it is a Gaussian."""
+def _shape_values(field: Field, n: int, arrays: dict[str, Array], rng: np.random.Generator) -> Array:
+    """Return values of a field that only this shape has, away from the values of a Gaussian."""
     if field.neutral_from is not None:
-        other: Array = rng.permutation(arrays[field.neutral_from])
-        return other
+        return rng.permutation(arrays[field.neutral_from])
     if field.limit is not None or field.nonzero:
-        length = 1.0 if field.limit is None else _MOST_SKEWED * field.limit * rng.random((n, 1)) ** 0.25
+        length = 1.0 if field.limit is None else _MAX_SKEW * field.limit * rng.random((n, 1)) ** 0.25
         return length * _directions(n, field.width, rng)
     start = field.neutral[0] if field.start is None else field.start
     return start * np.exp(rng.normal(0, 0.2, public_shape(field, n)))
@@ -97,14 +100,12 @@ def _own(field: Field, n: int, arrays: dict[str, Array], rng: np.random.Generato
 
 def _directions(n: int, width: int, rng: np.random.Generator) -> NDArray[np.float64]:
     vectors = rng.standard_normal((n, width))
-    unit: NDArray[np.float64] = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return unit
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def _smooth_image(width: int, height: int, rng: np.random.Generator) -> ImageU8:
-    """Waves of a few periods in each channel."""
+    """Return an image of waves with a few periods in each channel."""
     x, y = np.arange(width)[None, :, None] / width, np.arange(height)[:, None, None] / height
     periods, phase = rng.uniform(-4, 4, (2, 3)), rng.uniform(0, 2 * np.pi, 3)
     wave = 0.5 + 0.4 * np.sin(2 * np.pi * (periods[0] * x + periods[1] * y) + phase)
-    image: ImageU8 = np.rint(255 * wave).astype(np.uint8)
-    return image
+    return np.rint(255 * wave).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""A scene to learn: posed images, points, and the split into training and test views."""
+"""Scenes for training: posed images, points, and the split into training and test views."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from .options import ALPHA_USES
 from .posed_images import PosedImages, read_colmap
 from .undistort import RegisteredImage
 
-MAX_WIDTH = 1600  # 3DGS: with resolution -1, wider images are reduced to this [px]
-_EXTENT_MARGIN = 1.1  # 3DGS: extent over the farthest camera's distance from their mean
+MAX_WIDTH = 1600  # with resolution -1, wider images are reduced to this width [px], as in 3DGS
+_EXTENT_MARGIN = 1.1  # extent over the largest distance of a camera from the cameras' mean, as in 3DGS
 
 __all__ = ["MAX_WIDTH", "Points", "Scene", "View", "load_scene"]
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One posed image.
+    """An image with its camera.
 
     Parameters
     ----------
-    name : of the image file, as the model has it.
-    camera : pinhole, of the image's size.
-    image : (H, W, 3) uint8; a photo with transparency lies over the scene's background.
-    mask : (H, W), True where a pixel counts; None where all do.
-    alpha : (H, W) uint8, opacity of a photo with transparency; None for others.
+    name : name of the image file in the scene's model.
+    camera : pinhole camera with the image's size.
+    image : (H, W, 3) uint8; photos with transparency are composited over the scene's background.
+    mask : (H, W) bool, True for pixels that count; None if all pixels count.
+    alpha : (H, W) uint8, opacity of a photo with transparency; None for other photos.
     """
 
     name: str
@@ -51,7 +51,7 @@ class View:
     alpha: ImageU8 | None = None
 
     def resized(self, width: int, height: int) -> View:
-        """The view at another size [px]."""
+        """Return the view at another size [px]."""
         if (width, height) == (self.camera.width, self.camera.height):
             return self
         return View(
@@ -65,17 +65,17 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Posed images with a structure-from-motion point cloud.
+    """Images with cameras, and a point cloud from structure from motion.
 
     Parameters
     ----------
-    name : of the scene's folder.
+    name : name of the scene's folder.
     path : the scene's folder, or its transforms file.
-    views : sorted by name.
-    points : may be empty.
+    views : all views, sorted by name.
+    points : point cloud, may be empty.
     test_names : names of the views held out for evaluation.
-    background : colour 0..1 that photos with transparency lie over.
-    reading : arguments of `load_scene` that read the scene, which a run records; None stands for a default.
+    background : colour 0..1 under photos with transparency.
+    reading : arguments of `load_scene` that a run records to read the scene again; None stands for a default.
     """
 
     name: str
@@ -103,19 +103,19 @@ class Scene:
 
     @cached_property
     def train(self) -> list[View]:
-        """Views to learn from."""
+        """Training views."""
         return [view for view in self.views if view.name not in self.test_names]
 
     @cached_property
     def test(self) -> list[View]:
-        """Views held out for evaluation."""
+        """Test views, held out for evaluation."""
         return [view for view in self.views if view.name in self.test_names]
 
     @cached_property
     def extent(self) -> float:
         """Size of the scene: 1.1 times the training cameras' largest distance from their mean [world units].
 
-        As in 3DGS, where it scales the positions' learning rate; 1 where all cameras stand in one place.
+        It scales the learning rate of positions, as in 3DGS. It is 1 if all cameras are at one position.
         """
         centres = np.array([view.camera.position for view in self.train])
         reach = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
@@ -137,30 +137,30 @@ def load_scene(
 
     Parameters
     ----------
-    path : the scene's folder, or one of its transforms files. A folder with both is read as COLMAP's.
-    images : folder of the photos inside it; "images" by default, or what transforms.json says. Reduced photos
-        (images_4) scale the cameras.
-    resolution : 3DGS's -r: 1, 2, 4, 8 divide the size, another number is the width wanted [px]; -1 keeps the
-        size but reduces images wider than 1600 px to that.
-    test_every : of the sorted names, each of this many is a test view, from the first on; where the scene's files
-        hold views out themselves (transforms_test.json, nerfstudio's lists), these are the test views instead.
-    test_list : file with the names of the test views, one a line, instead of `test_every`.
-    eval : False: no test view, learn from all.
+    path : the scene's folder, or one of its transforms files. A folder with both is read as a COLMAP scene.
+    images : folder of the photos inside the scene, by default "images" or the folder in transforms.json. If its photos
+        are reduced (images_4), the cameras are scaled.
+    resolution : 3DGS's -r. The values 1, 2, 4 and 8 divide the size; -1 keeps the size but reduces images wider than
+        1600 px to that width; another number is the width [px].
+    test_every : every n-th name of the sorted names, from the first on, is a test view. If the scene's files hold views
+        out (transforms_test.json, nerfstudio's lists), those are the test views instead.
+    test_list : text file with the names of the test views, one per line; replaces `test_every`.
+    eval : whether to hold out test views; if False, all views are training views.
     background : colour 0..1 under transparent pixels.
-    masks : folder inside the scene of masks (masks.py); by default "masks" where there is one, or what
-        transforms.json says; "none" for no masks.
-    alpha : what the transparency of a photo is: "background", which its colours are laid over, or "mask", which hides
-        pixels less than half opaque.
+    masks : folder of masks inside the scene (see files/masks.py), or "none" for no masks. By default "masks" if it
+        exists, and the masks named in transforms.json.
+    alpha : use of a photo's transparency. "background" composites the photo over the background; "mask" masks out
+        pixels that are less than half opaque.
 
     Warns
     -----
-    UserWarning : the model registers fewer than 80 % of the photos in the folder, photos are not there or cannot be
-        read, or masks hide all of a photo; those are left out.
+    UserWarning : the model registers fewer than 80 % of the photos in the folder. Photos that are missing, unreadable
+        or hidden by their masks are left out.
 
     Raises
     ------
-    InputError : a missing folder or photo, a damaged model or mask, no readable photo, sizes that do not fit, a bad
-        option.
+    InputError : a folder or photo is missing, a model or mask is damaged, no photo can be read, sizes do not fit, or
+        an option has a bad value.
     """
     root = Path(path)
     if alpha not in ALPHA_USES:
@@ -169,16 +169,15 @@ def load_scene(
         raise InputError(f"resolution {resolution}: use 1, 2, 4, 8, a width in pixels, or -1")
     posed = read_posed_images(root, images)
     test_names = select_test_names(posed, test_every, test_list) if eval else frozenset()
-
-    hiding = find_masks(root, posed, masks)
+    mask_of = find_masks(root, posed, masks)
 
     def view(photo: RegisteredImage) -> View | str:
-        return _view(photo, posed.files[photo.name], resolution, background, hiding.get(photo.name), alpha == "mask")
+        return _view(photo, posed.files[photo.name], resolution, background, mask_of.get(photo.name), alpha == "mask")
 
-    with ThreadPoolExecutor() as pool:  # decoding and resizing run outside the interpreter lock
-        found = list(pool.map(view, posed.photos))
-    views = [view for view in found if isinstance(view, View)]
-    _warn_of_left_out(root, [reason for reason in found if isinstance(reason, str)], len(found))
+    with ThreadPoolExecutor() as pool:  # decoding and resizing release the interpreter lock
+        results = list(pool.map(view, posed.photos))
+    views = [view for view in results if isinstance(view, View)]
+    _warn_of_left_out(root, [reason for reason in results if isinstance(reason, str)], len(results))
     folder = root.resolve()
     return Scene(
         (folder.parent if root.is_file() else folder).name,
@@ -200,23 +199,32 @@ def load_scene(
 
 
 def _reading(*, eval: bool, **arguments: Any) -> dict[str, Any]:
-    """A record of `load_scene`'s arguments: None for those that have their defaults, and always `eval`."""
+    """Return a record of `load_scene`'s arguments: None for default values, and always a value of `eval`."""
     parameters = inspect.signature(load_scene).parameters
     record = {name: None if value == parameters[name].default else value for name, value in arguments.items()}
     return record | {"eval": bool(eval)}
 
 
 def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, Path]:
-    """Files of masks, by the names of their photos."""
+    """Return the mask files of a scene by photo name.
+
+    Parameters
+    ----------
+    folder : folder of masks inside the scene, NO_MASKS, or None for the default folder.
+
+    Raises
+    ------
+    InputError : the named folder is missing or contains no mask of any photo.
+    """
     if folder == NO_MASKS:
         return {}
-    named = (root.parent if root.is_file() else root) / (folder or MASK_FOLDER)
-    if folder is not None and not named.is_dir():
-        raise InputError(f"{named}: no such folder of masks; name another, or {NO_MASKS!r} for no masks")
-    found = mask_files(named, posed.names)
-    if folder is not None and not found:
-        raise InputError(f"{named}: no mask of any photo in it; a mask of {posed.names[0]!r} is {posed.names[0]}.png")
-    return posed.masks | found
+    path = (root.parent if root.is_file() else root) / (folder or MASK_FOLDER)
+    if folder is not None and not path.is_dir():
+        raise InputError(f"{path}: no such folder of masks; name another, or {NO_MASKS!r} for no masks")
+    masks = mask_files(path, posed.names)
+    if folder is not None and not masks:
+        raise InputError(f"{path}: no mask of any photo in it; a mask of {posed.names[0]!r} is {posed.names[0]}.png")
+    return posed.masks | masks
 
 
 def _warn_of_left_out(root: Path, reasons: list[str], n: int) -> None:
@@ -231,6 +239,7 @@ def _warn_of_left_out(root: Path, reasons: list[str], n: int) -> None:
 
 
 def read_posed_images(root: Path, images: str | None) -> PosedImages:
+    """Read a scene's photos with poses, without decoding them; parameters and errors as `load_scene`."""
     transforms = find_transforms(root)
     if transforms and not (root / "sparse").is_dir():
         return read_transforms(transforms, images)
@@ -238,12 +247,13 @@ def read_posed_images(root: Path, images: str | None) -> PosedImages:
 
 
 def select_test_names(posed: PosedImages, test_every: int, test_list: str | os.PathLike[str] | None) -> frozenset[str]:
+    """Return the names of the test views; parameters as `load_scene`, raises InputError."""
     names = posed.names
     if test_list is None and posed.test_names is not None:
         chosen = sorted(posed.test_names)
     elif test_list is None:
         if test_every < 2:
-            raise InputError(f"test_every {test_every}: must be at least 2; to learn from all views, turn eval off")
+            raise InputError(f"test_every {test_every}: must be at least 2; to train on all views, turn eval off")
         chosen = names[::test_every]
     else:
         chosen = _read_names(Path(test_list))
@@ -266,7 +276,7 @@ def _read_names(path: Path) -> list[str]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"{path}: cannot be read as a list of names ({type(error).__name__}); "
-            "give a text file with one image name a line"
+            "give a text file with one image name per line"
         ) from None
     return [line.strip() for line in lines if line.strip()]
 
@@ -279,19 +289,19 @@ def _view(
     mask_file: Path | None,
     alpha_hides: bool,
 ) -> View | str:
-    """The view, or why there is none."""
+    """Return the view, or the reason why the photo cannot be used."""
     try:
         stored = read_image(file)
     except InputError as error:
         return str(error)
     height, width = stored.shape[:2]
-    counts = [] if mask_file is None else [read_mask(mask_file)]
+    masks = [] if mask_file is None else [read_mask(mask_file)]
     alpha = stored[:, :, 3] if stored.shape[2] == 4 else None
     if alpha is not None and alpha_hides:
-        counts.append(alpha >= 128)
+        masks.append(alpha >= 128)
         alpha, stored = None, stored[:, :, :3]
     image, camera = photo.fit(_opaque(stored, background))
-    fitted = [photo.fit_mask(each, width, height) for each in counts]
+    fitted = [photo.fit_mask(each, width, height) for each in masks]
     mask = np.logical_and.reduce(fitted) if fitted else None
     alpha = None if alpha is None else photo.fit_alpha(alpha)
     view = View(photo.name, camera, image, mask, alpha)
@@ -299,23 +309,22 @@ def _view(
     if view.mask is None:
         return view
     if not view.mask.any():
-        return f"{file}: its mask hides all of it"
+        return f"{file}: its mask hides every pixel"
     return replace(view, mask=None) if view.mask.all() else view
 
 
 def _opaque(image: ImageU8, background: Color) -> ImageU8:
-    """(H, W, 3 or 4) with straight alpha, composited over the background."""
+    """Return an image, (H, W, 3) or (H, W, 4) with straight alpha, composited over the background."""
     if image.shape[2] == 3:
         return image
     alpha = image[:, :, 3:].astype(np.float32) / 255.0
     under = 255.0 * np.clip(np.asarray(background, np.float32), 0.0, 1.0)
     blended = alpha * image[:, :, :3].astype(np.float32) + (1.0 - alpha) * under
-    opaque: ImageU8 = np.rint(blended).astype(np.uint8)
-    return opaque
+    return np.rint(blended).astype(np.uint8)
 
 
 def _target_size(width: int, height: int, resolution: int) -> tuple[int, int]:
-    """3DGS's rule: divisors round, widths truncate."""
+    """Return (width, height) [px] by 3DGS's rule: divisors round, widths truncate."""
     if resolution in (1, 2, 4, 8):
         return max(1, round(width / resolution)), max(1, round(height / resolution))
     if resolution == -1 and width <= MAX_WIDTH:

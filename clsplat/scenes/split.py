@@ -1,4 +1,4 @@
-"""Views held out of the training set: all that may be looked at when something is chosen."""
+"""Validation views, held out from the training views. Nothing else may be used to choose between models."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ from dataclasses import replace
 from ..errors import InputError
 from .scene import Scene
 
-EVERY = 7  # of the training views, one is held out, but three where there are as many
-FEWEST = 3  # training views: one to judge by, two to learn from
+STRIDE = 7  # hold out every 7th training view, or every 3rd, ... of a scene with few views
+MIN_TRAIN_VIEWS = 3  # smallest number of training views that can be split: one to validate, two to train
 
 
 def hold_out(scene: Scene) -> Scene:
-    """The scene without its test views, and every 7th training view held out in their place (of few: every third).
+    """Return the scene without its test views, and with every 7th training view as a test view instead.
 
-    The first view is kept: cameras often walk a path, and its ends see what no other view sees.
+    A scene with fewer than 21 training views has a smaller stride, so that three views are held out if possible. The
+    first view is never held out: cameras often follow a path, and its end sees things that no other view sees.
 
     Raises
     ------
-    InputError : fewer than three training views.
+    InputError : the scene has fewer than three training views.
     """
     views = scene.train
-    if len(views) < FEWEST:
+    if len(views) < MIN_TRAIN_VIEWS:
         raise InputError(
-            f"{scene.path}: has {len(views)} training views; at least {FEWEST} are needed to hold one "
+            f"{scene.path}: has {len(views)} training views; at least {MIN_TRAIN_VIEWS} are needed to hold one "
             "out: add photos, or choose the number of splats yourself (--cap-max)"
         )
-    every = max(2, min(EVERY, len(views) // FEWEST))
-    held_out = views[every // 2 :: every]
+    stride = max(2, min(STRIDE, len(views) // MIN_TRAIN_VIEWS))
+    held_out = views[stride // 2 :: stride]
     return replace(scene, views=views, test_names=frozenset(view.name for view in held_out))

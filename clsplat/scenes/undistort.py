@@ -1,4 +1,4 @@
-"""Lenses: photos with their poses, undistorted to pinhole images. Undistortion is COLMAP's, through pycolmap."""
+"""Lenses, and undistortion of registered images to pinhole images, as COLMAP does it through pycolmap."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..errors import InputError, reason_of
 
-# Before pycolmap on purpose (see images.py), hence also pycolmap only inside functions.
+# This import loads Pillow before pycolmap (see images.py). For the same reason functions import pycolmap late.
 from ..files import images as _images
 from ..files.masks import resize_mask
 
 Lens = Any  # a pycolmap.Camera
 
 _PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
-# Perspective models that are a plain pinhole when every distortion coefficient is 0.
+# Perspective models that are pinholes if every distortion coefficient is 0.
 _DISTORTED_PINHOLES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 
@@ -30,9 +30,9 @@ class RegisteredImage:
 
     Parameters
     ----------
-    name : as COLMAP stores it, with `/` between folders.
+    name : file name as COLMAP stores it, with `/` between folders.
     cam_from_world : (4, 4) world-to-camera pose.
-    lens : of the model, or of `make_lens`.
+    lens : camera of a pycolmap model, or result of `make_lens`.
     """
 
     name: str
@@ -40,19 +40,19 @@ class RegisteredImage:
     lens: Lens
 
     def fit(self, image: _images.ImageU8) -> tuple[_images.ImageU8, Camera]:
-        """The photo as a pinhole image, and its camera.
+        """Return the photo as a pinhole image, and its camera.
 
-        The lens is scaled to the image (folders images_2, images_4, ... hold reduced photos). A distorted
-        photo is undistorted as COLMAP's image_undistorter does it by default: focal lengths kept, the border
-        cropped or widened so that no pixel stays blank.
+        The lens is scaled to the image, because folders such as images_2 and images_4 hold reduced photos. A distorted
+        photo is undistorted with the defaults of COLMAP's image_undistorter: focal lengths stay, and the border is
+        cropped or widened so that no pixel is blank.
 
         Parameters
         ----------
-        image : (H, W, 3) uint8, as stored.
+        image : (H, W, 3) uint8, the photo as stored.
 
         Raises
         ------
-        InputError : the image has another aspect than the camera, or the lens has no pinhole image.
+        InputError : the image has another aspect ratio than the camera, or the lens has no pinhole image.
         """
         height, width = image.shape[:2]
         lens = _scaled(self.lens, width, height, self.name)
@@ -65,17 +65,18 @@ class RegisteredImage:
             raise InputError(f"image {self.name!r}: {error}; rebuild the model") from None
 
     def fit_alpha(self, alpha: _images.ImageU8) -> _images.ImageU8:
-        """The photo's opacity, (H, W) as stored, where `fit` puts its pixels; raises what `fit` raises."""
-        fitted: _images.ImageU8 = self.fit(np.repeat(alpha[:, :, None], 3, axis=2))[0][:, :, 0]
-        return fitted
+        """Return the photo's opacity, (H, W) as stored, moved as `fit` moves its pixels; raises as `fit`."""
+        return self.fit(np.repeat(alpha[:, :, None], 3, axis=2))[0][:, :, 0]
 
     def fit_mask(self, mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
-        """A mask of the photo as a mask of `fit`'s image: the nearest pixel, False outside the photo.
+        """Return a mask of the photo as a mask of the image that `fit` returns.
+
+        Each pixel takes the value of the nearest mask pixel; pixels outside the photo are False.
 
         Parameters
         ----------
-        mask : (h, w) bool, True where the photo counts; of the photo's size or a reduction of it.
-        width, height : of the photo as stored, before `fit` [px].
+        mask : (h, w) bool, True for pixels that count, of the photo's size or reduced.
+        width, height : size of the photo as stored, before `fit` [px].
 
         Returns
         -------
@@ -83,19 +84,20 @@ class RegisteredImage:
 
         Raises
         ------
-        InputError : the mask has another aspect than the photo, or what `fit` raises.
+        InputError : the mask has another aspect ratio than the photo, or `fit` would raise.
         """
         rows, columns = mask.shape
         if not _images.same_aspect((columns, rows), (width, height)):
             raise InputError(
                 f"image {self.name!r}: its mask is {columns}x{rows} px, the photo {width}x{height}; "
-                "make the mask of the photo's size"
+                "make the mask as large as the photo"
             )
         lens = _scaled(self.lens, width, height, self.name)
         if is_pinhole(lens):
             return resize_mask(mask, width, height)
         across, down = _seen_from(_pinhole_of(lens, self.name), lens)
-        # Outside the outermost pixel centres the image is blank (bilinear); rays that no pixel sees are NaN.
+        # Bilinear interpolation leaves the image blank outside the outermost pixel centres. Rays that no pixel sees
+        # are NaN.
         inside = (across >= 0.5) & (across <= width - 0.5) & (down >= 0.5) & (down <= height - 0.5)
         fitted = np.zeros(inside.shape, bool)
         row, column = down[inside] * (rows / height), across[inside] * (columns / width)
@@ -104,12 +106,12 @@ class RegisteredImage:
 
 
 def make_lens(model: str, width: int, height: int, params: list[float]) -> Lens:
-    """A lens by COLMAP's name of its model and its parameters [px, then distortion]."""
+    """Return a lens by COLMAP's model name and parameters: focal lengths and centre [px], then distortion."""
     return colmap_library().Camera(model=model, width=width, height=height, params=params)
 
 
 def pinhole_camera(lens: Lens, cam_from_world: NDArray[np.float64], width: int, height: int) -> Camera:
-    """The camera of a lens without distortion, for images of this size [px]; raises what Camera raises."""
+    """Return the camera of an undistorted lens for images of this size [px]; raises as `Camera`."""
     return Camera(
         width,
         height,
@@ -122,16 +124,15 @@ def pinhole_camera(lens: Lens, cam_from_world: NDArray[np.float64], width: int, 
 
 
 def colmap_library() -> ModuleType:
-    """pycolmap, silent: its errors reach the user as exceptions."""
+    """Import pycolmap without its log messages; its errors reach the user as exceptions."""
     import pycolmap
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-    library: ModuleType = pycolmap
-    return library
+    return pycolmap
 
 
 def _scaled(lens: Any, width: int, height: int, name: str) -> Any:
-    """The lens for an image of another size."""
+    """Return the lens for an image of this size [px]; raises InputError for another aspect ratio."""
     if not np.isfinite(lens.params).all():
         raise InputError(f"image {name!r}: its camera has a parameter that is not finite; rebuild the model")
     if not _images.same_aspect((width, height), (lens.width, lens.height)):
@@ -146,7 +147,7 @@ def _scaled(lens: Any, width: int, height: int, name: str) -> Any:
 
 
 def is_pinhole(lens: Any) -> bool:
-    """Whether its photos are pinhole images as they are."""
+    """Return whether photos of this lens are pinhole images already."""
     kind = lens.model.name
     if kind in _PINHOLES:
         return True
@@ -166,13 +167,13 @@ def _undistorted(image: _images.ImageU8, lens: Any, name: str) -> tuple[_images.
 
 
 def _pinhole_of(lens: Any, name: str) -> Any:
-    """The camera that `_undistorted` will give."""
+    """Return the pinhole lens of the image that `_undistorted` returns."""
     pycolmap = colmap_library()
     try:
         pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
     except (ValueError, RuntimeError, MemoryError) as error:
         raise _not_undistorted(lens, name, error) from None
-    # A panorama comes back as it was, and asking its camera for a focal length would end the process.
+    # pycolmap returns panoramas unchanged, and reading their focal length would abort the process.
     if pinhole.model.name != "PINHOLE":
         raise InputError(
             f"image {name!r}: the camera model {lens.model.name} has no pinhole image; "
@@ -189,7 +190,7 @@ def _not_undistorted(lens: Any, name: str, error: Exception) -> InputError:
 
 
 def _seen_from(pinhole: Any, lens: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where a lens puts the pixel centres of a pinhole camera: x and y [px], (H, W) each; NaN where nowhere."""
+    """Return where a lens sees the pixel centres of a pinhole camera: x and y [px], (H, W) each, NaN if unseen."""
     down, across = np.mgrid[: pinhole.height, : pinhole.width] + 0.5
     rays = np.stack(
         [

@@ -1,4 +1,4 @@
-"""Lenses that are undistorted or refused, and damaged model files."""
+"""Undistorted and refused lenses, and damaged model files."""
 
 from __future__ import annotations
 
@@ -38,8 +38,10 @@ def folder(tmp_path: Path) -> Path:
         ("OPENCV_FISHEYE", [200, 205, 202, 149, 0.02, 0.01, 0, 0]),
     ],
 )
-def test_undistorted_photo_shows_points_where_its_camera_says(model: str, params: list[float], scale: float) -> None:
-    """Round dots drawn where the lens puts them must lie where the pinhole camera puts them."""
+def test_undistorted_photo_shows_points_where_its_camera_projects_them(
+    model: str, params: list[float], scale: float
+) -> None:
+    """Dots drawn at the lens's projections must appear at the pinhole camera's projections."""
     import pycolmap
 
     lens = pycolmap.Camera(model=model, width=400, height=300, params=params)
@@ -64,7 +66,7 @@ def test_undistorted_photo_shows_points_where_its_camera_says(model: str, params
         assert np.linalg.norm(found - expected) < 0.15
         checked += 1
     assert checked >= 15
-    assert (flat[:4].sum(), flat[-4:].sum()) == (0, 0)  # the ground is black, so is what the border gets
+    assert (flat[:4].sum(), flat[-4:].sum()) == (0, 0)  # ground and border are black
 
 
 def _radial(r2: np.ndarray, *k: float) -> np.ndarray:
@@ -72,14 +74,14 @@ def _radial(r2: np.ndarray, *k: float) -> np.ndarray:
 
 
 def _fisheye(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Equidistant: as far from the centre as the angle from the axis."""
+    """Return the equidistant projection: the distance from the centre is the angle from the axis."""
     r = np.hypot(x, y)
     factor = np.where(r > 0, np.arctan(r) / np.where(r > 0, r, 1), 1.0)
     return factor * x, factor * y
 
 
-def _put_by_hand(model: str, p: list[float], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Pixels of rays (x, y, 1) by the formulas of https://colmap.github.io/cameras.html, in float64."""
+def _project(model: str, p: list[float], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return pixels of rays (x, y, 1) by the formulas of https://colmap.github.io/cameras.html, in float64."""
     if model == "FOV":  # fx fy cx cy omega (Devernay & Faugeras 2001)
         r = np.hypot(x, y)
         distorted = np.arctan(2 * r * np.tan(p[4] / 2)) / p[4]
@@ -121,7 +123,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_every_lens_is_undistorted_as_its_formula_says(model: str) -> None:
+def test_every_lens_is_undistorted_by_its_formula(model: str) -> None:
     """A smooth pattern, drawn along rays: each pixel of the pinhole image shows its own ray's value.
 
     Nothing of the library is in the expectation: the photo is drawn by inverting the formula here, the expected image
@@ -132,35 +134,35 @@ def test_every_lens_is_undistorted_as_its_formula_says(model: str) -> None:
         return 127.5 + 60 * np.sin(9 * x + 2 * y) + 60 * np.cos(8 * y - 3 * x)
 
     def invert(pixels: np.ndarray) -> np.ndarray:
-        """Rays by Newton's steps with a difference quotient, from the centre on."""
+        """Return rays by Newton's method with difference quotients, starting at the centre."""
         rays = np.zeros(pixels.shape)
         for share in (0.25, 0.5, 0.75, *[1.0] * 6):
             target = centre + share * (pixels - centre)
             h = 1e-6
-            at = _put_by_hand(model, p, rays[..., 0], rays[..., 1])
-            dx = (_put_by_hand(model, p, rays[..., 0] + h, rays[..., 1]) - at) / h
-            dy = (_put_by_hand(model, p, rays[..., 0], rays[..., 1] + h) - at) / h
+            at = _project(model, p, rays[..., 0], rays[..., 1])
+            dx = (_project(model, p, rays[..., 0] + h, rays[..., 1]) - at) / h
+            dy = (_project(model, p, rays[..., 0], rays[..., 1] + h) - at) / h
             step = np.linalg.solve(np.stack([dx, dy], axis=-1), (target - at)[..., None])[..., 0]
             rays = rays + step
         return rays
 
     pixel_sizes = 3 if model.startswith(("SIMPLE", "RADIAL")) else 4
     p = [value / 2 if place < pixel_sizes else float(value) for place, value in enumerate(LENSES[model])]
-    centre = _put_by_hand(model, p, np.zeros(()), np.zeros(()))
+    centre = _project(model, p, np.zeros(()), np.zeros(()))
     pixels = np.stack(np.meshgrid(np.arange(200) + 0.5, np.arange(150) + 0.5), axis=-1)
     rays = invert(pixels)
-    np.testing.assert_allclose(_put_by_hand(model, p, rays[..., 0], rays[..., 1]), pixels, atol=1e-6)
+    np.testing.assert_allclose(_project(model, p, rays[..., 0], rays[..., 1]), pixels, atol=1e-6)
     picture = np.rint(pattern(rays[..., 0], rays[..., 1])).astype(np.uint8)
     photo = RegisteredImage("pattern", np.eye(4), make_lens(model, 200, 150, p))
     flat, camera = photo.fit(np.repeat(picture[..., None], 3, axis=2))
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     x, y = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
-    at = _put_by_hand(model, p, x, y)
+    at = _project(model, p, x, y)
     inside = ((at > 1) & (at < (199, 149))).all(axis=-1)
     assert inside.mean() > 0.9
     off = np.abs(flat[..., 0] - pattern(x, y))[inside]
-    assert off.mean() < 0.7  # rounding twice alone is 0.35 in the mean
-    assert off.max() < 5  # bilinear between pixels; half a pixel off would be 4 in the mean
+    assert off.mean() < 0.7  # two roundings alone give a mean of 0.35
+    assert off.max() < 5  # bilinear interpolation; an error of half a pixel would give a mean of 4
     mask = photo.fit_mask(picture > 127, 200, 150)
     sure = inside & (np.abs(pattern(x, y) - 127.5) > 12)
     np.testing.assert_array_equal(mask[sure], (pattern(x, y) > 127.5)[sure])
@@ -176,7 +178,7 @@ def test_every_lens_is_undistorted_as_its_formula_says(model: str) -> None:
 )
 @pytest.mark.parametrize("reduced", [1, 2])
 def test_mask_follows_the_photo(model: str, params: list[float], reduced: int) -> None:
-    """A mask that is a threshold of the photo is that threshold of the fitted photo, but along edges."""
+    """A mask that thresholds the photo also thresholds the fitted photo, except along edges."""
     import pycolmap
 
     photo = RegisteredImage("disc", np.eye(4), pycolmap.Camera(model=model, width=400, height=300, params=params))
@@ -194,7 +196,7 @@ def test_mask_follows_the_photo(model: str, params: list[float], reduced: int) -
 def test_mask_is_false_outside_the_photo() -> None:
     import pycolmap
 
-    # This lens leaves a sliver of the fitted image blank.
+    # This lens leaves a thin strip of the fitted image blank.
     params = [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]
     photo = RegisteredImage("sliver", np.eye(4), pycolmap.Camera(model="OPENCV", width=400, height=300, params=params))
     white, _ = photo.fit(np.full((300, 400, 3), 255, np.uint8))
@@ -246,7 +248,7 @@ def test_unusable_lens_is_refused(folder: Path, model: int, params: list[float],
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes]]:
-    """Bytes of the same model as COLMAP writes it today (with rigs and frames), by kind of file."""
+    """Return the bytes of one model as pycolmap writes it, with rigs and frames, by suffix of the files."""
     import pycolmap
 
     root = tmp_path_factory.mktemp("whole")
@@ -282,7 +284,7 @@ def test_every_truncation_is_refused(whole: dict[str, dict[str, bytes]], tmp_pat
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
-def test_lying_counts_are_refused(whole: dict[str, dict[str, bytes]], tmp_path: Path, name: str) -> None:
+def test_wrong_counts_are_refused(whole: dict[str, dict[str, bytes]], tmp_path: Path, name: str) -> None:
     content = whole[".bin"][name]
     count = struct.unpack_from("<Q", content)[0]
     for lie in (0, count - 1, count + 1, 1 << 40, (1 << 64) - 1):

@@ -1,4 +1,4 @@
-"""The procedural capture: exact geometry, true visibility, lively pictures, equal files for equal seeds."""
+"""The demo scene: exact geometry, correct visibility, varied photos, and equal files for equal seeds."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def scene(folder: Path) -> Scene:
 
 
 def _look(world: World, camera: Camera) -> tuple[Hits, np.ndarray]:
-    """What the camera sees through its pixels' centres, and the directions of the rays."""
+    """Return where the rays through the pixel centres end, and their directions."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     local = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
     direction = local.reshape(-1, 3) @ camera.rotation
@@ -57,7 +57,7 @@ def test_test_views_come_from_both_rings() -> None:
     assert len(heights) == 2
 
 
-def test_photos_are_what_the_world_looks_like(scene: Scene) -> None:
+def test_photos_are_those_of_the_world(scene: Scene) -> None:
     image = photograph(World(0), scene.cameras[3])
     np.testing.assert_allclose(scene.images[3] / 255.0, image, atol=0.5 / 255 + 1e-6)
 
@@ -79,15 +79,15 @@ def test_points_lie_on_the_surfaces(scene: Scene) -> None:
     on_ground = (np.abs(xyz[:, 2]) < 1e-4) & (np.linalg.norm(xyz[:, :2], axis=1) < GROUND_RADIUS)
     on_dome = np.abs(np.linalg.norm(xyz, axis=1) - DOME_RADIUS) < 1e-3
     assert 0.2 < on_ground.mean() < 0.5
-    assert 0.01 < on_dome.mean() < 0.3  # far ones are in few of so few views
+    assert 0.01 < on_dome.mean() < 0.3  # few of the views see the same distant points
     things = xyz[~on_ground & ~on_dome]
     assert np.linalg.norm(things[:, :2], axis=1).max() < 2
     assert things[:, 2].min() >= 0
     assert things[:, 2].max() <= 1.5 + 1e-5
 
 
-def test_tracks_are_true(folder: Path, scene: Scene) -> None:
-    """Each observation is the point's projection, and the world's first surface there is the point."""
+def test_tracks_are_correct(folder: Path, scene: Scene) -> None:
+    """Each observation is the point's projection, and the first surface along its ray is at the point."""
     import pycolmap
 
     world = World(0)
@@ -107,15 +107,15 @@ def test_tracks_are_true(folder: Path, scene: Scene) -> None:
         origin = np.broadcast_to(camera.position, offset.shape).astype(np.float32)
         hits = world.cast(origin, (offset / distance[:, None]).astype(np.float32))
         np.testing.assert_allclose(hits.distance, distance, atol=2e-3)
-        dull = hits.surface != SURFACES.index("ball")  # its highlight moves with the view
+        dull = hits.surface != SURFACES.index("ball")  # the ball's highlight moves with the view
         color = np.array([point.color for point in points])
         agree += int((np.abs(255 * hits.color - color).max(axis=1) < 8)[dull].sum())
         count += int(dull.sum())
-    assert agree > 0.97 * count  # not all: at an edge of paint or shadow float32 may fall to either side
+    assert agree > 0.97 * count  # at an edge of colour or shadow, float32 rounding may choose either side
 
 
-def test_hidden_points_are_not_seen() -> None:
-    """A point on the panel's front is seen from the front, from the back not, and not through the box."""
+def test_hidden_points_are_not_visible() -> None:
+    """A point on the panel's front is visible from the front, not from the back, and not through the box."""
     world, cameras = World(0), ring_cameras(100, 75, 40)
     panel = SURFACES.index("panel")
     for camera in cameras[:20]:
@@ -166,7 +166,7 @@ def test_equal_seeds_give_equal_files(folder: Path, tmp_path: Path) -> None:
     assert (other / "images/view_000.png").read_bytes() != (folder / "images/view_000.png").read_bytes()
 
 
-def test_refusals(tmp_path: Path) -> None:
+def test_used_folders_and_small_scenes_are_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     with pytest.raises(OutputError, match="not an empty folder"):
         write_capture(tmp_path)

@@ -1,4 +1,4 @@
-"""Cameras for other programs: written, read back by our readers and by COLMAP's, the same."""
+"""Cameras for other programs: our readers and COLMAP's read back what was written."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from clsplat.scenes.scene import load_scene, read_posed_images
 from clsplat.scenes.undistort import RegisteredImage, make_lens
 from clsplat.splats.splats import Splats
 
-# Lenses, and what they are written as: transforms.json knows a few forms only.
+# Parameters of lenses by COLMAP model; transforms.json supports only a few models.
 LENSES = {
     "SIMPLE_PINHOLE": [33.0, 18.5, 16.25],
     "PINHOLE": [33.0, 31.0, 18.5, 16.25],
@@ -46,12 +46,12 @@ def with_lens(garden: Path, model: str) -> PosedImages:
     return PosedImages(photos, posed.files, posed.points)
 
 
-def assert_same(ours: list[RegisteredImage], theirs: list[RegisteredImage]) -> None:
-    """Poses to 1e-9, and lenses by where they see points."""
+def assert_same(photos: list[RegisteredImage], expected: list[RegisteredImage]) -> None:
+    """Compare poses to 1e-9, and lenses by the pixels where they see points."""
     rng = np.random.default_rng(0)
     rays = np.column_stack([rng.uniform(-0.4, 0.4, (30, 2)), np.ones(30)])
-    assert [photo.name for photo in ours] == [photo.name for photo in theirs]
-    for one, other in zip(ours, theirs, strict=True):
+    assert [photo.name for photo in photos] == [photo.name for photo in expected]
+    for one, other in zip(photos, expected, strict=True):
         np.testing.assert_allclose(one.cam_from_world, other.cam_from_world, atol=1e-9)
         assert (one.lens.width, one.lens.height) == (other.lens.width, other.lens.height)
         np.testing.assert_allclose(one.lens.img_from_cam(rays), other.lens.img_from_cam(rays), atol=1e-9)
@@ -82,7 +82,7 @@ def test_transforms_come_back(garden: Path, model: str) -> None:
     np.testing.assert_array_equal(back.points.rgb, posed.points.rgb)
 
 
-def test_plain_lenses_are_written_as_such(garden: Path, tmp_path: Path) -> None:
+def test_undistorted_lenses_are_written_as_pinhole(garden: Path, tmp_path: Path) -> None:
     """3DGS reads PINHOLE only, and transforms.json is read as FULL_OPENCV."""
     posed = read_posed_images(garden, None)
     photos = [
@@ -113,9 +113,9 @@ def test_a_scene_is_written_and_trains_as_before(garden: Path, tmp_path: Path) -
         np.testing.assert_array_equal(one.image, two.image)
 
 
-def test_a_model_s_cameras_and_centres(tmp_path: Path, model_folder: Path) -> None:
+def test_cameras_and_splat_centres_of_a_model(tmp_path: Path, model_folder: Path) -> None:
     model = model_folder
-    said = clsplat("cameras", model, tmp_path / "sparse" / "0")
+    output = clsplat("cameras", model, tmp_path / "sparse" / "0")
     named, found = read_cameras(model / "cameras.json"), read_model(tmp_path / "sparse" / "0")
     assert sorted(f"{entry.name}.png" for entry in named) == [photo.name for photo in found.photos]
     poses = {f"{entry.name}.png": entry.camera for entry in named}
@@ -125,7 +125,7 @@ def test_a_model_s_cameras_and_centres(tmp_path: Path, model_folder: Path) -> No
     splats = Splats.load(sorted(model.glob("point_cloud/*_60/point_cloud.ply"))[-1])
     opaque = splats.mean[splats.opacity_logit >= 0]
     np.testing.assert_array_equal(found.points.xyz, opaque)
-    assert f"{len(opaque)} points" in said
+    assert f"{len(opaque)} points" in output
     clsplat("cameras", model, tmp_path / "cameras.json")
     for one, two in zip(read_cameras(tmp_path / "cameras.json"), named, strict=True):
         assert (one.name, one.camera.fx, one.camera.cy) == (two.name, two.camera.fx, two.camera.cy)
@@ -135,17 +135,17 @@ def test_a_model_s_cameras_and_centres(tmp_path: Path, model_folder: Path) -> No
     assert "3 cameras" in clsplat("cameras", tmp_path / "path.json", tmp_path / "t" / "transforms.json")
 
 
-def test_what_has_no_cameras_or_no_form_is_refused(garden: Path, tmp_path: Path, model_folder: Path) -> None:
+def test_missing_cameras_and_unsupported_lenses_are_refused(garden: Path, tmp_path: Path, model_folder: Path) -> None:
     ply = sorted(model_folder.glob("point_cloud/*/point_cloud.ply"))[0]
     assert "has no cameras" in error_of("cameras", ply, tmp_path / "out.json")
     posed = with_lens(garden, "RADIAL")
     write_colmap(garden / "sparse" / "0", posed.photos, posed.points)
     assert "does not support distorted lenses" in error_of("cameras", garden, tmp_path / "cameras.json")
     photo = RegisteredImage("a.png", np.eye(4), make_lens("FOV", 40, 30, [33.0, 31.0, 18.5, 16.25, 0.9]))
-    with pytest.raises(Exception, match="no lens of COLMAP's model FOV"):
+    with pytest.raises(Exception, match="not support COLMAP's lens model FOV"):
         write_transforms(tmp_path / "t.json", [photo], ["a.png"], posed.points)
     six = make_lens("FULL_OPENCV", 40, 30, [33.0, 31.0, 18.5, 16.25, 0, 0, 0, 0, 0, 0.1, 0, 0])
-    with pytest.raises(Exception, match="no k4, k5 and k6"):
+    with pytest.raises(Exception, match="not support k4, k5 and k6"):
         write_transforms(tmp_path / "t.json", [RegisteredImage("a.png", np.eye(4), six)], ["a.png"], posed.points)
     assert not (tmp_path / "t.json").exists()
     assert relative_files([garden / "images" / "a.png"], garden / "out") == ["../images/a.png"]

@@ -1,4 +1,4 @@
-"""`clsplat info` of scenes: what is there, what is not, and nothing decoded."""
+"""`clsplat info` of scenes: contents and missing parts, without decoding a photo."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_scene_is_counted_without_decoding(tmp_path: Path, monkeypatch: pytest
     assert (found.unregistered, found.unreadable) == ((), ())
 
 
-def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+def test_faults_are_named(tmp_path: Path) -> None:
     garden = write_garden(tmp_path)
     write_png(garden / "images" / "more" / "late.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     (garden / "images" / NAMES[2]).write_bytes(b"no image")
@@ -46,9 +46,9 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     assert found.unreadable == (NAMES[2],)
     assert found.sizes == (((WIDTH, HEIGHT), 7), ((2 * WIDTH, 2 * HEIGHT), 1))
     assert found.masked == 1
-    said = clsplat("info", garden)
+    output = clsplat("info", garden)
     for text in (f"unreadable      1 ({NAMES[2]})", "without a pose  1 (more/late.png)", "masks           of 1 photos"):
-        assert text in said
+        assert text in output
     entry = json.loads(clsplat("info", "--json", garden))
     assert entry["scene"] == str(garden)
     assert entry["sizes"][1] == {"width": 2 * WIDTH, "height": 2 * HEIGHT, "photos": 1}
@@ -68,12 +68,12 @@ def test_transforms_with_distortion(tmp_path: Path) -> None:
     assert found.kind == "transforms.json"
     assert found.track_mean == 0
     for path in (tmp_path, file):
-        said = clsplat("info", path)
-        assert "FULL_OPENCV, 40x30 px, focal length 40.0 px (53 degrees across): 2 photos, undistorted" in said
-        assert "points          0\n" in said
+        output = clsplat("info", path)
+        assert "FULL_OPENCV, 40x30 px, focal length 40.0 px (53 degrees across): 2 photos, undistorted" in output
+        assert "points          0\n" in output
 
 
-def test_a_reconstructed_scene_says_how_it_went(tmp_path: Path) -> None:
+def test_a_reconstructed_scene_shows_its_record(tmp_path: Path) -> None:
     garden = write_garden(tmp_path)
     record = garden / "reconstruct.json"
     record.write_text('{"photos": 12, "registered": 9, "error": 0.254}')
@@ -90,16 +90,16 @@ def test_a_lens_without_a_focal_length_is_named(tmp_path: Path) -> None:
     file = garden / "sparse" / "0" / "cameras.bin"
     data = bytearray(file.read_bytes())
     for focal in (0.0, float("nan")):
-        data[32:40] = np.float64(focal).tobytes()  # behind the count, id, model, width and height
+        data[32:40] = np.float64(focal).tobytes()  # after the count, id, model, width and height
         file.write_bytes(data)
         assert "has a focal length of" in error_of("info", garden)
 
 
-def test_models_and_scenes_are_told_apart(tmp_path: Path, capture_folder: Path, model_folder: Path) -> None:
+def test_models_and_scenes_are_distinguished(tmp_path: Path, capture_folder: Path, model_folder: Path) -> None:
     model, scene = model_folder, capture_folder
-    said = clsplat("info", model, scene)
-    assert "400 splats" in said
-    assert "10 photos with poses" in said
+    output = clsplat("info", model, scene)
+    assert "400 splats" in output
+    assert "10 photos with poses" in output
     kinds = [next(iter(json.loads(line))) for line in clsplat("info", "--json", model, scene).splitlines()]
     assert kinds == ["model", "scene"]
     assert "neither a model (point_cloud/) nor a scene" in error_of("info", tmp_path)

@@ -1,4 +1,4 @@
-"""Masks: where they are found, how they follow their photos, and that what they hide teaches nothing."""
+"""Masks: where they are found, how they follow their photos, and that hidden pixels do not affect training."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def left_half(width: int = WIDTH, height: int = HEIGHT) -> NDArray[np.bool_]:
-    """Counts on the left."""
+    """Return a mask whose left half counts."""
     return np.broadcast_to(np.arange(width) < width // 2, (height, width))
 
 
@@ -56,7 +56,7 @@ def test_masks_in_folders_of_photos(tmp_path: Path) -> None:
 
 
 def test_masks_follow_the_size_of_the_photos(folder: Path) -> None:
-    """A mask of twice the photo's size, and a photo at half its size."""
+    """The mask has twice the photo's size, and the photo is read at half its size."""
     write_mask(folder / "masks" / f"{NAMES[0]}.png", left_half(2 * WIDTH, 2 * HEIGHT))
     for resolution, size in ((1, (WIDTH, HEIGHT)), (2, (WIDTH // 2, HEIGHT // 2))):
         view = load_scene(folder, resolution=resolution).views[0]
@@ -64,7 +64,7 @@ def test_masks_follow_the_size_of_the_photos(folder: Path) -> None:
         np.testing.assert_array_equal(view.mask, left_half(*size))
 
 
-def test_grey_is_a_choice_of_black_or_white(tmp_path: Path) -> None:
+def test_grey_becomes_black_or_white(tmp_path: Path) -> None:
     write_png(tmp_path / "grey.png", np.array([[0, 127, 128, 255]], np.uint8))
     np.testing.assert_array_equal(read_mask(tmp_path / "grey.png"), [[False, False, True, True]])
 
@@ -75,10 +75,12 @@ def test_nearest_pixel() -> None:
     np.testing.assert_array_equal(resize_mask(mask, 2, 1), [[False, True]])
 
 
-def test_a_mask_of_white_is_none_and_one_of_black_leaves_the_photo_out(folder: Path) -> None:
+def test_a_white_mask_is_dropped_and_a_black_mask_leaves_the_photo_out(folder: Path) -> None:
     write_mask(folder / "masks" / f"{NAMES[0]}.png", np.ones((HEIGHT, WIDTH), bool))
     write_mask(folder / "masks" / f"{NAMES[1]}.png", np.zeros((HEIGHT, WIDTH), bool))
-    with pytest.warns(UserWarning, match=rf"1 of {N_VIEWS} photos are left out: .*{NAMES[1]}: its mask hides all"):
+    with pytest.warns(
+        UserWarning, match=rf"1 of {N_VIEWS} photos are left out: .*{NAMES[1]}: its mask hides every pixel"
+    ):
         scene = load_scene(folder)
     assert NAMES[1] not in scene.names
     assert scene.views[0].mask is None
@@ -121,7 +123,7 @@ def test_transparency_as_background_or_mask(folder: Path) -> None:
 
 
 def test_mask_path_of_a_frame(tmp_path: Path) -> None:
-    """nerfstudio's key."""
+    """`mask_path` is nerfstudio's key."""
     write_png(tmp_path / "a.png", photo_of(0))
     write_mask(tmp_path / "hidden" / "whatever.png", left_half())
     frame = {"file_path": "a.png", "mask_path": "hidden/whatever.png", "transform_matrix": np.eye(4).tolist()}
@@ -131,7 +133,7 @@ def test_mask_path_of_a_frame(tmp_path: Path) -> None:
     assert view.mask is not None
     np.testing.assert_array_equal(view.mask, left_half())
     bad = {"nowhere.png": "nowhere.png: no such image file", 3: "mask_path 3 is not the name of a file"}
-    for named, complaint in bad.items():
-        (tmp_path / "transforms.json").write_text(json.dumps(document | {"frames": [frame | {"mask_path": named}]}))
-        with pytest.raises(InputError, match=complaint):
+    for mask_path, message in bad.items():
+        (tmp_path / "transforms.json").write_text(json.dumps(document | {"frames": [frame | {"mask_path": mask_path}]}))
+        with pytest.raises(InputError, match=message):
             load_scene(tmp_path, eval=False)

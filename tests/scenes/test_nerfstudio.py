@@ -1,4 +1,4 @@
-"""transforms.json of NeRF, instant-ngp and nerfstudio: poses, lenses, splits, points, and what is refused."""
+"""transforms.json of NeRF, instant-ngp and nerfstudio: poses, lenses, splits, points, and refused files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Values = dict[str, Any]
 
 
 def opengl(pose: np.ndarray) -> list[list[float]]:
-    """Camera-to-world with y up and z backwards, of a world-to-camera pose."""
+    """Return a world-to-camera pose as camera-to-world with y up and z backwards."""
     return (np.linalg.inv(pose) @ FLIP).tolist()
 
 
@@ -58,16 +58,16 @@ def test_poses_and_lens_are_those_of_colmap(folder: Path, tmp_path: Path) -> Non
     scene, other = load_scene(folder), load_scene(write_garden(tmp_path / "other"))
     assert scene.names == [f"images/{name}" for name in other.names]
     assert scene.name == "garden"
-    for ours, theirs in zip(scene.views, other.views, strict=True):
-        np.testing.assert_allclose(ours.camera.cam_from_world, theirs.camera.cam_from_world, atol=1e-12)
-        assert vars(ours.camera).keys() == vars(theirs.camera).keys()
-        assert (ours.camera.fx, ours.camera.fy, ours.camera.cx, ours.camera.cy) == (FX, FY, CX, CY)
-        np.testing.assert_array_equal(ours.image, theirs.image)
+    for actual, expected in zip(scene.views, other.views, strict=True):
+        np.testing.assert_allclose(actual.camera.cam_from_world, expected.camera.cam_from_world, atol=1e-12)
+        assert vars(actual.camera).keys() == vars(expected.camera).keys()
+        assert (actual.camera.fx, actual.camera.fy, actual.camera.cx, actual.camera.cy) == (FX, FY, CX, CY)
+        np.testing.assert_array_equal(actual.image, expected.image)
     assert scene.test_names == {f"images/{NAMES[0]}", f"images/{NAMES[8]}"}, "every 8th"
     assert len(scene.points) == 0
 
 
-def test_file_may_be_named_and_comes_after_colmap(folder: Path, tmp_path: Path) -> None:
+def test_a_file_can_be_named_and_a_folder_prefers_colmap(folder: Path, tmp_path: Path) -> None:
     both = write_garden(tmp_path / "other")
     file = write(both, LENS | {"frames": frames()[:4]})
     assert len(load_scene(both).views) == len(NAMES), "COLMAP's"
@@ -75,10 +75,10 @@ def test_file_may_be_named_and_comes_after_colmap(folder: Path, tmp_path: Path) 
     assert (named.name, len(named.views), named.path) == ("garden", 4, file)
 
 
-def test_own_lens_of_a_frame_comes_first(folder: Path) -> None:
-    own = frames()
-    own[2] |= {"fl_x": 50.0, "fl_y": 60.0, "cx": 10.0, "cy": 11.0}
-    views = load_scene(write(folder, LENS | {"frames": own})).views
+def test_the_lens_of_a_frame_takes_precedence(folder: Path) -> None:
+    changed_frames = frames()
+    changed_frames[2] |= {"fl_x": 50.0, "fl_y": 60.0, "cx": 10.0, "cy": 11.0}
+    views = load_scene(write(folder, LENS | {"frames": changed_frames})).views
     assert (views[2].camera.fx, views[2].camera.fy, views[2].camera.cx, views[2].camera.cy) == (50, 60, 10, 11)
     assert views[3].camera.fx == FX
 
@@ -91,8 +91,8 @@ def test_lens_is_scaled_to_reduced_photos(folder: Path) -> None:
     assert (camera.width, camera.height, camera.fx, camera.cx) == (WIDTH // 2, HEIGHT // 2, FX / 2, CX / 2)
 
 
-def test_distortion_is_undistorted(folder: Path) -> None:
-    """As the same lens of a COLMAP model is."""
+def test_photos_are_undistorted(folder: Path) -> None:
+    """The result is that of the same lens in a COLMAP model."""
     import pycolmap
 
     from clsplat.scenes.undistort import RegisteredImage
@@ -107,14 +107,14 @@ def test_distortion_is_undistorted(folder: Path) -> None:
 
 
 def blender_set(folder: Path) -> Path:
-    """Transparent photos in train/ and test/, one angle of view, no suffixes and no sizes."""
+    """Write transparent photos in train/ and test/, with one angle of view and without suffixes and sizes."""
     photo = np.zeros((8, 12, 4), np.uint8)
     photo[:, :6] = (200, 100, 0, 128)
     for name, every in (("train", 1), ("test", 3)):
         chosen = model_views()[::every]
         for view in chosen:
             write_png(folder / name / f"{view.name[:-4]}.png", photo)
-        own = [
+        entries = [
             {
                 "file_path": f"./{name}/{view.name[:-4]}",
                 "rotation": 0.1,
@@ -122,7 +122,7 @@ def blender_set(folder: Path) -> Path:
             }
             for view in chosen
         ]
-        write(folder, {"camera_angle_x": 0.7, "frames": own}, f"transforms_{name}.json")
+        write(folder, {"camera_angle_x": 0.7, "frames": entries}, f"transforms_{name}.json")
     return folder
 
 
@@ -169,7 +169,7 @@ def test_points_of_a_ply(folder: Path) -> None:
     np.testing.assert_array_equal(points.rgb, rgb)
 
 
-def test_points_of_the_model_behind_the_poses_move_along(folder: Path, tmp_path: Path) -> None:
+def test_points_of_the_model_behind_the_poses_are_transformed(folder: Path, tmp_path: Path) -> None:
     shutil.move(write_garden(tmp_path / "other") / "sparse", folder / "colmap" / "sparse")
     moved = [[0, 1, 0, 1], [-1, 0, 0, 2], [0, 0, 1, 3]]
     write(folder, LENS | {"applied_transform": moved, "applied_scale": 0.5, "frames": frames()})
@@ -177,12 +177,14 @@ def test_points_of_the_model_behind_the_poses_move_along(folder: Path, tmp_path:
     np.testing.assert_allclose(load_scene(folder).points.xyz, 0.5 * (xyz @ matrix[:, :3].T + matrix[:, 3]), atol=1e-12)
 
 
-def test_absent_photos_are_named_and_left_out(folder: Path) -> None:
+def test_missing_photos_are_named_and_left_out(folder: Path) -> None:
     (folder / "images" / NAMES[3]).unlink()
     write(folder, LENS | {"frames": frames()})
-    with pytest.warns(UserWarning, match=rf"1 of 9 frames name photos that are not there, such as 'images/{NAMES[3]}'"):
+    with pytest.warns(
+        UserWarning, match=rf"1 of 9 frames name photos that do not exist, for example 'images/{NAMES[3]}'"
+    ):
         assert len(load_scene(folder).views) == 8
-    with pytest.raises(InputError, match="none of its 9 photos is there"):
+    with pytest.raises(InputError, match="none of its 9 photos exists"):
         load_scene(write(folder, LENS | {"frames": frames("nowhere/")}))
 
 
@@ -195,7 +197,7 @@ def in_frame(**values: Any) -> Callable[[Values], Values]:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (changed(frames=[]), "has no list 'frames'"),
         (changed(frames=[3]), "frame 0: has no file_path"),
@@ -219,9 +221,9 @@ def in_frame(**values: Any) -> Callable[[Values], Values]:
         (in_frame(cx=float("nan")), "frame 1: cx is 'nan'"),
     ],
 )
-def test_faults_are_named(folder: Path, change: Callable[[Values], Values], said: str) -> None:
+def test_errors_name_frame_and_key(folder: Path, change: Callable[[Values], Values], message: str) -> None:
     file = write(folder, change(LENS | {"frames": frames()}))
-    with pytest.raises(InputError, match=said) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         load_scene(folder)
     assert str(caught.value).startswith(str(file.parent))
     assert "\n" not in str(caught.value)
@@ -238,18 +240,18 @@ def test_damaged_files_are_named(folder: Path, text: str) -> None:
 @pytest.mark.data
 def test_fox_has_the_cameras_of_its_colmap_model() -> None:
     folder = scene_folder("fox")
-    ours, theirs = load_scene(folder / "transforms.json", resolution=4), load_scene(folder, resolution=4)
-    assert [Path(name).name for name in ours.names] == theirs.names
-    for own, other in zip(ours.views, theirs.views, strict=True):
-        np.testing.assert_allclose(own.camera.cam_from_world, other.camera.cam_from_world, atol=1e-9)
-        assert own.camera.fx == pytest.approx(other.camera.fx)
-        np.testing.assert_array_equal(own.image, other.image)
-    order = [np.lexsort(points.xyz.astype(np.float32).T) for points in (ours.points, theirs.points)]
-    np.testing.assert_allclose(ours.points.xyz[order[0]], theirs.points.xyz[order[1]], atol=1e-4)
+    actual, expected = load_scene(folder / "transforms.json", resolution=4), load_scene(folder, resolution=4)
+    assert [Path(name).name for name in actual.names] == expected.names
+    for view, other in zip(actual.views, expected.views, strict=True):
+        np.testing.assert_allclose(view.camera.cam_from_world, other.camera.cam_from_world, atol=1e-9)
+        assert view.camera.fx == pytest.approx(other.camera.fx)
+        np.testing.assert_array_equal(view.image, other.image)
+    order = [np.lexsort(points.xyz.astype(np.float32).T) for points in (actual.points, expected.points)]
+    np.testing.assert_allclose(actual.points.xyz[order[0]], expected.points.xyz[order[1]], atol=1e-4)
 
 
 @pytest.mark.data
-def test_instant_ngp_fox_skips_absent_photos() -> None:
+def test_instant_ngp_fox_skips_missing_photos() -> None:
     with pytest.warns(UserWarning, match="17 of 67 frames"):
         scene = load_scene(scene_folder("fox") / "ngp", resolution=4)
     assert len(scene.views) == 50
@@ -257,7 +259,7 @@ def test_instant_ngp_fox_skips_absent_photos() -> None:
 
 
 @pytest.mark.data
-def test_lego_has_its_own_split() -> None:
+def test_lego_has_test_views_in_its_files() -> None:
     scene = load_scene(scene_folder("lego"), resolution=4, background=(1.0, 1.0, 1.0))
     assert (len(scene.train), len(scene.test)) == (100, 25)
     assert scene.views[0].image[0, 0].tolist() == [255, 255, 255]
@@ -272,8 +274,8 @@ ANYTHING = st.recursive(
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_fuzz_succeeds_or_says_why(folder: Path, data: st.DataObject) -> None:
-    """Any value of the file, at any depth, replaced by anything: a scene, or one line that names the file."""
+def test_random_values_are_read_or_refused_with_one_line(folder: Path, data: st.DataObject) -> None:
+    """Values of the file, at any depth, are replaced by random values. The error is one line that names the file."""
     whole = LENS | {
         "k1": 0.0,
         "camera_model": "OPENCV",
@@ -297,16 +299,16 @@ def test_fuzz_succeeds_or_says_why(folder: Path, data: st.DataObject) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            said = f"{len(read_transforms([file]).photos)} photos"
+            message = f"{len(read_transforms([file]).photos)} photos"
         except InputError as error:
-            said = str(error).removeprefix(str(folder))
-    assert said.endswith(" photos") or said.startswith("/"), "the file is named"
-    assert "\n" not in said
+            message = str(error).removeprefix(str(folder))
+    assert message.endswith(" photos") or message.startswith("/"), "the file is named"
+    assert "\n" not in message
 
 
 @pytest.mark.parametrize("name", ["/", "..", "é" * 200, "é" * 200 + "/a.png", "a/" * 1500 + "b", "a\0b", "\ud800"])
 @pytest.mark.parametrize("key", ["file_path", "ply_file_path"])
-def test_what_no_file_can_be_called_is_refused(tmp_path: Path, key: str, name: str) -> None:
+def test_impossible_file_names_are_refused(tmp_path: Path, key: str, name: str) -> None:
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
     write_png(tmp_path / "a.png", np.zeros((4, 6, 3)))
     values = {"fl_x": 5, "frames": [frame]}
@@ -316,8 +318,8 @@ def test_what_no_file_can_be_called_is_refused(tmp_path: Path, key: str, name: s
         load_scene(tmp_path)
 
 
-def test_names_lead_out_of_no_folder(tmp_path: Path) -> None:
-    """Renders are written under the names of their views."""
+def test_names_do_not_lead_out_of_the_folder(tmp_path: Path) -> None:
+    """Renders are written under the names of their views, so that such a name could overwrite other files."""
     scene = tmp_path / "scene"
     scene.mkdir()
     frames = []

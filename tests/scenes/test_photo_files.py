@@ -1,4 +1,4 @@
-"""Photographs without poses: what is found, how it is read, and what is refused."""
+"""Photos without poses: which files are found, how they are read, and which are refused."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def staged(tmp_path: Path, photo: PhotoFile) -> StagedPhoto | str:
 # --- finding -------------------------------------------------------------------------------
 
 
-def test_photos_are_found_below_but_not_hidden_ones_or_masks(tmp_path: Path) -> None:
+def test_photos_are_found_in_subfolders_without_hidden_files_and_masks(tmp_path: Path) -> None:
     for name in ("b.JPG", "a.png", "day/2.tif", "day/1.jpg", ".hidden/x.png", ".y.png", "masks/a.png"):
         put(tmp_path / name)
     (tmp_path / "notes.txt").write_text("no photo")
@@ -72,7 +72,7 @@ def test_images_folder_and_its_masks(tmp_path: Path) -> None:
     assert not is_photographs(tmp_path)
 
 
-def test_scene_names_stay_apart(tmp_path: Path) -> None:
+def test_scene_names_stay_unique(tmp_path: Path) -> None:
     for name in ("a.png", "a.tif", "a.bmp", "b.webp"):
         put(tmp_path / name)
     assert sorted(photo.name for photo in find_photos(tmp_path)) == ["a.bmp.png", "a.png", "a.tif.png", "b.png"]
@@ -90,7 +90,7 @@ def test_folders_without_photos(tmp_path: Path) -> None:
     assert not is_photographs(tmp_path)
 
 
-def test_names_that_no_model_can_hold(tmp_path: Path) -> None:
+def test_names_that_a_model_cannot_store(tmp_path: Path) -> None:
     try:
         (tmp_path / os.fsdecode(b"\xff.png")).write_bytes(b"")
     except OSError:
@@ -121,7 +121,7 @@ def test_fingerprint_follows_every_change(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_photos_are_turned_upright(tmp_path: Path, orientation: int) -> None:
-    """The stored image is the upright one turned back as EXIF's table of orientations says."""
+    """The stored image is the upright image, turned back by EXIF's table of orientations."""
     back = {
         1: lambda a: a,
         2: lambda a: a[:, ::-1],
@@ -142,7 +142,7 @@ def test_photos_are_turned_upright(tmp_path: Path, orientation: int) -> None:
         assert (image.size, image.getexif().get(ORIENTATION, 1), image.getexif()[MODEL]) == ((20, 12), 1, "Phone")
 
 
-def test_plain_photos_are_not_written_anew(tmp_path: Path) -> None:
+def test_plain_photos_are_linked(tmp_path: Path) -> None:
     file = put(tmp_path / "a.jpg", quality=50)
     ready = staged(tmp_path, PhotoFile("a.jpg", file))
     assert isinstance(ready, StagedPhoto)
@@ -150,7 +150,7 @@ def test_plain_photos_are_not_written_anew(tmp_path: Path) -> None:
 
 
 def png16(pixels: np.ndarray) -> bytes:
-    """A 16-bit PNG of (H, W, 1 to 4), which Pillow does not write in colour."""
+    """Return a 16-bit PNG of (H, W, 1 to 4); Pillow does not write such PNG in colour."""
     height, width, channels = pixels.shape
     lines = b"".join(b"\0" + line.astype(">u2").tobytes() for line in pixels)
     header = struct.pack(">IIBBBBB", width, height, 16, (0, 4, 2, 6)[channels - 1], 0, 0, 0)

@@ -1,4 +1,4 @@
-"""Made-up scenes: the same bits for the same arguments, and about the same work a pixel at every count."""
+"""Random scenes: the same arguments give the same bits, and the work per pixel hardly depends on the count."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clsplat.splats.shapes import SHAPES
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_every_shape_has_splats_off_its_neutral_values(shape: str) -> None:
+def test_splats_of_every_shape_differ_from_neutral_values(shape: str) -> None:
     scene, splats = synthetic_scene(300, 40, 30, shape, sh_degree=1, n_views=3)
     assert (splats.shape, len(splats), splats.sh_degree) == (shape, 300, 1)
     for field in SHAPES[shape].fields:
@@ -37,8 +37,8 @@ def test_equal_arguments_give_equal_bits() -> None:
     assert (another.mean != splats.mean).any()
 
 
-def test_useful_pairs_a_pixel_stay_the_same(devices: list[Device]) -> None:
-    """Four times the splats: within a quarter, as chance and the cutoff's mix differ."""
+def test_useful_pairs_per_pixel_stay_the_same(devices: list[Device]) -> None:
+    """With four times the splats, pairs per pixel stay within a quarter; chance and the cutoff cause the rest."""
     device = devices[0]
     kernels = KernelBuild("gaussian", 0, default_schedule(device.info))
     pipeline, pairs = Pipeline(device, kernels), []
@@ -50,6 +50,6 @@ def test_useful_pairs_a_pixel_stay_the_same(devices: list[Device]) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"n": 0}, {"width": 15}, {"height": 15}, {"n_views": 1}])
-def test_what_cannot_be(wrong: dict[str, int]) -> None:
+def test_impossible_scenes_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(InputError, match="at least 1 splat, 16x16 px and 2 views"):
         synthetic_scene(**{"n": 10, **wrong})

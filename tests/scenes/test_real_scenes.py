@@ -1,4 +1,4 @@
-"""Shapes and published systems learn a real scene; minutes, so only with `-m slow`, and only where the scenes are."""
+"""Training on a real scene, for shapes and published systems. It takes minutes and needs `-m slow` and the scenes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from clsplat.training.presets import PRESETS, preset
 pytestmark = [pytest.mark.slow, pytest.mark.data]
 
 
-def check_learnt(scene: Scene, config: clsplat.TrainConfig, gain_db: float) -> None:
-    """Train; the cap holds, all is finite, and unseen views are far better than the mean colour."""
+def check_training(scene: Scene, config: clsplat.TrainConfig, gain_db: float) -> None:
+    """Train and check that the cap holds, values are finite, and test views are far better than the mean colour."""
     model = clsplat.train(scene, config)
     assert 0 < len(model.splats) <= config.cap_max
     assert all(np.isfinite(array).all() for array in model.splats.to_numpy().values())
@@ -26,12 +26,12 @@ def check_learnt(scene: Scene, config: clsplat.TrainConfig, gain_db: float) -> N
 
 
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal", "generalised-exponential"])
-def test_kitchen_is_learnt(shape: str) -> None:
+def test_training_on_kitchen(shape: str) -> None:
     scene = clsplat.load_scene(scene_folder("kitchen"))
-    check_learnt(scene, clsplat.TrainConfig(shape=shape, iterations=300, cap_max=4000), 3.0)
+    check_training(scene, clsplat.TrainConfig(shape=shape, iterations=300, cap_max=4000), 3.0)
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_published_system_learns(name: str) -> None:
     scene = clsplat.load_scene(scene_folder("fox"), resolution=4)
-    check_learnt(scene, clsplat.TrainConfig(**preset(name) | {"iterations": 200, "cap_max": 2000}), 3.0)
+    check_training(scene, clsplat.TrainConfig(**preset(name) | {"iterations": 200, "cap_max": 2000}), 3.0)

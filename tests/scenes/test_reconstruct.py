@@ -1,4 +1,4 @@
-"""Photographs become a scene: the right poses, whole scenes or none, and messages for what does not work."""
+"""Reconstruction from photos: correct poses, complete scenes or none, and one-line errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _kept: dict[str, Path] = {}
 
 @pytest.fixture
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Photos, one hidden in part by a mask; made once, read only."""
+    """Photos, one of them with a mask; made once, read only."""
     if "walk" not in _kept:
         folder = photo_walk.write_walk(tmp_path_factory.mktemp("photos") / "walk")
         hidden = np.full((photo_walk.HEIGHT, photo_walk.WIDTH), 255, np.uint8)
@@ -60,9 +60,9 @@ def scene(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def aligned_error(scene: Scene) -> tuple[float, float]:
-    """Largest error of the camera centres [share of their spread] and of the viewing directions [degrees].
+    """Return the largest errors of camera centres [share of their spread] and viewing directions [degrees].
 
-    After the similarity that brings the centres onto the true ones (Umeyama 1991).
+    Errors are measured after the similarity transform that aligns the centres with the true ones (Umeyama 1991).
     """
     poses = np.array([photo_walk.cam_from_world(int(name[5:7])) for name in scene.names])
     true = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
@@ -93,8 +93,8 @@ def test_poses_are_the_true_ones(scene: Path) -> None:
     assert len({view.camera.fx for view in loaded.views}) == 1, "photos of one size share a lens"
 
 
-def test_points_lie_where_their_photos_see_them(scene: Path) -> None:
-    """The written observations, projected by hand."""
+def test_points_project_to_their_observations(scene: Path) -> None:
+    """The test projects the points with NumPy and compares the written observations."""
     import pycolmap
 
     model = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
@@ -114,7 +114,7 @@ def test_points_lie_where_their_photos_see_them(scene: Path) -> None:
     assert record["points"] == model.num_points3D()
 
 
-def test_mask_goes_along(scene: Path) -> None:
+def test_the_mask_is_undistorted_with_its_photo(scene: Path) -> None:
     mask = np.array(Image.open(scene / "masks" / "walk_03.png.png"))
     assert mask[10:-10, 10:70].max() == 0
     assert mask[10:-10, 90:-10].min() == 255
@@ -125,7 +125,7 @@ def test_mask_goes_along(scene: Path) -> None:
     assert len(points.points) > 0
 
 
-def test_a_scene_is_not_replaced_unasked(scene: Path, walk: Path, tmp_path: Path) -> None:
+def test_a_scene_is_not_replaced_without_overwrite(scene: Path, walk: Path, tmp_path: Path) -> None:
     assert "already holds a scene: use --overwrite" in error_of("reconstruct", walk, "-o", scene)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "work.txt").write_text("hours")
@@ -135,8 +135,8 @@ def test_a_scene_is_not_replaced_unasked(scene: Path, walk: Path, tmp_path: Path
     assert is_made_from(tmp_path, walk) is None
 
 
-def test_training_on_photographs_uses_the_scene_again(scene: Path, walk: Path, tmp_path: Path) -> None:
-    """The scene lies beside the model; other photos are not taken for it."""
+def test_training_on_photos_reuses_the_scene(scene: Path, walk: Path, tmp_path: Path) -> None:
+    """The scene lies beside the model, and is not used for other photos."""
     (tmp_path / "walk-scene").symlink_to(scene)
     options = ("--eval", "--iterations", 10, "--cap-max", 300, "--sh-degree", 0)
     result = run("train", walk, "-m", tmp_path / "model", *options)
@@ -166,8 +166,8 @@ def test_photos_that_do_not_fit_together(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["noise"]
 
 
-def test_a_crash_of_the_library_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A child that dies by a signal, and one that ends without a result."""
+def test_a_crash_of_pycolmap_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One child process dies by a signal, another ends without a result."""
     photo_walk.write_walk(tmp_path / "walk", 3)
     start = subprocess.Popen
     programs = {
@@ -184,7 +184,7 @@ def test_a_crash_of_the_library_is_one_line(tmp_path: Path, monkeypatch: pytest.
         assert [entry.name for entry in tmp_path.iterdir()] == ["walk"]
 
 
-def test_what_a_killed_run_left_goes_and_another_run_is_kept_out(tmp_path: Path) -> None:
+def test_leftovers_of_a_killed_run_are_removed_and_a_second_run_is_refused(tmp_path: Path) -> None:
     left = tmp_path / ".scene.unfinished"
     (left / "photos").mkdir(parents=True)
     (left / "database.db").write_bytes(b"half")
@@ -214,7 +214,7 @@ def test_ctrl_c_leaves_nothing(walk: Path, tmp_path: Path) -> None:
         [sys.executable, "-c", program, "reconstruct", walk, "-o", tmp_path / "scene"],
         stderr=subprocess.PIPE,
         text=True,
-        # Shells have their background jobs ignore it, and these what they start.
+        # Shells make background jobs ignore SIGINT, and child processes inherit this.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
@@ -246,7 +246,7 @@ def test_pairs_of_a_sequence() -> None:
     assert len(pairs) < 0.4 * 99 * 50
 
 
-def test_warnings_of_photos_that_are_not_placed(tmp_path: Path) -> None:
+def test_warnings_about_photos_without_a_pose(tmp_path: Path) -> None:
     from clsplat.files.images import PhotoHeader
     from clsplat.scenes.reconstruct.photo_files import StagedPhoto
 
@@ -276,7 +276,7 @@ def test_options(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_fisheye_photos_become_pinhole_images(tmp_path: Path) -> None:
-    """Drawn with an equidistant lens: poses, focal length and, by them, the undistorted images come out right."""
+    """Photos drawn with an equidistant lens give correct poses, focal length and undistorted images."""
     photo_walk.write_walk(tmp_path / "walk", fisheye=True)
     clsplat("reconstruct", tmp_path / "walk", "-o", tmp_path / "scene", "--camera-model", "OPENCV_FISHEYE")
     scene = load_scene(tmp_path / "scene", eval=False)
@@ -289,7 +289,7 @@ def test_fisheye_photos_become_pinhole_images(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_same_photos_same_model_and_a_video(walk: Path, tmp_path: Path) -> None:
-    """Bit for bit the same twice, from the API; and from a video of the photos."""
+    """Two runs in Python give the same bits, and a video of the photos gives a scene too."""
     steps: list[Step] = []
     files = []
     for name in ("a", "b"):

@@ -1,4 +1,4 @@
-"""COLMAP models and scenes: what is read, how it is split and sized, and what is refused."""
+"""COLMAP models and scenes: reading, split, image sizes, and refused files."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _message(error: pytest.ExceptionInfo[InputError]) -> str:
 # --- reading -------------------------------------------------------------------------------
 
 
-def test_scene_holds_what_was_written(folder: Path) -> None:
+def test_scene_contains_what_was_written(folder: Path) -> None:
     scene = load_scene(folder)
     xyz, rgb = cloud()
     assert scene.name == "garden"
@@ -95,7 +95,7 @@ def test_model_directly_in_sparse(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
-def test_missing_points_give_an_emptycloud(folder: Path, suffix: str) -> None:
+def test_missing_points_give_an_empty_cloud(folder: Path, suffix: str) -> None:
     model = folder / "sparse" / "0"
     if suffix == ".txt":
         as_text(model, folder / "sparse" / "t")
@@ -153,7 +153,7 @@ def test_split_by_list(folder: Path, tmp_path: Path) -> None:
         load_scene(folder, test_list=tmp_path / "absent.txt")
 
 
-def test_extent_is_of_the_training_cameras(folder: Path) -> None:
+def test_extent_is_that_of_the_training_cameras(folder: Path) -> None:
     scene = load_scene(folder)
     centres = np.array([camera.position for camera in scene.cameras[1:8]])
     farthest = max(np.linalg.norm(centre - centres.mean(axis=0)) for centre in centres)
@@ -195,7 +195,7 @@ def test_reduced_photos_scale_the_camera(folder: Path, size: tuple[int, int]) ->
 
 
 @pytest.mark.parametrize("size", [(30, 40), (20, 20), (40, 20)])
-def testphoto_of_another_aspect_is_refused(folder: Path, size: tuple[int, int]) -> None:
+def test_photo_of_another_aspect_is_refused(folder: Path, size: tuple[int, int]) -> None:
     write_png(folder / "images" / NAMES[4], photo_of(0, *size))
     with pytest.raises(InputError) as error:
         load_scene(folder)

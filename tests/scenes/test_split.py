@@ -1,4 +1,4 @@
-"""Views held out of the training set."""
+"""Validation views held out from the training views."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.scenes.scene import Scene
 from clsplat.scenes.split import hold_out
 
 
-def test_test_views_are_gone_and_training_views_held_out(scene: Scene) -> None:
+def test_training_views_are_held_out_in_place_of_test_views(scene: Scene) -> None:
     split = hold_out(scene)
     assert scene.test_names.isdisjoint(split.names)
     assert {view.name for view in scene.train} == set(split.names)
@@ -23,7 +23,7 @@ def test_test_views_are_gone_and_training_views_held_out(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("n", "places"), [(3, [1]), (4, [1, 3]), (9, [1, 4, 7]), (21, [3, 10, 17]), (43, [3, 10, 17, 24, 31, 38])]
 )
-def test_how_many_are_held_out(scene: Scene, n: int, places: list[int]) -> None:
+def test_number_of_held_out_views(scene: Scene, n: int, places: list[int]) -> None:
     views = [replace(scene.views[0], name=f"{i:03}") for i in range(n)]
     split = hold_out(Scene("many", Path("many"), views, scene.points))
     assert [view.name for view in split.test] == [f"{i:03}" for i in places]

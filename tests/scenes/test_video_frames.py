@@ -1,4 +1,4 @@
-"""Frames of a video: the sharpest of equal stretches."""
+"""Frames of a video: the sharpest frame of each of equal parts."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from clsplat.scenes.reconstruct.video_frames import extract_frames, sharpest
 pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
 
 
-def test_sharpest_of_each_stretch() -> None:
+def test_sharpest_frame_of_each_part() -> None:
     assert sharpest([1, 5, 2, 9, 3, 3], 3) == [1, 3, 4]
     assert sharpest([1, 2, 3, 4, 5], 2) == [1, 4]
     assert sharpest([4.0, 4.0], 10) == [0, 1]
 
 
 @pytest.mark.parametrize("fps", [10, 30, 60])
-def test_frames_are_the_sharp_ones_and_in_their_order(tmp_path: Path, fps: int) -> None:
-    """Of twelve frames, three are sharp; a patch tells which."""
+def test_sharp_frames_are_extracted_in_order(tmp_path: Path, fps: int) -> None:
+    """Three of twelve frames are sharp; a patch in each frame shows its number."""
     sharp = {2, 5, 10}
     noise = np.random.default_rng(0).integers(0, 256, (20, 30, 3)).astype(np.uint8).repeat(4, axis=0).repeat(4, axis=1)
     with VideoWriter(tmp_path / "walk.mp4", fps) as writer:
@@ -45,7 +45,7 @@ def test_frames_are_the_sharp_ones_and_in_their_order(tmp_path: Path, fps: int) 
     assert len(everything) == 12
 
 
-def test_what_is_no_video(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_video(tmp_path: Path) -> None:
     (tmp_path / "walk.mp4").write_bytes(b"no video")
     with pytest.raises(InputError, match=r"walk\.mp4: has 0 frames that can be decoded"):
         extract_frames(tmp_path / "walk.mp4", tmp_path / "frames")

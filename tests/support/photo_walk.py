@@ -1,4 +1,4 @@
-"""Photos of a textured corner, taken from known places: small enough for structure from motion in seconds."""
+"""Photos of a textured corner with known poses, small enough for structure from motion in seconds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def names(count: int = N_PHOTOS) -> list[str]:
 
 
 def cam_from_world(index: int, count: int = N_PHOTOS) -> NDArray[np.float64]:
-    """(4, 4) pose of a photo: on an arc around the corner, a little up and down."""
+    """Return the (4, 4) pose of a photo on an arc around the corner, at varying heights."""
     angle = np.radians(-24 + 48 * index / (count - 1))
     centre = np.array([3.2 * np.sin(angle), 0.25 * np.sin(2.1 * index), -3.2 * np.cos(angle)])
     forward = np.array([0.0, 0.0, 0.3]) - centre
@@ -32,9 +32,9 @@ def cam_from_world(index: int, count: int = N_PHOTOS) -> NDArray[np.float64]:
 
 
 def picture(index: int, count: int = N_PHOTOS, fisheye: bool = False) -> NDArray[np.uint8]:
-    """(H, W, 3) photo of two walls that meet at right angles behind the origin.
+    """Return a photo, (H, W, 3), of two walls that meet at right angles behind the origin.
 
-    fisheye : equidistant.
+    fisheye : whether the lens is an equidistant fisheye.
     """
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     focal = FISHEYE_FOCAL if fisheye else FOCAL
@@ -60,7 +60,7 @@ def picture(index: int, count: int = N_PHOTOS, fisheye: bool = False) -> NDArray
 
 
 def write_walk(folder: Path, count: int = N_PHOTOS, fisheye: bool = False) -> Path:
-    """All photos as PNG."""
+    """Write all photos as PNG and return their folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for index, name in enumerate(names(count)):
         Image.fromarray(picture(index, count, fisheye)).save(folder / name)
@@ -68,7 +68,7 @@ def write_walk(folder: Path, count: int = N_PHOTOS, fisheye: bool = False) -> Pa
 
 
 def _texture(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """0..1: noise at three scales, smooth within each."""
+    """Return smooth noise 0..1 of three scales."""
     rng = np.random.default_rng(3)
     total = np.zeros(u.shape)
     for cells, weight in ((2.5, 0.3), (6.0, 0.4), (13.0, 0.3)):

@@ -1,4 +1,4 @@
-"""A small COLMAP scene to load, damage and look at."""
+"""A small COLMAP scene for tests that load or damage it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NAMES = [f"shot_{index}.png" for index in range(N_VIEWS)]
 
 
 def model_views() -> list[ModelView]:
-    """Nine views that turn and walk, each of 8 of the points."""
+    """Return nine views from a moving and turning camera, each with 8 of the points."""
     rng = np.random.default_rng(1)
     views = []
     for index, name in enumerate(NAMES):
@@ -30,20 +30,20 @@ def model_views() -> list[ModelView]:
 
 
 def cloud() -> tuple[np.ndarray, np.ndarray]:
-    """Positions (P, 3) and colours of the points."""
+    """Return positions and colours of the points, (P, 3) each."""
     rng = np.random.default_rng(2)
     return rng.normal(size=(N_POINTS, 3)), rng.integers(0, 256, (N_POINTS, 3)).astype(np.uint8)
 
 
 def photo_of(index: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """A photo that tells its index and which side is up."""
+    """Return a photo whose pixels show its index and its orientation."""
     image = np.zeros((height, width, 3), np.uint8)
     image[..., 0], image[: height // 2, :, 1] = 20 * index, 200
     return image
 
 
 def write_garden(parent: Path) -> Path:
-    """The scene's folder, written backwards so that order in the files is not the order of names."""
+    """Write the scene and return its folder. Images are written backwards, so that they are not sorted by name."""
     root = parent / "garden"
     for index, name in enumerate(NAMES):
         write_png(root / "images" / name, photo_of(index))
@@ -52,7 +52,7 @@ def write_garden(parent: Path) -> Path:
 
 
 def as_text(model: Path, target: Path) -> None:
-    """The model in `model`, written as text to `target`."""
+    """Write the model in folder `model` as text files to folder `target`."""
     import pycolmap
 
     target.mkdir(parents=True, exist_ok=True)
