@@ -7,9 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from clsplat.comparison.charts import heat_map
-
 from .crafted import STATIC
+from .heat_map import heat_map
 from .training import TRAINING
 from .variants import VARIANTS
 

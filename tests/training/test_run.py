@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from reference.noise import add_noise
 
 import clsplat
 from clsplat.device.device import Device, open_device
@@ -24,7 +25,7 @@ from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 from clsplat.training.log import Progress
 from clsplat.training.loss import ImageLoss, LossValue
-from clsplat.training.optim.noise import add_noise, noise_reach
+from clsplat.training.optim.noise import noise_reach
 from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
 

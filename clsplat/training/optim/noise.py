@@ -7,8 +7,6 @@ of them are exact in float32; only log, sqrt and sin/cos may differ by some ulp 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -99,36 +97,6 @@ def covariance_times(quat: Array, log_scale: Array, vector: Array) -> NDArray[np
     in_frame = np.einsum("nji,nj->ni", rotation, vector) * np.exp(2.0 * log_scale.astype(np.float64))
     product: NDArray[np.float64] = np.einsum("nij,nj->ni", rotation, in_frame)
     return product
-
-
-def add_noise(
-    mean: Array,
-    quat: Array,
-    log_scale: Array,
-    strength: Array,
-    seed: int,
-    iteration: int,
-    amount: float,
-    reach: float = math.inf,
-) -> Array:
-    """Means after the noise step: mean + Sigma (xi gate amount), but by `reach` at most.
-
-    Parameters
-    ----------
-    mean (N, 3), quat (N, 4) wxyz of any norm above 0, log_scale (N, 3) : raw values.
-    strength : (N,) the largest |opacity| of each splat (Shape.strength).
-    amount : noise learning rate (5e5 in 3DGS-MCMC) times the mean's learning rate of this iteration.
-
-    Returns
-    -------
-    (N, 3) of the mean's dtype.
-    """
-    xi = normal3(seed, iteration, len(mean)).astype(np.float64)
-    step = xi * (noise_gate(strength) * amount)[:, None]
-    shift = covariance_times(quat, log_scale, step)
-    length = np.maximum(np.linalg.norm(shift, axis=1, keepdims=True), 1e-15)
-    moved: Array = (mean + shift * np.minimum(reach / length, 1.0)).astype(mean.dtype)
-    return moved
 
 
 def _halves(product: NDArray[np.uint64]) -> tuple[Words, Words]:
