@@ -1,4 +1,4 @@
-"""`clsplat compare`: systems trained side by side, and the table of them."""
+"""`clsplat compare`: train systems side by side and print a table."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.comparison.methods import DEFAULT, parse_methods
+from clsplat.comparison.methods import DEFAULT, Method, parse_methods
 from clsplat.errors import InputError
 from clsplat.scenes.options import READING_OPTIONS
 from clsplat.splats.color import BLACK
@@ -25,6 +25,7 @@ from .options import (
     photo_options,
     quiet_option,
     split_options,
+    warn_without_effect,
 )
 from .progress import TrainingDisplay, duration, table
 
@@ -44,10 +45,16 @@ if TYPE_CHECKING:
     default=",".join((DEFAULT, *PRESETS)),
     show_default=True,
     metavar="NAME,NAME,...",
-    help='Presets, shapes, or "default"; any with changes: sns:alternation=off,skew_map=coupled.',
+    help='Presets, shapes, or "default". Each may have changes, such as sns:alternation=off,skew_map=coupled.',
 )
-@click.option("--cap-max", "caps", type=Numbers("caps"), multiple=True, help="Most splats.  [default: 5000]")
-@click.option("--seeds", type=Numbers("seeds", 0), multiple=True, help="A run for each.  [default: 0]")
+@click.option(
+    "--cap-max",
+    "caps",
+    type=Numbers("caps"),
+    multiple=True,
+    help="Caps on the splats: a run for each.  [default: 5000]",
+)
+@click.option("--seeds", type=Numbers("seeds", 0), multiple=True, help="Seeds: a run for each.  [default: 0]")
 @photo_options
 @hiding_options
 @split_options
@@ -67,26 +74,28 @@ def compare_systems(
     quiet: bool,
     **values: Any,
 ) -> None:
-    """Train each of the systems on SCENES with equal caps, iterations and seeds, and measure the test views.
+    """Train each system on SCENES with equal caps, iterations and seeds, and measure the test views.
 
-    Options of training hold for all systems; a system's own changes replace them. Writes a line a run into
-    DIR/runs.jsonl, and table.md and results.json of all runs there. After Ctrl-C, the same command goes on.
+    Training options apply to all systems; the changes of a system replace them. The command appends a line for each
+    run to DIR/runs.jsonl, and writes table.md and results.json of all runs there. After Ctrl-C, the same command
+    continues.
     """
     from clsplat.comparison.compare import compare
     from clsplat.comparison.table import HEAD, cells, notes, summarise
 
-    common, loaded = options_and_scenes(ctx, scenes, values)
+    methods = parse_methods(systems)
+    common, loaded = options_and_scenes(ctx, scenes, methods, values)
     with TrainingDisplay(quiet) as display:
         records = compare(
             loaded,
-            parse_methods(systems),
+            methods,
             output,
-            flat(caps) or [5000],
-            flat(seeds) or [0],
+            distinct_numbers(caps) or [5000],
+            distinct_numbers(seeds) or [0],
             common,
             save_models=save_models,
             progress=display,
-            on_run=None if quiet else say_run,
+            on_run=None if quiet else report_run,
         )
     if not quiet:
         rows = summarise(records)
@@ -96,10 +105,12 @@ def compare_systems(
 
 
 def options_and_scenes(
-    ctx: click.Context, paths: Sequence[Path], values: dict[str, Any]
+    ctx: click.Context, paths: Sequence[Path], methods: Sequence[Method], values: dict[str, Any]
 ) -> tuple[dict[str, Any], Iterator[Scene]]:
-    """Options of training that stand on the command line, and the scenes, each read when it is asked for."""
+    """Return the training options on the command line, and an iterator that reads the scenes one by one."""
     common = config_values(ctx, values)
+    configs = [method.config(1, 0, common) for method in methods]
+    warn_without_effect(configs, common)
     reading = {key: values[key] for key in READING_OPTIONS if key in values and is_given(ctx, key)} | {"eval": True}
     names = [path.resolve().name for path in paths]
     for name in names:
@@ -109,13 +120,13 @@ def options_and_scenes(
     return common, (load_recorded_scene(path, reading, background) for path in paths)
 
 
-def flat(groups: tuple[tuple[int, ...], ...]) -> list[int]:
-    """All numbers once, in the order given."""
+def distinct_numbers(groups: tuple[tuple[int, ...], ...]) -> list[int]:
+    """Return all numbers of an option once, in the order of the command line."""
     return list(dict.fromkeys(number for group in groups for number in group))
 
 
-def say_run(run: Run, record: Record | None) -> None:
-    """Name a run before it starts, and its result after it."""
+def report_run(run: Run, record: Record | None) -> None:
+    """Print the name of a run before it starts, and its result after it."""
     if record is None:
         click.echo(str(run), err=True)
     elif record["failed"]:

@@ -1,4 +1,4 @@
-"""`clsplat frontier`: a sweep of systems and caps, its charts and the page that shows them."""
+"""`clsplat frontier`: train systems at several caps, and write charts and a page that shows them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import click
 from clsplat.comparison.methods import parse_methods
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
-from .compare import flat, options_and_scenes, say_run
+from .compare import distinct_numbers, options_and_scenes, report_run
 from .options import (
     PATH,
     Numbers,
@@ -38,23 +38,28 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
     default=",".join(SYSTEMS),
     show_default=True,
     metavar="NAME,NAME,...",
-    help="As of `clsplat compare`; the splats of the others are counted against the first.",
+    help="Systems as in `clsplat compare`. The first one is the reference for splats at equal quality.",
 )
 @click.option(
     "--cap-max",
     "caps",
     type=Numbers("caps"),
     multiple=True,
-    help=f"Most splats.  [default: {','.join(map(str, CAPS))}]",
+    help=f"Caps on the splats: a run for each.  [default: {','.join(map(str, CAPS))}]",
 )
-@click.option("--seeds", type=Numbers("seeds", 0), multiple=True, help="A run for each; 3 make a chart.  [default: 0]")
+@click.option(
+    "--seeds",
+    type=Numbers("seeds", 0),
+    multiple=True,
+    help="Seeds: a run for each. Three or more also make a chart of their spread.  [default: 0]",
+)
 @click.option(
     "--repeat",
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
     metavar="N",
-    help="Train the first seed N times: are the splats the same, bit by bit?",
+    help="Train the first seed N times, to compare the splats bit by bit.",
 )
 @click.option(
     "--curve",
@@ -62,16 +67,16 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
     default=12,
     show_default=True,
     metavar="N",
-    help="Measure the test views at N iterations along each run; 0: at its end only.",
+    help="Measure the test views at N iterations of each run. 0: only at its end.",
 )
 @click.option(
     "--add",
     type=PATH,
     multiple=True,
     metavar="DIR",
-    help="Draw the runs of this folder as well, such as another comparison's.",
+    help="Also draw the runs of this folder, such as those of another comparison.",
 )
-@click.option("--charts-only", is_flag=True, help="Train nothing: draw what is there.")
+@click.option("--charts-only", is_flag=True, help="Draw the existing runs, without training.")
 @photo_options
 @hiding_options
 @split_options
@@ -95,42 +100,43 @@ def draw_frontier(
 ) -> None:
     """Train the systems on SCENES at several caps and chart quality against time, render time, bytes and splats.
 
-    Writes DIR/report.html, DIR/charts (PNG, SVG, and their data as CSV and JSON) and what `clsplat compare` writes.
-    Runs that are there are not done again; after Ctrl-C the charts show what is there, and the same command goes on.
+    The command writes DIR/report.html, DIR/charts (PNG, SVG, and their data as CSV and JSON) and the files of `clsplat
+    compare`. Existing runs are not repeated. After Ctrl-C, the charts show the finished runs, and the same command
+    continues.
     """
     from clsplat.comparison.runs import distinct, read_runs
     from clsplat.comparison.sweep import sweep, write_report
 
     if charts_only == bool(scenes):
-        raise click.UsageError("give scenes, or --charts-only to draw the runs that are there")
-    contestants = parse_methods(systems)
+        raise click.UsageError("give scenes, or --charts-only to draw the existing runs")
+    methods = parse_methods(systems)
     more = [record for path in add for record in read_runs(path)]
     if charts_only:
         records = read_runs(output)
-        write_report(output, [*records, *more], reference=contestants[0].label)
+        write_report(output, [*records, *more], reference=methods[0].label)
     else:
-        common, loaded = options_and_scenes(ctx, scenes, values)
+        common, loaded = options_and_scenes(ctx, scenes, methods, values)
         with TrainingDisplay(quiet) as display:
             records = sweep(
                 loaded,
-                contestants,
+                methods,
                 output,
-                flat(caps) or CAPS,
-                flat(seeds) or [0],
+                distinct_numbers(caps) or CAPS,
+                distinct_numbers(seeds) or [0],
                 common,
                 curve=curve,
                 repeat=repeat,
                 more=more,
                 progress=display,
-                on_run=None if quiet else say_run,
+                on_run=None if quiet else report_run,
             )
     if not quiet:
-        report(distinct([*records, *more]), contestants[0].label)
+        report(distinct([*records, *more]), methods[0].label)
         click.echo(f"{output / 'report.html'}: charts and tables")
 
 
 def report(records: list[Record], reference: str) -> None:
-    """The tables that charts do not hold: all runs, and splats at equal quality."""
+    """Print the tables that the charts do not show: all runs, and splats at equal quality."""
     from clsplat.comparison.sweep_rows import equal_rows, point_rows
     from clsplat.comparison.sweep_tables import equal_table
     from clsplat.comparison.table import HEAD, cells, summarise

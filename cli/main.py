@@ -1,4 +1,4 @@
-"""The `clsplat` command: loads the subcommand that was named, and turns errors into one line each."""
+"""The `clsplat` command: loads one subcommand, and prints each error as one line."""
 
 from __future__ import annotations
 
@@ -12,29 +12,35 @@ import click
 from clsplat import __version__
 from clsplat.errors import ClsplatError
 
-# Name to (module:attribute, line in the list). Listed here so that --help imports none of them.
+# Each command: (module:attribute, line of --help). The table lets --help work without importing the modules.
 COMMANDS = {
     "devices": ("clsplat_cli.devices:devices", "List the OpenCL devices and try each."),
-    "demo": ("clsplat_cli.demo:demo", "Make a small scene, train on it, render and measure: a first trial."),
-    "reconstruct": ("clsplat_cli.reconstruct:reconstruct_scene", "Make a scene of photographs or a video: find poses."),
+    "demo": ("clsplat_cli.demo:demo", "Make a small scene, train, render and measure: a first trial."),
+    "reconstruct": (
+        "clsplat_cli.reconstruct:reconstruct_scene",
+        "Make a scene from photographs or a video.",
+    ),
     "train": ("clsplat_cli.train:train", "Learn a splat model of a scene."),
     "view": ("clsplat_cli.view:view", "Walk through a model in the browser."),
     "render": ("clsplat_cli.render:render", "Render a model or any splat PLY."),
-    "eval": ("clsplat_cli.evaluate:evaluate_models", "Measure models on the views they were not trained on."),
-    "info": ("clsplat_cli.info:show_info", "Say what a model or a scene holds."),
-    "prune": ("clsplat_cli.prune:prune_model", "Leave out of a model what its images do not miss."),
-    "compare": ("clsplat_cli.compare:compare_systems", "Train published systems side by side and tabulate them."),
-    "frontier": ("clsplat_cli.frontier:draw_frontier", "Sweep systems and caps, and chart quality against cost."),
+    "eval": ("clsplat_cli.evaluate:evaluate_models", "Measure models on views that were held out of training."),
+    "info": ("clsplat_cli.info:show_info", "Show what a model or a scene contains."),
+    "prune": ("clsplat_cli.prune:prune_model", "Remove the splats that a model's images do not need."),
+    "compare": ("clsplat_cli.compare:compare_systems", "Train published systems side by side and print a table."),
+    "frontier": ("clsplat_cli.frontier:draw_frontier", "Train systems at several caps and chart quality against cost."),
     "bench": ("clsplat_cli.bench:bench", "Time the stages of training and rendering on this device."),
     "blender-addon": ("clsplat_cli.blender_addon:build_addon", "Build the Blender add-on as a zip."),
-    "convert": ("clsplat_cli.convert:convert_model", "Write a model as another shape, or as a file for other viewers."),
-    "cameras": ("clsplat_cli.cameras:write_cameras_of", "Write a scene's or model's cameras for other programs."),
+    "convert": (
+        "clsplat_cli.convert:convert_model",
+        "Convert a model to another shape or file format.",
+    ),
+    "cameras": ("clsplat_cli.cameras:write_cameras_of", "Write the cameras of a scene or a model for other programs."),
 }
-INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+INTERRUPTED = 130  # exit code after Ctrl-C: 128 + SIGINT, as in shells
 
 
 class Commands(click.Group):
-    """Subcommands that are imported when used, with one-line errors."""
+    """Subcommands that are imported when they are used, with one-line errors."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -66,7 +72,7 @@ class Commands(click.Group):
                 _fail(ctx, message)
 
     def main(self, *args: Any, **extra: Any) -> Any:
-        """As click's, but a wrong command line is one line too (exit code 2)."""
+        """Run as click does, but print a wrong command line as one line too (exit code 2)."""
         extra["standalone_mode"] = False
         try:
             code = super().main(*args, **extra)
@@ -101,12 +107,12 @@ def _fail(ctx: click.Context, message: str, code: int = 1) -> None:
 
 
 def _known_failure(error: Exception) -> str | None:
-    """What to tell the user of an error that clsplat did not raise itself; None for a bug of ours."""
+    """Return the message for an error from outside clsplat. None for a bug in clsplat."""
     if isinstance(error, MemoryError):
         return "out of memory: lower --cap-max or use smaller images (-r 2, 4, 8)"
     if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
         return f"{error.filename}: {error.strerror}" if error.filename else str(error)
-    cl = sys.modules.get("pyopencl")  # without it no error can be OpenCL's
+    cl = sys.modules.get("pyopencl")  # if it is not loaded, the error is not from OpenCL
     if cl is None or not isinstance(error, cl.Error):
         return None
     from clsplat.device.opencl import first_line, is_out_of_memory
@@ -124,7 +130,7 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    if display := sys.modules.get("clsplat.training.progress"):  # where nothing is shown, it was never loaded
+    if display := sys.modules.get("clsplat.training.progress"):  # if it is not loaded, no live line is shown
         display.LiveLine.give_way()
     click.echo(f"warning: {_one_line(str(message))}", err=True)
 

@@ -1,9 +1,10 @@
-"""Options that several commands share, and those made from TrainConfig's fields."""
+"""Options that several commands share, and the flags of the training options."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,7 +13,7 @@ import click
 
 from clsplat.scenes.options import ALPHA_USES
 from clsplat.splats.color import Color
-from clsplat.training.config import OPTIONS, SECTIONS
+from clsplat.training.config import OPTIONS, SECTIONS, TrainConfig
 from clsplat.training.options.density import STRATEGIES
 from clsplat.training.options.option import Option, option_table
 
@@ -23,7 +24,7 @@ SETS = ("test", "train", "all")
 
 
 class ColorType(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
-    """R,G,B, each 0 to 1."""
+    """A colour as R,G,B, each part 0 to 1."""
 
     name = "R,G,B"
 
@@ -35,34 +36,35 @@ class ColorType(click.ParamType):  # type: ignore[type-arg]  # not generic befor
         except ValueError:
             rgb = ()
         if len(rgb) != 3 or not all(0 <= part <= 1 for part in rgb):
-            self.fail(f"{value!r} is no colour: give R,G,B, each 0 to 1, such as 1,1,1", param, ctx)
+            self.fail(f"{value!r} is not a colour: give R,G,B, each 0 to 1, such as 1,1,1", param, ctx)
         return rgb
 
 
 class Numbers(click.ParamType):  # type: ignore[type-arg]
-    """Whole numbers with commas or spaces between them.
+    """A list of whole numbers, separated by commas or spaces.
 
     Parameters
     ----------
-    what : they are, for messages. least : smallest allowed.
+    plural : what the numbers are, for messages.
+    smallest : smallest allowed number.
     """
 
     name = "N,N,..."
 
-    def __init__(self, what: str = "iterations", least: int = 1) -> None:
-        self.what, self.least = what, least
+    def __init__(self, plural: str = "iterations", smallest: int = 1) -> None:
+        self.plural, self.smallest = plural, smallest
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
         if isinstance(value, tuple):
             return value
         parts = [part for part in re.split(r"[,\s]+", value) if part]
-        if not parts or not all(part.isdecimal() and int(part) >= self.least for part in parts):
-            self.fail(f"{value!r} is no list of {self.what}: give for example 1000,2000", param, ctx)
+        if not parts or not all(part.isdecimal() and int(part) >= self.smallest for part in parts):
+            self.fail(f"{value!r} is not a list of {self.plural}: give for example 1000,2000", param, ctx)
         return tuple(int(part) for part in parts)
 
 
 class Decibels(click.ParamType):  # type: ignore[type-arg]
-    """A number of decibels: 0.1, 0.1dB."""
+    """A number of decibels, such as 0.1 or 0.1dB."""
 
     name = "dB"
 
@@ -71,7 +73,7 @@ class Decibels(click.ParamType):  # type: ignore[type-arg]
             return float(value)
         match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(dB)?\s*", value, re.I)
         if match is None:
-            self.fail(f"{value!r} is no number of decibels: give for example 0.1 or 0.1dB", param, ctx)
+            self.fail(f"{value!r} is not a number of decibels: give for example 0.1 or 0.1dB", param, ctx)
         return float(match[1])
 
 
@@ -102,7 +104,7 @@ class TrainingCommand(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         lists = {name for param in self.params if isinstance(param.type, Numbers) for name in param.opts}
         joined: list[str] = []
-        in_list = False  # whether the last argument belongs to a list that may go on
+        in_list = False  # whether the last argument is in a list that may continue
         for arg in args:
             if in_list and arg.isdecimal() and joined[-1].isdecimal():
                 joined += [next(opt for opt in reversed(joined) if opt.startswith("--")), arg]
@@ -116,12 +118,15 @@ device_option = click.option(
     "--device", metavar="SPEC", help='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name.'
 )
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print warnings and errors only.")
-overwrite_option = click.option("--overwrite", is_flag=True, help="Replace the model that is there.")
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace an existing model.")
 iteration_option = click.option(
-    "--iteration", type=click.IntRange(min=0), metavar="N", help="Point cloud of this iteration.  [default: the last]"
+    "--iteration",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="Point cloud to use, by iteration.  [default: the last]",
 )
 set_option = click.option(
-    "--set", "--views", "view_set", type=click.Choice(SETS), help="Which of the scene's views.  [default: test]"
+    "--set", "--views", "view_set", type=click.Choice(SETS), help="Views of the scene to use.  [default: test]"
 )
 
 
@@ -133,21 +138,21 @@ def background_options(function: F, **extra: Any) -> F:
 
 
 def background_of(background: Color | None, white: bool) -> Color | None:
-    """The background asked for, if any."""
+    """Return the background on the command line, or None."""
     if background is not None and white:
         raise click.UsageError("give --background or --white-background, not both")
     return (1.0, 1.0, 1.0) if white else background
 
 
 def photo_options(function: F) -> F:
-    """`-i` and `-r`: which photos of the scene, and how large."""
+    """Add `-i` and `-r`: the folder and the size of the photos."""
     function = click.option(
         "-r",
         "--resolution",
         type=int,
         metavar="N",
-        help="1, 2, 4, 8: divide the size of the photos; another number: their width in pixels; "
-        "-1: as they are, but at most 1600 wide.",
+        help="Size of the photos. 1, 2, 4 or 8 divide it; another number is the width in pixels; -1 keeps it up to a "
+        "width of 1600 pixels.",
     )(function)
     return click.option("-i", "--images", metavar="NAME", help="Folder of photos inside the scene, such as images_4.")(
         function
@@ -155,37 +160,41 @@ def photo_options(function: F) -> F:
 
 
 def scene_options(function: F) -> F:
-    """`-s`, `-i` and `-r`: where the photos are, and how large."""
+    """Add `-s`, `-i` and `-r`: the scene, and the folder and the size of its photos."""
     return click.option(
-        "-s", "--source-path", type=PATH, help="Scene: a folder with photos and a COLMAP model or transforms.json."
+        "-s", "--source-path", type=PATH, help="Folder of the scene, with photos and a COLMAP model or transforms.json."
     )(photo_options(function))
 
 
 def hiding_options(function: F) -> F:
-    """`--masks` and `--alpha`: which pixels of the photos count."""
+    """Add `--masks` and `--alpha`: which pixels of the photos are used."""
     function = click.option(
         "--alpha",
         type=click.Choice(ALPHA_USES),
-        help="Transparent photos: lay them over the background, or hide the transparent pixels.  [default: background]",
+        help="Transparent photos: composite them over the background, or ignore the transparent pixels.  "
+        "[default: background]",
     )(function)
     return click.option(
         "--masks",
         metavar="NAME",
-        help='Folder of masks inside the scene, black where a pixel is not to count; "none" for no '
-        "masks.  [default: masks, where it is there]",
+        help='Folder of masks inside the scene; black pixels are ignored. "none": no masks.  [default: masks, if it '
+        "exists]",
     )(function)
 
 
 def split_options(function: F) -> F:
-    """`--test-every` and `--test-list`: which views are held out."""
+    """Add `--test-every` and `--test-list`: which views are held out."""
     function = click.option(
-        "--test-list", type=PATH, metavar="FILE", help="Names of the test views, one a line; implies --eval."
+        "--test-list",
+        type=PATH,
+        metavar="FILE",
+        help="Names of the test views, one per line; implies --eval.",
     )(function)
     return click.option(
         "--test-every",
         type=int,
         metavar="N",
-        help="Of the sorted views, every Nth is a test view; implies --eval.  [default: 8]",
+        help="Every Nth of the sorted views is a test view; implies --eval.  [default: 8]",
     )(function)
 
 
@@ -202,6 +211,15 @@ def config_options(*without: str) -> Callable[[F], F]:
         return function
 
     return decorate
+
+
+def warn_without_effect(configs: Sequence[TrainConfig], names: Iterable[str]) -> None:
+    """Warn about flags that have no effect in any of the runs, because only the other strategy has them."""
+    strategies = " or ".join(dict.fromkeys(config.strategy for config in configs))
+    for name in names:
+        if all(config.without_effect([name]) for config in configs):
+            flag = "--" + name.replace("_", "-")
+            warnings.warn(f"{flag} has no effect with strategy {strategies}", stacklevel=2)
 
 
 def config_values(ctx: click.Context, values: dict[str, Any]) -> dict[str, Any]:

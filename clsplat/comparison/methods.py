@@ -1,4 +1,7 @@
-"""What `clsplat compare` compares: presets, shapes and the default, each with changes of its own."""
+"""The methods that `clsplat compare` compares: presets, shapes and the default, each with its own changes.
+
+Command line and tables call a method a system.
+"""
 
 from __future__ import annotations
 
@@ -12,22 +15,22 @@ from ..training.config import OPTIONS, TrainConfig
 from ..training.presets import PRESETS, with_preset
 
 DEFAULT = "default"
-# Equal for all systems of a comparison, or set by it.
+# Options that are equal for all methods of a comparison.
 SHARED = ("cap_max", "seed", "iterations", "background", "device", "save_iterations", "test_iterations")
 _SET_BY_COMPARISON = ("shape", "cap_max", "seed")
-_WORDS = {"true": True, "on": True, "yes": True, "1": True, "false": False, "off": False, "no": False, "0": False}
+_SWITCHES = {"true": True, "on": True, "yes": True, "1": True, "false": False, "off": False, "no": False, "0": False}
 
 
 @dataclass(frozen=True)
 class Method:
-    """One contestant.
+    """One method of a comparison.
 
     Parameters
     ----------
-    label : as in tables.
-    base : a preset, a shape (clsplat's default options with that shape), or "default".
-    changes : options replaced in it, by TrainConfig's names; what makes a preset may be replaced too, as the label
-        says so.
+    label : name in tables.
+    base : a preset, a shape (default options with that shape), or "default".
+    changes : options that replace those of the base, by the names of `TrainConfig`. They may also replace what
+        makes a preset, because the label shows them.
     """
 
     label: str
@@ -35,15 +38,15 @@ class Method:
     changes: Mapping[str, Any]
 
     def config(self, cap: int, seed: int, common: Mapping[str, Any] | None = None) -> TrainConfig:
-        """Its training options.
+        """Return the training options of one run.
 
         Parameters
         ----------
-        common : options of all systems; the system's changes replace them.
+        common : options of all methods; the changes of this method replace them.
 
         Raises
         ------
-        InputError : options that do not fit the system, or that the comparison sets itself.
+        InputError : options that contradict the method, that have no effect in it, or that the comparison sets.
         """
         shared = {key: value for key, value in (common or {}).items() if key not in self.changes}
         for key in _SET_BY_COMPARISON:
@@ -58,18 +61,18 @@ class Method:
         except InputError as error:
             raise InputError(f"system {self.label}: {error}") from None
         for key in config.without_effect(self.changes):
-            raise InputError(f"system {self.label}: {key} has no effect with strategy {config.strategy}: leave it out")
+            raise InputError(f"system {self.label}: {key} has no effect with strategy {config.strategy}: remove it")
         return config
 
 
 def parse_methods(text: str) -> list[Method]:
-    """Systems of a list such as `3dgs,gaussian,sns:alternation=off,skew_map=coupled`.
+    """Return the methods of a list such as `3dgs,gaussian,sns:alternation=off,skew_map=coupled`.
 
-    A comma before `key=value` goes on with the changes of the system before it.
+    A `key=value` after a comma is another change of the method before it.
 
     Raises
     ------
-    InputError : an unknown system or option, a value of the wrong kind, or the same system twice.
+    InputError : an unknown method or option, a value of another type, or the same method twice.
     """
     groups: list[list[str]] = []
     for part in (part.strip() for part in text.split(",")):
@@ -78,42 +81,43 @@ def parse_methods(text: str) -> list[Method]:
         elif part:
             name, colon, first = part.partition(":")
             groups.append([name.strip(), *([first.strip()] if colon else [])])
-    systems = [_system(name, changes) for name, *changes in groups]
-    if not systems:
-        raise InputError(f"systems {text!r}: name at least one of {', '.join(_known())}")
-    labels = [system.label for system in systems]
+    methods = [_parse_method(name, changes) for name, *changes in groups]
+    if not methods:
+        raise InputError(f"systems {text!r}: name at least one of {', '.join(_known_bases())}")
+    labels = [method.label for method in methods]
     for label in labels:
         if labels.count(label) > 1:
             raise InputError(f"system {label}: is named twice: name it once")
-    return systems
+    return methods
 
 
-def _known() -> tuple[str, ...]:
+def _known_bases() -> tuple[str, ...]:
     return (DEFAULT, *PRESETS, *SHAPES)
 
 
-def _system(name: str, changes: list[str]) -> Method:
+def _parse_method(name: str, changes: list[str]) -> Method:
     base = name.replace("_", "-")
-    if base not in _known():
-        raise InputError(f"unknown system {name!r}: choose one of {', '.join(_known())}")
-    values = dict(_change(name, change) for change in changes)
-    said = ",".join(f"{key}={change.partition('=')[2].strip()}" for key, change in zip(values, changes, strict=False))
-    return Method(f"{base}:{said}" if said else base, base, values)
+    if base not in _known_bases():
+        raise InputError(f"unknown system {name!r}: choose one of {', '.join(_known_bases())}")
+    values = dict(_parse_change(name, change) for change in changes)
+    texts = [change.partition("=")[2].strip() for change in changes]
+    suffix = ",".join(f"{key}={text}" for key, text in zip(values, texts, strict=False))
+    return Method(f"{base}:{suffix}" if suffix else base, base, values)
 
 
-def _change(name: str, change: str) -> tuple[str, Any]:
-    """Key and typed value of `key=value`."""
+def _parse_change(name: str, change: str) -> tuple[str, Any]:
+    """Return the key and the typed value of `key=value`."""
     key, equals, text = (part.strip() for part in change.partition("="))
     key = key.replace("-", "_")
     if not equals or not text:
-        raise InputError(f"system {name}: {change!r} is no key=value, such as strategy=mcmc")
+        raise InputError(f"system {name}: {change!r} is not a key=value, such as strategy=mcmc")
     if key in SHARED:
         raise InputError(f"system {name}: {key} is the same for all systems of a comparison: give it as a flag")
     if key not in OPTIONS:
         raise InputError(f"system {name}: unknown option {key!r}: the options of `clsplat train` can be changed")
-    kind = OPTIONS[key].value_type
-    try:  # all kinds but str, bool, int and float are of SHARED
-        return key, _WORDS[text.lower()] if kind is bool else kind(text)
+    value_type = OPTIONS[key].value_type
+    try:  # options of other types than str, bool, int and float are in SHARED
+        return key, _SWITCHES[text.lower()] if value_type is bool else value_type(text)
     except (KeyError, ValueError):
-        expected = {bool: "on or off", int: "a whole number", float: "a number"}[kind]
+        expected = {bool: "on or off", int: "a whole number", float: "a number"}[value_type]
         raise InputError(f"system {name}: {key}={text}: expected {expected}") from None

@@ -18,7 +18,7 @@ SEARCH = ("--eval", "--iterations", 20, "--cap-max", 150, "--sh-degree", 0, "--d
 
 @pytest.fixture(scope="module")
 def found(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A searched model's folder, and what the command said."""
+    """A searched model's folder, and what the command output."""
     folder = tmp_path_factory.mktemp("search") / "model"
     return folder, clsplat("train", scene, "-m", folder, "--budget", "auto", "--budget-tolerance", "1dB", *SEARCH)
 
@@ -48,13 +48,13 @@ def test_eval_writes_the_complexity(model: Path) -> None:
 
 def test_prune_leaves_out_what_is_not_missed(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
-    said = clsplat("prune", model, "-o", out, "--tolerance", "0.5dB")
+    output = clsplat("prune", model, "-o", out, "--tolerance", "0.5dB")
     ply = ModelFolder(model).latest_ply()[0]
     small, whole = Splats.load(out), Splats.load(ply)
     assert len(small) <= len(whole)
     assert out.stat().st_size < 0.8 * ply.stat().st_size
-    assert f"splats: {len(small)} of {len(whole)}, " in said
-    assert "validation views: PSNR " in said
+    assert f"splats: {len(small)} of {len(whole)}, " in output
+    assert "validation views: PSNR " in output
     clsplat(
         "prune",
         out,
@@ -83,8 +83,8 @@ def test_prune_takes_a_plain_3dgs_file(model: Path, scene: Path, tmp_path: Path)
     plain = tmp_path / "plain.ply"
     convert(Splats("skew-normal", arrays), "gaussian").save(plain)
     plain.write_bytes(plain.read_bytes().replace(b"comment clsplat shape=gaussian normalisation=peak\n", b""))
-    said = clsplat("prune", plain, "-s", scene, "-o", tmp_path / "out.ply", "--tolerance", 0.5)
-    assert "skew" not in said
+    output = clsplat("prune", plain, "-s", scene, "-o", tmp_path / "out.ply", "--tolerance", 0.5)
+    assert "skew" not in output
     assert Splats.load(tmp_path / "out.ply").shape == "gaussian"
     assert "give the scene's folder with -s" in error_of("prune", plain, "-o", tmp_path / "other.ply")
 
@@ -95,21 +95,23 @@ def test_prune_refuses(model: Path, tmp_path: Path) -> None:
     assert "exists already" in error_of("prune", model, "-o", out)
     assert out.read_text() == "precious"
     assert "is a folder" in error_of("prune", model, "-o", tmp_path)
-    assert "no number of decibels" in error_of("prune", model, "-o", tmp_path / "a.ply", "--tolerance", "much", code=2)
+    assert "not a number of decibels" in error_of(
+        "prune", model, "-o", tmp_path / "a.ply", "--tolerance", "much", code=2
+    )
     assert "no such model folder" in error_of("prune", tmp_path / "none", "-o", tmp_path / "a.ply")
     assert "no such model folder" in error_of("info", tmp_path / "none")
 
 
 def test_a_search_writes_a_smaller_model(found: tuple[Path, str]) -> None:
-    folder, said = found
+    folder, output = found
     report = json.loads((folder / "budget.json").read_text())
     assert report["options"]["tolerance"] == 1
     last = ModelFolder(folder).latest_ply()[0]
     splats = Splats.load(last)
     assert len(splats) == report["final"]["splats"] < 150
-    assert f"{last}: {len(splats)} splats, " in said
-    assert "growth: pays up to 150 splats" in said
-    assert "test views (2): PSNR " in said
+    assert f"{last}: {len(splats)} splats, " in output
+    assert "growth: pays up to 150 splats" in output
+    assert "test views (2): PSNR " in output
     entry = json.loads(clsplat("info", folder, "--json"))
     assert entry["splats"] == len(splats)
     assert entry["bytes"] == report["final"]["bytes"]
@@ -119,7 +121,7 @@ def test_a_search_that_is_done_or_is_another(found: tuple[Path, str], scene: Pat
     folder, _ = found
     assert "the search is finished: nothing to resume" in error_of("train", "--resume", "-m", folder)
     assert "already holds a model" in error_of("train", scene, "-m", folder, "--max-bytes", 1000)
-    assert "no number of decibels" in error_of("train", scene, "--target-psnr", "x", code=2)
+    assert "not a number of decibels" in error_of("train", scene, "--target-psnr", "x", code=2)
 
 
 def test_an_interrupted_search_says_how_to_go_on(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,8 +140,8 @@ def test_an_interrupted_search_says_how_to_go_on(scene: Path, tmp_path: Path, mo
         f"stopped; what is done is kept; to go on: clsplat train --resume -m {tmp_path / 'model'}"
     )
     assert "already holds a model" in error_of("train", scene, "-m", tmp_path / "model", *SEARCH)
-    said = clsplat("train", "--resume", "-m", tmp_path / "model")
-    assert "validation views: PSNR" in said
+    output = clsplat("train", "--resume", "-m", tmp_path / "model")
+    assert "validation views: PSNR" in output
     assert np.isfinite(Splats.load(ModelFolder(tmp_path / "model").latest_ply()[0]).mean).all()
     clsplat("train", scene, "-m", tmp_path / "model", "--overwrite", "-q", *SEARCH)
     assert not (tmp_path / "model" / "budget.json").exists(), "another run's folder now"

@@ -47,15 +47,15 @@ def test_compare_prints_a_table_and_goes_on(scene: Path, tmp_path: Path) -> None
 
 
 def test_compare_says_what_is_wrong(scene: Path, tmp_path: Path) -> None:
-    given = ("compare", scene, "-o", tmp_path / "out")
-    assert "unknown system 'cube'" in error_of(*given, "--systems", "cube")
+    arguments = ("compare", scene, "-o", tmp_path / "out")
+    assert "unknown system 'cube'" in error_of(*arguments, "--systems", "cube")
     assert "3dgs has strategy adc, which contradicts strategy mcmc" in error_of(
-        *given, "--systems", "3dgs", "--strategy", "mcmc"
+        *arguments, "--systems", "3dgs", "--strategy", "mcmc"
     )
-    assert "no list of seeds" in error_of(*given, "--seeds", "-1", code=2)
-    assert "no list of caps" in error_of(*given, "--cap-max", "0", code=2)
-    assert "--seed" in error_of(*given, "--seed", "1", code=2)
-    assert "two scenes are called yard" in error_of(*given, scene)
+    assert "not a list of seeds" in error_of(*arguments, "--seeds", "-1", code=2)
+    assert "not a list of caps" in error_of(*arguments, "--cap-max", "0", code=2)
+    assert "--seed" in error_of(*arguments, "--seed", "1", code=2)
+    assert "two scenes are called yard" in error_of(*arguments, scene)
     assert "output" in error_of("compare", scene, code=2)
     assert not (tmp_path / "out").exists()
     missing = tmp_path / "none"
@@ -79,7 +79,7 @@ def test_preset_is_resolved_in_config_json(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "flag", "value", "said"),
+    ("name", "flag", "value", "expected"),
     [
         ("3dgs", "--strategy", "mcmc", "preset 3dgs has strategy adc, which contradicts strategy mcmc"),
         ("3dgs-mcmc", "--shape", "skew-normal", "contradicts shape skew-normal"),
@@ -89,9 +89,11 @@ def test_preset_is_resolved_in_config_json(scene: Path, tmp_path: Path) -> None:
         ("sss", "--position-optimizer", "adam", "preset sss has position_optimizer sghmc-sss"),
     ],
 )
-def test_preset_and_a_flag_against_it(scene: Path, tmp_path: Path, name: str, flag: str, value: str, said: str) -> None:
+def test_preset_and_a_flag_against_it(
+    scene: Path, tmp_path: Path, name: str, flag: str, value: str, expected: str
+) -> None:
     message = error_of("train", scene, "-m", tmp_path / "m", "--preset", name, flag, value)
-    assert said in message
+    assert expected in message
     assert not (tmp_path / "m").exists()
 
 

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from cli_runner import CAP, clsplat, error_of
+from cli_runner import CAP, clsplat, error_of, run
 
 
 def config_of(model: Path) -> dict[str, object]:
@@ -14,12 +14,12 @@ def config_of(model: Path) -> dict[str, object]:
     return config
 
 
-def test_a_former_run_s_options_are_taken_and_replaced(scene: Path, tmp_path: Path, model_folder: Path) -> None:
+def test_options_of_a_former_run_are_used_and_replaced(scene: Path, tmp_path: Path, model_folder: Path) -> None:
     former, again = model_folder, tmp_path / "again"
     clsplat("train", scene, "-m", again, "--config", former / "config.json", "--iterations", 3, "-q")
-    taken, given = config_of(again), config_of(former)
-    assert given["cap_max"] == CAP
-    assert {key for key in taken if taken[key] != given[key]} == {"iterations"}
+    config, former_config = config_of(again), config_of(former)
+    assert former_config["cap_max"] == CAP
+    assert {key for key in config if config[key] != former_config[key]} == {"iterations"}
 
 
 def test_a_few_options_are_enough(scene: Path, tmp_path: Path) -> None:
@@ -31,7 +31,7 @@ def test_a_few_options_are_enough(scene: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("[1]", "expected a JSON object"),
         ("{", "is not JSON"),
@@ -41,10 +41,20 @@ def test_a_few_options_are_enough(scene: Path, tmp_path: Path) -> None:
         ('{"shape": "cube"}', "cube"),
     ],
 )
-def test_what_is_no_file_of_options_is_named(scene: Path, tmp_path: Path, text: str, said: str) -> None:
+def test_a_wrong_file_of_options_is_named(scene: Path, tmp_path: Path, text: str, expected: str) -> None:
     file = tmp_path / "options.json"
     file.write_text(text)
     message = error_of("train", scene, "-m", tmp_path / "model", "--config", file)
-    assert said in message
+    assert expected in message
     assert str(file) in message
     assert not (tmp_path / "model").exists()
+
+
+def test_a_flag_of_the_other_strategy_warns(scene: Path, tmp_path: Path) -> None:
+    short = ("--iterations", "2", "--cap-max", "30", "-q")
+    result = run("train", scene, "-m", tmp_path / "a", "--growth", "1.2", "--grad-threshold", "0.1", *short)
+    assert result.exit_code == 0
+    assert result.stderr == "warning: --growth has no effect with strategy adc\n"
+    result = run("train", scene, "-m", tmp_path / "b", "--strategy", "mcmc", "--growth", "1.2", *short)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert config_of(tmp_path / "b")["growth"] == 1.2
