@@ -23,45 +23,46 @@ KEYS = ("budget", "budget_tolerance", "target_psnr", "max_bytes")
 
 
 def budget_options(function: F) -> F:
-    """`--budget`, `--budget-tolerance`, `--target-psnr` and `--max-bytes`."""
+    """Add `--budget`, `--budget-tolerance`, `--target-psnr` and `--max-bytes`."""
     for option in (
         click.option(
             "--max-bytes",
             type=click.IntRange(min=1),
             metavar="N",
-            help="The best model whose file has at most N bytes; implies --budget auto.",
+            help="Search for the best model whose file has at most N bytes; implies --budget auto.",
         ),
         click.option(
             "--target-psnr",
             type=Decibels(),
             metavar="DB",
-            help="The smallest model with that PSNR on validation views; implies --budget auto.",
+            help="Search for the smallest model with this PSNR on validation views; implies --budget auto.",
         ),
         click.option(
             "--budget-tolerance",
             type=Decibels(),
             metavar="DB",
-            help="PSNR on validation views that fewer splats and parameters may cost; implies --budget "
+            help="Loss of PSNR on validation views that the search for a smaller model may accept; implies --budget "
             f"auto.  [default: {TOLERANCE:g}]",
         ),
         click.option(
             "--budget",
             type=click.Choice(["auto"]),
-            help="Find the smallest model that the scene needs, on views held out of the training set. "
-            "--cap-max is the most splats that are tried. Takes the time of five to nine runs.",
+            help="Search for the smallest model that keeps the quality of the largest one, on validation views held "
+            "out of the training set. Test views may lose more. --cap-max is the largest number of splats to try. The "
+            "search takes the time of five to nine runs.",
         ),
     ):
         function = option(function)
     return function
 
 
-def options_of(values: dict[str, Any]) -> BudgetOptions | None:
-    """The search asked for, if any; takes its options out of `values`."""
-    given = {key: values.pop(key) for key in KEYS}
-    if all(value is None for value in given.values()):
+def search_options(values: dict[str, Any]) -> BudgetOptions | None:
+    """Take the options of the search out of `values` and return them; None if the user wants no search."""
+    search = {key: values.pop(key) for key in KEYS}
+    if all(value is None for value in search.values()):
         return None
-    tolerance = given["budget_tolerance"]
-    return BudgetOptions(TOLERANCE if tolerance is None else tolerance, given["target_psnr"], given["max_bytes"])
+    tolerance = search["budget_tolerance"]
+    return BudgetOptions(TOLERANCE if tolerance is None else tolerance, search["target_psnr"], search["max_bytes"])
 
 
 def run_search(
@@ -74,7 +75,7 @@ def run_search(
     overwrite: bool,
     quiet: bool,
 ) -> None:
-    """Search with a live display, and say what was found."""
+    """Search with a live display, and print what was found."""
     from clsplat.compression.search import train_budget
 
     result: Budgeted | None = None
@@ -84,13 +85,13 @@ def run_search(
                 scene, config, options, display, output=model_path, resume=resume, overwrite=overwrite
             )
     except KeyboardInterrupt:
-        _say_stopped(ctx, model_path)
+        _report_interruption(ctx, model_path)
     if not result.finished:
-        _say_stopped(ctx, model_path)
+        _report_interruption(ctx, model_path)
     chart = draw_growth(result, model_path)
     if quiet:
         return
-    for line in lines_of(result):
+    for line in result_lines(result):
         click.echo(line)
     if chart is not None:
         click.echo(chart)
@@ -102,8 +103,8 @@ def run_search(
         click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
 
 
-def lines_of(result: Budgeted) -> list[str]:
-    """What the search found."""
+def result_lines(result: Budgeted) -> list[str]:
+    """Return the lines that describe what the search found."""
     report, final = result.report, result.report["final"]
     held_out = report["held_out"]
     lines = [
@@ -118,7 +119,7 @@ def lines_of(result: Budgeted) -> list[str]:
 
 
 def draw_growth(result: Budgeted, model_path: Path) -> str | None:
-    """Write growth.png and growth.svg; what to say of them, nothing where matplotlib is not installed."""
+    """Write growth.png and growth.svg, and return a line that names them; None if matplotlib is not installed."""
     from clsplat.comparison.charts import growth_chart
 
     report = result.report
@@ -133,6 +134,6 @@ def draw_growth(result: Budgeted, model_path: Path) -> str | None:
     return f"growth curve: {', '.join(str(file) for file in files)}"
 
 
-def _say_stopped(ctx: click.Context, model_path: Path) -> NoReturn:
+def _report_interruption(ctx: click.Context, model_path: Path) -> NoReturn:
     click.echo(f"stopped; what is done is kept; to go on: clsplat train --resume -m {model_path}", err=True)
     ctx.exit(INTERRUPTED)

@@ -14,7 +14,7 @@ from clsplat.training.folder import ModelFolder
 from .evaluate import describe
 from .options import PATH, device_option, overwrite_option, quiet_option
 from .progress import ViewCount, duration
-from .train import run_training, say_stopped
+from .train import report_interruption, run_training
 
 # Small enough for two CPU cores in minutes.
 ITERATIONS, CAP = 1500, 6000
@@ -65,7 +65,7 @@ def demo(
     scene = load_scene(make_demo_scene(out / "scene", width, views), background=config.background)
     model = run_training(scene, config, folder.path, overwrite=overwrite, quiet=quiet)
     if not model.finished:
-        say_stopped(ctx, model)
+        report_interruption(ctx, model)
     with ViewCount("measuring", quiet) as progress:
         measured = evaluate(
             folder.path, EvaluationOptions(scene_name="the demo"), renders=renders, device=device, progress=progress

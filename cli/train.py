@@ -17,7 +17,7 @@ from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
 from clsplat.training.stored_run import load_recorded_scene, read_options_file
 
-from .budget import budget_options, options_of, run_search
+from .budget import budget_options, run_search, search_options
 from .main import INTERRUPTED
 from .options import (
     PATH,
@@ -30,6 +30,7 @@ from .options import (
     quiet_option,
     scene_options,
     split_options,
+    warn_without_effect,
 )
 from .progress import TrainingDisplay, duration
 from .reconstruct import scene_of_photos
@@ -56,20 +57,20 @@ if TYPE_CHECKING:
 @hiding_options
 @click.option("--eval", is_flag=True, help="Hold test views out of training, and measure them at the end.")
 @split_options
-@click.option("--resume", is_flag=True, help="Go on from the model's checkpoint, with the options of its run.")
+@click.option("--resume", is_flag=True, help="Continue from the model's checkpoint, with the options of its run.")
 @overwrite_option
 @quiet_option
 @click.option(
     "--preset",
     type=click.Choice(list(PRESETS)),
-    help="A published system: kernel, optimizer, strategy and constants; other options replace constants.",
+    help="A published system: kernel, optimizer, strategy and constants. Flags replace its constants.",
 )
 @click.option(
     "--config",
     "config_file",
     type=PATH,
     metavar="FILE",
-    help="Options from a former run's config.json, or a JSON object of some; those given replace them.",
+    help="Training options from a config.json, or from a JSON object of some options. Flags replace them.",
 )
 @click.option("--view", is_flag=True, help="Show the run in the browser while it trains.")
 @server_options
@@ -92,13 +93,15 @@ def train(
     host: str,
     **values: Any,
 ) -> None:
-    """Learn a splat model of SCENE, a folder with photos in images/ and a COLMAP model in sparse/, or with
-    transforms.json or transforms_train.json (NeRF's Blender sets, instant-ngp, nerfstudio). A folder of photographs
-    alone, or a video, is reconstructed first, into NAME-scene beside the model's folder (see clsplat reconstruct).
+    """Learn a splat model of SCENE.
 
-    Writes config.json, cameras.json, log.jsonl, checkpoint.npz and point_cloud/iteration_N/point_cloud.ply
-    into the model's folder. Ctrl-C saves a checkpoint; --resume goes on from it. With --budget auto also budget.json
-    and the growth curve; the small model is the last point cloud.
+    SCENE is a folder with photos in images/ and a COLMAP model in sparse/. It may also have transforms.json or
+    transforms_train.json instead (NeRF's Blender sets, instant-ngp, nerfstudio). A folder with only photographs, or a
+    video, is reconstructed first, into NAME-scene next to the model's folder (see clsplat reconstruct).
+
+    The model's folder gets config.json, cameras.json, log.jsonl, checkpoint.npz and
+    point_cloud/iteration_N/point_cloud.ply. Ctrl-C saves a checkpoint; --resume continues from it. With --budget auto,
+    the folder also gets budget.json and the growth curve; the small model is the last point cloud.
     """
     from clsplat.scenes.reconstruct.photo_files import is_photographs, is_video
 
@@ -107,12 +110,11 @@ def train(
     if scene and source_path and scene != source_path:
         raise click.UsageError(f"two scenes: {scene} and {source_path}")
     path = scene or source_path
-    search = options_of(values)
+    search = search_options(values)
     if view and search is not None:
-        raise click.UsageError("--view shows one run: leave out --budget, or look at the result with clsplat view")
-    options = config_values(ctx, values)
-    if config_file is not None:
-        options = read_options_file(config_file) | options
+        raise click.UsageError("--view shows one run: remove --budget, or show the result with clsplat view")
+    flags = config_values(ctx, values)
+    options = flags if config_file is None else read_options_file(config_file) | flags
     if preset is not None:
         options = with_preset(preset, options)
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
@@ -129,10 +131,11 @@ def train(
         options, reading = stored.run.options | options, stored.run.scene | reading
         path, search = path or stored.run.scene_path, search or stored.search
     elif (folder.is_used or is_search(model_path)) and not overwrite:
-        # train() says so too, but only after the scene is read.
+        # The function train checks this too, but only after the scene is read.
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
     assert path is not None
     config = TrainConfig(**options)
+    warn_without_effect([config], flags)
     if is_photographs(path):
         path = scene_of_photos(path, model_path, overwrite, quiet)
     loaded = load_recorded_scene(path, reading, config.background)
@@ -145,7 +148,7 @@ def train(
         remove_search(model_path)
         model = run_training(loaded, config, model_path, resume, overwrite, quiet, live)
     if not model.finished:
-        say_stopped(ctx, model)
+        report_interruption(ctx, model)
     if not quiet:
         from clsplat.training.run import evaluate_test_views
 
@@ -161,7 +164,7 @@ def run_training(
     quiet: bool = False,
     live: TrainingSession | None = None,
 ) -> Model:
-    """Train with a live display, and a page in the browser if `live` is given."""
+    """Train with a live display, and with a page in the browser if `live` is not None."""
     from clsplat.training.run import train as train_model
 
     with TrainingDisplay(quiet) as display:
@@ -186,8 +189,8 @@ def _viewer(scene: Scene, config: TrainConfig, model_path: Path, host: str, port
     return session
 
 
-def say_stopped(ctx: click.Context, model: Model) -> NoReturn:
-    """After Ctrl-C: how to go on."""
+def report_interruption(ctx: click.Context, model: Model) -> NoReturn:
+    """Print how to continue after Ctrl-C, and exit."""
     click.echo(
         f"stopped at iteration {model.iteration}, checkpoint saved; to go on: clsplat train --resume -m {model.path}",
         err=True,
@@ -196,7 +199,7 @@ def say_stopped(ctx: click.Context, model: Model) -> NoReturn:
 
 
 def report(model: Model, metrics: Evaluation | None) -> None:
-    """Say where the model is, what it took, and how good it is."""
+    """Print where the model is, how long it took, and how good it is."""
     assert model.path is not None
     ply = ModelFolder(model.path).ply_path(model.iteration)
     click.echo(f"{ply}: {len(model.splats)} splats, {ply.stat().st_size / 1e6:.2f} MB")

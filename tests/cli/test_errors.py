@@ -1,4 +1,4 @@
-"""Bad input to every command: exit code not 0, one line that names file and mend, no traceback."""
+"""Bad input to every command: an exit code other than 0, one line that names file and remedy, no traceback."""
 
 from __future__ import annotations
 
