@@ -12,10 +12,22 @@ from ._version import __version__ as __version__
 
 if TYPE_CHECKING:
     from .cameras.camera import Camera
+    from .cameras.make_path import PathRequest
     from .compression.rules import BudgetOptions
     from .compression.search import Budgeted, train_budget
     from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
+    from .models.cameras import export_cameras
+    from .models.convert import conversion_cost, convert_model
+    from .models.evaluation import EvaluationOptions, evaluate, evaluate_models
+    from .models.info import inspect
+    from .models.model import LoadedModel, SceneChoice, load_model
+    from .models.prune import prune_model
+    from .models.render import ViewChoice, render_views
+    from .models.resume import resume
     from .rendering.renderer import Rendered, Renderer
+    from .rendering.views import RenderOutput
+    from .scenes.demo.make import make_demo_scene
+    from .scenes.reconstruct.reconstruct import reconstruct
     from .scenes.scene import Scene, load_scene
     from .splats.splats import Splats
     from .training.config import TrainConfig
@@ -42,6 +54,24 @@ _HOME = {
     "Budgeted": "compression.search",
     "train_budget": "compression.search",
     "TrainingDisplay": "training.progress",
+    "LoadedModel": "models.model",
+    "SceneChoice": "models.model",
+    "load_model": "models.model",
+    "EvaluationOptions": "models.evaluation",
+    "evaluate": "models.evaluation",
+    "evaluate_models": "models.evaluation",
+    "RenderOutput": "rendering.views",
+    "ViewChoice": "models.render",
+    "PathRequest": "cameras.make_path",
+    "render_views": "models.render",
+    "resume": "models.resume",
+    "convert_model": "models.convert",
+    "conversion_cost": "models.convert",
+    "prune_model": "models.prune",
+    "inspect": "models.info",
+    "export_cameras": "models.cameras",
+    "make_demo_scene": "scenes.demo.make",
+    "reconstruct": "scenes.reconstruct.reconstruct",
 }
 
 __all__ = [
@@ -50,17 +80,35 @@ __all__ = [
     "Camera",
     "ClsplatError",
     "DeviceError",
+    "EvaluationOptions",
     "InputError",
+    "LoadedModel",
     "Model",
     "OutputError",
+    "PathRequest",
+    "RenderOutput",
     "Rendered",
     "Renderer",
     "Scene",
+    "SceneChoice",
     "Splats",
     "TrainConfig",
     "TrainingDisplay",
     "TrainingError",
+    "ViewChoice",
+    "conversion_cost",
+    "convert_model",
+    "evaluate",
+    "evaluate_models",
+    "export_cameras",
+    "inspect",
+    "load_model",
     "load_scene",
+    "make_demo_scene",
+    "prune_model",
+    "reconstruct",
+    "render_views",
+    "resume",
     "train",
     "train_budget",
 ]

@@ -60,7 +60,7 @@ def evaluate(
     options: EvaluationOptions | None = None,
     *,
     iteration: int | None = None,
-    renders: Path | None = None,
+    renders: str | Path | None = None,
     device: str | None = None,
     progress: ViewProgress | None = None,
 ) -> ModelEvaluation:
@@ -82,7 +82,7 @@ def evaluate(
     """
     options = options or EvaluationOptions()
     evaluator = Evaluator(options, Renderer(device))
-    measured = evaluator(model_at(model, iteration), renders, progress)
+    measured = evaluator(model_at(model, iteration), None if renders is None else Path(renders), progress)
     if measured.write_error is not None:
         raise measured.write_error
     return measured

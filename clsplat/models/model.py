@@ -32,7 +32,7 @@ class SceneChoice:
     resolution : as for `load_scene`.
     """
 
-    path: Path | None = None
+    path: str | Path | None = None
     images: str | None = None
     resolution: int | None = None
 

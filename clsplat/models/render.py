@@ -34,7 +34,7 @@ class ViewChoice:
     size : (width, height) of the images [px]; the vertical field of view is kept.
     """
 
-    cameras: Path | None = None
+    cameras: str | Path | None = None
     scene: SceneChoice = field(default_factory=SceneChoice)
     view_set: str | None = None
     path: PathRequest | None = None
@@ -65,7 +65,7 @@ def render_views(
     choice: ViewChoice | None = None,
     *,
     background: Color | None = None,
-    save_path: Path | None = None,
+    save_path: str | Path | None = None,
     iteration: int | None = None,
     device: str | None = None,
     progress: ViewProgress | None = None,
@@ -90,7 +90,7 @@ def render_views(
     """
     choice = choice or ViewChoice()
     if output.video is not None:
-        VideoWriter(output.video, DEFAULT_FPS)  # reports a wrong ending or a missing encoder before the work begins
+        VideoWriter(Path(output.video), DEFAULT_FPS)  # reports a wrong ending before the work begins
     loaded = model_at(model, iteration)
     views, path = choose_views(loaded, choice)
     fps = output.fps or (path.fps if path is not None else DEFAULT_FPS)
@@ -105,7 +105,7 @@ def render_views(
         progress,
     )
     if path is not None and output.folder is not None:
-        write_cameras(output.folder / "cameras.json", views)
+        write_cameras(Path(output.folder) / "cameras.json", views)
     return ModelRenders(views, fps, rendered.render_ms, rendered.depth_scales)
 
 
@@ -118,7 +118,7 @@ def choose_views(model: LoadedModel, choice: ViewChoice) -> tuple[list[NamedCame
     """
     test_names, source, view_set = model.test_names, model.path, choice.view_set
     if choice.cameras is not None:
-        views, source, view_set = read_cameras(choice.cameras), choice.cameras, view_set or "all"
+        views, source, view_set = read_cameras(choice.cameras), Path(choice.cameras), view_set or "all"
     elif choice.scene:
         scene = model.load_scene(choice.scene)
         views = named_cameras(scene.names, scene.cameras)

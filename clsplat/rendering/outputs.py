@@ -59,9 +59,10 @@ def _safe(name: str) -> str:
     return str(PurePosixPath(*parts))
 
 
-def extra_video(video: Path, extra: str) -> Path:
+def extra_video(video: str | Path, extra: str) -> Path:
     """The file of a video's alpha or depth, beside the colours."""
-    return video.with_name(f"{video.stem}_{extra}{video.suffix}")
+    path = Path(video)
+    return path.with_name(f"{path.stem}_{extra}{path.suffix}")
 
 
 class ImageWriter:

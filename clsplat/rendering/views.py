@@ -41,8 +41,8 @@ class RenderOutput:
     fps : frames a second of the video; None takes those of the camera path, or DEFAULT_FPS.
     """
 
-    folder: Path | None = None
-    video: Path | None = None
+    folder: str | Path | None = None
+    video: str | Path | None = None
     format: str = "png"
     extras: tuple[str, ...] = ()
     depth_colours: bool = False
@@ -93,11 +93,11 @@ def render_to_files(
         writers: list[ImageWriter | VideoFiles] = []
         if output.folder is not None:
             coloured = near_far if output.depth_colours else None
-            images = ImageWriter(output.folder, output.format, output.extras, coloured, background)
+            images = ImageWriter(Path(output.folder), output.format, output.extras, coloured, background)
             writers.append(images)
             scales = images.depth_scales
         if output.video is not None:
-            video = VideoFiles(output.video, output.fps or DEFAULT_FPS, output.extras, near_far, background)
+            video = VideoFiles(Path(output.video), output.fps or DEFAULT_FPS, output.extras, near_far, background)
             writers.append(files.enter_context(video))
         for number, (stem, view) in enumerate(zip(stems, views, strict=True), 1):
             if progress is not None:

@@ -191,3 +191,26 @@ def test_files_stay_small() -> None:
     """About 300 lines a file, 400 at most."""
     for path in [*modules().values(), *(ROOT / "cl").rglob("*.cl*"), *(ROOT / "cli").glob("*.py")]:
         assert len(path.read_text().splitlines()) <= 400, path.name
+
+
+# Files of the command line that write a file, and why.
+COMMANDS_THAT_WRITE = {"blender_addon.py": "the add-on is a part of the command line's package, not of a model"}
+WRITERS = {"atomic_writer", "write_text", "write_bytes", "write_json", "savez", "save", "mkdir"}
+
+
+def names_used(tree: ast.AST) -> set[str]:
+    """Names of variables, attributes and imports."""
+    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    names |= {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    return names | {a.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for a in node.names}
+
+
+def test_commands_only_parse_call_and_print() -> None:
+    """The command line computes nothing and writes nothing itself: a notebook can do all that it does."""
+    writing = set()
+    for path in sorted((ROOT / "cli").glob("*.py")):
+        tree = ast.parse(path.read_text())
+        assert not foreign_imports(tree) & {"numpy", "scipy", "PIL", "pyopencl", "pycolmap", "matplotlib"}, path.name
+        if names_used(tree) & (WRITERS | {"open"}):
+            writing.add(path.name)
+    assert writing == set(COMMANDS_THAT_WRITE)
