@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,6 @@ from .options import PATH, device_option, is_given, scene_options
 from .progress import table
 
 if TYPE_CHECKING:
-    from clsplat.device.device import Device
     from clsplat.profiling.bench import Report, StageTime
     from clsplat.scenes.scene import Scene
     from clsplat.splats.splats import Splats
@@ -84,8 +82,7 @@ def bench(
     Other work on the machine makes all of it slower.
     """
     from clsplat.device.device import open_device
-    from clsplat.files.atomic import atomic_writer
-    from clsplat.profiling.bench import bench_trainer, measure_render, measure_training
+    from clsplat.profiling.bench import bench_trainer, measure_render, measure_training, write_reports
     from clsplat.profiling.roofline import measure_limits
 
     if source_path is None and (images or resolution is not None or model_path):
@@ -111,20 +108,7 @@ def bench(
         reports.append(measure(trainer, limits, iterations))
         click.echo("\n" + "\n".join(describe(reports[-1], scene.name)))
     if json_path is not None:
-        values = device_record(opened, schedule) | {
-            "scene": scene.name,
-            "copy_bytes_per_s": limits.copy,
-            "fma_flops_per_s": limits.fma,
-            "reports": [report.to_json() for report in reports],
-        }
-        with atomic_writer(json_path) as stream:
-            stream.write(json.dumps(values, indent=1).encode())
-
-
-def device_record(device: Device, schedule: str) -> dict[str, str]:
-    """What was measured on."""
-    info = device.info
-    return {"device": info.name, "platform": info.platform, "driver": info.driver, "schedule": schedule}
+        write_reports(json_path, trainer, limits, scene.name, reports)
 
 
 def describe(report: Report, scene: str) -> list[str]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 from ..device.device import Device
 from ..device.trace import recorded
 from ..errors import InputError
+from ..files.atomic import atomic_writer
 from ..rendering.frame import Frame
 from ..rendering.overdraw import count_pairs
 from ..rendering.pipeline import Pipeline
@@ -140,6 +142,32 @@ def measure_render(trainer: Trainer, limits: Limits, iterations: int) -> Report:
         return trainer.pipeline.forward(trainer.splats, next(cameras), trainer.config.background)
 
     return _measure("render", trainer, render, limits, iterations)
+
+
+def write_reports(path: Path, trainer: Trainer, limits: Limits, scene: str, reports: Sequence[Report]) -> None:
+    """Write all measurements as JSON, with the device, the schedule and the limits.
+
+    Parameters
+    ----------
+    scene : the scene's name.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
+    info = trainer.device.info
+    values = {
+        "device": info.name,
+        "platform": info.platform,
+        "driver": info.driver,
+        "schedule": str(trainer.kernels.schedule),
+        "scene": scene,
+        "copy_bytes_per_s": limits.copy,
+        "fma_flops_per_s": limits.fma,
+        "reports": [report.to_json() for report in reports],
+    }
+    with atomic_writer(path) as stream:
+        stream.write(json.dumps(values, indent=1).encode())
 
 
 @dataclass(frozen=True)
