@@ -1,13 +1,39 @@
-// lazy.cl: which vectors of splats a lazy step is for, and the steps that the others sat out, done without another
-// (clsplat/training/optim/lazy.py, clsplat/training/optim/waiting.py).
+// lazy.cl: Adam for visible splats (clsplat/training/optim/lazy.py has the formula). A vector of splats skips its steps
+// while none of its splats is visible. Before its next step, the skipped steps are done in closed form.
 
-#define CULLED_KEY 0xFFFFFFFFu  // as in project.cl
+// Effect of a number of skipped steps: factors of both moments, and the drift of the value for each unit of rate and of
+// m / sqrt(v). `keeps_moments`: only the value is updated.
+typedef struct {
+    real decay1, decay2, drift;
+    bool keeps_moments;
+} adam_skip;
 
-// Whose steps are due: of each vector of splats ages [vectors], the steps that everything but the skew, and the skew, sat out;
-// -1 for vectors that go on waiting. A vector is woken by a splat that is seen (depth_key [n]: cl/render/project.cl), by
-// having waited as long as the tables go, or if `all`. last [2, vectors]: the counts of steps that it was last brought up to,
-// set to those after the step that follows, of which base_steps and skew_steps are the counts before. `peeks`: last stays.
-kernel void wake_vectors(
+// decays [5, ADAM_WAITS] by the number of skipped steps: factors of m and v, and the drift of most rows, of the means (rate
+// included) and of the trainable skew.
+#define DRIFT 2
+#define DRIFT_MEAN 3
+#define DRIFT_SKEW 4
+static inline adam_skip skipped_steps(constant real *decays, int steps, int drift, bool keeps_moments) {
+    return (adam_skip){decays[steps], decays[ADAM_WAITS + steps], decays[drift * ADAM_WAITS + steps], keeps_moments};
+}
+
+// Does the skipped steps of a row. `high` > 0 marks fields that are optimised in log space. Their drift is monotonic, so
+// one clamp at the end equals a clamp at every step.
+static inline void
+adam_catch_up(adam_skip skip, real lr, real low, real high, global real *value, adam_moments adam, const ulong at) {
+    const vreal m = lanes_load(adam.m + at), v = lanes_load(adam.v + at), old = lanes_load(value + at);
+    const vreal moved = lr * skip.drift * (m / (sqrt(v) + (vreal)ADAM_EPS));
+    lanes_store(high > 0 ? lanes_clamp(old * exp(-moved), low, high) : old - moved, value + at);
+    if (skip.keeps_moments) return;
+    lanes_store(m * skip.decay1, adam.m + at);
+    lanes_store(v * skip.decay2, adam.v + at);
+}
+
+// Selects the vectors that step now. For each vector, writes ages = (skipped steps of the base parameters, skipped steps of
+// the skew), or (-1, -1) if the vector is not updated. A vector is updated if one of its splats is visible (depth_key [n],
+// cl/render/project.cl) or if it reached the maximum age. last [2, vectors] holds the step counts up to which a vector is
+// done. It becomes the counts after the coming step; base_steps and skew_steps are the counts before it.
+kernel void wake_visible(
     global const uint *restrict depth_key,
     global uint *restrict last,
     global int2 *restrict ages,
@@ -16,68 +42,160 @@ kernel void wake_vectors(
     uint base_steps,
     uint skew_steps,
     uint base_learns,
-    uint skew_learns,
-    uint all,
-    uint peeks
+    uint skew_learns
 ) {
     const uint v = get_global_id(0), first = v * LANES;
     if (v >= vectors) return;
     ages[v] = (int2)(-1, -1);
     if (first >= n_splats) return;
     const int2 age = {(int)(base_steps - last[v]), (int)(skew_steps - last[vectors + v])};
-    uint woken = all || max(age.x, age.y) >= ADAM_WAITS - 1;
-    if (!woken) {
-        uint key = CULLED_KEY;  // which has all bits
+    uint awake = max(age.x, age.y) >= ADAM_WAITS - 1;
+    if (!awake) {
+        uint key = CULLED_KEY;  // all bits are set
         for (uint l = 0; l < LANES; ++l) key &= depth_key[min(first + l, n_splats - 1)];
-        woken = key != CULLED_KEY;
+        awake = key != CULLED_KEY;
     }
-    if (!woken) return;
+    if (!awake) return;
     ages[v] = age;
-    if (peeks) return;
     last[v] = base_steps + base_learns;
     last[vectors + v] = skew_steps + skew_learns;
 }
 
-// The steps of step_splats that splats sat out, for those that wake_vectors woke; then nothing of geometry or colour is
-// pending. keeps_moments: of the values only. Global size: (capacity / LANES, PARTS + coefficients).
-kernel void settle_splats(
-    global real *restrict geom,
-    global real *restrict geom_m,
-    global real *restrict geom_v,
+// Selects all vectors; no step follows. `last` is not changed.
+kernel void wake_all(
+    global const uint *restrict last,
+    global int2 *restrict ages,
+    uint vectors,
+    uint n_splats,
+    uint base_steps,
+    uint skew_steps
+) {
+    const uint v = get_global_id(0);
+    if (v >= vectors) return;
+    const int2 age = {(int)(base_steps - last[v]), (int)(skew_steps - last[vectors + v])};
+    ages[v] = v * LANES < n_splats ? age : (int2)(-1, -1);
+}
+
+// Does the skipped steps of the selected vectors: of the colour, of the geometry except the skew, and of the skew.
+// Global sizes are those of step_color, step_geometry (with first_part = 0) and step_skew.
+kernel void settle_color(
     global real *restrict sh,
     global real *restrict sh_m,
     global real *restrict sh_v,
-    global real *restrict skew_s,
-    global real *restrict skew_m,
-    global real *restrict skew_v,
-    constant real *restrict rates,
     global const int2 *restrict ages,
-    constant real *restrict waits,
-    uint lazy_from,
+    constant real *restrict decays,
     ulong capacity,
-    real sh_lr,
-    real sh_rest_lr,
-    real skew_lr,
+    real lr,
+    real rest_lr,
     uint keeps_moments
 ) {
     const ulong i = get_global_id(0) * LANES;
-    const uint part = get_global_id(1);
+    const uint k = get_global_id(1);
     const int2 age = ages[get_global_id(0)];
-    if (part < lazy_from || age.x < 0) return;
-    if (part >= PARTS) {
-        const adam_moments adam = {sh_m + i, sh_v + i, 0, 0};
-        const uint k = part - PARTS;
-        const adam_wait wait = waited_steps(waits, age.x, DRIFT, keeps_moments);
-        if (age.x > 0) catch_up_coefficient(k, wait, k == 0 ? sh_lr : sh_rest_lr, sh + i, adam, capacity);
-        return;
-    }
-    geom += i;
-    const adam_moments adam = {geom_m + i, geom_v + i, 0, 0};
-    if (age.x > 0) catch_up_rows(part_rows(part), waits, age.x, keeps_moments, geom, adam, rates, capacity);
-#ifdef ROW_SKEW
-    if (part != PART_MAPS) return;
-    const adam_moments adam_s = {skew_m + i, skew_v + i, 0, 0};
-    if (age.y > 0) catch_up_skew(waits, age.y, keeps_moments, skew_lr, skew_s + i, adam_s, capacity);
-    if (age.y > 0 || SKEW_ROTATES) map_skew(geom, skew_s + i, capacity);
-#endif
+    if (age.x <= 0) return;
+    const adam_moments adam = {sh_m + i, sh_v + i, 0, 0};
+    const adam_skip skip = skipped_steps(decays, age.x, DRIFT, keeps_moments);
+    for (int c = 0; c < 3; ++c) adam_catch_up(skip, k == 0 ? lr : rest_lr, 0, 0, sh + i, adam, (3 * k + c) * capacity);
 }
+kernel void settle_geometry(
+    global real *restrict geom,
+    global real *restrict geom_m,
+    global real *restrict geom_v,
+    global const int2 *restrict ages,
+    constant real *restrict decays,
+    constant real *restrict rates,
+    ulong capacity,
+    uint keeps_moments
+) {
+    const ulong i = get_global_id(0) * LANES;
+    const int2 age = ages[get_global_id(0)];
+    if (age.x <= 0) return;
+    const uint2 rows = part_rows(get_global_id(1));
+    const bool means = rows.x == ROW_MEAN;
+    const adam_moments adam = {geom_m + i, geom_v + i, 0, 0};
+    const adam_skip skip = skipped_steps(decays, age.x, means ? DRIFT_MEAN : DRIFT, keeps_moments);
+    for (uint row = rows.x; row < rows.y; ++row)
+        adam_catch_up(
+            skip, means ? (real)1 : rates[row], rates[GEOM_ROWS + row], rates[2 * GEOM_ROWS + row], geom + i, adam,
+            row * capacity
+        );
+}
+#ifdef ROW_SKEW
+kernel void settle_skew(
+    global real *restrict geom,
+    global real *restrict skew_s,
+    global real *restrict skew_m,
+    global real *restrict skew_v,
+    global const int2 *restrict ages,
+    constant real *restrict decays,
+    ulong capacity,
+    real lr,
+    uint keeps_moments
+) {
+    const ulong i = get_global_id(0) * LANES;
+    const int2 age = ages[get_global_id(0)];
+    if (age.x < 0) return;
+    const adam_moments adam = {skew_m + i, skew_v + i, 0, 0};
+    const adam_skip skip = skipped_steps(decays, age.y, DRIFT_SKEW, keeps_moments);
+    if (age.y > 0)
+        for (int row = 0; row < SKEW_WIDTH; ++row) adam_catch_up(skip, lr, 0, 0, skew_s + i, adam, row * capacity);
+    if (age.y > 0 || SKEW_ROTATES) write_skew(geom + i, skew_s + i, capacity);
+}
+#endif
+
+// The kernels of optim.cl for the selected vectors.
+kernel void step_visible_color(
+    global real *restrict sh,
+    global const real *restrict grad_sh,
+    global real *restrict sh_m,
+    global real *restrict sh_v,
+    global const int2 *restrict ages,
+    ulong capacity,
+    int sh_degree,
+    real lr,
+    real rest_lr,
+    real correct1,
+    real correct2
+) {
+    if (ages[get_global_id(0)].x < 0) return;
+    color_step(sh, grad_sh, sh_m, sh_v, capacity, sh_degree, lr, rest_lr, correct1, correct2);
+}
+kernel void step_visible_geometry(
+    global real *restrict geom,
+    global const real *restrict grad_geom,
+    global real *restrict geom_m,
+    global real *restrict geom_v,
+    constant real *restrict rates,
+    global const int2 *restrict ages,
+    ulong capacity,
+    uint first_part,
+    real mean_lr,
+    real correct1,
+    real correct2,
+    real opacity_scale,
+    real scale_scale,
+    real bisect_scale
+) {
+    if (ages[get_global_id(0)].x < 0) return;
+    geometry_step(
+        geom, grad_geom, geom_m, geom_v, rates, capacity, first_part, mean_lr, correct1, correct2, opacity_scale,
+        scale_scale, bisect_scale
+    );
+}
+#ifdef ROW_SKEW
+kernel void step_visible_skew(
+    global real *restrict geom,
+    global const real *restrict grad_geom,
+    global real *restrict skew_s,
+    global real *restrict skew_m,
+    global real *restrict skew_v,
+    global const int2 *restrict ages,
+    ulong capacity,
+    real lr,
+    real correct1,
+    real correct2
+) {
+    if (ages[get_global_id(0)].x < 0) return;
+    skew_step(geom, grad_geom, skew_s, skew_m, skew_v, capacity, lr, correct1, correct2);
+}
+#endif

@@ -1,10 +1,9 @@
-// optim.cl: one step of all parameters, or of those of splats that were seen: Adam with regularisers and the skew map's chain
-// rule; SGHMC for positions, MCMC noise, and the kernels that move splats about. The NumPy forms are in
-// clsplat/training/optim/reference.py, optim_reference.py, optim_lazy.py, regularisers.py, sghmc.py, skew_map.py and noise.py; a test
-// compares them step for step.
+// optim.cl: one Adam step of colour, geometry and skew, with regularisers and the chain rule of the skew map.
+// The NumPy form is clsplat/training/optim/reference.py; a test compares both step by step.
+// All buffers are [rows, capacity], one column for each splat. A work-item steps LANES splats.
 
-// Coefficient k of the colour. grad_sh [6, capacity]: the gradient of the colour and the direction (cl/render/project.cl), whose
-// product with the basis is formed here.
+// One step of coefficient k of the colour. grad_sh [6, capacity] holds the gradient of the colour and the view direction
+// (cl/render/project.cl); the gradient of the coefficient is the product of both with the basis.
 static inline void step_coefficient(
     uint k,
     int degree,
@@ -20,19 +19,42 @@ static inline void step_coefficient(
         adam_step(basis[k] * lanes_load(grad_sh + c * capacity), lr, sh, adam, (3 * k + c) * capacity);
 }
 
-// Parts that a step of geometry is shared out in: each reads its own rows and writes them, so that few streams of memory
-// are open at a time. The skew goes with the rotation where its map depends on it.
-#define PART_MEAN 0
-#define PART_QUAT 1
-#define PART_SCALE 2
-#define PART_OWN 3  // opacities, and the shape's own but the skew
-#define PART_SKEW 4
-#define PARTS 5  // then one a coefficient of the colour
-#ifdef ROW_SKEW
-#define PART_MAPS (SKEW_ROTATES ? PART_QUAT : PART_SKEW)  // has the trainable skew
-#endif
+// Steps the colour. lr is the rate of the constant band, rest_lr the rate of the other bands.
+// Global size: (capacity / LANES, coefficients of sh_degree).
+static inline void color_step(
+    global real *sh,
+    global const real *grad_sh,
+    global real *sh_m,
+    global real *sh_v,
+    const ulong capacity,
+    int sh_degree,
+    real lr,
+    real rest_lr,
+    real correct1,
+    real correct2
+) {
+    const ulong i = get_global_id(0) * LANES;
+    const uint k = get_global_id(1);
+    const adam_moments adam = {sh_m + i, sh_v + i, correct1, correct2};
+    step_coefficient(k, sh_degree, k == 0 ? lr : rest_lr, sh + i, grad_sh + i, adam, capacity);
+}
+kernel void step_color(
+    global real *restrict sh,
+    global const real *restrict grad_sh,
+    global real *restrict sh_m,
+    global real *restrict sh_v,
+    ulong capacity,
+    int sh_degree,
+    real lr,
+    real rest_lr,
+    real correct1,
+    real correct2
+) {
+    color_step(sh, grad_sh, sh_m, sh_v, capacity, sh_degree, lr, rest_lr, correct1, correct2);
+}
 
-// Rows of a part, skew left out.
+// A geometry step has four parts. Each part reads and writes its own rows, so that few streams of memory are open at a
+// time. PART_OWN holds the opacities and the fields of the shape, except the skew.
 static inline uint2 part_rows(uint part) {
     switch (part) {
     case PART_MEAN:
@@ -42,68 +64,18 @@ static inline uint2 part_rows(uint part) {
     case PART_SCALE:
         return (uint2)(ROW_LOG_SCALE, ROW_LOG_SCALE + 3);
 #ifdef ROW_SKEW
-    case PART_OWN:
+    default:
         return (uint2)(ROW_OPACITY_LOGIT, ROW_SKEW);
 #else
-    case PART_OWN:
+    default:
         return (uint2)(ROW_OPACITY_LOGIT, GEOM_ROWS);
 #endif
-    default:
-        return (uint2)(0, 0);
     }
 }
-#define PART_ROWS 4  // at most
 
-// Steps that were sat out, of a coefficient of the colour, of a part's rows, and of the trainable skew.
-static inline void
-catch_up_coefficient(uint k, adam_wait wait, real lr, global real *sh, adam_moments adam, const ulong capacity) {
-    for (int c = 0; c < 3; ++c) adam_catch_up(wait, lr, 0, 0, sh, adam, (3 * k + c) * capacity);
-}
-static inline void catch_up_rows(
-    uint2 rows,
-    constant real *waits,
-    int steps,
-    bool keeps_moments,
-    global real *geom,
-    adam_moments adam,
-    constant real *rates,
-    const ulong capacity
-) {
-    const bool means = rows.x == ROW_MEAN;
-    const adam_wait wait = waited_steps(waits, steps, means ? DRIFT_MEAN : DRIFT, keeps_moments);
-    for (uint row = rows.x; row < rows.y; ++row)
-        adam_catch_up(
-            wait, means ? (real)1 : rates[row], rates[GEOM_ROWS + row], rates[2 * GEOM_ROWS + row], geom, adam,
-            row * capacity
-        );
-}
-#ifdef ROW_SKEW
-static inline void catch_up_skew(
-    constant real *waits,
-    int steps,
-    bool keeps_moments,
-    real lr,
-    global real *skew_s,
-    adam_moments adam,
-    const ulong capacity
-) {
-    const adam_wait wait = waited_steps(waits, steps, DRIFT_SKEW, keeps_moments);
-    for (int row = 0; row < SKEW_WIDTH; ++row) adam_catch_up(wait, lr, 0, 0, skew_s, adam, row * capacity);
-}
-
-// The kernel's skew from the trainable one, and from the rotation where the map looks at it.
-static inline void map_skew(global real *geom, global const real *skew_s, const ulong capacity) {
-    vec3 skew = skew_of(skew_s, capacity);
-#if SKEW_ROTATES
-    skew = mat3_apply_transposed(quat_rotation(quat_load(geom + ROW_QUAT * capacity, capacity)), skew);
-#endif
-    vec3_store(skew, geom + ROW_SKEW * capacity, capacity);
-}
-#endif
-
-// Adds to g, the gradients of a part's rows, those of opacity_scale * sum(|opacity|) + scale_scale * sum(scale)
-// (3DGS-MCMC's regularisers) and, where a splat has two opacities, whose mean counts then, of
-// bisect_scale * sum((one - other)^2) (3DSGS).
+// Adds the gradients of the regularisers to g, the gradients of the rows of a part.
+// 3DGS-MCMC: opacity_scale * sum(|opacity|) + scale_scale * sum(scale). With two opacities, |opacity| is their mean.
+// 3DSGS: bisect_scale * sum((one opacity - other opacity)^2).
 static inline void regularise(
     uint part,
     vreal *g,
@@ -129,176 +101,131 @@ static inline void regularise(
     }
 }
 
-// One step of all parameters but the means that SGHMC moves (then means_learn is 0): geom, sh and their moments in place.
-// grad_geom may change where the skew's map depends on the rotation. rates [3, GEOM_ROWS]: the rate (of the means
-// mean_lr instead), and the bounds of what is stepped in the logarithm (0, 0 without). The skew follows the trainable one,
-// skew_s with skew_m, skew_v [SKEW_WIDTH, capacity] (of any content in shapes without), which learns if skew_learns; all
-// else learns if base_learns. Parts from `lazy_from` on are stepped only in vectors of splats that wake_vectors woke, after
-// the steps that they sat out (ages, waits: not looked at if there is no such part).
-// Global size: (capacity / LANES, PARTS + coefficients of the degree).
-kernel void step_splats(
-    global real *restrict geom,
-    global real *restrict grad_geom,
-    global real *restrict geom_m,
-    global real *restrict geom_v,
-    global real *restrict sh,
-    global const real *restrict grad_sh,
-    global real *restrict sh_m,
-    global real *restrict sh_v,
-    global real *restrict skew_s,
-    global real *restrict skew_m,
-    global real *restrict skew_v,
-    constant real *restrict rates,
-    global const int2 *restrict ages,
-    constant real *restrict waits,
-    uint lazy_from,
-    ulong capacity,
-    int sh_degree,
-    uint base_learns,
-    uint means_learn,
-    uint skew_learns,
+// Steps the geometry except the skew. rates [3, GEOM_ROWS]: the rate of each row, and the bounds of fields that are
+// optimised in log space (0, 0 for the others). The rate of the means is mean_lr.
+// Global size: (capacity / LANES, number of parts from first_part on). SGHMC moves the means itself: first_part = 1.
+static inline void geometry_step(
+    global real *geom,
+    global const real *grad_geom,
+    global real *geom_m,
+    global real *geom_v,
+    constant real *rates,
+    const ulong capacity,
+    uint first_part,
     real mean_lr,
-    real sh_lr,
-    real sh_rest_lr,
-    real skew_lr,
     real correct1,
     real correct2,
-    real skew_correct1,
-    real skew_correct2,
     real opacity_scale,
     real scale_scale,
     real bisect_scale
 ) {
     const ulong i = get_global_id(0) * LANES;
-    const uint part = get_global_id(1);
-    int2 age = (int2)(0, 0);
-    if (part >= lazy_from) {
-        age = ages[get_global_id(0)];
-        if (age.x < 0) return;
-    }
-    if (part >= PARTS) {
-        const adam_moments adam = {sh_m + i, sh_v + i, correct1, correct2};
-        const uint k = part - PARTS;
-        const real lr = k == 0 ? sh_lr : sh_rest_lr;
-        if (age.x > 0) catch_up_coefficient(k, waited_steps(waits, age.x, DRIFT, false), lr, sh + i, adam, capacity);
-        if (base_learns) step_coefficient(k, sh_degree, lr, sh + i, grad_sh + i, adam, capacity);
-        return;
-    }
+    const uint part = first_part + get_global_id(1);
     geom += i;
     grad_geom += i;
     const uint2 rows = part_rows(part);
     const adam_moments adam = {geom_m + i, geom_v + i, correct1, correct2};
-    if (age.x > 0) catch_up_rows(rows, waits, age.x, false, geom, adam, rates, capacity);
     vreal g[PART_ROWS];
     for (uint row = rows.x; row < rows.y; ++row) g[row - rows.x] = lanes_load(grad_geom + row * capacity);
     if (opacity_scale > 0 || scale_scale > 0 || bisect_scale > 0)
         regularise(part, g, geom, capacity, opacity_scale, scale_scale, bisect_scale);
-#ifdef ROW_SKEW
-    const adam_moments adam_s = {skew_m + i, skew_v + i, skew_correct1, skew_correct2};
-    if (age.y > 0 && part == PART_MAPS) catch_up_skew(waits, age.y, false, skew_lr, skew_s + i, adam_s, capacity);
-    const bool maps = part == PART_MAPS && (skew_learns || SKEW_ROTATES || age.y > 0);
-    vreal v_s[SKEW_WIDTH];
-    if (maps) {
-        vec3 v = vec3_load(grad_geom + ROW_SKEW * capacity, capacity);
-#if SKEW_ROTATES
-        const unit_quat q = quat_load(geom + ROW_QUAT * capacity, capacity);
-        const vec3 a = skew_of(skew_s + i, capacity);
-        global real *v_quat = grad_geom + ROW_QUAT * capacity;
-        quat_rotation_vjp(q, (mat3){scale3(v, a.x), scale3(v, a.y), scale3(v, a.z)}, lanes_mask(1), v_quat, capacity);
-        for (int c = 0; c < 4; ++c) g[c] += lanes_load(v_quat + c * capacity);
-        v = mat3_apply(quat_rotation(q), v);
-#endif
-        skew_of_vjp(skew_s + i, v, v_s, capacity);
+    for (uint row = rows.x; row < rows.y; ++row) {
+        const real lr = part == PART_MEAN ? mean_lr : rates[row];
+        const real low = rates[GEOM_ROWS + row], high = rates[2 * GEOM_ROWS + row];
+        if (high > 0) adam_step_bounded(g[row - rows.x], lr, low, high, geom, adam, row * capacity);
+        else adam_step(g[row - rows.x], lr, geom, adam, row * capacity);
     }
-#endif
-    if (part == PART_MEAN ? means_learn : base_learns)
-        for (uint row = rows.x; row < rows.y; ++row) {
-            const real lr = part == PART_MEAN ? mean_lr : rates[row];
-            const real low = rates[GEOM_ROWS + row], high = rates[2 * GEOM_ROWS + row];
-            if (high > 0) adam_step_bounded(g[row - rows.x], lr, low, high, geom, adam, row * capacity);
-            else adam_step(g[row - rows.x], lr, geom, adam, row * capacity);
-        }
-#ifdef ROW_SKEW
-    if (!maps) return;
-    if (skew_learns)
-        for (int row = 0; row < SKEW_WIDTH; ++row) adam_step(v_s[row], skew_lr, skew_s + i, adam_s, row * capacity);
-    map_skew(geom, skew_s + i, capacity);
-#endif
 }
-
-// One step of the means with momentum [3, capacity]: clsplat/training/optim/sghmc.py has the formula and the coefficients.
-kernel void sghmc_step(
+kernel void step_geometry(
     global real *restrict geom,
     global const real *restrict grad_geom,
-    global real *restrict adam_m,
-    global real *restrict adam_v,
-    global real *restrict momentum,
+    global real *restrict geom_m,
+    global real *restrict geom_v,
+    constant real *restrict rates,
     ulong capacity,
-    uint n_splats,
-    uint seed_lo,
-    uint seed_hi,
-    uint iteration,
-    uint stream,
+    uint first_part,
+    real mean_lr,
     real correct1,
     real correct2,
-    real length,
-    real drive,
-    real keep,
-    real noise,
-    uint by_covariance
+    real opacity_scale,
+    real scale_scale,
+    real bisect_scale
 ) {
-    const uint first = get_global_id(0) * LANES;
-    if (first >= n_splats) return;
-    global real *at = geom + first;
-    const vreal gate = noise_gate(at, capacity);
-    vec3 spread = normal3(first, (uint2)(seed_lo, seed_hi), iteration, stream);
-    if (by_covariance) spread = covariance_times(at, capacity, spread);
-    const vreal random[3] = {spread.x, spread.y, spread.z};
-    for (int c = 0; c < 3; ++c) {
-        const ulong row = (ROW_MEAN + c) * capacity + first, own = c * capacity + first;
-        const vreal g = adam_direction(lanes_load(grad_geom + row), adam_m + row, adam_v + row, correct1, correct2);
-        const vreal p = gate * (keep * lanes_load(momentum + own) + noise * random[c]) - drive * g;
-        lanes_store(p, momentum + own);
-        lanes_store(lanes_load(geom + row) + length * p, geom + row);
-    }
+    geometry_step(
+        geom, grad_geom, geom_m, geom_v, rates, capacity, first_part, mean_lr, correct1, correct2, opacity_scale,
+        scale_scale, bisect_scale
+    );
 }
 
-// mean += Sigma (xi gate amount), Sigma = R S S R', gate = sigmoid(0.5 - 100 opacity) (3DGS-MCMC, Kheradmand 2024), but by
-// `reach` at most: of a splat as large as the scene a step would lead out of it for good.
-kernel void mcmc_noise(
+#ifdef ROW_SKEW
+// Writes the kernel's skew from the trainable skew, and from the rotation if the map depends on it.
+static inline void write_skew(global real *geom, global const real *skew_s, const ulong capacity) {
+    vec3 skew = skew_of(skew_s, capacity);
+#if SKEW_ROTATES
+    skew = mat3_apply_transposed(quat_rotation(quat_load(geom + ROW_QUAT * capacity, capacity)), skew);
+#endif
+    vec3_store(skew, geom + ROW_SKEW * capacity, capacity);
+}
+
+// Steps the trainable skew skew_s [SKEW_WIDTH, capacity] and writes the kernel's skew. Runs after step_geometry.
+// Global size: capacity / LANES.
+static inline void skew_step(
+    global real *geom,
+    global const real *grad_geom,
+    global real *skew_s,
+    global real *skew_m,
+    global real *skew_v,
+    const ulong capacity,
+    real lr,
+    real correct1,
+    real correct2
+) {
+    const ulong i = get_global_id(0) * LANES;
+    const adam_moments adam = {skew_m + i, skew_v + i, correct1, correct2};
+    vreal v_s[SKEW_WIDTH];
+    skew_of_vjp(skew_s + i, vec3_load(grad_geom + ROW_SKEW * capacity + i, capacity), v_s, capacity);
+    for (int row = 0; row < SKEW_WIDTH; ++row) adam_step(v_s[row], lr, skew_s + i, adam, row * capacity);
+    write_skew(geom + i, skew_s + i, capacity);
+}
+kernel void step_skew(
     global real *restrict geom,
+    global const real *restrict grad_geom,
+    global real *restrict skew_s,
+    global real *restrict skew_m,
+    global real *restrict skew_v,
     ulong capacity,
-    uint n_splats,
-    uint seed_lo,
-    uint seed_hi,
-    uint iteration,
-    real amount,
-    real reach
+    real lr,
+    real correct1,
+    real correct2
 ) {
-    const uint first = get_global_id(0) * LANES;
-    if (first >= n_splats) return;
-    global real *at = geom + first;
-    const vreal gate = amount * noise_gate(at, capacity);
-    const vec3 step = scale3(normal3(first, (uint2)(seed_lo, seed_hi), iteration, 0), gate);
-    vec3 moved = covariance_times(at, capacity, step);
-    moved = scale3(moved, min((vreal)1, reach / sqrt(max(dot3(moved, moved), (vreal)R(1e-30)))));
-    vec3_store(add3(vec3_load(at + ROW_MEAN * capacity, capacity), moved), at + ROW_MEAN * capacity, capacity);
+    skew_step(geom, grad_geom, skew_s, skew_m, skew_v, capacity, lr, correct1, correct2);
 }
 
-// moved[row, i] = values[row, source[i]]. Global size: (at least n, rows).
-kernel void gather_columns(
-    global const real *restrict values,
-    global const int *restrict source,
-    global real *restrict moved,
-    ulong capacity,
-    uint n
+#if SKEW_ROTATES
+// For a map that depends on the rotation: turns the gradient of the skew into the world's frame, in place, and adds the
+// part that belongs to the rotation to the gradient of the quaternion. Runs before step_geometry.
+kernel void turn_skew_gradient(
+    global const real *restrict geom,
+    global real *restrict grad_geom,
+    global const real *restrict skew_s,
+    ulong capacity
 ) {
-    const ulong i = get_global_id(0), row = get_global_id(1) * capacity;
-    if (i < n) moved[row + i] = values[row + source[i]];
+    const ulong i = get_global_id(0) * LANES;
+    const unit_quat q = quat_load(geom + ROW_QUAT * capacity + i, capacity);
+    const vec3 a = skew_of(skew_s + i, capacity);
+    const vec3 v = vec3_load(grad_geom + ROW_SKEW * capacity + i, capacity);
+    global real *v_quat = grad_geom + ROW_QUAT * capacity + i;
+    vreal g[4];
+    for (int c = 0; c < 4; ++c) g[c] = lanes_load(v_quat + c * capacity);
+    quat_rotation_vjp(q, (mat3){scale3(v, a.x), scale3(v, a.y), scale3(v, a.z)}, lanes_mask(1), v_quat, capacity);
+    for (int c = 0; c < 4; ++c) lanes_store(g[c] + lanes_load(v_quat + c * capacity), v_quat + c * capacity);
+    vec3_store(mat3_apply(quat_rotation(q), v), grad_geom + ROW_SKEW * capacity + i, capacity);
 }
 
-// values[row, i] = 0 where fresh[i]. Global size: (at least n, rows).
-kernel void zero_columns(global real *restrict values, global const uchar *restrict fresh, ulong capacity, uint n) {
-    const ulong i = get_global_id(0);
-    if (i < n && fresh[i]) values[get_global_id(1) * capacity + i] = 0;
+// Writes the kernel's skew while the trainable skew is frozen.
+kernel void map_skew(global real *restrict geom, global const real *restrict skew_s, ulong capacity) {
+    const ulong i = get_global_id(0) * LANES;
+    write_skew(geom + i, skew_s + i, capacity);
 }
+#endif
+#endif

@@ -7,6 +7,8 @@ import numpy as np
 from ..device.device import Device
 from ..device.program import Define, Program, build
 from ..rendering.build import MARGIN_X, MARGIN_Y, KernelBuild
+from ..splats.fields import Group
+from ..splats.shapes import SKEW_MAX, SLANT_MAX, shape_named
 from .optim import adam
 from .optim.skew_map import SKEW_MAPS
 
@@ -44,29 +46,53 @@ def exposure_program(device: Device, kernels: KernelBuild) -> Program:
     return build(device, ("math/lanes.clh", "train/exposure.cl"), defines, kernels.real)
 
 
+# Parts of a geometry step (cl/train/optim.cl): a work-item steps the rows of one part.
+PARTS = ("mean", "quat", "scale", "own")
+CULLED_KEY = 0xFFFFFFFF  # depth key of a splat that is not visible (cl/render/project.cl)
+
+_OPTIM_FILES = (
+    "math/lanes.clh",
+    "math/algebra.clh",
+    "math/opacity.clh",
+    "math/harmonics.clh",
+    "train/skew_map.clh",
+    "math/noise.clh",
+    "train/adam.clh",
+    "train/optim.cl",
+    "train/positions.cl",
+    "train/columns.cl",
+)
+
+
 def optim_program(device: Device, kernels: KernelBuild) -> Program:
-    """The optimizer's step with its skew map and regularisers, noise and gathers."""
-    wanted = ("ROW_", "LANES", "SKEW_", "SLANT_", "OPACITY_", "SH_", "GEOM_")
-    defines = {k: v for k, v in kernels.defines().items() if k.startswith(wanted)}
-    # 1 - beta is a constant of its own: as a difference of float32 it is off by 1e-5.
-    defines |= {
+    """The optimizer: steps of colour, geometry and skew, SGHMC, noise, and the kernels that move columns."""
+    return build(device, _OPTIM_FILES, _optim_defines(kernels), kernels.real)
+
+
+def lazy_program(device: Device, kernels: KernelBuild) -> Program:
+    """The optimizer with the kernels of visible splats (optim/lazy.py)."""
+    defines = _optim_defines(kernels) | {"ADAM_WAITS": adam.WAITS, "CULLED_KEY": CULLED_KEY}
+    return build(device, (*_OPTIM_FILES, "train/lazy.cl"), defines, kernels.real)
+
+
+def _optim_defines(kernels: KernelBuild) -> dict[str, Define]:
+    geometry = kernels.schema.group(Group.GEOM)
+    widths = {field.name: field.width for field in geometry if field.name not in ("mean", "quat", "log_scale", "skew")}
+    defines: dict[str, Define] = {f"PART_{name.upper()}": number for number, name in enumerate(PARTS)}
+    defines |= {f"ROW_{field.name.upper()}": kernels.schema.offset(field.name) for field in geometry}
+    # 1 - beta is a constant, because the difference of float32 numbers has a relative error of 1e-5.
+    return defines | {
+        "PART_ROWS": max(4, sum(widths.values())),
+        "GEOM_ROWS": kernels.schema.rows(Group.GEOM),
+        "LANES": kernels.lanes,
+        "SH_DEGREE": kernels.sh_degree,
+        "OPACITY_SIGNED": int(shape_named(kernels.shape).signed),
+        "SKEW_MAP": SKEW_MAPS.index(kernels.skew_map),
+        "SKEW_MAX": SKEW_MAX,
+        "SLANT_MAX": SLANT_MAX,
         "ADAM_BETA1": adam.BETA1,
         "ADAM_BETA2": adam.BETA2,
         "ADAM_EPS": adam.EPS,
         "ADAM_REST1": 1.0 - adam.BETA1,
         "ADAM_REST2": 1.0 - adam.BETA2,
-        "SKEW_MAP": SKEW_MAPS.index(kernels.skew_map),
-        "ADAM_WAITS": adam.WAITS,
     }
-    files = (
-        "math/lanes.clh",
-        "math/algebra.clh",
-        "math/opacity.clh",
-        "math/harmonics.clh",
-        "train/skew_map.clh",
-        "math/noise.clh",
-        "train/adam.clh",
-        "train/optim.cl",
-        "train/lazy.cl",
-    )
-    return build(device, files, defines, kernels.real)

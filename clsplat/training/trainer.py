@@ -22,10 +22,8 @@ from ..rendering.renderer import Renderer
 from ..rendering.splat_buffers import CompactGradients, SplatBuffers, SplatStatistics
 from ..rendering.tuning import schedule_for
 from ..scenes.scene import Scene, View
-from ..splats.morton import morton_order
 from ..splats.optical_depth import finite_rows
 from ..splats.splats import Splats
-from .alternation import active_blocks
 from .checkpoint import Checkpoint
 from .config import TrainConfig
 from .density.strategy import StepInfo, next_edit
@@ -36,6 +34,7 @@ from .interrupt import stoppable
 from .log import Progress, RunLog
 from .loss import ImageLoss, LossValue
 from .memory_estimate import check, estimate, peak_bytes, room_for_isects
+from .methods.sns import learning_groups
 from .optim.noise import noise_amount, noise_reach
 from .optim.optimizer import make_optimizer
 from .optim.skew_map import SKEW_MAPS
@@ -256,7 +255,7 @@ class Trainer:
         self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it, frame.projected.depth_key)
         if self.densify_first <= it <= self.densify_last and it % config.density.densify_interval == 0:
             self.densify()
-        if config.density.noise_lr and active_blocks(it, config).base:
+        if config.density.noise_lr and learning_groups(it, config).base:
             self.optim_program.mcmc_noise.over(
                 -(-self.splats.n // self.kernels.lanes),
                 self.pipeline.group,
@@ -282,10 +281,7 @@ class Trainer:
                 "check what training starts from (init) and the learning rates"
             )
         edit = next_edit(self.config, arrays, signals, self.rng, info)
-        if self.config.optim.visible_adam:  # splats seen together stay together
-            mean = edit.values.get("mean", arrays["mean"][edit.source])
-            edit = edit.permuted(morton_order(mean), self.splats.n)
-        self.optimizer.apply(edit)
+        self.optimizer.apply(self.optimizer.arranged(edit))
         self.pipeline.statistics.reset()
 
     def snapshot(self) -> Splats:

@@ -18,7 +18,7 @@ from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.radix_sort import DIGIT_BITS
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.training.optim.skew_map import SKEW_MAPS
-from clsplat.training.programs import exposure_program, loss_program, optim_program
+from clsplat.training.programs import exposure_program, lazy_program, loss_program, optim_program
 
 REALS = ("float", "double")
 
@@ -61,6 +61,7 @@ def build_all(device: Device, kernels: KernelBuild) -> None:
     loss_program(device, kernels)
     exposure_program(device, kernels)
     optim_program(device, kernels)
+    lazy_program(device, kernels)
 
 
 def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
@@ -72,9 +73,11 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
     build(compiler, ("measure/smoke.cl",))
     build(compiler, ("render/sort.cl",), {"SORT_GROUP": 64, "RADIX_BITS": DIGIT_BITS})
     build(compiler, ("render/order.cl", "render/bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
-    root = files("clsplat_cl")
-    there = {f.name for f in root.iterdir()} | {
-        f"{folder}/{f.name}" for folder in ("camera", "shape") for f in root.joinpath(folder).iterdir()
+    there = {
+        f"{folder.name}/{file.name}"
+        for folder in files("clsplat_cl").iterdir()
+        if folder.is_dir()
+        for file in folder.iterdir()
     }
     used = {name for names, *_ in compiler.programs for name in names}
     assert used == {name for name in there if name.endswith((".cl", ".clh"))}

@@ -34,7 +34,8 @@ from clsplat.training.config import TrainConfig
 from clsplat.training.density.edit import DensifyEdit
 from clsplat.training.log import Progress
 from clsplat.training.optim.adam import NumpyAdam
-from clsplat.training.optim.lazy import DRIFT_MEAN, WAITS, Drifts, woken
+from clsplat.training.optim.lazy import DRIFT_MEAN, WAITS, Drifts
+from clsplat.training.optim.lazy_reference import awake
 from clsplat.training.optim.optimizer import Optimizer
 from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
@@ -149,9 +150,9 @@ def test_drifts_are_those_of_dense_adam() -> None:
 def test_vectors_wake_by_a_splat_or_when_the_tables_end() -> None:
     last = np.array([[300, 300, 300 - WAITS + 1, 300], [7, 7, 7, 7]])
     seen = np.zeros(13, bool)
-    np.testing.assert_array_equal(woken(seen, last, (300, 7), 4), [False, False, True, False])
+    np.testing.assert_array_equal(awake(seen, last, (300, 7), 4), [False, False, True, False])
     seen[[5, 12]] = True
-    np.testing.assert_array_equal(woken(seen, last, (300, 7), 4), [False, True, True, True])
+    np.testing.assert_array_equal(awake(seen, last, (300, 7), 4), [False, True, True, True])
 
 
 @pytest.mark.parametrize("name", ["fused", "numpy"])

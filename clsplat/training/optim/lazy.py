@@ -1,28 +1,44 @@
-"""Adam where splats were seen: what dense Adam would have done in the steps that the others sat out, in closed form.
+"""Adam for visible splats: the steps that a splat skipped, in closed form.
 
-A splat outside of the image has gradients of zero, but momentum moves it on. k steps after step t of its block
+A splat outside of the image has gradients of zero, but its momentum still moves it. k steps after step t
 
     m <- beta1^k m,   v <- beta2^k v,   value <- value - m / (sqrt(v) + eps) sum_j rate(t+j) r^j c(t+j),   j = 1..k,
     r = beta1 / sqrt(beta2),   c(t) = sqrt(1 - beta2^t) / (1 - beta1^t),
 
-with m and v as they were after step t. The sums are kept by k, so corrections and changing rates are exact. Two things
-are not: rounding (one here, k in dense Adam), and eps, which dense Adam holds against a falling v: at most eps/sqrt(v)
-of the drift, 3e-5 for gradients of 1e-9. What is stepped in the logarithm drifts there; it drifts one way, so its
-bounds act as well at the end.
+where m and v are the moments after step t. A table holds the sums by k, so bias corrections and changing rates are
+exact. Two things differ from dense Adam. Rounding happens once instead of k times. Dense Adam compares eps with a
+falling v; the relative error of the drift is at most eps / sqrt(v). Fields in log space drift there. Their drift is
+monotonic, so one clamp at the end equals a clamp at every step.
 
-A vector of splats, LANES of them, waits until one of them is seen or it has sat out WAITS - 1 steps; then it catches up
-and steps. An image sees what waits as it was left: a splat that comes into view shows its drift an iteration late.
+A vector of splats, LANES of them, skips its steps until one of its splats is visible or until it reaches the maximum
+age, WAITS - 1 steps. Then it does the skipped steps and the present one. An image is rendered before that: a splat that
+becomes visible shows its drift one iteration late.
+
+Positions with regularisers, noise or SGHMC change in every step, also without a gradient. Then only the colour is lazy.
 """
 
 from __future__ import annotations
 
+import copy
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ...splats.fields import Array
-from .adam import BETA1, BETA2, EPS, WAITS
+from ...device.device import Device
+from ...device.memory import copy as copy_buffer
+from ...device.memory import send_to_device, to_device, to_host
+from ...device.program import GROUP_ITEMS, Kernel
+from ...rendering.build import KernelBuild
+from ...rendering.splat_buffers import CompactGradients, SplatBuffers
+from ...splats.fields import Array, Group, sh_coefficients
+from ...splats.morton import morton_order
+from ..density.edit import DensifyEdit
+from ..programs import PARTS, lazy_program
+from .adam import BETA1, BETA2, WAITS
+from .fused import FusedOptimizer
+from .rules import Rules, StepCounts
 
-Steps = tuple[int, int]  # counts of steps: of everything but the skew, and of the skew
 DRIFT, DRIFT_MEAN, DRIFT_SKEW = range(3)
 _AGES = np.arange(WAITS)
 _DECAYS = np.stack([BETA1**_AGES, BETA2**_AGES])
@@ -30,28 +46,35 @@ _RATIO = (BETA1 / np.sqrt(BETA2)) ** _AGES
 
 
 class Drifts:
-    """The sums above up to the present step.
+    """The sums of the formula up to the present step.
 
     Attributes
     ----------
-    sums : (3, WAITS) float64, by kind (DRIFT: of rate 1, DRIFT_MEAN: the positions', rates included, DRIFT_SKEW: of
-        rate 1, in the skew's own steps) and by the number of steps sat out.
+    sums : (3, WAITS) float64, by kind and by the number of skipped steps. DRIFT has rate 1. DRIFT_MEAN includes the
+        rates of the positions. DRIFT_SKEW has rate 1 and counts the steps of the skew.
     """
 
     def __init__(self) -> None:
         self.sums = np.zeros((3, WAITS))
 
-    def advance(self, learns: tuple[bool, bool], steps: Steps, mean_lr: float) -> None:
-        """One step more of the blocks that learn (blocks.Blocks); `steps` of both, with it; rate of the means in it."""
+    def advance(self, learns: tuple[bool, bool], counts: StepCounts, mean_lr: float) -> None:
+        """Add one step.
+
+        Parameters
+        ----------
+        learns : whether the base parameters and the skew make the step.
+        counts : step counts after the step.
+        mean_lr : rate of the positions in the step.
+        """
         if learns[0]:
-            self._add(DRIFT, steps[0], 1.0)
-            self._add(DRIFT_MEAN, steps[0], mean_lr)
+            self._add(DRIFT, counts[0], 1.0)
+            self._add(DRIFT_MEAN, counts[0], mean_lr)
         if learns[1]:
-            self._add(DRIFT_SKEW, steps[1], 1.0)
+            self._add(DRIFT_SKEW, counts[1], 1.0)
 
     @property
     def table(self) -> NDArray[np.float64]:
-        """(2 + 3, WAITS): what is left of m, of v, and the sums; `waits` of cl/train/adam.clh."""
+        """(2 + 3, WAITS): factors of m and of v, and the sums; `decays` of cl/train/lazy.cl."""
         return np.concatenate([_DECAYS, self.sums])
 
     def _add(self, kind: int, step: int, rate: float) -> None:
@@ -59,22 +82,148 @@ class Drifts:
         self.sums[kind, 1:] = self.sums[kind, :-1] + weight * _RATIO[1:]
 
 
-def woken(seen: NDArray[np.bool_], last: NDArray[np.integer], steps: Steps, lanes: int) -> NDArray[np.bool_]:
-    """Which vectors of splats step, (V,): wake_vectors of cl/train/lazy.cl.
+def in_morton_order(edit: DensifyEdit, splats: SplatBuffers) -> DensifyEdit:
+    """Return the edit with its rows along a Morton curve: splats that are visible together share vectors."""
+    mean = edit.values.get("mean")
+    if mean is None:
+        mean = splats.download(splats.n, ("mean",))["mean"][edit.source]
+    return edit.permuted(morton_order(mean), splats.n)
 
-    Parameters
+
+class VisibleOptimizer(FusedOptimizer):
+    """The optimizer on the device that steps only visible splats.
+
+    Attributes
     ----------
-    seen : (N,) splats. last : (2, V) counts of steps that each vector was brought up to. steps : the counts now.
-    lanes : splats of a vector.
+    ages, table : buffers of the latest selection: `ages` and `decays` of cl/train/lazy.cl.
     """
-    padded = np.zeros(last.shape[1] * lanes, bool)
-    padded[: len(seen)] = seen
-    overdue = (np.array(steps)[:, None] - last >= WAITS - 1).any(axis=0)
-    due: NDArray[np.bool_] = padded.reshape(-1, lanes).any(axis=1) | overdue
-    return due
 
+    def __init__(self, device: Device, kernels: KernelBuild, splats: SplatBuffers, rules: Rules) -> None:
+        super().__init__(device, kernels, splats, rules)
+        self.program = lazy_program(device, kernels)
+        self.drifts = Drifts()
+        self._vectors = splats.capacity // kernels.lanes
+        self.ages, self._last = (device.alloc(8 * self._vectors) for _ in range(2))
+        self.table = device.alloc(self._table().nbytes)
+        self._mark_settled()
 
-def ascent(first: Array, second: Array) -> Array:
-    """m / (sqrt(v) + eps): which way a value drifts."""
-    direction: Array = first / (np.sqrt(second) + first.dtype.type(EPS))
-    return direction
+    def step(
+        self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int, depth_key: Any = None
+    ) -> None:
+        groups = self.rules.groups(iteration)
+        self._select("wake_visible", depth_key=depth_key, base_learns=int(groups.base), skew_learns=int(groups.skew))
+        self._catch_up(self.splats, None if self.skew is None else self.skew.s.buffer)
+        super().step(grads, mean_lr, sh_degree, iteration)
+        self.drifts.advance(groups, self.counts, mean_lr)
+
+    def settle(self) -> None:
+        self._select("wake_all")
+        self._catch_up(self.splats, None if self.skew is None else self.skew.s.buffer)
+        self._mark_settled()
+
+    def arranged(self, edit: DensifyEdit) -> DensifyEdit:
+        return in_morton_order(edit, self.splats)
+
+    def read(self) -> dict[str, Array]:
+        for group in Group:
+            copy_buffer(self.device, self.splats.buffers[group], self.spare[group], self.splats.group_bytes(group))
+        settled = copy.copy(self.splats)
+        settled.buffers = self.spare
+        if self.skew is not None:
+            copy_buffer(self.device, self.skew.s.buffer, self.skew.s.spare, self.skew.s.nbytes)
+        self._select("wake_all")
+        self._catch_up(settled, None if self.skew is None else self.skew.s.spare, keeps_moments=True)
+        return settled.download(settled.n)
+
+    def apply(self, edit: DensifyEdit) -> None:
+        self.settle()
+        super().apply(edit)
+        self._mark_settled()
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        last = to_host(self.device, self._last, np.empty((2, self._vectors), np.uint32))
+        lazy = {"waiting.last": last[:, : self._used].copy(), "waiting.drifts": self.drifts.sums.copy()}
+        return super().state() | lazy
+
+    def load_state(self, state: dict[str, NDArray[Any]]) -> None:
+        super().load_state(state)
+        self.drifts.sums = state["waiting.drifts"].copy()
+        last = np.repeat(np.array(self.counts, np.uint32)[:, None], self._vectors, axis=1)
+        last[:, : self._used] = state["waiting.last"]
+        to_device(self.device, self._last, last)
+
+    @property
+    def _used(self) -> int:
+        """Vectors that hold splats."""
+        return -(-self.splats.n // self.kernels.lanes)
+
+    def _table(self) -> NDArray[np.floating]:
+        return self.drifts.table.astype(self.splats.dtype)
+
+    def _mark_settled(self) -> None:
+        """Record that no vector has skipped a step."""
+        to_device(self.device, self._last, np.repeat(np.array(self.counts, np.uint32), self._vectors))
+
+    def _select(self, kernel: str, **arguments: Any) -> None:
+        """Select vectors with wake_visible or wake_all; the counts are those before the coming step."""
+        self._sent = send_to_device(self.device, self.table, self._table())  # kept: releasing it waits for the transfer
+        self.program[kernel](
+            (-(-self._vectors // GROUP_ITEMS) * GROUP_ITEMS,),
+            (GROUP_ITEMS,),
+            last=self._last,
+            ages=self.ages,
+            vectors=self._vectors,
+            n_splats=self.splats.n,
+            base_steps=self.counts[0],
+            skew_steps=self.counts[1],
+            **arguments,
+        )
+
+    def _catch_up(self, splats: SplatBuffers, skew_s: Any, keeps_moments: bool = False) -> None:
+        """Do the skipped steps of the selected vectors, on these values."""
+        common = {
+            "ages": self.ages,
+            "decays": self.table,
+            "capacity": splats.capacity,
+            "keeps_moments": int(keeps_moments),
+        }
+        self.program.settle_color(
+            (self._columns, sh_coefficients(splats.schema.sh_degree)),
+            (GROUP_ITEMS, 1),
+            sh=splats.sh,
+            sh_m=self.first.sh,
+            sh_v=self.second.sh,
+            **self.color_rates,
+            **common,
+        )
+        if not self.rules.geometry_waits:
+            return
+        self.program.settle_geometry(
+            (self._columns, len(PARTS)),
+            (GROUP_ITEMS, 1),
+            geom=splats.geom,
+            geom_m=self.first.geom,
+            geom_v=self.second.geom,
+            rates=self.rates,
+            **common,
+        )
+        if self.skew is not None:
+            self.program.settle_skew(
+                (self._columns,),
+                (GROUP_ITEMS,),
+                geom=splats.geom,
+                skew_s=skew_s,
+                skew_m=self.skew.first.buffer,
+                skew_v=self.skew.second.buffer,
+                lr=self.rules.rates["skew"],
+                **common,
+            )
+
+    def _is_lazy(self, name: str) -> bool:
+        return name == "color" or self.rules.geometry_waits
+
+    def _kernel(self, name: str) -> Kernel:
+        return self.program[f"step_visible_{name}" if self._is_lazy(name) else f"step_{name}"]
+
+    def _selection(self, name: str) -> dict[str, Any]:
+        return {"ages": self.ages} if self._is_lazy(name) else {}

@@ -1,4 +1,4 @@
-"""Optimizers over splats on the device: the fused kernels, and NumPy's reference behind the same face."""
+"""Optimizers over splats on the device: the fused kernels, and the NumPy reference with the same interface."""
 
 from __future__ import annotations
 
@@ -13,52 +13,59 @@ from ...splats.fields import Array
 from ..config import TrainConfig
 from ..density.edit import DensifyEdit
 from .fused import FusedOptimizer
-from .reference import HostOptimizer
+from .lazy import VisibleOptimizer
+from .lazy_reference import VisibleReferenceOptimizer
+from .reference import ReferenceOptimizer
 from .rules import Rules
 
 
 class Optimizer(Protocol):
-    """Steps the splats; owns moments, momentum and the trainable skew s, of which the splats hold the kernel's.
+    """Steps the splats. Owns their moments, their momentum and the trainable skew s; the splats hold the kernel's skew.
 
-    Positions move by Adam or SGHMC (sghmc.py), fields with bounds by Adam on their logarithm, the skew by Adam on s
-    (skew_map.py), all else by Adam. A block that does not learn (blocks.py) keeps values, moments and step count.
+    Positions move by Adam or SGHMC (sghmc.py). Fields with bounds move by Adam in log space. The skew moves by Adam on
+    s (skew_map.py). All other fields move by Adam. A frozen parameter group keeps its values, moments and step count.
     """
 
     def step(
         self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int, depth_key: Any = None
     ) -> None:
-        """One step on all splats, or with `visible_adam` on those seen (optim_lazy.py); regularisers included.
+        """Step all splats, or with `visible_adam` the visible ones (lazy.py); includes the regularisers.
 
         Parameters
         ----------
-        grads : of the stored parameters; the optimizer may change them.
-        mean_lr : Adam's rate of the means at this iteration, scene extent and rate factor included [world units].
-        sh_degree : SH bands above it stay.
-        iteration : from 1; decides which blocks learn, and the noise.
-        depth_key : buffer (cl/render/project.cl) of the image that the gradients belong to; with `visible_adam` only.
+        grads : gradients of the stored parameters; the optimizer may change them.
+        mean_lr : Adam's rate of the means at this iteration, with scene extent and rate factor [world units].
+        sh_degree : higher SH bands do not change.
+        iteration : counts from 1; decides which parameter groups learn, and the noise.
+        depth_key : buffer of the image of the gradients (cl/render/project.cl); needed with `visible_adam`.
         """
 
     def settle(self) -> None:
-        """Do all steps that splats sat out, so that the buffers hold what `read` returns."""
+        """Do all skipped steps, so that the buffers hold the values that `read` returns."""
+
+    def arranged(self, edit: DensifyEdit) -> DensifyEdit:
+        """Return the edit with its rows in the order that suits this optimizer. The splats must be settled."""
 
     def read(self) -> dict[str, Array]:
-        """Public arrays of the splats, without anything pending; what is pending stays so."""
+        """Return the public arrays of the splats with all skipped steps done; the state does not change."""
 
     def apply(self, edit: DensifyEdit) -> None:
-        """Move, add, remove and reset splats as edited, from what they are once settled."""
+        """Settle, then move, add, remove and reset splats."""
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Everything but the buffers' splats, for a checkpoint; the same keys from both optimizers."""
+        """Return the state for a checkpoint, without the splats. Both optimizers use the same keys."""
 
     def load_state(self, state: dict[str, NDArray[Any]]) -> None:
-        """Go on from `state`; raises InputError when an entry is missing or unknown."""
+        """Continue from `state`; raises InputError if an entry is missing or unknown."""
 
 
 def make_optimizer(
     device: Device, kernels: KernelBuild, splats: SplatBuffers, config: TrainConfig, extent: float
 ) -> Optimizer:
-    """The optimizer that the config names; `extent` of the scene [world units]."""
+    """Return the optimizer that the config names. extent : extent of the scene [world units]."""
     rules = Rules(config, extent)
     if config.optim.optimizer == "fused":
-        return FusedOptimizer(device, kernels, splats, rules)
-    return HostOptimizer(splats, rules, kernels.lanes)
+        return (VisibleOptimizer if config.optim.visible_adam else FusedOptimizer)(device, kernels, splats, rules)
+    if config.optim.visible_adam:
+        return VisibleReferenceOptimizer(splats, rules, kernels.lanes)
+    return ReferenceOptimizer(splats, rules)

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...splats.fields import Array, Field, Schema
 from ...splats.shapes import Shape, shape_named
-from ..alternation import Blocks, active_blocks
 from ..config import TrainConfig
+from ..methods.sns import ParameterGroups, learning_groups
 from .noise import PUBLISHED_EXTENT
 from .regularisers import Penalty
 from .sghmc import Coefficients, Sghmc
 from .skew_map import SkewMap
+
+StepCounts = tuple[int, int]  # steps of the base parameters and of the skew
 
 SH_REST_FACTOR = 1.0 / 20.0  # 3DGS: bands above the constant learn 20 times slower
 
@@ -101,10 +103,10 @@ class Rules:
         factor = self.config.rate_factor("mean")
         return sghmc.coefficients(iteration, mean_lr / factor, factor)
 
-    def blocks(self, iteration: int) -> Blocks:
-        """The blocks that learn at `iteration`; of shapes without a skew that is no block."""
-        base, skew = active_blocks(iteration, self.config)
-        return Blocks(base, skew and self.map is not None)
+    def groups(self, iteration: int) -> ParameterGroups:
+        """The parameter groups that learn at `iteration`. Shapes without a skew do not have the second group."""
+        base, skew = learning_groups(iteration, self.config)
+        return ParameterGroups(base, skew and self.map is not None)
 
     def base_fields(self, schema: Schema) -> tuple[Field, ...]:
         """All fields but the skew: the base block."""

@@ -1,4 +1,4 @@
-"""blocks.py: the warm-up, the cycle, and whom alternation does not concern."""
+"""Alternating optimisation: the warm-up, the cycle, and the runs without alternation."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from clsplat.training.alternation import active_blocks
 from clsplat.training.config import TrainConfig
+from clsplat.training.methods.sns import learning_groups
 
 CONFIG = TrainConfig(
     iterations=100, alternation="cyclic", alternation_warmup=0.2, alternation_cycle=10, alternation_split=0.3
@@ -17,7 +17,7 @@ CONFIG = TrainConfig(
 def pattern(config: TrainConfig) -> str:
     """One letter an iteration: B base, S skew, J both."""
     letters = {(True, True): "J", (True, False): "B", (False, True): "S"}
-    return "".join(letters[active_blocks(it, config)] for it in range(1, config.iterations + 1))
+    return "".join(letters[learning_groups(it, config)] for it in range(1, config.iterations + 1))
 
 
 def test_joint_warm_up_then_cycles_that_begin_with_the_base() -> None:
@@ -25,7 +25,7 @@ def test_joint_warm_up_then_cycles_that_begin_with_the_base() -> None:
 
 
 @pytest.mark.parametrize(("split", "expected"), [(0.0, "S"), (1.0, "B")])
-def test_a_split_at_its_ends_freezes_one_block_for_good(split: float, expected: str) -> None:
+def test_a_split_at_its_ends_freezes_one_group_for_good(split: float, expected: str) -> None:
     assert pattern(replace(CONFIG, alternation_split=split)) == "J" * 20 + expected * 80
 
 
