@@ -181,7 +181,7 @@ class VisibleOptimizer(FusedOptimizer):
 
     def _catch_up(self, splats: SplatBuffers, skew_s: Any, keeps_moments: bool = False) -> None:
         """Do the skipped steps of the selected vectors, on these values."""
-        common = {
+        common: dict[str, Any] = {
             "ages": self.ages,
             "decays": self.table,
             "capacity": splats.capacity,
