@@ -1,6 +1,7 @@
 """Choices of scene functions that the command line offers. This module loads no image library."""
 
-ALPHA_USES = ("background", "mask")  # transparent pixels are composited over the background, or are masked out
+ALPHA_USES = ("background", "mask")  # transparent pixels are composited over the background, or are masked out.
+
 # Arguments of `load_scene`, besides the path and the background, that a run records to read its scene again.
 READING_OPTIONS = ("images", "resolution", "masks", "alpha", "test_every", "test_list", "eval")
 CAMERA_FORMATS = ("transforms", "colmap", "colmap-text", "cameras")  # formats that `clsplat cameras` writes

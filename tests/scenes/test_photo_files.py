@@ -81,7 +81,7 @@ def test_scene_names_stay_unique(tmp_path: Path) -> None:
 def test_folders_without_photos(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         find_photos(tmp_path / "absent")
-    with pytest.raises(InputError, match=r"no photos in it or below; looked for \.bmp"):
+    with pytest.raises(InputError, match=r"no photos in this folder or below; looked for \.bmp"):
         find_photos(tmp_path)
     (tmp_path / "IMG_1.HEIC").write_bytes(b"heic")
     with pytest.raises(InputError, match=r"1 file \.heic: convert them to JPEG"):

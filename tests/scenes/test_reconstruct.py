@@ -129,7 +129,7 @@ def test_a_scene_is_not_replaced_without_overwrite(scene: Path, walk: Path, tmp_
     assert "already holds a scene: use --overwrite" in error_of("reconstruct", walk, "-o", scene)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "work.txt").write_text("hours")
-    with pytest.raises(OutputError, match="no scene that was reconstructed"):
+    with pytest.raises(OutputError, match="is not a reconstructed scene"):
         reconstruct(walk, tmp_path / "mine", overwrite=True)
     assert is_made_from(scene, walk)
     assert is_made_from(tmp_path, walk) is None
@@ -253,12 +253,12 @@ def test_warnings_about_photos_without_a_pose(tmp_path: Path) -> None:
     facts = PhotoHeader(8, 8, True, (), b"")
     ready = [StagedPhoto(PhotoFile(f"{n}.jpg", tmp_path), facts, f"{n}.jpg") for n in range(10)]
     with pytest.warns(UserWarning, match=r"only 7 of 10 photos could be placed; left out are 7\.jpg, 8\.jpg, 9\.jpg\."):
-        module._warn_of_rest(tmp_path, ready, ready[:7], {"0": 7, "1": 2})
-    with pytest.warns(UserWarning, match=r"fall into 2 parts .* the largest \(8 photos\)"):
-        module._warn_of_rest(tmp_path, ready, ready[:8], {"0": 8, "1": 4})
+        module._warn_of_unplaced(tmp_path, ready, ready[:7], {"0": 7, "1": 2})
+    with pytest.warns(UserWarning, match=r"fall into 2 parts that do not connect; the largest \(8 photos\)"):
+        module._warn_of_unplaced(tmp_path, ready, ready[:8], {"0": 8, "1": 4})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        module._warn_of_rest(tmp_path, ready, ready, {"0": 10, "1": 4})
+        module._warn_of_unplaced(tmp_path, ready, ready, {"0": 10, "1": 4})
 
 
 def test_options(tmp_path: Path) -> None:
@@ -293,7 +293,7 @@ def test_same_photos_same_model_and_a_video(walk: Path, tmp_path: Path) -> None:
     steps: list[Step] = []
     files = []
     for name in ("a", "b"):
-        reconstruct(walk, tmp_path / name, tell=steps.append)
+        reconstruct(walk, tmp_path / name, progress=steps.append)
         files.append(
             [
                 (tmp_path / name / "sparse" / "0" / f"{stem}.bin").read_bytes()

@@ -1,1 +1,1 @@
-"""A made-up scene with known ground truth."""
+"""A demo scene with known ground truth, rendered without a data set."""

@@ -1,6 +1,6 @@
-"""A procedural capture with ground truth: photos, exact poses and a point cloud, for trials without data.
+"""The demo scene: photos, exact poses and a point cloud of a small world, for trials without a data set.
 
-The world (capture_world.py) has what is hard for splats: hard edges, thin poles, a panel whose sides differ,
+The world (world.py) contains what is difficult for splats: hard edges, thin poles, a panel with two different sides,
 cast shadows, and a glossy ball.
 """
 
@@ -19,30 +19,30 @@ from ...files.images import write_png
 from ..colmap_binary import ModelView, write_binary_model
 from .world import SURFACES, Hits, World
 
-RING_RADIUS = 3.6  # of the ring of cameras, world units
-_HEIGHTS = (0.75, 1.9)  # first half of the views low, second half high
+RING_RADIUS = 3.6  # radius of the rings of cameras [world units]
+_HEIGHTS = (0.75, 1.9)  # heights of the lower and the upper ring
 RING_TARGET = np.array([0.0, 0.0, 0.5])
-_FOCAL = 0.9  # of the image width: 58 degrees across
-_SUBPIXELS = (0.25, 0.75)  # 2x2 supersampling
+_FOCAL = 0.9  # focal length over the image width: 58 degrees wide
+_SUBPIXELS = (0.25, 0.75)  # positions of 2x2 samples inside a pixel
 
-_POINTS = 3000
-_FEWEST_OBSERVATIONS = 3
-# Parts of the point cloud by surface: thin and small things get more than their area.
+_N_POINTS = 3000
+_MIN_OBSERVATIONS = 3  # smallest number of views that see a point
+# Share of the point cloud on each surface; thin and small surfaces get more than their share of the area.
 _SHARES = {"ground": 0.36, "dome": 0.16, "box": 0.16, "ball": 0.08, "panel": 0.12, "poles": 0.12}
-_DEPTH_TOLERANCE = 2e-3  # world units: float32 casting is good to some 1e-5
+_DEPTH_TOLERANCE = 2e-3  # [world units]; float32 rays have an error of about 1e-5
 
 
 def write_capture(
     folder: str | os.PathLike[str], width: int = 200, height: int = 150, n_views: int = 40, seed: int = 0
 ) -> Path:
-    """Render the little world from two rings of cameras and write it as a COLMAP scene.
+    """Render the small world from two rings of cameras and write it as a COLMAP scene.
 
     Parameters
     ----------
-    folder : made; must be empty or absent. Gets images/*.png and sparse/0/*.bin.
+    folder : folder for images/*.png and sparse/0/*.bin; created if it does not exist, and empty otherwise.
     width, height : image size [px].
     n_views : number of photos, half of them on the lower ring.
-    seed : of the world's details and of the choice of points; equal arguments give equal files.
+    seed : seed of the world's details and of the choice of points. Equal arguments give equal files.
 
     Returns
     -------
@@ -50,20 +50,20 @@ def write_capture(
 
     Raises
     ------
-    InputError : images below 16 px or fewer than 4 views.
-    OutputError : the folder holds something, or cannot be written.
+    InputError : images are smaller than 16 px, or there are fewer than 4 views.
+    OutputError : the folder is not empty, or cannot be written.
     """
     if width < 16 or height < 16 or n_views < 4:
         raise InputError(f"capture: {width}x{height} px, {n_views} views; needs at least 16x16 px and 4 views")
     root = Path(folder)
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
-        raise OutputError(f"{root}: already there and not an empty folder; name another one")
+        raise OutputError(f"{root}: exists and is not an empty folder; name another folder")
     world, cameras = World(seed), ring_cameras(width, height, n_views)
     for index, camera in enumerate(cameras):
         write_png(root / "images" / _name(index), photograph(world, camera))
     points = _surface_points(world, cameras, np.random.default_rng(seed))
     seen = np.stack([visible(world, camera, points.position, points.normal) for camera in cameras])
-    kept = seen.sum(axis=0) >= _FEWEST_OBSERVATIONS
+    kept = seen.sum(axis=0) >= _MIN_OBSERVATIONS
     xyz, seen = points.position[kept].astype(np.float64), seen[:, kept]
     rgb = np.rint(255 * points.color[kept]).astype(np.uint8)
     views = [
@@ -82,7 +82,7 @@ def write_capture(
 
 
 def ring_cameras(width: int, height: int, n_views: int) -> list[Camera]:
-    """Cameras around the world's middle that look at it: a low ring, then a high one between its gaps."""
+    """Return cameras that look at the world's middle: a lower ring, then an upper ring between its gaps."""
     low = n_views // 2
     cameras = []
     for index in range(n_views):
@@ -100,26 +100,28 @@ def ring_cameras(width: int, height: int, n_views: int) -> list[Camera]:
 
 
 def photograph(world: World, camera: Camera) -> NDArray[np.float32]:
-    """(H, W, 3) colours 0..1: the mean of 2x2 rays a pixel."""
+    """Return a photo, (H, W, 3), colours 0..1, as the mean of 2x2 rays per pixel."""
     rays = [_cast(world, camera, _pixels(camera) + np.array([dx, dy])).color for dy in _SUBPIXELS for dx in _SUBPIXELS]
-    photo: NDArray[np.float32] = np.mean(rays, axis=0).reshape(camera.height, camera.width, 3)
-    return photo
+    return np.mean(rays, axis=0).reshape(camera.height, camera.width, 3)
 
 
 def visible(world: World, camera: Camera, xyz: NDArray[np.floating], normal: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which surface points the camera sees.
+    """Return whether the camera sees each surface point, (P,).
 
-    That is: inside the image, on the side of the surface that faces the camera, and with nothing nearer on
-    the ray to them. xyz, normal : (P, 3).
+    A visible point projects into the image, its surface faces the camera, and no other surface is in front of it.
+
+    Parameters
+    ----------
+    xyz, normal : (P, 3) positions and normals of the points.
     """
     pixels, depth = _project(camera, xyz)
     inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
     facing = ((xyz - camera.position) * normal).sum(axis=1) < 0
     seen = np.zeros(len(xyz), np.bool_)
-    of = np.flatnonzero(inside & facing)
-    distance = np.linalg.norm(xyz[of] - camera.position, axis=1)
-    nearest = world.distances(*_rays(camera, pixels[of])).min(axis=0)
-    seen[of] = np.abs(nearest - distance) < _DEPTH_TOLERANCE
+    candidates = np.flatnonzero(inside & facing)
+    distance = np.linalg.norm(xyz[candidates] - camera.position, axis=1)
+    nearest = world.distances(*_rays(camera, pixels[candidates])).min(axis=0)
+    seen[candidates] = np.abs(nearest - distance) < _DEPTH_TOLERANCE
     return seen
 
 
@@ -128,25 +130,25 @@ def _name(index: int) -> str:
 
 
 def _surface_points(world: World, cameras: list[Camera], rng: np.random.Generator) -> Hits:
-    """Surface points at random places of every view, by each surface's share."""
+    """Return surface points at random pixels of every view, with the share of each surface."""
     chosen: list[Hits] = []
     for camera in cameras:
         pixels = _pixels(camera) + rng.random((camera.width * camera.height, 2))
         surface = world.distances(*_rays(camera, pixels)).argmin(axis=0)
-        counts = [max(1, round(_POINTS * _SHARES[name] / len(cameras))) for name in SURFACES]
+        counts = [max(1, round(_N_POINTS * _SHARES[name] / len(cameras))) for name in SURFACES]
         picks = [rng.permutation(np.flatnonzero(surface == index))[:count] for index, count in enumerate(counts)]
         chosen.append(_cast(world, camera, pixels[np.concatenate(picks)]))
     return Hits(*(np.concatenate([getattr(hits, part.name) for hits in chosen]) for part in fields(Hits)))
 
 
 def _pixels(camera: Camera) -> NDArray[np.float64]:
-    """(H * W, 2) corners x, y of all pixels, row by row."""
+    """Return the corners x, y of all pixels, (H * W, 2), row by row."""
     y, x = np.mgrid[: camera.height, : camera.width]
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
 
 
 def _rays(camera: Camera, pixels: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Origins and unit directions (R, 3) of the rays through pixel positions (R, 2)."""
+    """Return origins and unit directions, (R, 3) each, of the rays through pixel positions (R, 2)."""
     local = np.concatenate(
         [(pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones((len(pixels), 1))], axis=1
     )
@@ -160,7 +162,7 @@ def _cast(world: World, camera: Camera, pixels: NDArray[np.float64]) -> Hits:
 
 
 def _project(camera: Camera, xyz: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Pixel positions (P, 2) and depths (P,) of world points."""
+    """Return pixel positions (P, 2) and depths (P,) of world points."""
     local = xyz @ camera.rotation.T + camera.translation
     depth = local[:, 2]
     safe = np.where(depth > 0, depth, 1.0)[:, None]

@@ -1,7 +1,7 @@
-"""The little world of the procedural capture: analytic surfaces, ray-cast with NumPy.
+"""The small world of the demo scene: analytic surfaces, ray-cast with NumPy.
 
-World axes: x, y level, z up. Colours are display values 0..1, and all averaging is done on them, as in splat
-blending. Rays are float32 arrays of shape (R, 3); directions have length 1.
+World axes x and y are level, and z points up. Colours are display values 0..1, and means are taken of these values, as
+in splat blending. Rays are float32 arrays of shape (R, 3); directions have length 1.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 Rays = NDArray[np.float32]
 
 _FAR = np.float32(np.inf)
-_NEAR = 1e-3  # rays that leave a surface do not meet it again
+_NEAR = 1e-3  # smallest distance of a hit, so that a ray from a surface does not hit that surface
 _SUN = np.array([0.45, -0.35, 0.82]) / np.linalg.norm([0.45, -0.35, 0.82])
-_AMBIENT, _DIFFUSE = 0.62, 0.42  # together a little above 1 in full sun
+_AMBIENT, _DIFFUSE = 0.62, 0.42  # light from the sky and from the sun; the sum is slightly above 1 in full sun
 
 GROUND_RADIUS = 5.0
 DOME_RADIUS = 14.0
@@ -29,22 +29,22 @@ SURFACES = ("ground", "dome", "box", "ball", "panel", "poles")
 
 
 def _turned(angle: float) -> NDArray[np.float64]:
-    """World from object rotation about z."""
+    """Return the object-to-world rotation about z."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays end.
+    """The points where rays hit surfaces.
 
     Parameters
     ----------
-    distance : (R,) along the ray.
+    distance : (R,) distance along the ray.
     surface : (R,) index into SURFACES.
-    position : (R, 3) world.
-    normal : (R, 3) of the surface, on the side that the ray meets.
-    color : (R, 3) display colour 0..1, lit.
+    position : (R, 3) position in the world.
+    normal : (R, 3) normal of the surface on the side of the ray.
+    color : (R, 3) display colour 0..1 with lighting.
     """
 
     distance: NDArray[np.float32]
@@ -56,11 +56,11 @@ class Hits:
 
 @dataclass(frozen=True)
 class World:
-    """The scene; `seed` moves the poles and changes the ground's noise."""
+    """The small world; `seed` moves the poles and changes the ground's noise."""
 
     seed: int = 0
-    poles: NDArray[np.float32] = field(init=False)  # (5, 2) feet
-    noise: NDArray[np.float32] = field(init=False)  # (64, 64) lattice of 0..1, periodic
+    poles: NDArray[np.float32] = field(init=False)  # (5, 2) positions on the ground
+    noise: NDArray[np.float32] = field(init=False)  # (64, 64) periodic lattice of values 0..1
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.seed)
@@ -70,7 +70,7 @@ class World:
         object.__setattr__(self, "noise", rng.random((64, 64), dtype=np.float32))
 
     def distances(self, origin: Rays, direction: Rays) -> NDArray[np.float32]:
-        """(len(SURFACES), R) distance to each surface along each ray; inf where it is missed."""
+        """Return the distance to each surface along each ray, (len(SURFACES), R); inf if the ray misses it."""
         ground = (0.0 - origin[:, 2]) / _nonzero(direction[:, 2])
         at = origin[:, :2] + ground[:, None] * direction[:, :2]
         ground = np.where((ground > _NEAR) & (_dot(at, at) < GROUND_RADIUS**2), ground, _FAR)
@@ -87,20 +87,20 @@ class World:
         ).astype(np.float32)
 
     def cast(self, origin: Rays, direction: Rays) -> Hits:
-        """First surface along each ray, with its colour in the sun's light and shadow."""
+        """Return the first hit of each ray, with its colour in sunlight or shadow."""
         distances = self.distances(origin, direction)
         surface = distances.argmin(axis=0).astype(np.int8)
         distance = distances.min(axis=0)
         position = origin + distance[:, None] * direction
         normal, color = np.empty_like(position), np.empty_like(position)
         for index, name in enumerate(SURFACES):
-            of = np.flatnonzero(surface == index)
-            if of.size == 0:
+            rows = np.flatnonzero(surface == index)
+            if rows.size == 0:
                 continue
-            paint, outward = getattr(self, f"_{name}_paint")(position[of], direction[of])
+            paint, outward = getattr(self, f"_{name}_paint")(position[rows], direction[rows])
             if name != "dome":
-                paint = self._lit(position[of], direction[of], paint, outward, glossy=name == "ball")
-            color[of], normal[of] = paint, outward
+                paint = self._lit(position[rows], direction[rows], paint, outward, glossy=name == "ball")
+            color[rows], normal[rows] = paint, outward
         return Hits(distance, surface, position, normal, np.clip(color, 0.0, 1.0))
 
     def _lit(self, position: Rays, direction: Rays, paint: Rays, normal: Rays, glossy: bool) -> Rays:
@@ -109,23 +109,20 @@ class World:
         blocked = np.delete(self.distances(position + 2e-3 * normal, toward), SURFACES.index("dome"), axis=0)
         slant = np.maximum(normal @ sun, 0.0) * ~np.isfinite(blocked).any(axis=0)
         sky = 0.8 + 0.2 * normal[:, 2]
-        lit: Rays = paint * (_AMBIENT * sky + _DIFFUSE * slant)[:, None]
-        if glossy:  # Blinn-Phong: the one colour here that changes with the view
+        lit = paint * (_AMBIENT * sky + _DIFFUSE * slant)[:, None]
+        if glossy:  # the Blinn-Phong highlight is the only colour that depends on the view
             half = sun - direction
             shine = np.maximum(_dot(normal, half) / np.sqrt(_dot(half, half)), 0.0) ** 40
             lit += (0.5 * (slant > 0) * shine).astype(np.float32)[:, None]
         return lit
 
     def _smooth(self, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Value noise 0..1: the lattice, blended with smoothstep weights."""
+        """Return value noise 0..1: the lattice, interpolated with smoothstep weights."""
         iu, iv = np.floor(u).astype(int), np.floor(v).astype(int)
         a, b = u - iu, v - iv
         a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
         at = [[self.noise[(iu + i) % 64, (iv + j) % 64] for j in (0, 1)] for i in (0, 1)]
-        blended: NDArray[np.float32] = (1 - a) * ((1 - b) * at[0][0] + b * at[0][1]) + a * (
-            (1 - b) * at[1][0] + b * at[1][1]
-        )
-        return blended
+        return (1 - a) * ((1 - b) * at[0][0] + b * at[0][1]) + a * ((1 - b) * at[1][0] + b * at[1][1])
 
     def _ground_paint(self, position: Rays, direction: Rays) -> tuple[Rays, Rays]:
         x, y = position[:, 0], position[:, 1]
@@ -171,7 +168,7 @@ class World:
     def _panel_paint(self, position: Rays, direction: Rays) -> tuple[Rays, Rays]:
         local = (position - _PANEL_CENTRE) @ _turned(_PANEL_ANGLE)
         x, z = local[:, 0] / _PANEL_HALF[0], local[:, 2] / _PANEL_HALF[1]
-        front = direction @ _turned(_PANEL_ANGLE)[:, 1].astype(np.float32) > 0  # its face looks along -y
+        front = direction @ _turned(_PANEL_ANGLE)[:, 1].astype(np.float32) > 0  # the front faces along -y
         mural = _mix((0.95, 0.75, 0.20), (0.70, 0.15, 0.45), (z + 1) / 2)
         mural[np.abs(_wave(3 * x + z)) < 0.2] = (0.10, 0.18, 0.40)
         mural[(x - 0.25) ** 2 * 2 + (z - 0.2) ** 2 < 0.16] = (0.97, 0.96, 0.92)
@@ -207,15 +204,13 @@ def _nonzero(value: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _wave(value: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Signed distance to the nearest whole number."""
-    wave: NDArray[np.float32] = value - np.rint(value)
-    return wave
+    """Return the signed distance to the nearest whole number."""
+    return value - np.rint(value)
 
 
 def _mix(low: tuple[float, ...], high: tuple[float, ...], weight: NDArray[np.float32]) -> Rays:
     w = np.clip(weight, 0, 1)[:, None].astype(np.float32)
-    mixed: Rays = (1 - w) * _rgb(*low) + w * _rgb(*high)
-    return mixed
+    return (1 - w) * _rgb(*low) + w * _rgb(*high)
 
 
 def _rgb(*color: float) -> NDArray[np.float32]:
@@ -223,9 +218,8 @@ def _rgb(*color: float) -> NDArray[np.float32]:
 
 
 def _dot(a: Rays, b: Rays) -> NDArray[np.float32]:
-    """Row by row; einsum because numpy is slow at sums over a short last axis."""
-    dot: NDArray[np.float32] = np.einsum("ij,ij->i", a, b)
-    return dot
+    """Return row-wise dot products. NumPy's sum over a short last axis is slow, so this uses einsum."""
+    return np.einsum("ij,ij->i", a, b)
 
 
 def _constant(like: Rays, value: tuple[float, ...] | NDArray[np.float64]) -> Rays:
@@ -235,7 +229,7 @@ def _constant(like: Rays, value: tuple[float, ...] | NDArray[np.float64]) -> Ray
 def _ball(
     origin: Rays, direction: Rays, centre: NDArray[np.float64], radius: float, inside: bool
 ) -> NDArray[np.float32]:
-    """Distance to a sphere, met from inside or from outside."""
+    """Return the distance to a sphere, hit from inside or from outside."""
     to = origin - centre.astype(np.float32)
     b = _dot(to, direction)
     root = b * b - _dot(to, to) + radius * radius
@@ -244,7 +238,7 @@ def _ball(
 
 
 def _box(origin: Rays, direction: Rays) -> NDArray[np.float32]:
-    """Distance to the turned box by the slab method."""
+    """Return the distance to the box by the slab method (Kay & Kajiya 1986)."""
     turn = _turned(_BOX_ANGLE).astype(np.float32)
     start = (origin - _BOX_CENTRE.astype(np.float32)) @ turn
     step = _nonzero(direction @ turn)
@@ -257,7 +251,7 @@ def _box(origin: Rays, direction: Rays) -> NDArray[np.float32]:
 
 
 def _panel(origin: Rays, direction: Rays) -> NDArray[np.float32]:
-    """Distance to the standing panel: a rectangle without thickness."""
+    """Return the distance to the panel, an upright rectangle without thickness."""
     turn = _turned(_PANEL_ANGLE).astype(np.float32)
     start, step = (origin - _PANEL_CENTRE.astype(np.float32)) @ turn, direction @ turn
     distance = -start[:, 1] / _nonzero(step[:, 1])
@@ -267,11 +261,11 @@ def _panel(origin: Rays, direction: Rays) -> NDArray[np.float32]:
 
 
 def _pole(origin: Rays, direction: Rays, foot: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Distance to an upright cylinder on the ground, its flat top included."""
+    """Return the distance to a pole, an upright cylinder on the ground with a flat top."""
     nearest = np.full(len(origin), _FAR)
     to, step = origin[:, :2] - foot, direction[:, :2]
     across = to[:, 0] * step[:, 1] - to[:, 1] * step[:, 0]
-    near = np.flatnonzero(across * across < _POLE_RADIUS**2 * _dot(step, step))  # few rays pass that near
+    near = np.flatnonzero(across * across < _POLE_RADIUS**2 * _dot(step, step))  # only few rays pass this near
     to, step, start, climb = to[near], step[near], origin[near, 2], direction[near, 2]
     a, b = np.maximum(_dot(step, step), 1e-12), _dot(to, step)
     side = (-b - np.sqrt(np.maximum(_POLE_RADIUS**2 * a - across[near] ** 2, 0))) / a

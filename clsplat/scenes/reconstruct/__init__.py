@@ -1,1 +1,1 @@
-"""Photographs or a video to a scene."""
+"""Scenes from photos or a video, by structure from motion."""

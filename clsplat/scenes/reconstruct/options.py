@@ -1,4 +1,4 @@
-"""How photographs become a scene: the options of a reconstruction, without what it takes to make one."""
+"""Options of a reconstruction. This module loads neither pycolmap nor an image library."""
 
 from __future__ import annotations
 
@@ -21,36 +21,41 @@ CAMERA_MODELS = (
 )
 CAMERA_MODES = ("auto", "single", "per-image", "per-folder")
 MATCHERS = ("auto", "exhaustive", "sequential")
-FRAMES = 120  # wanted of a video, where it has so many
-FEWEST = 3  # photos
+N_FRAMES = 120  # default number of frames to take from a video
+MIN_PHOTOS = 3  # smallest number of photos for structure from motion
 
 
 @dataclass(frozen=True)
 class ReconstructOptions:
-    """How photographs become a scene.
+    """Options of a reconstruction.
 
     Parameters
     ----------
     camera_model : COLMAP's name of the lens model.
-    camera_mode : which photos share a camera; "auto": those of one size and, by EXIF, one camera and focal length.
-    matcher : "exhaustive" matches all pairs, "sequential" neighbours by name; "auto": sequential for videos and for
-        more than 150 photos.
-    max_size : longest side at which features are looked for [px]; the scene keeps the photos' size.
-    frames : of a video.
-    seed : of all that is random.
+    camera_mode : which photos share a camera. "auto" groups photos with equal sizes and, by EXIF, equal camera and
+        focal length.
+    matcher : "exhaustive" matches all pairs of photos; "sequential" matches neighbours by name. "auto" is sequential
+        for videos and for more than 150 photos.
+    max_size : photos are reduced to this longest side to find features [px]; the scene keeps the photos' size.
+    frames : number of frames to take from a video.
+    seed : seed of all random numbers.
+
+    Raises
+    ------
+    InputError : an option has a bad value.
     """
 
     camera_model: str = "SIMPLE_RADIAL"
     camera_mode: str = "auto"
     matcher: str = "auto"
     max_size: int = 1600
-    frames: int = FRAMES
+    frames: int = N_FRAMES
     seed: int = 0
 
     def __post_init__(self) -> None:
         for name, allowed in (("camera_model", CAMERA_MODELS), ("camera_mode", CAMERA_MODES), ("matcher", MATCHERS)):
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name} {getattr(self, name)!r}: use one of {', '.join(allowed)}")
-        for name, least in (("max_size", 64), ("frames", FEWEST)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name} {getattr(self, name)}: must be at least {least}")
+        for name, minimum in (("max_size", 64), ("frames", MIN_PHOTOS)):
+            if getattr(self, name) < minimum:
+                raise InputError(f"{name} {getattr(self, name)}: must be at least {minimum}")

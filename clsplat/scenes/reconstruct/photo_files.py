@@ -1,4 +1,4 @@
-"""Photographs without poses: which files they are, what they share, how structure from motion gets them."""
+"""Photos without poses: finding files, grouping by camera, and preparing them for structure from motion."""
 
 from __future__ import annotations
 
@@ -25,14 +25,16 @@ from ...files.images import (
 from ...files.masks import MASK_FOLDER, Mask, mask_files, read_mask, resize_mask
 
 VIDEO_SUFFIXES = frozenset((".mp4", ".m4v", ".mov", ".mkv", ".avi", ".webm", ".mts", ".mpg", ".mpeg"))
-# Photographs of kinds that Pillow does not read.
-_FOREIGN = frozenset((".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".jxl", ".exr"))
-_OPAQUE_ENOUGH = 128  # an alpha below hides a pixel from the search for features
+# Formats of photos that Pillow does not read.
+_UNSUPPORTED = frozenset(
+    (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".jxl", ".exr")
+)
+_MIN_ALPHA = 128  # features are not searched for in pixels with a smaller alpha
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoFile:
-    """A photograph: its name in the scene to be, its file, and the file of its mask."""
+    """A photo without a pose: its name in the new scene, its file, and its mask's file."""
 
     name: str
     file: Path
@@ -41,60 +43,64 @@ class PhotoFile:
 
 @dataclass(frozen=True, eq=False)
 class StagedPhoto:
-    """A photograph that was read, as structure from motion gets it: upright, under a plain name.
+    """A photo in the working folder of a reconstruction: upright, with a number as its name.
 
     Parameters
     ----------
-    source : the photograph. facts : of its header. staged : its name in the working folder.
+    source : the original photo.
+    header : the original photo's header.
+    staged : name in the working folder.
     """
 
     source: PhotoFile
-    facts: PhotoHeader
+    header: PhotoHeader
     staged: str
 
     def pixels(self) -> ImageU8:
-        """(H, W, 3 or 4), upright."""
+        """Return the upright pixels, (H, W, 3) or (H, W, 4)."""
         return read_image(self.source.file, upright=True)
 
     def mask(self) -> Mask | None:
-        """(H, W), upright; None where there is none."""
-        return None if self.source.mask is None else _upright_mask(self.source.mask, self.source.file, self.facts)
+        """Return the upright mask, (H, W), or None."""
+        return None if self.source.mask is None else _upright_mask(self.source.mask, self.source.file, self.header)
 
 
 def is_video(path: Path) -> bool:
-    """Whether the file is a video, by its name."""
+    """Return whether the file is a video, by its suffix."""
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def is_photographs(path: Path) -> bool:
-    """Whether the path is a video, or a folder with photographs but without poses."""
+    """Return whether the path is a video, or a folder with photos but without poses."""
     if not path.is_dir():
         return is_video(path)
     posed = (path / "sparse").exists() or any(path.glob("transforms*.json"))
-    return not posed and bool(_photo_names(_home(path)))
+    return not posed and bool(_photo_names(_photo_folder(path)))
 
 
 def find_photos(path: Path) -> list[PhotoFile]:
-    """The photographs in a folder and below, or those in its `images`, sorted by name; masks from `masks` beside.
+    """Return the photos in a folder and its subfolders, sorted by name, with their masks.
 
-    Hidden files and folders are left out.
+    If the folder `images` inside it has photos, only those are returned. Masks are in the folder `masks`. Hidden files
+    and folders are ignored.
 
     Raises
     ------
-    InputError : no such folder, or no photograph of a kind that is read.
+    InputError : the folder does not exist, or has no photo of a supported format.
     """
     if not path.is_dir():
         raise InputError(
             f"{path}: no such folder; give a folder of photos, or a video file ({', '.join(sorted(VIDEO_SUFFIXES))})"
         )
-    home = _home(path)
+    home = _photo_folder(path)
     names = _photo_names(home)
     if not names:
-        foreign = _foreign(home)
-        mend = f"{foreign}: convert them to JPEG" if foreign else f"looked for {', '.join(sorted(IMAGE_SUFFIXES))}"
-        raise InputError(f"{home}: no photos in it or below; {mend}")
+        unsupported = _count_unsupported(home)
+        suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
+        remedy = f"{unsupported}: convert them to JPEG" if unsupported else f"looked for {suffixes}"
+        raise InputError(f"{home}: no photos in this folder or below; {remedy}")
     for name in names:
-        if not name.isprintable():  # bytes that are no UTF-8, or line ends: no model's files can hold them
+        if not name.isprintable():  # a model's files cannot store line ends and names that are not UTF-8
             raise InputError(f"{home}: the name {name!a} cannot be written into a model; rename the photo")
     folder = path / MASK_FOLDER
     masks = mask_files(folder, names) if folder.is_dir() else {}
@@ -105,12 +111,12 @@ def find_photos(path: Path) -> list[PhotoFile]:
 
 
 def unsupported_photos(path: Path) -> str:
-    """What a folder holds beside photos that are read: "3 files .heic"; empty where nothing."""
-    return _foreign(_home(path)) if path.is_dir() else ""
+    """Return the number and kinds of a folder's unsupported photos, such as "3 files .heic", or an empty text."""
+    return _count_unsupported(_photo_folder(path)) if path.is_dir() else ""
 
 
 def fingerprint(path: Path) -> str:
-    """Hex digest of a video's, or all photographs' and masks', names, sizes and times of change.
+    """Return a hex digest of the names, sizes and modification times of a video, or of photos and masks.
 
     Raises
     ------
@@ -124,73 +130,83 @@ def fingerprint(path: Path) -> str:
     digest = hashlib.sha256()
     for file in files:
         try:
-            state = file.stat()
-            facts = f"{state.st_size}\0{state.st_mtime_ns}"
-        except OSError as error:  # a link to nowhere: such a photo is named and left out when it is read
-            facts = str(error.errno)
-        digest.update(os.fsencode(os.path.relpath(file, path)) + f"\0{facts}\0".encode())
+            stat = file.stat()
+            state = f"{stat.st_size}\0{stat.st_mtime_ns}"
+        except OSError as error:  # a broken link; reading the photo later names it and leaves it out
+            state = str(error.errno)
+        digest.update(os.fsencode(os.path.relpath(file, path)) + f"\0{state}\0".encode())
     return digest.hexdigest()
 
 
 def stage_photo(photo: PhotoFile, number: int, photos: Path, masks: Path) -> StagedPhoto | str:
-    """Read a photograph whole and put it into the working folder, upright; a mask into `masks`, under COLMAP's name.
+    """Read a photo and put it upright into the working folder, and its mask into `masks` with COLMAP's name.
+
+    Parameters
+    ----------
+    photo : the original photo.
+    number : its number, which becomes its name.
+    photos, masks : folders to write to.
 
     Returns
     -------
-    The photograph, or one line on why it cannot be used.
+    The staged photo, or one line that says why it cannot be used.
     """
     try:
-        facts, pixels = read_photo_header(photo.file), read_image(photo.file, upright=True)
-        staged = f"{number:06}{'.png' if photo.file.suffix.lower() == '.png' and facts.plain else '.jpg'}"
-        prepared = StagedPhoto(photo, facts, staged)
-        mask = prepared.mask()
+        header, pixels = read_photo_header(photo.file), read_image(photo.file, upright=True)
+        staged = f"{number:06}{'.png' if photo.file.suffix.lower() == '.png' and header.plain else '.jpg'}"
+        result = StagedPhoto(photo, header, staged)
+        mask = result.mask()
     except InputError as error:
         return str(error)
-    if facts.plain and photo.file.suffix.lower() in (*JPEG_SUFFIXES, ".png"):
+    if header.plain and photo.file.suffix.lower() in (*JPEG_SUFFIXES, ".png"):
         _link(photo.file, photos / staged)
     else:
-        write_photo(photos / staged, pixels[:, :, :3], facts.exif)
+        write_photo(photos / staged, pixels[:, :, :3], header.exif)
     if pixels.shape[2] == 4:
-        opaque = pixels[:, :, 3] >= _OPAQUE_ENOUGH
+        opaque = pixels[:, :, 3] >= _MIN_ALPHA
         mask = opaque if mask is None else mask & opaque
     if mask is not None:
         _write_mask(masks, staged, mask)
-    return prepared
+    return result
 
 
 def complete_masks(photos: Sequence[StagedPhoto], masks: Path) -> Path | None:
-    """A mask for every photo, as COLMAP drops those without where others have one; None where none has."""
+    """Write white masks for photos without a mask, and return the folder; None if no photo has a mask.
+
+    COLMAP drops photos without a mask if other photos have one.
+    """
     if not any(masks.iterdir()):
         return None
     for photo in photos:
         if not (masks / f"{photo.staged}.png").exists():
-            _write_mask(masks, photo.staged, np.ones((photo.facts.height, photo.facts.width), bool))
+            _write_mask(masks, photo.staged, np.ones((photo.header.height, photo.header.width), bool))
     return masks
 
 
 def group_by_camera(photos: Sequence[StagedPhoto], mode: str) -> list[list[StagedPhoto]]:
-    """Photos grouped by the camera that they share.
+    """Return photos grouped by shared cameras.
 
     Parameters
     ----------
-    mode : "auto": equal size and EXIF (maker, model, focal length); "single", "per-image", "per-folder".
+    mode : "single", "per-image", "per-folder", or "auto". With "auto", photos of one camera have equal sizes and
+        equal EXIF data (maker, model, focal length).
 
     Raises
     ------
-    InputError : "single" or "per-folder", and sizes that differ.
+    InputError : photos of one camera have different sizes.
     """
     groups: dict[object, list[StagedPhoto]] = {}
     for photo in photos:
-        size = photo.facts.width, photo.facts.height
+        size = photo.header.width, photo.header.height
         folder = PurePosixPath(photo.source.name).parent
         key: object = {
-            "auto": (size, photo.facts.camera),
+            "auto": (size, photo.header.camera),
             "single": None,
             "per-image": photo.staged,
             "per-folder": folder,
         }[mode]
         group = groups.setdefault(key, [])
-        first = group[0].facts if group else photo.facts
+        first = group[0].header if group else photo.header
         if (first.width, first.height) != size:
             raise InputError(
                 f"{photo.source.file}: is {size[0]}x{size[1]} px, {group[0].source.name} {first.width}x"
@@ -200,8 +216,8 @@ def group_by_camera(photos: Sequence[StagedPhoto], mode: str) -> list[list[Stage
     return list(groups.values())
 
 
-def _home(path: Path) -> Path:
-    """The folder itself, or its `images` where there are photos in that."""
+def _photo_folder(path: Path) -> Path:
+    """Return the folder `images` inside a folder if it has photos, or else the folder itself."""
     images = path / "images"
     return images if images.is_dir() and _photo_names(images) else path
 
@@ -211,29 +227,29 @@ def _photo_names(home: Path) -> list[str]:
 
 
 def _names(home: Path, suffixes: frozenset[str]) -> list[str]:
-    """Files below the folder with one of the suffixes, `/` between folders."""
-    found = []
+    """Return files below the folder with one of the suffixes, as names with `/` between folders."""
+    names = []
     for folder, folders, files in os.walk(home):
         below = Path(folder).relative_to(home)
         folders[:] = [
             name for name in folders if not name.startswith(".") and not (below == Path() and name == MASK_FOLDER)
         ]
-        found += [
+        names += [
             (below / name).as_posix()
             for name in files
             if not name.startswith(".") and Path(name).suffix.lower() in suffixes
         ]
-    return sorted(found)
+    return sorted(names)
 
 
-def _foreign(home: Path) -> str:
-    names = _names(home, _FOREIGN)
+def _count_unsupported(home: Path) -> str:
+    names = _names(home, _UNSUPPORTED)
     kinds = sorted({Path(name).suffix.lower() for name in names})
     return f"{len(names)} file{'s' if len(names) > 1 else ''} {', '.join(kinds)}" if names else ""
 
 
 def _scene_names(names: list[str]) -> list[str]:
-    """Names in the scene, where photos are JPEG or PNG: other endings become .png, unless two would be the same."""
+    """Return the names in the scene: suffixes other than JPEG and PNG become .png, in a way that keeps names unique."""
     kept = {name for name in names if Path(name).suffix.lower() in (*JPEG_SUFFIXES, ".png")}
     renamed: list[str] = []
     for name in names:
@@ -242,16 +258,16 @@ def _scene_names(names: list[str]) -> list[str]:
     return renamed
 
 
-def _upright_mask(path: Path, photo: Path, facts: PhotoHeader) -> Mask:
-    """A mask of the photo as stored or of the upright photo, of its size or a reduction of it, at the upright size."""
+def _upright_mask(path: Path, photo: Path, header: PhotoHeader) -> Mask:
+    """Return a photo's mask at the photo's upright size; raises InputError for another aspect ratio."""
     mask = read_mask(path)
     rows, columns = mask.shape
-    if not same_aspect((columns, rows), (facts.width, facts.height)):
+    if not same_aspect((columns, rows), (header.width, header.height)):
         raise InputError(
-            f"{path}: is {columns}x{rows} px, the photo {photo.name} {facts.width}x{facts.height}; "
-            "make the mask of the photo's size, upright"
+            f"{path}: is {columns}x{rows} px, the photo {photo.name} {header.width}x{header.height}; "
+            "make the mask as large as the upright photo"
         )
-    return resize_mask(mask, facts.width, facts.height)
+    return resize_mask(mask, header.width, header.height)
 
 
 def _write_mask(folder: Path, staged: str, mask: Mask) -> None:
@@ -259,7 +275,7 @@ def _write_mask(folder: Path, staged: str, mask: Mask) -> None:
 
 
 def _link(file: Path, target: Path) -> None:
-    """A link, or a copy where the system makes none."""
+    """Make a link to a file, or a copy if the system does not allow links."""
     try:
         target.symlink_to(file.resolve())
     except OSError:

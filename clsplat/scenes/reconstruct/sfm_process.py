@@ -1,4 +1,4 @@
-"""Structure from motion in a child process: started, watched and told of, ended with its parent."""
+"""Structure from motion in a child process: it is started, watched, and ended with its parent."""
 
 from __future__ import annotations
 
@@ -17,39 +17,41 @@ from typing import Any
 
 from ...errors import InputError
 
-_LOOK = 0.3  # seconds between looks at the database
-# The table whose rows tell how far a stage is.
-_COUNTED = {"features": "keypoints", "pairs": "two_view_geometries", "pairs again": "two_view_geometries"}
-_SAID = {"features": "photos searched for features", "pairs": "pairs matched", "pairs again": "pairs matched again"}
+_POLL = 0.3  # time between two queries of the database [s]
+# The number of rows of these tables shows the progress of a stage.
+_TABLES = {"features": "keypoints", "pairs": "two_view_geometries", "pairs again": "two_view_geometries"}
+_LABELS = {"features": "photos searched for features", "pairs": "pairs matched", "pairs again": "pairs matched again"}
 
 
 @dataclass(frozen=True)
 class Step:
-    """How far the work is: `done` of `total` (0 where it is not known) of what `label` says."""
+    """Progress of the work: `done` of `total` items described by `label`; `total` is 0 if unknown."""
 
     label: str
     done: int
     total: int = 0
 
 
-Tell = Callable[[Step], None]
+StepCallback = Callable[[Step], None]
 
 
-def run_sfm(work: Path, job: dict[str, Any], tell: Tell, source: str) -> dict[str, int]:
-    """Find features, match and map.
+def run_sfm(work: Path, job: dict[str, Any], report: StepCallback, source: str) -> dict[str, int]:
+    """Find features, match pairs of photos, and map.
 
     Parameters
     ----------
-    work : folder with photos/ and pairs.txt. job : the rest of what sfm.py wants.
-    source : the photographs, for messages.
+    work : folder with photos/ and pairs.txt.
+    job : the other values of the job that sfm_worker.py describes.
+    report : called with each Step.
+    source : name of the photos, for messages.
 
     Returns
     -------
-    How many photos each model registers, by its folder.
+    Number of registered photos of each model, by the model's folder.
 
     Raises
     ------
-    InputError : no model comes of the photos, or the library failed.
+    InputError : the photos give no model, or pycolmap failed.
     """
     work = work.resolve()
     database = work / "database.db"
@@ -71,7 +73,7 @@ def run_sfm(work: Path, job: dict[str, Any], tell: Tell, source: str) -> dict[st
             start_new_session=True,
         )
     try:
-        last = _watch(child, database, tell)
+        last = _watch(child, database, report)
     finally:
         child.kill()
         child.wait()
@@ -86,34 +88,34 @@ def run_sfm(work: Path, job: dict[str, Any], tell: Tell, source: str) -> dict[st
     models: dict[str, int] = last["models"]
     if not models:
         raise InputError(
-            f"{source}: no two photos fit together, so none has a pose; take photos that overlap by more "
-            "than half, sharp, of things at rest and with texture"
+            f"{source}: no two photos fit together, so none has a pose; take sharp photos that overlap by "
+            "more than half, of a scene at rest and with texture"
         )
     return models
 
 
-def _watch(child: subprocess.Popen[bytes], database: Path, tell: Tell) -> dict[str, Any]:
-    """Tell of the child's steps until it ends; returns what it said last."""
+def _watch(child: subprocess.Popen[bytes], database: Path, report: StepCallback) -> dict[str, Any]:
+    """Report the child's steps until it ends, and return its last event."""
     events: queue.Queue[dict[str, Any] | None] = queue.Queue()
     threading.Thread(target=_listen, args=(child, events), daemon=True).start()
     last: dict[str, Any] = {}
     stage, total = "", 0
     while True:
         try:
-            event = events.get(timeout=_LOOK)
+            event = events.get(timeout=_POLL)
         except queue.Empty:
             event = {}
         if event is None:
             return last
         last = event or last
         if "stage" in event:
-            if stage in _COUNTED:
-                tell(Step(_SAID[stage], total, total))
+            if stage in _TABLES:
+                report(Step(_LABELS[stage], total, total))
             stage, total = event["stage"], event["total"]
         elif "done" in event:
-            tell(Step(stage, event["done"], total))
-        elif stage in _COUNTED and not event:
-            tell(Step(_SAID[stage], min(_rows(database, _COUNTED[stage]), total), total))
+            report(Step(stage, event["done"], total))
+        elif stage in _TABLES and not event:
+            report(Step(_LABELS[stage], min(_count_rows(database, _TABLES[stage]), total), total))
 
 
 def _listen(child: subprocess.Popen[bytes], events: queue.Queue[dict[str, Any] | None]) -> None:
@@ -121,17 +123,17 @@ def _listen(child: subprocess.Popen[bytes], events: queue.Queue[dict[str, Any] |
     for line in child.stdout:
         try:
             event = json.loads(line)
-        except ValueError:  # the library's own words
+        except ValueError:  # pycolmap prints lines that are not JSON
             continue
         if isinstance(event, dict):
             events.put(event)
     events.put(None)
 
 
-def _rows(database: Path, table: str) -> int:
-    """Rows of a table so far; 0 while it cannot be read."""
+def _count_rows(database: Path, table: str) -> int:
+    """Return the current number of rows of a table; 0 while it cannot be read."""
     try:
-        connection = sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=_LOOK)
+        connection = sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=_POLL)
         try:
             return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
         finally:
@@ -143,13 +145,13 @@ def _rows(database: Path, table: str) -> int:
 def _reason(last: dict[str, Any], code: int, log: Path) -> str:
     if "error" in last:
         return str(last["error"])
-    said = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
     ended = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-    return f"{ended}: {said[-1][:160]}" if said else ended
+    return f"{ended}: {lines[-1][:160]}" if lines else ended
 
 
 def _environment() -> dict[str, str]:
-    """So that the child finds this package where this process found it."""
+    """Return an environment in which the child imports this package from the same place."""
     home = str(Path(__file__).resolve().parents[3])
     paths = [home, *filter(None, [os.environ.get("PYTHONPATH")])]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}

@@ -1,4 +1,4 @@
-"""A sparse model of distorted photos as a scene of pinhole images: photos undistorted, observations moved with them."""
+"""Scenes of pinhole images from a sparse model of distorted photos: undistorted photos and moved observations."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from .photo_files import StagedPhoto
 
 
 class SparseModel:
-    """A model that COLMAP's mapper wrote.
+    """A sparse model that COLMAP's mapper wrote.
 
     Parameters
     ----------
-    folder : of the model.
+    folder : the model's folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -33,28 +33,31 @@ class SparseModel:
 
     @property
     def names(self) -> set[str]:
-        """Of the photos that it registers."""
+        """Names of the registered photos."""
         return set(self._photos)
 
     @property
     def points(self) -> Points:
-        """Positions, colours and track lengths."""
+        """Points with positions, colours and track lengths."""
         return read_points(self._model)
 
     @property
     def errors(self) -> NDArray[np.float64]:
-        """(P,) mean reprojection error of each point [px]."""
+        """Mean reprojection error of each point [px], (P,)."""
         return np.array([self._model.points3D[number].error for number in self._rows])
 
     def photo(self, name: str) -> RegisteredImage:
-        """A registered photo with its lens."""
+        """Return a registered photo with its lens."""
         return self._photos[name]
 
     def view(self, name: str, camera: Camera, scene_name: str) -> ModelView:
-        """The photo's observations [px] of points, where a pinhole camera sees them."""
-        seen = [(point.xy, self._rows[point.point3D_id]) for point in self._images[name].get_observation_points2D()]
+        """Return a photo as a view of a pinhole camera, with its observations moved to that camera [px].
+
+        Observations that the pinhole camera cannot see are dropped.
+        """
+        observed = [(point.xy, self._rows[point.point3D_id]) for point in self._images[name].get_observation_points2D()]
         lens = self._photos[name].lens
-        rays = np.asarray(lens.cam_from_img(np.array([xy for xy, _ in seen]).reshape(-1, 2))).reshape(-1, 2)
+        rays = np.asarray(lens.cam_from_img(np.array([xy for xy, _ in observed]).reshape(-1, 2))).reshape(-1, 2)
         kept = np.isfinite(rays).all(axis=1)
         pixels = rays[kept] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         return ModelView(
@@ -63,33 +66,34 @@ class SparseModel:
             (camera.fx, camera.fy, camera.cx, camera.cy),
             camera.cam_from_world,
             pixels,
-            np.array([row for _, row in seen], np.int64)[kept],
+            np.array([row for _, row in observed], np.int64)[kept],
         )
 
 
-def write_flat_photo(model: SparseModel, photo: StagedPhoto, scene: Path) -> ModelView:
-    """Undistort a registered photo, and its mask, into the scene's folders.
+def write_undistorted_photo(model: SparseModel, photo: StagedPhoto, scene: Path) -> ModelView:
+    """Write a registered photo and its mask undistorted into the scene's folders, and return its view.
 
     Raises
     ------
-    InputError : the file is not what it was, or the lens has no pinhole image. OutputError : cannot be written.
+    InputError : the file has changed, or the lens has no pinhole image.
+    OutputError : a file cannot be written.
     """
-    posed, pixels = model.photo(photo.staged), photo.pixels()
+    registered, pixels = model.photo(photo.staged), photo.pixels()
     height, width = pixels.shape[:2]
-    flat, camera = posed.fit(np.ascontiguousarray(pixels[:, :, :3]))
+    undistorted, camera = registered.fit(np.ascontiguousarray(pixels[:, :, :3]))
     if pixels.shape[2] == 4:
-        flat = np.dstack([flat, posed.fit_alpha(pixels[:, :, 3])])
+        undistorted = np.dstack([undistorted, registered.fit_alpha(pixels[:, :, 3])])
     mask = photo.mask()
-    write_photo(scene / "images" / photo.source.name, flat)
+    write_photo(scene / "images" / photo.source.name, undistorted)
     if mask is not None:
         write_png(
             scene / MASK_FOLDER / f"{photo.source.name}.png",
-            np.where(posed.fit_mask(mask, width, height), 255, 0).astype(np.uint8),
+            np.where(registered.fit_mask(mask, width, height), 255, 0).astype(np.uint8),
         )
     return model.view(photo.staged, camera, photo.source.name)
 
 
-def write_flat_model(model: SparseModel, views: Sequence[ModelView], scene: Path) -> None:
-    """Write `sparse`/0 of the scene, with cameras, poses, points and tracks."""
+def write_undistorted_model(model: SparseModel, views: Sequence[ModelView], scene: Path) -> None:
+    """Write sparse/0 of the scene with cameras, poses, points and tracks; raises OutputError."""
     points = model.points
     write_binary_model(scene / "sparse" / "0", views, points.xyz, points.rgb, model.errors)

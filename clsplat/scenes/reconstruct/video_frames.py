@@ -1,4 +1,4 @@
-"""The sharpest frames of a video, for structure from motion: ffmpeg decodes, through imageio's package."""
+"""The sharpest frames of a video, for structure from motion. ffmpeg, from the package imageio-ffmpeg, decodes."""
 
 from __future__ import annotations
 
@@ -12,29 +12,32 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files.video import require_encoder
-from .options import FEWEST, FRAMES
+from .options import MIN_PHOTOS, N_FRAMES
 from .photo_files import PhotoFile
 
-_SIDE = 384  # frames are compared at this width and height [px]
-# Frames one after another at a made-up steady rate, so that ffmpeg neither drops nor doubles any in either pass.
+_SIDE = 384  # sharpness is compared at this width and height [px]
+# Frames get a constant artificial rate, so that ffmpeg neither drops nor repeats a frame in either pass.
 _RATE = ("-r", "25")
 _STEADY = "setpts=N/25/TB"
 
 
 def extract_frames(
-    video: Path, folder: Path, frames: int = FRAMES, seen: Callable[[int], None] | None = None
+    video: Path, folder: Path, frames: int = N_FRAMES, progress: Callable[[int], None] | None = None
 ) -> list[PhotoFile]:
-    """Write the sharpest frame of each of `frames` equal stretches into `folder`, as JPEG.
+    """Write the sharpest frame of each of `frames` equal parts of a video as JPEG.
 
     Sharpness is the variance of the Laplacian of the grey image.
 
     Parameters
     ----------
-    seen : called with the number of frames looked at.
+    video : the video file.
+    folder : folder for the frames, created if it does not exist.
+    frames : number of parts; fewer if the video has fewer frames.
+    progress : called with the number of frames compared so far.
 
     Returns
     -------
-    The frames, `frame_00017.jpg` for the video's 17th (from 0 on), in their order.
+    The frames in order. Frame 17 of the video, counted from 0, is `frame_00017.jpg`.
 
     Raises
     ------
@@ -44,18 +47,18 @@ def extract_frames(
     sharpness = []
     for grey in _grey_frames(video):
         sharpness.append(_sharpness(grey))
-        if seen is not None:
-            seen(len(sharpness))
-    if len(sharpness) < FEWEST:
+        if progress is not None:
+            progress(len(sharpness))
+    if len(sharpness) < MIN_PHOTOS:
         raise InputError(f"{video}: has {len(sharpness)} frames that can be decoded; give another video, or photos")
     chosen = sharpest(sharpness, frames)
     folder.mkdir(parents=True, exist_ok=True)
-    wanted = "+".join(f"eq(n\\,{index})" for index in chosen)
+    selection = "+".join(f"eq(n\\,{index})" for index in chosen)
     _run(
         [
             *_ffmpeg(video),
             "-vf",
-            f"select={wanted},{_STEADY}",
+            f"select={selection},{_STEADY}",
             "-q:v",
             "1",
             "-qmin",
@@ -77,7 +80,7 @@ def extract_frames(
 
 
 def sharpest(sharpness: list[float], frames: int) -> list[int]:
-    """Index of the greatest in each of `frames` equal stretches; all where there are no more."""
+    """Return the index of the maximum in each of `frames` equal parts, or all indices if there are fewer."""
     edges = np.linspace(0, len(sharpness), min(frames, len(sharpness)) + 1).round().astype(int)
     return [int(start + np.argmax(sharpness[start:end])) for start, end in pairwise(edges)]
 
