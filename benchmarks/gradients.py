@@ -3,10 +3,11 @@
     python benchmarks/gradients.py [--out benchmarks/results/gradients.jsonl]
 
 Two measures, both relative to the field's gradient in the Euclidean norm:
-  differences  double build, thresholds 0, against central finite differences of the rendered image, over every
-               parameter (random per-pixel weights, non-square image, off-centre principal point)
-  reference    float32 build with the usual thresholds, against the exact (complex-step) gradient of the independent
-               NumPy renderer in tests/reference/renderer.py
+
+- differences: the double build with thresholds 0, against central finite differences over every parameter. The loss is
+  a random weighting of a non-square image with an off-centre principal point.
+- reference: the float32 build with the usual thresholds, against the exact (complex-step) gradient of the independent
+  NumPy renderer in tests/reference/renderer.py.
 """
 
 from __future__ import annotations

@@ -1,17 +1,16 @@
-"""kill -9 at random moments of training, `--resume` after each, and the result against an uninterrupted run's bytes.
+"""kill -9 at random moments of training, `--resume` after each, and a comparison with an uninterrupted run's bytes.
 
     python benchmarks/kill.py [--kills 50] [--seed 0] [--device 0:0]
 
-Runs are of a made capture of a few pixels, with a checkpoint every third iteration and many point clouds, so that files
-are being written half of the time. A third of the kills come at any time from the start of the process on (every tenth
-process begins with empty caches of kernels), a third some time after a checkpoint, a third when a file is half written.
-After each kill all files that are there must be whole; after each run that reaches its end point clouds and the columns
-of the log must be those of the run that nobody killed, and nothing else may lie in the folder. A JSON line is written.
+Each run trains on a made capture of a few pixels, with a checkpoint every third iteration and many point clouds. So
+files are being written half of the time. The kills are of three kinds, equally often: at any time after the start of
+the process, some time after a checkpoint, and while a file is half written. Every tenth process begins with empty
+caches of kernels. After each kill all files must be whole. Each run must end with the point clouds and the log columns
+of the uninterrupted run, and with no other files in the folder. The script writes a JSON line.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -51,30 +50,27 @@ OPTIONS = [
     "--eval",
     "--quiet",
 ]
-CLSPLAT = [sys.executable, "-c", "from clsplat_cli.main import main; main()"]
 MOMENTS = ("any time", "after a checkpoint", "while writing")
-LONGEST = 120  # seconds that a process may take
+TIMEOUT = 120  # seconds of a process
 CACHES = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "CUDA_CACHE_PATH")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, common.RESULTS / "kill.jsonl", table=False, smoke=False)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--device")
-    parser.add_argument("--out", type=Path, default=common.RESULTS / "kill.jsonl")
     args = parser.parse_args()
     device = open_device(args.device)
     with tempfile.TemporaryDirectory() as folder:
         row = Killer(Path(folder), device.info.index, args.seed).run(args.kills)
-    # The schedule is fixed, as empty caches would have it measured anew.
+    # The schedule is fixed: with empty caches it would be measured again.
     common.append(args.out, common.environment(device, "cpu16") | {"seed": args.seed} | row)
     print(json.dumps(row, indent=1))
     sys.exit(1 if row["faults"] else 0)
 
 
 class Killer:
-    """Runs to kill, and what was found."""
+    """Runs, kills them and collects the faults."""
 
     def __init__(self, folder: Path, device: str, seed: int) -> None:
         self.folder, self.rng = folder, np.random.default_rng(seed)
@@ -87,18 +83,18 @@ class Killer:
         self.processes, self.runs, self.faults = 0, 0, list[str]()
 
     def run(self, kills: int) -> dict[str, Any]:
-        """Kill so many times, and see every run to its end."""
+        """Kill that number of times, let every run end, and return the report."""
         start = time.perf_counter()
         reference = self.folder / "reference"
-        subprocess.run(self.command(reference), env=self.environment, check=True, timeout=LONGEST)
+        subprocess.run(self.command(reference), env=self.environment, check=True, timeout=TIMEOUT)
         self.seconds = time.perf_counter() - start
         while self.kills.total() < kills:
             self.runs += 1
             model = self.folder / f"run-{self.runs}"
             while self.kills.total() < kills and not self.process(model, str(self.rng.choice(MOMENTS))):
-                self.look(model)
+                self.check_files(model)
             self.process(model, "")
-            self.look(model)
+            self.check_files(model)
             self.compare(model, reference)
         return {
             "kills": self.kills.total(),
@@ -112,20 +108,30 @@ class Killer:
         }
 
     def command(self, model: Path) -> list[str]:
-        """Go on where there is a checkpoint; else begin, over what a killed beginning has left."""
+        """Return the command that resumes from a checkpoint, or starts if there is none."""
         if (model / "checkpoint.npz").is_file():
-            return [*CLSPLAT, "train", "--resume", "-m", str(model), "--device", self.device, "--quiet"]
-        return [*CLSPLAT, "train", str(self.scene), "-m", str(model), "--device", self.device, "--overwrite", *OPTIONS]
+            return [*common.CLSPLAT, "train", "--resume", "-m", str(model), "--device", self.device, "--quiet"]
+        return [
+            *common.CLSPLAT,
+            "train",
+            str(self.scene),
+            "-m",
+            str(model),
+            "--device",
+            self.device,
+            "--overwrite",
+            *OPTIONS,
+        ]
 
     def process(self, model: Path, moment: str) -> bool:
-        """Start, and kill at a moment ("": never); whether it came to its end first."""
+        """Start a process and kill it at a moment ("": never); return whether it ended first."""
         self.processes += 1
         environment = self.environment
         if moment and self.processes % 10 == 1:
             caches = self.folder / f"caches-{self.processes}"
             caches.mkdir()
             self.cold.append(str(caches))
-        if moment and self.cold and self.processes % 10 < 4:  # the second start finds what the first one left
+        if moment and self.cold and self.processes % 10 < 4:  # later starts find the caches of the first one
             environment = environment | dict.fromkeys(CACHES, self.cold[-1])
         checkpoint = model / "checkpoint.npz"
         before = stamp(checkpoint)
@@ -135,7 +141,7 @@ class Killer:
             if killed:
                 child.send_signal(signal.SIGKILL)
             try:
-                code = child.wait(LONGEST)
+                code = child.wait(TIMEOUT)
             except subprocess.TimeoutExpired:
                 child.kill()
                 self.faults.append(f"run {self.runs}: hung after {self.kills.total()} kills")
@@ -151,11 +157,11 @@ class Killer:
         return True
 
     def wait(self, child: subprocess.Popen[bytes], moment: str, checkpoint: Path, before: int) -> bool:
-        """Until the moment; whether the process is still there."""
+        """Wait until the moment; return whether the process is still running."""
         if moment == MOMENTS[0]:
             time.sleep(self.rng.uniform(0, 1.2 * self.seconds))
             return child.poll() is None
-        writes = int(self.rng.integers(1, 12))  # of half-written files that are let pass
+        writes = int(self.rng.integers(1, 12))  # half-written files until the kill
         while child.poll() is None:
             if moment == MOMENTS[1] and stamp(checkpoint) != before:
                 time.sleep(self.rng.uniform(0, 0.4))
@@ -167,8 +173,8 @@ class Killer:
             time.sleep(0.0005)
         return False
 
-    def look(self, model: Path) -> None:
-        """All files are whole, whatever was killed."""
+    def check_files(self, model: Path) -> None:
+        """Check that all files are whole."""
         place = f"run {self.runs}, after {self.kills.total()} kills"
         try:
             if (model / "checkpoint.npz").is_file():
@@ -181,7 +187,7 @@ class Killer:
             self.faults.append(f"{place}: {error}")
 
     def compare(self, model: Path, reference: Path) -> None:
-        """Of a run that has come to its end."""
+        """Compare a finished run with the uninterrupted one."""
         place = f"run {self.runs}"
         names = [
             sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file())
@@ -198,7 +204,7 @@ class Killer:
 
 
 def stamp(path: Path) -> int:
-    """When a file was written [ns]; 0 where it is not there."""
+    """Return when a file was written [ns]; 0 if there is no file."""
     try:
         return path.stat().st_mtime_ns
     except FileNotFoundError:
@@ -206,7 +212,7 @@ def stamp(path: Path) -> int:
 
 
 def timeless(log: Path) -> list[dict[str, Any]]:
-    """Lines of a log without their times."""
+    """Return the lines of a log without their times."""
     rows = [json.loads(line) for line in log.read_text().splitlines()]
     return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
 

@@ -1,15 +1,16 @@
-"""Where skew sits: a view of a model beside the same view coloured by |skew|, and the numbers.
+"""Where the skew is: a view of a model beside the same view coloured by |skew|, and quantiles of |skew|.
 
     python benchmarks/skew_picture.py MODEL_OR_PLY CAMERAS_JSON OUT.png [--view 0]
 
-Left the render, right |m| / its limit from black (Gaussian) over orange to white (half-Gaussian).
+The left half is the render. The right half shows |m| / its limit, from black (Gaussian) over orange to white
+(half-Gaussian).
 """
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
+import common
 import numpy as np
 
 from clsplat.cameras.cameras_json import read_cameras
@@ -21,7 +22,7 @@ from clsplat.training.folder import ModelFolder
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, device=False, table=False, smoke=False)
     parser.add_argument("model", type=Path)
     parser.add_argument("cameras", type=Path)
     parser.add_argument("out", type=Path)

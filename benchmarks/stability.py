@@ -4,22 +4,21 @@
     python benchmarks/stability.py --table      # print the tables from the file, run nothing
     python benchmarks/stability.py --charts     # draw the heat maps beside the file
 
-Kinds (benchmarks/hazards/ has each):
-  static      crafted splats: float32 kernels against the double build, on every usable device and with fast-math
-  training    a small capture with something wrong, beside the same run with nothing wrong (its benign twin)
-  capacity    120 000 splats over a tile; gradient records of more than 2^31 bytes in one buffer
-  recovery    known skewed splats, found again with every parameterisation of the slant
-  arithmetic  the textbook formula of a projected slant beside clsplat's
+Kinds (benchmarks/hazards/ defines each):
 
-A line that is in the file already is not run again: kill and restart at will. A model that training writes is read
-back: a number in it that is not finite is a failure, whatever the run said. benchmarks/STABILITY.md reads the results.
+- static: crafted splats, float32 kernels against the double build, on every usable device and with fast-math
+- training: a small capture with a fault, beside the same run without the fault (its benign twin)
+- capacity: 120 000 splats over a tile; gradient records of more than 2^31 bytes in one buffer
+- recovery: known skewed splats, recovered with every parameterisation of the slant
+- arithmetic: the textbook formula of a projected slant beside clsplat's
+
+A finished line is not repeated: kill and restart at will. A model that training writes is read back: a value that is
+not finite is a failure, also if the run reported none. benchmarks/STABILITY.md discusses the results.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 from typing import Any
 
 import common
@@ -35,7 +34,7 @@ from clsplat.rendering.tuning import schedule_for
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
 Row = dict[str, Any]
-Task = tuple[Row, Callable[[], Row | None]]  # what tells a line from others, and what measures it
+Task = tuple[Row, Callable[[], Row | None]]  # the key of a line, and the function that measures it
 
 KEY = ("kind", "hazard", "system", "optimizer", "device", "build")
 FAST_MATH = "-cl-fast-relaxed-math"
@@ -43,16 +42,13 @@ SMOKE = {"static": ("benign", "needles 1:10^4"), "training": ("all rates x10", "
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, common.RESULTS / "stability.jsonl")
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
-    parser.add_argument("--device", help="the first of the devices, as for clsplat; default: the best")
-    parser.add_argument("--out", type=Path, default=common.RESULTS / "stability.jsonl")
-    parser.add_argument("--table", action="store_true")
-    parser.add_argument("--charts", action="store_true")
-    parser.add_argument("--smoke", action="store_true", help="a few tiny cases of each kind")
+    parser.add_argument("--charts", action="store_true", help="draw the heat maps, run nothing")
     args = parser.parse_args()
+    runs = common.Runs(args.out, KEY)
     if args.table or args.charts:
-        rows = common.read(args.out)
+        rows = runs.rows
         if args.table:
             print_tables(rows)
         if args.charts:
@@ -65,30 +61,30 @@ def main() -> None:
         for info in list_devices()
         if info.fault is None and info.platform != "Oclgrind" and info.index != first.info.index
     ]
-    done = {tuple(row[key] for key in KEY) for row in common.read(args.out)}
     for kind in args.kinds:
         for key, measure in KINDS[kind](devices[:1] if args.smoke else devices, args.smoke):
-            if tuple(key[name] for name in KEY) in done:
+            if key in runs:
                 continue
             measured = measure()
             if measured is None:
                 continue
             device = next(device for device in devices if device.info.index == key["device"])
-            common.append(args.out, key | measured | {"environment": common.environment(device, schedule_for(device))})
+            runs.add(key | measured | {"environment": common.environment(device, schedule_for(device))})
             print(
                 f"{kind}: {key['hazard']}, {key['system']} {key['optimizer']} {key['build']}: "
                 f"{measured['verdict']} {measured['message']}",
                 flush=True,
             )
-    print_tables(common.read(args.out))
+    print_tables(runs.rows)
 
 
 def key_of(kind: str, hazard: str, system: str, device: Device, optimizer: str = "", build: str = "") -> Row:
+    """Return the key of a line."""
     return dict(zip(KEY, (kind, hazard, system, optimizer, device.info.index, build), strict=True))
 
 
 def static_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
-    """Every device as usual, and the first one with fast-math; a shape's kernels are built once for all its hazards."""
+    """Yield tasks for every device, and for the first one with fast-math; each shape's kernels are built once."""
     builds = [(device, "") for device in devices] + ([] if smoke else [(devices[0], FAST_MATH)])
     for device, build in builds:
         for shape in some(SHAPES, smoke, ("gaussian",)):
@@ -99,29 +95,31 @@ def static_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
                 shape: str = shape,
                 device: Device = device,
                 build: str = build,
-                kept: list[Renderers] = renderers,
+                cache: list[Renderers] = renderers,
             ) -> Row | None:
                 with build_options(build):
-                    if not kept:
-                        kept.append(Renderers(device, schedule_for(device)))
-                    return static_row(hazard, shape, kept[0])
+                    if not cache:
+                        cache.append(Renderers(device, schedule_for(device)))
+                    return static_row(hazard, shape, cache[0])
 
             for hazard in some(crafted.STATIC, smoke, SMOKE["static"]):
                 yield key_of("static", hazard, shape, device, build=build), lambda h=hazard, m=measure: m(h)
 
 
 def training_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
+    """Yield tasks: runs with a fault."""
     runs = Trainings(devices[0], devices[1] if len(devices) > 1 else None, *([20, 4] if smoke else []))
-    for system in VARIANTS[:1] if smoke else VARIANTS:
+    for variant in VARIANTS[:1] if smoke else VARIANTS:
         for optimizer in some(OPTIMIZERS, smoke, ("adam",)):
             for hazard in some(TRAINING, smoke, SMOKE["training"]):
                 yield (
-                    key_of("training", hazard, system.label, devices[0], optimizer),
-                    lambda h=hazard, s=system, o=optimizer: runs.row(h, s, o),
+                    key_of("training", hazard, variant.label, devices[0], optimizer),
+                    lambda h=hazard, s=variant, o=optimizer: runs.row(h, s, o),
                 )
 
 
 def capacity_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
+    """Yield tasks: scenes of extreme size."""
     for hazard in CAPACITY:
         for shape in ("gaussian", DEFAULT_SHAPE):
             yield (
@@ -131,35 +129,38 @@ def capacity_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
 
 
 def recovery_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
+    """Yield tasks: recoveries of known splats."""
     for case in coupled.cases()[: 1 if smoke else None]:
         for form in some(coupled.FORMS, smoke, ("coupled", "vanilla")):
             name = f"slant {case['slant']:g}, 1:{case['aspect']:g}, rate {case['skew_lr']:g}"
 
             def measure(form: str = form, case: dict[str, float] = case) -> Row:
-                found = coupled.recovered(devices[0], form, case, **({"iterations": 10} if smoke else {}))
+                result = coupled.recovered(devices[0], form, case, **({"iterations": 10} if smoke else {}))
                 return (
                     case
-                    | found
-                    | {"verdict": "stops" if found["message"] else "survives" if found["finite"] else "fails"}
+                    | result
+                    | {"verdict": "stops" if result["message"] else "survives" if result["finite"] else "fails"}
                 )
 
             yield key_of("recovery", name, form, devices[0]), measure
 
 
 def arithmetic_tasks(devices: list[Device], smoke: bool) -> Iterator[Task]:
+    """Yield tasks: formulas of the projected slant."""
     for length in slant_arithmetic.LENGTHS:
         for aspect in slant_arithmetic.ASPECTS[-1 if smoke else 0 :]:
             for slant in slant_arithmetic.SLANTS:
 
                 def measure(slant: float = slant, aspect: float = aspect, length: float = length) -> Row:
-                    found = slant_arithmetic.arithmetic_row(slant, aspect, length)
-                    lost = found["squares_not_positive"] > 0
-                    return found | {"finite": not lost, "message": "", "verdict": "fails" if lost else "survives"}
+                    result = slant_arithmetic.arithmetic_row(slant, aspect, length)
+                    lost = result["squares_not_positive"] > 0
+                    return result | {"finite": not lost, "message": "", "verdict": "fails" if lost else "survives"}
 
                 yield key_of("arithmetic", f"{length:g} px, 1:{aspect:g}, slant {slant:g}", "", devices[0]), measure
 
 
 def some(all_of: Iterable[str], smoke: bool, few: Iterable[str]) -> list[str]:
+    """Return all names, or a few in a smoke run."""
     return list(few if smoke else all_of)
 
 

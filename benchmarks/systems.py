@@ -245,7 +245,7 @@ def main() -> None:
 def page(folder: Path, validate: bool) -> str:
     """Return the tables by question: for each group and cap, the scenes side by side.
 
-    Each method has its mean ± half the spread over its seeds, and the difference to the first method of the group, over
+    Each method has its mean ± half the spread over its seeds. The difference to the first method of the group is over
     the seeds that both have.
     """
     scenes = {path.parent.name: common.read(path) for path in sorted(folder.glob(f"*/{RUNS}"))}

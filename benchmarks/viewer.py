@@ -1,16 +1,18 @@
-"""How fast the viewer is: pictures a second, from a camera's move to its picture, and what watching costs a run.
+"""How fast the viewer is: pictures a second, latency of a picture, and the cost of watching a training run.
 
     python benchmarks/viewer.py                      # moving and still, on the scenes' models
-    python benchmarks/viewer.py --training           # what watching costs a run
+    python benchmarks/viewer.py --training           # the cost of watching a run
 
-The server is a process of its own; the client walks along a path between training cameras as a browser does: a pose
-every 16 ms, whether pictures come or not, and decodes what comes. Each picture carries the number of its pose in its
-corner, as blocks that JPEG keeps. Latency: from sending a pose to having decoded the first picture of it or of a later
-one. After rest: from a single pose to the decoded first and full picture; the full one waits 150 ms for the camera to
-rest, and without that wait it tells how many full ones there could be in a second.
+The server is a process of its own. The client walks along a path between training cameras as a browser does: it sends a
+pose every 16 ms, whether pictures arrive or not, and decodes what arrives. Each picture carries the number of its pose
+in its corner, as blocks that JPEG keeps. The latency is the time from sending a pose to having decoded the first
+picture of it or of a later one. After a rest a single pose is sent, and the times of the first and of the full picture
+are measured. The full picture waits 150 ms for the camera to rest; without that wait its time gives the possible number
+of full pictures a second.
 
-Watching: one run in stretches of iterations, in turn without a viewer, with a client that rests (it gets a picture now
-and then) and with one that moves all the time; each stretch's time against those without a viewer before and after it.
+Watching: one run in stretches of iterations, in turn without a viewer, with a client at rest and with a moving client.
+A client at rest gets a picture now and then. The time of each stretch is compared with the stretches without a viewer
+before and after it.
 """
 
 from __future__ import annotations
@@ -36,22 +38,20 @@ POSE_SECONDS = 0.016
 REST = 0.15  # seconds, of clsplat/viewer/viewer.py
 KINDS = ("unwatched", "resting", "moving")
 STRETCH = 25  # iterations
-SETTLED = 2  # rounds of stretches that do not count: the first visit builds kernels
+SETTLED = 2  # first rounds of stretches, which do not count: the first visit builds kernels
 BITS, BLOCK = 12, 8  # of a pose's number; side of a bit [px]
 SCENES = {"fox": 2, "kitchen": -1}  # with their -r
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, common.RESULTS / "viewer.jsonl", table=False, smoke=False)
     parser.add_argument("--scenes", nargs="*", default=list(SCENES))
-    parser.add_argument("--models", type=Path, help="folder of trained models by scene; those missing are trained")
+    parser.add_argument("--models", type=Path, help="folder of trained models by scene; missing models are trained")
     parser.add_argument("--windows", nargs="*", default=["1280x720", "1920x1080"])
-    parser.add_argument("--seconds", type=float, default=10.0, help="that the camera moves")
+    parser.add_argument("--seconds", type=float, default=10.0, help="duration of the camera's movement")
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--cap-max", type=int, default=20000)
-    parser.add_argument("--training", action="store_true")
-    parser.add_argument("--device")
-    parser.add_argument("--out", type=Path, default=common.RESULTS / "viewer.jsonl")
+    parser.add_argument("--training", action="store_true", help="measure the cost of watching a run")
     parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--watch", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -74,13 +74,11 @@ def main() -> None:
 
 
 def training_command(scene: str, model: Path, args: argparse.Namespace) -> list[str]:
-    """`clsplat train` of a scene."""
+    """Return the `clsplat train` command of a scene."""
     device = ["--device", args.device] if args.device else []
     resolution = ["-r", str(SCENES[scene])] if scene in SCENES else []
     return [
-        sys.executable,
-        "-c",
-        "from clsplat_cli.main import main; main()",
+        *common.CLSPLAT,
         "train",
         str(common.data_folder() / scene),
         *resolution,
@@ -99,7 +97,7 @@ def training_command(scene: str, model: Path, args: argparse.Namespace) -> list[
 
 
 def path_of(model: Path) -> list[Any]:
-    """Cameras on the way through some training cameras, the same in both processes."""
+    """Return cameras on a path through some training cameras; both processes get the same ones."""
     from clsplat.cameras.cameras_json import read_cameras
     from clsplat.cameras.interpolate import interpolate
 
@@ -108,7 +106,7 @@ def path_of(model: Path) -> list[Any]:
 
 
 def serve(model: Path, device: str | None) -> None:
-    """The viewer, with the number of its pose in each picture; ends with its input."""
+    """Run the viewer with the number of the pose in each picture, until the input ends."""
     from clsplat.device.device import open_device
     from clsplat.models.model import load_model
     from clsplat.rendering.tuning import schedule_for
@@ -143,7 +141,7 @@ def serve(model: Path, device: str | None) -> None:
 
 
 def number_of(picture: Any) -> int:
-    """The number that a picture carries; -1 where it is too narrow for one."""
+    """Return the number that a picture carries; -1 if the picture is too narrow."""
     if picture.shape[1] < BITS * BLOCK:
         return -1
     bits = [picture[:BLOCK, BLOCK * bit : BLOCK * (bit + 1)].mean() > 127 for bit in range(BITS)]
@@ -151,7 +149,7 @@ def number_of(picture: Any) -> int:
 
 
 class Walker:
-    """A client that notes when which picture came.
+    """A client that records the arrival of pictures.
 
     Attributes
     ----------
@@ -174,7 +172,7 @@ class Walker:
         self.client.close()
 
     def pose(self, number: int) -> None:
-        """Tell of a camera of the path."""
+        """Send a camera of the path."""
         from scipy.spatial.transform import Rotation
 
         camera = self.cameras[number]
@@ -184,7 +182,7 @@ class Walker:
         self.client.look(camera.position.tolist(), (w, x, y, z), float(fov), *self.size)
 
     def wait_for(self, number: int, full: bool, timeout: float = 60.0) -> float:
-        """When a picture of this pose came, of full size if wanted."""
+        """Return when a picture of this pose arrived, of full size if `full`."""
         from clsplat.viewer.settings import DEFAULT_SIZE
 
         end = time.perf_counter() + timeout
@@ -209,7 +207,7 @@ class Walker:
 
 
 def walk(scene: str, model: Path, window: str, args: argparse.Namespace) -> None:
-    """One model in one window; appends its line."""
+    """Measure one model in one window and append its line."""
     width, height = (int(side) for side in window.split("x"))
     device = ["--device", args.device] if args.device else []
     server = subprocess.Popen(
@@ -220,8 +218,8 @@ def walk(scene: str, model: Path, window: str, args: argparse.Namespace) -> None
     )
     assert server.stdin is not None
     assert server.stdout is not None
-    told = json.loads(server.stdout.readline())
-    walker = Walker(told.pop("port"), path_of(model), width, height)
+    greeting = json.loads(server.stdout.readline())
+    walker = Walker(greeting.pop("port"), path_of(model), width, height)
     try:
         walker.pose(0)
         walker.wait_for(0, full=True)
@@ -257,7 +255,7 @@ def walk(scene: str, model: Path, window: str, args: argparse.Namespace) -> None
         "task": "view",
         "scene": scene,
         "window": window,
-        **told,
+        **greeting,
         "fps_moving": len(moving) / (end - start),
         "moving_width_px": [min(sides), statistics.median(sides), max(sides)],
         "latency_ms": quantiles(latencies),
@@ -273,7 +271,7 @@ def walk(scene: str, model: Path, window: str, args: argparse.Namespace) -> None
 
 
 def quantiles(seconds: list[float]) -> dict[str, float]:
-    """Median, 95th percentile and most [ms]."""
+    """Return the median, the 95th percentile and the maximum [ms]."""
     at = np.quantile(np.array(seconds) * 1e3, (0.5, 0.95, 1.0))
     return dict(zip(("median", "p95", "max"), np.round(at, 1).tolist(), strict=True))
 
@@ -282,7 +280,7 @@ def quantiles(seconds: list[float]) -> dict[str, float]:
 
 
 def watch_training(scene: str, args: argparse.Namespace) -> None:
-    """One run in stretches without a viewer, with a client at rest and with one that moves; appends a line."""
+    """Train in stretches without a viewer, with a client at rest and with a moving client; append the line."""
     from clsplat.device.device import open_device
     from clsplat.rendering.tuning import schedule_for
     from clsplat.scenes.scene import load_scene
@@ -304,7 +302,7 @@ def watch_training(scene: str, args: argparse.Namespace) -> None:
     )
     assert watcher.stdin is not None
     assert watcher.stdout is not None
-    watcher.stdout.readline()  # it is connected
+    watcher.stdout.readline()  # the client is connected
     seconds: dict[str, list[float]] = {kind: [] for kind in KINDS}
     now = ["unwatched", time.perf_counter()]
 
@@ -328,7 +326,7 @@ def watch_training(scene: str, args: argparse.Namespace) -> None:
     server.close()
     rounds = min(map(len, seconds.values()))
     times = np.array([seconds[kind][:rounds] for kind in KINDS])[:, SETTLED:]
-    # Each stretch against the mean of the unwatched ones before and after it: other work on the machine weighs on both.
+    # The unwatched stretches before and after a stretch suffer as much from other work on the machine.
     plain = 0.5 * (times[0, :-1] + times[0, 1:])
     more = {kind: quartiles(times[place, :-1] / plain - 1.0) for place, kind in enumerate(KINDS) if place}
     device = open_device(args.device)
@@ -349,12 +347,12 @@ def watch_training(scene: str, args: argparse.Namespace) -> None:
 
 
 def quartiles(values: Any) -> list[float]:
-    """Lower quartile, median, upper quartile."""
+    """Return the lower quartile, the median and the upper quartile."""
     return np.round(np.quantile(values, (0.25, 0.5, 0.75)), 4).tolist()
 
 
 def watch(port: int) -> None:
-    """A client that does as it is told by lines of its input; counts pictures by what it did."""
+    """Run a client that rests or moves as the lines of its input say; print the number of pictures by kind."""
     from viewer_client import Client
 
     kind = [KINDS[0]]

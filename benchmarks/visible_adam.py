@@ -5,8 +5,8 @@
     python benchmarks/visible_adam.py --table                # print the finished runs, run nothing
     python benchmarks/visible_adam.py --smoke --scenes NAME:1:60 --out FILE
 
-`wide`: cameras around a ball of random splats, each of which sees about an eighth of them; 40 iterations that learn
-nothing useful, with the splats in Morton order. `train`: SCENE:REDUCTION:CAP from the points on, with every 7th
+`wide`: cameras around a ball of random splats; each sees about an eighth of them. 40 iterations learn nothing useful,
+with the splats in Morton order. `train`: SCENE:REDUCTION:CAP from the points on, with every 7th
 training view held out; choices are made on their PSNR. Times are medians of the device's clock at full size, except
 `wall`. A vector holds as many splats as the schedule has lanes. `splats seen` and `vectors seen` are the shares that
 the image saw, as means over the measured iterations. A finished run of this commit, device and schedule is skipped.

@@ -1,4 +1,4 @@
-"""More than fits: a tile under 120 000 splats, and gradient records of more than 2^31 bytes in one buffer."""
+"""Scenes of extreme size: 120 000 splats over a tile, and gradient records of more than 2^31 bytes in one buffer."""
 
 from __future__ import annotations
 
@@ -17,16 +17,21 @@ from clsplat.splats.splats import Splats
 
 from . import crafted
 
-# Image side [px], splats that all cover all of it, and isects of a band in the run that it is compared with.
+# Image side [px], splats that all cover the image, and isects of a band in the run for comparison.
 CAPACITY: dict[str, tuple[int, int, int | None]] = {
     "120 000 splats over one tile": (16, 120_000, None),
     "records of 2.2 GB in one buffer": (320, 160_000, 4_000_000),
 }
-_ROOM = 3 * 2**30  # bytes of the device that the second one takes
+_ROOM = 3 * 2**30  # device bytes of the second case
 
 
 def capacity_row(hazard: str, shape: str, device: Device, smoke: bool = False) -> dict[str, Any] | None:
-    """The gradient again in double, or in bands, which must give the same bits; None where memory lacks."""
+    """Compare the gradient with double precision, or with a run in bands, which must give the same bits.
+
+    Returns
+    -------
+    The row; None if the device has too little memory.
+    """
     side, n, band = CAPACITY[hazard]
     if smoke:
         side, n, band = min(side, 32), n // 500, band and 400
@@ -40,7 +45,7 @@ def capacity_row(hazard: str, shape: str, device: Device, smoke: bool = False) -
     line, frame = renderer._last
     kernels, n_isects, n_bands = line.kernels, frame.n_isects, len(frame.bands)
     nbytes = n_isects * kernels.v_record * kernels.dtype.itemsize
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "isects": n_isects,
         "record_bytes": nbytes,
         "bytes": n_isects * isect_bytes(kernels),
@@ -53,23 +58,24 @@ def capacity_row(hazard: str, shape: str, device: Device, smoke: bool = False) -
         with mock.patch.object(pipeline, "isect_limit", return_value=band):
             other = gradients(Renderer(device), splats, camera, v_color)
         error = max(float(np.abs(got[name] - other[name]).max()) for name in got)
-        return found | {"gradient_error": error, "verdict": "survives" if error == 0 and found["finite"] else "fails"}
+        return result | {"gradient_error": error, "verdict": "survives" if error == 0 and result["finite"] else "fails"}
     wide = Splats(shape, {name: values.astype(np.float64) for name, values in splats.arrays.items()})
     want = gradients(Renderer(device, "float64"), wide, camera, v_color)
     error = max(
         float(np.linalg.norm(got[name] - want[name]) / max(np.linalg.norm(want[name]), 1e-30))
         for name in ("opacity_logit", "sh")
     )
-    return found | {"gradient_error": error, "verdict": "survives" if error < 1e-2 and found["finite"] else "fails"}
+    return result | {"gradient_error": error, "verdict": "survives" if error < 1e-2 and result["finite"] else "fails"}
 
 
 def gradients(renderer: Renderer, splats: Splats, camera: Camera, v_color: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the gradients of a render."""
     renderer.render(splats, camera)
     return renderer.backward(v_color)
 
 
 def stack(shape: str, n: int, side: int) -> tuple[Splats, Camera]:
-    """n faint splats, each as wide as the image, one behind the other."""
+    """Return n faint splats, each as wide as the image, one behind the other."""
     arrays = crafted.benign(SHAPES[shape], n)
     rng = np.random.default_rng(2)
     arrays["mean"] = np.column_stack([rng.normal(0, 0.05, (n, 2)), rng.uniform(1, 9, n)])

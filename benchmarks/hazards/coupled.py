@@ -1,11 +1,11 @@
-"""Recovering known skewed splats with each parameterisation of the slant: does the coupled one fail alone?
+"""Recovery of known skewed splats with each parameterisation of the slant: is the coupled one the only one to fail?
 
-Truth: splats of the direct form with slants of one length, long in one axis. Training starts from them with their axes
-turned, their scales and opacities changed, and a small slant; nothing is added or removed. What is measured is how well
-the photos are fitted in the end. "vanilla" is the textbook form: the coupled slant without a bound and without the
-normalisation by the peak. The library bounds every slant: the bound is lifted here and nowhere else. As vanilla
-differs in three ways, the forms between it and the decoupled ones are there too.
-The commit that is tagged `before-diet` also has the radial map, of which STABILITY.md has three columns.
+The true splats have the direct form, slants of one length, and one long axis. Training starts from them with turned
+axes, changed scales and opacities, and a small slant; no splat is added or removed. The result is the PSNR of the final
+fit to the photos. "vanilla" is the textbook form: the coupled slant without a bound and without the normalisation by
+the peak. The library bounds every slant; only this file removes the bound. Vanilla differs from the decoupled forms in
+three ways, so the forms between them are measured too. The radial map of STABILITY.md is in the commit with the tag
+`before-diet`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.colmap import Points
 from clsplat.scenes.demo.scene import RING_TARGET, ring_cameras
 from clsplat.scenes.scene import Scene, View
-from clsplat.splats.splats import Splats, shapes
+from clsplat.splats import shapes
+from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
 from clsplat.training.optim import skew_map
 
@@ -53,7 +54,7 @@ SLANTS, ASPECTS, TURN, SKEW_LR = (2.0, 9.0), (1.0, 10.0, 100.0), 30.0, 1.25e-2
 
 
 def cases() -> list[dict[str, float]]:
-    """Slants and aspects; then the strong slant with 10 and 100 times the rate of the skew."""
+    """Return slants and aspects; then the strong slant with 10 and 100 times the rate of the skew."""
     usual = [{"slant": slant, "aspect": aspect, "skew_lr": SKEW_LR} for slant in SLANTS for aspect in ASPECTS]
     return usual + [{"slant": SLANTS[-1], "aspect": ASPECTS[1], "skew_lr": factor * SKEW_LR} for factor in (10, 100)]
 
@@ -61,7 +62,7 @@ def cases() -> list[dict[str, float]]:
 def recovered(
     device: Device, form: str, case: dict[str, float], seed: int = 0, iterations: int = ITERATIONS
 ) -> dict[str, Any]:
-    """One run: PSNR over all photos, and whether its file is finite."""
+    """Train once; return the PSNR over all photos, and whether the file is finite."""
     rng = np.random.default_rng(seed)
     truth = true_splats(case["slant"], case["aspect"], rng)
     renderer = Renderer(device)
@@ -104,7 +105,7 @@ def recovered(
 
 
 def true_splats(slant: float, aspect: float, rng: np.random.Generator) -> Splats:
-    """Long in their first axis, slanted in any direction, around the middle of the ring."""
+    """Return splats around the middle of the ring, long in their first axis and slanted in random directions."""
     direction = rng.normal(size=(COUNT, 3))
     short = 0.22 / np.sqrt(aspect)
     arrays = {
@@ -119,7 +120,7 @@ def true_splats(slant: float, aspect: float, rng: np.random.Generator) -> Splats
 
 
 def disturbed(truth: Splats, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
-    """What training starts from: axes turned about a random one, other scales and opacities, hardly any slant."""
+    """Return the start of training: axes turned about a random one, other scales and opacities, a small slant."""
     arrays = truth.to_numpy()
     axis = rng.normal(size=(COUNT, 3))
     turn = Rotation.from_rotvec(np.radians(TURN) * axis / np.linalg.norm(axis, axis=1, keepdims=True))
@@ -133,7 +134,7 @@ def disturbed(truth: Splats, rng: np.random.Generator) -> dict[str, NDArray[Any]
 
 @contextmanager
 def unbounded(lift: bool) -> Iterator[None]:
-    """The bound of the slant lifted, as the textbook form has none."""
+    """Remove the bound of the slant for a while, because the textbook form has no bound."""
     if not lift:
         yield
         return

@@ -1,6 +1,6 @@
-"""Static hazards: splats made by hand, each a model that a file may hold or that training may reach.
+"""Static hazards: crafted splats that a file may hold or that training may reach.
 
-Every function gives arrays of one shape as `Splats` has them. The camera stands at the origin and looks along z; a
+Every function returns the arrays of one shape, as `Splats` holds them. The camera is at the origin and looks along z. A
 splat of scale 1 at depth 4 has a deviation of 10 px.
 """
 
@@ -20,18 +20,18 @@ Arrays = dict[str, NDArray[np.float64]]
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 45, 35, 40.0, 4.0
 COUNT = 24
-_MOST = 0.98  # of a bounded vector's limit, where a hazard wants a strong skew that is not at its bound
+_STRONG = 0.98  # share of a vector's limit: a strong skew that is not at its bound
 
 
 def camera(scale: float = 1.0) -> Camera:
-    """Off-centre, not square, at the origin; `scale` of the world (positions of cameras scale with it)."""
+    """Return a camera at the origin with an off-centre, non-square image; its position scales with `scale`."""
     pose = np.eye(4)
     pose[:3, 3] *= scale
     return Camera(WIDTH, HEIGHT, FOCAL, 1.1 * FOCAL, 0.45 * WIDTH, 0.55 * HEIGHT, pose)
 
 
 def benign(shape: Shape, n: int = COUNT, strength: float = 0.6) -> Arrays:
-    """Splats of 2 to 8 px all over the image, with a skew of `strength` times its limit."""
+    """Return splats of 2 to 8 px all over the image, with a skew of `strength` times its limit."""
     rng = np.random.default_rng(5)
     depth = rng.uniform(0.8, 1.2, n) * DEPTH
     pixel = rng.uniform(0.1, 0.9, (n, 2)) * (WIDTH, HEIGHT)
@@ -58,14 +58,14 @@ def benign(shape: Shape, n: int = COUNT, strength: float = 0.6) -> Arrays:
 
 
 def unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    lengths: NDArray[np.float64] = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return lengths
+    """Return vectors of length 1."""
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def own_at_bound(shape: Shape, factor: float = 1 - 1e-6) -> Arrays:
-    """The shape's own fields at their limits, half of the bounded ones at either end; beyond them by `factor`.
+def fields_at_bound(shape: Shape, factor: float = 1 - 1e-6) -> Arrays:
+    """Return splats whose shape-specific fields are at `factor` times their limits, bounded ones at either end.
 
-    Not to the last bit: a slant's radial gradient ends at its bound.
+    The default factor stays just inside: the radial gradient of a slant ends at its bound.
     """
     arrays, met = benign(shape), False
     for field in shape.fields:
@@ -84,7 +84,7 @@ def own_at_bound(shape: Shape, factor: float = 1 - 1e-6) -> Arrays:
 
 
 def needles(shape: Shape, turn: str = "any", pixels: float = 8.0, ratio: float = 1e-4) -> Arrays:
-    """1:10^4, the long axis of so many pixels; "any" direction, or "edge-on": a thin disk seen from its side."""
+    """Return needles of 1:10^4 in "any" direction, or disks seen "edge-on"; `pixels` is their long axis."""
     arrays = benign(shape)
     log_scale = np.full((COUNT, 3), np.log(pixels * DEPTH / FOCAL))
     if turn == "any":
@@ -99,14 +99,14 @@ def needles(shape: Shape, turn: str = "any", pixels: float = 8.0, ratio: float =
 
 
 def sized(shape: Shape, pixels: float) -> Arrays:
-    """Deviations of that many pixels."""
+    """Return splats whose deviations have that many pixels."""
     arrays = benign(shape)
     arrays["log_scale"] += np.log(pixels * DEPTH / FOCAL / 0.4)
     return arrays
 
 
 def at_near_plane(shape: Shape) -> Arrays:
-    """From behind the camera through the near plane to just before it, small and large."""
+    """Return small and large splats from behind the camera to just in front of the near plane."""
     arrays = benign(shape)
     beyond = np.geomspace(1e-3, 1.0, COUNT - 8)
     depth = NEAR + np.concatenate([[-1.0, -NEAR, -1e-3, -1e-7, 2e-9, 1e-7, 1e-6, 1e-4], beyond])
@@ -116,26 +116,26 @@ def at_near_plane(shape: Shape) -> Arrays:
 
 
 def across_near_plane(shape: Shape) -> Arrays:
-    """Skewed along the view, so that centroid and location lie on either side of the near plane."""
+    """Return splats skewed along the view, with centroid and location on opposite sides of the near plane."""
     if shape.skew_form is None and "normal" not in shape.schema(1):
         return {}
     arrays = benign(shape)
     arrays["quat"] = np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1))
     name = "skew" if shape.skew_form else "normal"
     field = shape.schema(1)[name]
-    length = 1.0 if field.limit is None else _MOST * field.limit
+    length = 1.0 if field.limit is None else _STRONG * field.limit
     arrays[name] = length * unit(
         np.random.default_rng(6).normal(0, 0.1, (COUNT, 3))
         + np.where(np.arange(COUNT)[:, None] % 2, 1.0, -1.0) * np.array([0.0, 0.0, 1.0])
     )
-    # Deviation 0.5 along the view; the middle of the splat within one of them of the plane.
+    # The deviation along the view is 0.5; the middle of each splat is closer than that to the near plane.
     arrays["log_scale"] = np.log(np.array([[0.02, 0.02, 0.5]])) + np.zeros((COUNT, 3))
     arrays["mean"] *= ((NEAR + np.linspace(-0.45, 0.45, COUNT)) / arrays["mean"][:, 2])[:, None]
     return arrays
 
 
 def opacity(shape: Shape, values: NDArray[np.float64]) -> Arrays:
-    """Raw opacities of given values, in turn."""
+    """Return splats whose raw opacities take these values in turn."""
     arrays = benign(shape)
     for name in ("opacity_logit", "opacity_minus_logit"):
         if name in arrays:
@@ -145,33 +145,33 @@ def opacity(shape: Shape, values: NDArray[np.float64]) -> Arrays:
 
 
 def faint(shape: Shape) -> Arrays:
-    """Opacity 1/255, and one rounding beside it."""
+    """Return splats of opacity 1/255, and one rounding beside it."""
     exact = float(shape.raw_opacity(np.float64(1 / 255)))
     return opacity(shape, exact + np.array([0.0, 1e-6, -1e-6, 1e-3, -1e-3, -30.0, -100.0]))
 
 
 def opaque(shape: Shape) -> Arrays:
-    """Opacity 1, in float32 exactly so; signed ones of either sign."""
+    """Return splats whose opacity rounds to 1 in float32; signed ones have either sign."""
     raw = np.array([4.0, 10.0, 20.0, 90.0])
     return opacity(shape, np.concatenate([raw, -raw]) if shape.signed else raw)
 
 
 def quaternions(shape: Shape) -> Arrays:
-    """Norms from 1e-15 to 1e15, the least and the most that a model may hold."""
+    """Return quaternions of norms 1e-15 to 1e15, the limits of a model."""
     arrays = benign(shape)
     arrays["quat"] = unit(arrays["quat"]) * np.geomspace(1.1e-15, 0.9e15, COUNT)[:, None]
     return arrays
 
 
 def duplicates(shape: Shape) -> Arrays:
-    """The same splat 40 times over, and other splats at exactly its depth."""
+    """Return the same splat 40 times, and other splats at exactly its depth."""
     arrays = benign(shape, 16)
     arrays["mean"][:, 2] = DEPTH
     return {name: np.concatenate([np.repeat(values[:1], 40, axis=0), values]) for name, values in arrays.items()}
 
 
 def raw_extremes(shape: Shape) -> Arrays:
-    """Values whose activation overflows or vanishes in float32: scales of e^±90, colours and positions of 1e30."""
+    """Return values whose activation overflows or vanishes in float32: scales of e^±90, colours, positions of 1e30."""
     arrays = benign(shape)
     arrays["log_scale"][::4] = 90.0
     arrays["log_scale"][1::4] = -90.0
@@ -181,18 +181,18 @@ def raw_extremes(shape: Shape) -> Arrays:
 
 
 def not_a_number(shape: Shape) -> Arrays:
-    """One NaN: a model refuses it."""
+    """Return splats with one NaN, which a model refuses."""
     arrays = benign(shape)
     arrays["log_scale"][3, 1] = np.nan
     return arrays
 
 
-Craft = Callable[[Shape], Arrays]  # {} where a shape has nothing to put at risk
+Craft = Callable[[Shape], Arrays]  # returns {} if the shape has nothing at risk
 
 STATIC: dict[str, Craft] = {
     "benign": benign,
-    "skew (own field) at its bound": own_at_bound,
-    "skew (own field) beyond it": lambda s: own_at_bound(s, 1.5),
+    "skew (own field) at its bound": fields_at_bound,
+    "skew (own field) beyond it": lambda s: fields_at_bound(s, 1.5),
     "needles 1:10^4": needles,
     "needles 1:10^4, 400 px long": lambda s: needles(s, pixels=400.0),
     "disks 1:10^4, edge-on": lambda s: needles(s, "edge-on"),

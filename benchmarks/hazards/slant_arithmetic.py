@@ -1,7 +1,7 @@
 """1 - k of projected slants in float32: the textbook formula, as skew-normal splats are published, beside clsplat's.
 
-1 - k = 1 - D'C^-1 D says how sharp the edge on the screen is; its root divides the slope. For strong slants on needles
-k is 1 to seven digits. Sums of squares (cl/shape/displacement.clh) lose none of them.
+1 - k = 1 - D'C^-1 D is the sharpness of the edge on the screen; its root divides the slope. For strong slants on
+needles the first seven digits of k are 1.000000. Sums of squares (cl/shape/displacement.clh) keep all digits of 1 - k.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ SLANTS, ASPECTS, LENGTHS = (2.0, 10.0, 1e3), (1.0, 1e2, 1e4), (30.0, 3000.0)  # 
 
 
 def arithmetic_row(slant: float, aspect: float, length: float) -> dict[str, Any]:
-    """Of random splats: how many have 1 - k at or below 0 (their edge is a NaN), and the 99th centile of its error."""
+    """Return the share of random splats with 1 - k <= 0 (a NaN edge), and the 99th centile of its relative error."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(COUNT, 3))
     eta = slant * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    # Two rows of A R S, seen from anywhere.
+    # Two rows of A R S, from random directions.
     turned = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0]
     b = turned[:, :2] * np.array([length, length / aspect, length / aspect])
     exact = textbook(b, eta, np.float64, by_squares=True)
-    found: dict[str, Any] = {"slant": slant, "aspect": aspect, "length_px": length}
+    result: dict[str, Any] = {"slant": slant, "aspect": aspect, "length_px": length}
     for name, by_squares in (("textbook", False), ("squares", True)):
         with np.errstate(all="ignore"):
             got = textbook(b, eta, np.float32, by_squares)
-        error = np.where(np.isfinite(got), np.abs(got - exact) / exact, 1e9)  # not finite: beyond any quantile
-        found |= {f"{name}_not_positive": float(np.mean(~(got > 0))), f"{name}_error": float(np.quantile(error, 0.99))}
-    return found
+        error = np.where(np.isfinite(got), np.abs(got - exact) / exact, 1e9)  # 1e9: not finite
+        result |= {f"{name}_not_positive": float(np.mean(~(got > 0))), f"{name}_error": float(np.quantile(error, 0.99))}
+    return result
 
 
 def textbook(b: np.ndarray, eta: np.ndarray, dtype: type, by_squares: bool) -> np.ndarray:
-    """1 - k, (N,): as 1 minus k, or as a ratio of sums of squares."""
+    """Return 1 - k, (N,): as 1 minus k, or as a ratio of sums of squares."""
     b, eta = b.astype(dtype), eta.astype(dtype)
     one = dtype(1)
     rest = one / (one + np.sum(eta * eta, axis=1))

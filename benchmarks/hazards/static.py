@@ -1,4 +1,4 @@
-"""Crafted splats through the float32 kernels, beside the double build of the same kernels."""
+"""Crafted splats rendered by the float32 kernels, compared with the double build of the same kernels."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from clsplat.splats.splats import Splats
 from . import crafted
 
 IMAGE_TOLERANCE = 0.5 / 255  # half an 8-bit step
-GRADIENT_TOLERANCE = 1e-2  # of a field's gradient, relative in the Euclidean norm: far below the spread of views
-NEGLIGIBLE = 1e-3  # of the largest field's: below it a field is the rounding of others
+GRADIENT_TOLERANCE = 1e-2  # relative error of a field's gradient, in the Euclidean norm; views differ by far more
+NEGLIGIBLE = 1e-3  # share of the largest field's gradient; a smaller one is the rounding of others
 BACKGROUND = (0.2, 0.5, 0.9)
 
 
 @dataclass
 class Renderers:
-    """Float32 as usual; double with every threshold a little lower and a little higher."""
+    """A float32 renderer, and two double ones with every threshold a little lower and a little higher."""
 
     device: Device
     schedule: Schedule
@@ -46,13 +46,13 @@ class Renderers:
 
 
 def static_row(hazard: str, shape: str, renderers: Renderers) -> dict[str, Any] | None:
-    """What happens; None where the shape has nothing that the hazard could put at risk."""
+    """Return the row of a hazard; None if the shape has nothing at risk."""
     arrays = crafted.STATIC[hazard](SHAPES[shape])
     return judged(shape, arrays, renderers.single, renderers.double, renderers.other) if arrays else None
 
 
 def judged(shape: str, arrays: crafted.Arrays, single: Renderer, double: Renderer, other: Renderer) -> dict[str, Any]:
-    """The float32 renderer against the double one; `other`: a pixel that it shows otherwise is not looked at."""
+    """Compare the float32 renderer with the double one; pixels that differ in `other` are at a threshold: ignored."""
     try:
         splats = Splats(shape, {name: values.astype(np.float32) for name, values in arrays.items()})
     except ClsplatError as error:
@@ -63,7 +63,7 @@ def judged(shape: str, arrays: crafted.Arrays, single: Renderer, double: Rendere
     def render(renderer: Renderer, of: Splats) -> Rendered:
         return renderer.render(of, camera, BACKGROUND)
 
-    # A pixel at a threshold may fall to either side.
+    # Rounding decides on which side of a threshold a pixel falls.
     shifted, exact = render(other, wide), render(double, wide)
     brightest = max(1.0, float(np.abs(exact.color).max()))
     decided = np.abs(shifted.color - exact.color).max(axis=2) < 1e-4 * brightest
@@ -93,7 +93,7 @@ def judged(shape: str, arrays: crafted.Arrays, single: Renderer, double: Rendere
 
 
 def worst_field(got: dict[str, NDArray[Any]], want: dict[str, NDArray[Any]]) -> tuple[str, float]:
-    """The field whose gradient is off the most, and by how much of its norm."""
+    """Return the field with the largest gradient error, and that error relative to its norm."""
     with np.errstate(over="ignore", invalid="ignore"):
         norms = {name: float(np.linalg.norm(value.astype(np.float64))) for name, value in want.items()}
         floor = max(NEGLIGIBLE * max(norms.values()), 1e-30)
@@ -106,5 +106,5 @@ def worst_field(got: dict[str, NDArray[Any]], want: dict[str, NDArray[Any]]) -> 
 
 
 def number(value: float) -> float | None:
-    """What JSON can hold."""
+    """Return a value that JSON can hold: None if it is not finite."""
     return value if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Training hazards: the small scene and its options with something wrong, beside the same run with nothing wrong."""
+"""Training hazards: a small scene or its options with a fault, beside the same run without the fault."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ RATES = (
     "nu_lr",
 )
 
-Start = Callable[[Splats], Splats]  # what the first splats are turned into
+Start = Callable[[Splats], Splats]  # changes the splats that training starts from
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class Hazard:
 
     Parameters
     ----------
-    world : makes the scene out of the benign one.
-    options : of TrainConfig, on top of the optimizer's; rates: all of them times this.
+    world : makes the scene from the benign one.
+    options : of TrainConfig, in addition to those of the optimizer. rates : factor on all learning rates.
     start : changes the splats that training starts from.
-    only : optimizers that it is about; all by default.
-    of : which systems it is about.
+    only : the optimizers that have this hazard; default: all.
+    concerns : whether a variant has this hazard.
     build : options of every kernel build. other_device : run on the second usable device.
     """
 
@@ -66,13 +66,13 @@ class Hazard:
     rates: float = 1.0
     start: Start | None = None
     only: tuple[str, ...] = tuple(OPTIMIZERS)
-    of: Callable[[Variant], bool] = lambda system: True
+    concerns: Callable[[Variant], bool] = lambda variant: True
     build: str = ""
     other_device: bool = False
 
 
 def changed(splats: Splats, every: int = 10, **values: Any) -> Splats:
-    """With other values in every tenth splat, or in all."""
+    """Return the splats with other values in every tenth splat, or in all."""
     arrays = splats.to_numpy()
     for name, new in values.items():
         arrays[name][::every] = new[::every]
@@ -80,46 +80,50 @@ def changed(splats: Splats, every: int = 10, **values: Any) -> Splats:
 
 
 def needles(splats: Splats) -> Splats:
-    """1:10^4."""
+    """Return the splats with a tenth of them turned into needles of 1:10^4."""
     log_scale = splats.log_scale.copy()
     log_scale[:, 1:] += np.float32(np.log(1e-4))
     return changed(splats, log_scale=log_scale)
 
 
-def own_at_bound(splats: Splats) -> Splats:
-    """The shape's own fields at their limits in all splats, in directions of their own."""
+def fields_at_bound(splats: Splats) -> Splats:
+    """Return the splats with the shape-specific fields at their limits, vectors in random directions."""
     rng, values = np.random.default_rng(1), splats.to_numpy()
-    for own in SHAPES[splats.shape].fields:
-        if own.limit is not None:
-            values[own.name] = (own.limit * unit(rng.normal(size=values[own.name].shape))).astype(np.float32)
-        elif own.bounds is not None:
-            values[own.name] = np.resize(np.array(own.bounds, np.float32), len(splats))
+    for spec in SHAPES[splats.shape].fields:
+        if spec.limit is not None:
+            values[spec.name] = (spec.limit * unit(rng.normal(size=values[spec.name].shape))).astype(np.float32)
+        elif spec.bounds is not None:
+            values[spec.name] = np.resize(np.array(spec.bounds, np.float32), len(splats))
     return Splats(splats.shape, values, splats.normalisation)
 
 
-def has_own_limit(system: Variant) -> bool:
-    return any(own.limit is not None or own.bounds is not None for own in SHAPES[system.shape].fields)
+def has_limit(variant: Variant) -> bool:
+    """Return whether a field of the shape is bounded."""
+    return any(f.limit is not None or f.bounds is not None for f in SHAPES[variant.shape].fields)
 
 
-def is_skewed(system: Variant) -> bool:
-    return SHAPES[system.shape].skew_form is not None
+def is_skewed(variant: Variant) -> bool:
+    """Return whether the shape has a skew."""
+    return SHAPES[variant.shape].skew_form is not None
 
 
 def scale_of(splats: Splats, factor: float) -> Splats:
+    """Return the splats with a tenth of them scaled."""
     return changed(splats, log_scale=splats.log_scale + np.float32(np.log(factor)))
 
 
 def opacity_of(splats: Splats, value: float, every: int = 10) -> Splats:
+    """Return the splats with another opacity in every tenth splat, or in all."""
     raw = np.full(len(splats), SHAPES[splats.shape].raw_opacity(np.float64(value)), np.float32)
     return changed(splats, every, **{name: raw for name in splats.arrays if name.startswith("opacity")})
 
 
-TWO = ("adam", "mcmc")  # how positions move matters less than how splats are added and removed
+TWO = ("adam", "mcmc")  # adding and removing splats matters more than how positions move
 
 TRAINING: dict[str, Hazard] = {
     "all rates x10": Hazard(rates=10),
     "all rates x100": Hazard(rates=100),
-    "rate of skew x100": Hazard(options={"skew_lr": 0.25}, of=is_skewed),
+    "rate of skew x100": Hazard(options={"skew_lr": 0.25}, concerns=is_skewed),
     "rate of rotation x100": Hazard(options={"rotation_lr": 0.1}),
     "SGHMC, C x100": Hazard(options={"sghmc_friction": 1.2e4}, only=("sghmc",)),
     "SGHMC as SSS, C x100": Hazard(
@@ -143,14 +147,16 @@ TRAINING: dict[str, Hazard] = {
     "points far out": Hazard(lambda s: worlds.with_points(s, "outliers"), only=TWO),
     "four points": Hazard(lambda s: worlds.with_points(s, "four"), only=TWO),
     "a tenth needles 1:10^4": Hazard(start=needles, only=TWO),
-    "start: skew (own) at its bound": Hazard(start=own_at_bound, of=has_own_limit, only=TWO),
+    "start: skew (own) at its bound": Hazard(start=fields_at_bound, concerns=has_limit, only=TWO),
     "a tenth 100 times as large": Hazard(start=lambda s: scale_of(s, 100), only=TWO),
     "a tenth 1e-6 times as large": Hazard(start=lambda s: scale_of(s, 1e-6), only=TWO),
     "a tenth of opacity 0.9999": Hazard(start=lambda s: opacity_of(s, 0.9999), only=TWO),
     "a tenth of opacity 1/255": Hazard(start=lambda s: opacity_of(s, 1 / 255), only=TWO),
     "all transparent": Hazard(start=lambda s: opacity_of(s, 1e-3, every=1), only=TWO),
     "relocation every 5 iterations": Hazard(
-        start=own_at_bound, only=("mcmc",), options={"densify_interval": 5, "densify_until": 1.0, "opacity_reg": 0.05}
+        start=fields_at_bound,
+        only=("mcmc",),
+        options={"densify_interval": 5, "densify_until": 1.0, "opacity_reg": 0.05},
     ),
     "NumPy optimizer": Hazard(options={"optimizer": "numpy"}, only=("adam",)),
     "fast-math build": Hazard(build="-cl-fast-relaxed-math", only=("adam",)),
@@ -160,7 +166,7 @@ TRAINING: dict[str, Hazard] = {
 
 @dataclass
 class Trainings:
-    """Runs on one device, each twin once.
+    """Training runs on one device; each benign twin runs once.
 
     Parameters
     ----------
@@ -176,14 +182,14 @@ class Trainings:
     def __post_init__(self) -> None:
         self.renderer = Renderer(self.device)
 
-    def row(self, name: str, system: Variant, optimizer: str) -> dict[str, Any] | None:
-        """One hazard, one system, one optimizer; None where there is nothing to run."""
+    def row(self, name: str, variant: Variant, optimizer: str) -> dict[str, Any] | None:
+        """Run one hazard; return None if the variant or the optimizer does not have it."""
         hazard, scene = TRAINING[name], worlds.capture(self.views)
-        if (hazard.other_device and self.other is None) or not hazard.of(system) or optimizer not in hazard.only:
+        if (hazard.other_device and self.other is None) or not hazard.concerns(variant) or optimizer not in hazard.only:
             return None
-        twin = self.twin(system, optimizer)
+        twin = self.twin(variant, optimizer)
         world = hazard.world(scene)
-        result = self.run(world, system, optimizer, hazard)
+        result = self.run(world, variant, optimizer, hazard)
         judged = [view.name for view in (world.test or world.train)]
         row: dict[str, Any] = {key: result[key] for key in ("finite", "message", "seconds", "diverged_at")}
         row |= {"psnr": None, "twin_psnr": float(np.mean([twin[name] for name in judged]))}
@@ -195,18 +201,18 @@ class Trainings:
         lost = row["twin_psnr"] - psnr
         return row | {"psnr": psnr, "lost_db": lost, "verdict": "survives" if lost <= TOLERANCE_DB else "loses"}
 
-    def twin(self, system: Variant, optimizer: str) -> dict[str, float]:
-        """PSNR of every view after a run with nothing wrong."""
-        key = (system.label, optimizer)
+    def twin(self, variant: Variant, optimizer: str) -> dict[str, float]:
+        """Return the PSNR of every view after the run without a fault."""
+        key = (variant.label, optimizer)
         if key not in self.twins:
-            self.twins[key] = self.run(worlds.capture(self.views), system, optimizer, Hazard())["psnr"]
+            self.twins[key] = self.run(worlds.capture(self.views), variant, optimizer, Hazard())["psnr"]
         return self.twins[key]
 
-    def run(self, world: Scene, system: Variant, optimizer: str, hazard: Hazard) -> dict[str, Any]:
-        """Train into a folder, and look into every file of it."""
+    def run(self, world: Scene, variant: Variant, optimizer: str, hazard: Hazard) -> dict[str, Any]:
+        """Train into a folder, and check every file of it."""
         config = TrainConfig(
             **(
-                system.options
+                variant.options
                 | {
                     "iterations": self.iterations,
                     "cap_max": CAP,
@@ -215,13 +221,13 @@ class Trainings:
                     "checkpoint_interval": 50,
                 }
                 | OPTIMIZERS[optimizer]
-                | rates_of(hazard, system)
+                | rates_of(hazard, variant)
                 | hazard.options
             )
         )
         device = self.other if hazard.other_device and self.other is not None else self.device
         config = config.replace(device=device.info.index)
-        found: dict[str, Any] = {"message": "", "psnr": {}, "diverged_at": None}
+        result: dict[str, Any] = {"message": "", "psnr": {}, "diverged_at": None}
         start = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder, build_options(hazard.build):
             out = Path(folder) / "model"
@@ -239,21 +245,21 @@ class Trainings:
                 config = TrainConfig.from_json(config.to_json() | {"init": str(file)})
             try:
                 model = clsplat.train(world, config, output=out)
-                found["psnr"] = {
+                result["psnr"] = {
                     name: view["PSNR"]
                     for name, view in evaluate(self.renderer, model.splats, world.views).per_view.items()
                 }
             except ClsplatError as error:
-                found["message"] = str(error).replace(str(world.path), world.name)
-            found["seconds"] = time.perf_counter() - start
-            found["finite"] = all(finite_file(path) for path in out.rglob("*.ply"))
-            found["diverged_at"] = diverged_at(out / "log.jsonl")
-        return found
+                result["message"] = str(error).replace(str(world.path), world.name)
+            result["seconds"] = time.perf_counter() - start
+            result["finite"] = all(finite_file(path) for path in out.rglob("*.ply"))
+            result["diverged_at"] = diverged_at(out / "log.jsonl")
+        return result
 
 
 @contextmanager
 def build_options(options: str) -> Iterator[None]:
-    """Of every kernel built meanwhile."""
+    """Add options to every kernel build for a while."""
     before = os.environ.get(OPTIONS_VARIABLE)
     if options:
         os.environ[OPTIONS_VARIABLE] = options
@@ -266,18 +272,18 @@ def build_options(options: str) -> Iterator[None]:
                 os.environ[OPTIONS_VARIABLE] = before
 
 
-def rates_of(hazard: Hazard, system: Variant) -> dict[str, Any]:
-    """Every rate of the config times the hazard's factor."""
+def rates_of(hazard: Hazard, variant: Variant) -> dict[str, Any]:
+    """Return every learning rate times the factor of the hazard."""
     if hazard.rates == 1:
         return {}
-    plain = TrainConfig(**system.options)
+    plain = TrainConfig(**variant.options)
     values = {name: hazard.rates * getattr(plain, name) for name in RATES}
-    skew = [own.lr for own in SHAPES[system.shape].fields if own.name == "skew"]
+    skew = [f.lr for f in SHAPES[variant.shape].fields if f.name == "skew"]
     return values | ({"skew_lr": hazard.rates * skew[0]} if skew else {})
 
 
 def finite_file(path: Path) -> bool:
-    """Whether a written model loads, which it does not with a NaN or an infinity."""
+    """Return whether a written model loads; a model with a NaN or an infinity does not."""
     try:
         splats = Splats.load(path)
     except ClsplatError:
@@ -286,7 +292,7 @@ def finite_file(path: Path) -> bool:
 
 
 def diverged_at(log: Path) -> int | None:
-    """The first reported iteration from which on the loss stays above the first report's."""
+    """Return the iteration after which the loss stays above that of the first report; None if there is none."""
     if not log.exists():
         return None
     rows = [json.loads(line) for line in log.read_text().splitlines()]

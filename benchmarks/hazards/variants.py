@@ -1,4 +1,4 @@
-"""What is put at risk: shapes with their parameterisations, and optimizers."""
+"""The columns of the tables: shapes with their parameterisations, and optimizers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from clsplat.training.optim.skew_map import MAPS
 
 @dataclass(frozen=True)
 class Variant:
-    """A column of the table: a shape and the map of its skew ("" without one)."""
+    """A column of the table: a shape and the map of its skew ("" for shapes without a skew)."""
 
     shape: str
     skew_map: str = ""
@@ -22,7 +22,7 @@ class Variant:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Of TrainConfig."""
+        """Options of TrainConfig."""
         return {"shape": self.shape} | ({"skew_map": self.skew_map} if self.skew_map else {})
 
 
@@ -32,7 +32,7 @@ VARIANTS = tuple(
     for skew_map in (MAPS[shape.skew_form] if shape.skew_form else ("",))
 )
 
-# Positions by Adam under adaptive density control (the default), with relocation and noise, and by SGHMC.
+# How positions move: by Adam with adaptive density control (the default), by Adam with relocation and noise, by SGHMC.
 OPTIMIZERS: dict[str, dict[str, Any]] = {
     "adam": {},
     "mcmc": {"strategy": "mcmc", "growth": 1.0},

@@ -1,4 +1,4 @@
-"""Small scenes to train on, and what can be wrong with them."""
+"""Small scenes to train on, and their faults."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ WIDTH, HEIGHT, VIEWS = 64, 48, 26
 
 @cache
 def capture(views: int = VIEWS) -> Scene:
-    """A procedural capture, every 8th view a test view; some 2400 points."""
+    """Return a procedural capture with about 2400 points; every 8th view is a test view."""
     with tempfile.TemporaryDirectory() as folder:
         return load_scene(write_capture(Path(folder) / "capture", WIDTH, HEIGHT, views))
 
 
 def in_units(scene: Scene, scale: float) -> Scene:
-    """The same world with all lengths times `scale`."""
+    """Return the same world with all lengths times `scale`."""
 
     def camera(of: Camera) -> Camera:
         pose = of.cam_from_world.copy()
@@ -37,12 +37,12 @@ def in_units(scene: Scene, scale: float) -> Scene:
 
 
 def of_first(scene: Scene, n: int) -> Scene:
-    """Only n of the training views, and no test view: these are measured instead."""
+    """Return n of the training views and no test view; the training views are measured instead."""
     return rebuilt(scene, scene.train[:n], scene.points.xyz)
 
 
 def badly_exposed(scene: Scene, gain: float = 2.0) -> Scene:
-    """One training photo taken with another exposure, its highlights clipped."""
+    """Return the scene with one training photo of another exposure, its highlights clipped."""
     odd = scene.train[3]
     bright = np.minimum(odd.image.astype(np.float64) * gain, 255).astype(np.uint8)
     views = [replace(view, image=bright) if view is odd else view for view in scene.views]
@@ -50,14 +50,14 @@ def badly_exposed(scene: Scene, gain: float = 2.0) -> Scene:
 
 
 def with_points(scene: Scene, kind: str) -> Scene:
-    """Points as structure from motion should not give them."""
+    """Return the scene with faulty points from structure from motion."""
     xyz = scene.points.xyz.copy()
     rows = np.arange(len(xyz))
-    if kind == "doubled":  # each of half of the points twice
+    if kind == "doubled":  # half of the points, each twice
         xyz = xyz[rows // 2 * 2]
     elif kind == "coincident":
         xyz = np.repeat(xyz.mean(axis=0, keepdims=True), len(xyz), axis=0)
-    elif kind == "outliers":  # a hundredth of them far out
+    elif kind == "outliers":  # a hundredth of the points far away
         xyz[::100] = (xyz[::100] - xyz.mean(axis=0)) * 1e6
     elif kind == "four":
         rows = rows[:: len(rows) // 4][:4]
@@ -68,7 +68,7 @@ def with_points(scene: Scene, kind: str) -> Scene:
 
 
 def rebuilt(scene: Scene, views: list[View], xyz: np.ndarray, rows: np.ndarray | None = None) -> Scene:
-    """Of other views and positions; `rows` of the points' other properties, all by default."""
+    """Return the scene with other views and positions; `rows` selects the colours and tracks of the points."""
     points, keep = scene.points, slice(None) if rows is None else rows
     names = frozenset(view.name for view in views) & scene.test_names
     return Scene(scene.name, scene.path, views, Points(xyz, points.rgb[keep], points.track_length[keep]), names)
