@@ -74,10 +74,10 @@ def cases(args: argparse.Namespace) -> list[dict[str, Any]]:
 def run(
     case: dict[str, Any], device_name: str | None, iterations: int, out: Path, limits: dict[str, int] | None = None
 ) -> None:
-    """Measure one case and append its line, unless it is finished. limits : options of `measure_limits`."""
+    """Measure one case and append its line, unless it is finished. limits : options of `measure_roofline`."""
     from clsplat.device.device import open_device
     from clsplat.profiling.bench import bench_trainer, measure_render, measure_training
-    from clsplat.profiling.roofline import measure_limits
+    from clsplat.profiling.roofline import measure_roofline
     from clsplat.rendering.tuning import schedule_for
     from clsplat.scenes.random_scene import synthetic_scene
     from clsplat.scenes.scene import load_scene
@@ -96,7 +96,7 @@ def run(
     if case["scene"] == SYNTHETIC:
         scene, start = synthetic_scene(case["splats"], case["width"], case["height"], case["shape"])
     trainer = bench_trainer(scene, device, case["shape"], start)
-    measured = measure_limits(device, **limits or {})
+    measured = measure_roofline(device, **limits or {})
     reports = [measure(trainer, measured, iterations) for measure in (measure_training, measure_render)]
     row = (
         case

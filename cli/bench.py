@@ -1,4 +1,4 @@
-"""`clsplat bench`: where the time goes on the user's own device, and what limits it."""
+"""`clsplat bench`: the time of each stage on the user's device, and what limits it."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 SPLATS, WIDTH, HEIGHT = 30_000, 640, 480
 HEAD = ("stage", "ms", "share", "MB", "of copy limit", "Mflop", "of FMA limit")
-_DOMINANT = 0.1  # of an iteration: stages that get a sentence
-_NEAR = 0.5  # of a limit: closer than that it is what limits
+_DOMINANT = 0.1  # share of an iteration from which a stage gets a sentence
+_NEAR = 0.5  # fraction of a limit from which it counts as the limit of a stage
 
 
 @click.command()
@@ -38,7 +38,7 @@ _NEAR = 0.5  # of a limit: closer than that it is what limits
     "--splats",
     type=click.IntRange(min=1),
     metavar="N",
-    help=f"How many made-up splats, or with -s how many of the scene's points at most.  [default: {SPLATS}; "
+    help=f"Number of random splats; with -s the maximum number of the scene's points.  [default: {SPLATS}; "
     "with -s all]",
 )
 @click.option("--width", type=click.IntRange(min=16), default=WIDTH, show_default=True, help="Without -s [px].")
@@ -55,9 +55,9 @@ _NEAR = 0.5  # of a limit: closer than that it is what limits
     type=click.IntRange(1, 1000),
     default=10,
     show_default=True,
-    help="How many are timed, after a few that are not.",
+    help="Number of timed iterations; a few more run before them.",
 )
-@click.option("--json", "json_path", type=PATH, metavar="FILE", help="Write all numbers there, too.")
+@click.option("--json", "json_path", type=PATH, metavar="FILE", help="Also write all numbers to this file.")
 @device_option
 @click.pass_context
 def bench(
@@ -75,22 +75,22 @@ def bench(
     json_path: Path | None,
     device: str | None,
 ) -> None:
-    """Time each stage of a training step and of an image, and compare with what the device can do at best.
+    """Time each stage of a training step and of an image, and compare it with the limits of the device.
 
-    The limits are measured on the same device: bytes a second of a copy, operations a second of fused multiply-adds.
-    Bytes and operations are those that the work needs at least; only pairs of splat and pixel that show are counted.
-    Other work on the machine makes all of it slower.
+    The limits are measured on the same device: bytes per second of a copy, and operations per second of fused
+    multiply-adds. The bytes and operations of a stage are the least that it needs. Of all pairs of splat and pixel,
+    only those that change the image are counted. Other programs on the machine make all numbers worse.
     """
     from clsplat.device.device import open_device
     from clsplat.profiling.bench import bench_trainer, measure_render, measure_training, write_reports
-    from clsplat.profiling.roofline import measure_limits
+    from clsplat.profiling.roofline import measure_roofline
 
     if source_path is None and (images or resolution is not None or model_path):
-        raise click.UsageError("-i, -r and -m belong to a scene: give it with -s")
+        raise click.UsageError("-i, -r and -m belong to a scene: add -s")
     if source_path is not None and (is_given(ctx, "width") or is_given(ctx, "height")):
-        raise click.UsageError("--width and --height are for made-up scenes: with -s use -r")
+        raise click.UsageError("--width and --height belong to random scenes: use -r with -s")
     if model_path is not None and splats is not None:
-        raise click.UsageError("give -m or --splats, not both")
+        raise click.UsageError("-m and --splats exclude each other: remove one")
     opened = open_device(device)
     if source_path is not None:
         scene, start = _read(source_path, images, resolution, model_path, splats)
@@ -100,7 +100,7 @@ def bench(
         scene, start = synthetic_scene(splats or SPLATS, width, height, shape or DEFAULT_SHAPE, sh_degree)
     kernel = shape or (DEFAULT_SHAPE if isinstance(start, int) else start.shape)
     trainer = bench_trainer(scene, opened, kernel, start, sh_degree)
-    limits = measure_limits(opened)
+    limits = measure_roofline(opened)
     schedule = str(trainer.kernels.schedule)
     click.echo(f"device: {opened.info}, schedule {schedule}\nlimits measured on it: {limits}")
     reports = []
@@ -112,7 +112,7 @@ def bench(
 
 
 def describe(report: Report, scene: str) -> list[str]:
-    """Lines: what was measured, the table, and a sentence on each stage that takes much of the time."""
+    """Return lines of text: the task, the table, and a sentence on each stage that takes much of the time."""
     sizes = report.sizes
     lines = [
         f"{report.task}: {report.wall_ms:.1f} ms ({1e3 / report.wall_ms:.3g} a second), median of {report.iterations}",
@@ -126,7 +126,7 @@ def describe(report: Report, scene: str) -> list[str]:
 
 
 def cells(stage: StageTime) -> tuple[str, ...]:
-    """One row of the table; nothing where nothing is counted."""
+    """Return a row of the table; cells are empty if nothing is counted."""
     return (
         stage.stage,
         f"{stage.ms:.3f}",
@@ -139,7 +139,7 @@ def cells(stage: StageTime) -> tuple[str, ...]:
 
 
 def sentence(stage: StageTime) -> str:
-    """What limits a stage, as far as the two fractions tell."""
+    """Return a sentence on what limits a stage, judged by its two fractions."""
     start = f"{stage.stage} takes {_percent(stage.share)} of the time"
     fractions = [
         f"{_percent(fraction)} of the {name} limit"
@@ -153,7 +153,7 @@ def sentence(stage: StageTime) -> str:
     start += ", at " + " and ".join(fractions)
     fma, copy = stage.of_fma or 0.0, stage.of_copy or 0.0
     if max(fma, copy) < _NEAR:
-        return f"{start}: neither limits it: latency, or work beyond what is counted, does."
+        return f"{start}: neither limits it: latency or uncounted work does."
     if fma >= copy:
         return f"{start}: arithmetic limits it."
     return f"{start}: " + ("memory limits it." if copy <= 1 else "the caches help it; memory limits it.")
@@ -166,7 +166,7 @@ def _percent(fraction: float | None) -> str:
 def _read(
     path: Path, images: str | None, resolution: int | None, model: Path | None, splats: int | None
 ) -> tuple[Scene, Splats | int]:
-    """The scene, all of its views, and what to start from."""
+    """Return the scene with all of its views, and the splats or the number of points to start from."""
     from clsplat.scenes.scene import load_scene
 
     scene = load_scene(path, images, -1 if resolution is None else resolution, eval=False)
@@ -176,5 +176,5 @@ def _read(
 
     loaded = load_model(model).splats
     if not len(loaded):
-        raise InputError(f"{model}: holds no splats")
+        raise InputError(f"{model}: has no splats")
     return scene, loaded

@@ -1,4 +1,4 @@
-"""`clsplat devices`: what OpenCL offers here, whether it works, and what to do where it does not."""
+"""`clsplat devices`: the OpenCL devices of this machine, whether they work, and how to fix those that do not."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ if TYPE_CHECKING:
 @click.command()
 @click.pass_context
 def devices(ctx: click.Context) -> None:
-    """List the OpenCL devices, try each with a small kernel, and name the mend for known ailments.
+    """List the OpenCL devices, test each with a small kernel, and suggest fixes for known faults.
 
-    The first time, a device's quickest schedule is measured, which takes some seconds.
+    The first call measures the fastest schedule of each device, which takes some seconds.
 
-    The device that the other commands take by default is marked; --device takes an index such as 0:1, "cpu",
-    "gpu", or a part of a platform's or device's name. Exit code 1 when no device works.
+    The default device of the other commands is marked. --device takes an index such as 0:1, "cpu", "gpu", or a part
+    of a platform's or device's name. The exit code is 1 if no device works.
     """
     from clsplat.device.device import NO_PLATFORM, list_devices, open_device
 
     try:
-        found = list_devices()
-        chosen = open_device().info.index if found else None
+        infos = list_devices()
+        default = open_device().info.index if infos else None
     except DeviceError as error:
         click.echo(f"error: {error}", err=True)
-        chosen = None
-    if not found:
+        default = None
+    if not infos:
         click.echo(f"error: {NO_PLATFORM}", err=True)
     working = 0
-    for info in found:
-        mark = "  (default)" if info.index == chosen else ""
+    for info in infos:
+        mark = "  (default)" if info.index == default else ""
         click.echo(f"{info.index}  {info.name}{mark}")
         rows = {
             "platform": f"{info.platform}, {info.platform_version}",
@@ -53,20 +53,20 @@ def devices(ctx: click.Context) -> None:
             rows["FAILED"] = str(error)
         for name, text in rows.items():
             click.echo(f"     {name:<11}{text}")
-    for hint in hints({info.platform for info in found}, any(info.type == "GPU" for info in found)):
+    for hint in hints({info.platform for info in infos}, any(info.type == "GPU" for info in infos)):
         click.echo(f"hint: {hint}", err=True)
     if not working:
         ctx.exit(1)
 
 
 def hints(platforms: set[str], has_gpu: bool, root: Path = Path("/")) -> list[str]:
-    """Mends for hardware that is there but that OpenCL does not show (Linux).
+    """Return fixes for GPUs of this machine that OpenCL does not list (Linux).
 
     Parameters
     ----------
-    platforms : names of the OpenCL platforms found.
+    platforms : names of the OpenCL platforms.
     has_gpu : whether any of their devices is a GPU.
-    root : where `dev` lies.
+    root : folder that contains `dev`.
     """
     if any("NVIDIA" in name for name in platforms):
         return []
@@ -87,7 +87,7 @@ def hints(platforms: set[str], has_gpu: bool, root: Path = Path("/")) -> list[st
 
 
 def _try(info: DeviceInfo) -> dict[str, str]:
-    """Schedule and smoke test of one device; DeviceError where it does not work."""
+    """Return the schedule and the result of the smoke test; DeviceError if the device does not work."""
     from clsplat.device.device import open_device
     from clsplat.device.program import smoke_test
     from clsplat.device.schedule import SCHEDULES

@@ -1,7 +1,7 @@
 """Parameters of kernels, read from OpenCL C text.
 
-Style: `kernel void name(` with parameters `global [const] T *restrict name`, `local T *name`, and scalars of the
-types in `_SCALARS`; `real` is float or double.
+A kernel is written `kernel void name(...)`. Its parameters are `global [const] T *restrict name`, `local T *name` and
+scalars of the types in `_SCALARS`. The type `real` is float or double.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from ..errors import DeviceError
 Real = Literal["float", "double"]
 
 _SCALARS = {"int": np.int32, "uint": np.uint32, "ulong": np.uint64, "float": np.float32, "double": np.float64}
-_ATTRIBUTE = r"__attribute__\s*\(\(.*?\)\)\)?\s*"  # the third brace closes reqd_work_group_size(...)
+_ATTRIBUTE = r"__attribute__\s*\(\(.*?\)\)\)?\s*"  # the third parenthesis closes reqd_work_group_size(...)
 _KERNEL = re.compile(rf"\b(?:__)?kernel\s+(?:{_ATTRIBUTE})*void\s+(\w+)\s*\(([^)]*)\)", re.S)
 _COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.S)
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One kernel parameter: `kind` is "buffer", "local" or "scalar" (then with its NumPy dtype)."""
+    """A parameter of a kernel. A scalar has a NumPy dtype."""
 
     name: str
     kind: Literal["buffer", "local", "scalar"]
@@ -32,7 +32,12 @@ class Parameter:
 
 
 def parse_signatures(text: str, real: Real) -> dict[str, tuple[Parameter, ...]]:
-    """Parameters of every kernel in OpenCL C text, by kernel name; DeviceError names what it cannot read."""
+    """Return the parameters of every kernel in OpenCL C text, by kernel name.
+
+    Raises
+    ------
+    DeviceError : a parameter of an unknown form, or two kernels of one name with different parameters.
+    """
     signatures: dict[str, tuple[Parameter, ...]] = {}
     for name, inside in _KERNEL.findall(_COMMENT.sub(" ", text)):
         parts = [part for part in inside.split(",") if part.strip() not in ("", "void")]
@@ -55,4 +60,4 @@ def _parse_parameter(kernel: str, text: str, real: Real) -> Parameter:
         dtype = _SCALARS.get(real if types[0] == "real" else types[0])
         if dtype is not None:
             return Parameter(name, "scalar", np.dtype(dtype))
-    raise DeviceError(f"kernel {kernel}: parameter {' '.join(text.split())!r} is of no type that can be bound")
+    raise DeviceError(f"kernel {kernel}: parameter {' '.join(text.split())!r} has a type that cannot be bound")

@@ -1,9 +1,9 @@
-"""Make Intel's CPU runtime usable when it came by pip, which cannot register it with the OpenCL loader.
+"""Register Intel's CPU runtime with the OpenCL loader if pip installed it, because pip cannot.
 
-The wheels `intel-opencl-rt` and `intel-cmplr-lib-rt` put their libraries into `<prefix>/lib`, where the
-dynamic linker does not look, and an `.icd` file with a path of Intel's build machine. So: load the libraries
-that the runtime needs, write an `.icd` file with the true path beside copies of the system's, and point the
-loader there.
+The wheels `intel-opencl-rt` and `intel-cmplr-lib-rt` put their libraries into `<prefix>/lib`, where the dynamic linker
+does not search. Their `.icd` file holds a path of Intel's build machine. This module loads the libraries that the
+runtime needs. Then it writes an `.icd` file with the true path, next to copies of the system's, and shows the loader
+this folder.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ VENDORS_VARIABLE = "OCL_ICD_VENDORS"
 SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
 RUNTIME = "libintelocl.so"
 _ICD = "clsplat-intel-cpu.icd"
-# What libintelocl.so links against, each after what it needs itself.
+# Libraries that libintelocl.so links against. Each stands after those that it needs.
 _PRELOAD = ("libintlc.so.5", "libirng.so", "libimf.so", "libsvml.so", "libtbb.so.12")
 
 
 def register_pip_runtime() -> bool:
-    """Register the pip-installed runtime with this process's OpenCL loader; True when it is registered.
+    """Register the pip-installed runtime with this process's OpenCL loader; return whether it is registered.
 
-    Must run before the loader's first use in the process; doing it again costs nothing. Does nothing where
-    the runtime is not installed, the system has registered one, or the user has set OCL_ICD_VENDORS.
+    It must run before the loader's first use in the process; further calls cost nothing. It does nothing if the runtime
+    is not installed, if the system has registered one, or if the user has set OCL_ICD_VENDORS.
     """
     library = Path(sys.prefix) / "lib" / RUNTIME
     if not library.is_file():
         return False
     chosen = os.environ.get(VENDORS_VARIABLE)
     if chosen is not None:
-        # Ours, set earlier or by a parent process? Then this process still has to load the libraries.
+        # If an earlier call or a parent process has set it, this process still has to load the libraries.
         return (Path(chosen) / _ICD).is_file() and _preload(library.parent)
     system = sorted(SYSTEM_VENDORS.glob("*.icd"))
     if any(RUNTIME in icd.read_text(errors="replace") for icd in system) or not _preload(library.parent):
@@ -50,7 +50,7 @@ def register_pip_runtime() -> bool:
 
 
 def _preload(folder: Path) -> bool:
-    """Load the runtime's own libraries for everyone in this process; False when one cannot be."""
+    """Load the runtime's libraries for the whole process; return False if one cannot be loaded."""
     try:
         for name in _PRELOAD:
             ctypes.CDLL(str(folder / name), mode=ctypes.RTLD_GLOBAL)

@@ -1,8 +1,8 @@
-"""Programs as a driver compiled them, kept in the user's cache folder: for drivers that keep none themselves.
+"""A cache of compiled programs in the user's cache folder, for drivers that have no cache.
 
-One file a program, named by everything it depends on; written whole (atomic.py) and checked against its own digest
-when read, so that processes need no lock between them and a damaged file is only a miss. pyopencl's cache has a lock
-that a killed process leaves behind, and ends the program with a KeyError at a damaged file (2026.1).
+Each program has one file, whose name is a digest of everything that the program depends on. A file is written
+atomically and holds its own digest. So processes need no lock, and a damaged file is only a cache miss. pyopencl's
+cache has a lock that a killed process leaves behind, and fails with a KeyError at a damaged file (2026.1).
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from ..errors import OutputError
 from ..files.atomic import atomic_writer
 from .device import DeviceInfo
 
-# These keep what they build from source by themselves, PoCL also each kernel by its group size.
+# Platforms whose drivers cache programs. PoCL also caches each kernel by its group size.
 SELF_CACHING = ("Portable Computing Language", "NVIDIA CUDA")
-MAX_BYTES = 256 << 20  # of all files; beyond it those unused for longest go
+MAX_BYTES = 256 << 20  # of all files; the files unused for longest are removed first
 
 _DIGEST = hashlib.sha256().digest_size
 
 
 def cache_folder() -> Path:
-    """clsplat's folder in the user's cache (it need not exist); RuntimeError where the user has no home."""
+    """Return clsplat's folder in the user's cache, which may not exist; RuntimeError if the user has no home."""
     home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
     return Path(home) / "clsplat"
 
 
 def binary_path(info: DeviceInfo, text: str, options: list[str]) -> Path | None:
-    """The file of a program's binary, whether it exists or not; None when the driver, or no folder, keeps it."""
+    """Return the file for a program's binary. None if the driver has a cache, or if the user has no cache folder."""
     if info.platform in SELF_CACHING:
         return None
-    place = (
+    identity = (
         info.platform,
         info.platform_version,
         info.name,
@@ -43,7 +43,7 @@ def binary_path(info: DeviceInfo, text: str, options: list[str]) -> Path | None:
         info.driver,
         _cpu_features() if info.type == "CPU" else "",
     )
-    digest = hashlib.sha256("\0".join((*place, *options, text)).encode()).hexdigest()
+    digest = hashlib.sha256("\0".join((*identity, *options, text)).encode()).hexdigest()
     try:
         return cache_folder() / "programs" / f"{digest[:40]}.bin"
     except RuntimeError:
@@ -51,7 +51,7 @@ def binary_path(info: DeviceInfo, text: str, options: list[str]) -> Path | None:
 
 
 def load_binary(path: Path) -> bytes | None:
-    """What `store_binary` wrote; None when there is nothing, or nothing whole."""
+    """Return the binary that `store_binary` wrote; None if the file is missing or damaged."""
     try:
         stored = path.read_bytes()
     except OSError:
@@ -60,12 +60,12 @@ def load_binary(path: Path) -> bytes | None:
     if hashlib.sha256(binary).digest() != stored[:_DIGEST]:
         return None
     with suppress(OSError):
-        os.utime(path)  # used just now
+        os.utime(path)  # marks it as used
     return binary
 
 
 def store_binary(path: Path, binary: bytes) -> None:
-    """Keep a binary; a folder that cannot be written only costs the build again."""
+    """Store a binary. Without write access nothing is stored, and the program is built again next time."""
     with suppress(OutputError, OSError):
         with atomic_writer(path) as stream:
             stream.write(hashlib.sha256(binary).digest() + binary)
@@ -73,14 +73,14 @@ def store_binary(path: Path, binary: bytes) -> None:
 
 
 def _trim(folder: Path) -> None:
-    """Remove the files unused for longest until the rest fit MAX_BYTES. Others may be removing the same ones."""
-    held = []
+    """Remove the files unused for longest until the rest fit MAX_BYTES. Other processes may remove the same files."""
+    files = []
     for file in folder.iterdir():
         with suppress(FileNotFoundError):
             status = file.stat()
-            held.append((status.st_mtime, status.st_size, file))
-    excess = sum(size for _, size, _ in held) - MAX_BYTES
-    for _, size, file in sorted(held):
+            files.append((status.st_mtime, status.st_size, file))
+    excess = sum(size for _, size, _ in files) - MAX_BYTES
+    for _, size, file in sorted(files):
         if excess <= 0:
             return
         file.unlink(missing_ok=True)
@@ -89,7 +89,7 @@ def _trim(folder: Path) -> None:
 
 @cache
 def _cpu_features() -> str:
-    """What tells this processor from others of the same name, for machines that share a home folder."""
+    """Return the features of this processor: machines that share a home folder may differ in them."""
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
         for line in file:
             if line.startswith(("flags", "Features")):

@@ -1,4 +1,4 @@
-"""What a device was told to do: every kernel launch and transfer while a block runs, with its device time."""
+"""A record of the commands of a device: kernel launches and transfers, with their device times."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from .device import Device
 from .opencl import Event, elapsed_ms
 
-TRANSFERS = ("upload", "download", "fill", "copy")  # the commands that are no kernels
+TRANSFERS = ("upload", "download", "fill", "copy")  # commands that are not kernels
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,13 +22,13 @@ class Launch:
 
     @property
     def ms(self) -> float:
-        """Time on the device [ms]; the command must have ended."""
+        """Time on the device [ms]; the command must have finished."""
         return elapsed_ms(self.event)
 
 
 @contextmanager
 def recorded(device: Device) -> Iterator[list[Launch]]:
-    """The list that all commands of the block are added to, in their order. Blocks may be nested."""
+    """Return a list that all commands of a `with` block are added to, in order. Blocks may be nested."""
     launches: list[Launch] = []
     outer = device.observer
 

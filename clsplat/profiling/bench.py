@@ -1,4 +1,4 @@
-"""Where the time of a training step and of a rendered image goes, stage by stage, beside what the device can do."""
+"""The time of a training step and of a rendered image, stage by stage, compared with the limits of the device."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from ..scenes.scene import Scene
 from ..splats.splats import Splats
 from ..training.config import PUBLISHED_ITERATIONS, TrainConfig
 from ..training.trainer import Trainer
-from .roofline import Limits
+from .roofline import Roofline
 from .stages import HOST, STAGES, Sizes, by_stage, work_of
 
-WARM_UP = 4  # iterations not counted: kernels are built, buffers grow, the SH degree rises to 3
-MOST_ITERATIONS = 1000  # so few that the strategy does not act: it is measured by itself
+WARM_UP = 4  # iterations that are not counted: kernels are built, buffers grow, the SH degree rises to 3
+MAX_ITERATIONS = 1000  # few enough that the strategy does not act; its action is measured separately
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class StageTime:
 
     Attributes
     ----------
-    ms : on the device; of `host` the wall time that is left, of `strategy` the wall time of one action over the
-        iterations from one to the next.
-    share : of the iteration's wall time.
-    bytes, flops : at least needed (stages.Work); 0 where not counted.
-    of_copy, of_fma : the rate that this makes, as a fraction of the measured limit; None where not counted.
+    ms : device time. For `host`: the rest of the wall time. For `strategy`: the wall time of one action, divided by the
+        number of iterations between two actions.
+    share : fraction of the iteration's wall time.
+    bytes, flops : minimum that the stage has to move and compute (stages.Work); 0 if it is not counted.
+    of_copy, of_fma : the rate achieved, as a fraction of the measured limit; None if it is not counted.
     """
 
     stage: str
@@ -55,12 +55,14 @@ class StageTime:
 
 @dataclass(frozen=True)
 class Report:
-    """One task, "training step" or "render", measured.
+    """Measured times of one task.
 
     Attributes
     ----------
-    width, height : of the largest image. sizes : medians.
-    wall_ms : of an iteration, until the device is done; with the strategy's part.
+    task : "training step" or "render".
+    width, height : size of the largest image [px].
+    sizes : medians over the iterations.
+    wall_ms : wall time of an iteration until the device has finished, with the strategy's part.
     """
 
     task: str
@@ -78,12 +80,12 @@ class Report:
         return self.sizes.pairs / max(256 * self.sizes.isects, 1)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values for json.dump."""
+        """Return plain values for json.dump."""
         return dataclasses.asdict(self)
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Report:
-        """The report that `to_json` gave; InputError if it is none."""
+        """Return the report of values from `to_json`; InputError if they are not a report."""
         try:
             sizes = Sizes(**values["sizes"])
             stages = tuple(StageTime(**stage) for stage in values["stages"])
@@ -93,15 +95,15 @@ class Report:
 
 
 def bench_trainer(scene: Scene, device: Device, shape: str, start: Splats | int, sh_degree: int = 3) -> Trainer:
-    """A training run at full size and full SH degree, as in the middle of 30 000 iterations.
+    """Return a training run at full image size and full SH degree, as in the middle of 30 000 iterations.
 
     Parameters
     ----------
-    start : the splats, whose number stays; or the most of the scene's points to start from.
+    start : the splats, whose number stays; or the maximum number of the scene's points to start from.
 
     Raises
     ------
-    DeviceError : not enough memory. InputError : a scene without a training view.
+    DeviceError : the device does not have the memory. InputError : the scene has no training view.
     """
     with tempfile.TemporaryDirectory() as folder:
         if isinstance(start, Splats):
@@ -121,8 +123,8 @@ def bench_trainer(scene: Scene, device: Device, shape: str, start: Splats | int,
         return Trainer(scene, config, device=device)
 
 
-def measure_training(trainer: Trainer, limits: Limits, iterations: int) -> Report:
-    """Time `iterations` training steps, each waited for, and one action of the strategy."""
+def measure_training(trainer: Trainer, limits: Roofline, iterations: int) -> Report:
+    """Time `iterations` training steps, waiting for each, and one action of the strategy."""
     measured = _measure("training step", trainer, trainer.step, limits, iterations)
     start = time.perf_counter()
     trainer.densify()
@@ -134,8 +136,8 @@ def measure_training(trainer: Trainer, limits: Limits, iterations: int) -> Repor
     return dataclasses.replace(measured, wall_ms=wall_ms, stages=tuple(stages))
 
 
-def measure_render(trainer: Trainer, limits: Limits, iterations: int) -> Report:
-    """Time `iterations` images of the run's splats, left on the device."""
+def measure_render(trainer: Trainer, limits: Roofline, iterations: int) -> Report:
+    """Time `iterations` images of the run's splats. The images stay on the device."""
     cameras = itertools.cycle(view.camera for view in trainer.scene.train)
 
     def render() -> Frame:
@@ -172,26 +174,26 @@ def write_reports(path: Path, trainer: Trainer, limits: Limits, scene: str, repo
 
 @dataclass(frozen=True)
 class _Iteration:
-    """One iteration as it was: wall time and time of each stage [ms], and its sizes."""
+    """One iteration: wall time and time of each stage [ms], and sizes."""
 
     wall_ms: float
     stage_ms: dict[str, float]
     sizes: Sizes
 
 
-def _measure(task: str, trainer: Trainer, run: Callable[[], Frame], limits: Limits, iterations: int) -> Report:
-    if not 1 <= iterations <= MOST_ITERATIONS:
-        raise InputError(f"{iterations} iterations: must be 1 to {MOST_ITERATIONS}")
-    done = [_timed(trainer.pipeline, run) for _ in range(WARM_UP + iterations)][WARM_UP:]
-    wall_ms = statistics.median(one.wall_ms for one in done)
+def _measure(task: str, trainer: Trainer, run: Callable[[], Frame], limits: Roofline, iterations: int) -> Report:
+    if not 1 <= iterations <= MAX_ITERATIONS:
+        raise InputError(f"{iterations} iterations: must be 1 to {MAX_ITERATIONS}")
+    timed = [_timed(trainer.pipeline, run) for _ in range(WARM_UP + iterations)][WARM_UP:]
+    wall_ms = statistics.median(one.wall_ms for one in timed)
     stages = [
-        _stage_time(stage, done, trainer, limits, wall_ms)
+        _stage_time(stage, timed, trainer, limits, wall_ms)
         for stage in (*STAGES, HOST)
-        if any(stage in one.stage_ms for one in done)
+        if any(stage in one.stage_ms for one in timed)
     ]
     sizes = Sizes(
         *(
-            int(statistics.median(dataclasses.astuple(one.sizes)[i] for one in done))
+            int(statistics.median(dataclasses.astuple(one.sizes)[i] for one in timed))
             for i in range(len(dataclasses.fields(Sizes)))
         )
     )
@@ -218,11 +220,11 @@ def _timed(pipeline: Pipeline, run: Callable[[], Frame]) -> _Iteration:
     return _Iteration(wall_ms, stage_ms, sizes)
 
 
-def _stage_time(stage: str, done: list[_Iteration], trainer: Trainer, limits: Limits, wall_ms: float) -> StageTime:
-    times = [one.stage_ms.get(stage, 0.0) for one in done]
+def _stage_time(stage: str, timed: list[_Iteration], trainer: Trainer, limits: Roofline, wall_ms: float) -> StageTime:
+    times = [one.stage_ms.get(stage, 0.0) for one in timed]
     ms = statistics.median(times)
     is_cpu = trainer.device.info.type == "CPU"
-    work = [found for one in done if (found := work_of(trainer.kernels, one.sizes, is_cpu).get(stage)) is not None]
+    work = [amount for one in timed if (amount := work_of(trainer.kernels, one.sizes, is_cpu).get(stage))]
     if not work:
         return StageTime(stage, ms, ms / wall_ms)
 

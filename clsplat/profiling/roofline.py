@@ -1,34 +1,34 @@
-"""What a device can do at best, measured on it: bytes copied and fused multiply-adds a second."""
+"""The roofline of a device, measured: bytes copied and fused multiply-adds per second."""
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from ..device.device import Device
 from ..device.memory import fill_zero
+from ..device.opencl import Event, elapsed_ms
 from ..device.program import GROUP_ITEMS, Program, build
-from ..device.trace import Launch
 
-CHAINS = (4, 8, 12)  # too few leave the units idle, too many spill registers: the best of them counts
-STEPS = 16  # of a round, in cl/measure/roofline.cl
-_LONG_MS = 5.0  # a launch of this length is timed well by any driver
+# Independent sums of a work-item. Few leave units idle and many spill registers, so the fastest number counts.
+CHAINS = (4, 8, 12)
+STEPS = 16  # multiply-adds of a round in cl/measure/roofline.cl
+_LONG_MS = 5.0  # length of a launch that every driver times well
 _REPEATS = 7
-_CACHES, _LEAST_BYTES, _MOST_BYTES = 4, 128 << 20, 512 << 20  # an array: several caches
+_CACHES, _MIN_BYTES, _MAX_BYTES = 4, 128 << 20, 512 << 20  # size of an array: several caches
 _GROUPS_PER_UNIT = {"CPU": 8}
 _GPU_GROUPS_PER_UNIT = 64
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Measured bounds.
+class Roofline:
+    """Measured limits of a device.
 
     Attributes
     ----------
-    copy : bytes read plus bytes written a second by a kernel that copies arrays much larger than the caches.
-    fma : float32 operations a second of independent fused multiply-adds, two each.
+    copy : bytes read plus bytes written per second by a kernel that copies arrays much larger than the caches.
+    fma : float32 operations per second of independent fused multiply-adds; each one counts as two.
     """
 
     copy: float
@@ -38,32 +38,32 @@ class Limits:
         return f"copy {1e-9 * self.copy:.1f} GB/s, FMA {1e-9 * self.fma:.0f} Gflop/s"
 
 
-def limits_program(device: Device, chains: int) -> Program:
-    """The two kernels; on CPUs in vectors of 16, whatever the schedule: these are the device's limits."""
+def roofline_program(device: Device, chains: int) -> Program:
+    """Return the program of the two kernels. CPUs use vectors of 16, whatever the schedule."""
     lanes = 16 if device.info.type == "CPU" else 1
     return build(device, ("math/lanes.clh", "measure/roofline.cl"), {"LANES": lanes, "CHAINS": chains})
 
 
-def measure_limits(device: Device, repeats: int = _REPEATS, nbytes: int | None = None) -> Limits:
-    """Medians of `repeats` launches each, about a second in all.
+def measure_roofline(device: Device, repeats: int = _REPEATS, nbytes: int | None = None) -> Roofline:
+    """Measure both limits as medians of `repeats` launches; this takes about a second.
 
     Parameters
     ----------
-    nbytes : size of each of the two arrays copied; by default four times the device's cache, 128 to 512 MB.
+    nbytes : size of each of the two arrays of the copy. The default is four times the device's cache, 128 to 512 MB.
 
     Raises
     ------
-    DeviceError : no memory for the arrays.
+    DeviceError : the device does not have the memory for the arrays.
     """
     if nbytes is None:
         cache = int(getattr(device.cl_device, "global_mem_cache_size", 0))
-        nbytes = min(max(_CACHES * cache, _LEAST_BYTES), _MOST_BYTES, device.info.max_alloc_bytes)
+        nbytes = min(max(_CACHES * cache, _MIN_BYTES), _MAX_BYTES, device.info.max_alloc_bytes)
     fma = max(_fma(device, chains, repeats) for chains in CHAINS)
-    return Limits(_copy(device, nbytes, repeats), fma)
+    return Roofline(_copy(device, nbytes, repeats), fma)
 
 
 def _copy(device: Device, nbytes: int, repeats: int) -> float:
-    kernel = limits_program(device, CHAINS[0]).copy_vectors
+    kernel = roofline_program(device, CHAINS[0]).copy_vectors
     vector = 64 if device.info.type == "CPU" else 4  # bytes
     n = nbytes // vector
     source, target = device.alloc(n * vector), device.alloc(n * vector)
@@ -72,13 +72,13 @@ def _copy(device: Device, nbytes: int, repeats: int) -> float:
 
 
 def _fma(device: Device, chains: int, repeats: int) -> float:
-    kernel = limits_program(device, chains).fma_chains
+    kernel = roofline_program(device, chains).fma_chains
     is_cpu = device.info.type == "CPU"
     group, lanes = (1, 16) if is_cpu else (GROUP_ITEMS, 1)
     items = device.info.compute_units * group * _GROUPS_PER_UNIT.get(device.info.type, _GPU_GROUPS_PER_UNIT)
     sums = device.alloc(4 * items)
 
-    def launch(rounds: int) -> Callable[[], Any]:
+    def launch(rounds: int) -> Callable[[], Event]:
         return lambda: kernel((items,), (group,), sums=sums, a=0.5, b=1.0, rounds=rounds)
 
     rounds = 64
@@ -87,11 +87,11 @@ def _fma(device: Device, chains: int, repeats: int) -> float:
     return 2e3 * STEPS * chains * lanes * items * rounds / _median_ms(launch(rounds), repeats)
 
 
-def _median_ms(launch: Callable[[], Any], repeats: int) -> float:
-    """Device time of `launch`, after one that is not counted."""
+def _median_ms(launch: Callable[[], Event], repeats: int) -> float:
+    """Return the median device time of `launch` [ms]. One more launch before is not counted."""
     times = []
     for _ in range(repeats + 1):
         event = launch()
         event.wait()
-        times.append(Launch("", (), event).ms)
+        times.append(elapsed_ms(event))
     return statistics.median(times[1:])

@@ -1,4 +1,4 @@
-"""The stages of an iteration: which kernels make up each, and what each must read, write and compute at least."""
+"""The stages of an iteration: the kernels of each, and the least that it has to read, write and compute."""
 
 from __future__ import annotations
 
@@ -42,23 +42,23 @@ STAGES = {
     "strategy": ("gather_columns", "zero_columns"),
     "transfers": TRANSFERS,
 }
-HOST = "host"  # wall time in which the device did nothing
+HOST = "host"  # wall time in which the device is idle
 STAGE_OF = {kernel: stage for stage, kernels in STAGES.items() for kernel in kernels}
 
-# Kernels that several stages share: theirs is the stage that the last of these launches began.
+# Kernels that several stages share. They belong to the stage that the last launch of _BEGINS has begun.
 SHARED = ("radix_histogram", "radix_scatter", "scan_sums", "scan_spine", "scan_apply")
 _BEGINS = {"fill_iota": "depth sort", "count_isects": "binning", "emit_isects": "tile sort"}
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What the work of one iteration grows with.
+    """Sizes that determine the work of one iteration.
 
     Attributes
     ----------
-    splats, isects : their numbers. pixels : of the image.
-    pairs : useful pairs of splat and pixel (pairs.py).
-    sh_degree : in use.
+    splats, isects, pixels : numbers of splats, of splat-tile pairs, and of pixels of the image.
+    pairs : number of useful splat-pixel pairs (rendering/overdraw.py).
+    sh_degree : degree of spherical harmonics in use.
     """
 
     splats: int
@@ -70,14 +70,14 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Work:
-    """Bytes read and written, each array once, and floating-point operations (0: not counted)."""
+    """Bytes read and written, each array once, and floating-point operations; 0 if they are not counted."""
 
     bytes: int = 0
     flops: int = 0
 
 
 def by_stage(launches: Iterable[Launch]) -> Iterator[tuple[str, Launch]]:
-    """The launches with their stages, in order; raises KeyError for a kernel that has none."""
+    """Yield the launches with their stages, in order. Raises KeyError for a kernel without a stage."""
     shared = "depth sort"
     for launch in launches:
         shared = _BEGINS.get(launch.name, shared)
@@ -85,10 +85,10 @@ def by_stage(launches: Iterable[Launch]) -> Iterator[tuple[str, Launch]]:
 
 
 def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]:
-    """What each stage must move and compute at these sizes; without those that are not counted.
+    """Return the work of each stage at these sizes. Stages that are not counted are left out.
 
-    Flops are those of useful pairs, in the raster stages, of pixels in the loss, and of Adam. Bytes are those of the
-    stages' own buffers as ARCHITECTURE.md lists them, as if caches kept nothing between kernels and all within one.
+    Operations are those of useful pairs in the raster stages, of pixels in the loss, and of Adam. Bytes are those of
+    the buffers of a stage, as if caches kept everything within a kernel and nothing between two.
     """
     real, shape = kernels.dtype.itemsize, shape_named(kernels.shape)
     n, isects, pixels, pairs = sizes.splats, sizes.isects, sizes.pixels, sizes.pairs
@@ -99,25 +99,29 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
     forward, backward = shape.flops
     if is_cpu:
         listing = {
-            "depth sort": Work(40 * n),  # keys three times; pairs and numbers written, pairs twice read
-            "binning": Work(28 * n),  # order, boxes, boxes in order
-            "tile sort": Work(20 * n + 8 * isects + 8 * tiles),  # order, boxes, each splat's range; ids and splats
+            "depth sort": Work(40 * n),  # keys read three times, pairs and numbers written, pairs read twice
+            "binning": Work(28 * n),  # order and boxes read, boxes written in order
+            # Order, boxes and the range of each splat; ids and splats of isects.
+            "tile sort": Work(20 * n + 8 * isects + 8 * tiles),
         }
     else:
         listing = {
-            "depth sort": Work(n * (4 + 20 * depth_passes)),  # numbers; keys twice, values, and both written
-            "binning": Work(68 * n + 12 * isects),  # order and boxes twice, counts and their scan; three words out
+            # Indices written; in each pass keys are read twice, values once, and both are written.
+            "depth sort": Work(n * (4 + 20 * depth_passes)),
+            # Order and boxes read twice, counts and their scan; three words of each isect written.
+            "binning": Work(68 * n + 12 * isects),
             "tile sort": Work((4 + 20 * tile_passes) * isects + 8 * tiles),
         }
     return listing | {
         "project": Work(n * (real * (geometry + colour) + record + 20)),
         "rasterize": Work((12 + record) * isects + 4 * real * pixels, pairs * (forward + BLEND)),
-        # truth twice; planes: 3 and three maps of each out, 12 back, 3 out
+        # The target is read twice. The planes are 3 and three maps of each written, 12 read, 3 written.
         "loss": Work((6 + real * 27) * pixels, 3 * LOSS * pixels),
         "rasterize_vjp": Work(
             (12 + record + v_record) * isects + 6 * real * pixels, pairs * (forward + backward + BLEND_VJP)
         ),
         "gather": Work((8 + v_record) * n + v_record * isects),
-        "project_vjp": Work(n * (real * (2 * geometry + colour + 6 + 3 + 6) + v_record + 4)),  # colour read, 6 out
+        # The gradients of colour are compact: 6 rows.
+        "project_vjp": Work(n * (real * (2 * geometry + colour + 6 + 3 + 6) + v_record + 4)),
         "step": Work(real * n * (7 * geometry + 6 * colour + 6), ADAM * n * (geometry + colour)),
     }

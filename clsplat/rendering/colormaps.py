@@ -1,6 +1,6 @@
-"""Renders as pictures to look at: colour, depth, alpha, how many splats a pixel takes in, and how skewed they are.
+"""Renders as pictures: colour, depth, alpha, number of splats in each pixel, and their skew.
 
-Pictures are (H, W, 3) bytes. Depth, counts and skew go through one colour map, dark to bright.
+Pictures are (H, W, 3) bytes. Depth, counts and skew are shown with one colour map, from dark to bright.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from .renderer import Rendered, Renderer
 Picture = NDArray[np.uint8]
 
 MODES = ("colour", "depth", "alpha", "splats", "skew")
-FULL_COUNT = 255  # splats a pixel at the bright end; the scale is logarithmic, as counts spread over decades
+FULL_COUNT = 255  # splats of a pixel at the bright end; the scale is logarithmic, because counts span decades
 
-# Violet over blue, teal and green to yellow: lightness L* rises evenly from 12 to 92 (CIELAB), at hues that fall evenly
-# in OKLab and as much chroma as sRGB has there.
+# Violet, blue, teal, green, yellow. Lightness L* rises evenly from 12 to 92 (CIELAB), and the hue falls evenly in
+# OKLab. The chroma is the largest that sRGB has there.
 _CONTROL = np.array(
     [
         (57, 2, 75),
@@ -41,9 +41,9 @@ _CONTROL = np.array(
 )
 _STEPS = np.linspace(0.0, 1.0, 256)
 _TABLE = np.stack([np.interp(_STEPS, np.linspace(0.0, 1.0, len(_CONTROL)), channel) for channel in _CONTROL.T], axis=1)
-_QUANTILES = (0.02, 0.98)  # of depths: a few stray splats do not stretch the range
-_SAMPLES = 50_000  # pixels that are enough for quantiles
-_SOLID = 0.5  # alpha from which a pixel has a say in the range of depths
+_QUANTILES = (0.02, 0.98)  # of the depths, so that a few stray splats do not stretch the range
+_SAMPLES = 50_000  # pixels that determine the quantiles well enough
+_SOLID = 0.5  # alpha from which a pixel counts for the range of depths
 
 
 def picture(
@@ -55,18 +55,18 @@ def picture(
     near_far: tuple[float, float] | None = None,
     sh_degree: int | None = None,
 ) -> Picture:
-    """One view of a model.
+    """Render one view of a model as a picture.
 
     Parameters
     ----------
-    splats : what `model_for` makes of the model in this mode.
+    splats : result of `model_for` for the model and the mode.
     mode : one of MODES.
-    near_far : depths at the bright and at the dark end [world units]; None: the image's own (`depth_range`).
-    sh_degree : highest band of colour shown; None: all.
+    near_far : depths at the bright and at the dark end [world units]; None for the range of the image (`depth_range`).
+    sh_degree : highest band of spherical harmonics in use; None for all.
 
     Raises
     ------
-    InputError : an unknown mode.
+    InputError : unknown mode, or wrong `near_far`.
     """
     if mode not in MODES:
         raise InputError(f"picture {mode!r}: choose one of {', '.join(MODES)}")
@@ -81,19 +81,24 @@ def picture_of(
     near_far: tuple[float, float] | None = None,
     counts: Array | None = None,
 ) -> Picture:
-    """The picture of a render in a mode (see `picture`).
+    """Return the picture of a rendered image (see `picture`).
 
     Parameters
     ----------
-    image : in mode "skew" of `model_for`'s splats before black.
-    counts : (H, W) splats a pixel, for mode "splats".
+    image : for mode "skew", the splats of `model_for` on black.
+    counts : (H, W) number of splats of each pixel; mode "splats" needs it.
+
+    Raises
+    ------
+    InputError : wrong `near_far`.
     """
     if mode == "depth":
         return depth_picture(image, near_far, background)
     if mode == "alpha":
         return to_bytes(image.alpha)[..., None].repeat(3, axis=2)
     if mode == "splats":
-        assert counts is not None
+        if counts is None:
+            raise ValueError('mode "splats" needs `counts`')
         return count_picture(counts)
     if mode == "skew":
         return _over(_divided(image.color[..., 0], image.alpha), image.alpha, background)
@@ -101,10 +106,9 @@ def picture_of(
 
 
 def model_for(splats: Splats, mode: str) -> Splats:
-    """The splats to render in a mode: the model itself, or with the magnitude of its skew for a colour.
+    """Return the splats to render in a mode: the model itself, or for "skew" with its skew as the colour.
 
-    The magnitude is |m|, the shift from location to mean in standard deviations, over its limit; a slant eta counts as
-    the m of the same skewness. Shapes without skew have 0. Keep the result: each one is uploaded for itself.
+    The colour is `skew_magnitude`. Keep the result: a renderer uploads every new object.
     """
     if mode != "skew":
         return splats
@@ -114,7 +118,11 @@ def model_for(splats: Splats, mode: str) -> Splats:
 
 
 def skew_magnitude(splats: Splats) -> NDArray[np.float64]:
-    """(N,) |m| over its limit, 0 (a Gaussian) to 1."""
+    """Return the magnitude of the skew (N,), from 0 for a Gaussian to 1 for the limit.
+
+    The magnitude is |m| / limit, where m is the shift from location to mean in standard deviations. A slant eta is
+    converted to the m of the same skewness. Shapes without skew have 0.
+    """
     form = shape_named(splats.shape).skew_form
     squared = np.sum(splats.skew.astype(np.float64) ** 2, axis=1)
     if form is None:
@@ -122,31 +130,28 @@ def skew_magnitude(splats: Splats) -> NDArray[np.float64]:
     if form == "direct":  # t = k / (pi/2 - k) with k = |eta|^2 / (1 + |eta|^2) (Azzalini & Dalla Valle 1996)
         k = squared / (1.0 + squared)
         squared = k / (0.5 * math.pi - k)
-    magnitude: NDArray[np.float64] = np.minimum(np.sqrt(squared) / SKEW_LIMIT, 1.0)
-    return magnitude
+    return np.minimum(np.sqrt(squared) / SKEW_LIMIT, 1.0)
 
 
 def colour_map(values: Array) -> Picture:
-    """(..., 3) bytes of values 0..1, dark to bright; what lies beyond takes the end's, NaN the dark one."""
-    colours: Picture = np.take(np.rint(_TABLE).astype(np.uint8), to_bytes(values), axis=0)
-    return colours
+    """Return colours (..., 3) for values 0..1, dark to bright. Values outside are clipped; NaN is dark."""
+    return np.take(np.rint(_TABLE).astype(np.uint8), to_bytes(values), axis=0)
 
 
 def to_bytes(values: Array) -> Picture:
-    """Reals to bytes as PNG files have them: clipped to 0..1, rounded; NaN becomes 0."""
+    """Return reals as bytes for image files: clipped to 0..1 and rounded; NaN becomes 0."""
     reals = np.atleast_1d(np.clip(values, 0.0, 1.0))
     if np.isnan(reals).any():
         np.nan_to_num(reals, copy=False, nan=0.0)
     reals *= 255.0
-    rounded: Picture = np.rint(reals, out=reals).astype(np.uint8).reshape(np.shape(values))
-    return rounded
+    return np.rint(reals, out=reals).astype(np.uint8).reshape(np.shape(values))
 
 
 def depth_range(image: Rendered) -> tuple[float, float]:
-    """Nearest and farthest depth that matter: quantiles over the pixels that are mostly covered."""
+    """Return the nearest and farthest depth: quantiles over the pixels that are mostly covered."""
     depths = _divided(image.depth, image.alpha)
-    for least in (_SOLID, 1.0 / 255.0):
-        seen = depths[(image.alpha > least) & (depths > 0.0) & np.isfinite(depths)]
+    for min_alpha in (_SOLID, 1.0 / 255.0):
+        seen = depths[(image.alpha > min_alpha) & (depths > 0.0) & np.isfinite(depths)]
         if len(seen):
             seen = seen[:: max(len(seen) // _SAMPLES, 1)]
             near, far = (float(depth) for depth in np.quantile(seen, _QUANTILES))
@@ -157,13 +162,13 @@ def depth_range(image: Rendered) -> tuple[float, float]:
 def depth_picture(
     image: Rendered, near_far: tuple[float, float] | None = None, background: ArrayLike = BLACK
 ) -> Picture:
-    """Mean depth by the colour map, near bright and far dark; the background shows where the splats let it.
+    """Return the mean depth with the colour map, near bright and far dark, over the background.
 
-    Even in 1/depth: the near is told apart as well as the far.
+    The scale is even in 1/depth, so near depths are resolved as well as far ones.
 
     Raises
     ------
-    InputError : near_far not 0 < near < far.
+    InputError : `near_far` is not 0 < near < far.
     """
     near, far = near_far or depth_range(image)
     if not 0.0 < near < far < math.inf:
@@ -173,18 +178,17 @@ def depth_picture(
 
 
 def count_picture(counts: Array) -> Picture:
-    """Counts by the colour map: 0 is dark, `FULL_COUNT` and more is bright, doublings are even steps."""
+    """Return counts with the colour map: 0 is dark, `FULL_COUNT` and more is bright, doublings are even steps."""
     return colour_map(np.log1p(counts) / math.log1p(FULL_COUNT))
 
 
 def _divided(sums: Array, alpha: Array) -> Array:
-    """Weighted sums to means; 0 where nothing is seen."""
-    mean: Array = np.divide(sums, alpha, out=np.zeros_like(sums), where=alpha > 0.0)
-    return mean
+    """Return means of weighted sums; 0 in pixels without splats."""
+    return np.divide(sums, alpha, out=np.zeros_like(sums), where=alpha > 0.0)
 
 
 def _over(values: Array, alpha: Array, background: ArrayLike) -> Picture:
-    """Values by the colour map before a background, as far as alpha covers it."""
+    """Return values with the colour map, blended over a background by alpha."""
     cover = np.clip(alpha, 0.0, 1.0, dtype=np.float32)[..., None]
     shown = np.take((_TABLE / 255.0).astype(np.float32), to_bytes(values), axis=0)
     shown *= cover

@@ -16,7 +16,7 @@ def count_pairs(pipeline: Pipeline, frame: Frame) -> int:
     return int(_block_counts(pipeline, frame).sum())
 
 
-def pairs_per_pixel(pipeline: Pipeline, frame: Frame) -> NDArray[np.float32]:
+def splats_per_pixel(pipeline: Pipeline, frame: Frame) -> NDArray[np.float32]:
     """Return the useful splats of each pixel (H, W), as the mean over its block of pixels.
 
     A block is what the schedule computes at once: 4 x 4 pixels with 16 lanes, 4 x 2 with 8, and one pixel with 1 lane.

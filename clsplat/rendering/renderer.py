@@ -18,7 +18,7 @@ from ..splats.fields import Array
 from ..splats.splats import Splats
 from .build import ALPHA_MAX, ALPHA_MIN, T_MIN, KernelBuild
 from .frame import DeviceImage, Frame
-from .overdraw import pairs_per_pixel
+from .overdraw import splats_per_pixel
 from .pipeline import Pipeline
 from .splat_buffers import ParameterBuffers, SplatBuffers
 from .tuning import schedule_for
@@ -28,11 +28,11 @@ PRECISIONS: dict[str, Real] = {"float32": "float", "float64": "double"}
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """One image.
+    """A rendered image.
 
     Attributes
     ----------
-    color : (H, W, 3), 0 = black, 1 = white; may exceed 1.
+    color : (H, W, 3), 0 = black, 1 = white; values may exceed 1.
     alpha : (H, W), 1 - final transmittance.
     depth : (H, W), sum of weight * camera z [world units]; divide by alpha for a mean depth.
     """
@@ -47,16 +47,15 @@ class Renderer:
 
     Parameters
     ----------
-    device : None (the best one), a `--device` string ("cpu", "gpu", "0:1", part of a name), or an opened
-        Device.
+    device : None (the best one), a `--device` string ("cpu", "gpu", "0:1", part of a name), or an open Device.
     precision : "float32" or "float64".
-    schedule : how a tile's pixels are shared out; None lets the device choose.
+    schedule : distribution of a tile's pixels over work-items; None for the fastest one of the device.
     alpha_min, alpha_max, t_min : blending thresholds; (0, 1, 0) makes the image smooth, for gradient checks.
-    keep : models that stay on the device, those last rendered.
+    keep : number of models that stay on the device; the least recently rendered one is removed first.
 
     Raises
     ------
-    DeviceError : no such device, or no doubles on it. InputError : unknown precision.
+    DeviceError : there is no such device, or it has no double precision. InputError : unknown precision.
     """
 
     def __init__(
@@ -88,12 +87,17 @@ class Renderer:
     def render(
         self, splats: Splats, camera: Camera, background: ArrayLike = BLACK, sh_degree: int | None = None
     ) -> Rendered:
-        """Image of the splats (semantics: those of gsplat, see ARCHITECTURE.md).
+        """Render the splats, with the semantics of gsplat (docs/kernels.md).
 
         Parameters
         ----------
-        background : three reals shown where transmittance is left.
-        sh_degree : highest band of colour shown; None: all.
+        background : R, G, B behind the splats.
+        sh_degree : highest band of spherical harmonics in use; None for all.
+
+        Raises
+        ------
+        InputError : `background` is not three finite numbers.
+        DeviceError : the device does not have the memory.
         """
         rgb = np.asarray(background, np.float64)
         if rgb.shape != (3,) or not np.all(np.isfinite(rgb)):
@@ -105,31 +109,31 @@ class Renderer:
         return read_frame(frame)
 
     def count_splats(self) -> NDArray[np.float32]:
-        """(H, W) splats that each pixel of the last render takes in (see `pairs.pairs_per_pixel`).
+        """Return how many splats each pixel of the last render needs, (H, W) (`overdraw.splats_per_pixel`).
 
         Raises
         ------
-        InputError : nothing rendered yet.
+        InputError : nothing is rendered yet.
         """
         if self._last is None:
             raise InputError("count_splats: render an image first")
-        return pairs_per_pixel(*self._last)
+        return splats_per_pixel(*self._last)
 
     def backward(self, v_color: ArrayLike, v_alpha: ArrayLike | None = None) -> dict[str, Array]:
-        """Gradients of the last render's loss with respect to the raw values.
+        """Return the gradients of a loss of the last render with respect to the raw parameters.
 
         Parameters
         ----------
         v_color : (H, W, 3), gradient of the loss with respect to `color`.
-        v_alpha : (H, W), likewise for `alpha`, or None.
+        v_alpha : (H, W), gradient of the loss with respect to `alpha`; None for zero.
 
         Returns
         -------
-        mean (N, 3), quat (N, 4), log_scale (N, 3), opacity_logit (N,), sh (N, K, 3) and the shape's own.
+        mean (N, 3), quat (N, 4), log_scale (N, 3), opacity_logit (N,), sh (N, K, 3) and the fields of the shape.
 
         Raises
         ------
-        InputError : nothing rendered yet, or arrays of another size than the image.
+        InputError : nothing is rendered yet, or the arrays have another size than the image.
         """
         if self._last is None:
             raise InputError("backward: render an image first")
@@ -164,10 +168,10 @@ class Renderer:
         return self._pipelines[kernels]
 
     def _upload(self, splats: Splats, pipeline: Pipeline) -> SplatBuffers:
-        """Splats are immutable: the same object need not travel twice."""
+        """Return the splats on the device. Splats are immutable, so one object is copied once."""
         known = next((item for item in self._uploaded if item[0] is splats), None)
         if known is None:
-            del self._uploaded[: max(len(self._uploaded) + 1 - self._keep, 0)]  # first: memory may be short
+            del self._uploaded[: max(len(self._uploaded) + 1 - self._keep, 0)]  # before the upload: memory may be short
             kernels = pipeline.kernels
             known = (splats, SplatBuffers.of(self.device, splats, kernels.dtype))
         else:

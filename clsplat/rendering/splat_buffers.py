@@ -1,4 +1,6 @@
-"""Splats and their gradients on the device: one row of a buffer for each component, one column for each splat."""
+"""Splats, their gradients and their statistics on the device. A buffer has a row for each component of a field, and a
+column for each splat.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +16,17 @@ from ..splats.fields import Array, Group, Schema, public_shape
 from ..splats.harmonics import sh_basis
 from ..splats.splats import Splats
 
-CAPACITY_STEP = 1024  # columns are padded: whole groups of 64 items of 16 lanes stay inside
-COMPACT_ROWS = 6  # of colour: its gradient, and a direction
+CAPACITY_STEP = 1024  # columns are padded, so that whole groups of 64 items with 16 lanes stay inside
+COMPACT_ROWS = 6  # of `CompactGradients.sh`: the gradient of the colour, and a direction
 
 
 def capacity_for(n: int) -> int:
-    """Columns to allocate for n splats."""
+    """Return the number of columns to allocate for n splats."""
     return max(CAPACITY_STEP, -(-n // CAPACITY_STEP) * CAPACITY_STEP)
 
 
 class ParameterBuffers:
-    """One value per parameter of every splat: `geom` and `sh`, each [rows, capacity]. Starts at zero."""
+    """One value for each parameter of every splat, in buffers `geom` and `sh`, each [rows, capacity]; zero at first."""
 
     def __init__(
         self,
@@ -39,7 +41,7 @@ class ParameterBuffers:
             fill_zero(device, buffer, self.group_bytes(group))
 
     def group_bytes(self, group: Group) -> int:
-        """Size of one of the two buffers."""
+        """Return the size of one of the two buffers."""
         return self.schema.rows(group) * self.capacity * self.dtype.itemsize
 
     @property
@@ -51,7 +53,7 @@ class ParameterBuffers:
         return self.buffers[Group.SH]
 
     def upload(self, arrays: Mapping[str, Array]) -> None:
-        """Public arrays (schema.public_shape) of n <= capacity splats, by field, into the first n columns."""
+        """Copy arrays of n <= capacity splats, by field, into the first n columns (shapes: fields.public_shape)."""
         for name in arrays:
             field = self.schema[name]
             array = np.asarray(arrays[name], self.dtype)
@@ -61,7 +63,7 @@ class ParameterBuffers:
             to_device(self.device, self.buffers[field.group], padded, self._offset_bytes(field.name))
 
     def download(self, n: int, names: tuple[str, ...] | None = None) -> dict[str, Array]:
-        """Public arrays of the first n splats."""
+        """Return the arrays of the first n splats, by field."""
         arrays: dict[str, Array] = {}
         for name in names or self.schema.names:
             field = self.schema[name]
@@ -95,7 +97,7 @@ class SplatBuffers(ParameterBuffers):
         dtype: np.dtype[np.floating],
         capacity: int = 0,
     ) -> SplatBuffers:
-        """Upload of host splats, with room for `capacity`."""
+        """Copy splats to the device, with room for `capacity`."""
         self = cls(device, splats.schema, max(capacity, len(splats)), dtype)
         self.set(splats.to_numpy())
         return self
@@ -107,11 +109,11 @@ class SplatBuffers(ParameterBuffers):
 
 
 class CompactGradients(ParameterBuffers):
-    """Gradients of all parameters, those of SH coefficients by the two things that they are the product of.
+    """Gradients of all parameters. The gradients of the SH coefficients are kept as the two factors of a product.
 
-    `sh` is [6, capacity], (N, 2, 3) on the host: the gradient of the colour, and the unit direction from the camera,
-    in which the basis is taken. Written out, the gradients would be 3 K reals a splat, and most of what the backward
-    writes.
+    `sh` is [6, capacity], or (N, 2, 3) on the host: the gradient of the colour, and the unit direction from the camera,
+    at which the SH basis is evaluated. Their product would have 3 K numbers for each splat and would be the largest
+    output of the backward pass.
     """
 
     def __init__(self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating]) -> None:
@@ -120,7 +122,7 @@ class CompactGradients(ParameterBuffers):
         super().__init__(device, Schema(tuple(fields)), capacity, dtype)
 
     def written_out(self, n: int) -> dict[str, Array]:
-        """Public arrays of the gradients of the first n splats' parameters, `sh` as (N, K, 3)."""
+        """Return the gradients of the first n splats by field, with `sh` multiplied out to (N, K, 3)."""
         arrays = self.download(n)
         v_rgb, direction = arrays["sh"][:, :1], arrays["sh"][:, 1]
         return arrays | {"sh": sh_basis(direction, self.sh_degree)[:, :, None] * v_rgb}

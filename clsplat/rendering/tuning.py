@@ -1,7 +1,7 @@
-"""Which schedule a device runs best: measured once on a small scene, then remembered.
+"""The fastest schedule of a device: measured once on a small scene, then cached.
 
-`CLSPLAT_SCHEDULE` (a name of device.SCHEDULES, or GROUPxVECSxLANES) overrides; the cache is one JSON file in
-the user's cache folder, keyed by device, driver and the kernels' text.
+`CLSPLAT_SCHEDULE` overrides it with a name of `SCHEDULES` or GROUPxVECSxLANES. The cache is one JSON file in the user's
+cache folder. Its keys are device, driver and the text of the kernels.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ _chosen: dict[str, Schedule] = {}
 
 
 def schedule_for(device: Device) -> Schedule:
-    """The device's best schedule: from the environment, from the cache, or measured now (some seconds).
+    """Return the device's best schedule from the environment or from the cache, or measure it, which takes seconds.
 
     Raises
     ------
-    DeviceError : the variable holds no schedule.
+    DeviceError : the variable does not hold a schedule.
     """
     forced = os.environ.get(SCHEDULE_VARIABLE)
     if forced:
@@ -52,15 +52,14 @@ def schedule_for(device: Device) -> Schedule:
         cached = _read_cache().get(key)
         if cached is None:
             times = measure(device)
-            fallback = str(default_schedule(device.info))
-            cached = min(times, key=times.__getitem__) if times else fallback
+            cached = min(times, key=times.__getitem__) if times else str(default_schedule(device.info))
             _write_cache(key, cached)
         _chosen[key] = Schedule.parse(cached)
     return _chosen[key]
 
 
 def measure(device: Device) -> dict[str, float]:
-    """Milliseconds of rasterize and rasterize_vjp together, by schedule; without those that do not run."""
+    """Return the time of rasterize and rasterize_vjp together by schedule [ms], without schedules that do not run."""
     kind = device.info.type if device.info.type in _CANDIDATES else "other"
     times: dict[str, float] = {}
     for name in _CANDIDATES[kind]:
@@ -124,6 +123,6 @@ def _read_cache() -> dict[str, str]:
 
 
 def _write_cache(key: str, schedule: str) -> None:
-    """Remember; a read-only home only costs the measurement again."""
+    """Store a schedule. Without write access nothing is stored, and it is measured again next time."""
     with suppress(OutputError, OSError), atomic_writer(_cache_path()) as stream:
         stream.write(json.dumps(_read_cache() | {key: schedule}, indent=1).encode())

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from ..cameras.camera import Camera
 from ..errors import InputError
 from ..rendering.colormaps import MODES, Picture, model_for, picture, picture_of
-from ..rendering.overdraw import pairs_per_pixel
+from ..rendering.overdraw import splats_per_pixel
 from ..rendering.pipeline import Pipeline
 from ..rendering.renderer import read_frame
 from ..training.config import TrainConfig
@@ -65,7 +65,7 @@ class TrainingSource:
             degree = min(degree, settings.sh_degree)
         frame = pipeline.forward(trainer.splats, camera, settings.background, degree)
         image = read_frame(frame)
-        counts = pairs_per_pixel(pipeline, frame) if settings.mode == "splats" else None
+        counts = splats_per_pixel(pipeline, frame) if settings.mode == "splats" else None
         return picture_of(image, settings.mode, settings.background, counts=counts)
 
 

@@ -10,13 +10,13 @@ from cli_runner import HEIGHT, N_VIEWS, WIDTH, clsplat, error_of
 from clsplat_cli.bench import sentence
 
 from clsplat.profiling.bench import Report, StageTime
-from clsplat.profiling.roofline import Limits
+from clsplat.profiling.roofline import Roofline
 from clsplat.profiling.stages import HOST, STAGES
 
 
 @pytest.fixture(autouse=True)
 def limits_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("clsplat.profiling.roofline.measure_limits", lambda device: Limits(1e10, 1e11))
+    monkeypatch.setattr("clsplat.profiling.roofline.measure_roofline", lambda device: Roofline(1e10, 1e11))
 
 
 def test_made_up_scene(tmp_path: Path) -> None:

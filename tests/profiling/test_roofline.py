@@ -1,4 +1,4 @@
-"""Limits: the two kernels compute what they claim to, so that their time means something."""
+"""Roofline: the two kernels compute what they claim to, so that their time means something."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import pytest
 
 from clsplat.device.device import Device
 from clsplat.device.memory import to_device, to_host
-from clsplat.profiling.roofline import CHAINS, STEPS, limits_program, measure_limits
+from clsplat.profiling.roofline import CHAINS, STEPS, measure_roofline, roofline_program
 
 
 @pytest.mark.parametrize("chains", CHAINS)
 def test_fma_takes_every_step_on_every_chain(device: Device, chains: int) -> None:
     lanes = 16 if device.info.type == "CPU" else 1
     sums = device.alloc(4 * 64)
-    limits_program(device, chains).fma_chains.over(64, sums=sums, a=0.96875, b=0.25, rounds=2)
+    roofline_program(device, chains).fma_chains.over(64, sums=sums, a=0.96875, b=0.25, rounds=2)
     x = np.add.outer(np.arange(chains), np.arange(lanes)).astype(np.float64)
     for _ in range(2 * STEPS):
         x = 0.96875 * x + 0.25
@@ -27,14 +27,14 @@ def test_copy_copies_all_and_no_more(device: Device) -> None:
     source, target = device.alloc(values.nbytes), device.alloc(values.nbytes)
     to_device(device, source, values)
     to_device(device, target, np.zeros_like(values))
-    limits_program(device, CHAINS[0]).copy_vectors.over(99, values=source, copied=target, n=99)
+    roofline_program(device, CHAINS[0]).copy_vectors.over(99, values=source, copied=target, n=99)
     copied = to_host(device, target, np.empty_like(values))
     np.testing.assert_array_equal(copied[:99], values[:99])
     assert not copied[99:].any()
 
 
 def test_limits_are_positive(device: Device) -> None:
-    limits = measure_limits(device, repeats=1, nbytes=1 << 20)
+    limits = measure_roofline(device, repeats=1, nbytes=1 << 20)
     assert limits.copy > 0
     assert limits.fma > 0
     assert "GB/s" in str(limits)

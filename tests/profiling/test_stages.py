@@ -17,7 +17,7 @@ from clsplat.device.schedule import SCHEDULES
 from clsplat.device.trace import Launch
 from clsplat.errors import InputError
 from clsplat.profiling.bench import Report, bench_trainer, measure_render, measure_training
-from clsplat.profiling.roofline import Limits
+from clsplat.profiling.roofline import Roofline
 from clsplat.profiling.stages import HOST, SHARED, STAGE_OF, STAGES, Sizes, by_stage, work_of
 from clsplat.rendering.build import T_MIN, KernelBuild
 from clsplat.rendering.overdraw import count_pairs
@@ -114,7 +114,7 @@ def test_work_is_counted_from_sizes() -> None:
 def test_a_step_and_an_image_have_their_stages(devices: list[Device]) -> None:
     scene, splats = synthetic_scene(400, 48, 32, "skew-normal")
     trainer = bench_trainer(scene, devices[0], "skew-normal", splats)
-    limits = Limits(1e9, 1e9)
+    limits = Roofline(1e9, 1e9)
     training, render = measure_training(trainer, limits, 2), measure_render(trainer, limits, 2)
     assert [stage.stage for stage in training.stages] == [
         *(name for name in STAGES if name != "strategy"),

@@ -12,7 +12,7 @@ from kernel_checks import KERNELS
 from clsplat.device.device import Device
 from clsplat.device.program import build
 from clsplat.device.schedule import SCHEDULES
-from clsplat.profiling.roofline import CHAINS, limits_program
+from clsplat.profiling.roofline import CHAINS, roofline_program
 from clsplat.rendering.binning import BUCKET_BITS
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.radix_sort import DIGIT_BITS
@@ -69,7 +69,7 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
     for kernels in some_builds():
         build_all(compiler, kernels)
     KernelBuild(DEFAULT_SHAPE, 3, SCHEDULES["cpu16"]).count_program(compiler)
-    limits_program(compiler, CHAINS[0])
+    roofline_program(compiler, CHAINS[0])
     build(compiler, ("measure/smoke.cl",))
     build(compiler, ("render/sort.cl",), {"SORT_GROUP": 64, "RADIX_BITS": DIGIT_BITS})
     build(compiler, ("render/order.cl", "render/bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
