@@ -86,11 +86,11 @@ def bench(
     from clsplat.profiling.roofline import measure_roofline
 
     if source_path is None and (images or resolution is not None or model_path):
-        raise click.UsageError("-i, -r and -m belong to a scene: add -s")
+        raise click.UsageError("-i, -r and -m need a scene: name it with -s")
     if source_path is not None and (is_given(ctx, "width") or is_given(ctx, "height")):
         raise click.UsageError("--width and --height belong to random scenes: use -r with -s")
     if model_path is not None and splats is not None:
-        raise click.UsageError("-m and --splats exclude each other: remove one")
+        raise click.UsageError("use -m or --splats, not both")
     opened = open_device(device)
     if source_path is not None:
         scene, start = _read(source_path, images, resolution, model_path, splats)
