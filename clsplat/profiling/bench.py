@@ -146,7 +146,7 @@ def measure_render(trainer: Trainer, limits: Roofline, iterations: int) -> Repor
     return _measure("render", trainer, render, limits, iterations)
 
 
-def write_reports(path: Path, trainer: Trainer, limits: Limits, scene: str, reports: Sequence[Report]) -> None:
+def write_reports(path: Path, trainer: Trainer, limits: Roofline, scene: str, reports: Sequence[Report]) -> None:
     """Write all measurements as JSON, with the device, the schedule and the limits.
 
     Parameters
