@@ -73,10 +73,10 @@ def package_of(name: str) -> str:
 def package_line() -> list[str]:
     """Return the packages of ARCHITECTURE.md's package line, from left to right."""
     text = (ROOT / "ARCHITECTURE.md").read_text()
-    line = re.search(r"^    (\w+(?: < \w+)+(?:, \w+)*)$", text, re.M)
+    line = re.search(r"^    (\w+(?:\s+< \w+)+(?:, \w+)*)$", text, re.M)
     if line is None:
         raise ValueError("ARCHITECTURE.md has no line 'package < package < ...'")
-    return re.split(r" < |, ", line[1])
+    return re.findall(r"\w+", line[1])
 
 
 def arrows() -> list[Arrow]:

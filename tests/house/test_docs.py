@@ -216,6 +216,15 @@ def test_evidence_is_there() -> None:
             assert "NAME" in named or (ROOT / named).exists(), f"{page}: {named}"
 
 
+def test_the_pipeline_drawing_names_kernels() -> None:
+    """The names at the head of each step in the drawing are kernels."""
+    steps = re.findall(r"^      │ (\w+_\w+(?:, \w+)*|rasterize)(?= )", TEXTS["ARCHITECTURE.md"], re.M)
+    sources = "".join(path.read_text() for path in (ROOT / "cl").rglob("*.cl"))
+    kernels = {name for step in steps for name in step.split(", ")}
+    assert len(kernels) > 12
+    assert [name for name in kernels if not re.search(rf"\b{name}\(", sources)] == []
+
+
 def test_no_import_points_upward_in_the_drawing() -> None:
     heights = draw_imports.positions()
     upward = [arrow for arrow in draw_imports.arrows() if heights[arrow.source] >= heights[arrow.target]]
