@@ -108,12 +108,12 @@ def result_lines(result: Budgeted) -> list[str]:
     report, final = result.report, result.report["final"]
     held_out = report["held_out"]
     lines = [
-        f"growth: pays up to {report['knee']} splats",
-        f"rounds: {report['rounds'][report['chosen']]['splats']} of {report['rounds'][0]['splats']} splats stay",
+        f"growth: more than {report['knee']} splats gain too little",
+        f"rounds: {report['rounds'][report['chosen']]['splats']} of {report['rounds'][0]['splats']} splats remain",
         f"validation views: PSNR {held_out['psnr_pruned']:.2f} dB, with all splats and parameters "
         f"{report['rounds'][0]['psnr']:.2f} dB",
         f"{result.path}: {final['splats']} splats, {final['skewed_fraction']:.0%} skewed, "
-        f"{final['parameters_in_use']} parameters, {final['bytes'] / 1e6:.2f} MB; {result.seconds:.0f} s in all",
+        f"{final['parameters_in_use']} parameters, {final['bytes'] / 1e6:.2f} MB; {result.seconds:.0f} s in total",
     ]
     return lines + [f"warning: {final['missed']}"] * (final["missed"] is not None)
 
@@ -135,5 +135,5 @@ def draw_growth(result: Budgeted, model_path: Path) -> str | None:
 
 
 def _report_interruption(ctx: click.Context, model_path: Path) -> NoReturn:
-    click.echo(f"stopped; what is done is kept; to go on: clsplat train --resume -m {model_path}", err=True)
+    click.echo(f"interrupted, finished steps are kept; to continue: clsplat train --resume -m {model_path}", err=True)
     ctx.exit(INTERRUPTED)

@@ -28,7 +28,7 @@ from .options.option import Option, OptionGroup, check_options, option, option_t
 
 # Options that change nothing in the result: runs that differ only in these are the same run.
 FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
-REMOVED_OPTIONS = {"sampling": "opacity"}  # options of earlier versions, with the one value that files may still hold
+REMOVED_OPTIONS = {"sampling": "opacity"}  # options of earlier versions, with the value that old files may have
 PUBLISHED_ITERATIONS = 30_000  # run length for which 3DGS's learning rates were published
 # Powers of `TrainConfig.rate_factor`, by field.
 _RATE_POWERS = {"mean": 0.75, "quat": 0.5, "skew": 0.5, "normal": 0.5, "beta": 0.5, "nu": 0.5, "log_scale": 0.25}
@@ -38,11 +38,15 @@ _RATE_POWERS = {"mean": 0.75, "quat": 0.5, "skew": 0.5, "normal": 0.5, "beta": 0
 class TrainConfig:
     """Options of a training run. Constants are those of 3DGS and 3DGS-MCMC unless stated otherwise.
 
-    Options that most parts of the program read are attributes; the others are in groups. The constructor takes the
-    attributes, whole groups, and the options of the groups by their names. These two are equal:
+    Options that most parts of the program read are attributes; the others are in groups (`training/options/`). The
+    constructor takes the attributes, whole groups, and the options of the groups by their names:
 
-    >>> TrainConfig(iterations=200, cap_max=3000, density=Mcmc(growth=1.1))
-    >>> TrainConfig(iterations=200, cap_max=3000, strategy="mcmc", growth=1.1)
+    >>> from clsplat.training.options.density import Mcmc
+    >>> grouped = TrainConfig(iterations=200, cap_max=3000, density=Mcmc(growth=1.1))
+    >>> grouped == TrainConfig(iterations=200, cap_max=3000, strategy="mcmc", growth=1.1)
+    True
+    >>> grouped.density.growth
+    1.1
 
     `to_json` and `from_json` use one flat dictionary. Its keys are also the flags of the command line. An option that
     only the other strategy has is accepted and has no effect (see `without_effect`).
@@ -179,9 +183,9 @@ def read_options(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _density_of(options: Mapping[str, Any]) -> Adc | Mcmc:
-    """Return the strategy's options: of the group `density` if it is there, replaced by those given by name.
+    """Return the group `density`: the one in `options` or the default, with the options that are there by name.
 
-    If `strategy` names another strategy than the group's, the new group takes the options that both have.
+    If `strategy` names another strategy than the group's, the new group keeps the values of the shared options.
     """
     group: Adc | Mcmc | None = options.get("density")
     name = options.get("strategy", DEFAULT_STRATEGY if group is None else group.strategy)
@@ -227,8 +231,8 @@ def _sections() -> dict[str, tuple[Option, ...]]:
     shared = option_table(DensityConfig)
     sections = {"Training": tuple(RUN_OPTIONS.values()), DensityConfig.title: tuple(shared.values())}
     for strategy in (Adc, Mcmc):
-        own_options = (known for name, known in option_table(strategy).items() if name not in shared)
-        sections[strategy.title] = tuple(own_options)
+        specific = (known for name, known in option_table(strategy).items() if name not in shared)
+        sections[strategy.title] = tuple(specific)
     return sections | {group.title: tuple(option_table(group).values()) for group in GROUPS.values()}
 
 

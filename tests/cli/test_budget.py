@@ -1,4 +1,4 @@
-"""`clsplat info`, `clsplat prune` and `clsplat train --budget`: files, what they say, and what they refuse."""
+"""`clsplat info`, `clsplat prune` and `clsplat train --budget`: files, output, and errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SEARCH = ("--eval", "--iterations", 20, "--cap-max", 150, "--sh-degree", 0, "--d
 
 @pytest.fixture(scope="module")
 def found(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A searched model's folder, and what the command output."""
+    """Folder of a model from a search, and the output of the command."""
     folder = tmp_path_factory.mktemp("search") / "model"
     return folder, clsplat("train", scene, "-m", folder, "--budget", "auto", "--budget-tolerance", "1dB", *SEARCH)
 
@@ -46,7 +46,7 @@ def test_eval_writes_the_complexity(model: Path) -> None:
     assert entry["sh_coefficients"] == [3 * entry["splats"], 9 * entry["splats"]]
 
 
-def test_prune_leaves_out_what_is_not_missed(model: Path, tmp_path: Path) -> None:
+def test_prune_removes_unnecessary_splats(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
     output = clsplat("prune", model, "-o", out, "--tolerance", "0.5dB")
     ply = ModelFolder(model).latest_ply()[0]
@@ -71,7 +71,7 @@ def test_prune_leaves_out_what_is_not_missed(model: Path, tmp_path: Path) -> Non
     assert b"clsplat_" not in out.read_bytes().split(b"end_header")[0]
 
 
-def test_prune_trains_on_if_asked(model: Path, tmp_path: Path) -> None:
+def test_prune_fine_tunes_with_iterations(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
     clsplat("prune", model, "-o", out, "--tolerance", "0.5", "--iterations", 5, "-q")
     assert len(Splats.load(out)) <= len(Splats.load(ModelFolder(model).latest_ply()[0]))
@@ -110,21 +110,23 @@ def test_a_search_writes_a_smaller_model(found: tuple[Path, str]) -> None:
     splats = Splats.load(last)
     assert len(splats) == report["final"]["splats"] < 150
     assert f"{last}: {len(splats)} splats, " in output
-    assert "growth: pays up to 150 splats" in output
+    assert "growth: more than 150 splats gain too little" in output
     assert "test views (2): PSNR " in output
     entry = json.loads(clsplat("info", folder, "--json"))
     assert entry["splats"] == len(splats)
     assert entry["bytes"] == report["final"]["bytes"]
 
 
-def test_a_search_that_is_done_or_is_another(found: tuple[Path, str], scene: Path) -> None:
+def test_a_finished_search_is_not_resumed_or_replaced(found: tuple[Path, str], scene: Path) -> None:
     folder, _ = found
     assert "the search is finished: nothing to resume" in error_of("train", "--resume", "-m", folder)
     assert "already holds a model" in error_of("train", scene, "-m", folder, "--max-bytes", 1000)
     assert "not a number of decibels" in error_of("train", scene, "--target-psnr", "x", code=2)
 
 
-def test_an_interrupted_search_says_how_to_go_on(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_search_prints_how_to_continue(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from cli_runner import run
 
     import clsplat.compression.search as budget
@@ -137,7 +139,7 @@ def test_an_interrupted_search_says_how_to_go_on(scene: Path, tmp_path: Path, mo
         result = run("train", scene, "-m", tmp_path / "model", "--target-psnr", 10, *SEARCH)
     assert result.exit_code == 130
     assert result.stderr.splitlines()[-1] == (
-        f"stopped; what is done is kept; to go on: clsplat train --resume -m {tmp_path / 'model'}"
+        f"interrupted, finished steps are kept; to continue: clsplat train --resume -m {tmp_path / 'model'}"
     )
     assert "already holds a model" in error_of("train", scene, "-m", tmp_path / "model", *SEARCH)
     output = clsplat("train", "--resume", "-m", tmp_path / "model")

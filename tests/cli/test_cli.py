@@ -1,4 +1,4 @@
-"""The program, `clsplat train` and `clsplat demo`: the files they write, exactly, and what they say."""
+"""The program, `clsplat train` and `clsplat demo`: their files and their output."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_ply_has_3dgs_columns_then_the_skew(model: Path) -> None:
     assert len(read_ply(ply(model)).arrays["mean"]) <= CAP
 
 
-def test_train_says_where_the_model_is_and_how_good(scene: Path, tmp_path: Path) -> None:
+def test_train_prints_where_the_model_is_and_how_good(scene: Path, tmp_path: Path) -> None:
     result = run("train", "-s", scene, "-o", tmp_path / "m", "--eval", *SHORT)
     assert str(ply(tmp_path / "m")) in result.stdout
     assert "test views (2): PSNR" in result.stdout
@@ -217,7 +217,7 @@ def test_existing_models_are_kept_unless_overwritten(scene: Path, tmp_path: Path
 
 
 def test_interrupt_then_resume(scene: Path, tmp_path: Path) -> None:
-    """Ctrl-C in a real process; then --resume without repeating any option."""
+    """Ctrl-C in a real process, then --resume without any option."""
     model = tmp_path / "m"
     args = [
         "train",
@@ -261,7 +261,7 @@ def test_resume_of_a_finished_run_changes_nothing(model: Path) -> None:
 # --- demo --------------------------------------------------------------------------------------
 
 
-def test_demo_goes_all_the_way_and_again(tmp_path: Path) -> None:
+def test_demo_runs_all_steps_and_runs_again(tmp_path: Path) -> None:
     small = ["--iterations", "20", "--cap-max", "200", "--width", str(WIDTH), "--views", str(N_VIEWS)]
     out = clsplat("demo", tmp_path / "d", *small)
     assert "PSNR" in out

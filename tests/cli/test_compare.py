@@ -1,4 +1,4 @@
-"""`clsplat compare` and `clsplat train --preset`: what they write and print, and one line for each mistake."""
+"""`clsplat compare` and `clsplat train --preset`: files, output, and one line for each mistake."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clsplat.training.presets import PRESETS, preset
 TINY = ["--iterations", "12", "--sh-degree", "1", "--densify-interval", "5"]
 
 
-def test_compare_prints_a_table_and_goes_on(scene: Path, tmp_path: Path) -> None:
+def test_compare_prints_a_table_and_continues(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = ("compare", scene, "-o", out, "--systems", "gaussian,default:dense_size=0.02", "--cap-max", "40", *TINY)
     first = run(*arguments, "--seeds", "0", "1")
@@ -46,7 +46,7 @@ def test_compare_prints_a_table_and_goes_on(scene: Path, tmp_path: Path) -> None
     assert rows[0]["config"]["iterations"] == 12
 
 
-def test_compare_says_what_is_wrong(scene: Path, tmp_path: Path) -> None:
+def test_compare_names_each_mistake(scene: Path, tmp_path: Path) -> None:
     arguments = ("compare", scene, "-o", tmp_path / "out")
     assert "unknown system 'cube'" in error_of(*arguments, "--systems", "cube")
     assert "3dgs has strategy adc, which contradicts strategy mcmc" in error_of(
@@ -89,7 +89,7 @@ def test_preset_is_resolved_in_config_json(scene: Path, tmp_path: Path) -> None:
         ("sss", "--position-optimizer", "adam", "preset sss has position_optimizer sghmc-sss"),
     ],
 )
-def test_preset_and_a_flag_against_it(
+def test_a_flag_that_contradicts_the_preset(
     scene: Path, tmp_path: Path, name: str, flag: str, value: str, expected: str
 ) -> None:
     message = error_of("train", scene, "-m", tmp_path / "m", "--preset", name, flag, value)

@@ -20,13 +20,13 @@ MODEL_FILES = ["cameras.bin", "images.bin", "points3D.bin"]
 
 @pytest.fixture
 def scene(tmp_path: Path, capture_folder: Path) -> Path:
-    """A copy of the capture, to damage."""
+    """A copy of the capture that a test may damage."""
     return Path(shutil.copytree(capture_folder, tmp_path / "yard"))
 
 
 @pytest.fixture
 def copied(tmp_path: Path, model: Path) -> Path:
-    """A copy of the model, to damage."""
+    """A copy of the model that a test may damage."""
     return Path(shutil.copytree(model, tmp_path / "copied"))
 
 
@@ -137,7 +137,7 @@ def test_unknown_command() -> None:
 def test_a_loss_that_is_not_finite(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from clsplat.training.loss import ImageLoss, LossValue
 
-    monkeypatch.setattr(ImageLoss, "value", lambda self: LossValue(float("nan"), 0, 0, 0))
+    monkeypatch.setattr(ImageLoss, "value", lambda *_: LossValue(float("nan"), 0, 0, 0))
     assert "learning rates" in error_of("train", scene, "-m", scene / "m", *SHORT)
 
 
@@ -145,7 +145,7 @@ def test_a_loss_that_is_not_finite(scene: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def with_value(vertex: int, properties: list[str], value: float) -> Callable[[Path], None]:
-    """Overwrites properties of a vertex in the file's bytes."""
+    """Return a function that overwrites properties of a vertex in a file."""
 
     def damage(path: Path) -> None:
         header, body = path.read_bytes().split(b"end_header\n", 1)

@@ -29,7 +29,7 @@ def test_frontier_sweeps_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert (out / "report.html").read_text().count("<svg") >= 2
     curves = json.loads((out / "charts" / "time.json").read_text())
     assert [row["iteration"] for row in curves] == [1, 3, 8] * 2
-    # Once more, from the runs alone and beside another folder's.
+    # The same charts are drawn again from the runs, together with those of another folder.
     monkeypatch.setattr(chart_style, "available", lambda: False)
     shutil.copytree(out, tmp_path / "other")
     shutil.rmtree(out / "charts")
@@ -38,7 +38,7 @@ def test_frontier_sweeps_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert {path.name: path.read_text() for path in (out / "charts").iterdir()} == data
 
 
-def test_frontier_without_matplotlib_says_so_and_writes_the_data(
+def test_frontier_without_matplotlib_warns_and_writes_the_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capture_folder: Path
 ) -> None:
     monkeypatch.setattr(chart_style, "available", lambda: False)
@@ -60,7 +60,7 @@ def test_frontier_without_matplotlib_says_so_and_writes_the_data(
     assert {path.name for path in (tmp_path / "charts").iterdir()} == {"time.csv", "time.json"}
 
 
-def test_frontier_says_what_is_wrong(tmp_path: Path, capture_folder: Path) -> None:
+def test_frontier_names_each_mistake(tmp_path: Path, capture_folder: Path) -> None:
     scene = capture_folder
     assert "give scenes, or --charts-only" in error_of("frontier", "-o", tmp_path / "out", code=2)
     assert "give scenes, or --charts-only" in error_of("frontier", scene, "-o", tmp_path, "--charts-only", code=2)

@@ -1,4 +1,4 @@
-"""Pieces of the command line: display, names of images, option types, orbits."""
+"""Parts of the command line: display, names of images, types of options, orbits."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_look_at() -> None:
 
 
 def test_orbit_of_a_half_ring_closes_it() -> None:
-    """Cameras on half a ring about (1, 2, 0.5), z up: the orbit is the whole ring."""
+    """The cameras are on half a ring around (1, 2, 0.5), z up. The orbit is the whole ring."""
     target, angles = np.array([1.0, 2.0, 0.5]), np.linspace(0, np.pi, 7)
     ring = [facing([1 + 4 * math.cos(a), 2 + 4 * math.sin(a), 1.5], [1, 2, 0.5], [0, 0, 1]) for a in angles]
     made = orbit(cloud(), ring, 12)
@@ -147,6 +147,6 @@ def test_orbit_without_cameras_sees_the_splats() -> None:
         pixels = local[:, :2] / local[:, 2:] * camera.fx + (camera.cx, camera.cy)
         inside = ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
         assert inside.mean() > 0.8
-    assert len(orbit(splats.select([0]), (), 2)) == 2  # one splat: no extent
+    assert len(orbit(splats.select([0]), (), 2)) == 2  # one splat has no extent
     with pytest.raises(InputError):
         orbit(splats.select([]), (), 2)

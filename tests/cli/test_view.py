@@ -157,7 +157,7 @@ def test_train_view_shows_the_run(tmp_path: Path, capture_folder: Path) -> None:
         while log.read_text() == before:
             time.sleep(0.05)
         assert command.end() == 130
-        assert "to go on: clsplat train --resume" in command.said
+        assert "to continue: clsplat train --resume" in command.said
         assert "Traceback" not in command.said
     finally:
         if command.process.poll() is None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import doctest
+import importlib
 import json
 from typing import Any
 
@@ -54,11 +56,9 @@ def test_the_strategies_differ_in_defaults_of_shared_options() -> None:
 def test_another_strategy_keeps_the_options_that_both_have() -> None:
     config = TrainConfig(strategy="mcmc", growth=1.2, opacity_reg=0.02)
     changed = config.replace(strategy="adc", densify_until=0.0)
-    assert changed.density == Adc(**{name: getattr(config.density, name) for name in SHARED} | {"densify_until": 0.0})
+    shared = {name: getattr(config.density, name) for name in option_table(DensityConfig)}
+    assert changed.density == Adc(**shared | {"densify_until": 0.0})
     assert changed.density.opacity_reg == 0.02
-
-
-SHARED = tuple(option_table(DensityConfig))
 
 
 def test_options_of_the_other_strategy_have_no_effect() -> None:
@@ -102,3 +102,17 @@ def test_a_file_of_another_order_of_keys_is_the_same_config() -> None:
     config = TrainConfig(strategy="mcmc", growth=1.3, save_iterations=(3, 4))
     stored = json.loads(json.dumps(config.to_json(), sort_keys=True))
     assert TrainConfig.from_json(stored) == config
+
+
+def test_a_file_of_an_earlier_version_loads() -> None:
+    """Such a file has options of both strategies, null for defaults, and options that were removed since."""
+    file = {"strategy": "adc", "growth": 1.2, "relocation": "length", "sampling": "opacity", "init_scale": None}
+    assert TrainConfig.from_json(file) == TrainConfig(strategy="adc")
+    with pytest.raises(InputError, match="config: unknown option 'sampling'"):
+        TrainConfig.from_json({"sampling": "pull"})
+
+
+def test_the_example_in_the_documentation() -> None:
+    module = importlib.import_module("clsplat.training.config")
+    assert doctest.testmod(module).failed == 0
+    assert doctest.testmod(module).attempted > 0
