@@ -191,10 +191,8 @@ def _viewer(scene: Scene, config: TrainConfig, model_path: Path, host: str, port
 
 def report_interruption(ctx: click.Context, model: Model) -> NoReturn:
     """Print how to continue after Ctrl-C, and exit."""
-    click.echo(
-        f"stopped at iteration {model.iteration}, checkpoint saved; to continue: clsplat train --resume -m {model.path}",
-        err=True,
-    )
+    command = f"clsplat train --resume -m {model.path}"
+    click.echo(f"stopped at iteration {model.iteration}, checkpoint saved; to continue: {command}", err=True)
     ctx.exit(INTERRUPTED)
 
 
