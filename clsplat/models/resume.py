@@ -16,7 +16,7 @@ from ..training.stored_run import StoredRun, load_recorded_scene, stored_run
 
 if TYPE_CHECKING:
     from ..compression.search import Budgeted
-    from ..training.trainer import Model
+    from ..training.model import Model
 
 
 @dataclass(frozen=True)

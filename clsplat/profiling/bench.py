@@ -127,7 +127,7 @@ def measure_training(trainer: Trainer, limits: Roofline, iterations: int) -> Rep
     """Time `iterations` training steps, waiting for each, and one action of the strategy."""
     measured = _measure("training step", trainer, trainer.step, limits, iterations)
     start = time.perf_counter()
-    trainer.densify()
+    trainer.density.densify(trainer.iteration)
     trainer.device.queue.finish()
     action_ms = 1e3 * (time.perf_counter() - start) / trainer.config.density.densify_interval
     wall_ms = measured.wall_ms + action_ms

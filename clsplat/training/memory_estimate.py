@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..device.device import Device
@@ -11,9 +12,12 @@ from ..rendering.build import KernelBuild
 from ..rendering.frame import ImageLayout
 from ..rendering.pipeline import isect_bytes
 from ..rendering.splat_buffers import COMPACT_ROWS, capacity_for
+from ..scenes.scene import View
 from ..splats.fields import Group
 from .config import TrainConfig
+from .exposure import exposure_bytes
 from .optim.skew_map import SkewMap
+from .targets import target_budget, target_bytes, target_channels
 
 _ROLES = 5  # value, gradient, two moments, and the copy that relocation swaps with; of colour the gradient is compact
 # Colour and transmittance, both once more for bands, gradients of SSIM's maps, v_color.
@@ -78,6 +82,19 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, tar
         isect,
         max(buffers),
     )
+
+
+def run_memory(device: Device, kernels: KernelBuild, config: TrainConfig, views: Sequence[View]) -> Estimate:
+    """Return the memory estimate of a run on these training views; raises DeviceError if the device has too little."""
+    largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
+    layout = ImageLayout(largest.width, largest.height)
+    channels = target_channels(views, config.random_background)
+    images = target_bytes(views, target_budget(device), channels)
+    needed = estimate(
+        config, kernels, layout, images + exposure_bytes(layout, kernels.dtype.itemsize, config, channels)
+    )
+    check(needed, device)
+    return needed
 
 
 def room_for_isects(needed: Estimate, device: Device) -> int:

@@ -6,14 +6,28 @@ import numpy as np
 
 from ..device.device import Device
 from ..device.program import Define, Program, build
+from ..device.schedule import Schedule
 from ..rendering.build import MARGIN_X, MARGIN_Y, KernelBuild
 from ..splats.fields import Group
 from ..splats.shapes import SKEW_MAX, SLANT_MAX, shape_named
+from .config import TrainConfig
 from .optim import adam
 from .optim.skew_map import SKEW_MAPS
 
 EXPOSURE_VECS = 8  # vectors of a work-item of cl/train/exposure.cl
 EXPOSURE_GROUP = 64
+
+
+def kernel_build(config: TrainConfig, schedule: Schedule) -> KernelBuild:
+    """Return the build of the renderer's kernels for a run."""
+    return KernelBuild(
+        config.shape,
+        config.sh_degree,
+        schedule,
+        config.normalisation,
+        skew_map=config.skew_map or SKEW_MAPS[0],
+        antialiased=config.antialiased,
+    )
 
 
 def loss_strip(kernels: KernelBuild) -> int:

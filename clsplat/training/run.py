@@ -15,7 +15,8 @@ from .checkpoint import Checkpoint
 from .config import FREE_OPTIONS, TrainConfig
 from .folder import ModelFolder
 from .log import Progress
-from .trainer import Model, Trainer, Visit
+from .model import Model
+from .trainer import Trainer, Visit
 
 __all__ = ["Model", "Progress", "train"]
 

@@ -7,14 +7,61 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 from ..errors import InputError
+from .config import TrainConfig
+from .options.density import Mcmc
 
 # (fraction of the run, downscale): coarse to fine, the last half at full resolution.
 COARSE_TO_FINE = ((0.0, 4), (0.2, 2), (0.5, 1))
 MANY_PIXELS = 8.0  # of the image for each splat: above it coarse stages last longer
 LONGEST = 1.3  # times as long: full resolution from 0.65 of the run
+
+
+@dataclass(frozen=True)
+class RunSchedule:
+    """The schedules of a run, from its config.
+
+    Attributes
+    ----------
+    mean_rate : iteration to the learning rate of positions, without the scene extent.
+    sh_interval : iterations from one SH degree to the next.
+    densify_first, densify_last : iterations between which the strategy densifies.
+    growth : factor of the number of splats per densification (strategy "mcmc").
+    """
+
+    mean_rate: Callable[[int], float]
+    sh_interval: int
+    densify_first: int
+    densify_last: int
+    growth: float
+
+    @classmethod
+    def create(cls, config: TrainConfig, n_first: int) -> RunSchedule:
+        """Return the schedules of a run that starts with `n_first` splats."""
+        steps = config.iterations
+        first = max(int(config.density.densify_from * steps), 1)
+        last = int(config.density.densify_until * steps)
+        return cls(
+            exponential_decay(config.optim.position_lr_init, config.optim.position_lr_final, steps),
+            config.schedule.sh_interval or max(1, min(1000, steps // 10)),
+            first,
+            last,
+            growth_factor(config, n_first, last - first),
+        )
+
+
+def growth_factor(config: TrainConfig, n_first: int, window: int) -> float:
+    """Return the growth per densification: the option `growth`, or more if the cap is far.
+
+    The larger factor reaches the cap after half of the densifications in `window` iterations.
+    """
+    if not isinstance(config.density, Mcmc):
+        return 1.0
+    actions = max(window // config.density.densify_interval // 2, 1)
+    return float(max(config.density.growth, (config.cap_max / n_first) ** (1 / actions)))
 
 
 def exponential_decay(start: float, end: float, steps: int) -> Callable[[int], float]:

@@ -15,7 +15,6 @@ from ..rendering.pipeline import Pipeline
 from ..rendering.renderer import read_frame
 from ..training.config import TrainConfig
 from ..training.log import Progress
-from ..training.schedules import sh_degree_at
 from ..training.trainer import Trainer
 from .settings import Settings
 from .viewer import FRAME_TIME, Viewer
@@ -60,7 +59,7 @@ class TrainingSource:
         if settings.mode == "skew":
             shown = model_for(trainer.snapshot(), settings.mode)
             return picture(trainer.renderer, shown, camera, settings.mode, settings.background)
-        degree = sh_degree_at(trainer.iteration, trainer.sh_interval, self._config.sh_degree)
+        degree = trainer.sh_degree
         if settings.sh_degree is not None:
             degree = min(degree, settings.sh_degree)
         frame = pipeline.forward(trainer.splats, camera, settings.background, degree)

@@ -243,7 +243,7 @@ def test_training_steps_what_was_seen_and_settles_before_each_action(
         n = len(arrays["mean"])
         return DensifyEdit(np.arange(n), {}, np.zeros(n, bool))
 
-    monkeypatch.setattr("clsplat.training.trainer.next_edit", lambda config, arrays, *rest: unchanged(arrays))
+    monkeypatch.setattr("clsplat.training.density.control.next_edit", lambda config, arrays, *rest: unchanged(arrays))
     for _ in range(40):
         before = trainer.splats.download(500)
         trainer.step()

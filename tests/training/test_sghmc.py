@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
+from clsplat.training.methods.sss import PublishedSghmc
 from clsplat.training.optim.noise import covariance_times, noise_gate, normal3
 from clsplat.training.optim.sghmc import SSS_EXTENT, STREAM, Coefficients, Sghmc, step
 
@@ -16,7 +17,7 @@ FRICTION, BURN_IN_FRICTION = 120.0, 5e5
 
 
 def sghmc(extent: float = SSS_EXTENT, literal: bool = False, friction: float = FRICTION, burn_in: int = 5) -> Sghmc:
-    return Sghmc(literal, extent, friction, BURN_IN_FRICTION, burn_in)
+    return (PublishedSghmc if literal else Sghmc)(extent, friction, BURN_IN_FRICTION, burn_in)
 
 
 def ends(options: Sghmc, iterations: int = 300, factor: float = 1.0, n: int = 64) -> np.ndarray:

@@ -26,6 +26,7 @@ from ...errors import InputError, TrainingError
 from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import finite_rows, opacity_names, optical_depth, raw_of_optical_depth
 from ...splats.shapes import Shape
+from ..methods import sss
 from .edit import DensifyEdit
 
 # 3DGS-MCMC's constants.
@@ -33,8 +34,8 @@ MIN_OPACITY = 0.005  # at or below: dead, relocated
 GROWTH = 1.05  # per call
 N_MAX = 51  # copies are counted up to this
 
-# The power of the length factor that scales are multiplied by.
-RULES = {"length": 1.0, "length-squared": 2.0, "opacity-only": 0.0}
+# Power of the length factor by which scales are multiplied. "opacity-only" is the rule of Deformable Beta Splatting.
+RULES = {"length": 1.0, "length-squared": sss.RELOCATION_POWER, "opacity-only": 0.0}
 
 # Nodes on each side of 0 at z = _KNEE sinh(asinh(_FARTHEST / _KNEE) u^3), u the midpoints of equal cells. A step or a
 # cusp at 0 does no harm: each side is smooth in u, and the cube brings the nodes to the cusp of

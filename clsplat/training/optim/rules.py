@@ -1,4 +1,4 @@
-"""What both optimizers go by: rates, regularisers, the skew map, how positions move, and which blocks learn when."""
+"""Rules of both optimizers: rates, regularisers, skew map, optimizer of the positions, groups that learn."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from ...splats.fields import Array, Field, Schema
 from ...splats.shapes import Shape, shape_named
 from ..config import TrainConfig
 from ..methods.sns import ParameterGroups, learning_groups
+from ..methods.sss import PublishedSghmc
 from .noise import PUBLISHED_EXTENT
 from .regularisers import Penalty
 from .sghmc import Coefficients, Sghmc
@@ -48,7 +49,7 @@ def field_rate(config: TrainConfig, field: Field) -> float:
 
 @dataclass(frozen=True)
 class Rules:
-    """The config as the optimizers read it; `extent` of the scene [world units]."""
+    """The config as the optimizers use it. extent : extent of the scene [world units]."""
 
     config: TrainConfig
     extent: float
@@ -64,16 +65,16 @@ class Rules:
         return {field.name: field_rate(self.config, field) * self.config.rate_factor(field.name) for field in fields}
 
     def sh_rates(self, rows: int, dtype: np.dtype[np.floating]) -> Array:
-        """Rate per row of colour, of which the first three are the constant band."""
+        """Return the rate of each row of the colour. The first three rows are the constant band."""
         rates = np.full(rows, self.rates["sh"], dtype)
         rates[3:] *= SH_REST_FACTOR
         return rates
 
     def penalty(self, n: int) -> Penalty:
-        """The regularisers of n splats: the config's weights are those of means over splats.
+        """Return the regularisers of n splats. The weights of the config belong to means over splats.
 
-        Scales are taken in world units, as published, and in larger scenes than that in units of the extent: else
-        they would outweigh the images.
+        Scales are in world units, as published. In scenes larger than the published ones they are in units of the
+        extent; otherwise the regulariser would outweigh the image loss.
         """
         config = self.config
         scale = config.density.scale_reg * min(PUBLISHED_EXTENT / self.extent, 1.0)
@@ -81,17 +82,16 @@ class Rules:
 
     @cached_property
     def map(self) -> SkewMap | None:
-        """The map of the trainable skew, where the shape has one."""
+        """The map of the trainable skew; None for shapes without a skew."""
         return SkewMap(self.config.skew_map) if self.config.skew_map else None
 
     @cached_property
     def sghmc(self) -> Sghmc | None:
-        """How positions move, unless by Adam."""
+        """SGHMC of the positions; None if Adam moves them."""
         config = self.config
         if config.sghmc.position_optimizer == "adam":
             return None
-        return Sghmc(
-            config.sghmc.position_optimizer == "sghmc-sss",
+        return (PublishedSghmc if config.sghmc.position_optimizer == "sghmc-sss" else Sghmc)(
             self.extent,
             config.sghmc.sghmc_friction,
             config.sghmc.sghmc_burn_in_friction,
@@ -99,7 +99,7 @@ class Rules:
         )
 
     def coefficients(self, sghmc: Sghmc, iteration: int, mean_lr: float) -> Coefficients:
-        """Of SGHMC's step, from the rate that Adam would take."""
+        """Return the coefficients of an SGHMC step. mean_lr : the rate of an Adam step."""
         factor = self.config.rate_factor("mean")
         return sghmc.coefficients(iteration, mean_lr / factor, factor)
 

@@ -1,22 +1,24 @@
-"""Stochastic gradient Hamiltonian Monte Carlo for positions (Chen, Fox & Guestrin 2014), as SSS trains them.
+"""Stochastic gradient Hamiltonian Monte Carlo for positions (Chen, Fox & Guestrin 2014; SSS 2025), in a stable form.
 
-Student Splatting and Scooping (2025) moves means x with a momentum p, where g is Adam's bias-corrected direction, l the
-square root of Adam's rate, s = sigmoid(0.5 - 100 |opacity|) a gate that only nearly transparent splats pass (noise.py),
-and xi a standard normal:
+Student Splatting and Scooping (SSS) moves the means x with a momentum p:
 
     burn-in   p <- -l g + Sigma s sqrt(2 l C_b) xi                x <- x + l p
     after     p <- s (1 - l C) p - l g + s sqrt(2 l C) xi         x <- x + l p     (p = 0 before the first)
 
-A visible splat thus takes Adam's steps, l^2 g; momentum and noise act on nearly transparent ones.
+g is the bias-corrected direction of Adam, l the square root of Adam's rate and xi a standard normal. The gate s =
+sigmoid(0.5 - 100 |opacity|) is open only for nearly transparent splats (noise.py). So a visible splat takes Adam's
+steps, l^2 g. Momentum and noise move nearly transparent splats.
 
-As written ("sghmc-sss") it diverges where s |1 - l C| > 1, that is in large scenes (l grows with the square root of
-the extent E) or with a large C, and its noise does not scale with the scene. "sghmc" takes E out of l: with
-l' = l / sqrt(E) the friction per step is f = min(l' C', 1), so that s (1 - f) < 1 always, and the displacement by noise
-grows as E, in the burn-in too. C' = C sqrt(E_SSS) and the factors of the noise are such that both forms have
-the same noise, and the same friction up to the bound, at E = E_SSS, the extent to which SSS's constants belong.
+The published form is methods/sss.py ("sghmc-sss"). It diverges if s |1 - l C| > 1. That happens in large scenes,
+because l grows with the square root of the extent E. Its noise does not scale with the scene.
 
-Our rates are larger in runs shorter than SSS's (config.rate_factor). That factor multiplies g alone: friction
-and noise keep the published rate of the same fraction of the run.
+The stable form ("sghmc") removes E from l. With l' = l / sqrt(E), the friction per step is f = min(l' C', 1), so
+s (1 - f) < 1 always. The displacement by noise grows as E, also in the burn-in. C' = C sqrt(E_SSS), where E_SSS is the
+extent that the constants of SSS belong to. At E = E_SSS both forms have the same noise, and the same friction up to the
+bound.
+
+The rates here are larger in runs shorter than those of SSS (TrainConfig.rate_factor). That factor multiplies only g.
+Friction and noise keep the published rate at the same fraction of the run.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from .noise import PUBLISHED_EXTENT as SSS_EXTENT
 from .noise import covariance_times, noise_gate
 
 STREAM = 1  # of noise.normal3
-_SMALLEST_EXTENT = 1e-6  # cameras in one place have none
+_SMALLEST_EXTENT = 1e-6  # for cameras in one place, whose extent is 0
 
 
 class Coefficients(NamedTuple):
@@ -48,36 +50,36 @@ class Coefficients(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Sghmc:
-    """The options of a run.
+    """SGHMC in scene units.
 
     Parameters
     ----------
-    literal : as SSS writes it, else in scene units and stable.
-    extent : of the scene [world units].
-    friction, burn_in_friction : C and C_b.
-    burn_in : its last iteration.
+    extent : extent of the scene [world units].
+    friction, burn_in_friction : C and C_b of SSS.
+    burn_in : last iteration of the burn-in.
     """
 
-    literal: bool
     extent: float
     friction: float
     burn_in_friction: float
     burn_in: int
 
     def coefficients(self, iteration: int, rate: float, factor: float) -> Coefficients:
-        """Of an iteration (from 1), from Adam's rate without the factor of short runs, and that factor."""
+        """Return the coefficients of an iteration (from 1).
+
+        Parameters
+        ----------
+        rate : Adam's rate, without the factor of short runs.
+        factor : that factor (TrainConfig.rate_factor).
+        """
         length = math.sqrt(rate)
         burning = iteration <= self.burn_in
-        friction = self.burn_in_friction if burning else self.friction
-        if self.literal:
-            unit, noise = length, 1.0
-        else:
-            extent = max(self.extent, _SMALLEST_EXTENT)
-            unit, friction = length / math.sqrt(extent), friction * math.sqrt(SSS_EXTENT)
-            # x moves by length * noise, and in the burn-in by Sigma, too, which grows as E^2.
-            noise = (SSS_EXTENT / extent) ** 1.5 if burning else math.sqrt(extent / SSS_EXTENT)
-        lost = unit * friction if self.literal else min(unit * friction, 1.0)
-        keep = 1.0 - lost if iteration > self.burn_in + 1 else 0.0
+        extent = max(self.extent, _SMALLEST_EXTENT)
+        unit = length / math.sqrt(extent)
+        friction = (self.burn_in_friction if burning else self.friction) * math.sqrt(SSS_EXTENT)
+        # x moves by length * noise. In the burn-in, the factor Sigma grows as E^2 as well.
+        noise = (SSS_EXTENT / extent) ** 1.5 if burning else math.sqrt(extent / SSS_EXTENT)
+        keep = 1.0 - min(unit * friction, 1.0) if iteration > self.burn_in + 1 else 0.0
         return Coefficients(length, length * factor, keep, noise * math.sqrt(2.0 * unit * friction), burning)
 
 
@@ -91,7 +93,7 @@ def step(
     strength: Array,
     c: Coefficients,
 ) -> tuple[Array, Array]:
-    """Means and momenta after one step.
+    """Return the means and momenta after one step.
 
     Parameters
     ----------

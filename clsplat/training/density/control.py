@@ -1,0 +1,91 @@
+"""Changes of the splats after optimizer steps: densification, and the exploration noise of 3DGS-MCMC."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...device.program import lane_group
+from ...errors import TrainingError
+from ...rendering.build import KernelBuild
+from ...rendering.splat_buffers import SplatBuffers, SplatStatistics
+from ..config import TrainConfig
+from ..methods.sns import learning_groups
+from ..optim.noise import noise_amount, noise_reach
+from ..optim.optimizer import Optimizer
+from ..programs import optim_program
+from ..schedules import RunSchedule
+from .strategy import StepInfo, next_edit
+
+
+class DensityControl:
+    """Applies the densification strategy of a run.
+
+    Parameters
+    ----------
+    statistics : gradient statistics of the splats since the last densification.
+    rng : generator of the run.
+    extent : extent of the scene [world units].
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        schedule: RunSchedule,
+        splats: SplatBuffers,
+        optimizer: Optimizer,
+        statistics: SplatStatistics,
+        rng: np.random.Generator,
+        extent: float,
+    ) -> None:
+        self.config, self.schedule, self.splats, self.optimizer = config, schedule, splats, optimizer
+        self.statistics, self.rng, self.extent = statistics, rng, extent
+
+    def is_due(self, iteration: int) -> bool:
+        """Whether the strategy densifies after this iteration."""
+        first, last = self.schedule.densify_first, self.schedule.densify_last
+        return first <= iteration <= last and iteration % self.config.density.densify_interval == 0
+
+    def densify(self, iteration: int) -> None:
+        """Add, move and remove splats, and start the statistics anew.
+
+        Raises
+        ------
+        TrainingError : no splat was visible since the last densification, or no splat is finite.
+        """
+        info = StepInfo(iteration, self.schedule.densify_last, self.schedule.growth, self.extent)
+        self.optimizer.settle()
+        arrays, statistics = self.splats.download(self.splats.n), self.statistics.read(self.splats.n)
+        if self.splats.n and not statistics[SplatStatistics.TIMES_SEEN].any():
+            raise TrainingError(
+                f"iteration {iteration}: no image shows any splat (transparent, or outside of all images): "
+                "check the start (init) and the learning rates"
+            )
+        edit = next_edit(self.config, arrays, statistics, self.rng, info)
+        self.optimizer.apply(self.optimizer.arranged(edit))
+        self.statistics.reset()
+
+
+class ExplorationNoise:
+    """Moves nearly transparent splats at random after each step of the base parameters (3DGS-MCMC)."""
+
+    def __init__(self, config: TrainConfig, kernels: KernelBuild, splats: SplatBuffers, extent: float) -> None:
+        self.config, self.kernels, self.splats, self.extent = config, kernels, splats, extent
+        self.program = optim_program(splats.device, kernels)
+
+    def add(self, iteration: int, mean_lr: float) -> None:
+        """Add the noise of one iteration. mean_lr : rate of the positions, with the scene extent [world units]."""
+        config = self.config
+        if not config.density.noise_lr or not learning_groups(iteration, config).base:
+            return
+        self.program.mcmc_noise.over(
+            -(-self.splats.n // self.kernels.lanes),
+            lane_group(self.splats.device),
+            geom=self.splats.geom,
+            capacity=self.splats.capacity,
+            n_splats=self.splats.n,
+            seed_lo=config.seed & 0xFFFFFFFF,
+            seed_hi=config.seed >> 32,
+            iteration=iteration,
+            amount=noise_amount(config.density.noise_lr, mean_lr, self.extent),
+            reach=noise_reach(self.extent),
+        )

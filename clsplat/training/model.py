@@ -1,0 +1,41 @@
+"""The result of a training run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..evaluation.evaluate import Evaluation
+from ..splats.splats import Splats
+from .config import TrainConfig
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained model.
+
+    Attributes
+    ----------
+    iteration : iterations done; fewer than the config's if the run was interrupted.
+    seconds : training time, without evaluations.
+    peak_bytes : host memory at its peak. On a CPU device it includes the device memory.
+    device_bytes : memory of the pools of buffers.
+    evaluations : metrics of the test views by iteration, for the config's `test_iterations`.
+    evaluation_seconds : training time at each evaluation.
+    path : the model folder, or None.
+    """
+
+    splats: Splats
+    config: TrainConfig
+    iteration: int
+    seconds: float
+    peak_bytes: int
+    device_bytes: int
+    evaluations: dict[int, Evaluation] = field(default_factory=dict)
+    evaluation_seconds: dict[int, float] = field(default_factory=dict)
+    path: Path | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether all iterations are done."""
+        return self.iteration >= self.config.iterations
