@@ -1,7 +1,7 @@
-"""How every chart looks, and how it is written: the only module that imports matplotlib.
+"""Looks and files of every chart. This is the only module that imports matplotlib.
 
-Colours are told apart with the common kinds of colour blindness (Okabe and Ito 2008, the yellow darkened); each shape
-has one, the same in every chart, and a marker besides. Files are the same bytes for the same data.
+The colours can be distinguished with the common kinds of colour blindness (Okabe and Ito 2008, the yellow darkened).
+Each shape has one colour and one marker, the same in every chart. The same data give the same bytes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ _CATEGORIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8c8c1e", "#56b4e9",
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X", "h")
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1, 1.3)), (0, (6, 1.3, 1, 1.3)), (0, (3, 1.2, 1, 1.2, 1, 1.2)))
 _LEGEND_COLUMNS = 4
-# Of a label beside its point: across in 6 points, up in 8. Above a front and to its left there is nothing.
+# Positions of a label beside its point: across in units of 6 points, up in units of 8. The first ones are above and to
+# the left, because no point of a Pareto front lies there.
 _SPOTS = ((-1.0, 0.7), (0.0, 1.2), (-1.0, 0.0), (1.0, -0.7), (1.0, 0.7), (1.0, 0.0), (0.0, -1.2), (-1.0, -0.7))
 _STYLE = {
     "figure.dpi": 100,
@@ -67,18 +68,18 @@ _STYLE = {
 
 
 def available() -> bool:
-    """Whether charts can be drawn here."""
+    """Whether matplotlib is installed."""
     return importlib.util.find_spec("matplotlib") is not None
 
 
 @contextmanager
 def drawing(out: str | Path, width: float = WIDTH, height: float = 4.0) -> Iterator[Any]:
-    """An empty figure to draw on, written as `out`.png and `out`.svg when the block ends well.
+    """An empty figure to draw on. Its files `out`.png and `out`.svg are written if the block ends without an error.
 
     Parameters
     ----------
-    out : path without a suffix, or with that of one of the two.
-    width, height : inches; 100 dots an inch on a page, 200 in the PNG.
+    out : path without a suffix, or with one of the two suffixes.
+    width, height : size [inches]; 100 dots an inch on a page, 200 in the PNG.
 
     Raises
     ------
@@ -110,36 +111,48 @@ def chart_paths(out: str | Path) -> list[Path]:
 
 
 def shape_colour(shape: str) -> str:
-    """Its colour; ink for a shape that is not known."""
-    return dict(zip(SHAPES, _COLOURS, strict=True)).get(shape, INK)
+    """Colour of a shape; INK for an unknown shape."""
+    return _shape_style(shape, _COLOURS, INK)
 
 
-def category_colour(place: int) -> str:
-    """Colour of the `place`th of some categories that are no shapes."""
-    return _CATEGORIES[place % len(_CATEGORIES)]
+def category_colour(index: int) -> str:
+    """Colour of a category that is not a shape."""
+    return _CATEGORIES[index % len(_CATEGORIES)]
 
 
-def looks(systems: dict[str, str]) -> dict[str, dict[str, Any]]:
-    """Keywords of `Axes.plot` for systems, label to shape: the shape's colour and marker, and dashes within it."""
-    seen: dict[str, int] = {}
-    found = {}
-    # A system called by its shape is the plain one of its colour, whatever stands before it.
-    for label, shape in sorted(systems.items(), key=lambda item: item[0] != item[1]):
-        place = seen.setdefault(shape, 0)
-        seen[shape] += 1
-        marker = dict(zip(SHAPES, _MARKERS, strict=True)).get(shape, "o")
-        found[label] = {
+def looks(methods: dict[str, str]) -> dict[str, dict[str, Any]]:
+    """Keywords of `Axes.plot` for each method.
+
+    A method has the colour and the marker of its shape. Methods of one shape differ in their dashes.
+
+    Parameters
+    ----------
+    methods : the shape of each method, by label.
+    """
+    count: dict[str, int] = {}
+    keywords = {}
+    # The method that has its shape's name gets the plain line.
+    for label, shape in sorted(methods.items(), key=lambda item: item[0] != item[1]):
+        index = count.setdefault(shape, 0)
+        count[shape] += 1
+        keywords[label] = {
             "color": shape_colour(shape),
-            "marker": marker,
-            "linestyle": _DASHES[place % len(_DASHES)],
-            "markerfacecolor": shape_colour(shape) if place % 2 == 0 else "white",
+            "marker": _shape_style(shape, _MARKERS, "o"),
+            "linestyle": _DASHES[index % len(_DASHES)],
+            "markerfacecolor": shape_colour(shape) if index % 2 == 0 else "white",
             "markeredgecolor": shape_colour(shape),
         }
-    return {label: found[label] for label in systems}
+    return {label: keywords[label] for label in methods}
+
+
+def _shape_style(shape: str, styles: Sequence[str], unknown: str) -> str:
+    """A style for each shape; they repeat if there are more shapes than styles."""
+    names = list(SHAPES)
+    return styles[names.index(shape) % len(styles)] if shape in names else unknown
 
 
 def short_count(number: float, _: object = None) -> str:
-    """950, 1k, 2.5k, 1M: for ticks and labels."""
+    """A number for ticks and labels, such as 950, 1k, 2.5k, 1M."""
     for unit, letter in ((1e6, "M"), (1e3, "k")):
         if abs(number) >= 0.9995 * unit:
             return f"{number / unit:.3g}{letter}"
@@ -147,11 +160,12 @@ def short_count(number: float, _: object = None) -> str:
 
 
 def log_axis(axis: Any, low: float, high: float) -> None:
-    """Ticks at 1, 2, 5 of each decade (1 alone over many decades), as `short_count`.
+    """Set ticks at 1, 2 and 5 of each decade, written by `short_count`; over many decades at 1 alone.
 
     Parameters
     ----------
-    axis : `Axes.xaxis` or `yaxis`, on a logarithmic scale. low, high : what it shows.
+    axis : `Axes.xaxis` or `yaxis`, on a logarithmic scale.
+    low, high : range of the axis.
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
@@ -163,7 +177,7 @@ def log_axis(axis: Any, low: float, high: float) -> None:
 
 
 def tile(corner: tuple[float, float], fill: str, label: str | None = None) -> Any:
-    """A unit square, as a cell of a table or, with a label, in a legend."""
+    """A unit square: a cell of a table, or with a label an entry of a legend."""
     from matplotlib.patches import Rectangle
 
     return Rectangle(corner, 1, 1, facecolor=fill, edgecolor=FAINT if label else "white", linewidth=1.2, label=label)
@@ -183,11 +197,12 @@ def star(shape: str) -> dict[str, Any]:
 
 
 def system_legend(figure: Any, styles: dict[str, dict[str, Any]], stars: dict[str, str] | None = None) -> None:
-    """All systems below the panels.
+    """Draw a legend of all methods below the panels.
 
     Parameters
     ----------
-    styles : of `looks`. stars : label to shape of those drawn as stars.
+    styles : what `looks` returned.
+    stars : shapes of the methods that are drawn as stars, by label.
     """
     from matplotlib.lines import Line2D
 
@@ -197,19 +212,19 @@ def system_legend(figure: Any, styles: dict[str, dict[str, Any]], stars: dict[st
 
 
 def legend_rows(entries: int) -> int:
-    """Lines of a legend, each about 0.2 inches high."""
+    """Number of lines of a legend, each about 0.2 inches high."""
     return -(-entries // _LEGEND_COLUMNS)
 
 
 def place_labels(figure: Any, labels: Sequence[tuple[Any, Sequence[Label]]], *, size: float = 7.5) -> None:
-    """Write beside points where no curve, point or other label is; without room for it a label is left out.
+    """Write labels beside points, where they cover no curve, point or other label.
 
-    Call it last: the layout is settled by it.
+    A label without room is left out. Call this last, because it fixes the layout.
 
     Parameters
     ----------
     labels : axes and the labels on them, the most important first.
-    size : of the letters, points.
+    size : of the letters [points].
     """
     _settle(figure)
     for axes, points in labels:
@@ -217,14 +232,14 @@ def place_labels(figure: Any, labels: Sequence[tuple[Any, Sequence[Label]]], *, 
 
 
 def _settle(figure: Any) -> None:
-    """Lay out once and for all, not again for each file."""
+    """Fix the layout, so that it is not computed again for each file."""
     if figure.get_constrained_layout():
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
 
 
 def _place(axes: Any, points: Sequence[Label], size: float, dot: float) -> None:
-    """The labels of one panel; `dot` is a point's pixels."""
+    """Place the labels of one panel. `dot` is the size of a point [px]."""
     box, near = axes.bbox, 3 * dot
     marked = [line for line in axes.lines if line.get_marker() not in ("None", "", None)]
     taken = [(x - near, y - near, x + near, y + near) for line in marked for x, y in _pixels(line, near)]
@@ -252,7 +267,7 @@ def _place(axes: Any, points: Sequence[Label], size: float, dot: float) -> None:
 
 
 def _pixels(line: Any, step: float) -> list[tuple[float, float]]:
-    """Places on a line's path, at most `step` pixels apart; of a line without strokes its points."""
+    """Positions on a line, at most `step` pixels apart; for a line without strokes its points."""
     path = line.get_path()
     corners = line.get_transform().transform(path.vertices).tolist()
     found = [(x, y) for x, y in corners]

@@ -1,4 +1,4 @@
-"""Rendering views and measuring them against their photographs."""
+"""Evaluation of a model on views: rendering, and metrics against the photos."""
 
 from __future__ import annotations
 
@@ -16,12 +16,19 @@ from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from .metrics import DEFAULT_PROTOCOL, MetricProtocol
 
-MAX_PSNR = 100.0  # stands in for the infinity of two equal images, which JSON cannot hold
+MAX_PSNR = 100.0  # replaces the infinite PSNR of equal images, which JSON cannot hold
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Metrics of views: means, and per view by name; `render_ms` is the median wall time of a render."""
+    """Metrics of views.
+
+    Attributes
+    ----------
+    psnr, ssim : means over the views; PSNR in dB.
+    render_ms : median wall time of a render [ms].
+    per_view : metrics by the view's name.
+    """
 
     psnr: float
     ssim: float
@@ -37,16 +44,16 @@ def evaluate(
     protocol: MetricProtocol = DEFAULT_PROTOCOL,
     on_view: Callable[[View, Rendered], None] | None = None,
 ) -> Evaluation:
-    """Render every view and compare it with its photograph.
+    """Render every view and compare it with its photo.
 
     Parameters
     ----------
-    views : at least one; pixels that a mask hides are left out.
-    on_view : called with each view and its render, to save it.
+    views : at least one; pixels that a mask hides do not count.
+    on_view : called with each view and its render.
     """
     per_view: dict[str, dict[str, float]] = {}
     times = []
-    renderer.render(splats, views[0].camera, background)  # builds, uploads
+    renderer.render(splats, views[0].camera, background)  # builds the kernels and uploads the splats
     for view in views:
         start = time.perf_counter()
         image = renderer.render(splats, view.camera, background)

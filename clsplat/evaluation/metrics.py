@@ -1,7 +1,7 @@
-"""Image quality: PSNR and SSIM, and the protocol that says how they were taken.
+"""Image quality: PSNR and SSIM, and the protocol that defines how they are computed.
 
-"PSNR" and "SSIM" differ between tools by rounding and by padding, enough to change a ranking; every table
-therefore names its `MetricProtocol`.
+"PSNR" and "SSIM" differ between tools by rounding and by padding, enough to change a ranking. Therefore every table
+names its `MetricProtocol`.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ SSIM_C2 = 0.03**2
 
 @dataclass(frozen=True, slots=True)
 class MetricProtocol:
-    """How metrics are taken.
+    """How metrics are computed.
 
     Parameters
     ----------
     name : as on the command line.
-    rounded : both images are rounded to 8 bits first.
-    padding : SSIM over windows inside the image only ("valid"), or zeros around it and one window per
-        pixel ("zero").
-    corrected : the first image is brought to the second one's exposure before, by `color_corrected`.
+    rounded : round both images to 8 bits first.
+    padding : "valid" computes SSIM over windows inside the image only; "zero" pads the image with zeros and takes one
+        window per pixel.
+    corrected : bring the first image to the exposure of the second before, by `color_corrected`.
     """
 
     name: str
@@ -42,19 +42,19 @@ class MetricProtocol:
     corrected: bool = False
 
     def measure(self, a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> dict[str, float]:
-        """`{"PSNR": dB, "SSIM": -1..1}` of one image pair.
+        """Return `{"PSNR": dB, "SSIM": -1..1}` for one pair of images.
 
         Parameters
         ----------
-        a, b : (H, W) or (H, W, C), a render and its photo, say.
-        mask : (H, W), True where a pixel counts; None where all do.
+        a, b : (H, W) or (H, W, C), such as a render and its photo.
+        mask : (H, W), True where a pixel counts; None counts all pixels.
         """
         if self.corrected:
             a = color_corrected(a, b, mask)
         return {"PSNR": psnr(a, b, self.rounded, mask), "SSIM": ssim(a, b, self.padding, self.rounded, mask)}
 
     def describe(self) -> dict[str, str]:
-        """What to write beside the numbers."""
+        """Texts on how each metric is computed, by metric; and the protocol's name."""
         images = "rounded to 8 bits" if self.rounded else "real-valued, clipped to 0..1"
         if self.corrected:
             images = f"render in the photo's exposure (affine, least squares), {images}"
@@ -69,7 +69,7 @@ DEFAULT_PROTOCOL = PROTOCOLS["clsplat"]
 
 
 def protocol_named(name: str) -> MetricProtocol:
-    """Protocol of `name`; raises InputError listing the known names."""
+    """Return the protocol of that name; raise InputError, which lists the known names, for another."""
     try:
         return PROTOCOLS[name]
     except KeyError:
@@ -77,13 +77,13 @@ def protocol_named(name: str) -> MetricProtocol:
 
 
 def color_corrected(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
-    """Image `a` (H, W, 3), 0..1, through the affine map of colours that brings it nearest to `b`, in least squares.
+    """Return image `a` (H, W, 3), 0..1, after the affine map of colours that brings it nearest to `b` in least squares.
 
-    For photos of unknown exposure, whose error would hide all others.
+    This is for photos of unknown exposure: the error of the exposure would hide all other errors.
 
     Parameters
     ----------
-    mask : (H, W), True where a pixel counts.
+    mask : (H, W), True where a pixel counts; None counts all pixels.
 
     Raises
     ------
@@ -94,19 +94,18 @@ def color_corrected(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | 
         raise InputError(f"colour correction: an image of shape {x.shape}; expected (H, W, 3)")
     inputs = np.concatenate([x, np.ones((*x.shape[:2], 1))], axis=2)
     counts = np.ones(x.shape[:2], bool) if mask is None else mask
-    found = np.linalg.lstsq(inputs[counts], y[counts], rcond=None)[0]
-    corrected: NDArray[np.float64] = np.clip(inputs @ found, 0.0, 1.0)
-    return corrected
+    colour_map = np.linalg.lstsq(inputs[counts], y[counts], rcond=None)[0]
+    return np.clip(inputs @ colour_map, 0.0, 1.0)
 
 
 def psnr(a: NDArray[Any], b: NDArray[Any], rounded: bool = True, mask: NDArray[np.bool_] | None = None) -> float:
-    """Peak signal-to-noise ratio [dB] over all pixels that count and channels; infinite for equal images.
+    """Return the peak signal-to-noise ratio [dB] over channels and pixels that count; infinite for equal images.
 
     Parameters
     ----------
     a, b : (H, W) or (H, W, C), uint8 or real numbers that are clipped to 0..1.
-    rounded : round both to 8 bits first, as files would.
-    mask : (H, W), True where a pixel counts; None where all do.
+    rounded : round both to 8 bits first, as an image file does.
+    mask : (H, W), True where a pixel counts; None counts all pixels.
 
     Raises
     ------
@@ -125,15 +124,15 @@ def ssim(
     rounded: bool = True,
     mask: NDArray[np.bool_] | None = None,
 ) -> float:
-    """Structural similarity, the mean over its map and over channels.
+    """Return the structural similarity (Wang et al. 2004): the mean of its map over pixels and channels.
 
     Parameters
     ----------
     a, b : (H, W) or (H, W, C), uint8 or real numbers that are clipped to 0..1.
     padding : "valid" uses windows inside the image only; "zero" sets zeros around it (3DGS).
-    rounded : round both to 8 bits first, as files would.
-    mask : (H, W), True where a pixel counts; None where all do. Elsewhere `a` is taken to equal `b`, and windows around
-        such pixels do not count.
+    rounded : round both to 8 bits first, as an image file does.
+    mask : (H, W), True where a pixel counts; None counts all pixels. Hidden pixels of `a` are set to those of `b`, and
+        windows around them do not count.
 
     Raises
     ------
@@ -157,14 +156,14 @@ def ssim(
     if padding == "valid":
         inside = slice(SSIM_RADIUS, -SSIM_RADIUS)
         similarity, mask = similarity[inside, inside], None if mask is None else mask[inside, inside]
-    # Where a mask leaves nothing inside the border, there is nothing to be unlike.
+    # A mask can hide everything inside the border; no difference is then visible.
     counted = similarity if mask is None else similarity[mask]
     return float(np.mean(counted)) if counted.size else 1.0
 
 
 def _blur(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """SSIM's window mean along both axes, zeros outside."""
-    from scipy.ndimage import correlate1d  # half a second to import
+    """Mean over SSIM's window, with zeros outside the image."""
+    from scipy.ndimage import correlate1d  # slow to import
 
     offsets = np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1)
     window = np.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
@@ -183,7 +182,7 @@ def _pair(a: NDArray[Any], b: NDArray[Any], rounded: bool) -> tuple[NDArray[np.f
 
 
 def _unit(image: NDArray[Any], rounded: bool) -> NDArray[np.float64]:
-    """Image as float64 in 0..1."""
+    """The image as float64 in 0..1."""
     if image.dtype == np.uint8:
         return image.astype(np.float64) / 255.0
     unit = np.clip(image.astype(np.float64), 0.0, 1.0)

@@ -1,7 +1,7 @@
-"""Metrics of other packages: LPIPS (lpips, with PyTorch) and FLIP (flip-evaluator). The only module that imports them.
+"""Metrics of other packages: LPIPS (lpips, with PyTorch) and FLIP (flip-evaluator).
 
-Both compare images rounded to 8 bits. Where a mask hides pixels, the photo's stand in for the render's, so that nothing
-differs there.
+This is the only module that imports them. Both compare images rounded to 8 bits. Hidden pixels of the render are
+replaced by those of the photo, so that no difference is visible there.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, reason_of
+from ..files.masks import Mask
 
 Image = NDArray[np.floating[Any]] | NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
-# The trunk that torchvision fetches for the net "vgg" (its IMAGENET1K_V1); lpips brings what lies on top of it.
+# Weights that torchvision downloads for the net "vgg" (its IMAGENET1K_V1); lpips itself contains the layers on top.
 VGG_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 VGG_MEGABYTES = 528
 _line = partial(reason_of, max_length=160)
-_LEAST = 32  # px, of VGG's five halvings
+MIN_SIZE = 32  # px: VGG halves the image five times
 
 
 class Lpips:
-    """LPIPS 0.1 (Zhang et al. 2018) with VGG16, as papers on splatting report it; 0 for equal images, less is better.
+    """LPIPS 0.1 (Zhang et al. 2018) with VGG16, as papers on splatting report it; 0 for equal images, lower is better.
 
     Parameters
     ----------
-    unit_range : images go into the net in 0..1, as 3DGS's script has it, not in the -1..1 that the net was made for.
+    unit_range : pass images to the net in 0..1, as 3DGS's script does. The net was made for -1..1.
 
     Raises
     ------
-    InputError : the package or its weights cannot be had; says which, and where to put them.
+    InputError : the package is not installed, or its weights are missing; the message says where to put them.
     """
 
     def __init__(self, unit_range: bool = False) -> None:
@@ -48,7 +48,7 @@ class Lpips:
                 f"LPIPS needs the package lpips, with PyTorch and torchvision ({_line(error)}): "
                 "pip install 'clsplat[lpips]'"
             ) from None
-        except Exception as error:  # of torch and torchvision builds that do not belong together
+        except Exception as error:  # torch and torchvision of different versions raise many kinds
             raise InputError(
                 f"LPIPS: the package lpips cannot be loaded ({_line(error)}): install versions of torch "
                 "and torchvision that belong together"
@@ -60,7 +60,7 @@ class Lpips:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # lpips calls torchvision by an old name
                 self._net = lpips.LPIPS(net="vgg", verbose=False)
-        except Exception as error:  # of the network, the disk, or a damaged file
+        except Exception as error:  # the network, the disk or a damaged file
             if was_there:
                 raise InputError(
                     f"{weights}: LPIPS's weights cannot be read ({_line(error)}): delete the file, and "
@@ -72,22 +72,22 @@ class Lpips:
             ) from None
 
     def __call__(self, render: Image, photo: Image, mask: Mask | None = None) -> float:
-        """Distance of two images (H, W, 3), bytes or reals in 0..1.
+        """Return the distance of two images (H, W, 3), bytes or reals in 0..1.
 
         Raises
         ------
-        InputError : an image below 32 px.
+        InputError : an image is smaller than MIN_SIZE.
         """
-        if min(photo.shape[:2]) < _LEAST:
+        if min(photo.shape[:2]) < MIN_SIZE:
             raise InputError(
-                f"LPIPS: an image of {photo.shape[1]}x{photo.shape[0]} px; the net needs {_LEAST} at least"
+                f"LPIPS: an image of {photo.shape[1]}x{photo.shape[0]} px; the net needs {MIN_SIZE} at least"
             )
         a, b = (self._tensor(image) for image in _pair(render, photo, mask))
         with self._torch.inference_mode():
             return float(self._net(a, b))
 
     def describe(self) -> str:
-        """What to write beside the numbers."""
+        """Text on how the metric is computed."""
         return f"lpips 0.1, net vgg, inputs {'0..1' if self.unit_range else '-1..1'}, rounded to 8 bits"
 
     def _tensor(self, image: NDArray[np.float32]) -> Any:
@@ -96,7 +96,7 @@ class Lpips:
 
 
 class Flip:
-    """LDR-FLIP (Andersson et al. 2020), at 67 pixels a degree; 0 for equal images, 1 at most.
+    """LDR-FLIP (Andersson et al. 2020) at 67 pixels a degree, from 0 for equal images to 1.
 
     Raises
     ------
@@ -113,19 +113,19 @@ class Flip:
         self._evaluate = flip_evaluator.evaluate
 
     def __call__(self, render: Image, photo: Image, mask: Mask | None = None) -> NDArray[np.float32]:
-        """(H, W) map of two images (H, W, 3), bytes or reals in 0..1."""
+        """Return the (H, W) map of differences of two images (H, W, 3), bytes or reals in 0..1."""
         a, b = _pair(render, photo, mask)
-        found = np.asarray(self._evaluate(b, a, "LDR", applyMagma=False, computeMeanError=False)[0], np.float32)
-        return found.reshape(found.shape[:2])
+        flip_map = np.asarray(self._evaluate(b, a, "LDR", applyMagma=False, computeMeanError=False)[0], np.float32)
+        return flip_map.reshape(flip_map.shape[:2])
 
     @staticmethod
-    def mean(found: NDArray[np.float32], mask: Mask | None = None) -> float:
-        """Of a map, over the pixels that count."""
-        return float(np.mean(found if mask is None else found[mask], dtype=np.float64))
+    def mean(flip_map: NDArray[np.float32], mask: Mask | None = None) -> float:
+        """Mean of a map over the pixels that count."""
+        return float(np.mean(flip_map if mask is None else flip_map[mask], dtype=np.float64))
 
     @staticmethod
     def describe() -> str:
-        """What to write beside the numbers."""
+        """Text on how the metric is computed."""
         return "LDR-FLIP, mean of the map, 67 pixels a degree, rounded to 8 bits"
 
 
@@ -135,6 +135,6 @@ def _pair(render: Image, photo: Image, mask: Mask | None) -> tuple[NDArray[np.fl
 
 
 def _unit(image: Image) -> NDArray[np.float32]:
-    """In 0..1 and steps of 8 bits."""
+    """The image in 0..1, in steps of 8 bits."""
     steps = image if image.dtype == np.uint8 else np.rint(np.clip(image, 0.0, 1.0) * 255.0)
     return np.ascontiguousarray(steps, np.float32) / np.float32(255)

@@ -1,4 +1,4 @@
-"""The state of a run between two iterations, in one file written whole or not at all."""
+"""The state of a run between two iterations, in one file that is written whole or not at all."""
 
 from __future__ import annotations
 
@@ -26,14 +26,15 @@ class Checkpoint:
 
     Parameters
     ----------
-    iteration : iterations done.
-    config : of the run, as JSON.
+    iteration : number of iterations done.
+    config : the run's options, as JSON.
     splats : public arrays by field.
-    optimizer : its state by key.
+    optimizer : the optimizer's state by key.
     rng : state of the NumPy generator, as JSON.
-    queue : training views still to come in this epoch.
-    seconds : training time so far. schedule : of the kernels, whose rounding depends on it.
-    n_first : splats at the start, which the growth depends on.
+    queue : training views left in this epoch.
+    seconds : training time so far.
+    schedule : schedule of the kernels, which their rounding depends on.
+    n_first : number of splats at the start, which the growth depends on.
     signals : (3, N), see Pipeline.signals.
     """
 
@@ -49,7 +50,7 @@ class Checkpoint:
     signals: Array
 
     def save(self, path: Path) -> None:
-        """Write; raises OutputError when the disk is full or the folder read-only (the old file stays)."""
+        """Write the file. If that fails, raise OutputError and keep the old file."""
         meta = {
             "version": VERSION,
             "iteration": self.iteration,
@@ -69,7 +70,7 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:
-        """Read; raises InputError when the file is missing, damaged or of another version."""
+        """Read the file; raise InputError if it is missing, damaged or of another version."""
         try:
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
@@ -104,8 +105,10 @@ class Checkpoint:
         return checkpoint
 
     def _check(self) -> None:
-        """Raises one of _DAMAGE where a value cannot be what `save` wrote. The zip's checksums find damage to bytes;
-        this finds a file that was put together by something else."""
+        """Raise one of _DAMAGE if a value cannot be what `save` wrote.
+
+        The zip's checksums find damaged bytes. This finds a file that another program made.
+        """
         for name, kind in _KINDS.items():
             value = getattr(self, name)
             if not isinstance(value, kind) or isinstance(value, bool):
@@ -113,12 +116,12 @@ class Checkpoint:
         if self.iteration < 0 or self.n_first < 1 or not 0 <= self.seconds < math.inf:
             raise ValueError("its iteration, n_first or seconds are out of range")
         if not all(type(place) is int and place >= 0 for place in self.queue):
-            raise ValueError("its queue is none of views")
+            raise ValueError("its queue is not a list of views")
         np.random.default_rng().bit_generator.state = self.rng
         n = len(self.splats["mean"])
         for group in (self.splats, self.optimizer, {"signals": self.signals}):
             if not all(values.dtype.kind in "fiu" and values.ndim for values in group.values()):
-                raise ValueError("it holds something that is no array of numbers")
+                raise ValueError("it holds something that is not an array of numbers")
         if any(len(values) != n for values in self.splats.values()) or self.signals.shape != (3, n):
             raise ValueError("its arrays are not of the same splats")
 

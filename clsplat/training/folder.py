@@ -49,16 +49,16 @@ class ModelFolder:
         return self.path / "checkpoint.npz"
 
     def ply_path(self, iteration: int) -> Path:
-        """Point cloud of one iteration."""
+        """File of an iteration's point cloud."""
         return self.path / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
     @property
     def is_used(self) -> bool:
-        """Whether a run has written here."""
+        """Whether a run has written into the folder."""
         return any(p.exists() for p in (self.config_path, self.checkpoint_path, self.path / "point_cloud"))
 
     def iterations(self) -> list[int]:
-        """Iterations with a point cloud, rising."""
+        """Iterations with a point cloud, in rising order."""
         found = []
         for folder in (self.path / "point_cloud").glob("iteration_*"):
             match = _ITERATION.fullmatch(folder.name)
@@ -67,7 +67,7 @@ class ModelFolder:
         return sorted(found)
 
     def latest_ply(self, iteration: int | None = None) -> tuple[Path, int]:
-        """Point cloud of `iteration`, or the last; raises InputError when there is none."""
+        """Return the point cloud of an iteration, or the last, and its iteration; raise InputError if there is none."""
         found = self.iterations()
         if not found:
             raise InputError(f"{self.path}: no point_cloud/iteration_N/point_cloud.ply in it: train a model first")
@@ -77,7 +77,7 @@ class ModelFolder:
         return self.ply_path(chosen), chosen
 
     def prepare(self) -> None:
-        """Make the folder; raises OutputError when nothing can be written there."""
+        """Make the folder; raise OutputError if it cannot be written."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             probe = self.path / ".clsplat-write-test"
@@ -88,7 +88,7 @@ class ModelFolder:
             raise OutputError(f"{self.path}: cannot be written ({reason}): choose another folder") from None
 
     def clear(self) -> None:
-        """Remove what a former run wrote, and nothing else."""
+        """Remove the files of an earlier run, and nothing else."""
         for path in (
             self.checkpoint_path,
             self.log_path,
@@ -109,23 +109,23 @@ class ModelFolder:
         self.write_config({"config": config, "scene": scene_record(scene)})
 
     def write_config(self, values: dict[str, Any]) -> None:
-        """The run's options and scene."""
+        """Write config.json."""
         write_json(self.config_path, values)
 
     def read_config(self) -> dict[str, Any]:
-        """What `write_config` wrote; raises InputError when it is missing or damaged."""
+        """Read config.json; raise InputError if it is missing or damaged."""
         return read_object(self.config_path)
 
     def write_cameras(self, named: list[NamedCamera]) -> None:
-        """3DGS's cameras.json."""
+        """Write 3DGS's cameras.json."""
         write_cameras(self.cameras_path, named)
 
     def write_exposures(self, by_photo: dict[str, list[list[float]]]) -> None:
-        """3DGS's exposure.json."""
+        """Write 3DGS's exposure.json."""
         write_json(self.exposures_path, by_photo)
 
     def save(self, splats: Splats, iteration: int) -> Path:
-        """Write the point cloud of an iteration."""
+        """Write the point cloud of an iteration and return its file."""
         path = self.ply_path(iteration)
         splats.save(path)
         return path

@@ -1,4 +1,4 @@
-"""Ctrl-C that lets an iteration end."""
+"""Handling of Ctrl-C that lets an iteration end."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 @contextmanager
 def stoppable(enabled: bool) -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; a second one interrupts as usual."""
+    """Yield an event that the first Ctrl-C sets. A second Ctrl-C interrupts as usual."""
     stop = threading.Event()
     if not enabled or threading.current_thread() is not threading.main_thread():
         yield stop

@@ -1,4 +1,4 @@
-"""log.jsonl of a run, and what a progress display is told."""
+"""A run's log.jsonl, and the values for a progress display."""
 
 from __future__ import annotations
 
@@ -15,7 +15,16 @@ from ..files.atomic import atomic_writer
 
 @dataclass(frozen=True)
 class Progress:
-    """What a progress display needs; `psnr` is of the last training image, `seconds` of training only."""
+    """Values for a progress display.
+
+    Attributes
+    ----------
+    iteration, iterations : done, and in all.
+    loss, psnr : of the last training image; PSNR in dB.
+    seconds : training time, without evaluations.
+    per_second : iterations a second.
+    message : text to show instead of these values.
+    """
 
     iteration: int
     iterations: int
@@ -32,7 +41,7 @@ class Progress:
 
 
 class RunLog:
-    """log.jsonl: one line per report, appended; lines past the resumed iteration are dropped."""
+    """The file log.jsonl, with one line for each report. A resumed run removes the lines after its iteration."""
 
     def __init__(self, path: Path | None, iteration: int) -> None:
         self.path = path
@@ -45,7 +54,7 @@ class RunLog:
                     if json.loads(line)["iteration"] <= iteration:
                         kept.append(line + b"\n")
                 except (ValueError, KeyError, TypeError):
-                    continue  # a line cut short by a crash
+                    continue  # a crash cut this line short
         with atomic_writer(path) as stream:  # a crash while it is written loses nothing
             stream.writelines(kept)
         self._stream = self._guard(lambda: path.open("a"))

@@ -1,4 +1,4 @@
-"""What a long run shows: one line that is rewritten on a terminal or in a notebook, elsewhere a line now and then."""
+"""Progress of a long run: one line that is rewritten on a terminal or in a notebook; elsewhere a line at intervals."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from typing import ClassVar, TextIO
 
 from .log import Progress
 
-PLAIN_INTERVAL = 10.0  # seconds between lines where nothing can be rewritten
-_BAR = (4, 20)  # characters, least and most
+PLAIN_INTERVAL = 10.0  # seconds between lines if a line cannot be rewritten
+_MIN_BAR, _MAX_BAR = 4, 20  # length of the bar [characters]
 _NOTEBOOK_COLUMNS, _USUAL_COLUMNS = 100, 80
 
 
 class LiveLine:
     """A line of text that changes.
 
-    It uses no colours and no escape sequences but the carriage return; where that cannot be trusted (a file, a pipe,
-    TERM=dumb) it writes whole lines, `PLAIN_INTERVAL` apart.
+    The carriage return is its only control character. If the stream does not support it (a file, a pipe, TERM=dumb),
+    whole lines are written, PLAIN_INTERVAL apart.
 
     Parameters
     ----------
-    stream : standard error by default, in a notebook standard output. clock : seconds.
+    stream : by default standard error, and in a notebook standard output.
+    clock : a function that returns seconds.
     """
 
-    _open: ClassVar[LiveLine | None] = None  # the one whose cursor stands at the end of a line
+    _open: ClassVar[LiveLine | None] = None  # the line that the cursor is on
 
     def __init__(self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         notebook = stream is None and _in_notebook()
@@ -44,7 +45,8 @@ class LiveLine:
 
         Parameters
         ----------
-        text : or what makes one that fits some columns; 0 stands for any number. last : it is to stay.
+        text : the line, or a function that makes one for a number of columns; 0 columns means any length.
+        last : keep the line, and go to the next.
         """
         make = text if callable(text) else lambda _: text
         if self.live:
@@ -59,25 +61,25 @@ class LiveLine:
             self._write(make(0) + "\n")
 
     def say(self, text: str) -> None:
-        """A line of its own, above the one that changes."""
+        """Write a separate line above the one that changes."""
         self.clear()
         self._write(text + "\n")
 
     def clear(self) -> None:
-        """Take the line away, for others to write; it comes back when it is next shown."""
+        """Remove the line until it is shown again, so that others can write."""
         if LiveLine._open is self:
             self._write("\r" + " " * self._length + "\r")
             self._length, LiveLine._open = 0, None
 
     def close(self) -> None:
-        """Leave the line as it stands and go to the next."""
+        """Keep the line and go to the next."""
         if LiveLine._open is self:
             self._write("\n")
             self._length, LiveLine._open = 0, None
 
     @classmethod
     def give_way(cls) -> None:
-        """Clear whichever line is open."""
+        """Clear the line that is open, if there is one."""
         if cls._open is not None:
             cls._open.clear()
 
@@ -87,11 +89,12 @@ class LiveLine:
 
 
 class TrainingDisplay:
-    """A `progress` callback for `train`, `train_budget` and others; a context manager too, which ends the line.
+    """A `progress` callback for `train`, `train_budget` and others. As a context manager it ends the line.
 
     Parameters
     ----------
-    quiet : show nothing. stream, clock : as of `LiveLine`.
+    quiet : show nothing.
+    stream, clock : as for `LiveLine`.
     """
 
     def __init__(
@@ -117,12 +120,12 @@ class TrainingDisplay:
 
 
 def progress_line(progress: Progress, columns: int = 0) -> str:
-    """Iteration, loss, PSNR, splats, speed and time left, with a bar.
+    """Return a line with iteration, loss, PSNR, splats, speed, time left and a bar.
 
     Parameters
     ----------
-    columns : that it may take: the loss, the speed and the number of splats are left out, in this order, where it is
-        narrow, the bar too; 0: as long as it is, without a bar.
+    columns : maximum length; 0 means any length, without a bar. If the line is too long, the loss, the speed, the
+        number of splats and the PSNR are omitted in this order, and the bar is shorter or omitted.
     """
     share = progress.iteration / progress.iterations
     count = f"{progress.iteration}/{progress.iterations}"
@@ -140,13 +143,12 @@ def progress_line(progress: Progress, columns: int = 0) -> str:
             break
         del fields[dropped]
     text = "  ".join(fields.values())
-    least, most = _BAR
-    bar = min(columns - len(count) - len(text) - 5, most)
-    return f"{count} [{'#' * round(bar * share):-<{bar}}]  {text}" if bar >= least else f"{count} {percents}  {text}"
+    bar = min(columns - len(count) - len(text) - 5, _MAX_BAR)
+    return f"{count} [{'#' * round(bar * share):-<{bar}}]  {text}" if bar >= _MIN_BAR else f"{count} {percents}  {text}"
 
 
 def duration(seconds: float) -> str:
-    """7 s, 2:31 or 1:02:31."""
+    """Return seconds as text, such as 7 s, 2:31 or 1:02:31."""
     if not math.isfinite(seconds):
         return "?"
     whole = round(seconds)
@@ -164,6 +166,6 @@ def _columns(stream: TextIO) -> int:
 
 
 def _in_notebook() -> bool:
-    """Whether this runs in the kernel of a notebook, whose output takes carriage returns though it is no terminal."""
+    """Whether this is the kernel of a notebook. Its output supports carriage returns, but is not a terminal."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return getattr(shell, "kernel", None) is not None

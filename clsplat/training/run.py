@@ -1,4 +1,4 @@
-"""The public call that trains: where results go, what may be overwritten, what a resumed run must agree with."""
+"""The public function that trains. It checks what may be overwritten, and that a resumed run has its first options."""
 
 from __future__ import annotations
 
@@ -35,18 +35,24 @@ def train(
 
     Parameters
     ----------
+    config : options of the run; by default those of TrainConfig.
     progress : called about every 50 iterations.
-    output : model folder; without it nothing is written and Ctrl-C raises as usual.
-    resume : go on from the folder's checkpoint; the config must be the same but for `iterations`-independent
-        options such as `device`.
-    overwrite : allow replacing a model in `output`.
+    output : model folder. Without it nothing is written, and Ctrl-C raises as usual.
+    resume : continue from the folder's checkpoint. The config must be the same, except for options without an effect
+        on the result, such as `device`.
+    overwrite : replace a model in `output`.
     visit : see `Trainer.run`.
+
+    Returns
+    -------
+    The model. After Ctrl-C it is not finished, and `resume` continues it.
 
     Raises
     ------
-    InputError : no training views, or a checkpoint that does not fit. OutputError : `output` holds a model and
-    neither resume nor overwrite is given, another run writes into it, or it cannot be written. DeviceError : not enough
-    memory. TrainingError : the loss is not finite; the last checkpoint is kept.
+    InputError : the scene has no training views, or the checkpoint does not fit.
+    OutputError : `output` holds a model, another run writes into it, or it cannot be written.
+    DeviceError : the device has too little memory.
+    TrainingError : the loss is not finite; the last checkpoint is kept.
     """
     config = config or TrainConfig()
     folder = None if output is None else ModelFolder(output)
@@ -81,7 +87,7 @@ def evaluate_test_views(model: Model, scene: Scene) -> Evaluation | None:
 
 
 def _fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:
-    """The folder's checkpoint if the run it belongs to had this config."""
+    """The folder's checkpoint; raise InputError if its run had another config."""
     checkpoint = Checkpoint.load(folder.checkpoint_path)
     stored = TrainConfig.from_json(checkpoint.config).to_json()
     for key, value in config.to_json().items():

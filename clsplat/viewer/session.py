@@ -136,7 +136,7 @@ class ViewingSession:
 
 
 def known_cameras(model: LoadedModel, scene: SceneChoice | None = None) -> SceneCameras:
-    """Cameras of the scene that is chosen, else those in the model folder; a file alone has none."""
+    """Cameras of the scene that is chosen, else those in the model folder. A file alone does not have cameras."""
     if scene:
         loaded = model.load_scene(scene)
         cameras, test_names = named_cameras(loaded.names, loaded.cameras), loaded.test_names

@@ -1,1 +1,1 @@
-"""The page that `clsplat eval` writes."""
+"""The report that `clsplat eval` writes."""

@@ -1,4 +1,4 @@
-"""How far renders are from photos: the distribution of errors as inlined SVG."""
+"""The distribution of errors between renders and photos, as inlined SVG."""
 
 from __future__ import annotations
 
@@ -10,29 +10,35 @@ from numpy.typing import NDArray
 from ...files.html_page import escape
 from ..chart_style import category_colour
 
-# First and last error of each bar, in steps of 8 bits: doublings, as errors spread over decades.
+# First and last error of each bar, in steps of 8 bits. The bars double, because errors spread over decades.
 BINS = ((0, 0), (1, 1), (2, 2), (3, 4), (5, 8), (9, 16), (17, 32), (33, 64), (65, 128), (129, 255))
 _WIDTH, _HEIGHT = 640, 240
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 8, 12, 40
 
 
 def shares(counts: NDArray[np.int64]) -> list[float]:
-    """Share of the values in each of BINS [%], of counts by error."""
-    whole = max(int(counts.sum()), 1)
-    return [100.0 * float(counts[first : last + 1].sum()) / whole for first, last in BINS]
+    """Share of the values in each of BINS [%].
+
+    Parameters
+    ----------
+    counts : (256,) number of values by error.
+    """
+    total = max(int(counts.sum()), 1)
+    return [100.0 * float(counts[first : last + 1].sum()) / total for first, last in BINS]
 
 
 def quantile(counts: NDArray[np.int64], share: float) -> int:
-    """The error that `share` (0..1) of the values do not exceed, in steps of 8 bits."""
+    """The error that a share (0..1) of the values does not exceed, in steps of 8 bits."""
     return int(np.searchsorted(np.cumsum(counts), share * counts.sum()))
 
 
 def histogram(labels: Sequence[str], counts: Sequence[NDArray[np.int64]]) -> str:
-    """A figure with bars by model, and a legend where there are several.
+    """HTML of a figure with bars for each model, and a legend if there are several.
 
     Parameters
     ----------
-    labels : of the models. counts : (256,) values by error, of each.
+    labels : of the models.
+    counts : (256,) number of values by error, for each model.
     """
     by_model = [shares(of_model) for of_model in counts]
     top = _ceiling(max(max(of_model) for of_model in by_model))
@@ -61,14 +67,16 @@ def histogram(labels: Sequence[str], counts: Sequence[NDArray[np.int64]]) -> str
     parts.append(
         f'<text x="{_LEFT + wide / 2:.0f}" y="{_HEIGHT - 6}" text-anchor="middle">absolute error, steps of 255</text>'
     )
-    spoken = f"Bar chart of errors: {'; '.join(map(_spoken, labels, counts))}"
+    description = f"Bar chart of errors: {'; '.join(map(_described, labels, counts))}"
     drawing = (
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(spoken)}">' + "".join(parts) + "</svg>"
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(description)}">'
+        + "".join(parts)
+        + "</svg>"
     )
     return f'<figure class="histogram">{drawing}{_legend(labels) if len(labels) > 1 else ""}</figure>\n'
 
 
-def _spoken(label: str, counts: NDArray[np.int64]) -> str:
+def _described(label: str, counts: NDArray[np.int64]) -> str:
     return (
         f"{label}: half of the values are within {quantile(counts, 0.5)}, 95 % within {quantile(counts, 0.95)} of 255"
     )
@@ -83,6 +91,6 @@ def _legend(labels: Sequence[str]) -> str:
 
 
 def _ceiling(share: float) -> float:
-    """The next round number of per cents, one that four parts divide."""
-    rounds = (4.0, 8.0, 12.0, 16.0, 20.0, 24.0, 32.0, 40.0, 60.0, 80.0, 100.0)
-    return next(top for top in rounds if top >= min(share, 100.0))
+    """The next round percentage that four divides."""
+    tops = (4.0, 8.0, 12.0, 16.0, 20.0, 24.0, 32.0, 40.0, 60.0, 80.0, 100.0)
+    return next(top for top in tops if top >= min(share, 100.0))

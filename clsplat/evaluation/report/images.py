@@ -1,4 +1,4 @@
-"""What a page of measurements shows of a view: the photo, the render and their difference, small enough to be sent."""
+"""Images of one view in a report: the photo, the render and their difference, reduced to a size that can be sent."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from ...files.images import encode_jpeg, resize_area
 from ...rendering.colormaps import Picture, colour_map, to_bytes
 
 LEVELS = 256  # errors are counted in steps of 8 bits
-LONGEST = 800  # px of a shown image's longer side
-_FULL_SCALES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # for pages to agree in where they can
-_QUANTILE = 0.99  # of errors below full scale
-_SAMPLES = 20_000  # pixels a view that are enough for it
-_STRIPE, _VEIL = 6, 0.7  # width of the stripes over masked pixels [px], and how much of the image they hide
+LONGEST = 800  # longer side of an image in the report [px]
+_FULL_SCALES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # a few values, so that most reports have the same scale
+_QUANTILE = 0.99  # share of the errors below full scale
+_SAMPLES = 20_000  # pixels of a view that determine the scale
+_STRIPE, _VEIL = 6, 0.7  # width of the stripes over masked pixels [px], and their opacity
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedImage:
-    """One view of one model, reduced to `LONGEST`; its counts are of the whole.
+    """A photo and its render by one model, reduced to LONGEST.
 
     Parameters
     ----------
     photo, render : (h, w, 3) bytes.
     error : (h, w) bytes, absolute difference, mean over the channels.
-    hidden : (h, w), True where a mask hides the pixel; None where none does.
-    counts : (LEVELS,) values of the image, all channels, by their absolute difference in steps of 8 bits.
-    flip : (h, w) bytes, FLIP's map; None where it was not asked for.
+    hidden : (h, w), True where a mask hides the pixel; None without a mask.
+    counts : (LEVELS,) number of values by their absolute difference in steps of 8 bits. It counts all channels of the
+        image before the reduction.
+    flip : (h, w) bytes, FLIP's map; None if FLIP was not measured.
     """
 
     photo: Picture
@@ -49,12 +50,14 @@ class ComparedImage:
 def compare_images(
     photo: Picture, color: NDArray[Any], mask: NDArray[np.bool_] | None = None, flip: NDArray[np.float32] | None = None
 ) -> ComparedImage:
-    """A view's photo and render for the page.
+    """Compare a view's photo with its render.
 
     Parameters
     ----------
-    photo : (H, W, 3) bytes. color : (H, W, 3) reals. mask : (H, W), True where a pixel counts; None: all do.
-    flip : (H, W), 0 to 1.
+    photo : (H, W, 3) bytes.
+    color : (H, W, 3) reals, the render.
+    mask : (H, W), True where a pixel counts; None counts all pixels.
+    flip : (H, W) map, 0 to 1.
     """
     render = to_bytes(color)
     difference = np.abs(render.astype(np.int16) - photo)
@@ -72,21 +75,21 @@ def compare_images(
 
 
 def full_scale(images: list[ComparedImage]) -> float:
-    """The error (0..1) at the bright end of all maps: the next round one that 99 % of the pixels stay below."""
-    errors = [shot.error if shot.hidden is None else shot.error[~shot.hidden] for shot in images]
-    some = np.concatenate([error.ravel()[:: max(error.size // _SAMPLES, 1)] for error in errors])
-    most = float(np.quantile(some, _QUANTILE)) / (LEVELS - 1) if len(some) else 0.0
-    return next(scale for scale in _FULL_SCALES if scale >= most)
+    """Return the error (0..1) at the bright end of all maps: a round value that nearly all pixels stay below."""
+    errors = [image.error if image.hidden is None else image.error[~image.hidden] for image in images]
+    samples = np.concatenate([error.ravel()[:: max(error.size // _SAMPLES, 1)] for error in errors])
+    high = float(np.quantile(samples, _QUANTILE)) / (LEVELS - 1) if len(samples) else 0.0
+    return next(scale for scale in _FULL_SCALES if scale >= high)
 
 
 def map_of(values: Picture, full: float, hidden: NDArray[np.bool_] | None) -> Picture:
-    """(h, w) bytes by the colour map, `full` (0..1) at its bright end; hidden pixels are striped grey."""
+    """Return values (h, w) as colours, with `full` (0..1) at the bright end; hidden pixels are striped."""
     coloured = colour_map(values.astype(np.float32) / (255.0 * full))
     return coloured if hidden is None else np.where(hidden[..., None], _stripes(*values.shape), coloured)
 
 
 def veiled(picture: Picture, hidden: NDArray[np.bool_] | None) -> Picture:
-    """The picture, its hidden pixels mostly under grey stripes."""
+    """Return the picture with grey stripes over its hidden pixels."""
     if hidden is None:
         return picture
     veil = np.rint((1.0 - _VEIL) * picture + _VEIL * _stripes(*hidden.shape)).astype(np.uint8)
@@ -94,12 +97,12 @@ def veiled(picture: Picture, hidden: NDArray[np.bool_] | None) -> Picture:
 
 
 def data_uri(picture: Picture) -> str:
-    """The picture inside a page."""
+    """Return the picture as a URI that contains it."""
     return "data:image/jpeg;base64," + b64encode(encode_jpeg(picture)).decode()
 
 
 def colour_stops(n: int = 17) -> str:
-    """The colour map as the stops of a CSS gradient."""
+    """Return the colour map as the stops of a CSS gradient."""
     return ", ".join(f"#{bytes(colour).hex()}" for colour in colour_map(np.linspace(0.0, 1.0, n)))
 
 

@@ -1,4 +1,4 @@
-"""The page that `clsplat eval` writes: measurements of one model or several, with images to look at."""
+"""The page that `clsplat eval` writes: measurements of one or several models, with their images."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ...files.html_page import Section, escape, package_text, write_page
 from .histogram import histogram, quantile
 from .images import LONGEST, ComparedImage, colour_stops, data_uri, full_scale, map_of, veiled
 
-IMAGE_BYTES = 16_000_000  # of all images of a page, about; at least one view is shown
-_WORST = 8  # views with the lowest PSNR are shown first, others are spread evenly
+IMAGE_BYTES = 16_000_000  # approximate limit of all images of a page; at least one view is shown
+_WORST = 8  # number of views with the lowest PSNR that are always shown; the others are spread evenly
 _DIGITS = {"PSNR": 2, "SSIM": 4, "LPIPS": 4, "FLIP": 4}
 _UNITS = {"PSNR": "PSNR [dB]"}
 _LESS_IS_BETTER = ("LPIPS", "FLIP")
@@ -24,14 +24,15 @@ _LESS_IS_BETTER = ("LPIPS", "FLIP")
 
 @dataclass(frozen=True, eq=False)
 class ModelReport:
-    """A model and what was measured of it.
+    """Measurements of one model.
 
     Parameters
     ----------
-    label : as in tables. costs : cells of the first table by their headings, beside the metrics' means.
-    facts : lines of a table, what and how much.
-    per_view : by metric ("PSNR", "SSIM", perhaps "LPIPS", "FLIP"), values by the views' names.
-    images : by the views' names.
+    label : name of the model in tables.
+    costs : cells of the first table by their headings, beside the means of the metrics.
+    facts : rows of a table: name and value.
+    per_view : values by metric ("PSNR", "SSIM", and "LPIPS" and "FLIP" if measured) and view.
+    images : by view.
     """
 
     label: str
@@ -41,27 +42,28 @@ class ModelReport:
     images: Mapping[str, ComparedImage]
 
     def mean(self, metric: str) -> float:
-        """Over the views."""
+        """Mean of a metric over the views."""
         return statistics.fmean(self.per_view[metric].values())
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """(LEVELS,) values of all views by their error."""
-        counts: NDArray[np.int64] = np.sum([shot.counts for shot in self.images.values()], axis=0)
-        return counts
+        """(LEVELS,) number of values of all views by their error."""
+        return np.sum([image.counts for image in self.images.values()], axis=0)
 
 
 def write_report(path: Path, models: Sequence[ModelReport], what: str, protocol: Sequence[str]) -> Path:
-    """Write the page; returns its path.
+    """Write the page and return its path.
 
     Parameters
     ----------
-    models : measured on the same views, in the same way.
-    what : views were measured, such as "6 test views of fox". protocol : paragraphs on how.
+    models : measured on the same views with the same protocol.
+    what : the views, such as "6 test views of fox".
+    protocol : paragraphs on how the metrics were computed.
 
     Raises
     ------
-    InputError : the models' views are not the same. OutputError : cannot be written.
+    InputError : the models were measured on different views.
+    OutputError : the page cannot be written.
     """
     names = list(models[0].images)
     for model in models[1:]:
@@ -74,8 +76,8 @@ def write_report(path: Path, models: Sequence[ModelReport], what: str, protocol:
             )
     psnr = {name: statistics.fmean(model.per_view["PSNR"][name] for model in models) for name in names}
     worst_first = sorted(names, key=lambda name: psnr[name])
-    every = [shot for model in models for shot in model.images.values()]
-    full = full_scale(every)
+    all_images = [image for model in models for image in model.images.values()]
+    full = full_scale(all_images)
     shown = _views(models, worst_first, full)
     many = len(models) > 1
     title = f"{what}: " + (f"{len(models)} models" if many else models[0].label)
@@ -97,7 +99,7 @@ def write_report(path: Path, models: Sequence[ModelReport], what: str, protocol:
         Section(
             "Views", ["Worst first; a click on a heading sorts by it."], markup=_view_table(models, worst_first, shown)
         ),
-        Section("Images", _about_images(every, len(shown), len(names), full), markup="".join(shown.values())),
+        Section("Images", _about_images(all_images, len(shown), len(names), full), markup="".join(shown.values())),
         Section(
             "Errors",
             [_spread(model) for model in models],
@@ -109,7 +111,7 @@ def write_report(path: Path, models: Sequence[ModelReport], what: str, protocol:
                 *protocol,
                 *(
                     ["Pixels that a mask hides are left out of all numbers."]
-                    * any(shot.hidden is not None for shot in every)
+                    * any(image.hidden is not None for image in all_images)
                 ),
             ],
         ),
@@ -133,21 +135,21 @@ def _about_images(images: Sequence[ComparedImage], shown: int, n: int, full: flo
         f"Error maps: absolute difference, mean of the channels, all on one scale; {full:g} of the full range "
         "and more is brightest."
     )
-    if any(shot.hidden is not None for shot in images):
+    if any(image.hidden is not None for image in images):
         text.append("Masked pixels are striped.")
     if shown < n:
         text.append(
             f"{shown} of {n} views are shown: the {min(_WORST, shown)} worst, and others spread evenly, "
             f"as far as {IMAGE_BYTES / 1e6:g} MB go."
         )
-    if any(max(shot.size) >= LONGEST for shot in images):
+    if any(max(image.size) >= LONGEST for image in images):
         text.append(f"Images are reduced to {LONGEST} pixels at most; numbers are of whole images.")
     return text
 
 
 def _spread(model: ModelReport) -> str:
-    half, most = quantile(model.counts, 0.5), quantile(model.counts, 0.95)
-    return f"{model.label}: half of the values are within {half} of 255 of the photo's, 95 % within {most}."
+    median, high = quantile(model.counts, 0.5), quantile(model.counts, 0.95)
+    return f"{model.label}: half of the values are within {median} of 255 of the photo's, 95 % within {high}."
 
 
 # --- the table of views ------------------------------------------------------------------------
@@ -186,18 +188,18 @@ def _view_table(models: Sequence[ModelReport], names: Sequence[str], shown: Mapp
 
 
 def _views(models: Sequence[ModelReport], worst_first: Sequence[str], full: float) -> dict[str, str]:
-    """Markup of as many views as the page has room for, by name, worst first."""
-    wanted = [*worst_first[:_WORST], *_spread_evenly(worst_first[_WORST:])]
+    """HTML of the views that the page has room for, by name, worst first."""
+    candidates = [*worst_first[:_WORST], *_spread_evenly(worst_first[_WORST:])]
     stops = colour_stops()
-    found: dict[str, str] = {}
+    shown: dict[str, str] = {}
     used = 0
-    for name in wanted:
+    for name in candidates:
         markup = _view(models, name, full, stops, _anchor(worst_first, name))
-        if found and used + len(markup) > IMAGE_BYTES:
+        if shown and used + len(markup) > IMAGE_BYTES:
             break
-        found[name] = markup
+        shown[name] = markup
         used += len(markup)
-    return {name: found[name] for name in worst_first if name in found}
+    return {name: shown[name] for name in worst_first if name in shown}
 
 
 def _anchor(worst_first: Sequence[str], name: str) -> str:
@@ -205,7 +207,7 @@ def _anchor(worst_first: Sequence[str], name: str) -> str:
 
 
 def _spread_evenly(names: Sequence[str]) -> list[str]:
-    """All names, in an order that any first part of is spread over the whole: halves, quarters, eighths."""
+    """All names in an order whose every beginning is spread over the whole: halves, quarters, eighths."""
     order: list[int] = []
     step = 1
     while step < 2 * len(names):
@@ -223,10 +225,10 @@ def _view(models: Sequence[ModelReport], name: str, full: float, stops: str, anc
     width, height = models[0].images[name].size
     parts = [_wipe(models, name)]
     for model in models:
-        shot, of = model.images[name], f" of {model.label}" if len(models) > 1 else ""
-        parts.append(_map(data_uri(map_of(shot.error, full, shot.hidden)), f"Error{of}", name, stops, full))
-        if shot.flip is not None:
-            parts.append(_map(data_uri(map_of(shot.flip, 1.0, shot.hidden)), f"FLIP{of}", name, stops, 1.0))
+        image, of = model.images[name], f" of {model.label}" if len(models) > 1 else ""
+        parts.append(_map(data_uri(map_of(image.error, full, image.hidden)), f"Error{of}", name, stops, full))
+        if image.flip is not None:
+            parts.append(_map(data_uri(map_of(image.flip, 1.0, image.hidden)), f"FLIP{of}", name, stops, 1.0))
     return (
         f'<h3 id="{anchor}">{escape(name)} <small>{escape(numbers)}</small></h3>\n'
         f'<div class="images" style="--shape: {width / height:.4f}">{"".join(parts)}</div>\n'
