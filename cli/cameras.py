@@ -1,4 +1,4 @@
-"""`clsplat cameras`: cameras and points of a scene or a model as files for other programs."""
+"""`clsplat cameras`: write cameras and points of a scene or a model as files for other programs."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def write_cameras_of(
     overwrite: bool,
     quiet: bool,
 ) -> None:
-    """Write the cameras of SOURCE into OUTPUT, a .json file or a COLMAP model's folder, with points beside them.
+    """Write the cameras and points of SOURCE to OUTPUT, a .json file or the folder of a COLMAP model.
 
     SOURCE is a scene, a model folder, a cameras.json or a camera path. Cameras of a scene keep their lenses, and the
-    files name its photos. Cameras of a model are those of its training images: without distortion, at the size that
-    they were reduced to. Each is then named images/NAME.png, and the points are the centres of opaque splats.
+    files name its photos. Cameras of a model are those of its training images, undistorted and at their reduced size.
+    Their images are named images/NAME.png, and their points are the centres of opaque splats.
     """
     from clsplat.models.cameras import export_cameras
 

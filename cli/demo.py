@@ -1,4 +1,4 @@
-"""`clsplat demo`: the whole way once, on a scene that clsplat makes itself."""
+"""`clsplat demo`: make a small scene, train on it, render it and measure it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .options import PATH, device_option, overwrite_option, quiet_option
 from .progress import ViewCount, duration
 from .train import report_interruption, run_training
 
-# Small enough for two CPU cores in minutes.
+# These values take minutes on two CPU cores.
 ITERATIONS, CAP = 1500, 6000
 
 
@@ -43,7 +43,7 @@ def demo(
 ) -> None:
     """Make a small scene in OUT/scene, train on it, render its test views and measure them.
 
-    OUT/scene is kept when it is there already; OUT/model and OUT/renders are replaced with --overwrite.
+    An existing OUT/scene is used again. --overwrite replaces OUT/model and OUT/renders.
     """
     from clsplat.evaluation.metrics import DEFAULT_PROTOCOL
     from clsplat.models.evaluation import EvaluationOptions, evaluate
@@ -57,9 +57,7 @@ def demo(
         raise OutputError(f"{folder.path}: already holds a model: use --overwrite or another folder")
     if not quiet:
         exists = (out / "scene").exists()
-        message = (
-            f"{out / 'scene'}: exists already and is used" if exists else f"making {views} photos in {out / 'scene'}"
-        )
+        message = f"{out / 'scene'}: exists and is used" if exists else f"making {views} photos in {out / 'scene'}"
         click.echo(message, err=True)
     config = TrainConfig(iterations=iterations, cap_max=cap_max, device=device)
     scene = load_scene(make_demo_scene(out / "scene", width, views), background=config.background)

@@ -1,4 +1,4 @@
-"""`clsplat info`: what a model is made of and how much of it is in use, and what a scene holds."""
+"""`clsplat info`: show the contents of models and scenes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from clsplat.models.info import ModelInfo
     from clsplat.scenes.info import LensUse, SceneInfo
 
-_NAMED = 5  # names in a list before it is cut
+_MAX_LISTED = 5  # longest list of names that is printed in full
 
 
 @click.command("info")
@@ -24,7 +24,7 @@ _NAMED = 5  # names in a list before it is cut
 @click.option("-i", "--images", metavar="NAME", help="Folder of the photos inside a scene, such as images_4.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, one object for each path.")
 def show_info(paths: tuple[Path, ...], iteration: int | None, images: str | None, as_json: bool) -> None:
-    """Show what PATHS hold: models (folders or PLY files), or scenes.
+    """Show the contents of PATHS: models (folders or PLY files), or scenes.
 
     For a model: its splats, skewed splats, SH coefficients, parameters and bytes. For a scene: its photos, lenses,
     points and test views, without decoding a photo.
@@ -56,7 +56,7 @@ def _model_lines(info: ModelInfo) -> list[str]:
 
 
 def model_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Rows of the table: name, number in use, number in all."""
+    """Return the rows of the table: name, number in use, total number."""
     n = found["splats"]
     rows = [(f"splats with {name}", str(count), str(n)) for name, count in found["fields_in_use"].items()]
     rows += [
@@ -79,7 +79,7 @@ def _scene_lines(path: Path, info: SceneInfo) -> list[str]:
 
 
 def scene_rows(found: SceneInfo) -> list[tuple[str, str]]:
-    """Rows of the table: name and contents."""
+    """Return the rows of the table: name and contents."""
     rows = [
         (
             "photos",
@@ -91,14 +91,16 @@ def scene_rows(found: SceneInfo) -> list[tuple[str, str]]:
         placed, photos, error = found.placed
         rows.append(("reconstructed", f"{placed} of {photos} photos, {error:.2f} px off"))
     if found.unreadable:
-        rows.append(("unreadable", _named(found.unreadable)))
-    rows.append(("without a pose", _named(found.unregistered) if found.unregistered else "none"))
-    rows += [("lens", _lens(lens)) for lens in found.lenses[:_NAMED]]
-    if len(found.lenses) > _NAMED:
-        rows.append(("", f"and {len(found.lenses) - _NAMED} lenses more"))
+        rows.append(("unreadable", _list_names(found.unreadable)))
+    rows.append(("without a pose", _list_names(found.unregistered) if found.unregistered else "none"))
+    rows += [("lens", _lens(lens)) for lens in found.lenses[:_MAX_LISTED]]
+    if len(found.lenses) > _MAX_LISTED:
+        rows.append(("", f"and {len(found.lenses) - _MAX_LISTED} more lenses"))
     seen = f", each in {found.track_mean:.1f} photos (median {found.track_median:g})" if found.track_mean > 1 else ""
     rows.append(("points", f"{found.points}{seen}"))
-    rows.append(("test views", f"with --eval {_named(found.test)}; {found.photos - len(found.test)} are left to learn"))
+    rows.append(
+        ("test views", f"with --eval {_list_names(found.test)}; {found.photos - len(found.test)} remain for training")
+    )
     rows.append(("masks", f"of {found.masked} photos" if found.masked else "none"))
     return rows
 
@@ -111,5 +113,5 @@ def _lens(lens: LensUse) -> str:
     return text if lens.pinhole else f"{text}, undistorted when they are read"
 
 
-def _named(names: tuple[str, ...]) -> str:
-    return f"{len(names)} ({', '.join(names[:_NAMED])}{', ...' if len(names) > _NAMED else ''})"
+def _list_names(names: tuple[str, ...]) -> str:
+    return f"{len(names)} ({', '.join(names[:_MAX_LISTED])}{', ...' if len(names) > _MAX_LISTED else ''})"

@@ -1,4 +1,4 @@
-"""`clsplat reconstruct`: photographs or a video become a scene. Also what `train` does with photos without poses."""
+"""`clsplat reconstruct`: make a scene from photos or a video. `train` does the same for photos without poses."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ _DEFAULTS = ReconstructOptions()
     type=click.Choice(CAMERA_MODES),
     default=_DEFAULTS.camera_mode,
     show_default=True,
-    help="Which photos share a lens; auto: those of one size, camera and focal length.",
+    help="Which photos share a lens. auto: photos of equal size, camera and focal length.",
 )
 @click.option(
     "--matcher",
     type=click.Choice(MATCHERS),
     default=_DEFAULTS.matcher,
     show_default=True,
-    help="Which photos are compared: all pairs, or neighbours by name (auto: videos, more than 150 photos).",
+    help="Which photos are compared: all pairs, or neighbours by name (auto: for videos and more than 150 photos).",
 )
 @click.option(
     "--max-size",
@@ -53,7 +53,7 @@ _DEFAULTS = ReconstructOptions()
     default=_DEFAULTS.max_size,
     show_default=True,
     metavar="PX",
-    help="Longest side at which features are looked for; the scene keeps the photos' size.",
+    help="Photos are reduced to this longest side to find features; the scene keeps their size.",
 )
 @click.option(
     "--frames",
@@ -61,17 +61,17 @@ _DEFAULTS = ReconstructOptions()
     default=_DEFAULTS.frames,
     show_default=True,
     metavar="N",
-    help="Of a video: the sharpest frame of each of N equal stretches.",
+    help="Number of frames to take from a video: the sharpest frame of each of N equal parts.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=_DEFAULTS.seed, show_default=True)
 @overwrite_option
 @quiet_option
 def reconstruct_scene(photos: Path, scene: Path, overwrite: bool, quiet: bool, **values: Any) -> None:
-    """Make a scene to train on of PHOTOS, a folder of photographs or a video.
+    """Make a scene for training from PHOTOS, a folder of photos or a video.
 
-    COLMAP's library finds the poses; SCENE gets images/ (upright, without lens distortion), sparse/0/ and
-    reconstruct.json. Folders below PHOTOS belong to it. Masks, black where a photo does not count, lie in PHOTOS/masks
-    as NAME.png or NAME.jpg.png.
+    COLMAP's library finds the poses. SCENE gets images/ (upright and undistorted), sparse/0/ and reconstruct.json.
+    Subfolders of PHOTOS are included. Masks are in PHOTOS/masks as NAME.png or NAME.jpg.png; black pixels of a mask do
+    not count.
     """
     result = run_reconstruction(photos, scene, ReconstructOptions(**values), overwrite, quiet)
     if not quiet:
@@ -82,7 +82,7 @@ def reconstruct_scene(photos: Path, scene: Path, overwrite: bool, quiet: bool, *
 def run_reconstruction(
     photos: Path, scene: Path, options: ReconstructOptions, overwrite: bool, quiet: bool
 ) -> ReconstructionResult:
-    """Reconstruct with a live display."""
+    """Reconstruct a scene with a live display."""
     from clsplat.scenes.reconstruct.reconstruct import reconstruct
 
     with StepDisplay(quiet) as display:
@@ -90,7 +90,7 @@ def run_reconstruction(
 
 
 def report(result: ReconstructionResult) -> None:
-    """Say what came of it."""
+    """Print the result of a reconstruction."""
     click.echo(
         f"{result.scene}: {result.registered} of {result.photos} photos placed, {result.points} points seen by "
         f"{result.track_length:.1f} photos each, {result.error:.2f} px off, in {duration(result.seconds)}"
@@ -98,11 +98,11 @@ def report(result: ReconstructionResult) -> None:
 
 
 def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> Path:
-    """The scene to train on for photographs without poses: beside the model, made when it is not there yet.
+    """Return the scene for training on photos without poses; it lies beside the model and is made if missing.
 
     Raises
     ------
-    OutputError : the scene that is there was made of other photos. Others as `reconstruct`.
+    OutputError : the existing scene was made from other photos. Other errors are those of `reconstruct`.
     """
     from clsplat.scenes.reconstruct.photo_files import find_photos, is_video
     from clsplat.scenes.reconstruct.reconstruct import estimate_seconds, is_made_from
@@ -112,12 +112,12 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
     made = is_made_from(scene, photos)
     if made:
         if not quiet:
-            click.echo(f"{photos}: no poses: {scene} was reconstructed of it before and is used", err=True)
+            click.echo(f"{photos}: no poses: {scene} was reconstructed from it before and is used", err=True)
         return scene
     if made is False and not overwrite:
         raise OutputError(
-            f"{scene}: was reconstructed of other photos than {photos} now has: use --overwrite to make "
-            f"it anew, or clsplat reconstruct {photos} -o OTHER and train on that"
+            f"{scene}: was reconstructed from other photos than {photos} now has: use --overwrite to replace "
+            f"it, or clsplat reconstruct {photos} -o OTHER and train on that"
         )
     if not quiet:
         what = f"{options.frames} frames"
@@ -132,16 +132,16 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
 
 
 def _minutes(seconds: float) -> str:
-    """Roughly: an estimate is no better."""
+    """Return the duration in minutes; an estimate is not more accurate."""
     return "about a minute" if seconds < 90 else f"about {round(seconds / 60)} min"
 
 
 class StepDisplay:
-    """Shows Steps: a line for each kind of work, rewritten on a terminal.
+    """A display of Steps: one line per kind of work, updated on a terminal.
 
     Parameters
     ----------
-    quiet : show nothing.
+    quiet : whether to show nothing.
     """
 
     def __init__(self, quiet: bool = False) -> None:
@@ -165,6 +165,6 @@ class StepDisplay:
             self._line, self._label = LiveLine(), step.label
             self._begun = self._line.clock()
         last = step.done == step.total
-        # What is done within the interval needs one line in a log.
+        # In a log, work that takes less than the interval gets a single line.
         if last or self._line.live or self._line.clock() - self._begun >= PLAIN_INTERVAL:
             self._line.show(f"{step.label} {step.done}" + (f"/{step.total}" if step.total else ""), last)

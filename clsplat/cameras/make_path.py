@@ -16,22 +16,22 @@ from .path import DEFAULT_FPS, CameraPath, read_path
 
 AROUND = ("orbit", "ellipse", "spiral")
 BETWEEN = "interpolate"
-FRAMES = 60
-_NAMES_IN_MESSAGE = 8
+FRAMES = 60  # default number of frames
+_NAMES_IN_MESSAGE = 8  # longest list of camera names in a message
 
 
 @dataclass(frozen=True)
 class PathRequest:
-    """A path to make.
+    """Description of a camera path to make.
 
     Parameters
     ----------
     kind : one of AROUND, BETWEEN, or a path file's name.
-    keys : names of the cameras to interpolate between, in this order; None takes all, sorted by name.
-    closed : interpolate back to the first camera.
-    frames, seconds : length of the path, one of them; by default FRAMES, or what the file has.
-    fps : frames a second; by default DEFAULT_FPS, or what the file has.
-    size : (width, height) of the images [px]; the vertical field of view is kept.
+    keys : names of the cameras to interpolate between, in this order; None for all cameras, sorted by name.
+    closed : whether to interpolate back to the first camera.
+    frames, seconds : length of the path, one of the two; by default FRAMES, or the length of the path file.
+    fps : frames per second; by default DEFAULT_FPS, or the rate of the path file.
+    size : (width, height) of the images [px]; the vertical field of view stays.
 
     Raises
     ------
@@ -51,7 +51,7 @@ class PathRequest:
             raise InputError("camera path: give frames or seconds, not both")
 
     def frame_count(self, fps: float) -> int | None:
-        """Number of frames at a rate; None if the request names neither frames nor seconds."""
+        """Return the number of frames at a frame rate; None if the request sets neither frames nor seconds."""
         return self.frames if self.seconds is None else max(1, round(self.seconds * fps))
 
 
@@ -62,9 +62,10 @@ def make_path(
 
     Parameters
     ----------
-    splats : the model, which a path around a scene without cameras goes around.
-    views : cameras to go around or between.
-    source : where the views come from, for messages.
+    request : description of the path.
+    splats : the model; without views, a path goes around these splats.
+    views : cameras that the path goes around or between.
+    source : origin of the views, for messages.
 
     Raises
     ------
@@ -87,13 +88,13 @@ def make_path(
 
 
 def resize_path(path: CameraPath, size: tuple[int, int]) -> CameraPath:
-    """The path at another image size (width, height) [px]."""
+    """Return the path at another image size (width, height) [px]."""
     cameras, keys = (tuple(resized_by_height(camera, *size) for camera in part) for part in (path.cameras, path.keys))
     return CameraPath(cameras, path.fps, keys, path.closed)
 
 
 def name_frames(path: CameraPath, kind: str) -> list[NamedCamera]:
-    """The path's frames under the names of their images."""
+    """Return the path's frames with the names of their images."""
     stem = kind if kind in AROUND else "frame"
     digits = max(3, len(str(len(path.cameras) - 1)))
     return [NamedCamera(f"{stem}_{index:0{digits}}", camera) for index, camera in enumerate(path.cameras)]
@@ -111,7 +112,7 @@ def _from_file(request: PathRequest) -> CameraPath:
 
 
 def _chosen(views: Sequence[NamedCamera], source: str | Path, keys: Sequence[str] | None) -> list[Camera]:
-    """The cameras of those names."""
+    """Return the cameras with these names, or all cameras sorted by name; raises InputError."""
     if not views:
         raise InputError(
             f"{source}: no cameras to interpolate between: give --cameras cameras.json, or a scene with -s"

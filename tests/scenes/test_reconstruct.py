@@ -141,12 +141,12 @@ def test_training_on_photos_reuses_the_scene(scene: Path, walk: Path, tmp_path: 
     options = ("--eval", "--iterations", 10, "--cap-max", 300, "--sh-degree", 0)
     result = run("train", walk, "-m", tmp_path / "model", *options)
     assert result.exit_code == 0, result.output
-    assert f"no poses: {tmp_path / 'walk-scene'} was reconstructed of it before" in result.stderr
+    assert f"no poses: {tmp_path / 'walk-scene'} was reconstructed from it before" in result.stderr
     assert "test views (1)" in result.stdout
     assert "resumed at iteration 10" in run("train", walk, "-m", tmp_path / "model", "--resume").stderr
     clsplat("eval", tmp_path / "model", "--no-report")
     (walk / "walk_00.png").touch()
-    assert "was reconstructed of other photos" in error_of("train", walk, "-m", tmp_path / "other", *options)
+    assert "was reconstructed from other photos" in error_of("train", walk, "-m", tmp_path / "other", *options)
 
 
 def test_too_few_photos(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Every reader of files from elsewhere: a sound sample to damage, and what reading it means."""
+"""All readers of external files: a sound sample to damage, and the function that reads it."""
 
 from __future__ import annotations
 
@@ -32,8 +32,14 @@ from clsplat.training.config import TrainConfig
 
 @dataclass(frozen=True)
 class Sample:
-    """make : writes it into an empty folder. read : raises InputError, or checks what it has read. damaged : a part of
-    the paths of the files to damage."""
+    """A sample of files for one reader.
+
+    Parameters
+    ----------
+    make : writes the files into an empty folder.
+    read : reads them; it raises InputError or checks the result.
+    damaged : a part of the paths of the files to damage.
+    """
 
     make: Callable[[Path], object]
     read: Callable[[Path], object]
@@ -163,7 +169,7 @@ def make_checkpoint(folder: Path) -> None:
 
 
 def read_checkpoint(folder: Path) -> None:
-    """As far as resuming goes before it asks for a device."""
+    """Do the steps of resuming that need no device."""
     from clsplat.device.schedule import Schedule
     from clsplat.training.folder import ModelFolder
     from clsplat.training.run import _fitting_checkpoint
@@ -228,7 +234,7 @@ def make_images(folder: Path) -> None:
 
 
 def read_images(folder: Path) -> None:
-    """All that can be read; the first that cannot decides."""
+    """Read all images; raise the error of the first that cannot be read."""
     failed: InputError | None = None
     for path in sorted(folder.iterdir()):
         try:
@@ -257,7 +263,7 @@ def make_photographs(folder: Path) -> None:
 
 
 def read_photographs(folder: Path) -> None:
-    """As far as a reconstruction goes before it looks for features."""
+    """Do the steps of a reconstruction before the search for features."""
     import tempfile
 
     from clsplat.scenes.reconstruct.photo_files import (
@@ -279,7 +285,7 @@ def read_photographs(folder: Path) -> None:
         ]
     group_by_camera([photo for photo in ready if not isinstance(photo, str)], "auto")
     for line in ready:
-        if isinstance(line, str):  # those are left out, with this line
+        if isinstance(line, str):  # a reconstruction leaves such photos out with this line
             raise InputError(line)
 
 

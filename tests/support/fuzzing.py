@@ -1,11 +1,11 @@
-"""Damaged files for every reader: what is damaged, and a campaign that survives what the readers do with it.
+"""Damaged files for every reader, and a campaign in worker processes that survives crashes of the readers.
 
     python tests/support/fuzzing.py TABLE READER,... FIRST COUNT SEED   # the worker
 
-A reader is sound where each input ends with an error of clsplat's own in one line, or with a result that its check
-accepts. All else is a fault: another exception (MemoryError too: the worker's address space is bounded), a message of
-several lines, a reader that takes longer than SECONDS, or the worker's end. An input depends on its reader, its number
-and the seed alone.
+For each input, a sound reader raises a ClsplatError with one line, or returns a result that its check accepts. Faults
+are other exceptions, messages of several lines, a reader that takes longer than SECONDS, and a worker that dies. The
+worker's address space is limited, so that MemoryError is a fault too. An input depends only on its reader, its number
+and the seed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 SECONDS = 10
-ROOM = 1 << 30  # bytes of address space above what the worker has at its start; the samples have some kB
+ROOM = 1 << 30  # address space that the worker may use in addition [bytes]; samples have a few kB
 _ODD_BYTES = [
     b"\0" * 8,
     b"\xff" * 8,
@@ -88,12 +88,12 @@ _ODD_VALUES: list[Any] = [
 
 
 class TooLong(BaseException):
-    """Raised by the worker's clock; no reader catches it."""
+    """Raised by the worker's timer; no reader catches it."""
 
 
 @dataclass
 class Campaign:
-    """What became of a reader's inputs."""
+    """Results of a reader: numbers of inputs and refused inputs, and faults."""
 
     reader: str
     inputs: int = 0
@@ -102,40 +102,44 @@ class Campaign:
 
 
 def campaign(readers: Sequence[str], count: int, seed: int = 0, table: str = "fuzz_readers") -> list[Campaign]:
-    """Try `count` inputs of each in a process of its own; one that ends is begun again behind the input that ended it.
+    """Try `count` inputs of each reader in a worker process.
 
-    table : the module whose READERS has the readers.
+    If an input kills the worker, a new worker starts with the next input.
+
+    Parameters
+    ----------
+    table : name of the module whose READERS contains the readers.
     """
     results, first = {reader: Campaign(reader) for reader in readers}, 0
-    left = list(readers)
-    while left:
-        command = [sys.executable, __file__, table, ",".join(left), str(first), str(count), str(seed)]
-        reader = left[0]
+    remaining = list(readers)
+    while remaining:
+        command = [sys.executable, __file__, table, ",".join(remaining), str(first), str(count), str(seed)]
+        reader = remaining[0]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             assert process.stderr is not None
             for line in process.stdout:
-                said = json.loads(line)
-                if "begun" in said:
-                    reader, first = said["begun"]
+                event = json.loads(line)
+                if "begun" in event:
+                    reader, first = event["begun"]
                     results[reader].inputs += 1
-                elif "fault" in said:
-                    results[reader].faults.append({"reader": reader, "seed": seed, "input": first} | said)
+                elif "fault" in event:
+                    results[reader].faults.append({"reader": reader, "seed": seed, "input": first} | event)
                 else:
                     results[reader].refused += 1
-            said, code = process.stderr.read(), process.wait()
+            errors, code = process.stderr.read(), process.wait()
         if code == 0:
             break
         results[reader].faults.append(
-            {"reader": reader, "seed": seed, "input": first, "fault": f"the process ended ({code}): {said[-300:]}"}
+            {"reader": reader, "seed": seed, "input": first, "fault": f"the process ended ({code}): {errors[-300:]}"}
         )
-        left = left[left.index(reader) :]
+        remaining = remaining[remaining.index(reader) :]
         first += 1
     return list(results.values())
 
 
 def work(table: str, readers: str, first: int, count: int, seed: int) -> None:
-    """Try inputs in this process, of the first reader from input `first` on."""
+    """Try inputs in this process; the first reader starts at input `first`."""
     warnings.simplefilter("ignore")
     signal.signal(signal.SIGALRM, _too_long)
     for reader in readers.split(","):
@@ -145,14 +149,14 @@ def work(table: str, readers: str, first: int, count: int, seed: int) -> None:
             folder.mkdir()
             sample.make(folder)
             pristine = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-            sample.read(folder)  # also imports what the reader needs, before memory is bounded
+            sample.read(folder)  # loads the reader's modules before memory is limited
             pages = int(Path("/proc/self/statm").read_text().split()[0])
-            _, most = resource.getrlimit(resource.RLIMIT_AS)
-            resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ROOM, most))
+            _, limit = resource.getrlimit(resource.RLIMIT_AS)
+            resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ROOM, limit))
             damaged = {path: data for path, data in pristine.items() if sample.damaged in str(path)}
             for index in range(first, count):
                 print(json.dumps({"begun": [reader, index]}), flush=True)
-                # Not the folder's name nor Python's hash: an input is the same in every process.
+                # The seed uses neither the folder's name nor Python's hash, so that inputs are equal in all processes.
                 rng = np.random.default_rng([seed, index, *reader.encode()])
                 changed = damage(damaged, rng)
                 fault = _fault(sample, folder)
@@ -166,7 +170,7 @@ def work(table: str, readers: str, first: int, count: int, seed: int) -> None:
 
 
 def _fault(sample: Any, folder: Path) -> str | None:
-    """What is wrong with how the reader took it; "" where it read something sound, None where it refused."""
+    """Return the reader's fault, "" if it read a sound result, or None if it refused the input."""
     from clsplat.errors import ClsplatError
 
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
@@ -175,7 +179,7 @@ def _fault(sample: Any, folder: Path) -> str | None:
     except ClsplatError as error:
         message = str(error)
         sound = "\n" not in message and message.strip()
-        return None if sound else f"message of several lines or none: {message[:300]!r}"
+        return None if sound else f"message of several lines, or empty: {message[:300]!r}"
     except TooLong:
         return f"took longer than {SECONDS} s"
     except BaseException as error:
@@ -188,7 +192,7 @@ def _fault(sample: Any, folder: Path) -> str | None:
 
 
 def damage(pristine: dict[Path, bytes], rng: np.random.Generator) -> list[Path]:
-    """Change one or two of the files; returns which."""
+    """Change one or two of the files and return their paths."""
     files = sorted(pristine)
     chosen = [files[i] for i in rng.permutation(len(files))[: 1 + (rng.random() < 0.2)]]
     for path in chosen:
@@ -201,7 +205,7 @@ def damage(pristine: dict[Path, bytes], rng: np.random.Generator) -> list[Path]:
             path.write_bytes(odd_json(structured, rng))
         elif path.suffix == ".npz" and rng.random() < 0.8:
             _odd_npz(path, rng)
-        elif path.suffix == ".spz" and rng.random() < 0.8:  # behind gzip's checksum
+        elif path.suffix == ".spz" and rng.random() < 0.8:  # the bytes inside gzip, so that its checksum stays correct
             path.write_bytes(gzip.compress(odd_bytes(gzip.decompress(data), rng)))
         else:
             path.write_bytes(odd_bytes(data, rng))
@@ -209,10 +213,10 @@ def damage(pristine: dict[Path, bytes], rng: np.random.Generator) -> list[Path]:
 
 
 def odd_bytes(data: bytes, rng: np.random.Generator) -> bytes:
-    """One to four changes."""
+    """Return the bytes with one to four changes."""
     raw = bytearray(data)
     for _ in range(int(rng.integers(1, 5))):
-        # Half of the changes in the first kB: headers and counts are there.
+        # Half of the changes are in the first kB, which has headers and counts.
         span = len(raw) if rng.random() < 0.5 else min(len(raw), 1024)
         at = int(rng.integers(0, max(span, 1)))
         kind = rng.integers(8)
@@ -231,7 +235,7 @@ def odd_bytes(data: bytes, rng: np.random.Generator) -> bytes:
             raw[at : at + len(odd)] = odd
         elif kind == 6:
             odd = _ODD_BYTES[rng.integers(len(_ODD_BYTES))]
-            at -= at % 4  # counts and numbers are aligned more often than not
+            at -= at % 4  # most counts and numbers are aligned
             raw[at : at + len(odd)] = odd
         else:
             raw[at:at] = raw[at : at + int(rng.integers(1, 200))]
@@ -239,7 +243,7 @@ def odd_bytes(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def odd_json(values: Any, rng: np.random.Generator) -> bytes:
-    """One to three values replaced, removed or repeated; now and then nested deeply."""
+    """Return JSON with one to three values replaced, removed or repeated, or sometimes deeply nested JSON."""
     values = json.loads(json.dumps(values))
     if rng.random() < 0.03:
         return b"[" * 100_000 if rng.random() < 0.5 else b'{"a":' * 50_000 + b"1" + b"}" * 50_000
@@ -264,11 +268,12 @@ def odd_json(values: Any, rng: np.random.Generator) -> bytes:
     return json.dumps(values).encode()
 
 
-def _containers(values: Any, found: list[Any]) -> None:
+def _containers(values: Any, containers: list[Any]) -> None:
+    """Append all lists and objects inside a value."""
     if isinstance(values, dict | list):
-        found.append(values)
+        containers.append(values)
         for part in values.values() if isinstance(values, dict) else values:
-            _containers(part, found)
+            _containers(part, containers)
 
 
 def _json_of(data: bytes) -> Any:
@@ -279,7 +284,7 @@ def _json_of(data: bytes) -> Any:
 
 
 def _odd_npz(path: Path, rng: np.random.Generator) -> None:
-    """A whole archive of damaged arrays: the zip's checksums find all else."""
+    """Write an intact archive of damaged arrays, because the zip format's checksums detect all other damage."""
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in stored.files}
     name = sorted(arrays)[rng.integers(len(arrays))] if rng.random() < 0.5 else "meta"
@@ -304,7 +309,7 @@ def _odd_npz(path: Path, rng: np.random.Generator) -> None:
 
 
 def _replace(path: Path, rng: np.random.Generator) -> None:
-    """By nothing, an empty file, a folder, a link to itself, to nowhere or to a device without end."""
+    """Replace a file by nothing, an empty file, a folder, a link to itself, a broken link, or another name."""
     path.unlink()
     kind = rng.integers(6)
     if kind == 1:
@@ -319,7 +324,7 @@ def _replace(path: Path, rng: np.random.Generator) -> None:
         os.rename(path.parent, path.parent.with_name("moved"))
         path.parent.mkdir()
         for other in path.parent.with_name("moved").iterdir():
-            # A name that is no text beside the others, and the file itself gone.
+            # The file is gone, and a file whose name is not text is beside the others.
             other.rename(path.parent / other.name)
         path.parent.with_name("moved").rmdir()
         (Path(os.fsdecode(os.fsencode(path.parent) + b"/\xff\xfe" + os.fsencode(path.suffix)))).write_bytes(b"x")

@@ -1,4 +1,4 @@
-"""The demo scene in a folder, made once."""
+"""A folder with the demo scene, made once."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from .scene import write_capture
 
 
 def make_demo_scene(folder: str | os.PathLike[str], width: int = 200, n_views: int = 40) -> Path:
-    """Render the demo scene into a folder, whole or not at all. Keep a folder that exists.
+    """Render the demo scene into a folder, completely or not at all. An existing folder is kept.
 
     Parameters
     ----------
-    width : of a photo [px]; the height is three quarters of it.
+    folder : the scene's folder.
+    width : width of a photo [px]; the height is three quarters of it.
     n_views : number of photos.
 
     Returns
@@ -31,7 +32,7 @@ def make_demo_scene(folder: str | os.PathLike[str], width: int = 200, n_views: i
         return folder
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     try:
-        if unfinished.exists():  # an interrupted run left it
+        if unfinished.exists():  # left by an interrupted run
             shutil.rmtree(unfinished)
         write_capture(unfinished, width, width * 3 // 4, n_views)
         os.replace(unfinished, folder)
