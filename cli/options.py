@@ -202,12 +202,12 @@ def config_options(*without: str) -> Callable[[F], F]:
     """Add a flag for each training option except those in `without`; `config_values` reads them."""
 
     def decorate(function: F) -> F:
-        for section, known_options in reversed(SECTIONS.items()):
-            for known in reversed(known_options):
-                if known.name == "background":
+        for section, definitions in reversed(SECTIONS.items()):
+            for definition in reversed(definitions):
+                if definition.name == "background":
                     function = background_options(function, cls=ConfigOption, section=section)
-                elif known.name not in without:
-                    function = _flag_of(known, section)(function)
+                elif definition.name not in without:
+                    function = _flag_of(definition, section)(function)
         return function
 
     return decorate
@@ -239,20 +239,24 @@ def is_given(ctx: click.Context, name: str) -> bool:
     return ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
 
 
-def _flag_of(known: Option, section: str) -> Callable[[F], F]:
+def _flag_of(definition: Option, section: str) -> Callable[[F], F]:
     """Return the decorator that adds the flag of a training option."""
-    flag = "--" + known.name.replace("_", "-")
-    extra: dict[str, Any] = {"cls": ConfigOption, "section": section, "help": known.help}
-    if known.value_type is bool:
-        return click.option(f"{flag}/--no-{flag[2:]}", known.name, default=known.default, show_default=True, **extra)
-    if known.value_type == tuple[int, ...]:
-        return click.option(flag, known.name, type=Numbers(), multiple=True, **extra)
-    if known.default is MISSING:
-        extra["help"] += f"  [default: {_strategy_defaults(known.name)}]"
+    flag = "--" + definition.name.replace("_", "-")
+    extra: dict[str, Any] = {"cls": ConfigOption, "section": section, "help": definition.help}
+    if definition.value_type is bool:
+        return click.option(
+            f"{flag}/--no-{flag[2:]}", definition.name, default=definition.default, show_default=True, **extra
+        )
+    if definition.value_type == tuple[int, ...]:
+        return click.option(flag, definition.name, type=Numbers(), multiple=True, **extra)
+    if definition.default is MISSING:
+        extra["help"] += f"  [default: {_strategy_defaults(definition.name)}]"
     else:
-        extra |= {"default": known.default, "show_default": known.default is not None}
-    value_type: Any = click.Choice(known.choices) if known.choices else known.value_type
-    return click.option(flag, *known.aliases, known.name, type=value_type, metavar=known.metavar, **extra)
+        extra |= {"default": definition.default, "show_default": definition.default is not None}
+    value_type: Any = click.Choice(definition.choices) if definition.choices else definition.value_type
+    return click.option(
+        flag, *definition.aliases, definition.name, type=value_type, metavar=definition.metavar, **extra
+    )
 
 
 def _strategy_defaults(name: str) -> str:

@@ -98,7 +98,7 @@ class TrainConfig:
         unknown = [name for name in options if name not in OPTIONS and name not in ("density", *GROUPS)]
         if unknown:
             raise TypeError(f"TrainConfig has no option {unknown[0]!r}")
-        values = {name: options.get(name, known.default) for name, known in option_table(TrainConfig).items()}
+        values = {name: options.get(name, definition.default) for name, definition in option_table(TrainConfig).items()}
         values["density"] = _density_of(options)
         for name, group in GROUPS.items():
             changes = {key: options[key] for key in option_table(group) if key in options}
@@ -144,7 +144,7 @@ class TrainConfig:
 
         Options of the other strategy have their default values, so that all runs have the same keys.
         """
-        values = {name: known.default for name, known in OPTIONS.items()}
+        values = {name: definition.default for name, definition in OPTIONS.items()}
         values |= {name: getattr(self, name) for name in RUN_OPTIONS}
         for name in ("density", *GROUPS):
             values |= dataclasses.asdict(getattr(self, name))
@@ -231,11 +231,11 @@ def _sections() -> dict[str, tuple[Option, ...]]:
     shared = option_table(DensityConfig)
     sections = {"Training": tuple(RUN_OPTIONS.values()), DensityConfig.title: tuple(shared.values())}
     for strategy in (Adc, Mcmc):
-        specific = (known for name, known in option_table(strategy).items() if name not in shared)
+        specific = (definition for name, definition in option_table(strategy).items() if name not in shared)
         sections[strategy.title] = tuple(specific)
     return sections | {group.title: tuple(option_table(group).values()) for group in GROUPS.values()}
 
 
 SECTIONS = _sections()
 # All options by their flat name.
-OPTIONS = {known.name: known for section in SECTIONS.values() for known in section}
+OPTIONS = {definition.name: definition for section in SECTIONS.values() for definition in section}

@@ -33,8 +33,8 @@ def test_every_option_is_in_one_group_and_has_help() -> None:
     assert len(names) == len(set(names))
     assert not set(names) & {field.name for field in dataclasses.fields(TrainConfig)}
     assert TrainConfig().to_json().keys() == OPTIONS.keys()
-    for known in OPTIONS.values():
-        assert known.help.endswith("."), known.name
+    for definition in OPTIONS.values():
+        assert definition.help.endswith("."), definition.name
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
@@ -48,9 +48,9 @@ def test_a_strategy_has_defaults_of_its_own(strategy: str) -> None:
 
 
 def test_the_strategies_differ_in_defaults_of_shared_options() -> None:
-    for name, known in option_table(DensityConfig).items():
+    for name, definition in option_table(DensityConfig).items():
         differ = getattr(Adc(), name) != getattr(Mcmc(), name)
-        assert differ == (known.default is dataclasses.MISSING), name
+        assert differ == (definition.default is dataclasses.MISSING), name
 
 
 def test_another_strategy_keeps_the_options_that_both_have() -> None:

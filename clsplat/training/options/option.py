@@ -128,7 +128,7 @@ def option(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-_TABLES: dict[type, dict[str, Option]] = {}
+_TABLES: dict[type, dict[str, Option]] = {}  # by class; each table is made once
 
 
 def option_table(group: type[Any]) -> dict[str, Option]:
@@ -148,8 +148,8 @@ def option_table(group: type[Any]) -> dict[str, Option]:
 
 def check_options(values: Any) -> None:
     """Raise InputError naming the first option of a dataclass object that has a wrong value."""
-    for name, checked in option_table(type(values)).items():
-        checked.check(getattr(values, name))
+    for name, definition in option_table(type(values)).items():
+        definition.check(getattr(values, name))
 
 
 class OptionGroup:
