@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @scene_options
 @click.option("-o", "--output", required=True, type=PATH, metavar="FILE", help="The PLY file to write.")
 @click.option(
-    "--tolerance", type=Decibels(), default=0.1, show_default=True, help="PSNR that the validation views may lose."
+    "--tolerance", type=Decibels(), default=0.1, show_default=True, help="Allowed loss of PSNR on the validation views."
 )
 @click.option(
     "--iterations",

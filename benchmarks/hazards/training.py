@@ -276,8 +276,8 @@ def rates_of(hazard: Hazard, variant: Variant) -> dict[str, Any]:
     """Return every learning rate times the factor of the hazard."""
     if hazard.rates == 1:
         return {}
-    plain = TrainConfig(**variant.options)
-    values = {name: hazard.rates * getattr(plain, name) for name in RATES}
+    options = TrainConfig(**variant.options).to_json()
+    values = {name: hazard.rates * options[name] for name in RATES}
     skew = [f.lr for f in SHAPES[variant.shape].fields if f.name == "skew"]
     return values | ({"skew_lr": hazard.rates * skew[0]} if skew else {})
 

@@ -1,4 +1,4 @@
-"""Leaving out what images do not miss: whole splats, own fields such as the skew, SH bands.
+"""Removal of parts that the images do not need: whole splats, shape-specific fields such as the skew, SH bands.
 
 Each kind of part is ranked by the squared change of the training images per byte saved (importance.py). Bisection on
 the ranks finds the threshold at which the validation PSNR falls by the kind's share of the tolerance. The next kind may
@@ -26,19 +26,19 @@ from ..splats.ply_compact import bands_in_use, in_use, layout_bytes, plan_layout
 from ..splats.splats import Splats
 from .importance import Importance, lower_bands, measure_importance
 
-SHARES = {"splats": 0.5, "fields": 0.75, "bands": 1.0}  # of the tolerance, spent once the kind is done
-_STEPS = 10  # of a bisection: one in a thousand of the ranks
-_INDEX = 1  # words beside those of a sparse row
-HEADER_BYTES = 4096  # more than any header of a compact file takes
+SHARES = {"splats": 0.5, "fields": 0.75, "bands": 1.0}  # of the tolerance, used after each kind
+_STEPS = 10  # of a bisection: it resolves a thousandth of the ranks
+_INDEX = 1  # words of a sparse row besides its values
+HEADER_BYTES = 4096  # above the size of any header of a compact file
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Mean squared change of the images per byte saved, up to which parts go; 0: none goes.
+    """Largest mean squared change of the images per byte saved at which a part is removed; 0: nothing is removed.
 
     Parameters
     ----------
-    splats, bands : of whole splats, and of SH bands. fields : of own fields, by name.
+    splats, bands : for whole splats, and for SH bands. fields : for shape-specific fields, by name.
     """
 
     splats: float = 0.0
@@ -48,13 +48,14 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Pruned:
-    """A smaller model.
+    """The result of pruning.
 
     Attributes
     ----------
+    splats : the smaller model.
     before, after : PSNR on the validation views [dB].
-    costs : PSNR lost by kind: "splats", a field's name, "bands".
-    thresholds : that were used.
+    costs : loss of PSNR [dB] by kind: "splats", a field's name, "bands".
+    thresholds : the thresholds that bisection found.
     """
 
     splats: Splats
@@ -65,16 +66,17 @@ class Pruned:
 
 
 class Validation:
-    """PSNR of models on some views, the mean over them [dB]."""
+    """PSNR of models on the validation views."""
 
     def __init__(self, renderer: Renderer, views: Sequence[View], background: Color = BLACK) -> None:
         self.renderer, self.views, self.background = renderer, views, background
 
     def psnr(self, splats: Splats) -> float:
+        """Return the mean PSNR over the views [dB]."""
         return statistics.fmean(self.per_view(splats))
 
     def per_view(self, splats: Splats) -> list[float]:
-        """PSNR of each view; 0 of a model without splats."""
+        """Return the PSNR of each view [dB]; 0 for a model without splats."""
         if not len(splats):
             return [0.0] * len(self.views)
         return [
@@ -91,24 +93,26 @@ def prune(
     kinds: Sequence[str] = tuple(SHARES),
     seed: int = 0,
 ) -> Pruned:
-    """Leave out as much as the validation views allow.
+    """Remove as much as the tolerance on the validation views allows.
 
     Parameters
     ----------
-    views : training views, on which needs are measured. validation : of the validation views.
-    tolerance : that PSNR on the validation views may fall by [dB]. kinds : any of SHARES, in their order.
-    seed : of the signs (see `measure_importance`).
+    views : training views, on which the importance is measured.
+    validation : the validation views.
+    tolerance : allowed loss of PSNR on the validation views [dB].
+    kinds : any of SHARES, in their order.
+    seed : seed of the signs (see `measure_importance`).
 
     Raises
     ------
-    InputError : no splats, or a tolerance that is negative.
+    InputError : the model has no splats, or the tolerance is negative.
     """
     if not len(splats):
         raise InputError("prune: the model has no splats")
     if not tolerance >= 0:
         raise InputError(f"tolerance {tolerance}: must be at least 0 dB")
     before = now = validation.psnr(splats)
-    found, costs = Thresholds(), {}
+    thresholds, costs = Thresholds(), {}
     if "splats" in kinds:
         scores = splat_scores(
             splats,
@@ -116,7 +120,7 @@ def prune(
                 measure_importance(validation.renderer, splats, views, validation.background, seed, parts=False), views
             ),
         )
-        threshold, splats, after = _farthest(
+        threshold, splats, after = _highest_threshold(
             scores,
             splats,
             now,
@@ -124,13 +128,13 @@ def prune(
             partial(without_splats, scores=scores),
             validation,
         )
-        found, costs["splats"], now = replace(found, splats=threshold), now - after, after
+        thresholds, costs["splats"], now = replace(thresholds, splats=threshold), now - after, after
     if "fields" not in kinds and "bands" not in kinds:
-        return Pruned(splats, before, now, costs, found)
+        return Pruned(splats, before, now, costs, thresholds)
     importance = per_pixel(measure_importance(validation.renderer, splats, views, validation.background, seed), views)
     for name, change in importance.fields.items() if "fields" in kinds else ():
         scores = field_scores(splats, name, change)
-        threshold, splats, after = _farthest(
+        threshold, splats, after = _highest_threshold(
             scores,
             splats,
             now,
@@ -138,11 +142,15 @@ def prune(
             partial(without_field, name=name, scores=scores),
             validation,
         )
-        found, costs[name], now = replace(found, fields=found.fields | {name: threshold}), now - after, after
+        thresholds, costs[name], now = (
+            replace(thresholds, fields=thresholds.fields | {name: threshold}),
+            now - after,
+            after,
+        )
     if "bands" in kinds and splats.sh_degree:
         assert importance.colour is not None
         lower, lost = lower_bands(splats.sh, importance.colour)
-        threshold, splats, after = _farthest(
+        threshold, splats, after = _highest_threshold(
             band_slopes(lost),
             splats,
             now,
@@ -150,8 +158,8 @@ def prune(
             partial(without_bands, lower=lower, lost=lost),
             validation,
         )
-        found, costs["bands"], now = replace(found, bands=threshold), now - after, after
-    return Pruned(splats, before, now, costs, found)
+        thresholds, costs["bands"], now = replace(thresholds, bands=threshold), now - after, after
+    return Pruned(splats, before, now, costs, thresholds)
 
 
 def apply_thresholds(
@@ -162,7 +170,7 @@ def apply_thresholds(
     background: Color = BLACK,
     seed: int = 0,
 ) -> Splats:
-    """The model without the fields and bands that thresholds found on another one of its scene leave out."""
+    """Return the model without the fields and bands below thresholds that were found on another model of its scene."""
     importance = per_pixel(measure_importance(renderer, splats, views, background, seed), views)
     for name, threshold in thresholds.fields.items():
         splats = without_field(splats, threshold, name, field_scores(splats, name, importance.fields[name]))
@@ -180,13 +188,13 @@ def within_bytes(
     background: Color = BLACK,
     seed: int = 0,
 ) -> Splats | None:
-    """The model with as many of its fields and bands as a compact file of at most `limit` bytes holds.
+    """Return the model with the most important fields and bands that fit into a compact file of `limit` bytes.
 
-    One threshold holds for both kinds, so that what goes is what changes the views least for its bytes.
+    One threshold holds for both kinds, so that the removed parts change the views least for their bytes.
 
     Returns
     -------
-    None where even the splats' bare columns do not fit.
+    None if even the splats without these parts do not fit.
     """
     if body_bytes(splats) <= limit - HEADER_BYTES:
         return splats
@@ -201,8 +209,8 @@ def within_bytes(
     while low < high:
         middle = high if best is None else (low + high) // 2
         candidate = splats
-        for name, own in scores.items():
-            candidate = without_field(candidate, float(ranked[middle]), name, own)
+        for name, values in scores.items():
+            candidate = without_field(candidate, float(ranked[middle]), name, values)
         candidate = without_bands(candidate, float(ranked[middle]), lower, lost)
         if body_bytes(candidate) <= limit - HEADER_BYTES:
             best, high = candidate, middle
@@ -216,13 +224,13 @@ def within_bytes(
 
 
 def body_bytes(splats: Splats) -> int:
-    """Of a compact file, without its header."""
+    """Return the size of a compact file without its header."""
     single = {name: values.astype(np.float32) for name, values in splats.arrays.items()}
     return layout_bytes(splats.schema, plan_layout(splats.schema, single), len(splats))
 
 
 def per_pixel(importance: Importance, views: Sequence[View]) -> Importance:
-    """Means over the pixels and channels of the views, instead of sums: they are of one size in scenes of any size."""
+    """Divide the sums by the pixels and channels of the views, so that thresholds hold for scenes of any size."""
     count = 3 * sum(view.camera.width * view.camera.height for view in views)
     colour = None if importance.colour is None else importance.colour / np.float32(count)
     return Importance(
@@ -231,38 +239,38 @@ def per_pixel(importance: Importance, views: Sequence[View]) -> Importance:
 
 
 def splat_scores(splats: Splats, importance: Importance) -> DoubleArray:
-    """(N,) change per byte of each splat."""
+    """Return the change per byte of each splat, (N,)."""
     width = sum(values[:1].size for values in splats.arrays.values())
     return importance.removal / (4 * width)
 
 
 def field_scores(splats: Splats, name: str, change: DoubleArray) -> DoubleArray:
-    """(N,) change per byte of each splat's field; infinite where it is neutral already."""
-    own = splats.schema[name]
-    return np.where(in_use(own, splats.arrays[name]), change / (4 * (own.width + _INDEX)), np.inf)
+    """Return the change per byte of each splat's field, (N,); infinite if the field is neutral already."""
+    spec = splats.schema[name]
+    return np.where(in_use(spec, splats.arrays[name]), change / (4 * (spec.width + _INDEX)), np.inf)
 
 
 def band_slopes(lost: DoubleArray) -> DoubleArray:
-    """(N * degree,) loss per byte of each step of a degree down, from those that any step can have."""
+    """Return the loss per byte of each step to the next lower degree, (N * degree,)."""
     words = [3 * sh_coefficients(degree) for degree in range(lost.shape[1])]
     return ((lost[:, :-1] - lost[:, 1:]) / (4 * np.diff(words))).ravel()
 
 
 def without_splats(splats: Splats, threshold: float, scores: DoubleArray) -> Splats:
-    """Those whose score is above the threshold."""
+    """Return the splats whose score is above the threshold."""
     return splats.select(scores > threshold)
 
 
 def strongest(splats: Splats, scores: DoubleArray, count: int) -> Splats:
-    """The `count` splats of the highest scores, in their order."""
+    """Return the `count` splats with the highest scores, in the order of the model."""
     return splats.select(np.sort(np.argsort(-scores, kind="stable")[:count]))
 
 
 def without_field(splats: Splats, threshold: float, name: str, scores: DoubleArray) -> Splats:
-    """A field's neutral value for splats whose score is not above the threshold."""
-    own = splats.schema[name]
+    """Return the splats with the neutral value of a field if their score is not above the threshold."""
+    neutral = splats.schema[name].neutral
     arrays = splats.to_numpy()
-    arrays[name][scores <= threshold] = own.neutral if own.width > 1 else own.neutral[0]
+    arrays[name][scores <= threshold] = neutral if len(neutral) > 1 else neutral[0]
     return splats.with_arrays(arrays)
 
 
@@ -273,13 +281,13 @@ def without_bands(splats: Splats, threshold: float, lower: Sequence[Array], lost
     arrays = splats.to_numpy()
     used = bands_in_use(splats.sh)
     for degree, colours in enumerate(lower):
-        rows = (degrees == degree) & (used > degree)  # others keep their bits
+        rows = (degrees == degree) & (used > degree)  # all other splats keep their bits
         arrays["sh"][rows, : colours.shape[1]] = colours[rows]
         arrays["sh"][rows, colours.shape[1] :] = 0.0
     return splats.with_arrays(arrays)
 
 
-def _farthest(
+def _highest_threshold(
     scores: DoubleArray,
     splats: Splats,
     now: float,
@@ -287,17 +295,18 @@ def _farthest(
     apply: Callable[[Splats, float], Splats],
     validation: Validation,
 ) -> tuple[float, Splats, float]:
-    """The highest threshold, by bisection on the ranks of the scores, that keeps PSNR at the floor or above.
+    """Find the highest threshold that keeps the PSNR at the floor or above, by bisection on the ranks of the scores.
 
     Returns
     -------
-    Threshold, model and its PSNR; (0, `splats`, `now`) where nothing may go.
+    Threshold, model and its PSNR; (0, `splats`, `now`) if nothing can be removed.
     """
     ranked = np.unique(scores[np.isfinite(scores)])
-    low, high = 0, len(ranked) + 1  # thresholds below ranked[low - 1] are good, from ranked[high - 1] on they are not
+    # Thresholds up to ranked[low - 1] are good; those from ranked[high - 1] on are not.
+    low, high = 0, len(ranked) + 1
     best = (0.0, splats, now)
     for step in range(_STEPS):
-        middle = high - 1 if step == 0 else (low + high) // 2  # all of it first: often nothing is missed
+        middle = high - 1 if step == 0 else (low + high) // 2  # often everything can be removed
         if middle <= low:
             break
         candidate = apply(splats, float(ranked[middle - 1]))

@@ -1,8 +1,7 @@
-"""Fewer splats, round by round: the least needed go, and the others are trained on to take over.
+"""Rounds of pruning: the least important splats are removed, and the others are trained on to replace them.
 
-A quarter of the splats goes in a round. Trained on for a tenth of the run, the rest is as good as before for several
-rounds: of fox's 32 000 splats (1000 iterations, 31.16 dB on validation views) 18 000 had 31.33 dB after two rounds and
-10 125 had 31.11 dB after four; a run at 16 000 has 30.43 dB.
+A round removes a quarter of the splats and trains the others for a tenth of the run. The model stays as good as before
+for several rounds, and is then better than a run with that number of splats.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ from ..training.trainer import Trainer
 from .importance import measure_importance
 from .prune import Validation, splat_scores, strongest
 
-KEPT = 0.75  # of the splats, by a round
-SETTLING = 0.3  # rate of a last part without removal: 0.2 dB better than at full rate (fox, 13 500 and 5700 splats)
-_WARM = 10.0  # positions' first rate over their last: removing splats leaves gaps to be closed
+KEPT = 0.75  # share of the splats that a round keeps
+FINAL_RATE = 0.3  # factor on the rates of the last part, which removes no splat
+_WARM = 10.0  # first rate of positions over the last: removed splats leave gaps, which positions must close
 
 
 def without_quarter(
@@ -36,13 +35,13 @@ def without_quarter(
     seed: int = 0,
     count: int | None = None,
 ) -> Splats:
-    """The splats whose removal would change the views most: KEPT of them, or `count` where that is more."""
+    """Return the most important splats: the share KEPT of them, or `count` if that is more."""
     importance = measure_importance(renderer, splats, views, background, seed, parts=False)
     keep = max(int(KEPT * len(splats)), count or 1)
     return strongest(splats, splat_scores(splats, importance), min(keep, len(splats)))
 
 
-def trained_rounds(
+def prune_in_rounds(
     scene: Scene,
     splats: Splats,
     validation: Validation,
@@ -51,13 +50,14 @@ def trained_rounds(
     device: Device,
     progress: Callable[[Progress], None] | None = None,
 ) -> Splats:
-    """Rounds for a model whose run is not known, until the validation PSNR falls below the floor; the last good one.
+    """Run rounds on a model until the validation PSNR falls below the floor, and return the last good model.
 
-    Rates are those that a run of clsplat's defaults, ten times as long as a round, ends with.
+    The training run of the model is not known. Rates are those at the end of a run with clsplat's defaults that is ten
+    times as long as a round.
 
     Parameters
     ----------
-    iterations : of a round.
+    floor : lowest allowed PSNR [dB]. iterations : length of a round.
     """
     config = TrainConfig(
         shape=splats.shape,
@@ -85,12 +85,12 @@ def fine_tune(
     progress: Callable[[Progress], None] | None = None,
     rate: float = 1.0,
 ) -> Splats:
-    """`splats` after some more iterations, at the rates that `config`'s run ends with; their number stays.
+    """Train `splats` on, at the rates at the end of `config`'s run; their number does not change.
 
     Parameters
     ----------
-    scene : its training views are used. config : of the run that made the splats.
-    iterations : 0 gives the splats back. rate : times all rates but the positions'.
+    scene : its training views are used. config : options of the run that made the splats.
+    iterations : 0 returns the splats unchanged. rate : factor on all rates but that of the positions.
     """
     if not iterations:
         return splats
@@ -107,19 +107,19 @@ def fine_tune(
 
 
 def without_messages(progress: Callable[[Progress], None] | None) -> Callable[[Progress], None] | None:
-    """The same, told of iterations only: where parts of a run start from is no news."""
+    """Return a callback that gets reports of iterations only, without the messages of the partial runs."""
     if progress is None:
         return None
 
-    def told(report: Progress) -> None:
+    def iterations_only(report: Progress) -> None:
         if not report.message:
             progress(report)
 
-    return told
+    return iterations_only
 
 
 def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Path, rate: float = 1.0) -> TrainConfig:
-    """Options that train `splats`, saved in `start`, on: full images, all bands, no strategy, no noise."""
+    """Return options that train the splats in the file `start`: full images, all bands, no strategy, no noise."""
     short = config.replace(iterations=iterations)
     # Rates of short runs are larger: the short run gets options that lead to the rates of the long one.
     rates = {

@@ -1,4 +1,4 @@
-"""What a search for the smallest model decides, from the PSNR of its models on validation views."""
+"""Decisions of the search for the smallest model, made from the PSNR of its models on validation views."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from typing import Any
 from ..errors import InputError
 
 TOLERANCE = 0.1  # dB
-KNEE_SHARE, ROUNDS_SHARE, PARTS_SHARE = 0.5, 0.25, 0.25  # of the tolerance: together they may cost all of it
+KNEE_SHARE, ROUNDS_SHARE, PARTS_SHARE = 0.5, 0.25, 0.25  # shares of the tolerance that the stages may use
 FIRST_CAP = 1000
-PATIENCE = 2  # doublings that may gain too little before growth stops, and rounds that may lose too much
-FEWEST = 50  # splats: no round goes below
+PATIENCE = 2  # bad doublings before growth stops, and bad rounds before the rounds stop
+MIN_SPLATS = 50  # the rounds stop at this number
 
-# A model: "splats", "psnr"; "cap" (growth, whole runs), "views" (growth), "fitted_psnr" (where bytes are limited);
-# "lost" (the first of the rounds): how much lower its PSNR is than that of the best whole run.
+# A model: "splats" and "psnr"; "cap" (growth and whole runs); "views", the PSNR of each view (growth); "fitted_psnr"
+# (with a limit of bytes); "lost", the PSNR below the best whole run (first of the rounds).
 ModelRow = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class BudgetOptions:
-    """What the smallest model must do.
+    """Conditions for the smallest model.
 
     Parameters
     ----------
-    tolerance : PSNR that it may lose to the best model found, on validation views [dB].
-    target_psnr : on validation views, instead: the smallest model that has it [dB].
-    max_bytes : of the file; the best model that fits.
+    tolerance : allowed loss of PSNR to the best model, on validation views [dB].
+    target_psnr : replaces the tolerance: find the smallest model with this PSNR on validation views [dB].
+    max_bytes : size of the file: find the best model that fits.
 
     Raises
     ------
-    InputError : a value that makes no sense.
+    InputError : a value is out of range.
     """
 
     tolerance: float = TOLERANCE
@@ -48,14 +48,14 @@ class BudgetOptions:
             raise InputError(f"max bytes {self.max_bytes}: must be at least 1")
 
 
-def growth_caps(most: int) -> list[int]:
-    """Caps of the growth: doubling, and the largest itself."""
-    caps = [FIRST_CAP * 2**step for step in range(64) if FIRST_CAP * 2**step < most]
-    return [*caps, most]
+def growth_caps(largest: int) -> list[int]:
+    """Return the caps of the growth: doubling, and the largest itself."""
+    caps = [FIRST_CAP * 2**step for step in range(64) if FIRST_CAP * 2**step < largest]
+    return [*caps, largest]
 
 
 def growth_is_over(rows: list[ModelRow], options: BudgetOptions) -> bool:
-    """Whether the last doublings gained too little, or the target is reached."""
+    """Return whether the last doublings gained too little, or the target is reached."""
     if options.target_psnr is not None and rows and rows[-1]["psnr"] >= options.target_psnr:
         return True
     before = [row["psnr"] for row in rows[:-PATIENCE]]
@@ -63,9 +63,10 @@ def growth_is_over(rows: list[ModelRow], options: BudgetOptions) -> bool:
 
 
 def candidates(rows: list[ModelRow], options: BudgetOptions) -> list[int]:
-    """Caps that may be the knee, rising: the smallest that is as good as the best, and the smallest that may be.
+    """Return the possible knees: one cap, or two rising ones.
 
-    The latter differs from the best by less than the standard error: short runs cannot tell them apart, whole ones may.
+    The larger one is the smallest cap that is as good as the best. The smaller one is the smallest cap that differs
+    from the best by less than the standard error: only whole runs can decide between the two.
     """
     for row in rows:
         if options.target_psnr is not None and row["psnr"] >= options.target_psnr:
@@ -79,28 +80,27 @@ def candidates(rows: list[ModelRow], options: BudgetOptions) -> list[int]:
 
 
 def knee_of(whole: list[ModelRow], options: BudgetOptions) -> int:
-    """The smallest cap of whole runs that is as good as the best of them."""
+    """Return the smallest cap of whole runs that is as good as the best of them."""
     best = max(float(row["psnr"]) for row in whole)
-    knee: int = next(row["cap"] for row in whole if row["psnr"] >= best - KNEE_SHARE * options.tolerance)
-    return knee
+    return next(int(row["cap"]) for row in whole if row["psnr"] >= best - KNEE_SHARE * options.tolerance)
 
 
 def standard_error(first: list[float], second: list[float]) -> float:
-    """Of the mean difference of two models on the same views; 0 of a single view, which tells nothing of it."""
+    """Return the standard error of the mean difference of two models on the same views; 0 for a single view."""
     differences = [a - b for a, b in zip(first, second, strict=True)]
     return statistics.stdev(differences) / math.sqrt(len(differences)) if len(differences) > 1 else 0.0
 
 
 def rounds_are_over(rows: list[ModelRow], options: BudgetOptions) -> bool:
-    """Whether fewer splats would not do: the last models were not good enough, or hardly a splat is left."""
+    """Return whether the last models were not good enough, or hardly a splat is left."""
     last = rows[-PATIENCE:]
-    return rows[-1]["splats"] <= FEWEST or (
+    return rows[-1]["splats"] <= MIN_SPLATS or (
         len(last) == PATIENCE and all(meets(row, rows, options) is False for row in last)
     )
 
 
 def meets(row: ModelRow, rows: list[ModelRow], options: BudgetOptions) -> bool | None:
-    """Whether a model of the rounds is good enough beside the others; None: not yet small enough."""
+    """Return whether a model of the rounds is good enough compared with the others; None if it is still too large."""
     floor = options.target_psnr
     if floor is None:
         floor = max(other["psnr"] for other in rows) - rounds_allowed(rows, options)
@@ -110,12 +110,12 @@ def meets(row: ModelRow, rows: list[ModelRow], options: BudgetOptions) -> bool |
 
 
 def rounds_allowed(rows: list[ModelRow], options: BudgetOptions) -> float:
-    """PSNR that rounds may lose [dB]: their share of the tolerance, and what the knee has left of its own."""
+    """Return the PSNR that rounds may lose [dB]: their share of the tolerance and the rest of the knee's share."""
     return (KNEE_SHARE + ROUNDS_SHARE) * options.tolerance - float(rows[0].get("lost", KNEE_SHARE * options.tolerance))
 
 
 def chosen_of(rows: list[ModelRow], options: BudgetOptions) -> int:
-    """Number of rounds after which the model is the one wanted; of none that is, after which it is best."""
+    """Return the number of rounds that lead to the chosen model; if no model is good enough, to the best one."""
     if options.max_bytes is not None:
         fitting = [row["fitted_psnr"] for row in rows if row["fitted_psnr"] is not None]
         if not fitting:

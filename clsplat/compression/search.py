@@ -1,18 +1,18 @@
-"""No more model than the scene needs: growth while it pays, then fewer splats, then fewer parameters of each.
+"""Search for the smallest model of a scene: growth, then fewer splats, then fewer parameters of each splat.
 
-Everything is decided on validation views, held out of the training set (validation.py); test views are never looked at.
+All decisions are made on validation views, held out of the training set (scenes/split.py). Test views are never used.
 
-    growth    short runs (a quarter of the iterations), the cap doubling, until two doublings have gained less than the
-              tolerance; the knee is the smallest cap within half of it of the best. Where a smaller cap is within the
-              standard error (over views) of the best, too, a whole run of each decides
-    rounds    from a whole run at the knee, rounds that remove a quarter of the splats and train the others on
-              (shrink.py), until two have a PSNR lower than the best so far, which most often is not the first, by more
-              than a quarter of the tolerance and what the knee has left of its half; the fewest splats that have not
-              are taken, and trained on at lower rates
-    parts     of that model, the fields and bands that the last quarter allows (prune.py)
-    refit     the same with all training views: the run at the knee, as many rounds, the thresholds found before
+1. Growth. Short runs (a quarter of the iterations) double the cap, until two doublings gain less than the tolerance.
+   The knee is the smallest cap within half of the tolerance of the best. If a smaller cap is within the standard error
+   (over views) of the best, a whole run of each decides.
+2. Rounds. They start from a whole run at the knee. Each round removes a quarter of the splats and fine-tunes the others
+   (prune_and_refine.py). The allowed loss to the best round is a quarter of the tolerance and the unused part of the
+   knee's half. The rounds stop after two models below that line. The smallest model above it is fine-tuned once more at
+   lower rates.
+3. Parts. The last quarter of the tolerance allows fields and bands of that model to be removed (prune.py).
+4. Refit. The same steps with all training views: the run at the knee, the same number of rounds, the same thresholds.
 
-A target of PSNR or bytes replaces the tolerance as what ends the rounds. Finished stages are kept (budget_state.py).
+A target of PSNR or bytes replaces the tolerance as the condition that ends the rounds. state.py keeps finished stages.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from ..training.log import Progress
 from ..training.run import train
 from ..training.trainer import Trainer
 from .prune import Thresholds, Validation, apply_thresholds, prune, within_bytes
-from .prune_and_refine import SETTLING, fine_tune, without_messages, without_quarter
+from .prune_and_refine import FINAL_RATE, fine_tune, without_messages, without_quarter
 from .rules import (
-    FEWEST,
+    MIN_SPLATS,
     PARTS_SHARE,
     BudgetOptions,
     ModelRow,
@@ -54,7 +54,7 @@ from .rules import (
 )
 from .state import BudgetState
 
-GROWTH_PART, ROUND_PART = 4, 10  # the run's iterations over those of a run of growth, and of a round
+GROWTH_PART, ROUND_PART = 4, 10  # iterations of the run over those of a growth run, and of a round
 
 ProgressCallback = Callable[[Progress], None]
 
@@ -65,8 +65,8 @@ class Budgeted:
 
     Attributes
     ----------
-    splats : the model. path : of its file. finished : False: interrupted, and to be resumed.
-    report : what budget.json holds: growth, knee, rounds, what went, and what was reached.
+    splats : the model. path : its file. finished : False after an interruption; the search can be resumed.
+    report : content of budget.json: growth, knee, rounds, removed parts and the result.
     """
 
     splats: Splats
@@ -76,7 +76,7 @@ class Budgeted:
 
     @property
     def seconds(self) -> float:
-        """Of all stages: growth, held-out run, rounds, parts, refit."""
+        """Seconds of all stages: growth, held-out run, rounds, parts, refit."""
         report = self.report
         stages = [
             *report.get("growth", []),
@@ -102,14 +102,14 @@ def train_budget(
 
     Parameters
     ----------
-    config : of a whole run; its `cap_max` is the largest cap that is tried. progress : as `train`'s.
-    output : model folder: besides what `train` writes, budget.json, and the small model as its last point cloud.
-    resume : go on after the last stage that is done; the options must be the same. overwrite : as `train`'s.
+    config : options of a whole run; its `cap_max` is the largest cap that is tried. progress : as of `train`.
+    output : model folder. It gets the files of `train`, budget.json, and the small model as its last point cloud.
+    resume : continue after the last finished stage, with the same options. overwrite : as of `train`.
 
     Raises
     ------
-    InputError : too few training views, options that do not fit, or a target that no model can meet.
-    OutputError, DeviceError, TrainingError : as `train`. KeyboardInterrupt : Ctrl-C; stages that are done are kept.
+    InputError : too few training views, other options than before, or a target that no model can meet.
+    OutputError, DeviceError, TrainingError : as `train`. KeyboardInterrupt : Ctrl-C; finished stages are kept.
     """
     config, options = config or TrainConfig(), options or BudgetOptions()
     state = BudgetState(Path(output))
@@ -128,7 +128,7 @@ def train_budget(
 
 
 class _Search:
-    """The stages, each done once."""
+    """The stages of a search, each done once."""
 
     def __init__(
         self,
@@ -148,16 +148,21 @@ class _Search:
         self.part = max(config.iterations // ROUND_PART, 1)
 
     def run(self) -> Budgeted:
-        """All that is left to do."""
+        """Run the missing stages."""
         values = self.state.values
-        stages = {"candidates": self.grow, "knee": self.decide, "chosen": self.shrink, "thresholds": self.find_parts}
+        stages = {
+            "candidates": self.grow,
+            "knee": self.decide,
+            "chosen": self.remove_splats,
+            "thresholds": self.find_parts,
+        }
         for key, stage in stages.items():
             if key not in values:
                 stage()
         if "refit" not in values:
             resume = self.folder.checkpoint_path.is_file()
             config = self.config.replace(cap_max=values["knee"])
-            self.say(f"refit: all {len(self.scene.train)} training views, at most {values['knee']} splats")
+            self.report_message(f"refit: all {len(self.scene.train)} training views, at most {values['knee']} splats")
             model = train(
                 self.scene,
                 config,
@@ -173,7 +178,7 @@ class _Search:
         return self.finish()
 
     def grow(self) -> None:
-        """Short runs at rising caps."""
+        """Make short runs at rising caps."""
         iterations = max(self.config.iterations // GROWTH_PART, 1)
         interval = max(self.config.density.densify_interval // GROWTH_PART, 1)
         rows: list[ModelRow] = self.state.values.get("growth", [])
@@ -182,7 +187,7 @@ class _Search:
                 continue
             if growth_is_over(rows, self.options):
                 break
-            self.say(f"growth: at most {cap} splats, {iterations} iterations")
+            self.report_message(f"growth: at most {cap} splats, {iterations} iterations")
             config = self.config.replace(
                 cap_max=cap,
                 iterations=iterations,
@@ -203,17 +208,17 @@ class _Search:
                 },
             ]
             self.state.put("growth", rows)
-            if len(splats) < cap:  # it grows no further by itself
+            if len(splats) < cap:  # a larger cap would give the same run
                 break
         self.state.put("candidates", candidates(rows, self.options))
 
     def decide(self) -> None:
-        """A whole run at each cap that may be the knee."""
+        """Make a whole run at each cap that may be the knee."""
         rows: list[ModelRow] = self.state.values.get("whole", [])
         for cap in self.state.values["candidates"]:
             if any(row["cap"] == cap for row in rows):
                 continue
-            self.say(
+            self.report_message(
                 f"held out: at most {cap} splats, {len(self.split.train)} training views, "
                 f"{len(self.split.test)} validation views"
             )
@@ -223,8 +228,8 @@ class _Search:
             self.state.put("whole", rows)
         self.state.put("knee", knee_of(rows, self.options))
 
-    def shrink(self) -> None:
-        """Rounds."""
+    def remove_splats(self) -> None:
+        """Run rounds that remove splats."""
         values, goal = self.state.values, self.options
         if "rounds" not in values:
             self.state.save("held_out_0", self.state.model(f"whole_{values['knee']}"))
@@ -241,9 +246,9 @@ class _Search:
         self.state.put("chosen", chosen_of(rows, goal))
 
     def find_parts(self) -> None:
-        """Fields and bands that the validation views do not miss."""
+        """Find the fields and bands that the validation views do not need."""
         values, start = self.state.values, time.perf_counter()
-        splats = self.settle(self.split, self.state.model(f"held_out_{values['chosen']}"), values["chosen"])
+        splats = self.final_part(self.split, self.state.model(f"held_out_{values['chosen']}"), values["chosen"])
         now = self.validation.psnr(splats)
         allowed = PARTS_SHARE * self.options.tolerance
         if self.options.target_psnr is not None:
@@ -265,7 +270,7 @@ class _Search:
         self.state.put("thresholds", {"fields": found.thresholds.fields, "bands": found.thresholds.bands})
 
     def finish(self) -> Budgeted:
-        """Rounds, thresholds and the file of the refitted model."""
+        """Repeat the rounds and thresholds on the refitted model, and write its file."""
         values = self.state.values
         start = time.perf_counter()
         done = values["refit"]["done"]
@@ -274,7 +279,7 @@ class _Search:
             splats, done = self.round(self.scene, splats, done + 1), done + 1
             self.state.save(f"refit_{done}", splats)
             self.state.put("refit", values["refit"] | {"done": done})
-        splats = self.settle(self.scene, splats, done)
+        splats = self.final_part(self.scene, splats, done)
         found = values["thresholds"]
         thresholds = Thresholds(0.0, found["fields"], found["bands"])
         splats = apply_thresholds(
@@ -294,25 +299,27 @@ class _Search:
         return Budgeted(splats, path, True, values)
 
     def round(self, scene: Scene, splats: Splats, number: int) -> Splats:
-        """A quarter fewer splats, trained on."""
-        fewer = without_quarter(splats, scene.train, self.renderer, self.config.background, self.config.seed, FEWEST)
-        self.say(f"round {number}: {len(fewer)} splats, {self.part} iterations")
+        """Remove a quarter of the splats and train the others on."""
+        fewer = without_quarter(
+            splats, scene.train, self.renderer, self.config.background, self.config.seed, MIN_SPLATS
+        )
+        self.report_message(f"round {number}: {len(fewer)} splats, {self.part} iterations")
         return fine_tune(scene, fewer, self.config, self.part, self.device, self.progress)
 
-    def settle(self, scene: Scene, splats: Splats, rounds: int) -> Splats:
-        """The last part, at lower rates; without rounds the run's own end was it."""
+    def final_part(self, scene: Scene, splats: Splats, rounds: int) -> Splats:
+        """Fine-tune at lower rates; without rounds the end of the run did that already."""
         if not rounds:
             return splats
-        self.say(f"last part: {len(splats)} splats, {self.part} iterations at lower rates")
-        return fine_tune(scene, splats, self.config, self.part, self.device, self.progress, SETTLING)
+        self.report_message(f"last part: {len(splats)} splats, {self.part} iterations at lower rates")
+        return fine_tune(scene, splats, self.config, self.part, self.device, self.progress, FINAL_RATE)
 
     def run_of(self, config: TrainConfig) -> tuple[Splats, float]:
-        """A training run without the held-out views; and its seconds."""
+        """Train without the held-out views; return the model and the seconds."""
         model = Trainer(self.split, config, progress=without_messages(self.progress), device=self.device).run()
         return model.splats, round(model.seconds, 2)
 
     def row(self, splats: Splats, seconds: float) -> ModelRow:
-        """A model of the rounds; with a limit of bytes, as good as it is once it fits."""
+        """Return the row of a model; with a limit of bytes also its PSNR once it fits."""
         row: ModelRow = {"splats": len(splats), "psnr": self.validation.psnr(splats), "seconds": seconds}
         if self.options.max_bytes is not None:
             fitted = self.fitted(splats, self.split)
@@ -320,26 +327,26 @@ class _Search:
         return row
 
     def fitted(self, splats: Splats, scene: Scene) -> Splats | None:
-        """The model within the limit of bytes, if it can be."""
+        """Return the model within the limit of bytes; None if it cannot fit."""
         assert self.options.max_bytes is not None
         return within_bytes(
             splats, scene.train, self.renderer, self.options.max_bytes, self.config.background, self.config.seed
         )
 
     def missed(self, nbytes: int) -> str | None:
-        """What of the targets was not met, in one sentence."""
+        """Return a sentence for each target that was not met; None if all are met."""
         options, reached = self.options, self.state.values["held_out"]["psnr_pruned"]
-        said = []
+        sentences = []
         if options.target_psnr is not None and reached < options.target_psnr:
-            said.append(
+            sentences.append(
                 f"target PSNR {options.target_psnr:g} dB was not reached: the best model, which is kept, has "
                 f"{reached:.2f} dB on validation views: try more --iterations or a higher --cap-max"
             )
         if options.max_bytes is not None and nbytes > options.max_bytes:
-            said.append(f"{nbytes} bytes are more than {options.max_bytes}: the smallest model tried is kept")
-        return "; ".join(said) or None
+            sentences.append(f"{nbytes} bytes are more than {options.max_bytes}: the smallest model tried is kept")
+        return "; ".join(sentences) or None
 
-    def say(self, message: str) -> None:
-        """Tell the display what begins."""
+    def report_message(self, message: str) -> None:
+        """Send a message to the display."""
         if self.progress is not None:
             self.progress(Progress(0, self.config.iterations, math.nan, math.nan, 0, 0.0, 0.0, message))

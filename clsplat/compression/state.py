@@ -1,4 +1,4 @@
-"""What a search for the smallest model has found so far: budget.json and the models of its stages, for `--resume`."""
+"""Progress of a search for the smallest model: budget.json and the models of its stages, for `--resume`."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ FILE, FOLDER = "budget.json", "budget"
 
 
 class BudgetState:
-    """budget.json in a model's folder, written after every stage, and the PLY files of stages beside it.
+    """budget.json in a model's folder, written after every stage, and the PLY files of the stages.
 
     Attributes
     ----------
-    values : "config", "options", "scene" (how it was read), and a key for each stage that is done.
+    values : "config", "options", "scene" (how it was read), and a key for each finished stage.
     """
 
     def __init__(self, output: Path) -> None:
@@ -32,14 +32,14 @@ class BudgetState:
         self.values: dict[str, Any] = {}
 
     def begin(self, config: TrainConfig, options: BudgetOptions, scene: dict[str, Any]) -> None:
-        """Forget what a former search found."""
+        """Start a new search and delete the stages of an earlier one."""
         shutil.rmtree(self.folder, ignore_errors=True)
         values = {"config": config.to_json(), "options": asdict(options), "scene": scene}
-        self.values = json.loads(json.dumps(values))  # as a search that is resumed reads them
+        self.values = json.loads(json.dumps(values))  # the types that a resumed search reads
         write_json(self.path, self.values)
 
     def load(self) -> None:
-        """What a search left there; InputError where there is none, or it is damaged."""
+        """Read an earlier search; raises InputError if it is missing or damaged."""
         if not self.path.is_file():
             raise InputError(f"{self.path}: no search to resume from: start without --resume")
         values = read_object(self.path)
@@ -49,7 +49,7 @@ class BudgetState:
         self.values = values
 
     def check(self, config: TrainConfig, options: BudgetOptions) -> None:
-        """Raises InputError unless the search was started with these options."""
+        """Raise InputError unless the search was started with these options."""
         stored = TrainConfig.from_json(self.values["config"]).to_json() | self.values["options"]
         for key, value in (config.to_json() | asdict(options)).items():
             if key not in FREE_OPTIONS and stored.get(key) != value:
@@ -59,25 +59,25 @@ class BudgetState:
                 )
 
     def put(self, stage: str, value: Any) -> None:
-        """A stage is done."""
+        """Store the result of a finished stage."""
         self.values[stage] = value
         write_json(self.path, self.values)
 
     def save(self, name: str, splats: Splats) -> None:
-        """Keep a stage's model."""
+        """Save the model of a stage."""
         splats.save(self.folder / f"{name}.ply")
 
     def model(self, name: str) -> Splats:
-        """The model of a stage that is done."""
+        """Load the model of a finished stage."""
         return Splats.load(self.folder / f"{name}.ply")
 
     def remove(self) -> None:
-        """Delete budget.json and the stages' models."""
+        """Delete budget.json and the models of the stages."""
         self.end()
         self.path.unlink(missing_ok=True)
 
     def end(self) -> None:
-        """The stages' models are no longer needed."""
+        """Delete the models of the stages, which are no longer needed."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 

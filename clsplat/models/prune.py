@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ..compression.prune import SHARES, Pruned, Validation, prune
-from ..compression.prune_and_refine import trained_rounds
+from ..compression.prune_and_refine import prune_in_rounds
 from ..device.device import open_device
 from ..errors import InputError, OutputError
 from ..rendering.renderer import Renderer
@@ -97,7 +97,7 @@ def _pruned(
         return prune(model.splats, scene.train, validation, tolerance)
     before = validation.psnr(model.splats)
     floor = before - SHARES["splats"] * tolerance
-    splats = trained_rounds(scene, model.splats, validation, floor, iterations, opened, progress)
+    splats = prune_in_rounds(scene, model.splats, validation, floor, iterations, opened, progress)
     now = validation.psnr(splats)
     parts = prune(splats, scene.train, validation, max(now - before + tolerance, 0.0), ("fields", "bands"))
     return replace(parts, before=before, costs={"splats": before - now, **parts.costs})
