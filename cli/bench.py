@@ -78,8 +78,8 @@ def bench(
     """Time each stage of a training step and of an image, and compare it with the limits of the device.
 
     The limits are measured on the same device: bytes per second of a copy, and operations per second of fused
-    multiply-adds. The bytes and operations of a stage are the least that it needs. Of all pairs of splat and pixel,
-    only those that change the image are counted. Other programs on the machine make all numbers worse.
+    multiply-adds. The bytes and operations of a stage are the least that it needs. Pairs of splat and pixel count only
+    if they change the image. Other programs on the machine make all numbers worse.
     """
     from clsplat.device.device import open_device
     from clsplat.profiling.bench import bench_trainer, measure_render, measure_training, write_reports

@@ -102,6 +102,7 @@ class Renderer:
         rgb = np.asarray(background, np.float64)
         if rgb.shape != (3,) or not np.all(np.isfinite(rgb)):
             raise InputError(f"background {background!r}: expected three finite numbers R, G, B")
+        self._last = None  # releases the splats of the last frame: memory may be short
         pipeline = self._pipeline(splats)
         buffers = self._upload(splats, pipeline)
         frame = pipeline.forward(buffers, camera, (float(rgb[0]), float(rgb[1]), float(rgb[2])), sh_degree)

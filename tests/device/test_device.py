@@ -44,7 +44,7 @@ def device() -> Device:
 
 
 class Opened:
-    """Stands in for Device where only the choice matters."""
+    """A stand-in for Device; these tests check the choice only."""
 
     def __init__(self, cl_device, info):
         self.info = info
@@ -52,7 +52,7 @@ class Opened:
 
 @pytest.fixture
 def choose(monkeypatch):
-    """choose(spec, infos) -> index of the device that open_device takes among invented ones."""
+    """choose(spec, infos): index of the device that open_device chooses among invented ones."""
     monkeypatch.delenv("PYOPENCL_CTX", raising=False)
     monkeypatch.setattr(device_module, "Device", Opened)
 
@@ -101,19 +101,19 @@ def test_best_device_is_a_gpu_then_pocl_then_intel(choose):
     assert choose(None, grind) == "3:0"
     assert choose("cpu", gpu, intel, pocl) == "1:0"
     assert choose("GPU", intel, gpu) == "0:0"
-    assert choose("intel", pocl, intel) == "2:0", "a platform's name goes before a device's"
+    assert choose("intel", pocl, intel) == "2:0", "platform names are searched before device names"
     assert choose("xeon", intel, pocl) == "1:0"
     assert choose("2:0", gpu, pocl, intel) == "2:0"
     assert choose("0", pocl, gpu, big) == "0:0"
 
 
-def test_unknown_device_lists_the_known_ones(choose):
+def test_an_unknown_device_lists_the_known_ones(choose):
     for spec in ("9:9", "nothing like it", ""):
         with pytest.raises(DeviceError, match=r"not found: choose one of 0:0 Anvil \(Acme\)"):
             choose(spec, INFO)
 
 
-def test_broken_pocl_wheel_is_passed_over_and_named(choose):
+def test_the_broken_pocl_wheel_is_skipped_and_named(choose):
     broken = dataclasses.replace(
         INFO, platform=POCL, platform_version="OpenCL 3.0 PoCL 3.0-rc2  Linux, Release", type="CPU"
     )
@@ -122,12 +122,12 @@ def test_broken_pocl_wheel_is_passed_over_and_named(choose):
         choose(None, broken)
 
 
-def test_no_platform_tells_what_to_install(choose):
+def test_without_a_platform_the_error_names_what_to_install(choose):
     with pytest.raises(DeviceError, match=r"no OpenCL platform.*pip install clsplat\[cpu\]"):
         choose(None)
 
 
-def test_environment_chooses_and_is_named_when_wrong(monkeypatch):
+def test_the_environment_chooses_and_is_named_if_wrong(monkeypatch):
     info = list_devices()[-1]
     monkeypatch.setenv("PYOPENCL_CTX", info.index)
     assert open_device().info == info
@@ -182,19 +182,19 @@ def prefix(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     monkeypatch.setattr(runtime, "SYSTEM_VENDORS", system)
     monkeypatch.setattr(runtime, "_preload", lambda folder: True)
-    # Set first, so that monkeypatch takes away what register_pip_runtime sets.
+    # Set first, so that monkeypatch removes what register_pip_runtime sets.
     monkeypatch.setenv(runtime.VENDORS_VARIABLE, "")
     monkeypatch.delenv(runtime.VENDORS_VARIABLE)
     return tmp_path
 
 
-def test_pip_runtime_is_registered_beside_the_systems(prefix):
+def test_the_pip_runtime_is_registered_with_those_of_the_system(prefix):
     assert runtime.register_pip_runtime()
     folder = Path(os.environ[runtime.VENDORS_VARIABLE])
     texts = {icd.name: icd.read_text().strip() for icd in folder.iterdir()}
     assert texts.pop("pocl.icd") == "libpocl.so"
     assert list(texts.values()) == [str((prefix / "lib" / runtime.RUNTIME).resolve())]
-    assert runtime.register_pip_runtime(), "again: still registered"
+    assert runtime.register_pip_runtime(), "a second call keeps it registered"
     assert os.environ[runtime.VENDORS_VARIABLE] == str(folder)
 
 

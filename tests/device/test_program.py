@@ -62,7 +62,7 @@ def warnings_are_errors(monkeypatch):
 
 
 def run_affine(device: Device, real: str, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """The kernel's output and what it must be."""
+    """Return the kernel's output and the expected output."""
     dtype = np.dtype(np.float64 if real == "double" else np.float32)
     x = np.linspace(-2, 5, n, dtype=dtype)
     xs, ys = device.alloc(x.nbytes), device.alloc(x.nbytes)
@@ -85,7 +85,7 @@ def test_kernel_binds_by_name_in_both_precisions(device, real, tolerance):
     assert np.allclose(got, expected, rtol=tolerance, atol=tolerance)
 
 
-def test_smoke_test_passes_and_notices_wrong_numbers(device, monkeypatch):
+def test_the_smoke_test_passes_and_detects_wrong_numbers(device, monkeypatch):
     build_ms, run_ms = smoke_test(device)
     assert build_ms >= 0
     assert run_ms >= 0
@@ -136,7 +136,7 @@ def test_unknown_cpu_is_named_as_the_broken_wheel(monkeypatch):
     assert BROKEN_POCL in str(caught.value)
 
 
-def test_missing_double_precision_is_said_before_building():
+def test_missing_double_precision_is_reported_before_building():
     class Single:
         has_fp64 = False
         info = "Anvil"

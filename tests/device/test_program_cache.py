@@ -1,4 +1,4 @@
-"""binaries.py: what a name depends on, and that no damage, race or full folder costs more than a build."""
+"""The program cache: names of files, and damaged files, races or full folders that only cost a build."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from clsplat.device import program_cache as binaries
+from clsplat.device import program_cache
 from clsplat.device.device import DeviceInfo
 from clsplat.device.program_cache import SELF_CACHING, binary_path, load_binary, store_binary
 
@@ -19,7 +19,7 @@ INFO = DeviceInfo("0:0", "Some OpenCL", "OpenCL 3.0", "Some device", "1.2", "Ope
 
 
 @pytest.fixture(autouse=True)
-def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
@@ -35,14 +35,14 @@ def test_the_name_depends_on_everything_that_the_binary_does() -> None:
     assert len({first, *others}) == 8
 
 
-def test_processors_of_one_name_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processors_of_one_name_have_different_files(monkeypatch: pytest.MonkeyPatch) -> None:
     cpu = replace(INFO, type="CPU")
     here = binary_path(cpu, "text", [])
-    monkeypatch.setattr(binaries, "_cpu_features", lambda: "flags: fewer")
+    monkeypatch.setattr(program_cache, "_cpu_features", lambda: "flags: fewer")
     assert binary_path(cpu, "text", []) != here
 
 
-def test_drivers_that_keep_their_own_are_left_to_it() -> None:
+def test_drivers_with_a_cache_get_no_file() -> None:
     assert all(binary_path(replace(INFO, platform=name), "text", []) is None for name in SELF_CACHING)
 
 
@@ -63,18 +63,18 @@ def test_a_damaged_file_is_a_miss(
         assert load_binary(path) is None
 
 
-def test_a_folder_that_cannot_be_made_costs_nothing_more(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_no_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     store_binary(tmp_path / "file" / "a.bin", b"binary")
     assert load_binary(tmp_path / "file" / "a.bin") is None
 
 
 def test_files_unused_for_longest_go_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(binaries, "MAX_BYTES", 3 * (100 + 32))
+    monkeypatch.setattr(program_cache, "MAX_BYTES", 3 * (100 + 32))
     long_ago = time.time() - 1000
     for i, name in enumerate("abc"):
         store_binary(tmp_path / name, bytes(100))
         os.utime(tmp_path / name, (long_ago + i, long_ago + i))
-    load_binary(tmp_path / "a")  # used: now the youngest of the three
+    load_binary(tmp_path / "a")  # marks it as used, so it is now the youngest of the three
     store_binary(tmp_path / "d", bytes(100))
     assert {path.name for path in tmp_path.iterdir()} == {"a", "c", "d"}

@@ -1,4 +1,4 @@
-"""Start-up: what a command imports, and processes that start together, or beside a damaged cache."""
+"""Start-up: the imports of a command, and processes that start together or with a damaged cache."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clsplat.device.program_cache import SELF_CACHING
 USABLE = [info for info in list_devices() if info.fault is None and info.platform != "Oclgrind"]
 PROCESSES = 4
 
-# Prints the digest of a small image.
+# The child prints the digest of a small image.
 CHILD = """
 import hashlib, sys
 import numpy as np
@@ -38,12 +38,12 @@ print(hashlib.sha256(image.color.tobytes()).hexdigest())
 
 
 def start(device: str, cache: Path) -> subprocess.Popen[str]:
-    """A process that renders, with its caches in the folder."""
+    """Start a process that renders, with its caches in the folder."""
     environment = os.environ | {
         "XDG_CACHE_HOME": str(cache),
         "POCL_CACHE_DIR": str(cache / "pocl"),
-        OPTIONS_VARIABLE: "-cl-opt-disable",
-    }  # builds in half the time
+        OPTIONS_VARIABLE: "-cl-opt-disable",  # builds faster
+    }
     (cache / "pocl").mkdir(parents=True, exist_ok=True)
     return subprocess.Popen(
         [sys.executable, "-c", CHILD, device],
@@ -55,7 +55,7 @@ def start(device: str, cache: Path) -> subprocess.Popen[str]:
 
 
 def digest(process: subprocess.Popen[str]) -> str:
-    """What it prints; it must end well and say nothing else."""
+    """Return the output of a process. It must succeed and print no warning."""
     out, errors = process.communicate(timeout=200)
     assert process.returncode == 0, errors
     assert errors == ""
@@ -67,18 +67,18 @@ def digest(process: subprocess.Popen[str]) -> str:
 def test_processes_share_an_empty_and_a_damaged_cache(index: str, tmp_path: Path) -> None:
     first = {digest(process) for process in [start(index, tmp_path) for _ in range(PROCESSES)]}
     assert len(first) == 1
-    kept = sorted((tmp_path / "clsplat" / "programs").glob("*"))
+    cached = sorted((tmp_path / "clsplat" / "programs").glob("*"))
     platform = next(info.platform for info in USABLE if info.index == index)
-    assert bool(kept) == (platform not in SELF_CACHING)
-    assert all(path.suffix == ".bin" for path in kept), "nothing temporary is left"
-    for path in kept:
+    assert bool(cached) == (platform not in SELF_CACHING)
+    assert all(path.suffix == ".bin" for path in cached), "no temporary file is left"
+    for path in cached:
         path.write_bytes(path.read_bytes()[:1000])
     assert {digest(start(index, tmp_path))} == first
-    assert all(path.stat().st_size > 1000 for path in kept), "mended"
+    assert all(path.stat().st_size > 1000 for path in cached), "written again"
 
 
 def test_help_imports_neither_numpy_nor_opencl() -> None:
-    """0.3 s are allowed: this says why it takes less, on any machine."""
+    """Heavy imports would make the help slow on every machine."""
     check = (
         "import sys; from clsplat_cli.main import main\n"
         "try: main(['--help'])\nexcept SystemExit: print([m for m in ('numpy', 'pyopencl', 'PIL') "

@@ -1,4 +1,4 @@
-"""Recording: each command once, in order, under its name, and nothing outside the block."""
+"""Recording: each command is listed once, in order and by name; commands outside the block are not."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from clsplat.device.trace import TRANSFERS, recorded
 def test_every_command_is_recorded_once(device: Device) -> None:
     smoke = build(device, ("measure/smoke.cl",)).smoke
     x = np.linspace(-1, 1, 100, dtype=np.float32)
-    given, result = device.alloc(x.nbytes), device.alloc(x.nbytes)
+    source, result = device.alloc(x.nbytes), device.alloc(x.nbytes)
     with recorded(device) as launches:
-        to_device(device, given, x)
+        to_device(device, source, x)
         fill_zero(device, result, x.nbytes)
         with recorded(device) as inner:
-            smoke.over(x.size, x=given, y=result, n=x.size)
-        smoke((0,), None, x=given, y=result, n=0)  # launches nothing
+            smoke.over(x.size, x=source, y=result, n=x.size)
+        smoke((0,), None, x=source, y=result, n=0)  # an empty launch
         to_host(device, result, np.empty_like(x))
-    to_device(device, given, x)
+    to_device(device, source, x)
     device.queue.finish()
     assert [launch.name for launch in inner] == ["smoke"]
     assert [(launch.name, launch.size) for launch in launches] == [

@@ -1,4 +1,4 @@
-"""Roofline: the two kernels compute what they claim to, so that their time means something."""
+"""The roofline: both kernels compute what they claim, so that their times mean something."""
 
 from __future__ import annotations
 

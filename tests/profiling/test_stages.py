@@ -1,4 +1,4 @@
-"""Stages: every kernel has one, a step has all of them, and what is counted is right."""
+"""Stages: every kernel has a stage, a step has all stages, and the counts are correct."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.splat_buffers import SplatBuffers
 from clsplat.scenes.random_scene import synthetic_scene
 
-OTHER_PROGRAMS = {"measure/smoke.cl", "measure/roofline.cl", "measure/count.cl"}  # no part of an iteration
+OTHER_PROGRAMS = {"measure/smoke.cl", "measure/roofline.cl", "measure/count.cl"}  # not part of an iteration
 
 
 def test_every_kernel_has_one_stage() -> None:
@@ -38,7 +38,7 @@ def test_every_kernel_has_one_stage() -> None:
     assert len(listed) == len(set(listed))
 
 
-def test_shared_kernels_belong_to_what_came_before() -> None:
+def test_shared_kernels_belong_to_the_stage_before_them() -> None:
     names = [
         "project_splats",
         "copy",
@@ -60,7 +60,7 @@ def test_shared_kernels_belong_to_what_came_before() -> None:
         list(by_stage([Launch("unheard_of", (1,), None)]))
 
 
-# One lane, a wide vector and a narrow one; alpha of either sign.
+# Schedules with 16 lanes, 8 lanes and one lane; alpha of both signs.
 @pytest.mark.parametrize(
     ("shape", "schedule"),
     [
@@ -72,7 +72,7 @@ def test_shared_kernels_belong_to_what_came_before() -> None:
     ],
 )
 def test_useful_pairs_are_those_of_the_reference(shape: str, schedule: str, devices: list[Device]) -> None:
-    """Pixel by pixel, front to back: |alpha| at the cutoff or above, and no splat before has finished the pixel."""
+    """A pair counts if |alpha| reaches the cutoff and no splat in front of it has finished the pixel."""
     arrays = random_splats(5, 40) | {"opacity_logit": np.random.default_rng(6).uniform(0, 4, 40)}
     case = Case(arrays, random_camera(5, 37, 21), shape)
     values = prepared(case.values, case.shape)
@@ -85,11 +85,11 @@ def test_useful_pairs_are_those_of_the_reference(shape: str, schedule: str, devi
         after = transmittance * (1 - alpha)
         finished |= (alpha != 0) & (after <= T_MIN)
         transmittance = np.where(finished, transmittance, after)
-    assert finished.any() == (shape != "student-t"), "negative alphas take T up again"
+    assert finished.any() == (shape != "student-t"), "negative alphas increase the transmittance again"
     kernels = KernelBuild(shape, 2, SCHEDULES[schedule]).for_rendering()
     pipeline = Pipeline(devices[0], kernels)
     frame = pipeline.forward(SplatBuffers.of(devices[0], case.splats, kernels.dtype), case.camera)
-    undecided = int((~case.decided).sum())  # one more or less in each
+    undecided = int((~case.decided).sum())  # each of these pixels may differ by one
     assert abs(count_pairs(pipeline, frame) - int(useful.sum())) <= undecided
 
 
@@ -147,6 +147,6 @@ def test_a_step_and_an_image_have_their_stages(devices: list[Device]) -> None:
 
 
 @pytest.mark.parametrize("values", [{}, {"sizes": {}, "stages": []}, {"sizes": 3, "stages": 4}])
-def test_no_report(values: dict[str, object]) -> None:
+def test_other_values_are_not_a_report(values: dict[str, object]) -> None:
     with pytest.raises(InputError, match="not a report"):
         Report.from_json(values)

@@ -1,4 +1,4 @@
-"""Images and gradients made in bands of tiles are those made at once; binning against NumPy."""
+"""Images and gradients in bands of tiles equal those of a single band; binning equals NumPy's."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ WIDTH, HEIGHT, N = 103, 71, 300  # 7 x 5 tiles
 IMAGES = ("color", "transmittance", "depth")
 CULLED = 0xFFFFFFFF
 
-# Sums have the same order in any bands, but Intel's compiler adds a splat's records in groups of its own, which bands
-# cut elsewhere: roundings of float32, relative to the largest entry of a field. Measured: 4e-6 (skew).
+# Bands do not change the order of sums. But Intel's compiler adds the records of a splat in groups, which bands cut at
+# other places. The tolerance is relative to the largest entry of a field; the largest measured error is 4e-6 (skew).
 REGROUPED = 2e-5
 POCL = "Portable Computing Language"
 
@@ -42,7 +42,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def as_kind(device: Device, kind: str) -> Device:
-    """The device once more, said to be of this kind."""
+    """Return the device opened once more and labelled as this kind."""
     other = open_device(device.info.index)
     other.info = replace(other.info, type=kind)
     return other
@@ -72,7 +72,7 @@ def assert_same(got: Arrays, want: Arrays, tolerance: float = 0.0) -> None:
         assert relative_error(got[name], values) <= (0.0 if name in IMAGES else tolerance), name
 
 
-# The least limit cuts rows along x.
+# The smallest limit cuts rows of tiles.
 @pytest.mark.parametrize(
     ("kind", "shape", "schedule"),
     [
@@ -104,7 +104,7 @@ def test_bands_give_what_one_band_gives(device: Device, kind: str, shape: str, s
 
 
 def test_both_binners_give_the_same(device: Device) -> None:
-    """In groups of another size a compiler may add in another order, too."""
+    """A compiler may also add in another order for another group size."""
     assert_same(
         rendered(as_kind(device, "GPU"), "gaussian", "cpu16", None)[2],
         rendered(as_kind(device, "CPU"), "gaussian", "cpu16", None)[2],
@@ -115,7 +115,7 @@ def test_both_binners_give_the_same(device: Device) -> None:
 def test_training_in_bands_has_the_same_bits(devices: list[Device], tmp_path: Path) -> None:
     device = next((device for device in devices if device.info.platform == POCL), None)
     if device is None:
-        pytest.skip("PoCL alone keeps the order of sums to the letter")
+        pytest.skip("only PoCL keeps the exact order of sums")
     scene = load_scene(write_garden(tmp_path))
     config = TrainConfig(iterations=30, cap_max=200, densify_interval=5, coarse_to_fine=False)
     trained = []
@@ -142,7 +142,7 @@ def test_cutting_halves_rows_first() -> None:
 @pytest.mark.parametrize("n", [1, 300, 2049, 40_000])
 @pytest.mark.parametrize("kind", ["CPU", "GPU"])
 def test_binning_is_that_of_numpy(device: Device, kind: str, n: int) -> None:
-    """Depths all over and the same for many, culled splats, rectangles up to the whole image; all tiles and a band."""
+    """Random and equal depths, culled splats, rectangles up to the whole image; all tiles and bands of them."""
     device = as_kind(device, kind)
     tiles_x, tiles_y, rng = 9, 6, np.random.default_rng(n)
     binner = (ChunkBinner if kind == "CPU" else GroupBinner)(Pool(device))
@@ -177,7 +177,7 @@ def check_band(
     end: int,
     tiles_x: int,
 ) -> None:
-    """Splats of each tile front to back, and each splat's ids in order of its tiles."""
+    """Compare the lists of each tile, front to back, and the isects of each splat, in order of its tiles."""
     order = np.argsort(keys, kind="stable")
     tiles = np.arange(first, end)
     x, y = tiles % tiles_x, tiles // tiles_x
@@ -207,7 +207,7 @@ def check_band(
 
 
 def test_counts_beyond_32_bits(device: Device) -> None:
-    """70 000 splats over all of 65 536 tiles: more than 2^32 isects are counted, not wrapped."""
+    """70 000 splats over 65 536 tiles: more than 2^32 isects are counted without overflow."""
     n, side = 70_000, 256
     for kind, binner_of in (("CPU", ChunkBinner), ("GPU", GroupBinner)):
         other = as_kind(device, kind)
@@ -231,7 +231,7 @@ def test_the_limit_follows_the_device(devices: list[Device]) -> None:
 
 
 def test_isects_alone_refuse_no_run(devices: list[Device]) -> None:
-    """1000 MB of them are cut into bands where splats and images leave 300 MB, not where they leave 60."""
+    """1000 MB of isects are cut into bands if splats and images leave 300 MB, and refused if they leave 60 MB."""
     device, needed = as_kind(devices[0], "CPU"), Estimate(500 * 10**6, 10**9, 200 * 10**6, 60, 10**6)
     device.info = replace(device.info, max_alloc_bytes=1 << 30, global_mem_bytes=10**9)
     check(needed, device)

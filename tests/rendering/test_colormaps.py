@@ -1,4 +1,4 @@
-"""Pictures of renders: an even colour map, depth before its background, counts of splats, skew as colour."""
+"""Pictures of renders: an even colour map, depth over a background, counts of splats, skew as colour."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from clsplat.splats.shapes import SHAPES, SKEW_LIMIT
 from clsplat.splats.splats import Splats
 
 BACKGROUND = (0.25, 0.5, 1.0)
-WIDTH, HEIGHT = 41, 27  # cuts tiles and blocks
+WIDTH, HEIGHT = 41, 27  # not a multiple of tiles or blocks
 
 
 def model(shape: str = "skew-normal", n: int = 40) -> Splats:
@@ -43,7 +43,7 @@ def camera() -> Camera:
 
 
 def one_splat(**fields: object) -> Splats:
-    """A large, nearly opaque splat two units before the camera of `facing`."""
+    """A large, nearly opaque splat, two units in front of the camera of `facing`."""
     arrays = {
         "mean": [[0, 0, 2]],
         "quat": [[1, 0, 0, 0]],
@@ -83,7 +83,7 @@ def test_bytes_are_those_of_png_files() -> None:
     assert to_bytes(np.array([-1.0, 0.0, 0.5, 1.0, 2.0, np.nan])).tolist() == [0, 0, 128, 255, 255, 0]
 
 
-def test_depth_is_the_mean_of_what_covers_a_pixel_and_leaves_the_background() -> None:
+def test_depth_is_a_mean_that_is_blended_over_the_background() -> None:
     alpha = np.array([[1.0, 0.5, 0.0]])
     image = Rendered(np.zeros((1, 3, 3)), alpha, 2.0 * alpha)
     shown = depth_picture(image, (1.0, 4.0), BACKGROUND)
@@ -105,14 +105,14 @@ def test_stray_depths_do_not_stretch_the_range() -> None:
 
 @pytest.mark.parametrize("depth", [0.0, 5.0, np.nan])
 def test_any_render_has_a_depth_picture(depth: float) -> None:
-    """Nothing seen, a flat wall, a broken pixel."""
+    """An empty image, a flat wall, a broken pixel."""
     for alpha in (0.0, 1.0, -0.2):
         image = Rendered(np.zeros((2, 2, 3)), np.full((2, 2), alpha), np.full((2, 2), depth))
         assert depth_picture(image).shape == (2, 2, 3)
 
 
 @pytest.mark.parametrize("near_far", [(0.0, 1.0), (2.0, 1.0), (1.0, np.inf), (np.nan, 1.0)])
-def test_a_range_that_is_none_is_refused(near_far: tuple[float, float]) -> None:
+def test_a_wrong_range_is_refused(near_far: tuple[float, float]) -> None:
     image = Rendered(np.zeros((1, 1, 3)), np.ones((1, 1)), np.ones((1, 1)))
     with pytest.raises(InputError, match="0 < near < far"):
         depth_picture(image, near_far)
@@ -166,16 +166,16 @@ def test_counts_of_blocks_are_the_means_of_their_pixels(make_renderer: MakeRende
         for y in range(0, HEIGHT, high):
             for x in range(0, WIDTH, 4):
                 block = counts[name][y : y + high, x : x + 4]
-                # A pair at the cutoff may fall either way.
+                # A pair at the cutoff may be counted or not.
                 assert abs(block - pixels[y : y + high, x : x + 4].mean()).max() <= 2.01 / block.size
 
 
-def test_counting_wants_a_render(device: Device) -> None:
+def test_counting_needs_a_render(device: Device) -> None:
     with pytest.raises(InputError, match="render an image first"):
         Renderer(device).count_splats()
 
 
-def test_skew_is_shown_as_its_share_of_the_limit(make_renderer: MakeRenderer, device: Device) -> None:
+def test_skew_is_shown_as_a_fraction_of_the_limit(make_renderer: MakeRenderer, device: Device) -> None:
     renderer = make_renderer(device)
     for share in (0.0, 0.5, 0.9):
         skewed = one_splat(skew=[[share * SKEW_LIMIT, 0.0, 0.0]])
@@ -186,7 +186,7 @@ def test_skew_is_shown_as_its_share_of_the_limit(make_renderer: MakeRenderer, de
         assert np.abs(shown[8, 8] - expected).max() <= 2.0
 
 
-def test_both_forms_of_a_skew_count_alike() -> None:
+def test_both_forms_of_a_skew_have_one_magnitude() -> None:
     shift = np.random.default_rng(2).uniform(-0.4, 0.4, (20, 3))
     arrays = random_splats(0, 20, 0)
     centred = Splats("skew-normal", arrays | {"skew": shift})
@@ -201,7 +201,7 @@ def test_every_shape_has_a_skew(shape: str) -> None:
     assert magnitude.any() == (SHAPES[shape].skew_form is not None)
 
 
-def test_lower_bands_are_the_model_without_the_higher(make_renderer: MakeRenderer, device: Device) -> None:
+def test_a_lower_degree_is_the_model_without_higher_bands(make_renderer: MakeRenderer, device: Device) -> None:
     renderer = make_renderer(device)
     arrays = model().to_numpy()
     full = renderer.render(model(), camera(), BACKGROUND).color
@@ -225,6 +225,6 @@ def test_models_in_use_stay_on_the_device(device: Device) -> None:
     again = uploads(first)
     assert again < fresh
     assert uploads(second) == again
-    assert uploads(third) == fresh  # first goes
+    assert uploads(third) == fresh  # `first` is removed
     assert uploads(second) == again
     assert uploads(first) == fresh

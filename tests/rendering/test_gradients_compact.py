@@ -1,4 +1,4 @@
-"""Gradients that training keeps compact: written out, they are those that the backward writes out."""
+"""Compact gradients of training: multiplied out, they equal the full gradients of the backward pass."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def test_the_basis(degree: int) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_written_out_they_are_the_backward_s_own(device: Device, degree: int) -> None:
-    """One image, both ways; all else to the bit. Some colours are clamped at 0, and 32 splats in a row unseen."""
+def test_multiplied_out_they_equal_the_full_gradients(device: Device, degree: int) -> None:
+    """Colour is compared to rounding, all else to the bit. Some colours are clamped, and 36 splats are not visible."""
     arrays = random_splats(3, 80, 3, np.float32)
     arrays["sh"][::5, 0] -= 3
     unseen = np.r_[:4, 32:64]

@@ -37,7 +37,7 @@ SIZES = [
     16384,
     16385,
     100_003,
-]  # about every run, group, block and chunk boundary
+]  # around every boundary of runs, groups, blocks and chunks
 ALL_BITS = 32
 UINT32, UINT64 = np.uint32, np.uint64
 
@@ -90,7 +90,7 @@ def check_scan(sorter: SortMachine, values: Array) -> None:
 
 @pytest.mark.parametrize("n", SIZES)
 def test_sort_is_numpy_s_stable_sort(sorter: SortMachine, n: int) -> None:
-    """Keys over all 32 bits (with the largest, which marks culled splats), and keys with many equals."""
+    """Keys of all 32 bits, with the largest one, which marks culled splats; and many equal keys."""
     rng = np.random.default_rng(n)
     keys = rng.integers(0, 2**32, n, UINT32)
     keys[rng.random(n) < 0.1] = 0xFFFFFFFF
@@ -100,7 +100,7 @@ def test_sort_is_numpy_s_stable_sort(sorter: SortMachine, n: int) -> None:
 
 @pytest.mark.parametrize("key_bits", [1, 4, 5, 8, 11, 12, 13, 16, 22, 23, 31, 32])
 def test_any_number_of_bits(sorter: SortMachine, key_bits: int) -> None:
-    """An odd and an even number of passes, digits cut by the top; keys have no higher bits."""
+    """Odd and even numbers of passes, and digits that are cut at the top. Keys have no higher bits."""
     keys = np.random.default_rng(key_bits).integers(0, 2**key_bits, 5000, UINT32)
     check_sort(sorter, keys, key_bits)
 

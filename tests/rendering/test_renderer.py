@@ -27,7 +27,7 @@ from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 
 SKEWED = "skew-normal"
-# What hangs on the raster and not on the formulas is tested with two shapes, with every other one among the slow tests.
+# Tests of the rasterizer, not of formulas: two shapes; the other shapes are slow tests.
 BOTH = pytest.mark.parametrize(
     "shape", [pytest.param(name, marks=[] if name in ("gaussian", SKEWED) else pytest.mark.slow) for name in SHAPES]
 )
@@ -36,7 +36,7 @@ EVERY = pytest.mark.parametrize("shape", SHAPES)
 
 @cache
 def cloud(shape: str, normalisation: str = "peak", dtype: type = np.float32) -> Case:
-    """24 splats of every kind in 3 x 2 tiles, the last ones cut."""
+    """24 splats of every kind in 3 x 2 tiles; the last tiles are cut by the edge."""
     return Case(random_splats(1, 24, 3), random_camera(1, 41, 27), shape, normalisation, dtype)
 
 
@@ -52,7 +52,7 @@ def test_every_schedule_agrees_with_the_reference(
 
 @BOTH
 def test_one_lane_agrees_with_the_reference(make_renderer: MakeRenderer, devices: list[Device], shape: str) -> None:
-    """The other form of every formula; the default schedules of CPUs have lanes."""
+    """One lane uses other forms of the formulas; the default schedules of CPUs have 16 lanes."""
     if not devices:
         pytest.skip("no OpenCL device")
     renderer = make_renderer(devices[0], schedule=SCHEDULES["gpu256"])
@@ -73,7 +73,7 @@ def test_double_precision_agrees_to_rounding(make_renderer: MakeRenderer, device
 
 @BOTH
 def test_schedules_and_devices_agree(make_renderer: MakeRenderer, devices: list[Device], shape: str) -> None:
-    """Each against each, on decided pixels: only the order of sums and exp's and Phi's last bits differ."""
+    """All pairs agree on decided pixels. Only the order of sums and the last bits of exp and Phi differ."""
     case, images, gradients = cloud(shape), {}, {}
     for place, name in DEVICE_SCHEDULES:
         device, schedule = devices[place], SCHEDULES[name]
@@ -105,7 +105,7 @@ def test_the_same_again_gives_the_same_bits(
 
 @cache
 def thin_cases(shape: str) -> dict[str, Case]:
-    """Images of odd sizes and counts of splats about the batch and the lanes; gradients of two fields."""
+    """Odd image sizes, and numbers of splats around the batch and the lanes; gradients of two fields."""
     fields = ("mean", "log_scale")
     cases = {}
     for width, height in ((1, 1), (TILE, TILE), (TILE + 1, TILE - 1), (200, 5), (5, 130), (33, 64)):
@@ -113,7 +113,7 @@ def thin_cases(shape: str) -> dict[str, Case]:
         cases[f"{width} x {height}"] = Case(random_splats(5, 12, 3), camera, shape, fields=fields)
     for n in (1, 7, 8, 9, 15, 16, 17, BATCH - 1, BATCH, BATCH + 1, 2 * BATCH + 1):
         arrays = random_splats(n, n, 3)
-        arrays["opacity_logit"] -= 2.0  # so that many shine through
+        arrays["opacity_logit"] -= 2.0  # faint, so that every splat counts
         cases[f"{n} splats"] = Case(arrays, random_camera(3, 13, 11), shape, fields=fields)
     return cases
 
@@ -161,8 +161,9 @@ def test_edges(make_renderer: MakeRenderer, device: Device, shape: str, name: st
 
 @EVERY
 def test_points_and_giants(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """Splats of no size are the low-pass; others far larger than the image are a haze. Their rotation and
-    scale matter next to nothing: only gradients of mean, opacity and colour have a scale to be compared on.
+    """Splats without size show the low-pass only; splats far larger than the image are a haze.
+
+    Rotation and scale hardly matter for them, so only gradients of mean, opacity and colour are compared.
     """
     fields = ("mean", "opacity_logit", "sh")
     for log_scale in (-12.0, 3.0):
@@ -172,7 +173,7 @@ def test_points_and_giants(make_renderer: MakeRenderer, device: Device, shape: s
 
 @EVERY
 def test_needles(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """Condition 3e3 costs float32 accuracy: 3e3 * 6e-8 in q, ten times that in gradients. Doubles: formulas hold."""
+    """A condition number of 3e3 costs float32 accuracy: 3e3 * 6e-8 in images, ten times that in gradients."""
     arrays, camera = changed(log_scale=[-6.0, -6.0, 1.0]), random_camera(7, 41, 27)
     single, double = (Case(arrays, camera, shape, dtype=dtype) for dtype in (np.float32, np.float64))
     single.check(make_renderer(device), 3e3 * 6e-8, 10 * 3e3 * 6e-8)
@@ -183,7 +184,7 @@ def test_needles(make_renderer: MakeRenderer, device: Device, shape: str) -> Non
 def test_opaque_stack_ends_for_good(
     make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule], shape: str
 ) -> None:
-    """Pixels finish in the first batch, others later; splats behind, thin ones too, take no part then."""
+    """Some pixels finish in the first batch, others later. Splats behind them do not contribute."""
     case = stack(shape)
     order = visible_order(prepared(case.values, shape), case.camera, shape)
     assert not case.gradients["mean"][order[-20:]].any(), "the last ones should be hidden"
@@ -195,11 +196,11 @@ def test_opaque_stack_ends_for_good(
 
 @cache
 def stack(shape: str) -> Case:
-    """192 wide splats, a few opaque ones among thin ones: pixels finish after some 40 to 140 of them."""
+    """192 wide splats, a few of them opaque: pixels finish after some 40 to 140 splats."""
     arrays = random_splats(7, 3 * BATCH, 3)
     arrays["mean"] *= 0.5
     arrays["log_scale"] = np.minimum(arrays["log_scale"] + 3.0, 0.8)
-    opaque = np.arange(3 * BATCH) % 21 == 1  # never one of a sign that may flip
+    opaque = np.arange(3 * BATCH) % 21 == 1  # not those whose sign may be flipped
     arrays["opacity_logit"][:] = np.where(opaque, 7.0, -3.0)
     fields = ("mean", "skew") if shape == SKEWED else ("mean",)
     return Case(arrays, random_camera(7, 18, 8), shape, fields=fields)
@@ -207,7 +208,7 @@ def stack(shape: str) -> Case:
 
 @BOTH
 def test_nothing_to_see(make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule], shape: str) -> None:
-    """No splats, or all behind the camera, too dim, or beside the image: background, gradients of zero."""
+    """No splats, or all of them behind the camera, too dim, or outside the image."""
     camera = random_camera(2, 19, 17)
     to_world = camera.rotation.T
     scenes = {
@@ -230,7 +231,7 @@ def test_nothing_to_see(make_renderer: MakeRenderer, scheduled: tuple[Device, Sc
 
 @EVERY
 def test_near_plane(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """A splat at the near plane is drawn, the next number below is not."""
+    """A splat at the near plane is drawn; one at the next smaller number is not."""
     camera = Camera(9, 7, 8.0, 8.0, 4.3, 3.6, np.eye(4))
     for z, seen in ((NEAR, True), (np.nextafter(NEAR, 0.0), False), (-1.0, False)):
         arrays = random_splats(3, 1, 3)
@@ -243,7 +244,7 @@ def test_near_plane(make_renderer: MakeRenderer, device: Device, shape: str) -> 
 
 @EVERY
 def test_extreme_values_stay_finite(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """Whatever finite values Splats takes, image and gradients are finite."""
+    """Image and gradients are finite for all finite values that `Splats` accepts."""
     rng = np.random.default_rng(0)
     n = 400
     arrays = random_splats(0, n, 3)
@@ -254,8 +255,8 @@ def test_extreme_values_stay_finite(make_renderer: MakeRenderer, device: Device,
     arrays["quat"] *= 10.0 ** rng.uniform(-12, 12, (n, 1))
     renderer, seen = make_renderer(device), 0
     for start in range(0, n, 8):
-        eight = {name: value[start : start + 8] for name, value in arrays.items()}
-        case = Case(eight, random_camera(0), shape)
+        part = {name: value[start : start + 8] for name, value in arrays.items()}
+        case = Case(part, random_camera(0), shape)
         image = case.render(renderer)
         assert all(np.isfinite(getattr(image, name)).all() for name in ("color", "alpha", "depth"))
         seen += image.alpha.any()
@@ -276,7 +277,7 @@ def test_not_a_number_is_refused_before_it_reaches_a_device() -> None:
 
 
 def test_an_overwritten_frame_raises(device: Device) -> None:
-    """Two frames share their buffers: the first one must not give the second one's images or gradients."""
+    """Two frames share their buffers: the first one must not return data of the second one."""
     case = cloud(SKEWED)
     pipeline = Pipeline(device, KernelBuild(SKEWED, 3, default_schedule(device.info)).for_rendering())
     splats = SplatBuffers.of(device, case.splats, pipeline.kernels.dtype)
@@ -296,7 +297,7 @@ def test_an_overwritten_frame_raises(device: Device) -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_fewer_sh_bands_in_use(device: Device, degree: int) -> None:
-    """Kernels built for degree 3 that use the lower bands only, as training does; other rows stay zero."""
+    """Kernels of degree 3 can use the lower bands only, as training does. The other rows stay zero."""
     case = cloud(SKEWED)
     pipeline = Pipeline(device, KernelBuild(SKEWED, 3, default_schedule(device.info)).for_rendering())
     splats = SplatBuffers.of(device, case.splats, pipeline.kernels.dtype)
@@ -317,13 +318,13 @@ def test_fewer_sh_bands_in_use(device: Device, degree: int) -> None:
     assert not got["sh"][:, bands:].any()
 
 
-def test_splats_of_no_sh_bands(make_renderer: MakeRenderer, device: Device) -> None:
+def test_splats_without_sh_bands(make_renderer: MakeRenderer, device: Device) -> None:
     case = Case(random_splats(4, 9, 0), random_camera(4), "gaussian")
     case.check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
 
 
 def test_one_renderer_serves_changing_scenes_and_sizes(make_renderer: MakeRenderer, device: Device) -> None:
-    """Buffers are kept and grow; nothing of an earlier frame may show in a later one."""
+    """Buffers are reused and grow; an earlier frame must not change a later one."""
     renderer = make_renderer(device)
     cases = [cloud("gaussian"), *thin_cases(SKEWED).values(), cloud(SKEWED), *thin_cases("gaussian").values()]
     for case in (*cases, *reversed(cases)):
@@ -340,7 +341,7 @@ def test_gradients_without_alpha_are_those_of_zero_alpha_weights(make_renderer: 
     assert not np.array_equal(without["mean"], renderer.backward(v_color, v_alpha)["mean"])
 
 
-def test_wrong_calls_are_named(make_renderer: MakeRenderer, device: Device) -> None:
+def test_wrong_calls_are_errors(make_renderer: MakeRenderer, device: Device) -> None:
     case, renderer = cloud("gaussian"), Renderer(device)
     with pytest.raises(InputError, match="render an image first"):
         renderer.backward(np.zeros((27, 41, 3)))
