@@ -253,7 +253,7 @@ def _flag_of(definition: Option, section: str) -> Callable[[F], F]:
         extra["help"] += f"  [default: {_strategy_defaults(definition.name)}]"
     else:
         extra |= {"default": definition.default, "show_default": definition.default is not None}
-    value_type: Any = click.Choice(definition.choices) if definition.choices else definition.value_type
+    value_type: Any = click.Choice(tuple(definition.choices)) if definition.choices else definition.value_type
     return click.option(
         flag, *definition.aliases, definition.name, type=value_type, metavar=definition.metavar, **extra
     )

@@ -32,7 +32,7 @@ kernel void count_pairs(
         real rec[RECORD];
         for (int j = 0; j < RECORD; ++j) rec[j] = from[j];
         shape_pixel pixel;
-        vreal alpha = shape_alpha(px - rec[0], py - rec[1], rec + HEAD, &pixel);
+        vreal alpha = shape_alpha(px - rec[HEAD_X], py - rec[HEAD_Y], rec + HEAD, &pixel);
         const vmask live = lanes_not(BLEND_DONE(T));
         vmask hit;
         blend(&alpha, &T, &hit);

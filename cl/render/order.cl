@@ -4,7 +4,6 @@
 // bits in which their keys differ; then each bucket, which fits a cache, is sorted by the rest. Stable throughout:
 // equal depths keep their index order. Culled splats are left out.
 
-#define CULLED_KEY 0xFFFFFFFFu  // as in project.cl
 #define BUCKETS (1 << BUCKET_BITS)
 #define DIGIT_BITS 8
 #define DIGITS (1 << DIGIT_BITS)

@@ -1,76 +1,19 @@
-// project.cl: splats to screen records, and the gradient back to the raw parameters. LANES splats a work-item.
+// project.cl: the projection of splats to screen records, and its gradient. A work-item has LANES splats.
 //
-// geom, sh: component-major parameter buffers [rows, capacity] (clsplat/splats/fields.py); rows by build constants.
-// Screen record of splat i: RECORD reals at records[i * RECORD]:
-//   mean_px x, y [px]; colour r, g, b; depth (camera z); first and last pixel row, then column, it can reach; shape's p.
+// geom, sh: component-major parameter buffers [rows, capacity] (clsplat/splats/fields.py). ROW_<FIELD> is the first row of a
+// field in geom. The screen record of splat i is RECORD reals at records[i * RECORD]: HEAD slots, which
+// clsplat/rendering/build.py lists, and the shape's SHAPE_N slots. Splats that the image does not show have CULLED_KEY.
 
-#ifndef SHAPE_SIZE
-#define shape_size(s) ((vreal)1)
-#define shape_size_vjp(s, v_size, g)
-#endif
-#ifndef SHAPE_DISPLACEMENT
-#define shape_displacement(s) zero3()
-#define shape_displacement_vjp(s, v_m, g)
-#endif
+// The build fails here if a shape file and its descriptor in clsplat/splats/shapes.py disagree.
+typedef char record_has_SHAPE_N_slots[P_COUNT == SHAPE_N ? 1 : -1];
+typedef char there_are_SHAPE_V_moments[V_COUNT == SHAPE_V ? 1 : -1];
 
-#define CULLED_KEY 0xFFFFFFFFu
-#define COV2D_MAX R(1e12)  // px^2: a wider splat would overflow float32 on the way, and is no longer a splat
+#define COV2D_MAX R(1e12)  // px^2: the computation would overflow float32 for a wider splat
 
-#if ANTIALIASED
-// What the low-pass leaves of a splat's height if it keeps the volume: sqrt(det(M) / det(M + low-pass)), the filter on the
-// screen of Mip-Splatting (Yu et al. 2024, eq. 9, with a wider low-pass). M is B B', of the shape's own size, or with its
-// displacement m B (1 + m m') B'. A skew-normal's peak changes besides: it is divided by the one before (skew_pixel.clh).
+// Terms that the projection and its gradient share.
 typedef struct {
-    vec3 b0, b1, area, m;
-    vreal size, along, stretch, flat, det, factor;  // along: area'm, stretch: 1 + m'm, flat: det(M)
-} lowering;
-
-static inline lowering lowered(splat_params s, vec3 b0, vec3 b1) {
-    lowering k;
-    k.size = shape_size(s);
-    k.m = shape_displacement(s);
-    k.b0 = scale3(b0, k.size);
-    k.b1 = scale3(b1, k.size);
-    k.area = cross3(k.b0, k.b1);
-    k.along = dot3(k.area, k.m);
-    k.stretch = (vreal)1 + dot3(k.m, k.m);
-    k.flat = k.stretch * dot3(k.area, k.area) - k.along * k.along;
-    const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
-    k.det = k.flat + LOW_PASS * (dot3(k.b0, k.b0) + dot3(k.b1, k.b1) + m0 * m0 + m1 * m1 + (vreal)LOW_PASS);
-    k.factor = sqrt(k.flat / k.det);
-    return k;
-}
-
-// Adds to g, whose opacities are those after lowering and become those before, and to the gradients of b0 and b1.
-static inline void lowered_vjp(lowering k, splat_params s, vec3 b0, vec3 b1, shape_grads *g, vec3 *v_b0, vec3 *v_b1) {
-    const vreal v_factor = g->s.opacity * s.opacity + g->s.opacity_minus * s.opacity_minus;
-    g->s.opacity *= k.factor;
-    g->s.opacity_minus *= k.factor;
-    // factor^2 = flat/det. A splat seen from its edge has no slope.
-    const vreal v_flat = lanes_if(
-        k.factor > (vreal)R(1e-6),
-        v_factor * ((vreal)1 - k.factor * k.factor) / (max(k.factor, (vreal)R(1e-6)) * k.det), (vreal)0
-    );
-    const vreal v_squares =
-        -LOW_PASS * v_factor * k.factor / k.det;  // both with the 2 that the squares in flat and det bring
-    const vec3 v_area = scale3(add3(scale3(k.area, k.stretch), scale3(k.m, -k.along)), v_flat);
-    const vreal m0 = dot3(k.b0, k.m), m1 = dot3(k.b1, k.m);
-    const vec3 v_c0 = add3(cross3(k.b1, v_area), scale3(add3(k.b0, scale3(k.m, m0)), v_squares));
-    const vec3 v_c1 = add3(cross3(v_area, k.b0), scale3(add3(k.b1, scale3(k.m, m1)), v_squares));
-    *v_b0 = add3(*v_b0, scale3(v_c0, k.size));
-    *v_b1 = add3(*v_b1, scale3(v_c1, k.size));
-    shape_size_vjp(s, dot3(v_c0, b0) + dot3(v_c1, b1), g);
-    const vec3 of_flat = add3(scale3(k.m, dot3(k.area, k.area)), scale3(k.area, -k.along));
-    shape_displacement_vjp(
-        s, add3(scale3(of_flat, v_flat), scale3(add3(scale3(k.b0, m0), scale3(k.b1, m1)), v_squares)), g
-    );
-}
-#endif
-
-// What projection and its gradient both need.
-typedef struct {
-    vec3 mean, c;  // the point that is projected: world, camera
-    vec3 centre;   // that point in the splat's own unit frame, from (x, y, z)
+    vec3 mean, c;  // projected point: in the world, in camera axes
+    vec3 centre;   // projected point less (x, y, z), in the splat's unit frame; only with SHAPE_CENTRE
     unit_quat quat;
     mat3 rotation;  // of the splat
     vec3 scale;
@@ -79,34 +22,21 @@ typedef struct {
     vec3 ar0, ar1;          // rows of A R
     vec3 b0, b1;            // rows of B = A R S
     sym2 cov2d;             // B B' + low-pass [px^2]
-    splat_params s, shown;  // as stored, and as the shape is to show it
+    splat_params s, shown;  // as stored, and lowered if ANTIALIASED
 #if ANTIALIASED
-    lowering low;  // from one to the other
+    lowering low;
 #endif
     vmask in_front;
 } splat_terms;
 
 static inline void load_params(global const real *geom, const ulong capacity, splat_params *s) {
-    no_params(s);
     s->opacity = opacity_of(lanes_load(geom + ROW_OPACITY_LOGIT * capacity));
-#ifdef ROW_OPACITY_MINUS_LOGIT
-    s->opacity_minus = opacity_of(lanes_load(geom + ROW_OPACITY_MINUS_LOGIT * capacity));
-#endif
-#ifdef ROW_SKEW
-    s->skew = vec3_load(geom + ROW_SKEW * capacity, capacity);
-#endif
-#ifdef ROW_NORMAL
-    s->skew = vec3_load(geom + ROW_NORMAL * capacity, capacity);
-#endif
-#ifdef ROW_BETA
-    s->beta = lanes_load(geom + ROW_BETA * capacity);
-#endif
-#ifdef ROW_NU
-    s->nu = lanes_load(geom + ROW_NU * capacity);
-#endif
+    s->height = (vreal)1;
+    UNROLL for (int row = 0; row < SHAPE_ROWS; ++row) s->raw[row] =
+        lanes_load(geom + (SHAPE_FIRST_ROW + row) * capacity);
 }
 
-static inline splat_terms splat_project(global const real *geom, const ulong capacity, constant real *cam) {
+static inline splat_terms splat_project(global const real *geom, const ulong capacity, constant camera *cam) {
     splat_terms s;
     load_params(geom, capacity, &s.s);
     s.quat = quat_load(geom + ROW_QUAT * capacity, capacity);
@@ -119,7 +49,7 @@ static inline splat_terms splat_project(global const real *geom, const ulong cap
     s.mean = add3(s.mean, mat3_apply(s.rotation, mul3(s.scale, s.centre)));
 #endif
     s.c = camera_from_world(cam, s.mean);
-    s.in_front = s.c.z >= (vreal)CAMERA_NEAR(cam);
+    s.in_front = s.c.z >= (vreal)cam->near;
     s.c.z = lanes_if(s.in_front, s.c.z, (vreal)1);
     s.to_px = camera_project(cam, s.c);
     const mat3 w = camera_rotation(cam);
@@ -134,24 +64,24 @@ static inline splat_terms splat_project(global const real *geom, const ulong cap
 #if ANTIALIASED
     s.low = lowered(s.s, s.b0, s.b1);
     s.shown.opacity *= s.low.factor;
-    s.shown.opacity_minus *= s.low.factor;
+    s.shown.height = s.low.factor;
 #endif
     return s;
 }
 
-static inline vec3 unit_direction(constant real *cam, vec3 mean, vreal *inv_norm) {
-    const vec3 from = add3(mean, scale3(CAMERA_CENTRE(cam), (vreal)-1));
+static inline vec3 unit_direction(constant camera *cam, vec3 mean, vreal *inv_norm) {
+    const vec3 from = add3(mean, scale3(camera_position(cam), (vreal)-1));
     *inv_norm = (vreal)1 / sqrt(max(dot3(from, from), (vreal)R(1e-30)));
     return scale3(from, *inv_norm);
 }
 
-// records [n, RECORD], depth_key [n] (monotonic in depth; CULLED_KEY when unseen), tile_rect [n] (first and
-// past-the-end tile, x then y). Overwrites, but for the records of vectors of which no splat is seen.
-// Global size: splats / LANES.
+// Overwrites depth_key [n], which grows with depth (CULLED_KEY for a splat that is not seen), tile_rect [n] (x and y of the
+// first tile, then of the tile past the end) and records [n, RECORD]. It leaves alone the records of a vector of splats
+// without a seen one. Global size: splats / LANES.
 kernel void project_splats(
     global const real *restrict geom,
     global const real *restrict sh,
-    constant real *restrict cam,
+    constant camera *restrict cam,
     global real *restrict records,
     global uint *restrict depth_key,
     global int4 *restrict tile_rect,
@@ -170,24 +100,24 @@ kernel void project_splats(
     vreal out[RECORD];
     extents box;
     shape_project(s.shown, s.b0, s.b1, s.cov2d, out + HEAD, &box);
-    out[0] = s.to_px.x;
-    out[1] = s.to_px.y;
-    out[5] = s.c.z;
+    out[HEAD_X] = s.to_px.x;
+    out[HEAD_Y] = s.to_px.y;
+    out[HEAD_DEPTH] = s.c.z;
 
-    // Pixels whose centres lie in the box; a NaN anywhere fails the comparison and culls the splat.
+    // Pixels whose centres lie in the box. A NaN fails the comparisons below, so such a splat is culled.
     const vreal far = (vreal)R(1e6), half_px = (vreal)R(0.5);
-    const vreal x_lo = ceil(lanes_clamp(out[0] - box.left - half_px, -far, far));
-    const vreal x_hi = floor(lanes_clamp(out[0] + box.right - half_px, -far, far));
-    const vreal y_lo = ceil(lanes_clamp(out[1] - box.up - half_px, -far, far));
-    const vreal y_hi = floor(lanes_clamp(out[1] + box.down - half_px, -far, far));
-    out[6] = y_lo;
-    out[7] = y_hi;
-    out[8] = x_lo;
-    out[9] = x_hi;
+    const vreal x_lo = ceil(lanes_clamp(out[HEAD_X] - box.left - half_px, -far, far));
+    const vreal x_hi = floor(lanes_clamp(out[HEAD_X] + box.right - half_px, -far, far));
+    const vreal y_lo = ceil(lanes_clamp(out[HEAD_Y] - box.up - half_px, -far, far));
+    const vreal y_hi = floor(lanes_clamp(out[HEAD_Y] + box.down - half_px, -far, far));
+    out[HEAD_TOP] = y_lo;
+    out[HEAD_BOTTOM] = y_hi;
+    out[HEAD_LEFT] = x_lo;
+    out[HEAD_RIGHT] = x_hi;
     const vmask seen = s.in_front & (box.left + box.right > (vreal)0) & (x_lo <= x_hi) & (y_lo <= y_hi)
                        & (x_hi >= (vreal)0) & (y_hi >= (vreal)0) & (x_lo < (vreal)width) & (y_lo < (vreal)height)
                        & (s.cov2d.xx < (vreal)COV2D_MAX) & (s.cov2d.yy < (vreal)COV2D_MAX);
-    if (!lanes_any(seen)) {  // neither colour is read nor a record written
+    if (!lanes_any(seen)) {  // the colour need not be read
         for (int l = 0; l < LANES && first + l < n_splats; ++l) {
             depth_key[first + l] = CULLED_KEY;
             tile_rect[first + l] = (int4)(0, 0, 0, 0);
@@ -202,7 +132,7 @@ kernel void project_splats(
     vreal rgb[3] = {(vreal)R(0.5), (vreal)R(0.5), (vreal)R(0.5)};
     for (int k = 0; k < used; ++k)
         for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * lanes_load(sh + first + (ulong)(3 * k + c) * capacity);
-    for (int c = 0; c < 3; ++c) out[2 + c] = max(rgb[c], (vreal)0);
+    for (int c = 0; c < 3; ++c) out[HEAD_RED + c] = max(rgb[c], (vreal)0);
 
     real lane[LANES][RECORD], edge[5][LANES];
     real column[LANES];
@@ -219,7 +149,7 @@ kernel void project_splats(
         const uint i = first + l;
         const bool keep = edge[4][l] > 0;
         for (int j = 0; j < RECORD; ++j) records[(ulong)i * RECORD + j] = lane[l][j];
-        depth_key[i] = keep ? as_uint((float)lane[l][5]) : CULLED_KEY;
+        depth_key[i] = keep ? as_uint((float)lane[l][HEAD_DEPTH]) : CULLED_KEY;
         const int4 rect = {
             max((int)edge[0][l], 0) / TILE, max((int)edge[2][l], 0) / TILE, min((int)edge[1][l] / TILE + 1, tiles_x),
             min((int)edge[3][l] / TILE + 1, tiles_y)
@@ -228,16 +158,17 @@ kernel void project_splats(
     }
 }
 
-// moments [rows SHAPE_V + 3, capacity]: summed over pixels; the last three are the gradient of the colour.
-// grad_geom, grad_sh: as geom, sh; overwritten (zero for unseen splats), sh only for the bands in use. If `compact`, grad_sh
-// is [6, capacity]: the gradient of the colour, and the unit direction whose basis times it is that of sh.
-// signals [3, capacity], for strategies, of the splats seen: added to, the norm of the gradient of mean_px in units of
+// moments [SHAPE_V + 3, capacity]: sums over pixels; the last three rows are the gradient of the colour.
+// Overwrites grad_geom and grad_sh, which have the rows of geom and sh, with zeros for splats that are not seen; of grad_sh
+// only the bands in use. If `compact`, grad_sh is [6, capacity]: the gradient of the colour and the unit direction; the
+// gradient of sh is the product of the colour's and the basis in that direction.
+// Adds to signals [3, capacity] for each seen splat, for densification: the norm of the gradient of mean_px in units of
 // half the image (3DGS's normalised device coordinates), the absolute gradient along the viewing ray [1/world unit]
-// (3DSGS's depth gradient) and 1.
+// (3DSGS's depth gradient), and 1.
 kernel void project_splats_vjp(
     global const real *restrict geom,
     global const real *restrict sh,
-    constant real *restrict cam,
+    constant camera *restrict cam,
     global const real *restrict moments,
     global const real *restrict records,
     global const uint *restrict depth_key,
@@ -259,7 +190,7 @@ kernel void project_splats_vjp(
     for (int l = 0; l < LANES; ++l)
         flag[l] = first + l < n_splats && depth_key[min(first + l, n_splats - 1)] != CULLED_KEY ? 1 : 0;
     const vmask seen = lanes_load(flag) > zero;
-    if (!lanes_any(seen)) {  // zeros, as below
+    if (!lanes_any(seen)) {  // the result is zeros
         for (int row = 0; row < GEOM_ROWS; ++row) lanes_store(zero, grad_geom + first + row * capacity);
         const int rows = compact ? 6 : 3 * (sh_degree + 1) * (sh_degree + 1);
         for (int row = 0; row < rows; ++row) lanes_store(zero, grad_sh + first + row * capacity);
@@ -267,7 +198,7 @@ kernel void project_splats_vjp(
     }
     for (int l = 0; l < LANES; ++l) {
         const ulong i = min(first + l, n_splats - 1);
-        for (int c = 0; c < 3; ++c) seen_rgb[c][l] = records[i * RECORD + 2 + c] > 0 ? flag[l] : 0;
+        for (int c = 0; c < 3; ++c) seen_rgb[c][l] = records[i * RECORD + HEAD_RED + c] > 0 ? flag[l] : 0;
     }
     const splat_terms s = splat_project(geom + first, capacity, cam);
 
@@ -309,7 +240,7 @@ kernel void project_splats_vjp(
 
     vreal v_rgb[3], inv_norm, v_basis[SH_COUNT];
     for (int c = 0; c < 3; ++c) v_rgb[c] = lanes_if(lanes_load(seen_rgb[c]) > zero, v[SHAPE_V + c], zero);
-    // Of splats that are not seen the mean may be anything, and 0 times a NaN would reach the colour.
+    // The mean of a splat that is not seen may hold any value, and 0 times a NaN would reach the colour.
     vec3 direction = unit_direction(cam, s.mean, &inv_norm);
     direction =
         (vec3){lanes_if(seen, direction.x, zero), lanes_if(seen, direction.y, zero), lanes_if(seen, direction.z, zero)};
@@ -338,7 +269,7 @@ kernel void project_splats_vjp(
     v_rotation.r0 = add3(v_rotation.r0, scale3(stretched, v_mean.x));
     v_rotation.r1 = add3(v_rotation.r1, scale3(stretched, v_mean.y));
     v_rotation.r2 = add3(v_rotation.r2, scale3(stretched, v_mean.z));
-    g.s.skew = add3(g.s.skew, shape_centre_vjp(s.s, mul3(v_stretched, s.scale)));
+    shape_centre_vjp(s.s, mul3(v_stretched, s.scale), &g);
 #endif
 
     global real *out = grad_geom + first;
@@ -356,25 +287,6 @@ kernel void project_splats_vjp(
     );
     quat_rotation_vjp(s.quat, v_rotation, seen, out + ROW_QUAT * capacity, capacity);
     lanes_store(lanes_if(seen, g.s.opacity * opacity_slope(s.s.opacity), zero), out + ROW_OPACITY_LOGIT * capacity);
-#ifdef ROW_OPACITY_MINUS_LOGIT
-    lanes_store(
-        lanes_if(seen, g.s.opacity_minus * opacity_slope(s.s.opacity_minus), zero),
-        out + ROW_OPACITY_MINUS_LOGIT * capacity
-    );
-#endif
-#ifdef ROW_BETA
-    lanes_store(lanes_if(seen, g.s.beta, zero), out + ROW_BETA * capacity);
-#endif
-#ifdef ROW_NU
-    lanes_store(lanes_if(seen, g.s.nu, zero), out + ROW_NU * capacity);
-#endif
-    const vec3 v_skew = {
-        lanes_if(seen, g.s.skew.x, zero), lanes_if(seen, g.s.skew.y, zero), lanes_if(seen, g.s.skew.z, zero)
-    };
-#ifdef ROW_SKEW
-    vec3_store(v_skew, out + ROW_SKEW * capacity, capacity);
-#endif
-#ifdef ROW_NORMAL
-    vec3_store(v_skew, out + ROW_NORMAL * capacity, capacity);
-#endif
+    UNROLL for (int row = 0; row < SHAPE_ROWS; ++row)
+        lanes_store(lanes_if(seen, g.s.raw[row], zero), out + (SHAPE_FIRST_ROW + row) * capacity);
 }

@@ -1,145 +1,35 @@
-// raster.cl: blend the isects of each tile front to back, and the gradient of that.
+// rasterize.cl: blend the isects of each tile from front to back, and the gradient of that.
 //
-// One group of GROUP work-items per tile of TILE x TILE pixels; each item owns VECS blocks of LANES pixels (cl/math/lanes.clh),
-// so GROUP * VECS * LANES = TILE * TILE. Block number b = v * GROUP + item, rows of blocks one after another: CPU schedules
-// walk the blocks that a splat reaches with accumulators in L1, GPU schedules (VECS = 1) keep one pixel in registers.
-// Splats come in batches of BATCH. Images are planar with a margin: plane c, pixel (x, y) at
-// c * plane + (y + MARGIN_Y) * stride + x + MARGIN_X; pixels beyond width or height are written as 0.
+// The plain algorithm, for one pixel (px, py) of a tile:
+//   T = 1, colour = 0
+//   for each isect of the tile, in depth order:
+//       alpha = shape_alpha(px - x, py - y, record)             // the shape's file
+//       weight = blend(&alpha, &T, ...)                         // blend.clh: clamp, cutoff, update of T
+//       colour += weight * (r, g, b), depth += weight * z
+//   colour += T * background
+// count.cl has this loop and nothing else. Here the loop is arranged for speed, with the same sums in the same order:
+// - A group of GROUP work-items has one tile of TILE x TILE pixels, and each work-item VECS blocks of LANES pixels of it, so
+//   GROUP * VECS * LANES = TILE * TILE. On CPUs one work-item keeps the accumulators of a tile in its first cache; on GPUs
+//   a work-item keeps one pixel in registers.
+// - Isects come in batches of BATCH (batch.clh). The loop ends when no pixel of the tile is live.
+// - An isect visits only the blocks that the splat can reach (blocks.clh).
+// - A pass computes alpha in all these blocks, and a second one blends. A CPU holds fewer operations in flight than the
+//   chain from pixel to transmittance of one block has; two short chains keep it busier than a long one.
+//
+// Images are planar with a margin: plane c has pixel (x, y) at c * plane + (y + MARGIN_Y) * stride + x + MARGIN_X. Pixels of
+// a tile beyond width or height are written as 0.
 
-#define BLOCKS_X (TILE / BLOCK_W)
-#define V_RECORD (SHAPE_V + 3)
+#define V_RECORD (SHAPE_V + 3)  // an isect's gradient record: the shape's moments, then the gradient of the colour
 
-#ifndef SHAPE_PLAIN  // no splat of such a shape is a Gaussian at less cost
+#ifndef SHAPE_PLAIN  // the shape has no cheaper formula for some splats
 #define shape_is_plain(p) false
 #define shape_alpha_plain(dx, dy, p) ((vreal)0)
 #define shape_alpha_plain_vjp(dx, dy, alpha, v_alpha, v)
 #define shape_sums_plain(sums)
 #endif
 
-// The screen records of a batch; `lists` holds isect ids in depth order. A group copies them to local memory; a single
-// work-item has them in its cache already and keeps where they are.
-#if ALONE
-typedef global const real *staged_record;
-#define BATCH_MEMORY uint batch[BATCH]
-static inline void stage_batch(
-    global const uint *lists,
-    global const uint *isect_splat,
-    global const real *records,
-    uint start,
-    int n,
-    uint *batch
-) {
-    for (int k = 0; k < n; ++k) {
-        batch[k] = isect_splat[lists[start + k]];
-        prefetch_reals(records + (ulong)batch[k] * RECORD, RECORD);
-    }
-}
-#define batch_record(k) (records + (ulong)batch[k] * RECORD)
-#else
-typedef local const real *staged_record;
-#define BATCH_MEMORY local real batch[BATCH * RECORD]
-static inline void stage_batch(
-    global const uint *lists,
-    global const uint *isect_splat,
-    global const real *records,
-    uint start,
-    int n,
-    local real *batch
-) {
-    for (int k = LID; k < n; k += GROUP) {
-        global const real *from = records + (ulong)isect_splat[lists[start + k]] * RECORD;
-        for (int j = 0; j < RECORD; ++j) batch[k * RECORD + j] = from[j];
-    }
-    group_barrier();
-}
-#define batch_record(k) (batch + (k) * RECORD)
-#endif
-static inline void read_record(staged_record from, real *rec) {
-    UNROLL for (int j = 0; j < RECORD; ++j) rec[j] = from[j];
-}
-
-// Column and row of a block's first pixel.
-static inline int block_column(int tile_x, int v) { return tile_x + (v * GROUP + LID) % BLOCKS_X * BLOCK_W; }
-static inline int block_row(int tile_y, int v) { return tile_y + (v * GROUP + LID) / BLOCKS_X * BLOCK_H; }
-static inline ulong block_at(int x, int y, int stride) { return (ulong)(y + MARGIN_Y) * stride + x + MARGIN_X; }
-
-// Centres of an item's pixels [px]; transmittance before any splat: pixels outside the image count as finished.
-static inline void start_blocks(int tile_x, int tile_y, int width, int height, vreal *px, vreal *py, vreal *T) {
-    for (int v = 0; v < VECS; ++v) {
-        px[v] = (vreal)(block_column(tile_x, v) + R(0.5)) + lanes_block_x();
-        py[v] = (vreal)(block_row(tile_y, v) + R(0.5)) + lanes_block_y();
-        T[v] = lanes_if((px[v] < (vreal)width) & (py[v] < (vreal)height), (vreal)1, (vreal)-1);
-    }
-}
-
-// The blocks of an item that a splat can reach. Where a work-item has all of the tile's, and in vectors: a bit each, those in
-// the splat's box that shape_reaches, tested LANES blocks at once. The forward keeps them for the gradient (isect_blocks).
-// Elsewhere first and past-the-end of those in the splat's pixel rows.
-#define CULLS_BLOCKS (ALONE && LANES > 1)
-#if CULLS_BLOCKS
-
-#define BITS 32
-typedef uint block_set;
-#define no_blocks_left(set) ((set) == 0)
-#define next_block(set) (BITS - 1 - (int)clz((set) & -(set)))
-#define without_next(set) ((set) & ((set) - 1))
-#define PARTS ((VECS + LANES - 1) / LANES)  // vectors of blocks
-
-// Columns and rows of the first pixels of LANES blocks from number `first` on.
-static inline vreal corners_x(int first) {
-    const vreal number = lanes_iota() + (vreal)first;
-    return (number - (real)BLOCKS_X * floor(number * (R(1.0) / BLOCKS_X))) * (real)BLOCK_W;
-}
-static inline vreal corners_y(int first) {
-    return floor((lanes_iota() + (vreal)first) * (R(1.0) / BLOCKS_X)) * (real)BLOCK_H;
-}
-
-static inline block_set blocks_reached(const real *rec, int tile_x, int tile_y) {
-    vmask bits = lanes_mask(0);
-    UNROLL for (int part = 0; part < PARTS; ++part) {
-        const int first = part * LANES, top = tile_y + first / BLOCKS_X * BLOCK_H;
-        if (PARTS == 1 || (rec[7] >= (real)top && rec[6] < (real)(top + LANES / BLOCKS_X * BLOCK_H))) {
-            const vreal x = corners_x(first) + (vreal)tile_x, y = corners_y(first) + (vreal)tile_y;
-            const vmask in_box = (x <= (vreal)rec[9]) & (x + (real)(BLOCK_W - 1) >= (vreal)rec[8])
-                                 & (y <= (vreal)rec[7]) & (y + (real)(BLOCK_H - 1) >= (vreal)rec[6]);
-            const vreal dx = x + R(0.5) * BLOCK_W - rec[0], dy = y + R(0.5) * BLOCK_H - rec[1];
-            bits |= in_box & shape_reaches(dx, dy, rec + HEAD) & lanes_bits(first);
-        }
-    }
-    const block_set reached = (block_set)(uint)lanes_or(bits);
-    return reached & (~(block_set)0 >> (BITS - VECS));  // fewer blocks than lanes: the rest lies outside of the tile
-}
-
-// Blocks with a pixel that is not finished.
-static inline block_set live_blocks(const vreal *T) {
-    block_set live = 0;
-    for (int v = 0; v < VECS; ++v) live |= (block_set)(lanes_any(lanes_not(BLEND_DONE(T[v]))) ? 1 : 0) << v;
-    return live;
-}
-
-#else
-
-typedef int2 block_set;
-#define no_blocks_left(set) ((set).x >= (set).y)
-#define next_block(set) ((set).x)
-#define without_next(set) ((set) + (int2)(1, 0))
-
-static inline block_set blocks_reached(const real *rec, int tile_x, int tile_y) {
-    const int top = max((int)rec[6] - tile_y, 0) / BLOCK_H, bottom = min((int)rec[7] - tile_y, TILE - 1) / BLOCK_H;
-    return (int2)(top * BLOCKS_X / GROUP, ((bottom + 1) * BLOCKS_X + GROUP - 1) / GROUP);
-}
-
-#endif
-
-// Whether any pixel of the item is not finished.
-static inline int any_live(const vreal *T) {
-    int live = 0;
-    for (int v = 0; v < VECS && !live; ++v) live = lanes_any(lanes_not(BLEND_DONE(T[v])));
-    return live;
-}
-
-// color [3 planes], transmittance [plane] (final T), depth [plane] (sum of weight * z; only if WITH_DEPTH).
-// isect_blocks [n_isects], by unsorted isect id, only where CULLS_BLOCKS: the blocks in which it was blended.
+// Overwrites color [3 planes], transmittance [plane] with the final T, depth [plane] with the sum of weight * z, and
+// isect_blocks [n_isects], by unsorted isect id, with the set of blocks in which the isect was blended.
 GROUP_ATTRIBUTE
 kernel void rasterize(
     global const uint2 *restrict tile_ranges,
@@ -148,8 +38,12 @@ kernel void rasterize(
     global const real *restrict records,
     global real *restrict color,
     global real *restrict transmittance,
+#if WITH_DEPTH
     global real *restrict depth,
+#endif
+#if CULLS_BLOCKS
     global uint *restrict isect_blocks,
+#endif
     int width,
     int height,
     int tiles_x,
@@ -186,7 +80,7 @@ kernel void rasterize(
         if (!group_any(any_live(T), scratch)) break;
 #endif
         stage_batch(lists, isect_splat, records, start, n, batch);
-#if CULLS_BLOCKS  // all first: the loop below then knows at once where to go
+#if CULLS_BLOCKS  // for the whole batch first: the processor then knows early which blocks come next
         block_set reached[BATCH];
         for (int k = 0; k < n; ++k) {
             real rec[RECORD];
@@ -203,30 +97,28 @@ kernel void rasterize(
 #else
             block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
-            // Alpha of all blocks before any is blended: a CPU holds fewer operations in flight than one block's chain from
-            // pixel to transmittance has, and two short chains keep it busier than a long one.
             vreal alphas[VECS];
             if (shape_is_plain(rec + HEAD))
                 for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
                     const int v = next_block(set);
-                    alphas[v] = shape_alpha_plain(px[v] - rec[0], py[v] - rec[1], rec + HEAD);
+                    alphas[v] = shape_alpha_plain(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD);
                 }
             else
                 for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
                     const int v = next_block(set);
                     shape_pixel pixel;
-                    alphas[v] = shape_alpha(px[v] - rec[0], py[v] - rec[1], rec + HEAD, &pixel);
+                    alphas[v] = shape_alpha(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD, &pixel);
                 }
             for (; !no_blocks_left(blocks); blocks = without_next(blocks)) {
                 const int v = next_block(blocks);
                 vreal alpha = alphas[v];
                 vmask hit;
                 const vreal weight = blend(&alpha, &T[v], &hit);
-                red[v] = lanes_mad(weight, (vreal)rec[2], red[v]);
-                green[v] = lanes_mad(weight, (vreal)rec[3], green[v]);
-                blue[v] = lanes_mad(weight, (vreal)rec[4], blue[v]);
+                red[v] = lanes_mad(weight, (vreal)rec[HEAD_RED], red[v]);
+                green[v] = lanes_mad(weight, (vreal)rec[HEAD_GREEN], green[v]);
+                blue[v] = lanes_mad(weight, (vreal)rec[HEAD_BLUE], blue[v]);
 #if WITH_DEPTH
-                z[v] = lanes_mad(weight, (vreal)rec[5], z[v]);
+                z[v] = lanes_mad(weight, (vreal)rec[HEAD_DEPTH], z[v]);
 #endif
             }
         }
@@ -251,10 +143,10 @@ kernel void rasterize(
     }
 }
 
-// Replays the blending front to back. With w_j = alpha_j T_j and g_j = c_j . v_color, the loss depends on alpha_i
-// through T_i g_i - (sum_{j>i} w_j g_j + T_final (background . v_color - v_alpha)) / (1 - alpha_i).
-// isect_grads [n_isects, V_RECORD], by unsorted isect id: moments of the shape, then the gradient of the colour.
-// Overwrites every record of every isect.
+// Repeats the blending from front to back. With w_j = alpha_j T_j and g_j = c_j . v_color, the gradient of alpha_i is
+//   T_i g_i - (sum_{j>i} w_j g_j + T_final (background . v_color - v_alpha)) / (1 - alpha_i).
+// `rest` holds the sum in the brackets. Overwrites isect_grads [n_isects, V_RECORD], by unsorted isect id: moments of the
+// shape, then the gradient of the colour.
 GROUP_ATTRIBUTE
 kernel void rasterize_vjp(
     global const uint2 *restrict tile_ranges,
@@ -264,8 +156,12 @@ kernel void rasterize_vjp(
     global const real *restrict color,
     global const real *restrict transmittance,
     global const real *restrict v_color,
+#if WITH_V_ALPHA
     global const real *restrict v_alpha,
+#endif
+#if CULLS_BLOCKS
     global const uint *restrict isect_blocks,
+#endif
     global real *restrict isect_grads,
     int width,
     int height,
@@ -314,28 +210,30 @@ kernel void rasterize_vjp(
 #else
             block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
-            vreal alphas[VECS];  // first, as above
+            vreal alphas[VECS];
             shape_pixel pixels[VECS];
             const bool plain = shape_is_plain(rec + HEAD);
             if (plain)
                 for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
                     const int v = next_block(set);
-                    alphas[v] = shape_alpha_plain(px[v] - rec[0], py[v] - rec[1], rec + HEAD);
+                    alphas[v] = shape_alpha_plain(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD);
                 }
             else
                 for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
                     const int v = next_block(set);
-                    alphas[v] = shape_alpha(px[v] - rec[0], py[v] - rec[1], rec + HEAD, &pixels[v]);
+                    alphas[v] = shape_alpha(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD, &pixels[v]);
                 }
             for (; !no_blocks_left(blocks); blocks = without_next(blocks)) {
                 const int v = next_block(blocks);
-                const vreal dx = px[v] - rec[0], dy = py[v] - rec[1];
+                const vreal dx = px[v] - rec[HEAD_X], dy = py[v] - rec[HEAD_Y];
                 const vreal raw_alpha = alphas[v];
                 vreal alpha = raw_alpha;
                 const vreal T_before = T[v];
                 vmask hit;
                 const vreal weight = blend(&alpha, &T[v], &hit);
-                const vreal g = lanes_mad(v_red[v], rec[2], lanes_mad(v_green[v], rec[3], v_blue[v] * rec[4]));
+                const vreal g = lanes_mad(
+                    v_red[v], rec[HEAD_RED], lanes_mad(v_green[v], rec[HEAD_GREEN], v_blue[v] * rec[HEAD_BLUE])
+                );
                 rest[v] = lanes_mad(-weight, g, rest[v]);
                 const vreal v_a = lanes_mad(T_before, g, -rest[v] / ((vreal)1 - alpha));
                 const vreal v_raw = lanes_if(hit, blend_clamp_vjp(raw_alpha, v_a), (vreal)0);
@@ -345,15 +243,15 @@ kernel void rasterize_vjp(
                 sums[SHAPE_V + 1] = lanes_mad(weight, v_green[v], sums[SHAPE_V + 1]);
                 sums[SHAPE_V + 2] = lanes_mad(weight, v_blue[v], sums[SHAPE_V + 2]);
             }
-            real own[V_RECORD];
-            lanes_sums(sums, V_RECORD, own);
-            if (plain) shape_sums_plain(own);
-            group_sum_store(own, V_RECORD, scratch, isect_grads + (ulong)lists[start + k] * V_RECORD);
+            real item_sums[V_RECORD];  // over the blocks of this work-item
+            lanes_sums(sums, V_RECORD, item_sums);
+            if (plain) shape_sums_plain(item_sums);
+            group_sum_store(item_sums, V_RECORD, scratch, isect_grads + (ulong)lists[start + k] * V_RECORD);
         }
     }
 }
 
-// moments [V_RECORD, capacity]: each splat's isects summed in order. Overwrites, or goes on with the sum that is there.
+// moments [V_RECORD, capacity]: the sum over each splat's isects, in order. Overwrites, or adds to the sum if `go_on`.
 // Global size: splats / LANES.
 kernel void gather_isect_grads(
     global const uint2 *restrict splat_isects,
@@ -368,11 +266,11 @@ kernel void gather_isect_grads(
     real sums[V_RECORD][LANES];
     for (uint l = 0; l < LANES; ++l) {
         const uint2 range = first + l < n_splats ? splat_isects[first + l] : (uint2)(0, 0);
-        real own[V_RECORD];
-        for (int j = 0; j < V_RECORD; ++j) own[j] = go_on ? moments[first + l + j * capacity] : 0;
+        real record[V_RECORD];
+        for (int j = 0; j < V_RECORD; ++j) record[j] = go_on ? moments[first + l + j * capacity] : 0;
         for (uint isect = range.x; isect < range.y; ++isect)
-            UNROLL for (int j = 0; j < V_RECORD; ++j) own[j] += isect_grads[(ulong)isect * V_RECORD + j];
-        for (int j = 0; j < V_RECORD; ++j) sums[j][l] = own[j];
+            UNROLL for (int j = 0; j < V_RECORD; ++j) record[j] += isect_grads[(ulong)isect * V_RECORD + j];
+        for (int j = 0; j < V_RECORD; ++j) sums[j][l] = record[j];
     }
     for (int j = 0; j < V_RECORD; ++j) lanes_store(lanes_load(sums[j]), moments + first + j * capacity);
 }

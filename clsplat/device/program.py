@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +43,10 @@ GROUP_ITEMS = 64  # of kernels with one work-item per splat or isect
 
 
 def source(*names: str) -> str:
-    """Return the text of source files such as "render/rasterize.cl", joined in order, each after its `#line`."""
+    """Return the text of source files, joined in order, each after its `#line`.
+
+    Names are those of the package ("render/rasterize.cl", "shape/gaussian.clh") or absolute paths.
+    """
     return "".join(f'#line 1 "{name}"\n{_read(name)}\n' for name in names)
 
 
@@ -86,7 +90,7 @@ def build_text(device: Device, text: str, defines: Mapping[str, Define] | None =
             built = _compiled(device, "\n".join([*lines, text]), options)
     except cl.Error as error:
         raise _build_error(device, error, defines or {}, real) from None
-    return Program(device, built, parse_signatures(text, real))
+    return Program(device, built, parse_signatures(text, real, defines))
 
 
 def lane_group(device: Device) -> int:
@@ -242,8 +246,20 @@ def _compiled(device: Device, text: str, options: list[str]) -> pyopencl.Program
     return built
 
 
-@cache
 def _read(name: str) -> str:
+    return _read_outside(Path(name)) if Path(name).is_absolute() else _read_package(name)
+
+
+def _read_outside(path: Path) -> str:
+    """Text of a file that is not part of the package (a shape that was registered)."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise DeviceError(f"{path}: kernel source cannot be read ({first_line(error)}): check the folder") from None
+
+
+@cache
+def _read_package(name: str) -> str:
     try:
         return importlib.resources.files("clsplat_cl").joinpath(*name.split("/")).read_text(encoding="utf-8")
     except (OSError, ModuleNotFoundError):

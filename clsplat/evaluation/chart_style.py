@@ -6,9 +6,11 @@ Each shape has one colour and one marker, the same in every chart. The same data
 
 from __future__ import annotations
 
+import colorsys
 import importlib.util
 import io
 import math
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -29,6 +31,7 @@ INK, FAINT, FRONT, MARK = "#262626", "#d9d9d9", "#c4c4c4", "#d55e00"
 _COLOURS = ("#262626", "#0072b2", "#56b4e9", "#009e73", "#cc79a7", "#d55e00", "#e69f00", "#8c8c1e")
 _CATEGORIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8c8c1e", "#56b4e9", "#e69f00", "#262626")
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X", "h")
+_MORE_MARKERS = ("<", ">", "p", "*", "8", "d", "H")  # of shapes beyond these
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1, 1.3)), (0, (6, 1.3, 1, 1.3)), (0, (3, 1.2, 1, 1.2, 1, 1.2)))
 _LEGEND_COLUMNS = 4
 # Positions of a label beside its point: across in units of 6 points, up in units of 8. The first ones are above and to
@@ -111,8 +114,13 @@ def chart_paths(out: str | Path) -> list[Path]:
 
 
 def shape_colour(shape: str) -> str:
-    """Colour of a shape; INK for an unknown shape."""
-    return _shape_style(shape, _COLOURS, INK)
+    """Colour of a shape: a fixed one for the first eight, others by their names; INK for an unknown shape."""
+    return _shape_style(shape, _COLOURS, INK) or _hashed_colour(shape)
+
+
+def shape_marker(shape: str) -> str:
+    """Marker of a shape, by the same rule; a circle for an unknown shape."""
+    return _shape_style(shape, _MARKERS, "o") or _MORE_MARKERS[_hash(shape) % len(_MORE_MARKERS)]
 
 
 def category_colour(index: int) -> str:
@@ -137,7 +145,7 @@ def looks(methods: dict[str, str]) -> dict[str, dict[str, Any]]:
         count[shape] += 1
         keywords[label] = {
             "color": shape_colour(shape),
-            "marker": _shape_style(shape, _MARKERS, "o"),
+            "marker": shape_marker(shape),
             "linestyle": _DASHES[index % len(_DASHES)],
             "markerfacecolor": shape_colour(shape) if index % 2 == 0 else "white",
             "markeredgecolor": shape_colour(shape),
@@ -146,9 +154,22 @@ def looks(methods: dict[str, str]) -> dict[str, dict[str, Any]]:
 
 
 def _shape_style(shape: str, styles: Sequence[str], unknown: str) -> str:
-    """A style for each shape; they repeat if there are more shapes than styles."""
-    names = list(SHAPES)
-    return styles[names.index(shape) % len(styles)] if shape in names else unknown
+    """A style for each of the first shapes; empty for a further one."""
+    if shape not in SHAPES:
+        return unknown
+    place = list(SHAPES).index(shape)
+    return styles[place] if place < len(styles) else ""
+
+
+def _hash(name: str) -> int:
+    """A number that is the same for a name in every process."""
+    return zlib.crc32(name.encode())
+
+
+def _hashed_colour(name: str) -> str:
+    """A colour of any hue, with a lightness that shows on white."""
+    red, green, blue = colorsys.hls_to_rgb(_hash(name) % 360 / 360.0, 0.4, 0.6)
+    return f"#{round(255 * red):02x}{round(255 * green):02x}{round(255 * blue):02x}"
 
 
 def short_count(number: float, _: object = None) -> str:

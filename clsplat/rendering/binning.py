@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from ..device.device import Device
 from ..device.memory import Pool, copy
 from ..device.opencl import Buffer
-from ..device.program import build
+from ..device.program import Define, build
 from ..errors import DeviceError
+from .build import CULLED_KEY
 from .frame import Band, ProjectedSplats, TileLists
 from .radix_sort import Sorter, SortPairs
 
 MAX_ISECTS = 2**31 - 1  # of a band: ids have 32 bits
-BUCKET_BITS = 11  # of a depth key, that choose its bucket
+BUCKET_BITS = 11  # bits of a depth key that choose its bucket
+ORDER_DEFINES: dict[str, Define] = {"BUCKET_BITS": BUCKET_BITS, "CULLED_KEY": f"{CULLED_KEY:#x}u"}
 _MIN_CHUNK = 2048  # splats of a chunk, so that there are few counters for each splat
 _CHUNKS_PER_UNIT = 4  # at most; near splats have more tiles, so equal chunks take unequal time
 
@@ -97,7 +99,7 @@ class ChunkBinner:
 
     def __init__(self, pool: Pool) -> None:
         self.units = max(pool.device.info.compute_units, 1)
-        self.program = build(pool.device, ("render/order.cl", "render/bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
+        self.program = build(pool.device, ("render/order.cl", "render/bin.cl"), ORDER_DEFINES)
         # Order by depth.
         self._span, self._bucket_counts = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 1 << BUCKET_BITS)
         self._bucket_starts, self._n_visible = pool.buffer(np.uint32), pool.buffer(np.uint32)

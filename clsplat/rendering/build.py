@@ -11,17 +11,21 @@ from ..device.device import Device
 from ..device.program import Define, Program, Real, build
 from ..device.schedule import TILE, Schedule
 from ..splats.fields import Group, Schema
-from ..splats.shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, shape_named
+from ..splats.shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, Shape, shape_named
+from .camera_block import CAMERA_MEMBERS
 
 MARGIN_X, MARGIN_Y = 16, 8  # zero margin of every image plane: the SSIM window reaches 5 pixels out
 BATCH = 64
 
 ALPHA_MIN, ALPHA_MAX, T_MIN = 1.0 / 255.0, 0.99, 1e-4  # of gsplat and 3DGS
 LOW_PASS = 0.3  # px^2
-RECORD_HEAD = 10  # HEAD of cl/shape/contract.clh
-NEAR = 0.01  # world units
+CULLED_KEY = 0xFFFFFFFF  # depth key of a splat that the image does not show
 
-_LOWER = (
+# First slots of a screen record: mean_px [px], colour, camera z, and the first and last pixel row and column that the
+# splat can reach. Kernels have them as HEAD_X and so on. The slots of the shape follow.
+RECORD_HEAD = ("x", "y", "red", "green", "blue", "depth", "top", "bottom", "left", "right")
+
+_BELOW_SHAPE = (
     "math/lanes.clh",
     "math/approx.clh",
     "render/group.clh",
@@ -32,13 +36,20 @@ _LOWER = (
     "render/blend.clh",
     "shape/contract.clh",
 )
+_ABOVE_SHAPE = (
+    "render/antialias.clh",
+    "render/project.cl",
+    "render/batch.clh",
+    "render/blocks.clh",
+    "render/rasterize.cl",
+)
 
 
 @dataclass(frozen=True)
 class KernelBuild:
     """One combination of shape, precision, schedule and thresholds.
 
-    `with_depth` adds the depth image, `with_v_alpha` a gradient coming in through alpha; training needs
+    `with_depth` adds the depth image, and `with_v_alpha` a gradient of the loss with respect to alpha. Training needs
     neither.
     """
 
@@ -67,12 +78,17 @@ class KernelBuild:
     @property
     def record(self) -> int:
         """Reals of a screen record."""
-        return RECORD_HEAD + shape_named(self.shape).record
+        return len(RECORD_HEAD) + shape_named(self.shape).record
 
     @property
     def v_record(self) -> int:
-        """Reals of an isect's gradient record: the shape's moments and three of colour."""
+        """Reals of an isect's gradient record: the moments of the shape and three of the colour."""
         return shape_named(self.shape).moments + 3
+
+    @property
+    def culls_blocks(self) -> bool:
+        """Whether an isect has a set of blocks, a bit each (cl/render/blocks.clh)."""
+        return self.schedule.group == 1 and self.schedule.lanes > 1
 
     @property
     def lanes(self) -> int:
@@ -80,47 +96,71 @@ class KernelBuild:
 
     def raster_program(self, device: Device) -> Program:
         """Projection, rasterisation, and their gradients."""
-        return self._shape_program(device, "render/project.cl", "render/rasterize.cl")
+        return self._shape_program(device, *_ABOVE_SHAPE)
 
     def count_program(self, device: Device) -> Program:
-        """Useful pairs of a frame (pairs.py)."""
+        """Count of the useful pairs of a frame (rendering/overdraw.py)."""
         return self._shape_program(device, "measure/count.cl")
 
     def for_rendering(self) -> KernelBuild:
-        """The same with depth and an alpha gradient."""
+        """The same build with depth and with a gradient through alpha."""
         return replace(self, with_depth=True, with_v_alpha=True)
 
     def _shape_program(self, device: Device, *files: str) -> Program:
-        """Files above the shape's own."""
+        """Program of these files above those of the shape."""
         shape = shape_named(self.shape)
-        return build(device, (*_LOWER, *shape.lower, shape.source, *files), self.defines(), self.real)
+        return build(device, (*_BELOW_SHAPE, *shape.lower, shape.source, *files), self.defines(), self.real)
 
     def defines(self) -> dict[str, Define]:
         """Constants of the kernels, by name."""
-        schema = self.schema
-        rows: dict[str, Define] = {
-            f"ROW_{field.name.upper()}": schema.offset(field.name) for field in schema.group(Group.GEOM)
-        }
-        return rows | {
-            "TILE": TILE,
-            "BATCH": BATCH,
-            "MARGIN_X": MARGIN_X,
-            "MARGIN_Y": MARGIN_Y,
-            "GROUP": self.schedule.group,
-            "VECS": self.schedule.vecs,
-            "LANES": self.lanes,
-            "SH_DEGREE": self.sh_degree,
-            "GEOM_ROWS": schema.rows(Group.GEOM),
-            "WITH_DEPTH": int(self.with_depth),
-            "WITH_V_ALPHA": int(self.with_v_alpha),
-            "ANTIALIASED": int(self.antialiased),
-            "NORMALISATION": NORMALISATIONS.index(self.normalisation),
-            "PEAK_STEPS": 3 if self.real == "float" else 4,
-            "SKEW_MAX": SKEW_MAX,
-            "SLANT_MAX": SLANT_MAX,
-            "OPACITY_SIGNED": int(shape_named(self.shape).signed),
-            "LOW_PASS": LOW_PASS,
-            "ALPHA_MIN": self.alpha_min,
-            "ALPHA_MAX": self.alpha_max,
-            "T_MIN": self.t_min,
-        }
+        shape = shape_named(self.shape)
+        heads = {f"HEAD_{name.upper()}": place for place, name in enumerate(RECORD_HEAD)}
+        return (
+            layout_defines(shape, self.schema)
+            | heads
+            | {
+                "HEAD": len(RECORD_HEAD),
+                "SHAPE_N": shape.record,
+                "SHAPE_V": shape.moments,
+                "CAMERA_MEMBERS": ", ".join(CAMERA_MEMBERS),
+                "CULLED_KEY": f"{CULLED_KEY:#x}u",
+                "TILE": TILE,
+                "BATCH": BATCH,
+                "MARGIN_X": MARGIN_X,
+                "MARGIN_Y": MARGIN_Y,
+                "GROUP": self.schedule.group,
+                "VECS": self.schedule.vecs,
+                "LANES": self.lanes,
+                "CULLS_BLOCKS": int(self.culls_blocks),
+                "WITH_DEPTH": int(self.with_depth),
+                "WITH_V_ALPHA": int(self.with_v_alpha),
+                "ANTIALIASED": int(self.antialiased),
+                "NORMALISATION": NORMALISATIONS.index(self.normalisation),
+                "PEAK_STEPS": 3 if self.real == "float" else 4,
+                "LOW_PASS": LOW_PASS,
+                "ALPHA_MIN": self.alpha_min,
+                "ALPHA_MAX": self.alpha_max,
+                "T_MIN": self.t_min,
+            }
+        )
+
+
+def layout_defines(shape: Shape, schema: Schema) -> dict[str, Define]:
+    """Rows of the parameter buffers and limits of raw values, which the renderer and the optimizer share.
+
+    ROW_<FIELD> is the first row of a field in geom. SHAPE_FIRST_ROW and SHAPE_ROWS are the rows of the fields that only
+    this shape has; RAW_<FIELD> counts from the first of these.
+    """
+    geom = schema.group(Group.GEOM)
+    first = schema.offset(shape.fields[0].name) if shape.fields else schema.rows(Group.GEOM)
+    rows: dict[str, Define] = {f"ROW_{field.name.upper()}": schema.offset(field.name) for field in geom}
+    rows |= {f"RAW_{field.name.upper()}": schema.offset(field.name) - first for field in shape.fields}
+    return rows | {
+        "GEOM_ROWS": schema.rows(Group.GEOM),
+        "SHAPE_FIRST_ROW": first,
+        "SHAPE_ROWS": schema.rows(Group.GEOM) - first,
+        "SH_DEGREE": schema.sh_degree,
+        "SKEW_MAX": SKEW_MAX,
+        "SLANT_MAX": SLANT_MAX,
+        "OPACITY_SIGNED": int(shape.signed),
+    }

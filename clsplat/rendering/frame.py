@@ -136,13 +136,8 @@ class RenderedImages:
 
     def reserve(self, layout: ImageLayout) -> dict[str, Buffer]:
         """Return the buffers for images of this layout, by the names of the kernel's parameters."""
-        color = self.color.reserve(layout)
-        return {
-            "color": color,
-            "transmittance": self.transmittance.reserve(layout),
-            # Without WITH_DEPTH the kernel does not touch this parameter.
-            "depth": color if self.depth is None else self.depth.reserve(layout),
-        }
+        buffers = {"color": self.color.reserve(layout), "transmittance": self.transmittance.reserve(layout)}
+        return buffers if self.depth is None else buffers | {"depth": self.depth.reserve(layout)}
 
 
 @dataclass(frozen=True)

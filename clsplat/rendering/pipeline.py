@@ -13,7 +13,6 @@ import weakref
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..device.device import Device
@@ -22,28 +21,10 @@ from ..device.opencl import Buffer, Event
 from ..device.program import lane_group
 from ..splats.color import BLACK, Color
 from .binning import MAX_ISECTS, cut_bands, make_binner
-from .build import NEAR, KernelBuild
+from .build import KernelBuild
+from .camera_block import camera_block
 from .frame import Band, Frame, ImageLayout, ProjectedSplats, RenderedImages, TileLists
 from .splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers, SplatStatistics
-
-
-def camera_block(camera: Camera) -> NDArray[np.float64]:
-    """Return the camera as kernels read it (order: cl/camera/pinhole.clh).
-
-    The tangents of the Jacobian are clamped at 0.3 of half the image beyond its edges, as in gsplat.
-    """
-    tan_x, tan_y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
-    return np.concatenate(
-        [
-            camera.rotation.ravel(),
-            camera.translation,
-            [camera.fx, camera.fy, camera.cx, camera.cy],
-            [-(camera.cx / camera.fx + 0.3 * tan_x), (camera.width - camera.cx) / camera.fx + 0.3 * tan_x],
-            [-(camera.cy / camera.fy + 0.3 * tan_y), (camera.height - camera.cy) / camera.fy + 0.3 * tan_y],
-            camera.position,
-            [NEAR],
-        ]
-    )
 
 
 class Pipeline:
@@ -59,7 +40,8 @@ class Pipeline:
     ----------
     pool : the memory of frames and their gradients.
     statistics : statistics of the gradients that `backward` adds up for each splat.
-    isect_blocks : for each isect of the last band, the set of pixel blocks that its splat reaches, a bit each.
+    isect_blocks : for each isect of the last band, the set of pixel blocks that its splat reaches, a bit each;
+        only of builds with `culls_blocks`.
     group : group size of kernels over vectors of splats.
     """
 
@@ -133,13 +115,16 @@ class Pipeline:
 
         Parameters
         ----------
-        v_color, v_alpha : gradients of the loss with respect to the image, in the frame's layout.
+        v_color, v_alpha : gradients of the loss with respect to the image, in the frame's layout; v_alpha if and only if
+            the build has it.
 
         Raises
         ------
-        RuntimeError : the frame is overwritten.
+        RuntimeError : the frame is overwritten. ValueError : v_alpha does not fit the build.
         """
         frame.check_current()
+        if (v_alpha is not None) != self.kernels.with_v_alpha:
+            raise ValueError(f"v_alpha: this build has {'one' if self.kernels.with_v_alpha else 'none'}")
         layout, splats, projected, n = frame.layout, frame.splats, frame.projected, frame.n_splats
         if not n:
             return
@@ -160,8 +145,8 @@ class Pipeline:
                 color=frame.images.color.buffer,
                 transmittance=frame.images.transmittance.buffer,
                 v_color=v_color,
-                v_alpha=v_color if v_alpha is None else v_alpha,
-                isect_blocks=self.isect_blocks.buffer,
+                **({} if v_alpha is None else {"v_alpha": v_alpha}),
+                **({"isect_blocks": self.isect_blocks.buffer} if self.kernels.culls_blocks else {}),
                 isect_grads=isect_grads,
                 width=layout.width,
                 height=layout.height,
@@ -259,7 +244,7 @@ class Pipeline:
             isect_splat=self._lists.isect_splat,
             records=frame.projected.records,
             **images.reserve(layout),
-            isect_blocks=self.isect_blocks.reserve(band.n_isects),
+            **({"isect_blocks": self.isect_blocks.reserve(band.n_isects)} if self.kernels.culls_blocks else {}),
             width=layout.width,
             height=layout.height,
             tiles_x=layout.tiles_x,

@@ -36,7 +36,9 @@ class Field:
     width : reals per splat.
     ply : property names in file order, one per component (`sh` has its own rule in ply.py).
     neutral : value at which a shape *is* the Gaussian; used where a file lacks the field.
-    lr : Adam's learning rate (3DGS's constants unless a comment says otherwise).
+    lr : Adam's learning rate at 30 000 iterations. For the fields that have an option (`--opacity-lr`,
+        `--beta-lr`, ...) the value of the option counts instead.
+    lr_power : p in the factor max(1, 30 000 / iterations)^p of the rate: shorter runs need larger steps.
     limit : largest allowed Euclidean norm of the stored vector, or None.
     bounds : lowest and highest allowed value of each component, or None. Bounded fields are positive, and the
         optimizer steps their logarithm.
@@ -51,6 +53,7 @@ class Field:
     ply: tuple[str, ...]
     neutral: tuple[float, ...]
     lr: float
+    lr_power: float = 0.0
     group: Group = Group.GEOM
     limit: float | None = None
     bounds: tuple[float, float] | None = None
@@ -73,9 +76,9 @@ def sh_degree_of(n_coefficients: int) -> int:
 
 
 # 3DGS's learning rates; the mean's is multiplied by the scene extent and decays (see train).
-MEAN = Field("mean", 3, ("x", "y", "z"), (0.0, 0.0, 0.0), 1.6e-4)
-QUAT = Field("quat", 4, ("rot_0", "rot_1", "rot_2", "rot_3"), (1.0, 0.0, 0.0, 0.0), 1e-3, nonzero=True)
-LOG_SCALE = Field("log_scale", 3, ("scale_0", "scale_1", "scale_2"), (0.0, 0.0, 0.0), 5e-3)
+MEAN = Field("mean", 3, ("x", "y", "z"), (0.0, 0.0, 0.0), 1.6e-4, 0.75)
+QUAT = Field("quat", 4, ("rot_0", "rot_1", "rot_2", "rot_3"), (1.0, 0.0, 0.0, 0.0), 1e-3, 0.5, nonzero=True)
+LOG_SCALE = Field("log_scale", 3, ("scale_0", "scale_1", "scale_2"), (0.0, 0.0, 0.0), 5e-3, 0.25)
 OPACITY_LOGIT = Field("opacity_logit", 1, ("opacity",), (0.0,), 5e-2)
 
 
@@ -84,7 +87,7 @@ def sh_field(degree: int) -> Field:
     k = sh_coefficients(degree)
     dc = ("f_dc_0", "f_dc_1", "f_dc_2")
     rest = tuple(f"f_rest_{i}" for i in range(3 * (k - 1)))
-    return Field("sh", 3 * k, dc + rest, (0.0,) * (3 * k), 2.5e-3, Group.SH)
+    return Field("sh", 3 * k, dc + rest, (0.0,) * (3 * k), 2.5e-3, group=Group.SH)
 
 
 CORE = (MEAN, QUAT, LOG_SCALE, OPACITY_LOGIT)

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from . import profiles
-from .fields import Array, Field, Schema, make_schema
+from .fields import CORE, Array, Field, Schema, make_schema
 from .flops import DENSITY, EXP, LOG, LOG1P, MOMENTS, PHI, QUADRATIC
 
 SKEW_LIMIT = math.sqrt(2.0 / (math.pi - 2.0))  # 1.3236: |m| of an infinitely skewed normal
@@ -83,13 +84,13 @@ class Shape:
 
 _SKEW_COLUMNS = ("skew_0", "skew_1", "skew_2")
 # m = 0 is a stationary point of the centred form; at 0.1 the skewness index is 4e-4, far below one 8-bit step.
-SKEW = Field("skew", 3, _SKEW_COLUMNS, (0.0, 0.0, 0.0), 2.5e-3, limit=SKEW_LIMIT, start=0.1)
-SLANT = Field("skew", 3, _SKEW_COLUMNS, (0.0, 0.0, 0.0), 1.25e-2, limit=SLANT_MAX, start=0.1)
+SKEW = Field("skew", 3, _SKEW_COLUMNS, (0.0, 0.0, 0.0), 2.5e-3, 0.5, limit=SKEW_LIMIT, start=0.1)
+SLANT = Field("skew", 3, _SKEW_COLUMNS, (0.0, 0.0, 0.0), 1.25e-2, 0.5, limit=SLANT_MAX, start=0.1)
 OPACITY_MINUS = Field("opacity_minus_logit", 1, ("opacity_minus",), (0.0,), 5e-2, neutral_from="opacity_logit")
 # 3D-HGS: rate 3e-3; it starts all normals at (0.6, 0.6, 0.6), here each has a random direction.
-NORMAL = Field("normal", 3, ("normal_0", "normal_1", "normal_2"), (0.0, 0.0, 1.0), 3e-3, nonzero=True, start=1.0)
-BETA = Field("beta", 1, ("beta",), (2.0,), 1e-3, bounds=BETA_BOUNDS)  # GES: rate 1e-3
-NU = Field("nu", 1, ("nu",), (NU_BOUNDS[1],), 1e-2, bounds=NU_BOUNDS, start=100.0)  # SSS starts at 100
+NORMAL = Field("normal", 3, ("normal_0", "normal_1", "normal_2"), (0.0, 0.0, 1.0), 3e-3, 0.5, nonzero=True, start=1.0)
+BETA = Field("beta", 1, ("beta",), (2.0,), 1e-3, 0.5, bounds=BETA_BOUNDS)  # GES: rate 1e-3
+NU = Field("nu", 1, ("nu",), (NU_BOUNDS[1],), 1e-2, 0.5, bounds=NU_BOUNDS, start=100.0)  # SSS starts at 100
 
 # Flops, term by term as the pixel formulas of cl/shape/ have them.
 _GAUSSIAN_FLOPS = (QUADRATIC + EXP + 1, 1 + 1 + MOMENTS)  # times opacity; w, its sum
@@ -206,6 +207,43 @@ SHAPES = {
     )
 }
 DEFAULT_SHAPE = SKEW_NORMAL.name
+
+
+def register_shape(shape: Shape, sources: str | Path | None = None) -> Shape:
+    """Add a shape to those that models, commands and charts know.
+
+    Parameters
+    ----------
+    shape : its descriptor. `source` and `lower` name files of cl/shape/ ("shape/gaussian_pixel.clh"), or of `sources`.
+    sources : folder with the shape's own kernel files.
+
+    Returns
+    -------
+    The descriptor with absolute paths of the files in `sources`.
+
+    Raises
+    ------
+    InputError : the name is taken, `sources` has no file `source`, or two shapes disagree about a field.
+    """
+    if shape.name in SHAPES:
+        raise InputError(f"shape {shape.name!r}: this name is taken: choose another")
+    known = {field.name: (field.width, field.ply) for field in known_fields()}
+    for field in shape.fields:
+        if known.get(field.name, (field.width, field.ply)) != (field.width, field.ply):
+            raise InputError(f"shape {shape.name!r}: another shape has a field {field.name!r}: choose another name")
+    if sources is not None:
+        folder = Path(sources).resolve()
+        if not (folder / shape.source).is_file():
+            raise InputError(f"{folder / shape.source}: no such kernel file: write the shape's formulas there")
+        found = tuple(str(folder / name) if (folder / name).is_file() else name for name in shape.lower)
+        shape = replace(shape, source=str(folder / shape.source), lower=found)
+    SHAPES[shape.name] = shape
+    return shape
+
+
+def known_fields() -> tuple[Field, ...]:
+    """Fields of all shapes, without colour."""
+    return (*CORE, *(field for shape in SHAPES.values() for field in shape.fields))
 
 
 def shape_named(name: str) -> Shape:

@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..files.json_file import describe
 from ..splats.color import BLACK, Color
 from ..splats.fields import MAX_SH_DEGREE
-from ..splats.shapes import DEFAULT_SHAPE, NORMALISATIONS, SHAPES, shape_named
+from ..splats.shapes import DEFAULT_SHAPE, NORMALISATIONS, SHAPES, known_fields, shape_named
 from .optim.skew_map import check_map, map_named
 from .options.density import DEFAULT_STRATEGY, STRATEGIES, Adc, DensityConfig, Mcmc
 from .options.groups import (
@@ -30,8 +30,6 @@ from .options.option import Option, OptionGroup, check_options, option, option_t
 FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
 REMOVED_OPTIONS = {"sampling": "opacity"}  # options of earlier versions, with the value that old files may have
 PUBLISHED_ITERATIONS = 30_000  # run length for which 3DGS's learning rates were published
-# Powers of `TrainConfig.rate_factor`, by field.
-_RATE_POWERS = {"mean": 0.75, "quat": 0.5, "skew": 0.5, "normal": 0.5, "beta": 0.5, "nu": 0.5, "log_scale": 0.25}
 
 
 @dataclass(frozen=True, init=False, kw_only=True)
@@ -56,7 +54,7 @@ class TrainConfig:
     InputError : a value is out of range. TypeError : an unknown option.
     """
 
-    shape: str = option(DEFAULT_SHAPE, help="Splat kernel.", choices=tuple(SHAPES))
+    shape: str = option(DEFAULT_SHAPE, help="Splat kernel.", choices=SHAPES)
     iterations: int = option(7000, help="Number of optimizer steps, one image each.", at_least=1, aliases=["--steps"])
     cap_max: int = option(100_000, help="Largest number of splats.", at_least=1)
     sh_degree: int = option(3, help="Highest degree of spherical harmonics, 0 to 3.", at_least=0, at_most=MAX_SH_DEGREE)
@@ -125,10 +123,10 @@ class TrainConfig:
     def rate_factor(self, field: str) -> float:
         """Return the factor on a field's learning rate for the length of the run: max(1, 30 000 / iterations)^p.
 
-        3DGS's rates were published for 30 000 iterations; shorter runs need larger steps. p is 3/4 for positions,
-        1/2 for rotation and the shape's own parameters, 1/4 for scale, and 0 for the others.
+        3DGS's rates were published for 30 000 iterations; shorter runs need larger steps. p is the field's
+        `lr_power`: 3/4 for positions, 1/2 for rotation and the parameters of shapes, 1/4 for scale, 0 for the others.
         """
-        power = _RATE_POWERS.get(field, 0.0)
+        power = next((known.lr_power for known in known_fields() if known.name == field), 0.0)
         return float(max(1.0, PUBLISHED_ITERATIONS / self.iterations) ** power)
 
     def replace(self, **options: Any) -> TrainConfig:

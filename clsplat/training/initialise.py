@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..rendering.build import NEAR
+from ..rendering.camera_block import NEAR
 from ..splats.fields import Array, sh_coefficients
 from ..splats.morton import morton_order
 from ..splats.shapes import DEFAULT_SHAPE, shape_named

@@ -7,9 +7,9 @@ import numpy as np
 from ..device.device import Device
 from ..device.program import Define, Program, build
 from ..device.schedule import Schedule
-from ..rendering.build import MARGIN_X, MARGIN_Y, KernelBuild
+from ..rendering.build import CULLED_KEY, MARGIN_X, MARGIN_Y, KernelBuild, layout_defines
 from ..splats.fields import Group
-from ..splats.shapes import SKEW_MAX, SLANT_MAX, shape_named
+from ..splats.shapes import shape_named
 from .config import TrainConfig
 from .optim import adam
 from .optim.skew_map import SKEW_MAPS
@@ -62,7 +62,6 @@ def exposure_program(device: Device, kernels: KernelBuild) -> Program:
 
 # Parts of a geometry step (cl/train/optim.cl): a work-item steps the rows of one part.
 PARTS = ("mean", "quat", "scale", "own")
-CULLED_KEY = 0xFFFFFFFF  # depth key of a splat that is not visible (cl/render/project.cl)
 
 _OPTIM_FILES = (
     "math/lanes.clh",
@@ -85,7 +84,7 @@ def optim_program(device: Device, kernels: KernelBuild) -> Program:
 
 def lazy_program(device: Device, kernels: KernelBuild) -> Program:
     """The optimizer with the kernels of visible splats (optim/lazy.py)."""
-    defines = _optim_defines(kernels) | {"ADAM_WAITS": adam.WAITS, "CULLED_KEY": CULLED_KEY}
+    defines = _optim_defines(kernels) | {"ADAM_WAITS": adam.WAITS, "CULLED_KEY": f"{CULLED_KEY:#x}u"}
     return build(device, (*_OPTIM_FILES, "train/lazy.cl"), defines, kernels.real)
 
 
@@ -93,17 +92,12 @@ def _optim_defines(kernels: KernelBuild) -> dict[str, Define]:
     geometry = kernels.schema.group(Group.GEOM)
     widths = {field.name: field.width for field in geometry if field.name not in ("mean", "quat", "log_scale", "skew")}
     defines: dict[str, Define] = {f"PART_{name.upper()}": number for number, name in enumerate(PARTS)}
-    defines |= {f"ROW_{field.name.upper()}": kernels.schema.offset(field.name) for field in geometry}
+    defines |= layout_defines(shape_named(kernels.shape), kernels.schema)
     # 1 - beta is a constant, because the difference of float32 numbers has a relative error of 1e-5.
     return defines | {
         "PART_ROWS": max(4, sum(widths.values())),
-        "GEOM_ROWS": kernels.schema.rows(Group.GEOM),
         "LANES": kernels.lanes,
-        "SH_DEGREE": kernels.sh_degree,
-        "OPACITY_SIGNED": int(shape_named(kernels.shape).signed),
         "SKEW_MAP": SKEW_MAPS.index(kernels.skew_map),
-        "SKEW_MAX": SKEW_MAX,
-        "SLANT_MAX": SLANT_MAX,
         "ADAM_BETA1": adam.BETA1,
         "ADAM_BETA2": adam.BETA2,
         "ADAM_EPS": adam.EPS,

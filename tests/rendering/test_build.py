@@ -13,7 +13,7 @@ from clsplat.device.device import Device
 from clsplat.device.program import build
 from clsplat.device.schedule import SCHEDULES
 from clsplat.profiling.roofline import CHAINS, roofline_program
-from clsplat.rendering.binning import BUCKET_BITS
+from clsplat.rendering.binning import ORDER_DEFINES
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.radix_sort import DIGIT_BITS
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
@@ -72,7 +72,7 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
     roofline_program(compiler, CHAINS[0])
     build(compiler, ("measure/smoke.cl",))
     build(compiler, ("render/sort.cl",), {"SORT_GROUP": 64, "RADIX_BITS": DIGIT_BITS})
-    build(compiler, ("render/order.cl", "render/bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
+    build(compiler, ("render/order.cl", "render/bin.cl"), ORDER_DEFINES)
     there = {
         f"{folder.name}/{file.name}"
         for folder in files("clsplat_cl").iterdir()
@@ -92,5 +92,5 @@ def test_every_kernel_builds_on_every_device(device: Device) -> None:
 @pytest.mark.parametrize("group", [64, 256])
 def test_sort_and_binning_build(device: Device, group: int) -> None:
     build(device, ("render/sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": DIGIT_BITS})
-    build(device, ("render/order.cl", "render/bin.cl"), {"BUCKET_BITS": BUCKET_BITS})
+    build(device, ("render/order.cl", "render/bin.cl"), ORDER_DEFINES)
     build(device, ("render/bin.cl",))

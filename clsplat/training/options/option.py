@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from types import NoneType, UnionType
 from typing import Any, ClassVar, get_args, get_origin, get_type_hints
@@ -64,7 +64,8 @@ class Option:
     type : Python type of its values, such as `float | None`.
     default : its default value, `dataclasses.MISSING` if the subclasses define it.
     help : one or two sentences for `--help`.
-    range : the range of numbers. choices : allowed words, empty if any value is allowed.
+    range : the range of numbers. choices : allowed words, empty if any value is allowed; a registry such as
+        SHAPES may grow.
     metavar : placeholder for the value in `--help`. aliases : further flags.
     """
 
@@ -73,7 +74,7 @@ class Option:
     default: Any
     help: str
     range: Range | None = None
-    choices: tuple[str, ...] = ()
+    choices: Collection[str] = ()
     metavar: str | None = None
     aliases: tuple[str, ...] = ()
 
@@ -112,7 +113,7 @@ def option(
     at_most: float | None = None,
     above: float | None = None,
     below: float | None = None,
-    choices: Sequence[str] = (),
+    choices: Collection[str] = (),
     metavar: str | None = None,
     aliases: Sequence[str] = (),
 ) -> Any:
@@ -121,7 +122,7 @@ def option(
     metadata = {
         "help": help,
         "range": None if allowed == Range() else allowed,
-        "choices": tuple(choices),
+        "choices": choices,
         "metavar": metavar,
         "aliases": tuple(aliases),
     }
