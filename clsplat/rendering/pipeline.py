@@ -115,8 +115,8 @@ class Pipeline:
 
         Parameters
         ----------
-        v_color, v_alpha : gradients of the loss with respect to the image, in the frame's layout; v_alpha if and only if
-            the build has it.
+        v_color, v_alpha : gradients of the loss with respect to the image, in the frame's layout. v_alpha is needed
+            if and only if the build has it.
 
         Raises
         ------

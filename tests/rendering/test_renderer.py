@@ -18,7 +18,8 @@ from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device
 from clsplat.device.schedule import SCHEDULES, TILE, Schedule, default_schedule
 from clsplat.errors import InputError
-from clsplat.rendering.build import BATCH, NEAR, KernelBuild
+from clsplat.rendering.build import BATCH, KernelBuild
+from clsplat.rendering.camera_block import NEAR
 from clsplat.rendering.frame import DeviceImage
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.renderer import Renderer
