@@ -1,12 +1,12 @@
-// count.cl: how much of a frame's work is useful. Not part of rendering: benchmarks compare with it.
+// count.cl: the number of useful pairs of splat and pixel in a frame, for benchmarks and overdraw images.
 //
-// A pair of splat and pixel is useful if |alpha| reaches the cutoff and the pixel is not yet finished by a splat before
-// it; the one that finishes it counts, as it had to be evaluated. Screen records as in project.cl.
+// A pair is useful if |alpha| reaches the cutoff and no splat before has finished the pixel. The pair that finishes the pixel
+// counts. This is the loop of rasterize.cl for one block, without batches and without culled blocks.
 
 #define BLOCKS_PER_TILE (TILE * TILE / LANES)
 #define BLOCKS_X (TILE / BLOCK_W)
 
-// counts [tiles, BLOCKS_PER_TILE]: useful pairs of each block of LANES pixels. Overwrites. Global size: the counts.
+// Overwrites counts [tiles, BLOCKS_PER_TILE] with the useful pairs of each block of LANES pixels. Global size: the counts.
 kernel void count_pairs(
     global const uint2 *restrict tile_ranges,
     global const uint *restrict lists,

@@ -1,13 +1,13 @@
-// limits.cl: what a device can do at best: bytes copied, and fused multiply-adds on CHAINS independent vectors.
+// roofline.cl: the peak rates of a device: bytes copied, and fused multiply-adds on CHAINS independent vectors.
 
-// n vectors of LANES. Global size: n.
+// Copies n vectors of LANES reals. Global size: n.
 kernel void copy_vectors(global const real *restrict values, global real *restrict copied, ulong n) {
     const ulong i = get_global_id(0);
     if (i < n) lanes_store(lanes_load(values + i * LANES), copied + i * LANES);
 }
 
-// sums [items]: x -> a x + b, `rounds` times 16 steps on each chain, which starts at its number plus the lane's; then all
-// are added up. 2 * 16 * CHAINS * LANES flops a round.
+// Overwrites sums [items]. Each chain starts at its number plus that of the lane and makes `rounds` times 16 steps
+// x -> a x + b; the results are added. A round has 2 * 16 * CHAINS * LANES flops.
 kernel void fma_chains(global real *restrict sums, real a, real b, uint rounds) {
     vreal x[CHAINS];
     for (int c = 0; c < CHAINS; ++c) x[c] = (vreal)c + lanes_iota();

@@ -1,16 +1,16 @@
-// order.cl: visible splats by depth, for devices of few work-items (CPUs); sort.cl is for the others.
+// order.cl: the visible splats by depth, for devices with few work-items (CPUs). The other devices use sort.cl.
 //
-// Work is cut into chunks of `run` splats, one work-item each. One pass scatters the splats to BUCKETS by the highest
-// bits in which their keys differ; then each bucket, which fits a cache, is sorted by the rest. Stable throughout:
-// equal depths keep their index order. Culled splats are left out.
+// A work-item has a chunk of `run` splats. One pass scatters the splats to BUCKETS by the highest bits in which their keys
+// differ (a most-significant-digit radix sort; Knuth, TAOCP 5.2.5). Then each bucket, which fits a cache, is sorted by the
+// remaining bits. The sort is stable: equal depths keep their index order. Culled splats are left out.
 
 #define BUCKETS (1 << BUCKET_BITS)
 #define DIGIT_BITS 8
 #define DIGITS (1 << DIGIT_BITS)
-#define FEW 48  // so few are sorted by insertion: counting DIGITS would cost more
+#define FEW 48  // up to this number, insertion is faster than counting DIGITS
 
-// span [chunks]: least and greatest key of each chunk's visible splats; (CULLED_KEY, 0) without any.
-// splat_isects [n]: (0, 0) for culled splats, which no later kernel meets.
+// Overwrites span [chunks] with the smallest and the largest key of the visible splats of each chunk, (CULLED_KEY, 0) if
+// there are none. Sets splat_isects [n] to (0, 0) for culled splats, because no later kernel visits them.
 kernel void depth_span(
     global const uint *restrict depth_key,
     global uint2 *restrict span,
@@ -19,31 +19,31 @@ kernel void depth_span(
     uint run
 ) {
     const uint chunk = get_global_id(0), start = chunk * run, end = min(start + run, n_splats);
-    uint least = CULLED_KEY, most = 0;
+    uint smallest = CULLED_KEY, largest = 0;
     for (uint i = start; i < end; ++i) {
         const uint key = depth_key[i];
         if (key == CULLED_KEY) {
             splat_isects[i] = (uint2)(0, 0);
             continue;
         }
-        least = min(least, key);
-        most = max(most, key);
+        smallest = min(smallest, key);
+        largest = max(largest, key);
     }
-    span[chunk] = (uint2)(least, most);
+    span[chunk] = (uint2)(smallest, largest);
 }
 
-// Least key of all, and the bits below those that choose the bucket.
+// Smallest key, and the number of bits below those that choose the bucket.
 static inline uint2 bucket_scale(global const uint2 *span, uint n_chunks) {
-    uint least = CULLED_KEY, most = 0;
+    uint smallest = CULLED_KEY, largest = 0;
     for (uint c = 0; c < n_chunks; ++c) {
-        least = min(least, span[c].x);
-        most = max(most, span[c].y);
+        smallest = min(smallest, span[c].x);
+        largest = max(largest, span[c].y);
     }
-    const int bits = 32 - (int)clz(most - least);
-    return (uint2)(least, (uint)max(bits - BUCKET_BITS, 0));
+    const int bits = 32 - (int)clz(largest - smallest);
+    return (uint2)(smallest, (uint)max(bits - BUCKET_BITS, 0));
 }
 
-// counts [chunks, BUCKETS]: visible splats. Overwrites.
+// Overwrites counts [chunks, BUCKETS]: the visible splats of each chunk in each bucket.
 kernel void depth_histogram(
     global const uint *restrict depth_key,
     global const uint2 *restrict span,
@@ -54,13 +54,13 @@ kernel void depth_histogram(
 ) {
     const uint chunk = get_global_id(0), start = chunk * run, end = min(start + run, n_splats);
     const uint2 scale = bucket_scale(span, n_chunks);
-    global uint *own = counts + (ulong)chunk * BUCKETS;
-    for (uint b = 0; b < BUCKETS; ++b) own[b] = 0;
+    global uint *of_chunk = counts + (ulong)chunk * BUCKETS;
+    for (uint b = 0; b < BUCKETS; ++b) of_chunk[b] = 0;
     for (uint i = start; i < end; ++i)
-        if (depth_key[i] != CULLED_KEY) ++own[(depth_key[i] - scale.x) >> scale.y];
+        if (depth_key[i] != CULLED_KEY) ++of_chunk[(depth_key[i] - scale.x) >> scale.y];
 }
 
-// pairs [n]: (key, splat) by bucket. bucket_starts [BUCKETS + 1]: the last is past the end. n_visible [1]: that number.
+// Overwrites pairs [n], (key, splat) by bucket, bucket_starts [BUCKETS + 1], the last of which is the end, and n_visible [1].
 kernel void depth_scatter(
     global const uint *restrict depth_key,
     global const uint2 *restrict span,
@@ -74,7 +74,8 @@ kernel void depth_scatter(
 ) {
     const uint chunk = get_global_id(0), start = chunk * run, end = min(start + run, n_splats);
     const uint2 scale = bucket_scale(span, n_chunks);
-    uint all[BUCKETS], to[BUCKETS];  // all: of every chunk; to: of the chunks before this one, then the place to write
+    uint all[BUCKETS],
+        to[BUCKETS];  // all: counts of all chunks; to: counts of the chunks before this one, then the place to write
     for (uint b = 0; b < BUCKETS; ++b) all[b] = to[b] = 0;
     for (uint c = 0; c < n_chunks; ++c) {
         global const uint *from = counts + (ulong)c * BUCKETS;
@@ -97,7 +98,7 @@ kernel void depth_scatter(
     }
 }
 
-// Insertion sort by key.
+// Sorts pairs by key, by insertion.
 static inline void sort_few(global uint2 *pairs, uint n) {
     for (uint k = 1; k < n; ++k) {
         const uint2 pair = pairs[k];
@@ -107,19 +108,20 @@ static inline void sort_few(global uint2 *pairs, uint n) {
     }
 }
 
-// Radix sort by the low `bits` bits of key - least; returns the one of the two buffers that holds the result.
-static inline global uint2 *sort_many(global uint2 *pairs, global uint2 *spare, uint n, uint least, uint bits) {
+// Sorts pairs by the low `bits` bits of key - smallest, with the least significant digit first. Returns the one of the two
+// buffers that holds the result.
+static inline global uint2 *sort_many(global uint2 *pairs, global uint2 *spare, uint n, uint smallest, uint bits) {
     for (uint shift = 0; shift < bits; shift += DIGIT_BITS) {
         uint to[DIGITS];
         for (uint d = 0; d < DIGITS; ++d) to[d] = 0;
-        for (uint k = 0; k < n; ++k) ++to[(pairs[k].x - least) >> shift & (DIGITS - 1)];
+        for (uint k = 0; k < n; ++k) ++to[(pairs[k].x - smallest) >> shift & (DIGITS - 1)];
         uint place = 0;
         for (uint d = 0; d < DIGITS; ++d) {
             const uint count = to[d];
             to[d] = place;
             place += count;
         }
-        for (uint k = 0; k < n; ++k) spare[to[(pairs[k].x - least) >> shift & (DIGITS - 1)]++] = pairs[k];
+        for (uint k = 0; k < n; ++k) spare[to[(pairs[k].x - smallest) >> shift & (DIGITS - 1)]++] = pairs[k];
         global uint2 *swap = pairs;
         pairs = spare;
         spare = swap;
@@ -127,7 +129,7 @@ static inline global uint2 *sort_many(global uint2 *pairs, global uint2 *spare, 
     return pairs;
 }
 
-// First bucket that starts at `place` or later.
+// The first bucket that starts at `place` or later.
 static inline uint bucket_from(global const uint *bucket_starts, uint place) {
     uint low = 0, high = BUCKETS;
     while (low < high) {
@@ -138,8 +140,8 @@ static inline uint bucket_from(global const uint *bucket_starts, uint place) {
     return low;
 }
 
-// depth_order [n visible]: splats front to back. pairs, spare [n]: lost. Each work-item sorts the buckets that start in
-// its part of the places.
+// Overwrites depth_order [n_visible] with the splats from front to back; pairs and spare [n] are lost. Each work-item sorts
+// the buckets that start in its part of the places.
 kernel void depth_buckets(
     global const uint *restrict bucket_starts,
     global const uint2 *restrict span,

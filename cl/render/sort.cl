@@ -1,12 +1,12 @@
-// sort.cl: stable least-significant-digit radix sort of (key, value) pairs, and the exclusive scan it needs.
+// sort.cl: a stable radix sort of (key, value) pairs, least significant digit first, and the exclusive scan that it needs.
 //
-// SORT_GROUP work-items share a block of the input; each owns a contiguous run of it, so order within a digit is
-// kept. RADIX = 1 << RADIX_BITS.
+// Each pass counts digits, scans the counts and scatters (Zagha and Blelloch 1991). SORT_GROUP work-items share a block of
+// the input. Each has a contiguous run of it, so pairs with the same digit keep their order. RADIX = 1 << RADIX_BITS.
 
 #define RADIX (1 << RADIX_BITS)
 #define SORT_ATTRIBUTE __attribute__((reqd_work_group_size(SORT_GROUP, 1, 1)))
 
-// Histograms of this group's runs: hist[digit * SORT_GROUP + item].
+// Overwrites hist[digit * SORT_GROUP + item] with the histograms of this group's runs.
 static inline void count_digits(global const uint *keys, uint n, uint run, uint shift, local uint *hist) {
     const uint lid = get_local_id(0);
     for (uint d = 0; d < RADIX; ++d) hist[d * SORT_GROUP + lid] = 0;
@@ -15,7 +15,7 @@ static inline void count_digits(global const uint *keys, uint n, uint run, uint 
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// counts [RADIX, n_blocks], digit-major: its exclusive scan is where each block's digit starts.
+// Overwrites counts [RADIX, n_blocks], digit-major. Its exclusive scan is the place where each digit of each block starts.
 SORT_ATTRIBUTE
 kernel void
 radix_histogram(global const uint *restrict keys, global uint *restrict counts, uint n, uint run, uint shift) {
@@ -28,7 +28,7 @@ radix_histogram(global const uint *restrict keys, global uint *restrict counts, 
     }
 }
 
-// starts: the scanned counts.
+// Overwrites keys_out and values_out with the pairs by digit. starts: the scanned counts.
 SORT_ATTRIBUTE
 kernel void radix_scatter(
     global const uint *restrict keys,
@@ -66,7 +66,8 @@ kernel void fill_iota(global uint *restrict values, uint n) {
     if (i < n) values[i] = i;
 }
 
-// Exclusive scan in three steps: sums of runs, one a work-item, scan of the sums by one group, scan within the runs.
+// The exclusive scan has three steps (Blelloch 1990): a work-item sums each run, one group scans the sums, and a work-item
+// scans each run. This is the first step.
 kernel void scan_sums(global const uint *restrict values, global ulong *restrict sums, uint n, uint run) {
     const ulong start = (ulong)get_global_id(0) * run;
     ulong sum = 0;
@@ -74,7 +75,7 @@ kernel void scan_sums(global const uint *restrict values, global ulong *restrict
     sums[get_global_id(0)] = sum;
 }
 
-// One group: sums becomes its own exclusive scan; total[0] the grand total.
+// Replaces sums by its exclusive scan, and writes the sum of all to total[0]. One group.
 SORT_ATTRIBUTE
 kernel void scan_spine(global ulong *restrict sums, global ulong *restrict total, uint n) {
     local ulong part[SORT_GROUP];
@@ -103,7 +104,7 @@ kernel void scan_spine(global ulong *restrict sums, global ulong *restrict total
     }
 }
 
-// scanned (modulo 2^32) must be another buffer than values.
+// Overwrites scanned, modulo 2^32. It must not be the buffer of values.
 kernel void scan_apply(
     global const uint *restrict values,
     global const ulong *restrict sums,

@@ -1,22 +1,21 @@
-// photo.cl: what stands between a render and a photo of the scene: the photo's exposure, pixels that a mask hides, and
-// transparent pixels over a background that is not the one they were laid over.
+// exposure.cl: the differences between a render and a photo of the scene: exposure, masks, and transparent pixels.
 //
-// A photo's exposure E is 12 reals, three rows of three factors and an offset: photo = E (r, g, b, 1) of the render.
-// Where a mask hides a pixel, the photo is taken for right: there is no error, and no gradient.
-// Planes of bytes of a truth are r, g, b, and with 5 channels the mask (0 hides) and the opacity.
-// A work-item has PHOTO_VECS vectors of a row. Images are planar with a zero margin (see raster.cl).
+// The exposure E of a photo is 12 reals, three rows of three factors and an offset: photo = E (r, g, b, 1) of the render.
+// A pixel that a mask hides has neither an error nor a gradient. A transparent pixel of a photo is laid over the background
+// of the render. The planes of bytes of a truth are r, g, b, and with 5 channels also the mask (0 hides) and the opacity.
+// A work-item has PHOTO_VECS vectors of a row. Images are planar with a zero margin (rasterize.cl).
 
 #define EXPOSURE 12
 #define SQUARES 10  // of the upper triangle of a 4 x 4 matrix, by rows
 #define SUMS (SQUARES + EXPOSURE)
-#define SATURATED R(0.98)  // a brighter photo says nothing of its exposure
+#define SATURATED R(0.98)  // a brighter pixel of a photo does not depend on the exposure
 
-// Vectors of a work-item's row.
+// Vectors of a row, and those of a work-item: from `first` to before `end`.
 typedef struct {
-    int vecs, first, past;
+    int vecs, first, end;
 } row_part;
 
-static inline row_part own_part(int width) {
+static inline row_part item_part(int width) {
     const int vecs = (width + LANES - 1) / LANES, first = get_global_id(0) * PHOTO_VECS;
     return (row_part){vecs, first, min(first + PHOTO_VECS, vecs)};
 }
@@ -27,9 +26,9 @@ static inline vmask counted(global const uchar *truth, ulong plane, int channels
     return channels > 3 ? inside & (lanes_uchar_to_real(truth + 3 * plane) > (vreal)0) : inside;
 }
 
-// photo [3 planes]: the render as the photo's camera would show it; target [3 planes of bytes], written with 5 channels:
-// the truth over the background that the render has. shift: that background less the truth's, times 255.
-// Overwrites; global size: (at least the row's vectors / PHOTO_VECS, height).
+// Overwrites photo [3 planes] with the render under the exposure of the photo. With 5 channels it also overwrites target
+// [3 planes of bytes] with the truth over the background of the render. shift: that background less the truth's, times 255.
+// Global size: (at least the vectors of a row / PHOTO_VECS, height).
 kernel void photo_of_render(
     global const real *restrict color,
     global const uchar *restrict truth,
@@ -46,13 +45,13 @@ kernel void photo_of_render(
     real shift_g,
     real shift_b
 ) {
-    const row_part own = own_part(width);
+    const row_part item = item_part(width);
     const int y = get_global_id(1);
     global const real *row = exposures + EXPOSURE * view;
     const real shift[3] = {shift_r, shift_g, shift_b};
     const vreal zero = (vreal)0;
     if (y >= height) return;
-    for (int vec = own.first; vec < own.past; ++vec) {
+    for (int vec = item.first; vec < item.end; ++vec) {
         const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + vec * LANES;
         const vmask inside = lanes_before(vec * LANES, width),
                     counts = counted(truth + at, plane, channels, vec, width);
@@ -64,19 +63,19 @@ kernel void photo_of_render(
             global const real *e = row + 4 * c;
             vreal shown = lanes_mad(r, (vreal)e[0], lanes_mad(g, (vreal)e[1], lanes_mad(b, (vreal)e[2], (vreal)e[3])));
             if (channels > 3) {
-                vreal wanted = lanes_mad(through, (vreal)shift[c], lanes_uchar_to_real(truth + at + c * plane));
-                wanted = lanes_if(inside, rint(lanes_clamp(wanted, 0, 255)), zero);
-                lanes_real_to_uchar(wanted, target + at + c * plane);
-                shown = lanes_if(counts, shown, wanted * (real)(1.0 / 255.0));
+                vreal aim = lanes_mad(through, (vreal)shift[c], lanes_uchar_to_real(truth + at + c * plane));
+                aim = lanes_if(inside, rint(lanes_clamp(aim, 0, 255)), zero);
+                lanes_real_to_uchar(aim, target + at + c * plane);
+                shown = lanes_if(counts, shown, aim * (real)(1.0 / 255.0));
             }
             lanes_store(lanes_if(inside, shown, zero), photo + at + c * plane);
         }
     }
 }
 
-// v [3 planes], in place: from the gradient of the photo to that of the render. partial [SUMS, parts]: with x = (r, g, b, 1)
-// of the render and y the target, sums of x x' and of y x' over the pixels that count and are not saturated; target: the
-// truth itself with 3 channels. Same global size.
+// Changes v [3 planes] from the gradient of the photo to that of the render. Overwrites partial [SUMS, parts]: with
+// x = (r, g, b, 1) of the render and y the target, sums of x x' and y x' over the pixels that count and are not saturated.
+// With 3 channels the target is the truth. Global size: that of photo_of_render.
 kernel void photo_of_render_vjp(
     global const real *restrict color,
     global const uchar *restrict truth,
@@ -91,21 +90,21 @@ kernel void photo_of_render_vjp(
     int stride,
     ulong plane
 ) {
-    const row_part own = own_part(width);
+    const row_part item = item_part(width);
     const int y = get_global_id(1);
     global const real *row = exposures + EXPOSURE * view;
     const vreal zero = (vreal)0;
     vreal sums[SUMS];
     for (int j = 0; j < SUMS; ++j) sums[j] = zero;
-    if (y >= height || own.first >= own.vecs) return;
-    for (int vec = own.first; vec < own.past; ++vec) {
+    if (y >= height || item.first >= item.vecs) return;
+    for (int vec = item.first; vec < item.end; ++vec) {
         const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + vec * LANES;
         const vmask counts = counted(truth + at, plane, channels, vec, width);
-        vreal x[4], v_photo[3], wanted[3], most = zero;
+        vreal x[4], v_photo[3], aim[3], brightest = zero;
         for (int c = 0; c < 3; ++c) {
             x[c] = lanes_load(color + at + c * plane);
-            wanted[c] = lanes_uchar_to_real(target + at + c * plane) * (real)(1.0 / 255.0);
-            most = max(most, wanted[c]);
+            aim[c] = lanes_uchar_to_real(target + at + c * plane) * (real)(1.0 / 255.0);
+            brightest = max(brightest, aim[c]);
             v_photo[c] = lanes_if(counts, lanes_load(v + at + c * plane), zero);
         }
         for (int c = 0; c < 3; ++c)
@@ -115,20 +114,20 @@ kernel void photo_of_render_vjp(
                 ),
                 v + at + c * plane
             );
-        x[3] = lanes_if(counts & (most < (vreal)SATURATED), (vreal)1, zero);
+        x[3] = lanes_if(counts & (brightest < (vreal)SATURATED), (vreal)1, zero);
         for (int c = 0; c < 3; ++c) x[c] *= x[3];
         int j = 0;
         for (int a = 0; a < 4; ++a)
             for (int b = a; b < 4; ++b, ++j) sums[j] = lanes_mad(x[a], x[b], sums[j]);
         for (int c = 0; c < 3; ++c)
-            for (int b = 0; b < 4; ++b, ++j) sums[j] = lanes_mad(wanted[c], x[b], sums[j]);
+            for (int b = 0; b < 4; ++b, ++j) sums[j] = lanes_mad(aim[c], x[b], sums[j]);
     }
-    const int items = (own.vecs + PHOTO_VECS - 1) / PHOTO_VECS;
+    const int items = (item.vecs + PHOTO_VECS - 1) / PHOTO_VECS;
     const ulong parts = (ulong)items * height, part = (ulong)y * items + get_global_id(0);
     for (int j = 0; j < SUMS; ++j) partial[j * parts + part] = lanes_sum(sums[j]);
 }
 
-// The exposure of least squares, S E' = T' with S and T those sums plus `pull` pixels' worth of the identity: by Cholesky.
+// The least-squares exposure: solves S E' = T' by Cholesky, where S and T are those sums plus `pull` times the identity.
 static inline void solve_exposure(local const real *sums, real pull, real *exposure) {
     real l[4][4];
     int j = 0;
@@ -153,10 +152,10 @@ static inline void solve_exposure(local const real *sums, real pull, real *expos
     }
 }
 
-// A view's exposure goes the fraction `rate` of the way to that of least squares, which `pull`, a fraction of the pixels,
-// draws to the identity. What that moves the mean of all exposures by is taken off all of them: a gain of all photos and
-// its inverse in all splats would look the same, and views without a photo are shown with the mean.
-// exposures [views, EXPOSURE]. One group of EXPOSURE_GROUP.
+// Moves the exposure of a view by the fraction `rate` towards that of least squares; `pull`, a fraction of the pixels, draws
+// the latter to the identity. Then it shifts all exposures so that their mean stays: a gain of all photos and its inverse in
+// all splats give the same images, and views without a photo are shown with the mean.
+// exposures [views, EXPOSURE], in place. One group of EXPOSURE_GROUP work-items.
 kernel void step_exposure(
     global real *restrict exposures,
     global const real *restrict partial,

@@ -7,10 +7,9 @@
 //   2 cov = h_s - h_d                  var_x + var_y = h_s + h_d
 // Four maps to blur instead of five, and where x is close to y less cancels.
 //
-// A work-item goes down a strip of up to STRIP vectors (one, with one lane), `segment` rows of it: it blurs each row,
-// keeps the last 11 in a ring, and blurs the columns from there, so that no blurred map is ever stored. Global size:
-// (at least the strips, segments, 3 channels). Images are planar with a zero margin (see raster.cl), the truth as
-// bytes.
+// A work-item goes down `segment` rows of a strip of up to STRIP vectors (one vector if LANES is 1). It blurs each row, keeps
+// the last 11 rows in a ring, and blurs the columns from there. So no blurred map is stored. Global size: (at least the
+// strips, segments, 3 channels). Images are planar with a zero margin (rasterize.cl); the truth has bytes.
 
 #define SSIM_C1 R(0.0001)
 #define SSIM_C2 R(0.0009)
@@ -19,8 +18,8 @@
 #define TAPS 11
 #define SIDE ((REACH + LANES - 1) / LANES)  // vectors that the window reaches beyond a strip
 
-// The ring [RING][STRIP][maps]. Each row is written twice, 11 slots apart: so the last 11 are contiguous wherever it
-// stands. With one lane it moves up by a row instead: no index is then variable, and it fits into registers.
+// The ring [RING][STRIP][maps]. Each row is written twice, 11 slots apart, so the last 11 rows are always contiguous. With
+// one lane the rows move up instead: then every index is a constant and the ring fits into registers.
 #define SHIFT (LANES == 1)
 #define RING (SHIFT ? TAPS : 2 * TAPS)
 #define SLOT (SHIFT ? TAPS - 1 : slot)
@@ -32,31 +31,31 @@
 
 #define truth_load(p) (lanes_uchar_to_real(p) * (real)(1.0 / 255.0))
 
-// Written out, as not every compiler unrolls: `pair(weight, k)` for both pixels k from the centre.
+// pair(weight, k) for the two pixels at distance k from the centre; written out because not every compiler unrolls.
 #define PAIRS_OF_WINDOW(pair) pair(WINDOW_4, 1) pair(WINDOW_3, 2) pair(WINDOW_2, 3) pair(WINDOW_1, 4) pair(WINDOW_0, 5)
 
-// Strip, rows and place of a work-item.
+// The part of the image of a work-item.
 typedef struct {
-    int first, n;  // vectors of the row
+    int first, n;  // vectors of a row
     int top, end;  // rows
-    ulong at;      // of the strip in row 0
+    ulong at;      // place of the strip in row 0
 } strip;
 
 static inline int strips_of(int stride) { return ((stride - 2 * MARGIN_X) / LANES + STRIP - 1) / STRIP; }
 
-// Strips as equal as can be.
-static inline strip own_strip(int height, int stride, ulong plane, int segment) {
+// The strip of this work-item. The widths of strips differ by one vector at most.
+static inline strip item_strip(int height, int stride, ulong plane, int segment) {
     const int vecs = (stride - 2 * MARGIN_X) / LANES, strips = strips_of(stride), i = get_global_id(0);
-    strip own;
-    own.first = i * vecs / strips;
-    own.n = STRIP == 1 ? 1 : (i + 1) * vecs / strips - own.first;
-    own.top = get_global_id(1) * segment;
-    own.end = min(own.top + segment, height);
-    own.at = get_global_id(2) * plane + (ulong)MARGIN_Y * stride + own.first * LANES + MARGIN_X;
-    return own;
+    strip item;
+    item.first = i * vecs / strips;
+    item.n = STRIP == 1 ? 1 : (i + 1) * vecs / strips - item.first;
+    item.top = get_global_id(1) * segment;
+    item.end = min(item.top + segment, height);
+    item.at = get_global_id(2) * plane + (ulong)MARGIN_Y * stride + item.first * LANES + MARGIN_X;
+    return item;
 }
 
-// 8-bit interleaved rows of `channels` into planes of bytes with a zero margin. Overwrites; global size: (stride, rows).
+// Overwrites planes of bytes with a zero margin, from 8-bit interleaved rows of `channels`. Global size: (stride, rows).
 kernel void unpack_image(
     global const uchar *restrict bytes,
     global uchar *restrict truth,
@@ -72,8 +71,8 @@ kernel void unpack_image(
         truth[c * plane + at] = inside ? bytes[channels * ((ulong)y * width + x) + c] : (uchar)0;
 }
 
-// partial [3, channels, segments, strips]: sums of |x - y|, SSIM and (x - y)^2. v_maps [3, 3 planes]: gradient of SSIM
-// with respect to the window's mean of x, h_s and h_d (zero outside the image). Overwrites.
+// Overwrites partial [3, channels, segments, strips] with the sums of |x - y|, SSIM and (x - y)^2. Overwrites v_maps
+// [3, 3 planes] with the gradients of SSIM with respect to the window's mean of x, h_s and h_d, zero outside the image.
 kernel void image_loss(
     global const real *restrict rendered,
     global const uchar *restrict truth,
@@ -87,22 +86,22 @@ kernel void image_loss(
 ) {
     const int strips = strips_of(stride);
     if (get_global_id(0) >= strips) return;
-    const strip own = own_strip(height, stride, plane, segment);
+    const strip item = item_strip(height, stride, plane, segment);
     vreal ring[RING][STRIP][4];  // s, d, s^2, d^2
     real s_row[(STRIP + 2 * SIDE) * LANES], d_row[(STRIP + 2 * SIDE) * LANES];
     vreal l1 = (vreal)0, ssims = (vreal)0, squares = (vreal)0;
     const vreal zero = (vreal)0;
     int slot = 0;
-    for (int row = own.top - REACH; row < own.end + REACH; ++row) {
+    for (int row = item.top - REACH; row < item.end + REACH; ++row) {
         MOVE_UP(4)
         if (row >= 0 && row < height) {
-            const ulong at = own.at + (long)row * stride - SIDE * LANES;
-            for (int v = 0; v < own.n + 2 * SIDE; ++v) {
+            const ulong at = item.at + (long)row * stride - SIDE * LANES;
+            for (int v = 0; v < item.n + 2 * SIDE; ++v) {
                 const vreal x = lanes_load(rendered + at + v * LANES), y = truth_load(truth + at + v * LANES);
                 lanes_store(x + y, s_row + v * LANES);
                 lanes_store(x - y, d_row + v * LANES);
             }
-            for (int v = 0; v < own.n; ++v) {
+            for (int v = 0; v < item.n; ++v) {
                 const real *s_at = s_row + (SIDE + v) * LANES, *d_at = d_row + (SIDE + v) * LANES;
                 const vreal s = lanes_load(s_at), d = lanes_load(d_at);
                 vreal s1 = WINDOW_5 * s, d1 = WINDOW_5 * d, s2 = s1 * s, d2 = d1 * d;
@@ -123,13 +122,13 @@ kernel void image_loss(
                 PUT(3, d2);
             }
         } else {
-            for (int v = 0; v < own.n; ++v)
+            for (int v = 0; v < item.n; ++v)
                 for (int map = 0; map < 4; ++map) PUT(map, zero);
         }
         slot = SHIFT || slot == TAPS - 1 ? 0 : slot + 1;
-        if (row < own.top + REACH) continue;
-        const ulong centre = own.at + (long)(row - REACH) * stride;
-        for (int v = 0; v < own.n; ++v) {
+        if (row < item.top + REACH) continue;
+        const ulong centre = item.at + (long)(row - REACH) * stride;
+        for (int v = 0; v < item.n; ++v) {
             const vreal(*mid)[4] = &ring[slot + REACH][v];
             vreal ms = WINDOW_5 * mid[0][0], md = WINDOW_5 * mid[0][1];
             vreal ms2 = WINDOW_5 * mid[0][2], md2 = WINDOW_5 * mid[0][3];
@@ -149,7 +148,7 @@ kernel void image_loss(
             const vreal v_hs = by_b2 + by_a2, v_hd = by_b2 - by_a2;
             const vreal v_mean = lanes_mad(ms, by_b1 + by_a1 - v_hs, md * (by_b1 - by_a1 - v_hd));
 
-            const vmask inside = lanes_before((own.first + v) * LANES, width);
+            const vmask inside = lanes_before((item.first + v) * LANES, width);
             const ulong at = centre + v * LANES;
             lanes_store(lanes_if(inside, v_mean, zero), v_maps + at);
             lanes_store(lanes_if(inside, v_hs, zero), v_maps + at + 3 * plane);
@@ -167,8 +166,8 @@ kernel void image_loss(
     partial[2 * n_parts + part] = lanes_sum(squares);
 }
 
-// v_color: gradient of the loss, from v_maps blurred (the window is symmetric: its own adjoint);
-// l1_scale = (1 - lambda) / count, ssim_scale = lambda / count. Overwrites.
+// Overwrites v_color with the gradient of the loss. It blurs v_maps: the window is symmetric, so it is its own adjoint.
+// l1_scale = (1 - lambda) / count, ssim_scale = lambda / count.
 kernel void image_loss_vjp(
     global const real *restrict rendered,
     global const uchar *restrict truth,
@@ -183,15 +182,15 @@ kernel void image_loss_vjp(
     real ssim_scale
 ) {
     if (get_global_id(0) >= strips_of(stride)) return;
-    const strip own = own_strip(height, stride, plane, segment);
+    const strip item = item_strip(height, stride, plane, segment);
     vreal ring[RING][STRIP][3];
     const vreal zero = (vreal)0;
     int slot = 0;
-    for (int row = own.top - REACH; row < own.end + REACH; ++row) {
+    for (int row = item.top - REACH; row < item.end + REACH; ++row) {
         MOVE_UP(3)
         if (row >= 0 && row < height) {
-            global const real *from = v_maps + own.at + (long)row * stride;
-            for (int v = 0; v < own.n; ++v, from += LANES) {
+            global const real *from = v_maps + item.at + (long)row * stride;
+            for (int v = 0; v < item.n; ++v, from += LANES) {
                 global const real *hs = from + 3 * plane, *hd = from + 6 * plane;
                 vreal v_mean = WINDOW_5 * lanes_load(from);
                 vreal v_hs = WINDOW_5 * lanes_load(hs), v_hd = WINDOW_5 * lanes_load(hd);
@@ -206,13 +205,13 @@ kernel void image_loss_vjp(
                 PUT(2, v_hd);
             }
         } else {
-            for (int v = 0; v < own.n; ++v)
+            for (int v = 0; v < item.n; ++v)
                 for (int map = 0; map < 3; ++map) PUT(map, zero);
         }
         slot = SHIFT || slot == TAPS - 1 ? 0 : slot + 1;
-        if (row < own.top + REACH) continue;
-        const ulong centre = own.at + (long)(row - REACH) * stride;
-        for (int v = 0; v < own.n; ++v) {
+        if (row < item.top + REACH) continue;
+        const ulong centre = item.at + (long)(row - REACH) * stride;
+        for (int v = 0; v < item.n; ++v) {
             const vreal(*mid)[3] = &ring[slot + REACH][v];
             vreal v_mean = WINDOW_5 * mid[0][0], v_hs = WINDOW_5 * mid[0][1], v_hd = WINDOW_5 * mid[0][2];
 #define ADD_PAIR(w, k) \
@@ -226,7 +225,7 @@ kernel void image_loss_vjp(
             const vreal v_ssim = lanes_mad(x + y, v_hs, lanes_mad(x - y, v_hd, v_mean));
             const vreal sign_l1 = lanes_if(x > y, (vreal)1, lanes_if(x < y, (vreal)-1, zero));
             lanes_store(
-                lanes_if(lanes_before((own.first + v) * LANES, width), l1_scale * sign_l1 - ssim_scale * v_ssim, zero),
+                lanes_if(lanes_before((item.first + v) * LANES, width), l1_scale * sign_l1 - ssim_scale * v_ssim, zero),
                 v_color + at
             );
         }

@@ -215,7 +215,7 @@ class ChunkBinner:
             lists=lists.isects,
             cells=image.cells,
             first_tile=band.first,
-            past_tile=band.end,
+            end_tile=band.end,
             tiles_x=image.tiles_x,
         )
         return lists
@@ -269,7 +269,7 @@ class GroupBinner:
             isect_splat=isect_splat,
             n_splats=splats.n,
             first_tile=band.first,
-            past_tile=band.end,
+            end_tile=band.end,
             tiles_x=image.tiles_x,
         )
         ranges = self._ranges.zeros(image.n_tiles)
@@ -289,7 +289,7 @@ class GroupBinner:
             counts=counts,
             n_splats=splats.n,
             first_tile=first,
-            past_tile=end,
+            end_tile=end,
             tiles_x=self._image.tiles_x,
         )
         self.sorter.scan(counts, offsets, splats.n, self._n_isects.reserve(1))
