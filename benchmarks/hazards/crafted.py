@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.cameras.camera import Camera
-from clsplat.rendering.build import NEAR
+from clsplat.rendering.camera_block import NEAR
 from clsplat.splats.fields import public_shape
 from clsplat.splats.shapes import Shape
 

@@ -128,7 +128,7 @@ def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Pat
         * config.rate_factor(field.name)
         / short.rate_factor(field.name)
         for field in splats.schema
-        if field.name != "mean"
+        if field.name != "mean" and hasattr(config.optim, rate_option(field))
     }
     last = config.optim.position_lr_final * config.rate_factor("mean") / short.rate_factor("mean")
     return short.replace(

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...device.memory import to_host
+from ...rendering.build import CULLED_KEY
 from ...rendering.splat_buffers import CompactGradients, SplatBuffers
 from ...splats.fields import Array
 from ..density.edit import DensifyEdit
 from ..methods.sns import ParameterGroups
-from ..programs import CULLED_KEY
 from .adam import EPS, WAITS, NumpyAdam
 from .lazy import DRIFT, DRIFT_MEAN, DRIFT_SKEW, Drifts, in_morton_order
 from .reference import ReferenceOptimizer, SplatIndices

@@ -37,13 +37,16 @@ _RATE_OPTIONS = {
 
 
 def rate_option(field: Field) -> str:
-    """Return the name of the option with a field's learning rate; a shape's field NAME has the option NAME_lr."""
+    """Return the name of the option with a field's learning rate.
+
+    A field NAME of a shape has the option NAME_lr; a field of a registered shape may have none.
+    """
     return _RATE_OPTIONS.get(field.name, f"{field.name}_lr")
 
 
 def field_rate(config: TrainConfig, field: Field) -> float:
-    """Return the learning rate of a field: its option, or the rate in its descriptor if the option is not set."""
-    value: float | None = getattr(config.optim, rate_option(field))
+    """Return the learning rate of a field: its option, or the rate in its descriptor if no option has a value."""
+    value: float | None = getattr(config.optim, rate_option(field), None)
     return field.lr if value is None else value
 
 
