@@ -12,8 +12,8 @@ largest, over fields, of the relative Euclidean norms. The reference of a cutoff
 reference's. Normalisations are trained one by one: their psnr_change is that of other models, the mean over seeds,
 against `peak`. A JSON line each; lines that are there are not made again. benchmarks/frontier.py draws them.
 
-The lines of other forms of exp and Phi, of colour in half precision and of other tiles come from the commit that is
-tagged `before-diet`: they were slower or less accurate, and this version has one form of each.
+Some lines of the results come from the commit with the tag `before-diet`: other forms of exp and Phi, colour in half
+precision, other tiles. They were slower or less accurate, so this version has one form of each.
 """
 
 from __future__ import annotations
@@ -102,11 +102,11 @@ def run(scene: Scene, shape: str, device: Device, args: argparse.Namespace) -> N
         "iterations": args.iterations,
     }
     there = {row["variant"] for row in common.read(args.out) if identity.items() <= row.items()}
-    wanted = [v for v in variants()[: args.variants] if v.name not in there]
+    variants_left = [v for v in variants()[: args.variants] if v.name not in there]
     trained = {}
-    if wanted:
+    if variants_left:
         trained["peak", args.seeds[0]] = splats = train(scene, shape, device, args)
-        for row in measure(scene, splats, device, wanted, args.repeats):
+        for row in measure(scene, splats, device, variants_left, args.repeats):
             common.append(args.out, row | identity)
     others = [n for n in NORMALISATIONS if f"normalisation {n}" not in there]
     if not shape_named(shape).normalised or not others:
@@ -142,9 +142,11 @@ def train(
     return Trainer(scene, config, device=device).run().splats
 
 
-def measure(scene: Scene, splats: Splats, device: Device, wanted: list[Variant], repeats: int) -> list[dict[str, Any]]:
-    """A row each; the default is timed with them whether it is wanted or not."""
-    timed = wanted if wanted[0].name == "default" else [Variant("default", "default"), *wanted]
+def measure(
+    scene: Scene, splats: Splats, device: Device, variants_left: list[Variant], repeats: int
+) -> list[dict[str, Any]]:
+    """A row each; the default is timed with them in any case."""
+    timed = variants_left if variants_left[0].name == "default" else [Variant("default", "default"), *variants_left]
     renderers = {v.name: Renderer(device, **v.options) for v in timed}
     views = scene.test[:3]
     rng = np.random.default_rng(0)
@@ -160,7 +162,7 @@ def measure(scene: Scene, splats: Splats, device: Device, wanted: list[Variant],
     medians = {name: {stage: statistics.median(ms) for stage, ms in each.items()} for name, each in times.items()}
     truths: dict[str, Any] = {}
     rows = []
-    for v in wanted:
+    for v in variants_left:
         key = repr(v.reference)
         if key not in truths:
             truths[key] = outputs(Renderer(device, "float64", **v.reference), scene, splats, losses)
@@ -197,7 +199,7 @@ def outputs(renderer: Renderer, scene: Scene, splats: Splats, losses: list[np.nd
 
 
 def errors(got: dict[str, Any], truth: dict[str, Any]) -> tuple[float, float]:
-    """Of images (root mean square), and of gradients (the worst field's relative norm)."""
+    """Errors of images (root mean square) and of gradients (the worst field's relative norm)."""
     image = np.sqrt(np.mean([np.mean((a - b) ** 2) for a, b in zip(got["images"], truth["images"], strict=True)]))
     worst = 0.0
     for a, b in zip(got["gradients"], truth["gradients"], strict=True):

@@ -77,8 +77,8 @@ find_tile_ranges(global const uint *restrict sorted_tile, global uint *restrict 
 
 // ---- Devices with few work-items (CPUs): each counts a chunk of depth ranks by tile, then writes it to the lists.
 
-// Overwrites ranked_rect [n_visible], the rectangles by depth rank, and counts [chunks, (tiles_x + 1) (tiles_y + 1)], the
-// splats of the chunk over each tile, in the first tiles_x tiles_y places. A rectangle adds to its four corners only, and
+// Overwrites ranked_rect [n_visible] with the rectangles by depth rank. Overwrites counts [chunks, (tiles_x + 1) (tiles_y + 1)]
+// with the splats of the chunk over each tile, in the first tiles_x tiles_y places. A rectangle adds to its four corners only, and
 // sums along x and y fill its inside (Crow 1984, summed-area tables): so large splats take no longer than small ones.
 kernel void count_tiles(
     global const uint *restrict order,

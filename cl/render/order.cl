@@ -60,7 +60,7 @@ kernel void depth_histogram(
         if (depth_key[i] != CULLED_KEY) ++of_chunk[(depth_key[i] - scale.x) >> scale.y];
 }
 
-// Overwrites pairs [n], (key, splat) by bucket, bucket_starts [BUCKETS + 1], the last of which is the end, and n_visible [1].
+// Overwrites pairs [n], (key, splat) by bucket, bucket_starts [BUCKETS + 1], whose last entry is the end, and n_visible [1].
 kernel void depth_scatter(
     global const uint *restrict depth_key,
     global const uint2 *restrict span,

@@ -75,9 +75,9 @@ static inline vec3 unit_direction(constant camera *cam, vec3 mean, vreal *inv_no
     return scale3(from, *inv_norm);
 }
 
-// Overwrites depth_key [n], which grows with depth (CULLED_KEY for a splat that is not seen), tile_rect [n] (x and y of the
-// first tile, then of the tile past the end) and records [n, RECORD]. It leaves alone the records of a vector of splats
-// without a seen one. Global size: splats / LANES.
+// Overwrites depth_key [n], which grows with depth, or is CULLED_KEY for a splat that is not seen. Overwrites tile_rect [n]: x
+// and y of the first tile, then of the tile past the end. Overwrites records [n, RECORD], but leaves alone those of a vector
+// of splats without a seen one. Global size: splats / LANES.
 kernel void project_splats(
     global const real *restrict geom,
     global const real *restrict sh,
@@ -162,9 +162,9 @@ kernel void project_splats(
 // Overwrites grad_geom and grad_sh, which have the rows of geom and sh, with zeros for splats that are not seen; of grad_sh
 // only the bands in use. If `compact`, grad_sh is [6, capacity]: the gradient of the colour and the unit direction; the
 // gradient of sh is the product of the colour's and the basis in that direction.
-// Adds to signals [3, capacity] for each seen splat, for densification: the norm of the gradient of mean_px in units of
-// half the image (3DGS's normalised device coordinates), the absolute gradient along the viewing ray [1/world unit]
-// (3DSGS's depth gradient), and 1.
+// Adds three numbers for densification to signals [3, capacity] for each seen splat. The first is the norm of the gradient of
+// mean_px in units of half the image (3DGS's normalised device coordinates). The second is the absolute gradient along the
+// viewing ray [1/world unit] (3DSGS's depth gradient). The third is 1.
 kernel void project_splats_vjp(
     global const real *restrict geom,
     global const real *restrict sh,

@@ -8,8 +8,8 @@
 //       colour += weight * (r, g, b), depth += weight * z
 //   colour += T * background
 // count.cl has this loop and nothing else. Here the loop is arranged for speed, with the same sums in the same order:
-// - A group of GROUP work-items has one tile of TILE x TILE pixels, and each work-item VECS blocks of LANES pixels of it, so
-//   GROUP * VECS * LANES = TILE * TILE. On CPUs one work-item keeps the accumulators of a tile in its first cache; on GPUs
+// - A group of GROUP work-items has one tile of TILE x TILE pixels. Each work-item has VECS blocks of LANES pixels of it:
+//   GROUP * VECS * LANES = TILE * TILE. On CPUs one work-item keeps the accumulators of a tile in its first cache. On GPUs
 //   a work-item keeps one pixel in registers.
 // - Isects come in batches of BATCH (batch.clh). The loop ends when no pixel of the tile is live.
 // - An isect visits only the blocks that the splat can reach (blocks.clh).
@@ -28,8 +28,8 @@
 #define shape_sums_plain(sums)
 #endif
 
-// Overwrites color [3 planes], transmittance [plane] with the final T, depth [plane] with the sum of weight * z, and
-// isect_blocks [n_isects], by unsorted isect id, with the set of blocks in which the isect was blended.
+// Overwrites color [3 planes], transmittance [plane] with the final T, and depth [plane] with the sum of weight * z.
+// Overwrites isect_blocks [n_isects], by unsorted isect id, with the set of blocks in which the isect was blended.
 GROUP_ATTRIBUTE
 kernel void rasterize(
     global const uint2 *restrict tile_ranges,

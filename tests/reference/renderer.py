@@ -1,10 +1,10 @@
-"""An independent float64 renderer, slow and obvious, that the OpenCL kernels are held against.
+"""An independent float64 renderer, slow and simple, which tests compare the OpenCL kernels with.
 
-It goes another way than the kernels wherever there is one: skewed splats are in the direct (location, scale matrix,
-slope) form, every pixel meets every splat, the peak is found by bisection, and gradients come by complex step instead
-of hand-written adjoints. The shapes' own parts are in reference_skewed.py and reference_radial.py.
+It avoids the methods of the kernels. Skewed splats are in the direct form (location, scale matrix, slope), and every
+pixel evaluates every splat. Bisection finds the peak. Gradients come from the complex step instead of adjoints. The
+formulas of the shapes are in reference/skewed.py and reference/radial.py.
 
-All of it accepts complex arrays; see reference_formulas.py for the closed forms and the complex step.
+All functions accept complex arrays; reference/formulas.py has the closed forms and the complex step.
 """
 
 from __future__ import annotations

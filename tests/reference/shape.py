@@ -49,9 +49,12 @@ class Kernel(NamedTuple):
 
 @dataclass(frozen=True)
 class Geometry:
-    """The projection that all shapes share: point_px (B, 2) of the point that is projected, the affine map about it
-    (B, 2, 3) [px per world unit], the splats' axes R S (B, 3, 3), world from unit frame, and what the low-pass adds
-    [px²].
+    """The projection that all shapes share.
+
+    Attributes
+    ----------
+    point_px : (B, 2) image of the projected point. affine : (B, 2, 3) affine map about it [px per world unit].
+    axes : (B, 3, 3) the matrices R S, from the unit frame to the world. low_pass : added variance [px²].
     """
 
     point_px: Array

@@ -189,7 +189,7 @@ def test_long_slants_act_as_the_bound(make_renderer: MakeRenderer, device: Devic
 def test_splats_without_skew_take_the_short_way_and_get_the_same(
     device: Device, make_renderer: MakeRenderer, shape: str
 ) -> None:
-    """Half of the splats have none: image and gradients are those of the reference, which knows no such way."""
+    """Half of the splats have no skew. The reference has one formula for all splats; results are equal."""
     arrays = random_splats(11, 16, 2)
     arrays["skew"][::2] = 0.0
     case = Case(arrays, random_camera(11, 37, 29), shape)

@@ -1,9 +1,9 @@
-"""Run under Oclgrind by test_oclgrind.py: `python oclgrind_child.py WHAT uninitialized|races` (WHAT: see `main`).
+"""The process that test_oclgrind.py runs under Oclgrind: `python oclgrind_child.py WHAT uninitialized|races`.
 
-Oclgrind 21.10 follows what kernels write and what a whole-buffer write from the host brings, but loses track
-of host writes at an offset, of fills, and of buffers whose memory served another one before. So this process
-replaces the first two by kernels and frees no buffer. It also misreads the halves of a vector (`v.hi`), so
-sums, ORs and blocks go lane by lane; and it knows no prefetch.
+`main` lists the values of WHAT. Oclgrind 21.10 tracks writes of kernels and writes of whole buffers from the host. It
+does not track host writes at an offset, fills, and buffers in memory that another buffer had before. So this process
+replaces the first two by kernels and frees no buffer. Oclgrind also misreads the halves of a vector (`v.hi`), so sums,
+ORs and blocks go lane by lane. It does not support prefetch.
 """
 
 from __future__ import annotations
