@@ -103,13 +103,15 @@ def train(
     point_cloud/iteration_N/point_cloud.ply. Ctrl-C saves a checkpoint; --resume continues from it. With --budget auto,
     the folder also gets budget.json and the growth curve; the small model is the last point cloud.
     """
-    from clsplat.scenes.reconstruct.photo_files import is_photographs, is_video
+    from clsplat.scenes.reconstruct.photo_files import is_photographs
 
     if resume and overwrite:
         raise click.UsageError("give --resume or --overwrite, not both")
     if scene and source_path and scene != source_path:
         raise click.UsageError(f"two scenes: {scene} and {source_path}")
     path = scene or source_path
+    if path is None and not (resume and model_path):
+        raise click.UsageError("give the scene's folder")
     search = search_options(values)
     if view and search is not None:
         raise click.UsageError("--view shows one run: remove --budget, or show the result with clsplat view")
@@ -118,19 +120,14 @@ def train(
     if preset is not None:
         options = with_preset(preset, options)
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
-    if path is None and not (resume and model_path):
-        raise click.UsageError("give the scene's folder")
-    if model_path is None:
-        assert path is not None
-        model_path = Path("output") / (path.stem if is_video(path) else path.resolve().name)
-    folder = ModelFolder(model_path)
+    model_path = model_path or _default_folder(path)
     if resume:
         stored = find_unfinished(model_path)
         if search is not None and stored.search is None:
             raise InputError(f"{model_path}: no search to resume from: start without --resume")
         options, reading = stored.run.options | options, stored.run.scene | reading
         path, search = path or stored.run.scene_path, search or stored.search
-    elif (folder.is_used or is_search(model_path)) and not overwrite:
+    elif (ModelFolder(model_path).is_used or is_search(model_path)) and not overwrite:
         # The function train checks this too, but only after the scene is read.
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
     assert path is not None
@@ -153,6 +150,14 @@ def train(
         from clsplat.training.run import evaluate_test_views
 
         report(model, evaluate_test_views(model, loaded))
+
+
+def _default_folder(scene: Path | None) -> Path:
+    """Return the model's folder for a scene: output/ and the name of the scene's folder, or of the video."""
+    from clsplat.scenes.reconstruct.photo_files import is_video
+
+    assert scene is not None
+    return Path("output") / (scene.stem if is_video(scene) else scene.resolve().name)
 
 
 def run_training(
