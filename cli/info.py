@@ -32,14 +32,14 @@ def show_info(paths: tuple[Path, ...], iteration: int | None, images: str | None
     from clsplat.models.info import ModelInfo, inspect
 
     for number, path in enumerate(paths):
-        found = inspect(path, iteration=iteration, images=images)
+        info = inspect(path, iteration=iteration, images=images)
         if as_json:
-            kind = "model" if isinstance(found, ModelInfo) else "scene"
-            click.echo(json.dumps({kind: str(path), **found.to_json()}))
+            kind = "model" if isinstance(info, ModelInfo) else "scene"
+            click.echo(json.dumps({kind: str(path), **info.to_json()}))
             continue
         if number:
             click.echo()
-        for line in _model_lines(found) if isinstance(found, ModelInfo) else _scene_lines(path, found):
+        for line in _model_lines(info) if isinstance(info, ModelInfo) else _scene_lines(path, info):
             click.echo(line)
 
 
@@ -47,24 +47,24 @@ def show_info(paths: tuple[Path, ...], iteration: int | None, images: str | None
 
 
 def _model_lines(info: ModelInfo) -> list[str]:
-    found = info.to_json()
+    values = info.to_json()
     return [
-        f"{info.model.ply}: {found['splats']} splats, shape {found['shape']}, SH degree {found['sh_degree']}, "
-        f"{'antialiased, ' if found['antialiased'] else ''}{found['bytes'] / 1e6:.2f} MB",
-        table(("", "in use", "of"), model_rows(found)),
+        f"{info.model.ply}: {values['splats']} splats, shape {values['shape']}, SH degree {values['sh_degree']}, "
+        f"{'antialiased, ' if values['antialiased'] else ''}{values['bytes'] / 1e6:.2f} MB",
+        table(("", "in use", "of"), model_rows(values)),
     ]
 
 
-def model_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
+def model_rows(values: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Return the rows of the table: name, number in use, total number."""
-    n = found["splats"]
-    rows = [(f"splats with {name}", str(count), str(n)) for name, count in found["fields_in_use"].items()]
+    n = values["splats"]
+    rows = [(f"splats with {name}", str(count), str(n)) for name, count in values["fields_in_use"].items()]
     rows += [
         (f"SH coefficients, band {band}", str(count), str(3 * (2 * band + 1) * n))
-        for band, count in enumerate(found["sh_coefficients"])
+        for band, count in enumerate(values["sh_coefficients"])
     ]
-    rows.append(("parameters", str(found["parameters_in_use"]), str(found["parameters"])))
-    rows.append(("bytes, written compactly", str(found["compact_bytes"]), str(found["bytes"])))
+    rows.append(("parameters", str(values["parameters_in_use"]), str(values["parameters"])))
+    rows.append(("bytes, written compactly", str(values["compact_bytes"]), str(values["bytes"])))
     return rows
 
 
@@ -78,30 +78,30 @@ def _scene_lines(path: Path, info: SceneInfo) -> list[str]:
     return [head, *(f"{name.ljust(width)}  {text}" for name, text in rows)]
 
 
-def scene_rows(found: SceneInfo) -> list[tuple[str, str]]:
+def scene_rows(info: SceneInfo) -> list[tuple[str, str]]:
     """Return the rows of the table: name and contents."""
     rows = [
         (
             "photos",
-            f"{', '.join(f'{n} of {w}x{h} px' for (w, h), n in found.sizes) or 'none readable'}, "
-            f"{found.photo_bytes / 1e6:.1f} MB",
+            f"{', '.join(f'{n} of {w}x{h} px' for (w, h), n in info.sizes) or 'none readable'}, "
+            f"{info.photo_bytes / 1e6:.1f} MB",
         )
     ]
-    if found.placed:
-        placed, photos, error = found.placed
+    if info.placed:
+        placed, photos, error = info.placed
         rows.append(("reconstructed", f"{placed} of {photos} photos, {error:.2f} px off"))
-    if found.unreadable:
-        rows.append(("unreadable", _list_names(found.unreadable)))
-    rows.append(("without a pose", _list_names(found.unregistered) if found.unregistered else "none"))
-    rows += [("lens", _lens(lens)) for lens in found.lenses[:_MAX_LISTED]]
-    if len(found.lenses) > _MAX_LISTED:
-        rows.append(("", f"and {len(found.lenses) - _MAX_LISTED} more lenses"))
-    seen = f", each in {found.track_mean:.1f} photos (median {found.track_median:g})" if found.track_mean > 1 else ""
-    rows.append(("points", f"{found.points}{seen}"))
+    if info.unreadable:
+        rows.append(("unreadable", _list_names(info.unreadable)))
+    rows.append(("without a pose", _list_names(info.unregistered) if info.unregistered else "none"))
+    rows += [("lens", _lens(lens)) for lens in info.lenses[:_MAX_LISTED]]
+    if len(info.lenses) > _MAX_LISTED:
+        rows.append(("", f"and {len(info.lenses) - _MAX_LISTED} more lenses"))
+    seen = f", each in {info.track_mean:.1f} photos (median {info.track_median:g})" if info.track_mean > 1 else ""
+    rows.append(("points", f"{info.points}{seen}"))
     rows.append(
-        ("test views", f"with --eval {_list_names(found.test)}; {found.photos - len(found.test)} remain for training")
+        ("test views", f"with --eval {_list_names(info.test)}; {info.photos - len(info.test)} remain for training")
     )
-    rows.append(("masks", f"of {found.masked} photos" if found.masked else "none"))
+    rows.append(("masks", f"of {info.masked} photos" if info.masked else "none"))
     return rows
 
 

@@ -122,8 +122,8 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
     if not quiet:
         what = f"{options.frames} frames"
         if not is_video(photos):
-            found = find_photos(photos)
-            what = f"{len(found)} photos, {_minutes(estimate_seconds(found, options))}"
+            files = find_photos(photos)
+            what = f"{len(files)} photos, {_minutes(estimate_seconds(files, options))}"
         click.echo(f"{photos}: no poses: reconstructing {scene} first ({what})", err=True)
     result = run_reconstruction(photos, scene, options, overwrite, quiet)
     if not quiet:

@@ -178,7 +178,7 @@ def write_grey16(path: str | os.PathLike[str], array: NDArray[np.uint16]) -> Non
 
 
 def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes (width, height) can be one image at two scales, with each side rounded to whole pixels."""
+    """Return whether two sizes (width, height) can be one image at two scales, up to rounding to whole pixels."""
     return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1]
 
 

@@ -21,7 +21,6 @@ from .quaternions import rotations
 from .shapes import SKEW_MAX, SLANT_MAX, Shape, shape_named
 from .splats import Splats
 
-Mask = NDArray[np.bool_]
 ArraysByField = dict[str, DoubleArray]
 
 EQUAL = 1e-6  # two raw opacities that differ by less are equal up to the rounding of float32
@@ -50,7 +49,7 @@ def convert(splats: Splats, shape: str) -> Splats:
     )
 
 
-def _refuse(bad: Mask, target: Shape, why: str, remedy: str) -> None:
+def _refuse(bad: NDArray[np.bool_], target: Shape, why: str, remedy: str) -> None:
     """Raise InputError if the mask `bad` has any splats."""
     if bad.any():
         count = f"{np.count_nonzero(bad)} of {len(bad)} splats"
@@ -162,7 +161,7 @@ def _gaussian(model: ArraysByField, normalisation: str, source: Shape, target: S
 def _without_skew(model: Mapping[str, DoubleArray], normalisation: str, source: Shape, target: Shape) -> ArraysByField:
     if not source.normalised:
         return {}  # _of_equal_opacities handles this skew
-    skewed: Mask = np.any(model["skew"] != 0.0, axis=1)
+    skewed = np.any(model["skew"] != 0.0, axis=1)
     _refuse(skewed, target, "are skewed", "set their skew to 0, or choose a skewed shape")
     if normalisation != "none":
         return {}
@@ -190,7 +189,7 @@ def _raw_of(shape: Shape, opacity: Array) -> DoubleArray:
 
 def _of_neutral_nu(model: Mapping[str, DoubleArray], normalisation: str, source: Shape, target: Shape) -> ArraysByField:
     (neutral,) = next(field.neutral for field in source.fields if field.name == "nu")
-    finite: Mask = model["nu"] < neutral * (1.0 - LIMIT_SLACK)
+    finite = model["nu"] < neutral * (1.0 - LIMIT_SLACK)
     _refuse(finite, target, f"have nu below {neutral:g}", "raise it")
     return {}
 

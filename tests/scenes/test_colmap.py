@@ -62,8 +62,8 @@ def test_undistorted_photo_shows_points_where_its_camera_projects_them(
         column, row = expected.astype(int)
         window = flat[row - 6 : row + 7, column - 6 : column + 7, 0].astype(float)
         rows, columns = np.mgrid[row - 6 : row + 7, column - 6 : column + 7] + 0.5
-        found = np.array([(columns * window).sum(), (rows * window).sum()]) / window.sum()
-        assert np.linalg.norm(found - expected) < 0.15
+        centroid = np.array([(columns * window).sum(), (rows * window).sum()]) / window.sum()
+        assert np.linalg.norm(centroid - expected) < 0.15
         checked += 1
     assert checked >= 15
     assert (flat[:4].sum(), flat[-4:].sum()) == (0, 0)  # ground and border are black

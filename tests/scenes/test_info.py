@@ -21,18 +21,18 @@ def test_a_scene_is_counted_without_decoding(tmp_path: Path, monkeypatch: pytest
     garden = write_garden(tmp_path)
     scene = load_scene(garden)
     monkeypatch.setattr(images, "read_image", None)
-    found = scene_info(garden)
-    assert (found.kind, found.photos, found.points, found.masked) == ("COLMAP", 9, N_POINTS, 0)
-    assert found.sizes == (((WIDTH, HEIGHT), 9),)
-    assert found.track_mean == pytest.approx(9 * 8 / N_POINTS)
-    assert found.track_median == np.median(scene.points.track_length)
-    assert set(found.test) == scene.test_names
-    (lens,) = found.lenses
+    info = scene_info(garden)
+    assert (info.kind, info.photos, info.points, info.masked) == ("COLMAP", 9, N_POINTS, 0)
+    assert info.sizes == (((WIDTH, HEIGHT), 9),)
+    assert info.track_mean == pytest.approx(9 * 8 / N_POINTS)
+    assert info.track_median == np.median(scene.points.track_length)
+    assert set(info.test) == scene.test_names
+    (lens,) = info.lenses
     camera: Camera = scene.cameras[0]
     assert (lens.focal, lens.pinhole, lens.photos) == (camera.fx, True, 9)
     assert lens.field_of_view == pytest.approx(62.4, abs=0.05), "2 atan(20 / 33)"
-    assert found.photo_bytes == sum(file.stat().st_size for file in (garden / "images").iterdir())
-    assert (found.unregistered, found.unreadable) == ((), ())
+    assert info.photo_bytes == sum(file.stat().st_size for file in (garden / "images").iterdir())
+    assert (info.unregistered, info.unreadable) == ((), ())
 
 
 def test_faults_are_named(tmp_path: Path) -> None:
@@ -41,11 +41,11 @@ def test_faults_are_named(tmp_path: Path) -> None:
     (garden / "images" / NAMES[2]).write_bytes(b"no image")
     write_png(garden / "images" / NAMES[4], np.zeros((2 * HEIGHT, 2 * WIDTH, 3), np.uint8))
     write_png(garden / "masks" / f"{NAMES[5]}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    found = scene_info(garden)
-    assert found.unregistered == ("more/late.png",)
-    assert found.unreadable == (NAMES[2],)
-    assert found.sizes == (((WIDTH, HEIGHT), 7), ((2 * WIDTH, 2 * HEIGHT), 1))
-    assert found.masked == 1
+    info = scene_info(garden)
+    assert info.unregistered == ("more/late.png",)
+    assert info.unreadable == (NAMES[2],)
+    assert info.sizes == (((WIDTH, HEIGHT), 7), ((2 * WIDTH, 2 * HEIGHT), 1))
+    assert info.masked == 1
     output = clsplat("info", garden)
     for text in (f"unreadable      1 ({NAMES[2]})", "without a pose  1 (more/late.png)", "masks           of 1 photos"):
         assert text in output
@@ -63,10 +63,10 @@ def test_transforms_with_distortion(tmp_path: Path) -> None:
         frames.append({"file_path": name, "transform_matrix": np.eye(4).tolist(), "k1": 0.1 if index else 0.0})
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps({"w": 40, "h": 30, "fl_x": 40.0, "fl_y": 40.0, "frames": frames}))
-    found = scene_info(tmp_path)
-    assert [(lens.pinhole, lens.photos) for lens in found.lenses] == [(False, 2), (True, 1)]
-    assert found.kind == "transforms.json"
-    assert found.track_mean == 0
+    info = scene_info(tmp_path)
+    assert [(lens.pinhole, lens.photos) for lens in info.lenses] == [(False, 2), (True, 1)]
+    assert info.kind == "transforms.json"
+    assert info.track_mean == 0
     for path in (tmp_path, file):
         output = clsplat("info", path)
         assert "FULL_OPENCV, 40x30 px, focal length 40.0 px (53 degrees across): 2 photos, undistorted" in output

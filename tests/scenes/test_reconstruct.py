@@ -66,8 +66,8 @@ def aligned_error(scene: Scene) -> tuple[float, float]:
     """
     poses = np.array([photo_walk.cam_from_world(int(name[5:7])) for name in scene.names])
     true = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-    found = np.array([view.camera.position for view in scene.views])
-    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    centres = np.array([view.camera.position for view in scene.views])
+    a, b = centres - centres.mean(axis=0), true - true.mean(axis=0)
     u, sizes, vt = np.linalg.svd(b.T @ a)
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     turn = u @ sign @ vt
@@ -250,8 +250,8 @@ def test_warnings_about_photos_without_a_pose(tmp_path: Path) -> None:
     from clsplat.files.images import PhotoHeader
     from clsplat.scenes.reconstruct.photo_files import StagedPhoto
 
-    facts = PhotoHeader(8, 8, True, (), b"")
-    ready = [StagedPhoto(PhotoFile(f"{n}.jpg", tmp_path), facts, f"{n}.jpg") for n in range(10)]
+    header = PhotoHeader(8, 8, True, (), b"")
+    ready = [StagedPhoto(PhotoFile(f"{n}.jpg", tmp_path), header, f"{n}.jpg") for n in range(10)]
     with pytest.warns(UserWarning, match=r"only 7 of 10 photos could be placed; left out are 7\.jpg, 8\.jpg, 9\.jpg\."):
         module._warn_of_unplaced(tmp_path, ready, ready[:7], {"0": 7, "1": 2})
     with pytest.warns(UserWarning, match=r"fall into 2 parts that do not connect; the largest \(8 photos\)"):

@@ -105,13 +105,13 @@ def reconstruct(
     report: StepCallback = progress or (lambda step: None)
     with _unfinished(target.absolute()) as work:
         if is_video(source):
-            found = extract_frames(
+            photo_files = extract_frames(
                 source, work / "frames", options.frames, lambda done: report(Step("video frames compared", done))
             )
         else:
-            found = find_photos(source)
+            photo_files = find_photos(source)
         source_digest = fingerprint(source)
-        ready = _stage_all(found, source, work, report)
+        ready = _stage_all(photo_files, source, work, report)
         groups = [[photo.staged for photo in group] for group in group_by_camera(ready, options.camera_mode)]
         pairs = _pairs(len(ready), _sequential(options, source, len(ready)))
         names = [photo.staged for photo in ready]
