@@ -1,4 +1,4 @@
-"""Charts of single questions: growth and its knee, hazards, seeds, arithmetic. Plain data in, PNG and SVG out."""
+"""Charts of growth with its knee, of seeds and of arithmetic, from plain rows to PNG and SVG."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ _ARITHMETIC = (
 def growth_chart(
     records: Sequence[Mapping[str, Any]], knee: int | None, out: str | Path, rounds: Sequence[Mapping[str, Any]] = ()
 ) -> list[Path]:
-    """Validation PSNR against splats, with the knee marked.
+    """Draw validation PSNR against splats, with the knee marked.
 
     Parameters
     ----------
-    records : each with "splats" and "psnr" [dB]. Those with a "label" as well (such as "pruned") are not of the curve:
-        each is a star, named.
-    knee : splats of the record that was chosen; None: none is marked.
+    records : each with "splats" and "psnr" [dB]. A record with a "label" (such as "pruned") is not on the curve: it is
+        drawn as a star with that name.
+    knee : splats of the chosen record; None marks no record.
     out : path without a suffix.
-    rounds : likewise "splats" and "psnr", of a longer run whose splats became fewer again: a curve of their own.
+    rounds : "splats" and "psnr" of a longer run that removed splats again, drawn as a second curve.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def growth_chart(
 
     Raises
     ------
-    InputError : no records, or `knee` is not one of the curve's. OutputError : no matplotlib, or not writable.
+    InputError : no records, or `knee` is not on the curve. OutputError : no matplotlib, or not writable.
     """
     curve = sorted((record["splats"], record["psnr"]) for record in records if not record.get("label"))
     chosen = [psnr for splats, psnr in curve if splats == knee]
@@ -103,12 +103,14 @@ def growth_chart(
 
 
 def seeds_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path]:
-    """Test PSNR of each seed, and beside it of one seed repeated; a panel a scene.
+    """Draw the test PSNR of each seed, and of repeats of one seed; a panel for each scene.
 
-    A dot is a seed, the bar their median; diamonds are repeats of one seed, and "=" says that their splats are the same
-    bit by bit. Below each name stands the spread, maximum less minimum, of seeds and of repeats.
+    A dot is a seed, and the bar is the median of the seeds. Diamonds are repeats of one seed; "=" means that they gave
+    the same splats, bit by bit. The text below each name is the spread (maximum less minimum) of seeds and of repeats.
 
-    rows : of `frontier_data.seed_rows`. out : path without a suffix.
+    Parameters
+    ----------
+    rows : of `sweep_rows.seed_rows`. out : path without a suffix.
 
     Raises
     ------
@@ -119,29 +121,29 @@ def seeds_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     with drawing(out, WIDTH, 3.6 * len(scenes) + 0.2) as figure:
         for panel, scene in zip(figure.subplots(len(scenes), squeeze=False)[:, 0], scenes, strict=True):
-            own = [row for row in rows if row["scene"] == scene]
+            shown = [row for row in rows if row["scene"] == scene]
             names = []
-            for place, system in enumerate(dict.fromkeys(row["system"] for row in own)):
-                names.append(_strip(panel, place, system, [row for row in own if row["system"] == system]))
+            for place, system in enumerate(dict.fromkeys(row["system"] for row in shown)):
+                names.append(_strip(panel, place, system, [row for row in shown if row["system"] == system]))
             panel.set_xticks(range(len(names)), names, fontsize=7.5)
             panel.set(ylabel="test PSNR [dB]", xlim=(-0.6, len(names) - 0.4))
-            panel.set_title(f"{scene}, cap {short_count(own[0]['cap'])}, {own[0]['iterations']} iterations")
+            panel.set_title(f"{scene}, cap {short_count(shown[0]['cap'])}, {shown[0]['iterations']} iterations")
             panel.grid(False, axis="x")
     return chart_paths(out)
 
 
 def _strip(panel: Any, place: int, system: str, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Draw one system's runs; returns its name and spreads for the axis."""
+    """Draw the runs of one method; return its name and spreads for the axis."""
     colour = shape_colour(rows[0]["shape"])
     seeds = sorted((row["seed"], row["psnr"]) for row in rows if not row["repeat"])
     values = [psnr for _, psnr in seeds]
-    # Side by side, so that equal values are both seen.
+    # The dots are side by side, so that equal values are visible.
     across = [place - 0.18 + 0.05 * (number - (len(seeds) - 1) / 2) for number in range(len(seeds))]
     panel.plot(across, values, marker="o", linestyle="none", color=colour, markersize=5.5, alpha=0.85)
     middle = statistics.median(values)
     panel.plot([place - 0.36, place], [middle, middle], color=colour, linewidth=2)
     name = "-\n".join(system.rsplit("-", 1)) if len(system) > 14 else system
-    said = f"{name}\nseeds {max(values) - min(values):.2f} dB"
+    label = f"{name}\nseeds {max(values) - min(values):.2f} dB"
     again = [row for row in rows if any(row["seed"] == other["seed"] and other["repeat"] for other in rows)]
     if again:
         repeated = [row["psnr"] for row in again]
@@ -156,16 +158,16 @@ def _strip(panel: Any, place: int, system: str, rows: Sequence[Mapping[str, Any]
         )
         same = "=" if len({row["digest"] for row in again}) == 1 else "≠"
         panel.annotate(same, (place + 0.15 + 0.07 * len(again), repeated[-1]), va="center", fontsize=9)
-        said += f"\nrepeats {max(repeated) - min(repeated):.2f} dB"
-    return said
+        label += f"\nrepeats {max(repeated) - min(repeated):.2f} dB"
+    return label
 
 
 def arithmetic_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path]:
-    """Error of image and gradient against relative time, of variants of the arithmetic; a row a shape.
+    """Draw the errors of image and gradient against relative time for variants of the arithmetic; a row a shape.
 
     Parameters
     ----------
-    rows : of `frontier_data.arithmetic_rows`; those without an error have no place here.
+    rows : of `sweep_rows.arithmetic_rows`; rows without an error are left out.
     out : path without a suffix.
 
     Raises
@@ -181,12 +183,12 @@ def arithmetic_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list
         labels: list[tuple[Any, list[Label]]] = []
         for line, shape in zip(figure.subplots(len(shapes), 2, squeeze=False), shapes, strict=True):
             for axes, (error, time, what, task) in zip(line, _ARITHMETIC, strict=True):
-                # What is exact has no place on a logarithmic axis. The far ones are named first: they differ most.
-                own = sorted(
+                # An error of 0 has no place on a logarithmic axis. The farthest points get their labels first.
+                shown = sorted(
                     (row for row in rows if row["shape"] == shape and row[error] > 0),
                     key=lambda row: (row["variant"] != "default", -abs(row[time] - 1)),
                 )
-                points = [(row[time], row[error], row["variant"], colours[row["kind"]]) for row in own]
+                points = [(row[time], row[error], row["variant"], colours[row["kind"]]) for row in shown]
                 for x, y, _, colour in points:
                     axes.plot(x, y, marker="o", color=colour, markersize=6)
                 axes.axvline(1, color=INK, linewidth=0.8, zorder=0.5)

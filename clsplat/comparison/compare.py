@@ -23,7 +23,7 @@ TABLE, RESULTS, MODELS = "table.md", "results.json", "models"
 
 def compare(
     scenes: Iterable[Scene],
-    systems: Sequence[Method],
+    methods: Sequence[Method],
     output: str | Path,
     caps: Sequence[int],
     seeds: Sequence[int],
@@ -36,39 +36,40 @@ def compare(
     progress: Callable[[Progress], None] | None = None,
     on_run: Callable[[Run, Record | None], None] | None = None,
 ) -> list[Record]:
-    """Train every system at every cap with every seed on every scene, and measure it on the test views.
+    """Train every method at every cap with every seed on every scene, and measure it on the test views.
 
-    Runs that `output` has already are not done again. The table is of all runs there, these and earlier ones.
+    Finished runs in `output` are not repeated. The table shows all runs there, new and earlier ones.
 
     Parameters
     ----------
-    scenes : with test views; one after the other, so that they may be loaded as they are needed.
-    output : folder of runs.jsonl, table.md and results.json; after Ctrl-C too.
-    common : options of all systems, by TrainConfig's names.
+    scenes : with test views. An iterator can load them one after the other.
+    output : folder of runs.jsonl, table.md and results.json, which are also written after Ctrl-C.
+    common : options of all methods, by the names of TrainConfig.
     save_models : keep the splats of each run in `output`/models.
-    curve : measure the test views at about that many iterations along each run; a run without is done again.
-    repeat : how often to train the first seed: on one device the splats are the same bits each time.
+    curve : number of measurements of the test views along each run; a run without a curve is repeated.
+    repeat : how often to train the first seed: on one device the splats have the same bits each time.
     extra : more keys of each record.
-    progress : as `train`'s. on_run : called with each run and None before it, and with its record after it.
+    progress : as of `train`. on_run : called with (run, None) before each run and (run, record) after it.
 
     Returns
     -------
-    All runs in `output`, in the order they were made; `compare_table.summarise` makes the table's rows of them.
+    All runs in `output`, in the order of their training; `table.summarise` makes the rows of the table.
 
     Raises
     ------
-    InputError : a scene without test views, or options that do not fit a system. OutputError : cannot be written, or
-    another comparison writes there. DeviceError : no device, or not enough memory. A run whose training fails is a
-    record of its own ("failed").
+    InputError : a scene has no test views, or options do not fit a method.
+    OutputError : `output` cannot be written, or another comparison writes there.
+    DeviceError : no device, or not enough memory.
+    A run whose training fails raises nothing: its record has the message ("failed").
     """
     folder = Path(output)
-    # Systems innermost: an interrupted comparison has as many runs of each.
+    # The loop over methods is the innermost: an interrupted comparison has equally many runs of each.
     configs = [
-        (system.label, system.config(cap, seed, common), again)
+        (method.label, method.config(cap, seed, common), again)
         for cap in caps
         for seed in seeds
         for again in range(repeat if seed == seeds[0] else 1)
-        for system in systems
+        for method in methods
     ]
     runs = RunFile(folder)
     device: Device | None = None
@@ -108,7 +109,7 @@ def compare(
 
 
 def write_table(folder: Path, records: Sequence[Record]) -> None:
-    """Write table.md and results.json, if there is anything to tell."""
+    """Write table.md and results.json, if there are records."""
     if records:
         rows = summarise(records)
         with atomic_writer(folder / TABLE) as stream:

@@ -32,7 +32,7 @@ RENDERS = 5  # renders of each view; the fastest counts
 
 
 def warm_up(scene: Scene, config: TrainConfig, device: Device) -> None:
-    """Let the driver compile, which it does at a kernel's first launch, so that no run's seconds hold it."""
+    """Train a few iterations, so that the driver compiles the kernels before the clock of a run starts."""
     trainer = Trainer(scene, config, device=device)
     for _ in range(min(WARM_UP, config.iterations)):
         trainer.step()
@@ -151,15 +151,15 @@ def render_ms(renderer: Renderer, splats: Splats, views: Sequence[View], backgro
 
 
 def curve_iterations(iterations: int, points: int) -> tuple[int, ...]:
-    """Where to measure along a run: at most `points` iterations in equal ratios, the last one last."""
-    first = max(1.0, iterations / 64)  # before that there is little to see
+    """Return the iterations to measure: at most `points` in equal ratios, with the last iteration of the run."""
+    first = max(1.0, iterations / 64)  # earlier images show little
     return tuple(sorted({round(at) for at in np.geomspace(iterations, first, points)}))
 
 
 def digest(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """SHA-256 of arrays: their names, shapes, types and bits."""
-    found = hashlib.sha256()
+    """Return the SHA-256 of arrays: their names, shapes, types and bits."""
+    result = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
-        found.update(f"{name} {array.shape} {array.dtype.str}\n".encode() + array.tobytes())
-    return found.hexdigest()
+        result.update(f"{name} {array.shape} {array.dtype.str}\n".encode() + array.tobytes())
+    return result.hexdigest()

@@ -1,4 +1,4 @@
-"""A sweep of systems, caps and seeds, and its charts: quality against time, render time, bytes and splats."""
+"""A sweep of methods, caps and seeds, and its charts: quality against time, render time, bytes and splats."""
 
 from __future__ import annotations
 
@@ -36,24 +36,25 @@ CURVE = 12  # points along a run
 _TEXT = {
     "time": (
         "Quality along the training",
-        "Test PSNR and SSIM against seconds of training, which leave out these measurements. Each point was "
+        "Test PSNR and SSIM against seconds of training, without the time of these measurements. Each point was "
         "measured. The axes begin 5 dB and 0.3 below the best.",
     ),
     "size": (
         "Quality against render time, bytes and splats",
-        "Each point is a training run, or the mean over its seeds. Grey: the Pareto front, which no other point "
-        "beats in both; its points are labelled by the cap on splats. A star chose its own number of splats. "
-        "Render time is the median over the test views of the fastest of five renders, on the host's clock.",
+        "Each point is a training run, or the mean over its seeds. Grey: the Pareto front; no point is both better "
+        "and cheaper than a point of the front. Its points are labelled by the cap on splats. A star chose its number "
+        "of splats itself. Render time is the median over the test views of the fastest of five renders, on the "
+        "host's clock; the protocol names the exceptions.",
     ),
     "equal": (
         "Splats needed at equal quality",
-        "How many splats a system needs for the PSNR that the reference has at each of its caps, linear in log "
+        "The number of splats that a system needs for the PSNR of the reference at each of its caps, linear in log "
         "splats between runs. Hollow, or ≤: its smallest model is better already. Dashed: 70 %.",
     ),
     "seeds": (
-        "What chance does",
-        "Test PSNR of runs that differ in the seed alone, their median, and beside them (diamonds) one seed "
-        "trained again; = : the same splats, bit by bit. Spread: maximum less minimum.",
+        "The effect of chance",
+        "Test PSNR of runs that differ only in the seed, and their median. Diamonds: one seed trained again; = : the "
+        "same splats, bit by bit. Spread: maximum less minimum.",
     ),
     "arithmetic": (
         "Arithmetic",
@@ -68,7 +69,7 @@ _TEXT = {
 
 def sweep(
     scenes: Iterable[Scene],
-    systems: Sequence[Method],
+    methods: Sequence[Method],
     output: str | Path,
     caps: Sequence[int],
     seeds: Sequence[int],
@@ -81,28 +82,28 @@ def sweep(
     progress: Callable[[Progress], None] | None = None,
     on_run: Callable[[Run, Record | None], None] | None = None,
 ) -> list[Record]:
-    """Train what is not in `output` yet, as `compare` does, and draw the charts of all that is there.
+    """Train the missing runs, as `compare` does, and draw the charts of all runs in `output`.
 
     Parameters
     ----------
-    scenes, systems, output, caps, seeds, common, curve, repeat, extra, progress, on_run : as of `compare`.
-    more : records of elsewhere, drawn as well; see `read_runs`.
+    scenes, methods, output, caps, seeds, common, curve, repeat, extra, progress, on_run : as of `compare`.
+    more : records of other comparisons, which are drawn too; see `read_runs`.
 
     Returns
     -------
-    All runs in `output`. Its charts and report.html are written after Ctrl-C too. Without matplotlib a warning says so
-    before the first run, and the charts' data are written alone.
+    All runs in `output`. The charts and report.html are also written after Ctrl-C. Without matplotlib only the data of
+    the charts are written, and a warning says so before the first run.
 
     Raises
     ------
     As `compare`.
     """
     if not chart_style.available():
-        warnings.warn(f"{chart_style.MISSING}; the charts' data are written all the same", stacklevel=2)
+        warnings.warn(f"{chart_style.MISSING}; only the data of the charts are written", stacklevel=2)
     try:
         return compare(
             scenes,
-            systems,
+            methods,
             output,
             caps,
             seeds,
@@ -115,23 +116,23 @@ def sweep(
         )
     finally:
         if (Path(output) / RUNS).exists():
-            write_report(output, [*read_runs(output), *more], reference=systems[0].label)
+            write_report(output, [*read_runs(output), *more], reference=methods[0].label)
 
 
 def write_report(
     folder: str | Path, records: Sequence[Record], *, reference: str | None = None, arithmetic: Sequence[ChartRow] = ()
 ) -> list[Path]:
-    """Charts of records, with their data as CSV and JSON, and the page that shows them all.
+    """Draw the charts of records, and write their data as CSV and JSON and the page that shows them.
 
     Parameters
     ----------
     records : of `compare` or `read_runs`; the first of equal runs counts.
-    reference : system that the others' splats are counted against; None: the first that was swept.
-    arithmetic : records of `frontier_data.arithmetic_rows`.
+    reference : system whose PSNR the others must reach; None: the first one with a cap.
+    arithmetic : records for `sweep_rows.arithmetic_rows`.
 
     Returns
     -------
-    The charts' files and the page. Without matplotlib the charts are left out, and the page says so.
+    The files of the charts and the page. Without matplotlib the page explains why the charts are missing.
 
     Raises
     ------
@@ -170,11 +171,11 @@ def write_report(
 
 
 def _protocol(records: Sequence[Record]) -> Section:
-    """What was run, on what, and how it was measured."""
+    """Return the section on the runs, the device and the measurements."""
     iterations = sorted({record["config"]["iterations"] for record in records})
-    said = [
+    sentences = [
         f"{len(records)} training runs of {', '.join(map(str, iterations))} iterations, measured on test views, "
         "from which nothing is chosen",
         *notes(records, summarise(records)),
     ]
-    return Section("Protocol", [f"{line[:1].upper()}{line[1:]}." for line in said])
+    return Section("Protocol", [f"{line[:1].upper()}{line[1:]}." for line in sentences])

@@ -1,4 +1,4 @@
-"""Charts of a sweep: quality along the time, quality against cost with its front, splats at equal quality."""
+"""Charts of a sweep: quality along the training, quality against cost with its front, splats at equal quality."""
 
 from __future__ import annotations
 
@@ -25,16 +25,20 @@ from ..evaluation.chart_style import (
 )
 from .sweep_rows import ChartRow
 
-# Below these the curves' first moments would press all else together.
+# Shown range below the best: the first points of the curves are far lower and would flatten the rest.
 _DB_SHOWN, _SSIM_SHOWN = 5.0, 0.3
 _COSTS = {"render_ms": ("render time [ms]", 1.0), "bytes": ("file [MB]", 1e-6), "splats": ("splats", 1.0)}
-EQUAL_AIM = 0.7  # share of the reference's splats that is looked for
+EQUAL_AIM = 0.7  # share of the reference's splats, drawn as a dashed line
 
 
 def time_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
-    """Test PSNR above, SSIM below, against seconds of training; a column a scene, a line a run.
+    """Draw test PSNR (above) and SSIM (below) against seconds of training; a column for each scene.
 
-    The axes begin 5 dB (0.3) below the best. rows : of `frontier_data.curve_rows`. out : path without a suffix.
+    Each line is a run. The axes begin 5 dB (0.3) below the best.
+
+    Parameters
+    ----------
+    rows : of `sweep_rows.curve_rows`. out : path without a suffix.
 
     Raises
     ------
@@ -44,11 +48,11 @@ def time_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
     with drawing(out, WIDTH, 5.6 + 0.2 * legend_rows(len(styles))) as figure:
         panels = figure.subplots(2, len(scenes), squeeze=False, sharex="col")
         for column, scene in enumerate(scenes):
-            own = [row for row in rows if row["scene"] == scene]
+            shown = [row for row in rows if row["scene"] == scene]
             runs: dict[tuple[str, int], list[ChartRow]] = {}
-            for row in own:
+            for row in shown:
                 runs.setdefault((row["system"], row["seed"]), []).append(row)
-            for axes, key, name, shown in (
+            for axes, key, name, height in (
                 (panels[0][column], "psnr", "test PSNR [dB]", _DB_SHOWN),
                 (panels[1][column], "ssim", "test SSIM", _SSIM_SHOWN),
             ):
@@ -58,8 +62,8 @@ def time_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
                         [row[key] for row in run],
                         **styles[system] | {"markersize": 3, "linewidth": 1.3},
                     )
-                best = max(row[key] for row in own)
-                visible = [row for row in own if row[key] >= best - shown]
+                best = max(row[key] for row in shown)
+                visible = [row for row in shown if row[key] >= best - height]
                 low, high = min(row["seconds"] for row in visible) / 1.1, max(row["seconds"] for row in visible) * 1.1
                 bottom = min(row[key] for row in visible)
                 axes.set(
@@ -70,19 +74,21 @@ def time_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
                 log_axis(axes.xaxis, low, high)
                 if column == 0:
                     axes.set_ylabel(name)
-            panels[0][column].set_title(f"{scene}, cap {short_count(own[0]['cap'])}")
+            panels[0][column].set_title(f"{scene}, cap {short_count(shown[0]['cap'])}")
             panels[1][column].set_xlabel("training time [s]")
         system_legend(figure, styles)
     return chart_paths(out)
 
 
 def size_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
-    """Test PSNR against render time, file size and splats; a row a scene.
+    """Draw test PSNR against render time, file size and splats; a row for each scene.
 
-    The Pareto front is grey, its points labelled by cap. Points of a system at several caps are joined; stars
-    chose their own number of splats.
+    The Pareto front is grey, and its points are labelled by their caps. Points of a method at several caps are joined.
+    Stars are runs that chose their number of splats themselves.
 
-    rows : of `frontier_data.point_rows`. out : path without a suffix. Raises as `time_chart`.
+    Parameters
+    ----------
+    rows : of `sweep_rows.point_rows`. out : path without a suffix. Raises as `time_chart`.
     """
     scenes = _scenes(rows, out)
     swept = [row for row in rows if not row["auto"]]
@@ -92,10 +98,10 @@ def size_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
         panels = figure.subplots(len(scenes), len(_COSTS), squeeze=False, sharey="row")
         labels: list[tuple[Any, list[Label]]] = []
         for line, scene in enumerate(scenes):
-            own = [row for row in rows if row["scene"] == scene]
+            shown = [row for row in rows if row["scene"] == scene]
             for axes, (cost, (name, unit)) in zip(panels[line], _COSTS.items(), strict=True):
-                _cost_panel(axes, own, cost, unit, styles)
-                front = sorted((row for row in own if row[f"front_{cost}"]), key=lambda row: not row["auto"])
+                _cost_panel(axes, shown, cost, unit, styles)
+                front = sorted((row for row in shown if row[f"front_{cost}"]), key=lambda row: not row["auto"])
                 names = ["auto" if row["auto"] else short_count(row["cap"]) for row in front]
                 labels.append(
                     (
@@ -115,11 +121,13 @@ def size_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
 
 
 def equal_chart(rows: Sequence[ChartRow], reference: str, out: str | Path) -> list[Path]:
-    """Splats needed for the PSNR of the reference, as a share of the reference's; a column a scene.
+    """Draw the splats needed for the PSNR of the reference, as a share of the reference's; a column for each scene.
 
-    A hollow point is a bound: the smallest model is better already. What is out of reach has no point.
+    A hollow point is a bound: the smallest model is better already. A PSNR that was not reached has no point.
 
-    rows : of `frontier_data.equal_rows`. out : path without a suffix. Raises as `time_chart`.
+    Parameters
+    ----------
+    rows : of `sweep_rows.equal_rows`. out : path without a suffix. Raises as `time_chart`.
     """
     rows = [row for row in rows if row["ratio"] is not None]
     scenes, styles = _scenes(rows, out), looks({row["system"]: row["shape"] for row in rows})
@@ -127,12 +135,12 @@ def equal_chart(rows: Sequence[ChartRow], reference: str, out: str | Path) -> li
         (panels,) = figure.subplots(1, len(scenes), squeeze=False, sharey=True)
         for axes, scene in zip(panels, scenes, strict=True):
             for system, style in styles.items():
-                own = sorted(
+                shown = sorted(
                     (row for row in rows if row["scene"] == scene and row["system"] == system),
                     key=lambda row: float(row["reference_splats"]),
                 )
                 for bound in (False, True):
-                    part = [row for row in own if bool(row["bound"]) == bound]
+                    part = [row for row in shown if bool(row["bound"]) == bound]
                     how = {"linestyle": "none", "markerfacecolor": "white"} if bound else {}
                     axes.plot(
                         [row["reference_splats"] for row in part], [100 * row["ratio"] for row in part], **style | how
@@ -149,20 +157,22 @@ def equal_chart(rows: Sequence[ChartRow], reference: str, out: str | Path) -> li
     return chart_paths(out)
 
 
-def _cost_panel(axes: Any, own: Sequence[ChartRow], cost: str, unit: float, styles: dict[str, dict[str, Any]]) -> None:
-    """One panel of the size chart, without labels."""
-    front = sorted((unit * row[cost], row["psnr"]) for row in own if row[f"front_{cost}"])
+def _cost_panel(
+    axes: Any, shown: Sequence[ChartRow], cost: str, unit: float, styles: dict[str, dict[str, Any]]
+) -> None:
+    """Draw one panel of the size chart, without labels."""
+    front = sorted((unit * row[cost], row["psnr"]) for row in shown if row[f"front_{cost}"])
     axes.plot(*zip(*front, strict=True), color=FRONT, linewidth=3.5, drawstyle="steps-post", zorder=1)
     for system, style in styles.items():
         line = sorted(
-            (row["cap"], unit * row[cost], row["psnr"]) for row in own if row["system"] == system and not row["auto"]
+            (row["cap"], unit * row[cost], row["psnr"]) for row in shown if row["system"] == system and not row["auto"]
         )
         if line:
             axes.plot([point[1] for point in line], [point[2] for point in line], **style)
-    for row in own:
+    for row in shown:
         if row["auto"]:
             axes.plot([unit * row[cost]], [row["psnr"]], **star(row["shape"]))
-    costs = [unit * row[cost] for row in own]
+    costs = [unit * row[cost] for row in shown]
     low, high = min(costs) / 1.2, max(costs) * 1.2
     axes.set(xscale="log", xlim=(low, high))
     axes.margins(y=0.12)
@@ -170,6 +180,7 @@ def _cost_panel(axes: Any, own: Sequence[ChartRow], cost: str, unit: float, styl
 
 
 def _scenes(rows: Sequence[ChartRow], out: str | Path) -> list[str]:
+    """Return the scenes of some rows; raises InputError without rows."""
     if not rows:
         raise InputError(f"{out}: a chart needs points")
     return list(dict.fromkeys(row["scene"] for row in rows))

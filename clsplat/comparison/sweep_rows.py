@@ -1,6 +1,6 @@
-"""What the charts of a sweep show, as flat rows made from its records: curves, fronts, equal quality, seeds.
+"""Data of the charts of a sweep, as flat rows: curves, fronts, equal quality, seeds.
 
-A row is a dict of plain values; `write_rows` keeps each chart's as CSV and JSON.
+A row is a dictionary of plain values. `write_rows` writes the rows of a chart as CSV and JSON.
 """
 
 from __future__ import annotations
@@ -20,20 +20,22 @@ from .table import Record, scene_title, summarise
 
 ChartRow = dict[str, Any]
 
-COSTS = ("render_ms", "bytes", "splats")  # what PSNR is drawn against
-AUTO = "auto"  # first word of the system of a run that chose its own number of splats
-LEAST_SEEDS = 3  # that show a spread
+COSTS = ("render_ms", "bytes", "splats")  # the horizontal axes
+AUTO = "auto"  # first word of the system of a run that chose its group number of splats
+MIN_SEEDS = 3  # for a spread
 
 
 def curve_rows(records: Sequence[Record]) -> list[ChartRow]:
-    """Points along runs: "scene", "cap", "system", "shape", "seed", "iteration", "seconds", "psnr", "ssim".
+    """Return points along runs: "scene", "cap", "system", "shape", "seed", "iteration", "seconds", "psnr", "ssim".
 
-    For each scene of the cap and iterations at which most systems were followed.
+    Each scene has the cap and the iterations with the largest number of measured systems.
     """
     followed = [record for record in records if record.get("curve") and not record.get("repeat")]
     rows: list[ChartRow] = []
     for group in _by_scene(followed).values():
-        cap, iterations = _commonest([(r["config"]["cap_max"], r["config"]["iterations"], r["system"]) for r in group])
+        cap, iterations = _most_frequent(
+            [(r["config"]["cap_max"], r["config"]["iterations"], r["system"]) for r in group]
+        )
         rows += [
             {
                 "scene": scene_title(record),
@@ -51,13 +53,14 @@ def curve_rows(records: Sequence[Record]) -> list[ChartRow]:
 
 
 def point_rows(records: Sequence[Record]) -> list[ChartRow]:
-    """One point for each system and cap of the scenes that have several: means over seeds, of all runs not failed.
+    """Return a point for each system and cap, as means over the seeds; scenes with a single cap are left out.
+
+    Points have the most frequent iterations of their scene; automatic runs may have any.
 
     Returns
     -------
-    "scene", "system", "shape", "cap", "iterations", "seeds" (how many), "auto", "psnr" [dB], "ssim", "seconds",
-    "parameters" and COSTS; "front_C" for each cost C: whether no other point of the scene has at least its PSNR for no
-    more of C. Iterations are those of most points of the scene, of `auto` any.
+    "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "auto", "psnr" [dB], "ssim", "seconds",
+    "parameters" and COSTS. "front_C" for each cost C: whether the point is on the Pareto front of its scene.
     """
     rows = []
     for row in summarise(records):
@@ -72,26 +75,29 @@ def point_rows(records: Sequence[Record]) -> list[ChartRow]:
             )
     kept: list[ChartRow] = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
-        own = [row for row in rows if row["scene"] == scene]
-        swept = [row for row in own if not row["auto"]]
+        group = [row for row in rows if row["scene"] == scene]
+        swept = [row for row in group if not row["auto"]]
         if len({row["cap"] for row in swept}) < 2:
             continue
         usual = Counter(row["iterations"] for row in swept).most_common(1)[0][0]
-        own = [row for row in own if row["auto"] or row["iterations"] == usual]
+        group = [row for row in group if row["auto"] or row["iterations"] == usual]
         for cost in COSTS:
-            best = pareto([(row[cost], row["psnr"]) for row in own])
-            own = [row | {f"front_{cost}": place in best} for place, row in enumerate(own)]
-        kept += own
+            best = pareto([(row[cost], row["psnr"]) for row in group])
+            group = [row | {f"front_{cost}": place in best} for place, row in enumerate(group)]
+        kept += group
     return kept
 
 
 def is_auto(system: str) -> bool:
-    """Whether a system's label says that the run chose its own number of splats."""
+    """Return whether the label of a system means that the run chose its number of splats itself."""
     return system.split(" ")[0].split(":")[0] == AUTO
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
-    """Places of the points (cost, quality) that no other beats: none is as good for less, or better for no more."""
+    """Return the indices of the points (cost, quality) on the Pareto front.
+
+    No other point is as good for a lower cost, or better for the same cost.
+    """
     order = sorted(range(len(points)), key=lambda place: (points[place][0], -points[place][1]))
     best, front = -math.inf, set()
     for place in order:
@@ -102,7 +108,7 @@ def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
 
 
 def equal_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow]:
-    """How many splats each system needs for the PSNR of the reference system.
+    """Return the number of splats that each system needs for the PSNR of the reference system.
 
     Parameters
     ----------
@@ -110,9 +116,9 @@ def equal_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow]:
 
     Returns
     -------
-    For each scene, reference point and other system with several points: "scene", "system", "shape", "psnr" (the
-    reference's, dB), "reference_cap", "reference_splats", "splats" and "ratio" (None where the system does not reach
-    it), "bound" ("" or "at most": its smallest model is better already).
+    For each scene, reference point and other system with several points: "scene", "system", "shape", "psnr" [dB],
+    "reference_cap", "reference_splats", "splats", "ratio" and "bound". The PSNR is that of the reference. "splats" and
+    "ratio" are None if the system does not reach it. "bound" is "at most" if the smallest model is better already.
     """
     rows: list[ChartRow] = []
     for scene in dict.fromkeys(point["scene"] for point in points):
@@ -120,10 +126,10 @@ def equal_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow]:
         for point in points:
             if point["scene"] == scene and not point["auto"]:
                 curves.setdefault(point["system"], []).append(point)
-        for system, own in curves.items():
-            if system == reference or len(own) < 2:
+        for system, group in curves.items():
+            if system == reference or len(group) < 2:
                 continue
-            curve = [(point["splats"], point["psnr"]) for point in own]
+            curve = [(point["splats"], point["psnr"]) for point in group]
             for aim in sorted(curves.get(reference, ()), key=lambda point: float(point["splats"])):
                 splats = splats_needed(curve, aim["psnr"])
                 smallest = min(curve)[1] >= aim["psnr"]
@@ -131,7 +137,7 @@ def equal_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow]:
                     {
                         "scene": scene,
                         "system": system,
-                        "shape": own[0]["shape"],
+                        "shape": group[0]["shape"],
                         "psnr": aim["psnr"],
                         "reference_cap": aim["cap"],
                         "reference_splats": aim["splats"],
@@ -144,79 +150,81 @@ def equal_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow]:
 
 
 def auto_rows(points: Sequence[ChartRow]) -> list[ChartRow]:
-    """Runs that chose their own number of splats beside the best of the sweep with their shape.
+    """Return the runs that chose their number of splats, beside the best run of the sweep with their shape.
 
     Returns
     -------
-    For each `auto` of `point_rows`: "scene", "system", "shape", "psnr" [dB], "splats", "bytes", "best_cap",
-    "best_psnr", "lost" (best less own, dB), "splats_ratio" and "bytes_ratio" (own / best), "front" (costs on whose
-    front it lies). None for each of the best's where the shape was not swept.
+    For each "auto" of `point_rows`: "scene", "system", "shape", "psnr" [dB], "splats", "bytes", "best_cap" and
+    "best_psnr". "lost" is the PSNR below the best [dB]. "splats_ratio" and "bytes_ratio" are relative to the best. All
+    values of the best are None if the sweep does not have the shape. "front" names the costs on whose Pareto front the
+    run lies.
     """
     rows: list[ChartRow] = []
-    for own in points:
-        if own["auto"]:
+    for auto in points:
+        if auto["auto"]:
             swept = [
                 point
                 for point in points
-                if not point["auto"] and point["scene"] == own["scene"] and point["shape"] == own["shape"]
+                if not point["auto"] and point["scene"] == auto["scene"] and point["shape"] == auto["shape"]
             ]
             best = max(swept, key=lambda point: float(point["psnr"]), default=None)
             rows.append(
-                {key: own[key] for key in ("scene", "system", "shape", "psnr", "splats", "bytes")}
+                {key: auto[key] for key in ("scene", "system", "shape", "psnr", "splats", "bytes")}
                 | {
                     "best_cap": best and best["cap"],
                     "best_psnr": best and best["psnr"],
-                    "lost": best and best["psnr"] - own["psnr"],
-                    "splats_ratio": best and own["splats"] / best["splats"],
-                    "bytes_ratio": best and own["bytes"] / best["bytes"],
-                    "front": " ".join(cost for cost in COSTS if own[f"front_{cost}"]),
+                    "lost": best and best["psnr"] - auto["psnr"],
+                    "splats_ratio": best and auto["splats"] / best["splats"],
+                    "bytes_ratio": best and auto["bytes"] / best["bytes"],
+                    "front": " ".join(cost for cost in COSTS if auto[f"front_{cost}"]),
                 }
             )
     return rows
 
 
 def arithmetic_rows(records: Sequence[ChartRow]) -> list[ChartRow]:
-    """Variants of the arithmetic, their errors and times over scenes.
+    """Return the variants of the arithmetic with their errors and times over scenes.
 
     Parameters
     ----------
-    records : lines of benchmarks/arithmetic.py: "scene", "shape", "variant", "kind", "image_error", "gradient_error"
-        (None where a variant is another model), "psnr_change" [dB], "raster_ms", "raster_vjp_ms".
+    records : lines of benchmarks/arithmetic.py: "scene", "shape", "variant", "kind", "image_error", "gradient_error",
+        "psnr_change" [dB], "raster_ms", "raster_vjp_ms". The errors are None if a variant is another model.
 
     Returns
     -------
-    For each shape and variant: "shape", "variant", "kind", "scenes" (how many), geometric means of the errors, and of
-    "raster" and "raster_vjp", the times over those of the variant "default" in the same scene; the mean "psnr_change".
+    For each shape and variant: "shape", "variant", "kind", "scenes" (their number) and geometric means of the errors.
+    "raster" and "raster_vjp" are geometric means of the times relative to the variant "default" in the same scene.
+    "psnr_change" is a mean.
     """
     base = {(row["scene"], row["shape"]): row for row in records if row["variant"] == "default"}
     rows: list[ChartRow] = []
     for shape, variant in dict.fromkeys((row["shape"], row["variant"]) for row in records):
-        own = [row for row in records if (row["shape"], row["variant"]) == (shape, variant)]
-        timed = [row for row in own if row["image_error"] is not None and (row["scene"], shape) in base]
+        group = [row for row in records if (row["shape"], row["variant"]) == (shape, variant)]
+        timed = [row for row in group if row["image_error"] is not None and (row["scene"], shape) in base]
         ratios = {
             name: _geometric([row[f"{name}_ms"] / base[row["scene"], shape][f"{name}_ms"] for row in timed])
             for name in ("raster", "raster_vjp")
         }
         rows.append(
-            {"shape": shape, "variant": variant, "kind": own[0]["kind"], "scenes": len(own)}
+            {"shape": shape, "variant": variant, "kind": group[0]["kind"], "scenes": len(group)}
             | {name: _geometric([row[name] for row in timed]) for name in ("image_error", "gradient_error")}
             | ratios
-            | {"psnr_change": statistics.fmean(row["psnr_change"] for row in own)}
+            | {"psnr_change": statistics.fmean(row["psnr_change"] for row in group)}
         )
     return rows
 
 
 def _geometric(values: Sequence[float]) -> float | None:
-    """The geometric mean, 0 if any is, None of none."""
+    """Return the geometric mean: 0 if a value is 0, None without values."""
     if not values:
         return None
     return statistics.geometric_mean(values) if min(values) > 0 else 0.0
 
 
 def splats_needed(curve: Sequence[tuple[float, float]], psnr: float) -> float | None:
-    """Splats at which a curve (splats, PSNR) first has `psnr`: linear in log splats between its points.
+    """Return the splats at which a curve (splats, PSNR) first reaches `psnr`: linear in log splats between its points.
 
-    The smallest model's splats where that one is better already; None where none is good enough.
+    If the smallest model is better already, its splats are returned; if no model is good enough, None.
     """
     before: tuple[float, float] | None = None
     for splats, quality in sorted(curve):
@@ -230,21 +238,21 @@ def splats_needed(curve: Sequence[tuple[float, float]], psnr: float) -> float | 
 
 
 def seed_rows(records: Sequence[Record]) -> list[ChartRow]:
-    """Runs that show what chance does: those of systems with LEAST_SEEDS seeds or more, and their repeats.
+    """Return the runs that show the effect of chance: systems with at least MIN_SEEDS seeds, and their repeats.
 
     Returns
     -------
-    "scene", "cap", "iterations", "system", "shape", "seed", "repeat", "psnr" [dB], "ssim", "digest"; for each scene of
-    the cap and iterations at which most systems have such seeds.
+    "scene", "cap", "iterations", "system", "shape", "seed", "repeat", "psnr" [dB], "ssim", "digest". Each scene has the
+    cap and the iterations with the largest number of such systems.
     """
     done = [record for record in records if not record["failed"] and not is_auto(record["system"])]
     seeds: dict[tuple[Any, ...], set[int]] = {}
     for record in done:
         seeds.setdefault(_setting(record), set()).add(record["config"]["seed"])
-    spread = [record for record in done if len(seeds[_setting(record)]) >= LEAST_SEEDS]
+    spread = [record for record in done if len(seeds[_setting(record)]) >= MIN_SEEDS]
     rows: list[ChartRow] = []
     for group in _by_scene(spread).values():
-        chosen = _commonest([(r["config"]["cap_max"], r["config"]["iterations"], r["system"]) for r in group])
+        chosen = _most_frequent([(r["config"]["cap_max"], r["config"]["iterations"], r["system"]) for r in group])
         rows += [
             {
                 "scene": scene_title(record),
@@ -265,7 +273,7 @@ def seed_rows(records: Sequence[Record]) -> list[ChartRow]:
 
 
 def write_rows(folder: Path, name: str, rows: Sequence[ChartRow]) -> list[Path]:
-    """Write NAME.csv and NAME.json; returns their paths."""
+    """Write NAME.csv and NAME.json; return their paths."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
     text = io.StringIO()
     writer = csv.DictWriter(text, keys, lineterminator="\n")
@@ -279,6 +287,7 @@ def write_rows(folder: Path, name: str, rows: Sequence[ChartRow]) -> list[Path]:
 
 
 def _by_scene(records: Sequence[Record]) -> dict[str, list[Record]]:
+    """Return the records by scene."""
     groups: dict[str, list[Record]] = {}
     for record in records:
         groups.setdefault(json.dumps(record["scene"]), []).append(record)
@@ -286,12 +295,13 @@ def _by_scene(records: Sequence[Record]) -> dict[str, list[Record]]:
 
 
 def _setting(record: Record) -> tuple[Any, ...]:
+    """Return what runs that differ only in the seed have in common."""
     config: Mapping[str, Any] = record["config"]
     return json.dumps(record["scene"]), record["system"], config["cap_max"], config["iterations"]
 
 
-def _commonest(settings: Sequence[tuple[int, int, str]]) -> tuple[int, int]:
-    """Cap and iterations that most systems have; of equals the most."""
+def _most_frequent(settings: Sequence[tuple[int, int, str]]) -> tuple[int, int]:
+    """Return the cap and iterations with the largest number of systems; if equal, the largest cap."""
     systems: dict[tuple[int, int], set[str]] = {}
     for cap, iterations, system in settings:
         systems.setdefault((cap, iterations), set()).add(system)

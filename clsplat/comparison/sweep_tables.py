@@ -1,4 +1,4 @@
-"""The rows of a sweep as tables of text: a head and lines of cells, for pages and terminals."""
+"""The rows of a sweep as tables of text: titles and lines of cells, for pages and terminals."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ NONE: TextTable = (), []
 
 
 def equal_table(rows: Sequence[ChartRow], reference: str) -> TextTable:
-    """Splats needed at equal PSNR, as a share of the reference's; a column for each of its caps.
+    """Return the splats needed at equal PSNR, as a share of the reference's; a column for each of its caps.
 
-    rows : of `frontier_data.equal_rows`.
+    rows : of `sweep_rows.equal_rows`.
     """
     caps = sorted({row["reference_cap"] for row in rows})
     lines: list[tuple[str, ...]] = []
     for scene, system in dict.fromkeys((row["scene"], row["system"]) for row in rows):
-        own = {row["reference_cap"]: row for row in rows if (row["scene"], row["system"]) == (scene, system)}
-        lines.append((scene, system, *(_share(own[cap]) if cap in own else "" for cap in caps)))
+        runs = {row["reference_cap"]: row for row in rows if (row["scene"], row["system"]) == (scene, system)}
+        lines.append((scene, system, *(_share(runs[cap]) if cap in runs else "" for cap in caps)))
     return ("scene", "system", *(f"{reference}, cap {cap}" for cap in caps)), lines
 
 
 def auto_table(rows: Sequence[ChartRow]) -> TextTable:
-    """Automatic runs beside the best of the sweep. rows : of `frontier_data.auto_rows`."""
+    """Return automatic runs beside the best run of the sweep. rows : of `sweep_rows.auto_rows`."""
     head = (
         "scene",
         "system",
@@ -67,7 +67,7 @@ def auto_table(rows: Sequence[ChartRow]) -> TextTable:
 
 
 def seed_table(rows: Sequence[ChartRow]) -> TextTable:
-    """PSNR over seeds, and over repeats of one. rows : of `frontier_data.seed_rows`."""
+    """Return the PSNR over seeds, and over repeats of one seed. rows : of `sweep_rows.seed_rows`."""
     head = (
         "scene",
         "cap",
@@ -83,9 +83,9 @@ def seed_table(rows: Sequence[ChartRow]) -> TextTable:
     )
     lines: list[tuple[str, ...]] = []
     for scene, system in dict.fromkeys((row["scene"], row["system"]) for row in rows):
-        own = [row for row in rows if (row["scene"], row["system"]) == (scene, system)]
-        psnr = [row["psnr"] for row in own if not row["repeat"]]
-        same = repeated(own)
+        runs = [row for row in rows if (row["scene"], row["system"]) == (scene, system)]
+        psnr = [row["psnr"] for row in runs if not row["repeat"]]
+        same = repeated(runs)
         values = [row["psnr"] for row in same]
         again = (
             ("", "", "")
@@ -99,7 +99,7 @@ def seed_table(rows: Sequence[ChartRow]) -> TextTable:
         lines.append(
             (
                 scene,
-                str(own[0]["cap"]),
+                str(runs[0]["cap"]),
                 system,
                 str(len(psnr)),
                 f"{statistics.median(psnr):.2f}",
@@ -113,7 +113,7 @@ def seed_table(rows: Sequence[ChartRow]) -> TextTable:
 
 
 def arithmetic_table(rows: Sequence[ChartRow]) -> TextTable:
-    """Variants of the arithmetic. rows : of `frontier_data.arithmetic_rows`."""
+    """Return the variants of the arithmetic. rows : of `sweep_rows.arithmetic_rows`."""
     head = (
         "shape",
         "variant",
@@ -133,12 +133,13 @@ def arithmetic_table(rows: Sequence[ChartRow]) -> TextTable:
 
 
 def repeated(rows: Sequence[ChartRow]) -> list[ChartRow]:
-    """Of one system's rows those of the seed that was trained more than once."""
+    """Return the rows of the seed that was trained more than once."""
     seeds = {row["seed"] for row in rows if row["repeat"]}
     return [row for row in rows if row["seed"] in seeds]
 
 
 def _share(row: ChartRow) -> str:
+    """Return a share of splats as text."""
     if row["ratio"] is None:
         return "not reached"
     return f"{'≤ ' if row['bound'] else ''}{100 * row['ratio']:.0f} %"

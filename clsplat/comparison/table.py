@@ -1,4 +1,4 @@
-"""The table of a comparison: runs that differ in nothing but the seed make a row, with mean and spread."""
+"""The table of a comparison: runs that differ only in the seed make a row, with mean and spread."""
 
 from __future__ import annotations
 
@@ -22,37 +22,38 @@ _FROM_MEASURED = {
 
 
 def summarise(records: Sequence[Record]) -> list[Record]:
-    """One row for each scene, cap and system, in the order of their first runs within scene and cap.
+    """Return a row for each scene, cap and system, ordered by scene and cap, then by the first run.
 
-    Repeated runs do not count: `repeats` tells of them.
+    Repeated runs do not count; see `repeats`. Systems of the same name with different options have these options added
+    to "system".
 
     Returns
     -------
-    Rows with "scene", "cap", "iterations", "system", "config" (all options but the seed), "seeds", "failed" (messages
-    by seed), "finite", "cap_held" (over all its runs), and for each of MEASURED {"mean", "half_spread"}, the latter
-    being half of maximum less minimum; None where every run failed or none measured it. Systems of the same name but
-    other options are told apart in "system" by the options in which they differ.
+    Rows with "scene", "cap", "iterations", "system", "config" (all options but the seed), "seeds" and "failed".
+    "failed" holds the messages by seed. "finite" and "cap_held" are over all runs of the row. Each of MEASURED is
+    {"mean", "half_spread"}, half of maximum less minimum; it is None if every run failed or no run measured it.
     """
     groups: dict[str, list[Record]] = {}
     for record in records:
         if not record.get("repeat"):
             groups.setdefault(_group_key(record), []).append(record)
     rows = [_row(group) for group in groups.values()]
-    for row, said in zip(rows, [_differing(row, rows) for row in rows], strict=True):
-        row["system"] += said
+    for row, options in zip(rows, [_differing(row, rows) for row in rows], strict=True):
+        row["system"] += options
     places = {scene: place for place, scene in enumerate(dict.fromkeys(row["scene"] for row in rows))}
     rows.sort(key=lambda row: (places[row["scene"]], row["cap"]))
     return rows
 
 
 def repeats(records: Sequence[Record]) -> list[Record]:
-    """What the runs that were made more than once say of determinism: a row for each, in the order of the first.
+    """Return a row for each run that was made more than once: whether it gives the same splats each time.
+
+    Only runs of one device, driver, schedule and version are compared; failed runs are left out.
 
     Returns
     -------
-    Rows with "scene", "cap", "system", "seed", "runs", "same" (whether all made the same splats, bit by bit) and
-    "spread" (of PSNR, maximum less minimum, dB). Only runs of one device, driver, schedule and version are compared;
-    failed runs are left out.
+    Rows with "scene", "cap", "system", "seed", "runs", "same" and "spread". "same" is whether all runs gave the same
+    splats, bit by bit. "spread" is the maximum less the minimum of the PSNR [dB].
     """
     groups: dict[str, list[Record]] = {}
     for record in records:
@@ -75,13 +76,13 @@ def repeats(records: Sequence[Record]) -> list[Record]:
 
 
 def scene_title(record: Record) -> str:
-    """Name and size of a record's scene."""
+    """Return the name and size of a record's scene."""
     scene = record["scene"]
     return f"{scene['name']} {scene['width']}x{scene['height']}"
 
 
 def cells(row: Record) -> tuple[str, ...]:
-    """A row as text, under HEAD."""
+    """Return a row as text, in the order of HEAD."""
     texts = {
         "scene": row["scene"],
         "cap": str(row["cap"]),
@@ -100,14 +101,14 @@ def cells(row: Record) -> tuple[str, ...]:
 
 
 def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
-    """What a reader of the table must know, one sentence each."""
-    said = ["mean ± half the spread (maximum less minimum) over the seeds"]
-    said += [
+    """Return the notes below the table, one sentence each."""
+    sentences = ["mean ± half the spread (maximum less minimum) over the seeds"]
+    sentences += [
         f"failed: {row['system']} on {row['scene']} at cap {row['cap']}, seed {seed}: {message}"
         for row in rows
         for seed, message in row["failed"].items()
     ]
-    said += [
+    sentences += [
         f"{row['system']} on {row['scene']} at cap {row['cap']}: {fault}"
         for row in rows
         for key, fault in (("cap_held", "more splats than the cap"), ("finite", "parameters that are not finite"))
@@ -116,8 +117,8 @@ def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
     again = repeats(records)
     if again:
         same = sum(row["same"] for row in again)
-        said.append(f"repeated: {same} of {len(again)} runs gave the same splats each time, bit by bit")
-        said += [
+        sentences.append(f"repeated: {same} of {len(again)} runs gave the same splats each time, bit by bit")
+        sentences += [
             f"{row['system']} on {row['scene']} at cap {row['cap']}, seed {row['seed']}: {row['runs']} runs "
             f"differ, PSNR by {row['spread']:.4f} dB"
             for row in again
@@ -125,7 +126,7 @@ def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
         ]
     single = [record["system"] for record in records if record.get("renders_per_view") == 1]
     if single:
-        said.append(
+        sentences.append(
             f"render time of {', '.join(dict.fromkeys(single))}: one render of each view, not the fastest of several, "
             "so it is a little longer"
         )
@@ -138,8 +139,8 @@ def notes(records: Sequence[Record], rows: Sequence[Record]) -> list[str]:
     for name, of in by_key:
         values = list(dict.fromkeys(of(record) for record in records))
         mixed = " (mixed: seconds and rounding are not those of one machine)" if len(values) > 1 else ""
-        said.append(f"{name}: {', '.join(values)}{mixed}")
-    return said
+        sentences.append(f"{name}: {', '.join(values)}{mixed}")
+    return sentences
 
 
 def markdown(records: Sequence[Record]) -> str:
@@ -157,11 +158,13 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Co
 
 
 def _group_key(record: Record) -> str:
+    """Return what runs of one row have in common."""
     config = {key: value for key, value in record["config"].items() if key != "seed"}
     return json.dumps([record["scene"], record["system"], config], sort_keys=True)
 
 
 def _row(group: Sequence[Record]) -> Record:
+    """Return the row of runs that differ only in the seed."""
     first = group[0]
     row: Record = {
         "scene": scene_title(first),
@@ -184,10 +187,10 @@ def _row(group: Sequence[Record]) -> Record:
 
 
 def _differing(row: Record, rows: Sequence[Record]) -> str:
-    """The options that tell a row from others of the same scene, cap and system, as " [key=value, ...]"."""
+    """Return the options that distinguish a row from others of its scene, cap and system, as " [key=value, ...]"."""
     keys = ("scene", "cap", "system")
     others = [other for other in rows if all(other[key] == row[key] for key in keys)]
     differing = [key for key, value in row["config"].items() if any(o["config"].get(key) != value for o in others)]
-    differing = [key for key in differing if key != "iterations"]  # has a column of its own
-    said = ", ".join(f"{key}={row['config'][key]}" for key in differing)
-    return f" [{said}]" if said else ""
+    differing = [key for key in differing if key != "iterations"]  # iterations have a column
+    options = ", ".join(f"{key}={row['config'][key]}" for key in differing)
+    return f" [{options}]" if options else ""
