@@ -239,7 +239,8 @@ def test_bad_path_flags_and_files(model: Path, tmp_path: Path) -> None:
     assert "-o DIR for images" in error_of("render", model, code=2)
     assert "is not a size" in error_of("render", model, "--path", "orbit", "--size", "0x3", *out, code=2)
     assert "is not a range" in error_of("render", model, "--depth-range", "3,1", *out, code=2)
-    assert "v.avi: no video" in error_of("render", model, "--path", "orbit", "--video", tmp_path / "v.avi")
+    refused = error_of("render", model, "--path", "orbit", "--video", tmp_path / "v.avi")
+    assert "v.avi: not a supported video format" in refused
     assert files(tmp_path) == {"p.json"}
 
 

@@ -14,6 +14,9 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests/, which pytest adds by itself
+
 from reference.scenes import for_shape, random_camera, random_splats
 
 from clsplat.device import memory, program
