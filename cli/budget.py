@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from clsplat.compression.rules import TOLERANCE, BudgetOptions
-from clsplat.errors import OutputError
 from clsplat.training.config import TrainConfig
 
 from .main import INTERRUPTED
@@ -76,7 +75,9 @@ def run_search(
     quiet: bool,
 ) -> None:
     """Search with a live display, and print what was found."""
+    from clsplat.comparison.growth import draw_growth
     from clsplat.compression.search import train_budget
+    from clsplat.training.run import evaluate_test_views
 
     result: Budgeted | None = None
     try:
@@ -88,18 +89,15 @@ def run_search(
         _report_interruption(ctx, model_path)
     if not result.finished:
         _report_interruption(ctx, model_path)
-    chart = draw_growth(result, model_path)
+    charts = draw_growth(result, model_path)
     if quiet:
         return
     for line in result_lines(result):
         click.echo(line)
-    if chart is not None:
-        click.echo(chart)
-    if scene.test:
-        from clsplat.evaluation.evaluate import evaluate
-        from clsplat.rendering.renderer import Renderer
-
-        metrics = evaluate(Renderer(config.device), result.splats, scene.test, config.background)
+    if charts:
+        click.echo(f"growth curve: {', '.join(str(file) for file in charts)}")
+    metrics = evaluate_test_views(result.splats, scene, config)
+    if metrics is not None:
         click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
 
 
@@ -116,22 +114,6 @@ def result_lines(result: Budgeted) -> list[str]:
         f"{final['parameters_in_use']} parameters, {final['bytes'] / 1e6:.2f} MB; {result.seconds:.0f} s in total",
     ]
     return lines + [f"warning: {final['missed']}"] * (final["missed"] is not None)
-
-
-def draw_growth(result: Budgeted, model_path: Path) -> str | None:
-    """Write growth.png and growth.svg, and return a line that names them; None if matplotlib is not installed."""
-    from clsplat.comparison.charts import growth_chart
-
-    report = result.report
-    rows = [{"splats": row["splats"], "psnr": row["psnr"]} for row in report["growth"]]
-    knee = next(row["splats"] for row in report["growth"] if row["cap"] == report["knee"])
-    held_out = report["held_out"]
-    star = {"splats": held_out["splats"], "psnr": held_out["psnr_pruned"], "label": "chosen, pruned"}
-    try:
-        files = growth_chart([*rows, star], knee, model_path / "growth", report["rounds"])
-    except OutputError:
-        return None
-    return f"growth curve: {', '.join(str(file) for file in files)}"
 
 
 def _report_interruption(ctx: click.Context, model_path: Path) -> NoReturn:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.errors import OutputError
 from clsplat.scenes.reconstruct.options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, ReconstructOptions
 from clsplat.training.progress import PLAIN_INTERVAL, LiveLine
 
@@ -98,37 +97,24 @@ def report(result: ReconstructionResult) -> None:
 
 
 def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> Path:
-    """Return the scene for training on photos without poses; it lies beside the model and is made if missing.
+    """Return the scene to train on for photographs without poses, and make it if it does not exist."""
+    from clsplat.scenes.reconstruct.beside_model import plan_scene
 
-    Raises
-    ------
-    OutputError : the existing scene was made from other photos. Other errors are those of `reconstruct`.
-    """
-    from clsplat.scenes.reconstruct.photo_files import find_photos, is_video
-    from clsplat.scenes.reconstruct.reconstruct import estimate_seconds, is_made_from
-
-    scene = model.parent / f"{photos.resolve().stem if is_video(photos) else photos.resolve().name}-scene"
     options = ReconstructOptions()
-    made = is_made_from(scene, photos)
-    if made:
+    scene = plan_scene(photos, model, options, overwrite)
+    if scene.exists:
         if not quiet:
-            click.echo(f"{photos}: no poses: {scene} was reconstructed from it before and is used", err=True)
-        return scene
-    if made is False and not overwrite:
-        raise OutputError(
-            f"{scene}: was reconstructed from other photos than {photos} now has: use --overwrite to replace "
-            f"it, or clsplat reconstruct {photos} -o OTHER and train on that"
-        )
+            click.echo(f"{photos}: no poses: {scene.path} was reconstructed from it before and is used", err=True)
+        return scene.path
     if not quiet:
-        what = f"{options.frames} frames"
-        if not is_video(photos):
-            files = find_photos(photos)
-            what = f"{len(files)} photos, {_minutes(estimate_seconds(files, options))}"
-        click.echo(f"{photos}: no poses: reconstructing {scene} first ({what})", err=True)
-    result = run_reconstruction(photos, scene, options, overwrite, quiet)
+        work = f"{scene.photos} frames"
+        if scene.seconds is not None:
+            work = f"{scene.photos} photos, {_minutes(scene.seconds)}"
+        click.echo(f"{photos}: no poses: reconstructing {scene.path} first ({work})", err=True)
+    result = run_reconstruction(photos, scene.path, options, overwrite, quiet)
     if not quiet:
         report(result)
-    return scene
+    return scene.path
 
 
 def _minutes(seconds: float) -> str:

@@ -149,7 +149,7 @@ def train(
     if not quiet:
         from clsplat.training.run import evaluate_test_views
 
-        report(model, evaluate_test_views(model, loaded))
+        report(model, model.evaluations.get(model.iteration) or evaluate_test_views(model.splats, loaded, config))
 
 
 def _default_folder(scene: Path | None) -> Path:

@@ -11,6 +11,7 @@ from ..evaluation.evaluate import Evaluation, evaluate
 from ..files.lock import folder_lock
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
+from ..splats.splats import Splats
 from .checkpoint import Checkpoint
 from .config import FREE_OPTIONS, TrainConfig
 from .folder import ModelFolder
@@ -74,16 +75,14 @@ def train(
         return trainer.run(folder, visit)
 
 
-def evaluate_test_views(model: Model, scene: Scene) -> Evaluation | None:
-    """Measure a model on the test views, unless its run has done so at the end.
+def evaluate_test_views(splats: Splats, scene: Scene, config: TrainConfig) -> Evaluation | None:
+    """Measure a trained model on the scene's test views, on the device and with the background of its run.
 
     Returns
     -------
     The metrics, or None if the scene has no test views.
     """
-    if not scene.test or model.iteration in model.evaluations:
-        return model.evaluations.get(model.iteration)
-    return evaluate(Renderer(model.config.device), model.splats, scene.test, model.config.background)
+    return evaluate(Renderer(config.device), splats, scene.test, config.background) if scene.test else None
 
 
 def _fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:
