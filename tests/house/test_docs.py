@@ -288,7 +288,7 @@ def test_docstrings_are_rendered(tmp_path: Path) -> None:
     text = (tmp_path / "clsplat.html").read_text()
     for name in clsplat.__all__:
         assert f'id="{name}"' in text
-    assert "<li><strong>target_psnr</strong>: on validation views, instead" in text
+    assert "<li><strong>target_psnr</strong>: replaces the tolerance" in text
     assert "-----" not in text, "a section that docs/api.py did not parse"
 
 
