@@ -1,4 +1,4 @@
-"""rate_limits.py: what is refused, and that the defaults never are."""
+"""Limits of learning rates: high rates are refused, defaults and presets never are."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ def test_defaults_and_presets_pass(iterations: int) -> None:
 
 
 @pytest.mark.parametrize("name", LIMITS)
-def test_a_hundred_times_the_rate_is_refused_with_what_would_do(name: str) -> None:
+def test_a_hundred_times_the_rate_is_refused_and_a_usable_one_named(name: str) -> None:
     rate = 100 * getattr(TrainConfig().optim, name)
     if name == "position_lr_final":  # 100 times is the rate at the start
         rate *= 100
-    with pytest.raises(InputError, match=rf"^{name} .* of 200 iterations .*: use at most [\d.e-]+$") as caught:
+    with pytest.raises(InputError, match=rf"^{name} .* of 200 iterations .*: use at usable [\d.e-]+$") as caught:
         check_rates(TrainConfig(iterations=200, **{name: rate}))
-    most = float(str(caught.value).rsplit(" ", 1)[1])
-    check_rates(TrainConfig(iterations=200, **{name: most}))
+    usable = float(str(caught.value).rsplit(" ", 1)[1])
+    check_rates(TrainConfig(iterations=200, **{name: usable}))
