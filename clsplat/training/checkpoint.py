@@ -35,7 +35,7 @@ class Checkpoint:
     seconds : training time so far.
     schedule : schedule of the kernels, which their rounding depends on.
     n_first : number of splats at the start, which the growth depends on.
-    signals : (3, N), see Pipeline.signals.
+    signals : (3, N) densification statistics (SplatStatistics).
     """
 
     iteration: int

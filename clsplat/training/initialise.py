@@ -1,4 +1,4 @@
-"""The splats that training starts from: structure-from-motion points, random points, or an earlier model."""
+"""The first splats of a run, from structure-from-motion points, random points, or an earlier model."""
 
 from __future__ import annotations
 
@@ -18,14 +18,11 @@ from .random_points import random_points, seen
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
 
-# 3DGS-MCMC's start: small and half opaque (3DGS: opacity 0.1, scale factor 1).
-OPACITY = 0.5
-SCALE_FACTOR = 0.1
 RANDOM_POINTS = 100_000  # 3DGS
-FEW = 0.1  # of the cap: of fewer points, as many are added at random
-FEWEST_POINTS = 4  # a point and its three neighbours give the first scale
-_TOO_NEAR = 0.1  # of what cameras see may be nearer than the near plane
-_LOOKED_AT = 2000  # points, to find that out
+MIN_POINT_SHARE = 0.1  # scenes with fewer points than this share of the cap get random points added
+MIN_POINTS = 4  # the first scale needs a point and its three neighbours
+_MAX_NEAR_SHARE = 0.1  # largest share of the visible points that may be nearer than the near plane
+_SAMPLED_POINTS = 2000  # points that are tested against the near plane
 
 
 def initial_splats(
@@ -39,28 +36,28 @@ def initial_splats(
     normalisation: str = "peak",
     antialiased: bool = False,
     random_share: float | None = 0.0,
-    opacity: float = OPACITY,
-    scale_factor: float = SCALE_FACTOR,
+    opacity: float,
+    scale_factor: float,
 ) -> tuple[Splats, str]:
-    """Splats to start from and one sentence on where they come from.
+    """Return the first splats, and one sentence on where they come from.
 
-    Splats made from points follow a Morton curve, those of a model keep their order.
+    Splats from points follow a Morton curve. Splats of a model keep their order.
 
     Parameters
     ----------
-    scene : its points and training cameras are used.
-    shape, sh_degree, normalisation, antialiased : of the result.
-    cap : most splats; of more points those with the longest tracks are kept, of a model the most opaque.
-    init : "sfm", "random", or the path of a .ply model. "sfm" without points becomes "random" and says so.
-    seed : of random points and of the first skew.
-    random_share : points at random beside those of "sfm", as a fraction of the cap; None: a tenth where the scene has
-        fewer, else 0.
-    opacity, scale_factor : of splats made from points; scale = factor * distance to the three nearest.
+    scene : scene with points and training cameras.
+    shape, sh_degree, normalisation, antialiased : properties of the result.
+    cap : largest number of splats. The points with the longest tracks are kept, or the most opaque splats of a model.
+    init : "sfm", "random", or the path of a .ply model. "sfm" without points becomes "random", with a message.
+    seed : seed of random points and of the first skew.
+    random_share : random points that are added to those of "sfm", as a fraction of the cap. None: a tenth if the scene
+        has fewer points than that, otherwise 0.
+    opacity, scale_factor : properties of splats from points; scale = factor * distance to the three nearest points.
 
     Raises
     ------
-    InputError : cap below 1, unknown `init`, an unreadable model, one with skew of another normalisation, one that is
-        antialiased or not against what is asked for, or a scene so small that it lies before the near plane.
+    InputError : cap below 1, or an unknown `init`; a model that is unreadable, or whose normalisation or antialiasing
+        differs; a scene so small that it is nearer than the near plane.
     """
     if cap < 1:
         raise InputError(f"cap {cap}: at least 1 splat is needed")
@@ -89,48 +86,48 @@ def initial_splats(
 def _points(
     scene: Scene, init: str, cap: int, rng: np.random.Generator, random_share: float | None
 ) -> tuple[Array, NDArray[np.uint8], str]:
-    """Positions, colours and the message."""
+    """Return positions, colours and the message."""
     points = scene.points
-    found = len(points.xyz)
+    n_points = len(points.xyz)
     apart = distinct(points.xyz)
-    if init == "sfm" and len(apart) >= FEWEST_POINTS:
+    if init == "sfm" and len(apart) >= MIN_POINTS:
         xyz, rgb, tracks = points.xyz[apart], points.rgb[apart], points.track_length[apart]
         if random_share is None:
-            random_share = FEW if len(apart) < FEW * cap else 0.0
-        beside = min(round(random_share * cap), cap - 1)
-        if len(apart) <= cap - beside:
+            random_share = MIN_POINT_SHARE if len(apart) < MIN_POINT_SHARE * cap else 0.0
+        n_random = min(round(random_share * cap), cap - 1)
+        if len(apart) <= cap - n_random:
             message = f"{len(apart)} splats from the scene's points"
         else:
-            keep = best_observed(xyz, tracks, cap - beside, scene)
-            message = f"{cap - beside} splats from the scene's points: the best observed of {len(apart)}"
+            keep = best_observed(xyz, tracks, cap - n_random, scene)
+            message = f"{cap - n_random} splats from the scene's points: the best observed of {len(apart)}"
             xyz, rgb = xyz[keep], rgb[keep]
-        if not beside:
+        if not n_random:
             return xyz, rgb, message
-        placed = random_points(scene, beside, rng)
+        placed = random_points(scene, n_random, rng)
         return (
             np.concatenate([xyz, placed]),
             np.concatenate([rgb, rgb[nearest_of(xyz, placed)]]),
-            (f"{message}, {beside} at random where the cameras look"),
+            (f"{message}, {n_random} at random where the cameras look"),
         )
     count = min(cap, RANDOM_POINTS)
     placed = random_points(scene, count, rng)
     rgb = rng.integers(0, 256, (count, 3), dtype=np.uint8)
-    there = f"{found} points" if len(apart) == found else f"{found} points, {len(apart)} of them apart"
-    why = "" if init == "random" else f" (the scene has {there}): expect less than from good points"
+    available = f"{n_points} points" if len(apart) == n_points else f"{n_points} points, {len(apart)} of them apart"
+    why = "" if init == "random" else f" (the scene has {available}): expect less than from good points"
     return placed, rgb, f"{count} splats at random where the cameras look{why}"
 
 
 def nearest_of(xyz: Array, to: Array) -> NDArray[np.int64]:
-    """Indices of the points of `xyz` (P, 3) that are nearest to each of `to`."""
-    from scipy.spatial import cKDTree  # a third of a second to import
+    """Return the index of the point of `xyz` (P, 3) that is nearest to each point of `to`."""
+    from scipy.spatial import cKDTree  # imported late: slow to import
 
     return np.asarray(cKDTree(xyz).query(to, workers=-1)[1], np.int64)
 
 
 def distinct(xyz: Array) -> NDArray[np.int64]:
-    """Indices of the first point in each place, rising.
+    """Return the indices of the first point in each place, in rising order.
 
-    Points in one place have no distance that their splats' sizes could come from, and one splat does for them all.
+    Points in one place have a distance of zero, which cannot give the size of a splat. One splat represents them all.
     """
     order = np.lexsort(xyz.T)
     same = np.zeros(len(xyz), np.bool_)
@@ -139,11 +136,11 @@ def distinct(xyz: Array) -> NDArray[np.int64]:
 
 
 def check_size(scene: Scene) -> None:
-    """Raises InputError where what the cameras see lies before the near plane: such a scene cannot be rendered."""
-    xyz = scene.points.xyz[:: -(-len(scene.points.xyz) // _LOOKED_AT) or 1]
+    """Raise InputError if too much of the scene is nearer than the near plane: it cannot be rendered."""
+    xyz = scene.points.xyz[:: -(-len(scene.points.xyz) // _SAMPLED_POINTS) or 1]
     depths = [depth[inside] for depth, inside in (seen(view.camera, xyz) for view in scene.train)]
     depth = np.concatenate(depths) if depths else np.zeros(0)
-    if not len(depth) or np.mean(depth < NEAR) <= _TOO_NEAR:
+    if not len(depth) or np.mean(depth < NEAR) <= _MAX_NEAR_SHARE:
         return
     factor = 10.0 ** np.ceil(np.log10(10 * NEAR / np.median(depth)))
     raise InputError(
@@ -153,17 +150,17 @@ def check_size(scene: Scene) -> None:
 
 
 def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene: Scene) -> NDArray[np.int64]:
-    """Indices of `cap` points with long tracks that still cover the scene, rising.
+    """Return the indices of `cap` points with long tracks that cover the scene, in rising order.
 
-    Half of them are the best observed of each cell of a grid, the rest the longest tracks left: by tracks
-    alone a textured mat would take everything and leave the background empty. Space is contracted around the
-    cameras (Barron et al. 2022, Mip-NeRF 360, eq. 10), so that far points share larger cells.
+    Half of them are the best observed points of each cell of a grid. The rest are the longest tracks that remain. Track
+    length alone would take all points from a textured surface and leave the background empty. Space is contracted
+    around the cameras (Barron et al. 2022, Mip-NeRF 360, eq. 10), so that far points share larger cells.
     """
     centres = np.array([view.camera.position for view in scene.train])
     from_centre = (xyz - centres.mean(axis=0)) / scene.extent
     norm = np.maximum(np.linalg.norm(from_centre, axis=1, keepdims=True), 1e-12)
     contracted = np.where(norm > 1, from_centre / norm * (2 - 1 / norm), from_centre)
-    # A stable sort: equal tracks in the order of their indices.
+    # The sort is stable: equal tracks stay in the order of their indices.
     order = np.argsort(-track_length.astype(np.int64), kind="stable")
     low, high = 1.0, 4096.0  # cells per unit of length
     first = order[:0]
@@ -182,7 +179,7 @@ def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene
 def _from_model(
     path: str, shape: str, cap: int, sh_degree: int, normalisation: str, antialiased: bool
 ) -> tuple[Splats, str]:
-    """A model from a file, in the wanted shape, SH degree and count."""
+    """Return the splats of a file with this shape, SH degree and largest number, and a message."""
     loaded = Splats.load(path)
     if loaded.skew.any() and loaded.normalisation != normalisation:
         raise InputError(
@@ -206,7 +203,7 @@ def _from_model(
 
 
 def _fit_bands(sh: Array, coefficients: int) -> Array:
-    """Colour (N, K, 3) with `coefficients` in place of K: higher bands cut, or zero."""
+    """Return colour (N, K, 3) with `coefficients` instead of K: higher bands are removed, or zero."""
     fitted = np.zeros((len(sh), coefficients, 3), sh.dtype)
     shared = min(coefficients, sh.shape[1])
     fitted[:, :shared] = sh[:, :shared]
@@ -214,7 +211,7 @@ def _fit_bands(sh: Array, coefficients: int) -> Array:
 
 
 def _started(splats: Splats, rng: np.random.Generator) -> Splats:
-    """With the fields that must not start at their neutral value moved off it, where all splats are there."""
+    """Return splats with start values in fields whose neutral value has no gradient, if all splats have that value."""
     arrays = splats.to_numpy()
     for field in splats.schema:
         values = arrays[field.name]

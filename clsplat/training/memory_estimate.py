@@ -1,4 +1,4 @@
-"""How much device memory a run will take, before it starts."""
+"""Estimate of the device memory of a run, before it starts."""
 
 from __future__ import annotations
 
@@ -19,21 +19,28 @@ from .exposure import exposure_bytes
 from .optim.skew_map import SkewMap
 from .targets import target_budget, target_bytes, target_channels
 
-_ROLES = 5  # value, gradient, two moments, and the copy that relocation swaps with; of colour the gradient is compact
-# Colour and transmittance, both once more for bands, gradients of SSIM's maps, v_color.
+# A parameter has a value, a gradient, two moments and a spare copy. The gradient of colour is compact.
+_ROLES = 5
+# Planes of an image: colour and transmittance, both once more for bands, gradients of the SSIM maps, v_color.
 _IMAGE_PLANES = 4 + 4 + 9 + 3
-# Splat-tile pairs of an image: about 100 a tile, however few the splats, and 4 more a splat. At the end of runs on
-# three real scenes of 400-px photos with 5 000 and 20 000 splats there were 0.5 to 0.8 times as many.
+# Splat-tile pairs of an image: about 100 for each tile, and 4 for each splat. Runs on real scenes end with fewer.
 _ISECTS_PER_TILE, _ISECTS_PER_SPLAT = 100, 4
-_LEAST_ISECTS = 1 << 20  # that there must be room for: images with more are cut into bands
-# Words of a splat: key, order, two rectangles (6), two pairs (4), range of isects (2), statistics (3), tile counts (4).
+_MIN_ISECTS = 1 << 20  # isects that must fit; images with more are rendered in bands
+# Words of a splat on the screen: key, order, two rectangles (6), two pairs (4), range of isects (2), statistics (3),
+# tile counts (4).
 _SCREEN_WORDS = 21
-_WAITING_WORDS = 4  # of a splat with `visible_adam`, if a vector is one splat
+_WAITING_WORDS = 4  # words of a splat with `visible_adam`, if a vector is one splat
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Bytes by purpose, of an isect, and of the largest single buffer other than those of isects."""
+    """Bytes of a run by purpose.
+
+    Attributes
+    ----------
+    isect : bytes of one isect.
+    largest_buffer : bytes of the largest buffer that does not hold isects.
+    """
 
     splats: int
     isects: int
@@ -53,17 +60,17 @@ class Estimate:
 
 
 def peak_bytes() -> int:
-    """Most host memory this process has held; 0 where the system does not tell (Windows)."""
+    """Return the peak host memory of this process; 0 if the system does not report it (Windows)."""
     try:
         import resource
     except ImportError:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # bytes there, KiB elsewhere
+    return peak if sys.platform == "darwin" else peak * 1024  # bytes on macOS, KiB on Linux
 
 
 def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, target_bytes: int) -> Estimate:
-    """Memory at the cap, for the largest image, with `target_bytes` of images. Splat-tile pairs are a guess."""
+    """Return the memory at the cap, for the largest image. The number of splat-tile pairs is an estimate."""
     real, n = kernels.dtype.itemsize, capacity_for(config.cap_max)
     rows = {group: kernels.schema.rows(group) for group in Group}
     screen = (kernels.record + kernels.v_record) * real + 4 * (
@@ -98,18 +105,18 @@ def run_memory(device: Device, kernels: KernelBuild, config: TrainConfig, views:
 
 
 def room_for_isects(needed: Estimate, device: Device) -> int:
-    """Isects that fit beside splats and images; buffers that grow take half as much again."""
+    """Return the number of isects that fit next to splats and images. Growing buffers need half as much again."""
     return max(device.info.global_mem_bytes - needed.splats - needed.images, 0) * 2 // (3 * needed.isect)
 
 
 def check(needed: Estimate, device: Device) -> None:
-    """Raises DeviceError when splats and images do not fit the device, with some isects beside them."""
+    """Raise DeviceError if splats, images and a minimum of isects do not fit the device."""
     info = device.info
-    mend = "lower --cap-max, use smaller images (-r 2, 4, 8), a lower --sh-degree, or another --device"
-    if needed.total > info.global_mem_bytes and room_for_isects(needed, device) < _LEAST_ISECTS:
-        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, the run needs about {needed}: {mend}")
+    remedy = "lower --cap-max, use smaller images (-r 2, 4, 8), a lower --sh-degree, or another --device"
+    if needed.total > info.global_mem_bytes and room_for_isects(needed, device) < _MIN_ISECTS:
+        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, the run needs about {needed}: {remedy}")
     if needed.largest_buffer > info.max_alloc_bytes:
         raise DeviceError(
             f"{info} allows {info.max_alloc_bytes / 1e6:.0f} MB in one buffer, "
-            f"the run needs about {needed.largest_buffer / 1e6:.0f} MB: {mend}"
+            f"the run needs about {needed.largest_buffer / 1e6:.0f} MB: {remedy}"
         )

@@ -1,4 +1,4 @@
-"""Places for splats of a scene without points: where its cameras look."""
+"""Random points where the cameras of a scene look, for scenes without points."""
 
 from __future__ import annotations
 
@@ -15,51 +15,49 @@ if TYPE_CHECKING:
     from ..cameras.camera import Camera
     from ..scenes.scene import Scene
 
-SEEN_BY = 2  # cameras that must see a point, where there are as many: from one alone its place stays unknown
-MOST = 0.75  # of the cameras: half of the points are where so many look, if there is such a place
-_FARTHEST = 9.0  # from the middle, in median distances of the cameras
-_AHEAD = 3.0  # of parallel cameras: how far before them the middle is taken to be, in scene extents
-_DRAWS = 16  # of as many points as are wanted, of which those that are seen are kept
-_LOOKING = 32  # cameras, to find out who sees them
+SEEN_BY = 2  # smallest number of cameras that see a point: one camera alone does not determine its place
+CENTRAL_SHARE = 0.75  # half of the points are where this share of the cameras looks, if there is such a region
+_FARTHEST = 9.0  # largest distance from the centre, in median distances of the cameras
+_AHEAD = 3.0  # distance of the centre in front of parallel cameras, in scene extents
+_DRAWS = 16  # number of draws of `count` points; points that cameras see are kept
+_TESTED_CAMERAS = 32  # cameras that the points are tested against
 
 
 def random_points(scene: Scene, count: int, rng: np.random.Generator) -> Array:
-    """(count, 3) points, half of them where most cameras look, the others where two do.
+    """Return (count, 3) points: half of them where nearly all cameras look, the others where at least two look.
 
-    They are even in space contracted around the point nearest to all optical axes (Barron et al. 2022, Mip-NeRF 360,
-    eq. 10), with the cameras' median distance as its unit: far points are rare. On validation views (3000 splats, 600
-    iterations, one seed; a cube around the cameras in brackets): lego 24.2 (12.5), fox 22.9 (20.1), kitchen 18.6 dB
-    (16.2).
+    The points are uniform in a contracted space around the point nearest to all optical axes (Barron et al. 2022,
+    Mip-NeRF 360, eq. 10). Its unit is the median distance of the cameras, so far points are rare.
     """
-    cameras = [view.camera for view in scene.train[:: -(-len(scene.train) // _LOOKING)]]
+    cameras = [view.camera for view in scene.train[:: -(-len(scene.train) // _TESTED_CAMERAS)]]
     centres = np.array([view.camera.position for view in scene.train])
     middle = _middle(cameras, scene.extent)
     unit = float(np.median(np.linalg.norm(centres - middle, axis=1)))
     unit = unit if unit > 0 else 1.0
-    few, half = min(SEEN_BY, len(cameras)), count // 2
-    most, some, unseen = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
+    min_cameras, half = min(SEEN_BY, len(cameras)), count // 2
+    central, outer, unseen = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
     for _ in range(_DRAWS):
         drawn = middle + unit * _uncontracted(count, rng)
-        lookers = _lookers(cameras, drawn)
-        by_most = lookers >= max(few, MOST * len(cameras))
-        most = np.concatenate([most, drawn[by_most]])
-        some = np.concatenate([some, drawn[(lookers >= few) & ~by_most]])
-        unseen = drawn[lookers < few]
-        if len(some) >= count - half:
+        n_seeing = _cameras_seeing(cameras, drawn)
+        is_central = n_seeing >= max(min_cameras, CENTRAL_SHARE * len(cameras))
+        central = np.concatenate([central, drawn[is_central]])
+        outer = np.concatenate([outer, drawn[(n_seeing >= min_cameras) & ~is_central]])
+        unseen = drawn[n_seeing < min_cameras]
+        if len(outer) >= count - half:
             break
-    reach = float(np.linalg.norm(most - middle, axis=1).max(initial=0.0))
-    for _ in range(_DRAWS if reach > 0 else 0):  # where most look is often a small part of all that is seen
-        if len(most) >= half:
+    reach = float(np.linalg.norm(central - middle, axis=1).max(initial=0.0))
+    for _ in range(_DRAWS if reach > 0 else 0):  # the central region is often a small part of the visible space
+        if len(central) >= half:
             break
         drawn = middle + reach * _in_ball(count, rng)
-        lookers = _lookers(cameras, drawn)
-        most = np.concatenate([most, drawn[lookers >= max(few, MOST * len(cameras))]])
-    half = min(half, len(most))
-    return np.concatenate([most[:half], some[: count - half], most[half:], unseen])[:count]
+        n_seeing = _cameras_seeing(cameras, drawn)
+        central = np.concatenate([central, drawn[n_seeing >= max(min_cameras, CENTRAL_SHARE * len(cameras))]])
+    half = min(half, len(central))
+    return np.concatenate([central[:half], outer[: count - half], central[half:], unseen])[:count]
 
 
 def seen(camera: Camera, xyz: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """(P,) depths of points, and whether they lie before the camera and inside its image."""
+    """Return the depths (P,) of points, and whether they are in front of the camera and inside its image."""
     local = xyz @ camera.rotation.T + camera.translation
     depth = local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -68,13 +66,13 @@ def seen(camera: Camera, xyz: Array) -> tuple[Array, NDArray[np.bool_]]:
     return depth, inside
 
 
-def _lookers(cameras: Sequence[Camera], xyz: Array) -> NDArray[np.int64]:
-    """(P,) how many cameras see each point."""
+def _cameras_seeing(cameras: Sequence[Camera], xyz: Array) -> NDArray[np.int64]:
+    """Return the number of cameras that see each point, (P,)."""
     return np.asarray(np.sum([seen(camera, xyz)[1] for camera in cameras], axis=0), np.int64)
 
 
 def _middle(cameras: Sequence[Camera], extent: float) -> Array:
-    """The point nearest to all optical axes; of parallel ones a point ahead."""
+    """Return the point nearest to all optical axes, or a point in front of parallel cameras."""
     nearest = where_axes_meet(cameras)
     if nearest is not None:
         return nearest
@@ -83,7 +81,7 @@ def _middle(cameras: Sequence[Camera], extent: float) -> Array:
 
 
 def _uncontracted(count: int, rng: np.random.Generator) -> Array:
-    """(count, 3) points that are even in the contracted ball of radius 2."""
+    """Return (count, 3) points that are uniform in the contracted ball of radius 2."""
     ball = 2.0 * _in_ball(count, rng)
     radius = np.linalg.norm(ball, axis=1, keepdims=True)
     short = np.minimum(radius, 2.0 - 1.0 / _FARTHEST)
@@ -91,7 +89,7 @@ def _uncontracted(count: int, rng: np.random.Generator) -> Array:
 
 
 def _in_ball(count: int, rng: np.random.Generator) -> Array:
-    """(count, 3) points that are even in the unit ball."""
+    """Return (count, 3) points that are uniform in the unit ball."""
     direction = rng.standard_normal((count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return np.asarray(direction * rng.uniform(size=(count, 1)) ** (1 / 3))

@@ -1,6 +1,6 @@
-"""What changes during a run: learning rate and SH degree with the iteration, resolution also with the splats.
+"""Schedules of a run: learning rate and SH degree by iteration, resolution also by the number of splats.
 
-Iterations count from 1, as in 3DGS; every function also accepts 0.
+Iterations count from 1, as in 3DGS. Every function also accepts 0.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from ..errors import InputError
 from .config import TrainConfig
 from .options.density import Mcmc
 
-# (fraction of the run, downscale): coarse to fine, the last half at full resolution.
+# (fraction of the run, downscale). The second half of a run has full resolution.
 COARSE_TO_FINE = ((0.0, 4), (0.2, 2), (0.5, 1))
-MANY_PIXELS = 8.0  # of the image for each splat: above it coarse stages last longer
-LONGEST = 1.3  # times as long: full resolution from 0.65 of the run
+MANY_PIXELS = 8.0  # pixels per splat; with more, coarse stages last longer
+LONGEST = 1.3  # largest factor of the length of coarse stages: full resolution starts at 0.65 of the run
 
 
 @dataclass(frozen=True)
@@ -65,21 +65,21 @@ def growth_factor(config: TrainConfig, n_first: int, window: int) -> float:
 
 
 def exponential_decay(start: float, end: float, steps: int) -> Callable[[int], float]:
-    """Log-linear from `start` at iteration 0 to `end` at `steps`, constant beyond (3DGS's positions).
+    """Return a log-linear rate: `start` at iteration 0, `end` from `steps` on (the positions of 3DGS).
 
     Parameters
     ----------
     start, end : learning rates, both above 0.
-    steps : iterations from one to the other, at least 1.
+    steps : iterations from `start` to `end`, at least 1.
 
     Raises
     ------
-    InputError : a rate not above 0 or not finite, or fewer than one step.
+    InputError : a rate is not above 0 or not finite, or `steps` is below 1.
     """
     if not (0 < start < math.inf and 0 < end < math.inf):
         raise InputError(f"learning rates {start} -> {end}: both must be above 0 and finite")
     if steps < 1:
-        raise InputError(f"a decay over {steps} iterations: needs at least 1")
+        raise InputError(f"a decay over {steps} iterations: at least 1 is needed")
     ratio = math.log(end / start)
 
     def rate(iteration: int) -> float:
@@ -89,7 +89,7 @@ def exponential_decay(start: float, end: float, steps: int) -> Callable[[int], f
 
 
 def sh_degree_at(iteration: int, interval: int, max_degree: int) -> int:
-    """SH degree in use: one more every `interval` iterations up to `max_degree`; all if `interval` is 0."""
+    """Return the SH degree: one more every `interval` iterations up to `max_degree`, or that if `interval` is 0."""
     if interval <= 0:
         return max_degree
     return min(max_degree, max(iteration, 0) // interval)
@@ -101,23 +101,23 @@ def resolution_schedule(
     image_side: int | None = None,
     smallest_side: int = 64,
 ) -> list[tuple[int, int]]:
-    """When each image downscale begins.
+    """Return the first iteration of each image downscale.
 
     Parameters
     ----------
     iterations : length of the run.
-    stages : (fraction of the run in [0, 1), integer downscale); the first fraction is 0, fractions rise,
-        downscales fall and the last is 1, so that a run always ends at full resolution.
-    image_side : shorter side of the smallest image [px]; a downscale that would leave less than
-        `smallest_side` is replaced by the next finer one of the schedule.
+    stages : (fraction of the run in [0, 1), integer downscale). The first fraction is 0 and fractions rise. Downscales
+        fall and the last one is 1, so that a run always ends at full resolution.
+    image_side : shorter side of the smallest image [px]. A downscale to less than `smallest_side` is replaced by the
+        next finer one of the schedule.
 
     Returns
     -------
-    List of (first iteration, downscale), the first at iteration 0, without empty or repeated stages.
+    List of (first iteration, downscale) from iteration 0 on, without empty or repeated stages.
 
     Raises
     ------
-    InputError : stages out of order.
+    InputError : the stages are not in order.
     """
     fractions = [fraction for fraction, _ in stages]
     downscales = [downscale for _, downscale in stages]
@@ -139,7 +139,7 @@ def resolution_schedule(
 
 
 def downscale_at(schedule: Sequence[tuple[int, int]], iteration: int) -> int:
-    """Downscale of `iteration` in a schedule from `resolution_schedule`."""
+    """Return the downscale at `iteration` of a schedule from `resolution_schedule`."""
     current = schedule[0][1]
     for first, downscale in schedule:
         if iteration >= first:
@@ -148,13 +148,15 @@ def downscale_at(schedule: Sequence[tuple[int, int]], iteration: int) -> int:
 
 
 def downscale_for(schedule: Sequence[tuple[int, int]], iteration: int, n_splats: int, pixels: float) -> int:
-    """Downscale of `iteration`: the schedule's, later where splats are few: they learn as much from small images.
+    """Return the image downscale at `iteration`. With few splats per pixel, coarse stages last longer.
 
-    From MANY_PIXELS to twice as many pixels a splat, the stages grow longer, by LONGEST at most.
+    Few splats learn as much from small images. Between MANY_PIXELS and twice as many pixels per splat, the length of
+    the coarse stages grows up to the factor LONGEST.
 
     Parameters
     ----------
-    schedule : from `resolution_schedule`. pixels : of an image at full size.
+    schedule : schedule from `resolution_schedule`.
+    pixels : pixels of an image at full size.
     """
     plenty = min(max(pixels / (MANY_PIXELS * max(n_splats, 1)) - 1.0, 0.0), 1.0)
     return downscale_at(schedule, int(iteration / (1.0 + (LONGEST - 1.0) * plenty)))

@@ -11,12 +11,13 @@ from .schedules import downscale_for, resolution_schedule
 
 
 class ViewSampler:
-    """Draws from `rng`, one permutation of the views after another.
+    """Draws training views: one random permutation of the views after another.
 
     Parameters
     ----------
-    iterations : length of the run. coarse_to_fine : False: full size throughout.
-    queue : what is left of a permutation, of a resumed run.
+    iterations : length of the run.
+    coarse_to_fine : False: always full size.
+    queue : rest of the permutation of a resumed run.
     """
 
     def __init__(
@@ -28,7 +29,7 @@ class ViewSampler:
         self.stages = resolution_schedule(iterations, image_side=side) if coarse_to_fine else [(0, 1)]
 
     def next(self, iteration: int, n_splats: int) -> tuple[int, int]:
-        """Index of an iteration's view (from 1), and the downscale of its image that suits so many splats."""
+        """Return the index of the view of an iteration (from 1), and the downscale of its image for `n_splats`."""
         if not self.queue:
             self.queue = self.rng.permutation(len(self.views)).tolist()
         return self.queue.pop(), downscale_for(self.stages, iteration - 1, n_splats, self._pixels)

@@ -77,7 +77,7 @@ def wanted_of(
 
 
 def gradient_of(color: NDArray[np.float64], exposure: NDArray[np.float64], view: View) -> NDArray[np.float64]:
-    """Of the render (H, W, 3)."""
+    """Gradient of the loss with respect to the render (H, W, 3)."""
     v = reference_loss_gradient(*wanted_of(color, exposure, view))
     return (v if view.mask is None else v * view.mask[:, :, None]) @ exposure[:, :3]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,12 +16,15 @@ from clsplat.splats.morton import morton_order
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
-from clsplat.training.initialise import RANDOM_POINTS, initial_splats
+from clsplat.training.initialise import RANDOM_POINTS
+from clsplat.training.initialise import initial_splats as initial_splats_of
 from clsplat.training.presets import PRESETS, preset
+
+initial_splats = partial(initial_splats_of, opacity=0.5, scale_factor=0.1)
 
 
 def scene(n_points: int, extent: float = 2.0) -> Any:
-    """What `initial_splats` reads of a Scene: points, training cameras around (5, 0, 0), extent."""
+    """The parts of a Scene that `initial_splats` reads: points, training cameras around (5, 0, 0), extent."""
     rng = np.random.default_rng(0)
     views = []
     for x in (4.0, 6.0):
@@ -199,8 +203,8 @@ def test_a_scene_before_the_near_plane_is_refused() -> None:
         initial_splats(source)
 
 
-def test_random_points_beside_few() -> None:
-    """A fraction of the cap; of itself a tenth, where the scene has fewer points. In colours of neighbours."""
+def test_random_points_are_added_to_few() -> None:
+    """A fraction of the cap. By default a tenth, if the scene has fewer points. Their colours are the neighbours'."""
     source = scene(60)
     for share, cap, ours, placed in (
         (None, 500, 60, 0),

@@ -1,4 +1,4 @@
-"""Adam for visible splats: equal to dense Adam once settled, NumPy and device alike, whatever reads in between."""
+"""Adam for visible splats equals dense Adam once it is settled, in NumPy and on the device."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ VISIBLE = [
 
 
 def keys(buffers: SplatBuffers, seen: np.ndarray) -> Any:
-    """The depth keys of an image that saw these splats."""
+    """The depth keys of an image in which these splats are visible."""
     buffer = buffers.device.alloc(4 * len(seen))
     to_device(buffers.device, buffer, np.where(seen, 1000, CULLED).astype(np.uint32))
     return buffer
@@ -66,14 +66,14 @@ def step(
     iteration: int,
     sh_degree: int = 2,
 ) -> None:
-    """A step on the gradients of the splats seen, at a falling rate of the positions."""
+    """Make a step with gradients of the visible splats only, at a falling rate of the positions."""
     on_device = CompactGradients(buffers.device, buffers.schema, CAPACITY, buffers.dtype)
     on_device.upload({name: np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), a, 0) for name, a in grads.items()})
     optimizer.step(on_device, MEAN_LR * 0.95**iteration, sh_degree, iteration, keys(buffers, seen))
 
 
 def some_seen(n: int, rng: np.random.Generator) -> np.ndarray:
-    """As a camera sees splats in order: a few stretches of them, with holes; now and then none."""
+    """Visible splats as a camera sees them in Morton order: a few intervals with holes, sometimes none."""
     seen = np.zeros(n, bool)
     for _ in range(rng.integers(0, 3)):
         first = rng.integers(0, n)
@@ -88,7 +88,7 @@ def assert_near(got: dict[str, np.ndarray], wanted: dict[str, np.ndarray], toler
 
 @pytest.mark.parametrize("options", VISIBLE, ids=words)
 def test_lazy_steps_equal_dense_ones(device: Device, options: dict[str, object]) -> None:
-    """All fields of all shapes; read and settled at any time; through growth and shrinking."""
+    """All fields of all shapes, read and settled at any time, with growth and shrinking."""
     config = config_of(**options)
     splats = some_splats(config.shape)
     dense = started(device, config, splats)
@@ -157,7 +157,7 @@ def test_vectors_wake_by_a_splat_or_when_the_tables_end() -> None:
 
 @pytest.mark.parametrize("name", ["fused", "numpy"])
 def test_nothing_waits_longer_than_the_tables_go(devices: list[Device], name: str) -> None:
-    """Then a vector steps unseen: values and moments stay those of dense steps for ever."""
+    """At the maximum age a vector steps without being visible; values and moments stay those of dense steps."""
     config = config_of(shape="gaussian", optimizer=name)
     splats = some_splats("gaussian", 40, 0)
     dense, lazy = started(devices[0], config, splats), started(devices[0], replace(config, visible_adam=True), splats)
@@ -171,7 +171,7 @@ def test_nothing_waits_longer_than_the_tables_go(devices: list[Device], name: st
 
 
 def test_a_state_continues_to_the_same_bits(devices: list[Device]) -> None:
-    """Also what waits, and from one optimizer to the other."""
+    """Skipped steps are part of the state, also from one optimizer to the other."""
     config = config_of(shape="bisected-skew", visible_adam=True)
     rng = np.random.default_rng(3)
     buffers, optimizer = started(devices[0], config, some_splats(config.shape))
@@ -219,7 +219,7 @@ CONFIG = TrainConfig(
 
 @pytest.fixture(scope="module")
 def wide(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, TrainConfig]:
-    """A scene of which each image sees a part, and how to learn it."""
+    """A scene whose images each show a part of it, and a config."""
     scene, splats = synthetic_scene(500, 48, 32, sh_degree=1, n_views=5)
 
     def nearer(view: View) -> View:
@@ -265,7 +265,7 @@ def test_training_steps_what_was_seen_and_settles_before_each_action(
 
 
 def test_actions_leave_splats_in_morton_order(wide: tuple[Scene, TrainConfig], devices: list[Device]) -> None:
-    """After growth: by their places as they were then."""
+    """Also after growth, by the places of that moment."""
     trainer = Trainer(*wide, device=devices[0])
     for _ in range(20):
         trainer.step()

@@ -1,4 +1,4 @@
-"""Optimizers: the fused kernels against NumPy step for step, edits, bounded fields, frozen blocks, state."""
+"""Optimizers: the kernels against NumPy step by step, edits, bounded fields, frozen groups, state."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def some_splats(shape: str, n: int = 300, sh_degree: int = 2) -> Splats:
         if field.bounds is not None:
             values = np.exp(rng.uniform(*np.log(field.bounds), size))
         elif field.limit is not None:
-            # Ten steps do not reach 0 from here, where the cube-root map is steep and rounding is no measure.
+            # Ten steps do not reach 0 from here. At 0 the cube-root map is steep and amplifies rounding.
             length = field.limit * rng.uniform(0.45, 0.95, (n, 1))
             values *= length / np.linalg.norm(values, axis=1, keepdims=True)
         elif field.name == "log_scale":
@@ -173,13 +173,13 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
                 optimizer.apply(edits[iteration](target.download(target.n), np.random.default_rng(iteration)))
         else:
             moved = buffers.download(buffers.n)
-            blocks = {True: "skew" in moved, False: True}
+            learns = {True: "skew" in moved, False: True}
             if config.phases.alternation == "cyclic" and iteration > 2:
                 skew_turn = (iteration - 3) % 3 >= 2
-                blocks = {True: skew_turn, False: not skew_turn}
+                learns = {True: skew_turn, False: not skew_turn}
             for name in moved:
                 turns = name == "skew" and config.skew_map == "coupled"  # moves with the rotation, too
-                assert np.any(moved[name] != start[name]) == (blocks[name == "skew"] or turns), name
+                assert np.any(moved[name] != start[name]) == (learns[name == "skew"] or turns), name
     fused, numpy = (target.download(target.n) for target, _ in both.values())
     for name, expected in numpy.items():
         length = splats.schema[name].limit or 1.0
@@ -192,7 +192,7 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
 
 
 @pytest.mark.parametrize("name", ["fused", "numpy"])
-def test_a_plan_moves_parameters_and_states(devices: list[Device], name: str) -> None:
+def test_an_edit_moves_parameters_and_states(devices: list[Device], name: str) -> None:
     """Parameters equal DensifyEdit.apply, states DensifyEdit.apply_state. s is inverted only if the skew changed."""
     config = config_of(shape="bisected-skew", skew_map="polar", optimizer=name, **SGHMC)
     buffers, optimizer = started(devices[0], config, some_splats(config.shape))
@@ -217,7 +217,7 @@ def test_a_plan_moves_parameters_and_states(devices: list[Device], name: str) ->
 
 
 @pytest.mark.parametrize("name", ["fused", "numpy"])
-def test_a_frozen_block_keeps_values_moments_and_count(devices: list[Device], name: str) -> None:
+def test_a_frozen_group_keeps_values_moments_and_count(devices: list[Device], name: str) -> None:
     config = config_of(
         shape="skew-normal-direct", optimizer=name, alternation="cyclic", alternation_warmup=0, alternation_cycle=4
     )  # two iterations each

@@ -1,1 +1,1 @@
-"""Which splats are added, moved and removed."""
+"""Densification: splats that are added, moved and removed."""

@@ -1,22 +1,22 @@
-"""Adaptive density control of 3DGS (Kerbl et al. 2023), and 3DSGS's depth criterion, edited on the host.
+"""Adaptive density control of 3DGS (Kerbl et al. 2023), and the depth criterion of 3DSGS, as edits made on the host.
 
-Splats whose mean screen gradient is high are cloned (small ones: a copy in the same place) or split in two (large
-ones: both halves are drawn from the Gaussian, and smaller by 1.6); faint ones, and later large ones, are pruned. Large
-is meant in the world: 3DGS's limit on the screen (20 px) has no effect in its released code, nor had it in its
-published numbers (graphdeco-inria/gaussian-splatting#123, #643), and where splats are few it removes most of them.
+Splats with a high mean screen gradient are densified. Small ones are cloned: a copy in the same place. Large ones are
+split: two halves are drawn from the Gaussian, smaller by a factor of 1.6. Faint splats are pruned, after the first
+opacity reset large ones too. Size is measured in the world. The limit of 3DGS on the screen (20 px) has no effect in
+its released code (graphdeco-inria/gaussian-splatting#123, #643). With few splats it would remove most of them.
 
-With a depth threshold (3DSGS, arXiv 2605.18334) a splat is split when either gradient is high, always along its
-longest axis; that paper leaves the two halves open, so here they keep what the parent had:
+With a depth threshold (3DSGS, arXiv 2605.18334) a splat is split if either gradient is high, always along its longest
+axis. The paper does not define the two halves. Here they preserve these properties of the parent:
 
-    place    mean +- s/2 along the axis, s the parent's deviation there
-    scale    s sqrt(3)/2 along the axis: the variance of the pair is the parent's
-    skew     its part across the axis stays; the part along it is halved: a piece of a skewed density is less skewed
-             than the whole, and how the pieces differ is now their own opacities' and colours' business
-    two opacities    a half beyond the plane takes the opacity of that side on both of its sides, as far as the plane
-             faces the axis: the thicknesses are mixed by the square of the axis' component of delta (the plane's
-             unit normal; eta / sqrt(1 + |eta|^2) of a soft plane, which at no skew leaves both as they are)
+    place    mean +- s/2 along the axis, where s is the deviation of the parent along it
+    scale    s sqrt(3)/2 along the axis: the pair has the variance of the parent
+    skew     the part across the axis stays. The part along it is halved: a piece of a skewed density is less skewed
+             than the whole. Their own opacities and colours learn how the halves differ.
+    two opacities    a half on one side of the plane takes the opacity of that side, as far as the plane faces the axis:
+             the optical depths are mixed by the square of the axis' component of delta. delta is the unit normal of
+             the plane, or eta / sqrt(1 + |eta|^2) for a soft plane, which at no skew changes neither opacity.
 
-In the direct form of skew the place is that of the centroid, location + sqrt(2/pi) R S delta.
+In the direct form of skew, the place is that of the centroid, location + sqrt(2/pi) R S delta.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from ...splats.shapes import Shape
 from .edit import DensifyEdit
 
 # 3DGS's constants.
-MIN_OPACITY = 0.005  # below: pruned
+MIN_OPACITY = 0.005  # splats below are pruned
 SPLIT_SHRINK = 1.6
-WORLD_SIZE = 0.1  # of the scene extent; larger: pruned
+WORLD_SIZE = 0.1  # larger splats are pruned, in scene extents
 RESET_OPACITY = 0.01
 
-Rows = NDArray[np.int64]
+Indices = NDArray[np.int64]
 
 
 def plan_adc(
@@ -59,19 +59,19 @@ def plan_adc(
 ) -> DensifyEdit:
     """Clone, split and prune.
 
-    Each clone and each split adds one splat. Where the cap has no room for all, those with the highest gradient
-    (over its threshold) come first. Splats that are not finite are removed. Where the rules would prune all splats,
-    none but those is.
+    Each clone and each split adds one splat. If the cap has no room for all, those with the highest gradient (over its
+    threshold) come first. Splats that are not finite are removed. If the rules would prune all splats, only those are
+    removed.
 
     Parameters
     ----------
     arrays : all public arrays of the model.
-    stats : (at least 3, N), see cl/render/project.cl: sums of the screen and the depth gradient, times seen.
-    rng : advanced by three normals for each half that is drawn.
-    cap : most splats after growth; more than that are kept, not removed.
-    extent : of the scene [world units].
-    grad_threshold : of the mean screen gradient. depth_threshold : of the mean depth gradient
-        times the extent; 0: not looked at.
+    stats : (3, N) densification statistics (SplatStatistics): sums of the screen and the depth gradient, and counts.
+    rng : generator; three normals are drawn for each half.
+    cap : largest number of splats after growth. A larger number of splats is kept.
+    extent : extent of the scene [world units].
+    grad_threshold : threshold of the mean screen gradient.
+    depth_threshold : threshold of the mean depth gradient times the extent; 0: not used.
     dense_size : splats larger than this fraction of the extent are split, others cloned.
     prune_large : whether splats larger than WORLD_SIZE are pruned.
 
@@ -113,7 +113,7 @@ def plan_adc(
 
 
 def with_reset(edit: DensifyEdit, arrays: Mapping[str, Array], shape: Shape) -> DensifyEdit:
-    """The edit, then 3DGS's opacity reset: |opacity| at most RESET_OPACITY, and its optimizer state zero."""
+    """Return the edit with 3DGS's opacity reset: |opacity| at most RESET_OPACITY, and its optimizer state zero."""
     names = opacity_names(arrays)
     after = {name: edit.values.get(name, arrays[name][edit.source]) for name in names}
     low = {
@@ -126,7 +126,7 @@ def with_reset(edit: DensifyEdit, arrays: Mapping[str, Array], shape: Shape) -> 
 
 
 def _score(stats: Array, grad_threshold: float, depth_threshold: float, extent: float) -> DoubleArray:
-    """(N,) mean gradient over its threshold, the higher of the two; 0 where it is not finite."""
+    """Return the larger of both mean gradients over their thresholds, (N,); 0 if it is not finite."""
     seen = np.maximum(stats[2].astype(np.float64), 1.0)
     tiny = np.finfo(np.float64).tiny
     score: DoubleArray = stats[0] / seen / max(grad_threshold, tiny)
@@ -137,8 +137,8 @@ def _score(stats: Array, grad_threshold: float, depth_threshold: float, extent: 
 
 def _best(
     score: DoubleArray, splits: NDArray[np.bool_], clones: NDArray[np.bool_], keep: NDArray[np.bool_], cap: int
-) -> tuple[Rows, Rows]:
-    """Rows to split and rows to clone, rising, for which there is room."""
+) -> tuple[Indices, Indices]:
+    """Return the rows to split and the rows to clone that the cap has room for, in rising order."""
     rows = np.flatnonzero(splits | clones)
     rows = rows[np.argsort(-score[rows], kind="stable")]
     cost = np.cumsum(np.where(keep[rows], 1, 2))  # a split saves a splat that would be pruned for its size
@@ -147,13 +147,13 @@ def _best(
 
 
 def _drawn_halves(parents: Mapping[str, Array], shape: Shape, rng: np.random.Generator) -> dict[str, Array]:
-    """3DGS: places drawn from the parents' Gaussians, scales over 1.6. The fields that change, of each half."""
+    """Return the changed fields of halves as in 3DGS: places drawn from the parents' Gaussians, smaller scales."""
     shift = rng.standard_normal(parents["mean"].shape)
     return _placed(parents, shape, shift, {"log_scale": parents["log_scale"] - math.log(SPLIT_SHRINK)})
 
 
 def _halves_along_axis(parents: Mapping[str, Array], shape: Shape) -> dict[str, Array]:
-    """3DSGS, as the head of the file says; the first half of the rows lies at +s/2, the second at -s/2."""
+    """Return the changed fields of halves as in 3DSGS; the first half of the rows is at +s/2, the second at -s/2."""
     n = len(parents["mean"])
     row, axis = np.arange(n), parents["log_scale"].argmax(axis=1)
     side = np.where(row < n // 2, 1.0, -1.0)
@@ -169,15 +169,15 @@ def _halves_along_axis(parents: Mapping[str, Array], shape: Shape) -> dict[str, 
         delta = _delta(parents)[row, axis]
         thick = [optical_depth(shape, parents[name]) for name in names]
         beyond = np.where(side * delta > 0, thick[0], thick[1])
-        for name, own in zip(names, thick, strict=True):
-            changed[name] = raw_of_optical_depth(shape, own + delta**2 * (beyond - own), parents[name])
+        for name, depth in zip(names, thick, strict=True):
+            changed[name] = raw_of_optical_depth(shape, depth + delta**2 * (beyond - depth), parents[name])
     return _placed(parents, shape, shift, changed)
 
 
 def _placed(
     parents: Mapping[str, Array], shape: Shape, shift: DoubleArray, changed: dict[str, Array]
 ) -> dict[str, Array]:
-    """`changed` and the means: centroids move by `shift`, in the parents' deviations along their own axes."""
+    """Return `changed` with the means. Centroids move by `shift`, in deviations along the axes of the parents."""
     old, new = (np.exp(of["log_scale"].astype(np.float64)) for of in (parents, changed))
     step = old * (shift + _centroid(parents, shape)) - new * _centroid({**parents, **changed}, shape)
     step = np.einsum("nij,nj->ni", rotations(parents["quat"].astype(np.float64)), step)
@@ -185,7 +185,7 @@ def _placed(
 
 
 def _delta(arrays: Mapping[str, Array]) -> DoubleArray:
-    """(N, 3) delta of the direct form in the splat's own frame: of a slant, or of a plane's normal."""
+    """Return delta of the direct form in the frame of the splat, (N, 3), from a slant or from a plane's normal."""
     if "normal" in arrays:
         normal = arrays["normal"].astype(np.float64)
         unit: DoubleArray = normal / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -196,9 +196,9 @@ def _delta(arrays: Mapping[str, Array]) -> DoubleArray:
 
 
 def _centroid(arrays: Mapping[str, Array], shape: Shape) -> DoubleArray:
-    """(N, 3) from the stored position to the centroid, in deviations along the splat's own axes.
+    """Return the vector from the stored position to the centroid, (N, 3), in deviations along the axes of the splat.
 
-    Of two opacities the halves on either side of a plane are placed about the plane, not about the centroid.
+    With two opacities, the halves on both sides of the plane are placed relative to the plane, not to the centroid.
     """
     if shape.skew_form != "direct" or len(opacity_names(arrays)) == 2:
         return np.zeros((len(arrays["mean"]), 3))

@@ -1,4 +1,4 @@
-"""What becomes of each splat when a strategy acts: made on the host, applied by the optimizers."""
+"""Densification edits: a strategy makes them on the host, an optimizer applies them."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ...splats.fields import Array
 
 @dataclass(frozen=True, slots=True)
 class DensifyEdit:
-    """The splats after an action, as a gather of the old ones and new values of some fields.
+    """The splats after a densification: a gather of the old ones, and new values of some fields.
 
     Attributes
     ----------
-    source : (N_new,) int64, the old row whose parameters each new row copies.
-    values : by field, what replaces the copies: public arrays of N_new splats.
-    fresh : (N_new,) bool, rows whose optimizer state (moments, momentum) becomes zero.
-    state_source : (N_new,) int64, the old row whose optimizer state each new row takes over before that; None:
-        the state stays in its row, and rows beyond the old count start at zero.
-    reset_fields : fields whose state becomes zero in all rows.
-    relocated, added, removed : counts, for the log.
+    source : (N_new,) int64, the old row that each new row copies.
+    values : by field, public arrays of N_new splats that replace the copies.
+    fresh : (N_new,) bool, the rows whose optimizer state (moments, momentum) becomes zero.
+    state_source : (N_new,) int64, the old row whose optimizer state each new row copies before that. None: the state
+        stays in its row, and additional rows start at zero.
+    reset_fields : fields whose optimizer state becomes zero in all rows.
+    relocated, added, removed : numbers of splats.
     """
 
     source: NDArray[np.int64]
@@ -36,7 +36,13 @@ class DensifyEdit:
     removed: int = 0
 
     def permuted(self, order: NDArray[np.int64], n_old: int) -> DensifyEdit:
-        """The same splats in another order: `order` holds the edit's rows. n_old : splats before the edit."""
+        """Return the same splats in another order.
+
+        Parameters
+        ----------
+        order : rows of the edit.
+        n_old : number of splats before the edit.
+        """
         states, fresh = self.state_source, self.fresh
         if states is None:
             rows = np.arange(len(self.source))
@@ -45,14 +51,14 @@ class DensifyEdit:
         return replace(self, source=self.source[order], values=values, fresh=fresh[order], state_source=states[order])
 
     def apply(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
-        """The parameters after the edit (copies); the device's gather must do the same."""
+        """Return copies of the parameters after the edit; the gather on the device must do the same."""
         moved = {name: array[self.source] for name, array in arrays.items()}
         for name, values in self.values.items():
             moved[name] = values.astype(arrays[name].dtype)
         return moved
 
     def apply_state(self, state: Array, name: str) -> Array:
-        """Optimizer state (N, ...) of one field after the edit (a copy)."""
+        """Return a copy of the optimizer state (N, ...) of one field after the edit."""
         n, n_new = len(state), len(self.source)
         if self.state_source is not None:
             moved = state[self.state_source]

@@ -1,16 +1,15 @@
-"""Relocation and growth of 3DGS-MCMC (Kheradmand et al. 2024), for any shape, edited on the host.
+"""Relocation and growth of 3DGS-MCMC (Kheradmand et al. 2024) for every shape, as edits made on the host.
 
-A live splat of opacity o that is joined by copies of itself, N in all, becomes N splats of opacity o' and
-another scale, such that along a line through it the stack absorbs as much as the one did. With g the profile of the
-kernel (profiles.py):
+A splat of opacity o is replaced by N copies of itself, of opacity o' and another scale. Along a line through it, the
+stack of copies absorbs as much as the one splat did. With g the profile of the kernel (splats/profiles.py):
 
     1 - (1 - o')^N = o
     length factor = integral of o g  /  integral of 1 - (1 - o' g)^N
 
-Both integrals are numerical, which holds for every profile. For the Gaussian this is the published double sum. It
-is a factor on *lengths* (ubc-vision/3dgs-mcmc#37); Student splatting squares it, which is the rule "length-squared".
-Of a splat with two opacities each becomes o', and the line crosses the plane between them. Of a negative opacity
-(Student splatting's scooping) all this holds for |o|, and the sign stays.
+Both integrals are numerical, so they hold for every profile. For the Gaussian this is the published double sum. The
+factor applies to lengths (ubc-vision/3dgs-mcmc#37). Student splatting squares it: the rule "length-squared". If a splat
+has two opacities, each becomes its own o', and the line crosses the plane between them. For negative opacities
+(the scooping of Student splatting) the formula applies to |o|, and the sign stays.
 """
 
 from __future__ import annotations
@@ -30,21 +29,20 @@ from ..methods import sss
 from .edit import DensifyEdit
 
 # 3DGS-MCMC's constants.
-MIN_OPACITY = 0.005  # at or below: dead, relocated
-GROWTH = 1.05  # per call
-N_MAX = 51  # copies are counted up to this
+MIN_OPACITY = 0.005  # splats at or below are dead: they are relocated
+GROWTH = 1.05  # factor per call
+N_MAX = 51  # larger numbers of copies count as this
 
 # Power of the length factor by which scales are multiplied. "opacity-only" is the rule of Deformable Beta Splatting.
 RULES = {"length": 1.0, "length-squared": sss.RELOCATION_POWER, "opacity-only": 0.0}
 
-# Nodes on each side of 0 at z = _KNEE sinh(asinh(_FARTHEST / _KNEE) u^3), u the midpoints of equal cells. A step or a
-# cusp at 0 does no harm: each side is smooth in u, and the cube brings the nodes to the cusp of
-# exp(-|z|^beta), beta < 1. Against adaptive quadrature: 1e-13 for Gaussian profiles, 1e-7 for Student's t at nu = 1
-# (of the tail beyond _FARTHEST), 1e-5 for beta = 8 and opacities up to 0.9999.
+# The nodes on each side of 0 are z = _KNEE sinh(asinh(_FARTHEST / _KNEE) u^3), with u the midpoints of equal cells. A
+# step or a cusp at 0 causes no error, because each side is smooth in u. The cube places nodes close to the cusp of
+# exp(-|z|^beta), beta < 1. tests/training/test_relocation.py compares the integrals with adaptive quadrature.
 _NODES = 96
 _KNEE = 3.0
 _FARTHEST = 4e3
-_CHUNK = 2048  # splats integrated at once: some MB of work space
+_CHUNK = 2048  # splats that are integrated at once; they need some megabytes
 
 
 def plan_relocation(
@@ -61,19 +59,19 @@ def plan_relocation(
     """Move dead splats onto live ones and grow towards the cap.
 
     Splats with a parameter that is not finite are relocated like dead ones. All copies are drawn at once, with
-    replacement, in proportion to strength (the larger |opacity|). The edit depends on nothing but the arguments and
-    the generator's state. Where no splat is alive, nothing grows and the dead stay.
+    replacement, in proportion to strength (the larger |opacity|). The edit depends only on the arguments and the state
+    of the generator. If no splat is alive, the number does not grow and dead splats stay.
 
     Parameters
     ----------
     arrays : all public arrays of the model.
-    rng : advanced by one draw per copy.
-    cap : most splats that growth may reach; more than that are kept, not removed.
+    rng : generator; one number is drawn for each copy.
+    cap : largest number of splats after growth. A larger number of splats is kept.
     growth : new count over old count, at least 1.
-    min_opacity : splats at or below are dead; floor of the new opacities (of the larger one of two).
-    rule : "length" (opacity and scale, above), "length-squared" (Student splatting as released), or "opacity-only"
-        (scale kept; Deformable Beta Splatting).
-    limit : most dead splats relocated, as a fraction of all: the weakest. Those not finite are relocated in any case.
+    min_opacity : splats at or below are dead. It is also the minimum of new opacities (of the larger of two).
+    rule : "length" (opacity and scale, as above), "length-squared" (Student splatting as released), or "opacity-only"
+        (the scale does not change; Deformable Beta Splatting).
+    limit : largest number of relocated dead splats, the weakest, as a fraction of all. Non-finite splats always move.
 
     Raises
     ------
@@ -130,12 +128,12 @@ def plan_relocation(
 def relocation(
     shape: Shape, arrays: Mapping[str, Array], ratio: NDArray[np.integer], min_opacity: float = 0.0
 ) -> tuple[dict[str, DoubleArray], DoubleArray]:
-    """What each of `ratio` equal splats has that replace one.
+    """Return opacities and length factor of the copies if `ratio` equal splats replace one.
 
     Parameters
     ----------
     arrays : public arrays of N splats. ratio : (N,) at least 1, counted up to N_MAX.
-    min_opacity : floor of the new |opacity|, of the larger one where there are two (their ratio stays).
+    min_opacity : minimum of the new |opacity|; of the larger one of two, whose ratio stays.
 
     Returns
     -------
@@ -163,12 +161,12 @@ def _length_factor(
     new_opacity: DoubleArray,
     count: NDArray[np.integer],
 ) -> DoubleArray:
-    """Integral of the one over integral of the stack; opacities are (N, S)."""
+    """Return the integral of one splat over the integral of the stack; opacities are (N, S)."""
     z, weight = _nodes()
     profile = shape.profile(z, arrays)  # (N, S, K)
     one = np.einsum("nsk,ns,k->n", profile, opacity, weight)
     alpha = np.minimum(np.einsum("nsk,ns->nk", profile, new_opacity), 1.0)
-    with np.errstate(divide="ignore"):  # alpha = 1 of an opaque splat: the stack is opaque too
+    with np.errstate(divide="ignore"):  # alpha = 1: an opaque splat has an opaque stack
         stack = -np.expm1(count[:, None] * np.log1p(-alpha)) @ weight
     factor: DoubleArray = one / np.maximum(stack, 1e-300)
     return np.where(count > 1, factor, 1.0)
@@ -176,7 +174,7 @@ def _length_factor(
 
 @lru_cache(maxsize=1)
 def _nodes() -> tuple[DoubleArray, DoubleArray]:
-    """Nodes and weights of integrals over a line, (2 _NODES,) each, symmetric about 0."""
+    """Return the nodes and weights of integrals over a line, (2 _NODES,) each, symmetric about 0."""
     u = (np.arange(_NODES) + 0.5) / _NODES
     reach = math.asinh(_FARTHEST / _KNEE)
     z = _KNEE * np.sinh(reach * u**3)
@@ -188,7 +186,7 @@ def _nodes() -> tuple[DoubleArray, DoubleArray]:
 
 
 def _draw(weights: DoubleArray, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """`count` indices in proportion to `weights` (at least 0, not all 0), with replacement."""
+    """Draw `count` indices in proportion to `weights` (at least 0, not all 0), with replacement."""
     if count == 0:
         return np.zeros(0, np.int64)
     cumulative = np.cumsum(weights)

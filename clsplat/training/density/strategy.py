@@ -1,4 +1,4 @@
-"""What a run's strategy does to the splats at one of its actions: from the options to an edit."""
+"""Densification strategies: from the options of a run to the edit of one densification."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ from .adc import plan_adc, with_reset
 from .edit import DensifyEdit
 from .relocation import plan_relocation
 
-# Opacities are reset this many iterations apart at least, and not earlier, however short the run: their rate does not
-# grow in short runs. A reset at 500 of 1000 iterations cost 1 dB (half-Gaussians on 400 px photos).
+# Minimum interval of opacity resets, also in short runs. The rate of opacities does not grow in short runs, so they
+# need this many iterations to recover.
 RESET_INTERVAL_MIN = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class StepInfo:
-    """Where a run stands when its strategy acts.
+    """The iteration of a densification.
 
     Parameters
     ----------
-    iteration : from 1. last : the last one at which the strategy may act.
-    growth : new count over old count of "mcmc". extent : of the scene [world units].
+    iteration : counts from 1.
+    last : last iteration at which the strategy may densify.
+    growth : factor of the number of splats ("mcmc").
+    extent : extent of the scene [world units].
     """
 
     iteration: int
@@ -39,12 +41,13 @@ class StepInfo:
 def next_edit(
     config: TrainConfig, arrays: Mapping[str, Array], stats: Array, rng: np.random.Generator, info: StepInfo
 ) -> DensifyEdit:
-    """The edit of one action.
+    """Return the edit of one densification.
 
     Parameters
     ----------
-    arrays : all public arrays of the model. stats : (3, N), collected since the last action (cl/render/project.cl).
-    rng : of the run; the edit depends on nothing else that is random.
+    arrays : all public arrays of the model.
+    stats : (3, N) densification statistics since the last densification (SplatStatistics).
+    rng : generator of the run, the only source of randomness.
 
     Raises
     ------
@@ -52,7 +55,7 @@ def next_edit(
     """
     shape, density = shape_named(config.shape), config.density
     if isinstance(density, Mcmc):
-        # The profile has peak 1; without that the length factor would be another one for each view.
+        # The length factor needs a profile with peak 1. Other normalisations change the peak with the view.
         scaled = config.normalisation == "peak" or not shape.normalised
         return plan_relocation(
             arrays,
@@ -80,14 +83,15 @@ def next_edit(
 
 
 def reset_interval(density: Adc, iterations: int) -> int:
-    """Iterations from one opacity reset to the next; 0: there is none."""
+    """Return the iterations from one opacity reset to the next; 0: no resets."""
     return density.opacity_reset and max(iterations // density.opacity_reset, RESET_INTERVAL_MIN)
 
 
 def resets(density: Adc, iterations: int, info: StepInfo) -> bool:
-    """Whether the action resets opacities: the first at or after a multiple of the interval, but not the last.
+    """Whether this densification resets opacities: the first one at or after a multiple of the interval.
 
-    3DGS: at 3000, 6000, 9000 and 12 000 of 30 000 iterations, of which 15 000 densify.
+    The last densification does not. 3DGS resets at 3000, 6000, 9000 and 12 000 of 30 000 iterations, and densifies
+    until 15 000.
     """
     every = reset_interval(density, iterations)
     if not every or info.iteration >= info.last:

@@ -1,1 +1,1 @@
-"""How parameters move."""
+"""Optimizers: Adam on the device and in NumPy, SGHMC, skew maps, regularisers and noise."""

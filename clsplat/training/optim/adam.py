@@ -1,7 +1,7 @@
-"""Adam in NumPy: the reference that the fused device step is compared with, and the one to read.
+"""Adam in NumPy: the reference of the kernels.
 
-Kingma & Ba 2015 with 3DGS's constants. The step count is one for all splats, as in 3DGS: relocated splats get
-zero moments but no fresh bias correction.
+Kingma & Ba 2015 with the constants of 3DGS. All splats share one step count, as in 3DGS: relocated splats get moments
+of zero, but their bias correction does not restart.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...splats.fields import Array
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15  # 3DGS
-WAITS = 256  # one more than the steps that a splat may sit out (optim_lazy.py)
+WAITS = 256  # one more than the largest number of skipped steps (optim/lazy.py)
 
 
 class NumpyAdam:
@@ -23,12 +23,12 @@ class NumpyAdam:
 
     Parameters
     ----------
-    params : the arrays to come, for the shapes and dtypes of their moments.
+    params : arrays with the shapes and dtypes of the parameters.
 
     Attributes
     ----------
-    step_count : steps taken.
-    first, second : name to first and second moments.
+    step_count : number of steps.
+    first, second : first and second moments by name.
     """
 
     def __init__(
@@ -40,19 +40,19 @@ class NumpyAdam:
         self.second = {name: np.zeros_like(param) for name, param in params.items()}
 
     def advance(self) -> None:
-        """Begin a step: the bias corrections follow the count."""
+        """Begin a step; the bias corrections depend on the count."""
         self.step_count += 1
 
     def direction(self, name: str, grad: Array, rows: slice | NDArray[np.int64] = slice(None)) -> Array:
-        """Take a gradient of some splats, `rows`, into the moments of `name`.
+        """Update the moments of `name` with a gradient of the splats `rows`.
 
         Returns
         -------
-        Their bias-corrected direction, to be scaled by a rate.
+        Bias-corrected direction; the caller multiplies it by a rate.
 
         Raises
         ------
-        KeyError : no such name. ValueError : the gradient has another shape than the parameter.
+        KeyError : unknown name. ValueError : the shape of the gradient is not that of the parameter.
         """
         m, v = self.first[name][rows], self.second[name][rows]
         if grad.shape != m.shape:
@@ -72,8 +72,8 @@ class NumpyAdam:
 
         Parameters
         ----------
-        params, grads : name to array; every parameter needs a gradient of its shape.
-        lrs : name to rate, a number or anything that broadcasts over the parameter.
+        params, grads : arrays by name; every parameter needs a gradient of its shape.
+        lrs : rates by name; a rate broadcasts over the parameter.
         """
         self.advance()
         for name, param in params.items():

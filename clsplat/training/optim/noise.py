@@ -1,8 +1,8 @@
 """The exploration noise of 3DGS-MCMC, with random numbers that a kernel can repeat (cl/math/noise.clh).
 
-Random integers come from Philox4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): a
-pure function of (seed, iteration, splat), so order, device and thread count do not matter. The uniforms made
-of them are exact in float32; only log, sqrt and sin/cos may differ by some ulp between devices.
+Random integers come from Philox4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), a pure
+function of (seed, iteration, splat). So order, device and thread count do not change them. The uniform numbers are
+exact in float32. Only log, sqrt and sin/cos may differ by some ulp between devices.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ _WEYL = (0x9E3779B9, 0xBB67AE85)  # added to the key after each round: golden ra
 _ROUNDS = 10
 _MASK = 0xFFFFFFFF
 
-# 3DGS-MCMC (ubc-vision/3dgs-mcmc): sigmoid(100 ((1 - o) - 0.995)) = sigmoid(0.5 - 100 o): only splats that
-# are nearly transparent are moved.
+# 3DGS-MCMC (ubc-vision/3dgs-mcmc): sigmoid(100 ((1 - o) - 0.995)) = sigmoid(0.5 - 100 o). Only nearly transparent
+# splats move.
 GATE_SHARPNESS = 100.0
 GATE_OFFSET = 0.5
-# Extent of the scenes that the constants of 3DGS-MCMC and SSS belong to [world units].
+# Extent of the scenes for which 3DGS-MCMC and SSS publish their constants [world units].
 PUBLISHED_EXTENT = 7.45176
 
 
 def philox4x32(counter: FourWords, key: tuple[int, int]) -> FourWords:
-    """Philox4x32-10: four random words for every counter.
+    """Return four random words for every counter, by Philox4x32-10.
 
     Parameters
     ----------
-    counter : four uint32 arrays that broadcast together, least significant word first.
+    counter : four uint32 arrays that broadcast, least significant word first.
     key : two 32-bit integers.
     """
     c0, c1, c2, c3 = (np.asarray(word, np.uint32) for word in counter)
@@ -50,16 +50,16 @@ def philox4x32(counter: FourWords, key: tuple[int, int]) -> FourWords:
 
 
 def normal3(seed: int, iteration: int, n: int, stream: int = 0) -> NDArray[np.float32]:
-    """Three independent standard normals for each of `n` splats, (n, 3).
+    """Return three independent standard normals for each of `n` splats, (n, 3).
 
-    Key (seed low, seed high), counter (index, iteration, stream, 0); words 0, 1 give components 0, 1 and words
-    2, 3 component 2 (the second of that pair is not used), by Box-Muller:
-    radius sqrt(-2 ln uniform(word a)), angle 2 pi uniform(word b). |normal| < 5.8.
+    The key is (seed low, seed high), the counter (index, iteration, stream, 0). By Box-Muller, words 0 and 1 give
+    components 0 and 1, and words 2 and 3 give component 2; the second number of that pair is not used. The radius is
+    sqrt(-2 ln uniform(word a)), the angle 2 pi uniform(word b). |normal| < 5.8.
 
     Parameters
     ----------
     seed : 0 <= seed < 2^64. iteration : 0 <= iteration < 2^32.
-    stream : users of noise in one iteration have one each: 0 this module's, 1 sghmc.py's.
+    stream : independent numbers for each use in an iteration: 0 for this noise, 1 for SGHMC (sghmc.py).
     """
     index = np.arange(n, dtype=np.uint32)
     rest = [np.asarray(word, np.uint32) for word in (iteration, stream, 0)]
@@ -72,27 +72,27 @@ def normal3(seed: int, iteration: int, n: int, stream: int = 0) -> NDArray[np.fl
 
 
 def noise_amount(noise_lr: float, mean_lr: float, extent: float) -> float:
-    """What the noise is multiplied by, from its rate and the positions' (which has the extent in it).
+    """Return the factor of the noise, from its rate and the rate of positions (which includes the extent).
 
-    As published, rate times rate, it grows with the covariance: as the extent's third power, so in large units splats
-    would leave the scene. Beyond PUBLISHED_EXTENT it grows with the extent alone.
+    The published product of both rates and the covariance grows with the third power of the extent. In large units,
+    splats would leave the scene. So the displacement grows with the extent alone above PUBLISHED_EXTENT.
     """
     return noise_lr * mean_lr * min(PUBLISHED_EXTENT / extent, 1.0) ** 2
 
 
 def noise_reach(extent: float) -> float:
-    """The farthest that noise moves a splat in one step [world units]."""
+    """Return the largest distance that noise moves a splat in one step [world units]."""
     return 0.1 * extent
 
 
 def noise_gate(strength: Array) -> NDArray[np.float64]:
-    """How much of the noise a splat takes, (N,), by its largest |opacity|: .62 at 0, .5 at .005, .01 at .05."""
+    """Return the factor of the noise by the largest |opacity| of a splat, (N,): .62 at 0, .5 at .005, .01 at .05."""
     gate: NDArray[np.float64] = 1.0 / (1.0 + np.exp(GATE_SHARPNESS * strength.astype(np.float64) - GATE_OFFSET))
     return gate
 
 
 def covariance_times(quat: Array, log_scale: Array, vector: Array) -> NDArray[np.float64]:
-    """Sigma v of (N, 3) vectors, Sigma = R S S R'."""
+    """Return Sigma v for (N, 3) vectors, with Sigma = R S S R'."""
     rotation = rotations(quat.astype(np.float64))
     in_frame = np.einsum("nji,nj->ni", rotation, vector) * np.exp(2.0 * log_scale.astype(np.float64))
     product: NDArray[np.float64] = np.einsum("nij,nj->ni", rotation, in_frame)
@@ -100,10 +100,10 @@ def covariance_times(quat: Array, log_scale: Array, vector: Array) -> NDArray[np
 
 
 def _halves(product: NDArray[np.uint64]) -> tuple[Words, Words]:
-    """High and low 32 bits."""
+    """Return the high and the low 32 bits."""
     return (product >> np.uint64(32)).astype(np.uint32), product.astype(np.uint32)
 
 
 def _uniform(words: Words) -> NDArray[np.float64]:
-    """The top 23 bits at the centre of their interval: in (0, 1), exact in float32."""
+    """Return the top 23 bits as the centre of their interval in (0, 1), exact in float32."""
     return ((words >> np.uint32(9)).astype(np.float64) + 0.5) * 2.0**-23

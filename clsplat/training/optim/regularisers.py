@@ -1,4 +1,4 @@
-"""Penalties on opacities and scales in NumPy; the fused form is in cl/train/optim.cl."""
+"""Penalties on opacities and scales in NumPy; the kernel is in cl/train/optim.cl."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ...splats.shapes import Shape
 class Penalty(NamedTuple):
     """opacity * sum(|o|) + scale * sum(scales) (3DGS-MCMC's regularisers) + bisect * sum((o_plus - o_minus)^2) (3DSGS).
 
-    Of a splat with two opacities the mean of both counts as |o|.
+    If a splat has two opacities, |o| is their mean.
     """
 
     opacity: float
@@ -23,12 +23,12 @@ class Penalty(NamedTuple):
     bisect: float
 
     def gradients(self, shape: Shape, params: Mapping[str, Array]) -> dict[str, Array]:
-        """Of the raw opacities and the log scales, by field."""
+        """Return the gradients of the raw opacities and of the log scales, by field."""
         names = opacity_names(params)
         sides = [shape.opacity(params[name]) for name in names]
         gap = 2 * self.bisect * (sides[0] - sides[-1])
         grads: dict[str, Array] = {"log_scale": self.scale * np.exp(params["log_scale"])}
-        for name, o, pull in zip(names, sides, (gap, -gap), strict=False):  # one side has no gap
+        for name, o, v_gap in zip(names, sides, (gap, -gap), strict=False):  # the gap of one opacity is 0
             slope = 1 - o * o if shape.signed else o * (1 - o)
-            grads[name] = (self.opacity / len(sides) * np.sign(o) + pull) * slope
+            grads[name] = (self.opacity / len(sides) * np.sign(o) + v_gap) * slope
         return grads

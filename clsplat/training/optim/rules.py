@@ -112,20 +112,20 @@ class Rules:
         return ParameterGroups(base, skew and self.map is not None)
 
     def base_fields(self, schema: Schema) -> tuple[Field, ...]:
-        """All fields but the skew: the base block."""
+        """Return all fields but the skew."""
         return tuple(field for field in schema if field.name != "skew")
 
     @property
     def geometry_waits(self) -> bool:
-        """Whether with `visible_adam` geometry waits as colour does: nothing else moves splats, or looks at them."""
+        """Whether `visible_adam` skips steps of the geometry too: without regularisers, noise and SGHMC."""
         config = self.config
         pulled = config.density.opacity_reg or config.density.scale_reg or config.loss.bisect_reg
         return not (pulled or config.density.noise_lr or self.sghmc)
 
     def check_state(self, state: Mapping[str, NDArray[Any]], schema: Schema) -> None:
-        """Raises InputError naming an entry that an optimizer's state lacks, or has and should not."""
-        wanted = {"steps"} | {f"{role}.{name}" for role in ("first", "second") for name in schema.names}
-        wanted |= ({"skew_s"} if self.map else set()) | ({"momentum"} if self.sghmc else set())
-        wanted |= {"waiting.last", "waiting.drifts"} if self.config.optim.visible_adam else set()
-        if odd := sorted(wanted ^ set(state)):
+        """Raise InputError if an entry of an optimizer state is missing or unknown."""
+        expected = {"steps"} | {f"{role}.{name}" for role in ("first", "second") for name in schema.names}
+        expected |= ({"skew_s"} if self.map else set()) | ({"momentum"} if self.sghmc else set())
+        expected |= {"waiting.last", "waiting.drifts"} if self.config.optim.visible_adam else set()
+        if odd := sorted(expected ^ set(state)):
             raise InputError(f"optimizer state: missing or unknown entry {odd[0]!r}: start without --resume")

@@ -1,19 +1,19 @@
-"""From a splat's trainable skew s to the kernel's bounded vector, and back.
+"""Maps from the trainable skew s of a splat to the bounded vector of the kernel, and back.
 
-Kernels and files know only the vector: m in the centred form, the slant eta in the direct one (see shapes.py).
-r = |s|, n = s / r:
+Kernels and files hold only the vector: m in the centred form, the slant eta in the direct form (splats/shapes.py).
+With r = |s| and n = s / r:
 
     cube-root   m = n SKEW_MAX tanh(r)^(1/3)                  the skewness index is cubic in |m|: linear in r near 0
     polar       eta = u/|u| SLANT_MAX tanh(rho / SLANT_MAX)   s = (rho, u): a magnitude and a free direction
     coupled     eta = R' a, a = n SLANT_MAX tanh(r / SLANT_MAX)
 
-"polar" follows 3D Skew-Normal Splatting (2026), where the magnitude's activation is not published. "coupled" is the
-textbook form that it improves upon: a slant a in the world's frame with Omega^(1/2) = R S R', which turns and
-deforms with rotation and scale; its chain rule also adds to the rotation's gradient.
+"polar" follows 3D Skew-Normal Splatting (SNS, 2026), which does not give the activation of the magnitude. "coupled" is
+the textbook form that SNS improves: a slant a in the world's frame with Omega^(1/2) = R S R'. It turns and deforms with
+rotation and scale, so its chain rule also adds to the gradient of the rotation.
 
-At s = 0 the cube root's slope is infinite, and u = 0 has no direction, so lengths are floored at R_FLOOR inside
-the factors: below it the map is linear, and every gradient is finite. m = 0 is a stationary point of the kernel (which
-changes by the third order in m): training must start from a small m of random direction, see initialise.py.
+The slope of the cube root is infinite at s = 0, and u = 0 has no direction. So the factors use lengths of at least
+R_FLOOR: below it the map is linear, and every gradient is finite. m = 0 is a stationary point of the kernel, because
+its change is of third order in m. So training starts from a small m of random direction (training/initialise.py).
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from ...splats.fields import Array
 from ...splats.quaternions import rotations, rotations_vjp
 from ...splats.shapes import SKEW_MAX, SLANT_MAX
 
-# By the form of the skew (shapes.Shape.skew_form); the first is its default.
+# Maps by form of the skew (Shape.skew_form). The first map is the default.
 MAPS = {"centred": ("cube-root",), "direct": ("polar", "coupled")}
 SKEW_MAPS = tuple(name for names in MAPS.values() for name in names)
 R_FLOOR = 1e-6  # skew_map.clh has the same constant
-R_CEILING = 20.0  # cosh(r)^2 stays in float32's range; tanh is 1 long before
-TANH_CEILING = 1.0 - 1e-4  # inverse: keeps s where the map still has a slope
+R_CEILING = 20.0  # cosh(r)^2 stays in the range of float32; tanh is 1 there
+TANH_CEILING = 1.0 - 1e-4  # bound of the inverse, so that the map has a slope at s
 
 _F = TypeVar("_F", np.float32, np.float64)
 
 
 def map_named(name: str, form: str | None) -> str:
-    """`name`, or for "auto" the default map of a form of skew; "" where there is no skew."""
+    """Return `name`, or the default map of the form for "auto". Shapes without a skew (form None) give ""."""
     if form is None:
         return ""
     return MAPS[form][0] if name == "auto" else name
 
 
 def check_map(name: str, form: str | None) -> None:
-    """Raises InputError unless `name` is "auto" or a map of the form (any map where there is no skew)."""
+    """Raise InputError unless `name` is "auto" or a map of the form. form : None allows every map."""
     known = SKEW_MAPS if form is None else MAPS[form]
     if name != "auto" and name not in known:
         kind = "" if form is None else f" for the {form} form of skew"
@@ -59,8 +59,8 @@ def check_map(name: str, form: str | None) -> None:
 class SkewMap:
     """One parameterisation of the skew.
 
-    Arrays are s (N, width), skew and its gradient (N, 3), quat (N, 4) of any norm above 0; all float32 or all
-    float64, and the dtype is kept. Only "coupled" looks at the rotation.
+    Arrays are s (N, width), skew and its gradient (N, 3), quat (N, 4) of any norm above 0. All are float32 or all are
+    float64, and so is the result. Only "coupled" depends on the rotation.
 
     Parameters
     ----------
@@ -89,11 +89,11 @@ class SkewMap:
 
     @property
     def limit(self) -> float:
-        """What the length of the skew stays below."""
+        """Upper bound of the length of the skew."""
         return SKEW_MAX if self.name in MAPS["centred"] else SLANT_MAX
 
     def forward(self, s: NDArray[_F], quat: NDArray[_F]) -> NDArray[_F]:
-        """The skew of s."""
+        """Return the skew of s."""
         if self.name == "polar":
             return self._length(s[:, :1]) * (s[:, 1:] / _radius(s[:, 1:]))
         r = _radius(s)
@@ -101,7 +101,7 @@ class SkewMap:
         return _turned(skew, rotations(quat), back=True) if self.rotates else skew
 
     def vjp(self, s: NDArray[_F], quat: NDArray[_F], v_skew: NDArray[_F]) -> tuple[NDArray[_F], Array]:
-        """Gradients of s, and what the rotation's gradient gains (N, 4), given the gradient of the skew.
+        """Return the gradient of s and the addition to the gradient of the rotation (N, 4).
 
         With n = s / r, f = length / r and g = d length / dr the Jacobian is f I + (g - f) n n', symmetric.
         """
@@ -117,13 +117,13 @@ class SkewMap:
         n = s / r
         f = self._length(r) / r
         along = np.sum(n * v_skew, axis=-1, keepdims=True)
-        # Below the floor the factors are constants and |n| < 1: the map is f s, its Jacobian f I.
+        # Below R_FLOOR the factors are constants and |n| < 1. The map is f s, with the Jacobian f I.
         bend = np.where(r > R_FLOOR, self._slope(r) - f, np.zeros_like(f))
         v_s: NDArray[_F] = f * v_skew + bend * along * n
         return v_s, v_quat
 
     def inverse(self, skew: NDArray[_F], quat: NDArray[_F]) -> NDArray[_F]:
-        """The s that gives `skew`; a length at or above the limit is taken as just below it."""
+        """Return the s of `skew`. A length at or above the limit is replaced by one just below it."""
         if self.rotates:
             skew = _turned(skew, rotations(quat))
         length = np.sqrt(np.sum(skew * skew, axis=-1, keepdims=True))
@@ -132,18 +132,18 @@ class SkewMap:
         r = np.arctanh(np.minimum(tanh, length.dtype.type(TANH_CEILING))) * length.dtype.type(self._scale)
         tiny = np.finfo(length.dtype).tiny
         if self.name == "polar":
-            pole = np.array([0, 0, 1], length.dtype)  # any direction will do where there is no skew
+            pole = np.array([0, 0, 1], length.dtype)  # an arbitrary direction for a skew of zero
             direction = np.where(length > tiny, skew / np.maximum(length, tiny), pole)
             return np.concatenate([r, direction], axis=-1)
         floor = np.full_like(r, R_FLOOR)
-        with np.errstate(invalid="ignore"):  # what is not finite stays so
+        with np.errstate(invalid="ignore"):  # non-finite values stay non-finite
             s: NDArray[_F] = skew * np.where(r > floor, r / np.maximum(length, tiny), floor / self._length(floor))
         return s
 
     def follow(self, s: NDArray[_F], before: Mapping[str, Array], after: Mapping[str, Array]) -> NDArray[_F]:
-        """s where fields `skew` and `quat` were given new values: found anew in the rows that changed.
+        """Return s after changes of the fields `skew` and `quat`: the inverse in rows that changed.
 
-        The other rows keep theirs, as near the limit an inverse loses digits.
+        The other rows keep their s, because the inverse loses digits near the limit.
         """
         names = ("skew", "quat") if self.rotates else ("skew",)
         changed = np.zeros(len(s), bool)
@@ -158,25 +158,25 @@ class SkewMap:
         norm = _radius(u)
         n = u / norm
         along = np.sum(n * v_skew, axis=-1, keepdims=True)
-        # Where the floor acts the norm is a constant.
+        # Below R_FLOOR the norm is a constant.
         across = v_skew - np.where(norm > R_FLOOR, along, np.zeros_like(along)) * n
         v_s: NDArray[_F] = np.concatenate([self._slope(rho) * along, self._length(rho) / norm * across], axis=-1)
         return v_s
 
     @property
     def _scale(self) -> float:
-        """The r at which the length has bent: 1 in the centred form; the slant's slope at 0 is 1."""
+        """Scale of r in the tanh: 1 in the centred form. In the direct form the slope at 0 becomes 1."""
         return 1.0 if self.name in MAPS["centred"] else SLANT_MAX
 
     def _length(self, r: NDArray[_F]) -> NDArray[_F]:
-        """Length of the skew at r; odd in r."""
+        """Return the length of the skew at r; odd in r."""
         tanh = np.tanh(r / r.dtype.type(self._scale))
         bent = np.cbrt(tanh) if self.name == "cube-root" else tanh
         length: NDArray[_F] = r.dtype.type(self.limit) * bent
         return length
 
     def _slope(self, r: NDArray[_F]) -> NDArray[_F]:
-        """d length / dr."""
+        """Return d length / dr."""
         bent = np.clip(r / r.dtype.type(self._scale), r.dtype.type(-R_CEILING), r.dtype.type(R_CEILING))
         shrink = np.cosh(bent) ** 2
         if self.name == "cube-root":
@@ -187,12 +187,12 @@ class SkewMap:
 
 
 def _radius(s: NDArray[_F]) -> NDArray[_F]:
-    """|s| floored at R_FLOOR, (N, 1)."""
+    """Return |s|, at least R_FLOOR, (N, 1)."""
     r: NDArray[_F] = np.maximum(np.sqrt(np.sum(s * s, axis=-1, keepdims=True)), s.dtype.type(R_FLOOR))
     return r
 
 
 def _turned(vector: NDArray[_F], rotation: Array, back: bool = False) -> NDArray[_F]:
-    """R v of (N, 3) vectors, or R' v."""
+    """Return R v for (N, 3) vectors, or R' v."""
     turned: NDArray[_F] = np.einsum("nji,nj->ni" if back else "nij,nj->ni", rotation, vector)
     return turned
