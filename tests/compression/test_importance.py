@@ -39,7 +39,7 @@ def some_splats(scene: Scene, shape: str) -> Splats:
 
 
 def mean_importance(renderer: Renderer, splats: Splats, scene: Scene) -> Importance:
-    """Of many seeds: what a single one estimates."""
+    """Return the mean over many seeds, which a single seed estimates."""
     every = [measure_importance(renderer, splats, scene.train[:2], seed=seed) for seed in range(SEEDS)]
     colour = np.mean([importance.colour for importance in every if importance.colour is not None], axis=0)
     fields = {name: np.mean([importance.fields[name] for importance in every], axis=0) for name in every[0].fields}

@@ -1,4 +1,4 @@
-"""What hazards have shown to be wrong stays mended; the table of benchmarks/stability.py in small."""
+"""Faults that hazards found stay fixed: a small version of the tables of benchmarks/stability.py."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_crafted_splats(hazard: str, shape: str, devices: list[Device], make_ren
     if not arrays:
         pytest.skip("nothing of this shape is at risk")
     row = static.judged(shape, arrays, make_renderer(devices[0]), *[make_renderer(devices[0], "float64")] * 2)
-    # Of needles as long as ten images float32 loses the gradient of the scale (benchmarks/STABILITY.md).
+    # Float32 loses the gradient of the scale for needles as long as ten images (benchmarks/STABILITY.md).
     expected = "stops" if "beyond" in hazard or "NaN" in hazard else "loses" if "400 px" in hazard else "survives"
     assert row["verdict"] == expected, row
     assert row["finite"]
@@ -40,7 +40,7 @@ def test_crafted_splats(hazard: str, shape: str, devices: list[Device], make_ren
 
 
 def test_splats_out_of_sight_leave_their_colour_alone(devices: list[Device], make_renderer: MakeRenderer) -> None:
-    """A scale that overflows float32 gives a mean that is no number: 0 times it must not reach the colour."""
+    """A scale that overflows float32 gives a NaN mean, whose product with 0 must not reach the colour."""
     arrays = crafted.benign(SHAPES["skew-normal-direct"])
     arrays["log_scale"][::3] = 90.0
     renderer = make_renderer(devices[0])
