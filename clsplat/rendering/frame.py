@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device.memory import Pool, fill_zero, to_device, to_host
+from ..device.memory import Pool, to_device, to_host
 from ..device.opencl import Buffer
 from ..device.schedule import TILE
 from .build import MARGIN_X, MARGIN_Y, KernelBuild
@@ -85,14 +85,14 @@ class DeviceImage:
         self.device, self.dtype, self.planes = pool.device, dtype, planes
         self._memory = pool.buffer(dtype, planes)
         self._layout: ImageLayout | None = None
-        self._buffer: Buffer | None = None
 
     def reserve(self, layout: ImageLayout) -> Buffer:
         """Return the buffer for an image of this layout. It is set to zero when the layout changes."""
-        buffer = self._memory.reserve(layout.plane)
-        if self._layout != layout or self._buffer is not buffer:
-            fill_zero(self.device, buffer, self.planes * layout.plane * self.dtype.itemsize)
-            self._layout, self._buffer = layout, buffer
+        if layout == self._layout:
+            return self._memory.buffer
+        self._layout = None  # until the memory is there
+        buffer = self._memory.zeros(layout.plane)
+        self._layout = layout
         return buffer
 
     def write(self, layout: ImageLayout, image: NDArray[Any]) -> Buffer:
@@ -111,7 +111,7 @@ class DeviceImage:
     @property
     def buffer(self) -> Buffer:
         """Buffer of the present image."""
-        return self.reserve(self.layout)
+        return self._memory.buffer
 
     def read(self) -> NDArray[Any]:
         """Return the present image (H, W, C)."""
