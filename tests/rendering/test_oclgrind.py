@@ -32,7 +32,8 @@ def run_under_oclgrind(tmp_path: Path, what: str, mode: str) -> str:
     assert OCLGRIND is not None
     child = [sys.executable, str(CHILD), what, mode]
     command = [OCLGRIND, *flags, "--max-errors", "20", "--log", str(log), *child]
-    environment = {**os.environ, OPTIONS_VARIABLE: build_options, "OMP_NUM_THREADS": "1"}
+    tests = str(Path(__file__).resolve().parents[1])  # the child imports tests/reference
+    environment = {**os.environ, OPTIONS_VARIABLE: build_options, "OMP_NUM_THREADS": "1", "PYTHONPATH": tests}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.stdout.endswith("finished\n"), done.stdout + done.stderr
     return log.read_text() if log.exists() else ""
