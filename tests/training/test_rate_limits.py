@@ -22,7 +22,7 @@ def test_a_hundred_times_the_rate_is_refused_and_a_usable_one_named(name: str) -
     rate = 100 * getattr(TrainConfig().optim, name)
     if name == "position_lr_final":  # 100 times is the rate at the start
         rate *= 100
-    with pytest.raises(InputError, match=rf"^{name} .* of 200 iterations .*: use at usable [\d.e-]+$") as caught:
+    with pytest.raises(InputError, match=rf"^{name} .* of 200 iterations .*: use at most [\d.e-]+$") as caught:
         check_rates(TrainConfig(iterations=200, **{name: rate}))
     usable = float(str(caught.value).rsplit(" ", 1)[1])
     check_rates(TrainConfig(iterations=200, **{name: usable}))
