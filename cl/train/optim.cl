@@ -202,8 +202,8 @@ kernel void step_skew(
 }
 
 #if SKEW_ROTATES
-// For a map that depends on the rotation: turns the gradient of the skew into the world's frame, in place, and adds the
-// part that belongs to the rotation to the gradient of the quaternion. Runs before step_geometry.
+// For a map that depends on the rotation: turns the gradient of the skew into the world's frame, in place. Adds the part
+// of the rotation to the gradient of the quaternion. Runs before step_geometry.
 kernel void turn_skew_gradient(
     global const real *restrict geom,
     global real *restrict grad_geom,

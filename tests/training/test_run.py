@@ -65,7 +65,7 @@ def some_splats(n: int = 300, shape: str = "skew-normal", sh_degree: int = 2) ->
     }
     if shape == "skew-normal":
         skew = rng.standard_normal((n, 3))
-        # Ten steps do not reach 0 from here, where the cube-root map is steep and rounding is no measure.
+        # Ten steps do not reach 0 from here. At 0 the cube-root map is steep and amplifies rounding.
         arrays["skew"] = skew / np.linalg.norm(skew, axis=1, keepdims=True) * rng.uniform(0.6, 1.25, (n, 1))
     return Splats(shape, {name: array.astype(np.float32) for name, array in arrays.items()})
 

@@ -1,6 +1,6 @@
 """Relocation and growth of 3DGS-MCMC (Kheradmand et al. 2024) for every shape, as edits made on the host.
 
-A splat of opacity o is replaced by N copies of itself, of opacity o' and another scale. Along a line through it, the
+A splat of opacity o is replaced by N copies, of opacity o' and another scale. Along a line through it, the
 stack of copies absorbs as much as the one splat did. With g the profile of the kernel (splats/profiles.py):
 
     1 - (1 - o')^N = o
