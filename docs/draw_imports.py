@@ -21,7 +21,7 @@ DRAWING = ROOT / "docs" / "images" / "imports.svg"
 # Every package may import these two modules, so their arrows would hide the others.
 BASE = ("errors", "_version")
 
-BOX_WIDTH, BOX_HEIGHT, STEP = 300, 46, 74
+BOX_WIDTH, BOX_HEIGHT, STEP = 324, 46, 74
 LEFT, TOP = 24, 24
 REACH = 50  # px: how far an arrow swings out for each box it passes
 COLOURS = ("#4269d0", "#c77700", "#c7372f", "#3a8f8a", "#3ca951", "#d6457f", "#8a56c9", "#77624a")
