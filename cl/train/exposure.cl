@@ -7,7 +7,8 @@
 
 #define EXPOSURE 12
 #define SQUARES 10  // of the upper triangle of a 4 x 4 matrix, by rows
-#define SUMS (SQUARES + EXPOSURE)
+// SUMS is a define of clsplat/training/programs.py, which sizes the buffer of the sums by it.
+typedef char there_are_SUMS_sums[SUMS == SQUARES + EXPOSURE ? 1 : -1];
 #define SATURATED R(0.98)  // a brighter pixel of a photo does not depend on the exposure
 
 // Vectors of a row, and those of a work-item: from `first` to before `end`.

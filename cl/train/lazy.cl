@@ -8,11 +8,8 @@ typedef struct {
     bool keeps_moments;
 } adam_skip;
 
-// decays [5, ADAM_WAITS] by the number of skipped steps: factors of m and v, and the drift of most rows, of the means (rate
-// included) and of the trainable skew.
-#define DRIFT 2
-#define DRIFT_MEAN 3
-#define DRIFT_SKEW 4
+// decays [5, ADAM_WAITS] by the number of skipped steps: factors of m and v, then in the rows DRIFT, DRIFT_MEAN and
+// DRIFT_SKEW the drift of most rows, of the means (rate included) and of the trainable skew.
 static inline adam_skip skipped_steps(constant real *decays, int steps, int drift, bool keeps_moments) {
     return (adam_skip){decays[steps], decays[ADAM_WAITS + steps], decays[drift * ADAM_WAITS + steps], keeps_moments};
 }

@@ -22,11 +22,10 @@ from ..rendering.frame import DeviceImage, ImageLayout
 from ..splats.color import Color
 from .config import TrainConfig
 from .loss import ImageLoss, LossResult
-from .programs import EXPOSURE_GROUP, EXPOSURE_VECS, exposure_program
+from .programs import EXPOSURE_GROUP, EXPOSURE_SUMS, EXPOSURE_VECS, exposure_program
 from .targets import Target, Targets
 
 _KEY = "exposure"  # key of the optimizer state in a checkpoint
-_SUMS = 22  # sums of each work-item in cl/train/exposure.cl
 _IDENTITY = np.eye(3, 4)
 
 
@@ -51,7 +50,7 @@ class ExposureLoss:
         to_device(self.device, self._exposures, self._rows)
         self._photo = DeviceImage(loss.pool, self.kernels.dtype, 3)
         self._laid_over = DeviceImage(loss.pool, np.dtype(np.uint8), 3)
-        self._partial = loss.pool.buffer(self.kernels.dtype, _SUMS)
+        self._partial = loss.pool.buffer(self.kernels.dtype, EXPOSURE_SUMS)
 
     def evaluate(self, target: Target, rendered: Buffer, background: Color) -> LossResult:
         """Compute the loss of an image, rendered over `background`, and step the photo's exposure."""

@@ -16,6 +16,7 @@ from .optim.skew_map import SKEW_MAPS
 
 EXPOSURE_VECS = 8  # vectors of a work-item of cl/train/exposure.cl
 EXPOSURE_GROUP = 64
+EXPOSURE_SUMS = 22  # sums of each work-item of cl/train/exposure.cl
 
 
 def kernel_build(config: TrainConfig, schedule: Schedule) -> KernelBuild:
@@ -56,6 +57,7 @@ def exposure_program(device: Device, kernels: KernelBuild) -> Program:
         "MARGIN_Y": MARGIN_Y,
         "PHOTO_VECS": EXPOSURE_VECS,
         "EXPOSURE_GROUP": EXPOSURE_GROUP,
+        "SUMS": EXPOSURE_SUMS,
     }
     return build(device, ("math/lanes.clh", "train/exposure.cl"), defines, kernels.real)
 
@@ -84,7 +86,13 @@ def optim_program(device: Device, kernels: KernelBuild) -> Program:
 
 def lazy_program(device: Device, kernels: KernelBuild) -> Program:
     """The optimizer with the kernels of visible splats (optim/lazy.py)."""
-    defines = _optim_defines(kernels) | {"ADAM_WAITS": adam.WAITS, "CULLED_KEY": f"{CULLED_KEY:#x}u"}
+    defines = _optim_defines(kernels) | {
+        "ADAM_WAITS": adam.WAITS,
+        "CULLED_KEY": f"{CULLED_KEY:#x}u",
+        "DRIFT": adam.DECAY_ROWS + adam.DRIFT,
+        "DRIFT_MEAN": adam.DECAY_ROWS + adam.DRIFT_MEAN,
+        "DRIFT_SKEW": adam.DECAY_ROWS + adam.DRIFT_SKEW,
+    }
     return build(device, (*_OPTIM_FILES, "train/lazy.cl"), defines, kernels.real)
 
 

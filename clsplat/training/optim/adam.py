@@ -16,6 +16,8 @@ from ...splats.fields import Array
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15  # 3DGS
 WAITS = 256  # one more than the largest number of skipped steps (optim/lazy.py)
+DRIFT, DRIFT_MEAN, DRIFT_SKEW = range(3)  # kinds of drift during skipped steps (lazy.py)
+DECAY_ROWS = 2  # rows before the drifts in the table of lazy.py
 
 
 class NumpyAdam:

@@ -35,11 +35,10 @@ from ...splats.fields import Array, Group, sh_coefficients
 from ...splats.morton import morton_order
 from ..density.edit import DensifyEdit
 from ..programs import PARTS, lazy_program
-from .adam import BETA1, BETA2, WAITS
+from .adam import BETA1, BETA2, DRIFT, DRIFT_MEAN, DRIFT_SKEW, WAITS
 from .fused import FusedOptimizer
 from .rules import Rules, StepCounts
 
-DRIFT, DRIFT_MEAN, DRIFT_SKEW = range(3)
 _AGES = np.arange(WAITS)
 _DECAYS = np.stack([BETA1**_AGES, BETA2**_AGES])
 _RATIO = (BETA1 / np.sqrt(BETA2)) ** _AGES

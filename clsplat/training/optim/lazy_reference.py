@@ -13,8 +13,8 @@ from ...rendering.splat_buffers import CompactGradients, SplatBuffers
 from ...splats.fields import Array
 from ..density.edit import DensifyEdit
 from ..methods.sns import ParameterGroups
-from .adam import EPS, WAITS, NumpyAdam
-from .lazy import DRIFT, DRIFT_MEAN, DRIFT_SKEW, Drifts, in_morton_order
+from .adam import DECAY_ROWS, DRIFT, DRIFT_MEAN, DRIFT_SKEW, EPS, WAITS, NumpyAdam
+from .lazy import Drifts, in_morton_order
 from .reference import ReferenceOptimizer, SplatIndices
 from .rules import Rules, StepCounts
 
@@ -94,7 +94,7 @@ class VisibleReferenceOptimizer(ReferenceOptimizer):
             rate: Array = np.asarray(rules.rates.get(field.name, 1.0), dtype)
             if field.name == "sh":
                 rate = rules.sh_rates(field.width, dtype).reshape(1, -1, 3)
-            sums = table[2 + (DRIFT_MEAN if field.name == "mean" else DRIFT)]
+            sums = table[DECAY_ROWS + (DRIFT_MEAN if field.name == "mean" else DRIFT)]
             moved = _drift(self.base, field.name, rows, base, table, sums, rate, keeps_moments)
             if field.bounds is not None:  # in log space
                 params[field.name][rows] = np.clip(params[field.name][rows] * np.exp(-moved), *field.bounds)
@@ -104,7 +104,9 @@ class VisibleReferenceOptimizer(ReferenceOptimizer):
             return self.skew_s
         skew_s = self.skew_s.copy()
         rate = np.asarray(rules.rates["skew"], dtype)
-        skew_s[rows] -= _drift(self.skew, "skew", rows, skew, table, table[2 + DRIFT_SKEW], rate, keeps_moments)
+        skew_s[rows] -= _drift(
+            self.skew, "skew", rows, skew, table, table[DECAY_ROWS + DRIFT_SKEW], rate, keeps_moments
+        )
         changed = np.arange(len(skew_s))[rows][(skew > 0) | skew_map.rotates]
         params["skew"][changed] = skew_map.forward(skew_s[changed], params["quat"][changed])
         return skew_s
