@@ -19,8 +19,8 @@ from clsplat.files.atomic import atomic_writer
 from .options import PATH
 
 _MANIFEST = "blender_manifest.toml"
-_WHEN = (1980, 1, 1, 0, 0, 0)  # the same files make the same zip
-# Blender's names of the platforms that wheels are built for.
+_WHEN = (1980, 1, 1, 0, 0, 0)  # a fixed date, so that the same files make the same zip
+# Blender's names of platforms, by patterns of the tags of wheels.
 _PLATFORMS = {
     r"linux.*x86_64": "linux-x64",
     r"win_amd64": "windows-x64",

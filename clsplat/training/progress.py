@@ -124,8 +124,8 @@ def progress_line(progress: Progress, columns: int = 0) -> str:
 
     Parameters
     ----------
-    columns : maximum length; 0 means any length, without a bar. If the line is too long, the loss, the speed, the
-        number of splats and the PSNR are omitted in this order, and the bar is shorter or omitted.
+    columns : maximum length; 0 means any length, without a bar. If the line is too long, fields are
+        omitted in this order: loss, speed, number of splats, PSNR. The bar is then shorter or omitted.
     """
     share = progress.iteration / progress.iterations
     count = f"{progress.iteration}/{progress.iterations}"

@@ -1,4 +1,4 @@
-"""`clsplat render` and `clsplat eval`: the files they write, exactly, against Python's own images."""
+"""`clsplat render` and `clsplat eval`: their files against the images that Python renders."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_render_png_of_test_views_with_alpha_and_depth(model: Path, tmp_path: Pa
 
 
 def test_render_npy_of_given_cameras_is_the_renderers_image(model: Path, tmp_path: Path) -> None:
-    """A PLY alone with --cameras: every entry, float32, exactly what Python gives."""
+    """A PLY alone with --cameras: every camera gives the float32 image that Python gives."""
     clsplat(
         "render",
         ply(model, 40),
@@ -114,7 +114,7 @@ def test_render_other_paths(model: Path, tmp_path: Path, kind: str) -> None:
 
 
 def test_render_between_chosen_cameras_and_along_the_saved_path(model: Path, tmp_path: Path) -> None:
-    """The frames at the keys are those cameras' images; the path's file gives the same frames, or as many as asked."""
+    """Frames at the keys are the images of those cameras. The path's file gives the same frames, or another number."""
     named = {item.name: item.camera for item in read_cameras(model / "cameras.json")}
     clsplat(
         "render",
@@ -167,7 +167,7 @@ def test_coloured_depth_has_one_range_for_the_path(model: Path, tmp_path: Path) 
 
 
 def test_render_videos_of_colour_depth_and_alpha(model: Path, tmp_path: Path) -> None:
-    """Real files, decoded: as many frames as asked, of an even size, each near the image that was rendered."""
+    """The decoded videos have the right number of frames and an even size. Each frame is near the rendered image."""
     imageio = pytest.importorskip("imageio.v2", reason="the extra `video` is not installed")
     pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
     out = clsplat(
@@ -253,7 +253,7 @@ def test_folders_in_image_names_are_kept(model: Path, tmp_path: Path) -> None:
 
 
 def test_plain_3dgs_folders_render(model: Path, tmp_path: Path) -> None:
-    """A folder as 3DGS leaves it: cameras.json and a Gaussian PLY, nothing of ours."""
+    """A folder that 3DGS wrote, with cameras.json and a Gaussian PLY, renders."""
     target = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
     Splats.load(ply(model)).as_shape("gaussian").save(target)
     header, body = target.read_bytes().split(b"end_header\n", 1)
@@ -304,7 +304,7 @@ def test_eval_of_several_models_protocols_and_iterations(model: Path, tmp_path: 
 
 
 def test_eval_of_a_model_trained_from_python(scene: Path, tmp_path: Path) -> None:
-    """Its folder tells the scene and the split without the command line's help."""
+    """The folder records the scene and the test views without the command line."""
     import clsplat as package
 
     names = tmp_path / "names.txt"

@@ -1,4 +1,4 @@
-"""`clsplat view` and `clsplat train --view`: what they show, and what they say of bad input."""
+"""`clsplat view` and `clsplat train --view`: the pictures they show, and their messages for bad input."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_without_viser_both_say_what_to_install(
 
 
 class Command:
-    """A `clsplat ...` of its own process that serves a page."""
+    """A process that runs `clsplat ...` and serves a page."""
 
     def __init__(self, *args: object) -> None:
         command = [sys.executable, "-u", "-c", "from clsplat_cli.main import main; main()", *(str(arg) for arg in args)]
@@ -91,7 +91,7 @@ class Command:
         self.port = int(found[1] or found[2])
 
     def end(self) -> int:
-        """Ctrl-C."""
+        """Send Ctrl-C."""
         self.process.send_signal(signal.SIGINT)
         assert self.process.stdout is not None
         self.said += self.process.stdout.read()

@@ -89,7 +89,7 @@ def test_unusable_images_are_named() -> None:
 
 
 def test_masked_pixels_are_in_no_metric() -> None:
-    """Whatever stands there; PSNR is that of the other pixels, SSIM that of windows around them."""
+    """Hidden pixels have no effect: PSNR is that of the other pixels, SSIM that of the windows around them."""
     mask = np.ones(A.shape[:2], bool)
     mask[:, 9:] = False
     wild = np.where(mask[:, :, None], A, RNG.random(A.shape))

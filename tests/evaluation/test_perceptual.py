@@ -1,4 +1,4 @@
-"""LPIPS and FLIP: what goes into the packages, what comes out, and what is said where they cannot be had."""
+"""LPIPS and FLIP: inputs and outputs of the packages, and the messages if they are missing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MASK[:, :10] = False
 
 @pytest.fixture
 def packages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., list[tuple[np.ndarray, np.ndarray]]]:
-    """Stand-ins for lpips and torch: the net is the mean square; `fails` is raised when it is made."""
+    """Replace lpips and torch: the net returns the mean square, and its constructor raises `fails`."""
 
     def install(fails: Exception | None = None, import_fails: Exception | None = None) -> list[Any]:
         seen: list[Any] = []
@@ -48,7 +48,7 @@ def packages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., l
         torch = SimpleNamespace(
             from_numpy=lambda array: array,
             inference_mode=nullcontext,
-            Tensor=type("Tensor", (), {}),  # SciPy asks for it
+            Tensor=type("Tensor", (), {}),  # SciPy reads this attribute
             hub=SimpleNamespace(get_dir=lambda: str(tmp_path / "hub")),
         )
         monkeypatch.setitem(sys.modules, "lpips", lpips)

@@ -1,4 +1,4 @@
-"""The page of measurements: what stands on it, its bound, and that wipe and table obey mouse, touch and keys."""
+"""The report: its contents, its size limit, and its wipe and table under mouse, touch and keys."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def images(text: str) -> list[tuple[str, np.ndarray]]:
 def test_shots_count_whole_images_and_only_what_counts() -> None:
     photo = np.full((900, 1200, 3), 100, np.uint8)
     color = np.full(photo.shape, 103 / 255, np.float32)
-    color[:, :600, 0] = 1.5  # beyond white
+    color[:, :600, 0] = 1.5  # brighter than white
     mask = np.ones((900, 1200), bool)
     mask[:450] = False
     shot = compare_images(photo, color, mask)

@@ -1,4 +1,4 @@
-"""Full disks, read-only folders and files in the way: one line, and nothing that was there is lost."""
+"""Full disks, read-only folders and files in the way: the error is one line, and no existing file is lost."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from clsplat.training.folder import ModelFolder
 
 @contextmanager
 def mounted(folder: Path, *options: str) -> Iterator[Path]:
-    """Something mounted on the folder while the block lasts; skips where that is not allowed."""
+    """Mount a file system on the folder during the block; skip the test if that is not permitted."""
     folder.mkdir(exist_ok=True)
     command = ["mount", *options, str(folder)]
     if shutil.which("mount") is None or subprocess.run(command, capture_output=True).returncode:
@@ -39,7 +39,7 @@ def read_only(folder: Path) -> Iterator[Path]:
 
 
 def test_a_disk_that_fills_up_keeps_the_last_checkpoint(capture_folder: Path, tmp_path: Path) -> None:
-    """With room for one checkpoint, not for two; more room, and the run goes on to the bits of one in peace."""
+    """The disk has room for one checkpoint. With more room the run resumes, with the bits of an undisturbed run."""
     common = ["train", capture_folder, "--checkpoint-interval", "20", "--quiet", *SHORT, "-m"]
     clsplat(*common, tmp_path / "peace")
     size = (tmp_path / "peace" / "checkpoint.npz").stat().st_size
@@ -106,7 +106,7 @@ def test_places_that_take_no_files(capture_folder: Path, model_folder: Path, tmp
 
 
 def refused(*command: object) -> str:
-    """The one line that ends it; warnings may come before."""
+    """The last line of the output, which is the error; warnings may come before."""
     result = run(*command)
     assert result.exit_code == 1, result.output
     assert "Traceback" not in result.output

@@ -1,4 +1,4 @@
-"""Files that a run leaves for itself, changed by something else: named in one line, never a traceback."""
+"""Damaged files of a run: the error is one line that names the file, never a traceback."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clsplat.training.config import TrainConfig
 
 
 def rewritten(path: Path, **changes: Any) -> None:
-    """The checkpoint with other arrays, or other values in its `meta`; None leaves one out."""
+    """Write the checkpoint with other arrays or other values in its `meta`; None removes one."""
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in stored.files}
     meta = json.loads(arrays["meta"].tobytes())

@@ -1,4 +1,4 @@
-"""log.jsonl across interruptions: nothing twice, nothing lost, whatever the file holds."""
+"""log.jsonl across interruptions: no line is repeated or lost, whatever the file holds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progress on terminals of any width, in files, in notebooks and where carriage returns cannot be trusted."""
+"""Progress on terminals of any width, in files, in notebooks, and without support for carriage returns."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def at(iteration: int, message: str = "") -> Progress:
 
 
 class Terminal:
-    """A pseudo-terminal: what was written to it, and as it looks."""
+    """A pseudo-terminal that shows what was written to it."""
 
     def __init__(self) -> None:
         self.master, slave = pty.openpty()
@@ -46,8 +46,8 @@ class Terminal:
         self.columns = columns
 
     def seen(self) -> list[str]:
-        """Lines of what was written since the last look, as a terminal of today's width shows them."""
-        self.stream.write("\0")  # the kernel hands it on when it likes: read to here
+        """Lines written since the last call, as a terminal of the present width shows them."""
+        self.stream.write("\0")  # the kernel passes text on with a delay; this marks its end
         self.stream.flush()
         raw = b""
         while not raw.endswith(b"\0"):
