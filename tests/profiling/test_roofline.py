@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
 from clsplat.device.device import Device
 from clsplat.device.memory import to_device, to_host
+from clsplat.profiling import roofline
 from clsplat.profiling.roofline import CHAINS, STEPS, measure_roofline, roofline_program
 
 
@@ -33,9 +38,35 @@ def test_copy_copies_all_and_no_more(device: Device) -> None:
     assert not copied[99:].any()
 
 
-def test_limits_are_positive(device: Device) -> None:
-    limits = measure_roofline(device, repeats=1, nbytes=1 << 20)
-    assert limits.copy > 0
-    assert limits.fma > 0
-    assert "GB/s" in str(limits)
-    assert "Gflop/s" in str(limits)
+def test_limits_are_work_over_time(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With launches of 10 ms each, the limits follow from the bytes and operations that the tests above count."""
+    launches: list[int] = []
+
+    def ten_ms(launch: Callable[[], Any], repeats: int) -> float:
+        launches.append(repeats)
+        launch().wait()
+        return 10.0
+
+    monkeypatch.setattr(roofline, "_median_ms", ten_ms)
+    limits = measure_roofline(device, repeats=3, nbytes=1 << 20)
+    assert limits.copy == pytest.approx(2 * (1 << 20) / 0.01)
+    assert launches == [1, 3] * len(CHAINS) + [3], "a launch of 10 ms is long enough"
+    steps_of_a_lane = limits.fma * 0.01 / (2 * STEPS * 64 * max(CHAINS))  # 64 rounds of the most chains
+    units = device.info.compute_units
+    assert steps_of_a_lane == round(steps_of_a_lane)
+    assert steps_of_a_lane % units == 0, "each compute unit has the same number of work-items"
+
+
+def test_the_kernel_runs_long_enough_to_be_timed(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounds are added until a launch takes 5 ms on a device that needs 0.01 ms for each."""
+    rounds: list[int] = []
+
+    def launched(launch: Callable[[], Any], repeats: int) -> float:
+        rounds.append(inspect.getclosurevars(launch).nonlocals["rounds"])
+        return 0.01 * rounds[-1]
+
+    monkeypatch.setattr(roofline, "_median_ms", launched)
+    rate = roofline._fma(device, CHAINS[0], 3)
+    assert rounds == sorted(rounds)
+    assert 5.0 <= 0.01 * rounds[-1] <= 5.0 * 16
+    assert rate > 0

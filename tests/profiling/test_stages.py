@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +19,13 @@ from clsplat.device.trace import Launch
 from clsplat.errors import InputError
 from clsplat.profiling.bench import Report, bench_trainer, measure_render, measure_training
 from clsplat.profiling.roofline import Roofline
-from clsplat.profiling.stages import HOST, SHARED, STAGE_OF, STAGES, Sizes, by_stage, work_of
+from clsplat.profiling.stages import HOST, SHARED, STAGE_OF, STAGES, Sizes, Work, by_stage, work_of
 from clsplat.rendering.build import T_MIN, KernelBuild
 from clsplat.rendering.overdraw import count_pairs
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.splat_buffers import SplatBuffers
 from clsplat.scenes.random_scene import synthetic_scene
+from clsplat.splats.fields import Group
 
 OTHER_PROGRAMS = {"measure/smoke.cl", "measure/roofline.cl", "measure/count.cl"}  # not part of an iteration
 
@@ -31,7 +33,8 @@ OTHER_PROGRAMS = {"measure/smoke.cl", "measure/roofline.cl", "measure/count.cl"}
 def test_every_kernel_has_one_stage() -> None:
     folder = Path(__file__).resolve().parents[2] / "cl"
     files = {str(path.relative_to(folder)) for path in folder.rglob("*.cl")}
-    kernels = {name for file in files - OTHER_PROGRAMS for name in parse_signatures(source(file), "float")}
+    defines = KernelBuild("gaussian", 1, SCHEDULES["cpu16"]).defines()
+    kernels = {name for file in files - OTHER_PROGRAMS for name in parse_signatures(source(file), "float", defines)}
     assert len(kernels) > 20
     assert kernels <= set(STAGE_OF) | set(SHARED), "a kernel without a stage in clsplat/profiling/stages.py"
     listed = [kernel for names in STAGES.values() for kernel in names] + list(SHARED)
@@ -93,22 +96,51 @@ def test_useful_pairs_are_those_of_the_reference(shape: str, schedule: str, devi
     assert abs(count_pairs(pipeline, frame) - int(useful.sum())) <= undecided
 
 
-def test_work_is_counted_from_sizes() -> None:
+SIZES = Sizes(splats=1024, isects=5000, pixels=512, pairs=100_000, sh_degree=1)
+
+
+def test_work_grows_with_what_a_stage_handles() -> None:
+    """Pairs cost operations and no bytes, isects cost bytes and no operations, twice of all costs twice as much."""
     kernels = KernelBuild("gaussian", 1, SCHEDULES["cpu16"])
-    work = work_of(kernels, Sizes(splats=10, isects=50, pixels=512, pairs=1000, sh_degree=1), is_cpu=True)
-    assert work["rasterize"].flops == 1000 * (20 + 10)  # exponent 4, exp 15, opacity 1; blending 10
-    assert work["rasterize"].bytes == 50 * (12 + 4 * 15) + 4 * 4 * 512
-    assert work["rasterize_vjp"].flops == 1000 * (20 + 12 + 20)
-    assert work["gather"].bytes == 10 * (8 + 4 * 9) + 50 * 4 * 9
-    assert work["depth sort"].bytes == 10 * 40
-    assert work["binning"].bytes == 10 * 28
-    assert work["tile sort"].bytes == 10 * 20 + 50 * 8 + 2 * 8
-    assert work["step"].bytes == 4 * 10 * (7 * 11 + 6 * 12 + 6)
+    work = work_of(kernels, SIZES, is_cpu=True)
     assert set(work) < set(STAGES)
-    skewed = work_of(KernelBuild("skew-normal", 1, SCHEDULES["cpu16"]), Sizes(10, 50, 512, 1000, 1), is_cpu=False)
-    assert skewed["rasterize"].flops == 1000 * (52 + 10)
-    assert skewed["depth sort"].bytes == 10 * (4 + 8 * 20)
-    assert skewed["tile sort"].bytes == 50 * (4 + 20) + 2 * 8
+    assert all(each.bytes > 0 for each in work.values())
+    more_pairs = work_of(kernels, replace(SIZES, pairs=2 * SIZES.pairs), is_cpu=True)
+    changed = {name for name in work if more_pairs[name] != work[name]}
+    assert changed == {"rasterize", "rasterize_vjp"}
+    for name in changed:
+        assert more_pairs[name] == replace(work[name], flops=2 * work[name].flops)
+    more_isects = work_of(kernels, replace(SIZES, isects=2 * SIZES.isects), is_cpu=True)
+    changed = {name for name in work if more_isects[name] != work[name]}
+    assert changed == {"tile sort", "rasterize", "rasterize_vjp", "gather"}
+    assert all(more_isects[name].flops == work[name].flops for name in work)
+    twice = Sizes(2 * SIZES.splats, 2 * SIZES.isects, 2 * SIZES.pixels, 2 * SIZES.pairs, SIZES.sh_degree)
+    for name, each in work_of(kernels, twice, is_cpu=True).items():
+        assert each == Work(2 * work[name].bytes, 2 * work[name].flops), name
+
+
+def test_work_reads_the_buffers_of_the_splats(devices: list[Device]) -> None:
+    """A full buffer of splats is read whole by the projection, and its moments are read and written by the step."""
+    kernels = KernelBuild("skew-normal", 1, SCHEDULES["cpu16"])
+    buffers = SplatBuffers(devices[0], kernels.schema, SIZES.splats, kernels.dtype)
+    assert buffers.capacity == SIZES.splats
+    geometry, colour = (buffers.group_bytes(group) for group in Group)
+    screen = SIZES.splats * (kernels.dtype.itemsize * kernels.record + 4 + 16)  # record, depth key, tile rectangle
+    work = work_of(kernels, SIZES, is_cpu=True)
+    assert work["project"].bytes == geometry + colour + screen
+    # Values and two moments are read and written; the gradient is read, and colour has a compact one.
+    assert work["step"].bytes == 7 * geometry + 6 * colour + 6 * SIZES.splats * kernels.dtype.itemsize
+
+
+def test_a_skewed_splat_costs_more_and_pixels_cost_the_same() -> None:
+    plain, skewed = (
+        work_of(KernelBuild(shape, 1, SCHEDULES["cpu16"]), SIZES, is_cpu=False) for shape in ("gaussian", "skew-normal")
+    )
+    for name in ("rasterize", "rasterize_vjp"):
+        assert skewed[name].flops > plain[name].flops
+        assert skewed[name].bytes > plain[name].bytes
+    assert skewed["loss"] == plain["loss"]
+    assert skewed["tile sort"] == plain["tile sort"]
 
 
 def test_a_step_and_an_image_have_their_stages(devices: list[Device]) -> None:
