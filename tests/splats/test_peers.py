@@ -1,6 +1,6 @@
-"""Our files in other programs' readers: the values they find, not only that they open.
+"""Files of clsplat in the readers of other programs: the tests compare the values that these read.
 
-Wants npm packages that are none of clsplat's:
+The readers are npm packages, which clsplat does not install:
 
     npm install @playcanvas/splat-transform @mkkellogg/gaussian-splats-3d gsplat @sparkjsdev/spark
     CLSPLAT_NODE_MODULES=$PWD/node_modules pytest tests/splats/test_peers.py

@@ -97,7 +97,7 @@ def test_what_most_splats_use_stays_with_the_vertices(file: Path) -> None:
 
 
 def test_the_first_element_stands_alone(file: Path) -> None:
-    """A reader that knows no other element has the base colours and the moment-matched Gaussians."""
+    """A reader of the first element alone gets the base colours and the moment-matched Gaussians."""
     arrays = sparse_arrays("skew-normal", 50, seed=5, some=0.2)
     write_ply(file, "skew-normal", "peak", arrays, compact=True)
     head, body = file.read_bytes().split(b"end_header\n", 1)
@@ -125,7 +125,7 @@ def test_splats_save_and_load(tmp_path: Path) -> None:
 
 
 def saved(file: Path) -> bytes:
-    """A compact file with a skew and two elements of bands: 12 splats, of which 3 are skewed."""
+    """Return a compact file of 12 splats with two elements of SH bands; 3 of the splats are skewed."""
     arrays = sparse_arrays("skew-normal", 12, 7, some=0.0)
     arrays["skew"][[1, 5, 9]] = 0.25
     arrays["sh"][[0, 4], 2], arrays["sh"][[7], 12] = 1.0, 1.0
