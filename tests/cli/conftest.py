@@ -1,7 +1,8 @@
-"""The commands' tests know the shared scene and model as folders."""
+"""Fixtures of the tests of commands: the shared scene and model as folders."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -17,3 +18,9 @@ def scene(capture_folder: Path) -> Path:
 def model(model_folder: Path) -> Path:
     """Folder of the small model; tests must not write into it."""
     return model_folder
+
+
+@pytest.fixture
+def copied_model(model: Path, tmp_path: Path) -> Path:
+    """A copy of the small model, for a test that writes into its folder."""
+    return Path(shutil.copytree(model, tmp_path / "copy"))

@@ -38,9 +38,9 @@ def test_info_counts(model: Path, tmp_path: Path) -> None:
     assert second["sh_coefficients"] == [3 * n, 9 * n]
 
 
-def test_eval_writes_the_complexity(model: Path) -> None:
-    clsplat("eval", model, "-q")
-    (entry,) = json.loads((model / "results.json").read_text()).values()
+def test_eval_writes_the_complexity(copied_model: Path) -> None:
+    clsplat("eval", copied_model, "-q")
+    (entry,) = json.loads((copied_model / "results.json").read_text()).values()
     assert entry["skewed_fraction"] == 1.0
     assert entry["parameters_in_use"] == entry["parameters"]
     assert entry["sh_coefficients"] == [3 * entry["splats"], 9 * entry["splats"]]
