@@ -1,8 +1,9 @@
-"""Each kernel along one line through it, in NumPy: what relocation stacks copies of (see densify.py).
+"""Profiles of the kernels along one line, in NumPy. Relocation integrates them (training/density/relocation.py).
 
-A profile is a function (z, fields) -> (n, S, K): z (K,) in standard deviations from the location along the axis of the
-skew (any axis where there is none), seen from the side; `fields` holds the n splats' arrays by name. S is 1, or 2 for
-kernels with two opacities; alpha = sum over s of opacity_s * profile[:, s]. The highest value is 1.
+A profile is a function (z, fields) -> (n, S, K) with values up to 1. `fields` holds the arrays of n splats by name.
+The line runs along the axis of the skew, which is seen from the side; without a skew, along any axis. z (K,) is the
+distance from the location in standard deviations. S is the number of opacities of a splat, 1 or 2. The alpha is the
+sum over s of opacity_s * profile[:, s].
 """
 
 from __future__ import annotations
@@ -16,45 +17,48 @@ from .fields import Array
 
 
 def gaussian(z: Array, fields: Mapping[str, Array]) -> Array:
-    """exp(-z^2/2)."""
+    """Return exp(-z^2/2)."""
     n = len(next(iter(fields.values())))
     return np.broadcast_to(np.exp(-0.5 * z * z), (n, 1, len(z)))
 
 
 def skew_normal(z: Array, fields: Mapping[str, Array]) -> Array:
-    """exp(-z^2/2) Phi(slope z) / peak, from m: slope^2 = k / (1 - k), k = (pi/2) t / (1 + t), t = |m|^2."""
+    """Return exp(-z^2/2) Phi(slope z) / peak.
+
+    The field `skew` is m. With t = |m|^2 and k = (pi/2) t / (1 + t), slope^2 = k / (1 - k).
+    """
     t = np.sum(fields["skew"].astype(np.float64) ** 2, axis=1)
     k = 0.5 * math.pi * t / (1.0 + t)
     return _peak_normalised(z, np.sqrt(k / (1.0 - k)))
 
 
 def skew_normal_direct(z: Array, fields: Mapping[str, Array]) -> Array:
-    """The same from the slant eta: slope = |eta|."""
+    """Return exp(-z^2/2) Phi(slope z) / peak with slope = |eta|, the length of the field `skew`."""
     return _peak_normalised(z, np.linalg.norm(fields["skew"].astype(np.float64), axis=1))
 
 
 def generalised_exponential(z: Array, fields: Mapping[str, Array]) -> Array:
-    """exp(-(z^2/2)^(beta/2))."""
+    """Return exp(-(z^2/2)^(beta/2))."""
     beta = fields["beta"].astype(np.float64)[:, None]
     return np.exp(-((0.5 * z * z) ** (0.5 * beta)))[:, None]
 
 
 def student_t(z: Array, fields: Mapping[str, Array]) -> Array:
-    """(1 + z^2/nu)^(-(nu + 2)/2), the marginal in two dimensions."""
+    """Return (1 + z^2/nu)^(-(nu + 2)/2), the marginal in two dimensions."""
     nu = fields["nu"].astype(np.float64)[:, None]
     return np.exp(-0.5 * (nu + 2.0) * np.log1p(z * z / nu))[:, None]
 
 
 def half_gaussian(z: Array, fields: Mapping[str, Array]) -> Array:
-    """exp(-z^2/2) on either side of 0: first the side of `opacity_logit`."""
+    """Return exp(-z^2/2) on each side of 0 and zero on the other; first for the side of `opacity_logit`."""
     above = np.where(z > 0, 1.0, np.where(z < 0, 0.0, 0.5))
     n = len(next(iter(fields.values())))
     return np.broadcast_to(np.exp(-0.5 * z * z) * np.stack([above, 1.0 - above]), (n, 2, len(z)))
 
 
 def bisected_skew(z: Array, fields: Mapping[str, Array]) -> Array:
-    """exp(-z^2/2) Phi(+-slope z), slope = |eta|."""
-    from scipy.special import ndtr  # lazy: the command line starts without scipy
+    """Return exp(-z^2/2) Phi(slope z) and exp(-z^2/2) Phi(-slope z), with slope = |eta|."""
+    from scipy.special import ndtr  # imported late: slow to import
 
     u = np.linalg.norm(fields["skew"].astype(np.float64), axis=1)[:, None] * z
     parts: Array = np.exp(-0.5 * z * z) * np.stack([ndtr(u), ndtr(-u)], axis=1)
@@ -66,7 +70,9 @@ def _peak_normalised(z: Array, slope: Array) -> Array:
 
     slope = slope[:, None]
     mode = np.zeros_like(slope)
-    for _ in range(30):  # Newton for -z + slope R(slope z) = 0, R = phi / Phi; concave log, converges from 0
+    # The mode solves -z + slope R(slope z) = 0 with R = phi / Phi. Newton's method converges from 0, because the
+    # logarithm of the kernel is concave.
+    for _ in range(30):
         u = slope * mode
         inverse_mills = np.exp(-0.5 * u * u - 0.5 * math.log(2.0 * math.pi) - log_ndtr(u))
         mode -= (slope * inverse_mills - mode) / (-1.0 - slope**2 * inverse_mills * (inverse_mills + u))

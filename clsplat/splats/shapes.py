@@ -1,8 +1,8 @@
-"""Shape descriptors: everything Python knows about a splat kernel. The formulas are in cl/shape/*.clh.
+"""Shape descriptors: the properties of each splat kernel in Python. The formulas are in cl/shape/*.clh.
 
-Constants of the skew-normal's centred form (ARCHITECTURE.md; "centred parameters" of the skew-normal literature,
-Azzalini 1985): `skew` is m, the shift from location to mean in the splat's own standard deviations;
-|m| < sqrt(2 / (pi - 2)). In the direct form `skew` is the slant eta, without a unit.
+The skew has two forms (ARCHITECTURE.md). In the centred form (the "centred parameters" of Azzalini 1985), `skew` is m,
+the vector from the location to the mean. Its unit is the splat's standard deviation, and |m| < sqrt(2 / (pi - 2)). In
+the direct form, `skew` is the slant eta, which has no unit.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from .fields import CORE, Array, Field, Schema, make_schema
 from .flops import DENSITY, EXP, LOG, LOG1P, MOMENTS, PHI, QUADRATIC
 
 SKEW_LIMIT = math.sqrt(2.0 / (math.pi - 2.0))  # 1.3236: |m| of an infinitely skewed normal
-SKEW_MAX = 0.985 * SKEW_LIMIT  # kernels and training stay below: nothing cancels in float32 then
-SLANT_MAX = 10.0  # |eta|: 95 % of the half-Gaussian's peak
+SKEW_MAX = 0.985 * SKEW_LIMIT  # largest |m| of kernels and training, so that no difference cancels in float32
+SLANT_MAX = 10.0  # largest |eta|; its peak is 95 % of the half-Gaussian's
 BETA_BOUNDS = (0.5, 8.0)
 NU_BOUNDS = (1.0, 1e4)  # SSS: Hardtanh(1, 10000)
 NORMALISATIONS = ("peak", "pdf", "none")
@@ -34,14 +34,14 @@ class Shape:
 
     Parameters
     ----------
-    name : as in files and on the command line.
-    source : its file in cl/shape/; lower : files in cl/shape/ that it builds upon.
-    fields : learnable fields beside the core ones and colour.
-    record : reals of its screen record (SHAPE_N); moments : its gradient accumulators (SHAPE_V).
-    profile : alpha along the axis on which copies are stacked (see profiles.py).
-    flops : of one pixel's `shape_alpha` and, beyond it, `shape_alpha_vjp`, counted as flops.py says.
+    name : name in files and on the command line.
+    source : kernel file in cl/shape/. lower : files in cl/shape/ that are compiled before it.
+    fields : learnable fields, without the core fields and the colour.
+    record : number of reals of the screen record (SHAPE_N). moments : number of gradient accumulators (SHAPE_V).
+    profile : the kernel along one line (profiles.py).
+    flops : operations per pixel (flops.py) of `shape_alpha`, and the additional ones of `shape_alpha_vjp`.
     skew_form : "centred" (skew is m), "direct" (skew is eta) or None (no field `skew`).
-    normalised : whether `normalisation` means anything to it.
+    normalised : whether the option `normalisation` changes the kernel.
     signed : whether the opacity is tanh of its raw value, in (-1, 1), instead of the logistic function.
     """
 
@@ -58,22 +58,22 @@ class Shape:
     lower: tuple[str, ...] = ()
 
     def schema(self, sh_degree: int) -> Schema:
-        """Fields of this shape at one SH degree."""
+        """Return the fields of this shape at one SH degree."""
         return make_schema(self.fields, sh_degree)
 
     def opacity(self, raw: Array) -> Array:
-        """Opacity of the raw values of `opacity_logit` (or `opacity_minus_logit`)."""
+        """Return the opacity of raw values of `opacity_logit` or `opacity_minus_logit`."""
         opacity: Array = np.tanh(raw) if self.signed else 0.5 * (1.0 + np.tanh(0.5 * raw))
         return opacity
 
     def raw_opacity(self, opacity: Array) -> Array:
-        """The raw value that gives `opacity`."""
+        """Return the raw value of an opacity."""
         if self.signed:
             return np.arctanh(opacity)
         return np.log(opacity) - np.log1p(-opacity)
 
     def strength(self, arrays: Mapping[str, Array]) -> NDArray[np.float64]:
-        """(N,) the largest |opacity| of each splat: by it splats are alive, drawn and quiet."""
+        """Return the largest |opacity| of each splat, (N,)."""
         raw = arrays["opacity_logit"].astype(np.float64)
         strength: NDArray[np.float64] = np.abs(self.opacity(raw))
         if "opacity_minus_logit" in arrays:
@@ -83,20 +83,23 @@ class Shape:
 
 
 _SKEW_COLUMNS = ("skew_0", "skew_1", "skew_2")
-# m = 0 is a stationary point of the centred form; at 0.1 the skewness index is 4e-4, far below one 8-bit step.
+# Training starts from |m| = 0.1, because m = 0 is a stationary point of the centred form. The skewness index is then
+# 4e-4, which no 8-bit image shows.
 SKEW = Field("skew", 3, _SKEW_COLUMNS, (0.0, 0.0, 0.0), 2.5e-3, 0.5, limit=SKEW_LIMIT, start=0.1)
 SLANT = Field("skew", 3, _SKEW_COLUMNS, (0.0, 0.0, 0.0), 1.25e-2, 0.5, limit=SLANT_MAX, start=0.1)
 OPACITY_MINUS = Field("opacity_minus_logit", 1, ("opacity_minus",), (0.0,), 5e-2, neutral_from="opacity_logit")
-# 3D-HGS: rate 3e-3; it starts all normals at (0.6, 0.6, 0.6), here each has a random direction.
+# 3D-HGS has the same rate, but the first normal (0.6, 0.6, 0.6) for all splats. Here each has a random direction.
 NORMAL = Field("normal", 3, ("normal_0", "normal_1", "normal_2"), (0.0, 0.0, 1.0), 3e-3, 0.5, nonzero=True, start=1.0)
 BETA = Field("beta", 1, ("beta",), (2.0,), 1e-3, 0.5, bounds=BETA_BOUNDS)  # GES: rate 1e-3
 NU = Field("nu", 1, ("nu",), (NU_BOUNDS[1],), 1e-2, 0.5, bounds=NU_BOUNDS, start=100.0)  # SSS starts at 100
 
-# Flops, term by term as the pixel formulas of cl/shape/ have them.
-_GAUSSIAN_FLOPS = (QUADRATIC + EXP + 1, 1 + 1 + MOMENTS)  # times opacity; w, its sum
-# Argument of Phi 2; w and z 2, the sums of w and z 2, moments of z 4.
+# Operations of the pixel formulas in cl/shape/. The comments give the terms that have no name.
+# Alpha: the product with the opacity 1. Gradient: w 1, its sum 1.
+_GAUSSIAN_FLOPS = (QUADRATIC + EXP + 1, 1 + 1 + MOMENTS)
+# Alpha: argument of Phi 2. Gradient: w and z 2, their sums 2, moments of z 4.
 _SKEW_FLOPS = (QUADRATIC + EXP + 1 + 2 + PHI + 1, DENSITY + 1 + 2 + 2 + MOMENTS + 4)
-# above 1, alpha 3; below 1, density 2, w and z 2, both opacities 4, sum and moments of z 5.
+# Alpha: `above` 1, the sum of both sides 3. Gradient: `below` 1, density 2, w and z 2, gradients of both opacities 4,
+# sum and moments of z 5.
 _TWO_SIDED_FLOPS = (QUADRATIC + EXP + 2 + PHI + 1 + 3, 1 + DENSITY + 2 + 2 + 4 + MOMENTS + 5)
 
 GAUSSIAN = Shape(
@@ -122,7 +125,7 @@ SKEW_NORMAL = Shape(
     lower=("shape/skew_pixel.clh",),
 )
 
-# As skew-normal splatting was published: (x, y, z) is the location, R S S R' the scale matrix.
+# The form of the publication (SNS, 2026): (x, y, z) is the location, R S S R' the scale matrix.
 SKEW_NORMAL_DIRECT = Shape(
     "skew-normal-direct",
     "shape/skew_normal_direct.clh",
@@ -135,7 +138,7 @@ SKEW_NORMAL_DIRECT = Shape(
     normalised=True,
     lower=("shape/skew_pixel.clh", "shape/displacement.clh"),
 )
-# A plane through the location, one opacity a side, projected exactly.
+# A Gaussian divided by a plane through its location, with one opacity on each side. The projection is exact.
 HALF_GAUSSIAN = Shape(
     "half-gaussian",
     "shape/half_gaussian.clh",
@@ -146,8 +149,8 @@ HALF_GAUSSIAN = Shape(
     flops=_TWO_SIDED_FLOPS,
     lower=("shape/displacement.clh", "shape/two_sided.clh"),
 )
-# The same divided by a finite skew: gaussian (equal opacities), skew-normal-direct (one of them 0), half-gaussian
-# (infinite skew) are its limits.
+# A Gaussian divided by a skew instead of a plane. Its limits are gaussian (equal opacities), skew-normal-direct (one
+# opacity is 0) and half-gaussian (infinite skew).
 BISECTED_SKEW = Shape(
     "bisected-skew",
     "shape/bisected_skew.clh",
@@ -166,10 +169,10 @@ GENERALISED_EXPONENTIAL = Shape(
     record=6,
     moments=7,
     profile=profiles.generalised_exponential,
-    # times beta, times opacity; w, its power, quotient 3, sums
+    # alpha: product with beta 1, with the opacity 1; gradient: w, its power and a quotient 3, sums 1 and 2
     flops=(QUADRATIC + LOG + 1 + EXP + EXP + 1, 3 + 1 + MOMENTS + 2),
 )
-# GES as released: beta only scales the Gaussian, by 2 / (1 + exp(-0.1 (beta - 2))).
+# The released form of GES: beta only scales the Gaussian, by 2 / (1 + exp(-0.1 (beta - 2))).
 GES_MODULATION = Shape(
     "ges-modulation",
     "shape/ges_modulation.clh",
@@ -187,12 +190,12 @@ STUDENT_T = Shape(
     record=6,
     moments=7,
     profile=profiles.student_t,
-    # times nu, times opacity; inverse, share, e, g 5, gap 9, sums
+    # alpha: product with nu 1, with the opacity 1; gradient: inverse, share, e and g 5, gap 9, sums 1 and 4
     flops=(QUADRATIC + LOG1P + 1 + EXP + 1, 5 + 9 + 1 + MOMENTS + 4),
     signed=True,
 )
 
-# In the order in which a file without clsplat's comment is matched by its columns.
+# All shapes by name. The columns of a file without clsplat's comment are compared with the shapes in this order.
 SHAPES = {
     shape.name: shape
     for shape in (
@@ -210,11 +213,11 @@ DEFAULT_SHAPE = SKEW_NORMAL.name
 
 
 def register_shape(shape: Shape, sources: str | Path | None = None) -> Shape:
-    """Add a shape to those that models, commands and charts know.
+    """Add a shape to those of models, commands and charts, and return it with its files resolved.
 
     Parameters
     ----------
-    shape : its descriptor. `source` and `lower` name files of cl/shape/ ("shape/gaussian_pixel.clh"), or of `sources`.
+    shape : the descriptor. `source` and `lower` name files in `sources` or in cl/ ("shape/gaussian_pixel.clh").
     sources : folder with the shape's own kernel files.
 
     Returns
@@ -223,7 +226,7 @@ def register_shape(shape: Shape, sources: str | Path | None = None) -> Shape:
 
     Raises
     ------
-    InputError : the name is taken, `sources` has no file `source`, or two shapes disagree about a field.
+    InputError : the name is taken, `sources` has no file `source`, or another shape has a different field of this name.
     """
     if shape.name in SHAPES:
         raise InputError(f"shape {shape.name!r}: this name is taken: choose another")
@@ -242,12 +245,12 @@ def register_shape(shape: Shape, sources: str | Path | None = None) -> Shape:
 
 
 def known_fields() -> tuple[Field, ...]:
-    """Fields of all shapes, without colour."""
+    """Return the fields of all shapes, without colour."""
     return (*CORE, *(field for shape in SHAPES.values() for field in shape.fields))
 
 
 def shape_named(name: str) -> Shape:
-    """Descriptor of `name`; raises InputError listing the known names."""
+    """Return the shape of this name. An unknown name raises InputError, which lists the known ones."""
     try:
         return SHAPES[name]
     except KeyError:
@@ -255,7 +258,7 @@ def shape_named(name: str) -> Shape:
 
 
 def check_normalisation(name: str) -> str:
-    """`name` if it is a known normalisation; raises InputError otherwise."""
+    """Return `name`. Raise InputError if it is not a normalisation."""
     if name not in NORMALISATIONS:
         raise InputError(f"unknown normalisation {name!r}: choose one of {', '.join(NORMALISATIONS)}")
     return name
