@@ -1,7 +1,7 @@
-"""3DGS's loss, (1 - weight) L1 + weight (1 - SSIM), by an independent route: value and gradient.
+"""Value and gradient of 3DGS's loss, (1 - weight) L1 + weight (1 - SSIM), by independent methods.
 
-SSIM as 3DGS computes it (Wang et al. 2004): 11 x 11 Gaussian window of sigma 1.5, zero padding,
-K = (.01, .03), data range 1, mean over pixels and channels. Means are taken by dense banded matrices.
+SSIM is computed as in 3DGS (Wang et al. 2004): 11 x 11 Gaussian window of sigma 1.5, zero padding,
+K = (.01, .03), data range 1, mean over pixels and channels. Dense banded matrices compute the means.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ Array = NDArray[Any]
 WINDOW = 11
 SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2
-STEP = 1e-20  # of the complex step; its square must vanish beside 1
+STEP = 1e-20  # the complex step; its square must vanish compared with 1
 
 
 def blur_matrix(size: int) -> NDArray[np.float64]:
-    """(size, size) matrix that averages a line of pixels with the window, zeros beyond its ends."""
+    """Return the (size, size) matrix that averages a line of pixels with the window. Pixels outside are zero."""
     offset = np.arange(size)[:, None] - np.arange(size)[None, :]
     window = np.exp(-0.5 * (np.arange(WINDOW) - WINDOW // 2) ** 2 / SIGMA**2)
     weight = np.exp(-0.5 * (offset / SIGMA) ** 2) / window.sum()
@@ -28,11 +28,11 @@ def blur_matrix(size: int) -> NDArray[np.float64]:
 
 
 def ssim_map(image: Array, target: Array) -> Array:
-    """(H, W, 3) map of SSIM; `image` may be complex."""
+    """Return the (H, W, 3) map of SSIM. `image` may be complex."""
     rows, columns = blur_matrix(image.shape[0]), blur_matrix(image.shape[1])
 
     def mean(values: Array) -> Array:
-        # einsum, as threads of a BLAS and of OpenCL devices hinder one another
+        # einsum, because threads of a BLAS compete with threads of OpenCL devices
         return np.einsum("ij,xjc->xic", columns, np.einsum("yx,xjc->yjc", rows, values))
 
     mu_x, mu_y = mean(image), mean(target)
@@ -44,16 +44,17 @@ def ssim_map(image: Array, target: Array) -> Array:
 
 
 def reference_loss(image: ArrayLike, target: ArrayLike, weight: float = 0.2) -> float:
-    """Loss of an image against its target, both (H, W, 3) in 0..1; `weight` is 3DGS's lambda_dssim."""
+    """Return the loss of an image against its target, both (H, W, 3) in 0..1. `weight` is 3DGS's lambda_dssim."""
     x, y = np.asarray(image, dtype=np.float64), np.asarray(target, dtype=np.float64)
     return float((1.0 - weight) * np.abs(x - y).mean() + weight * (1.0 - ssim_map(x, y).mean()))
 
 
 def reference_loss_gradient(image: ArrayLike, target: ArrayLike, weight: float = 0.2) -> NDArray[np.float64]:
-    """(H, W, 3) gradient of `reference_loss` with respect to the image; L1's is 0 where both are equal.
+    """Return the (H, W, 3) gradient of `reference_loss` with respect to the image.
 
-    Complex steps on every 11th pixel of every 11th row at once: each window sees one of them, so each
-    entry of the map belongs to the one step in its window, and 121 rounds reach all pixels.
+    The gradient of L1 is 0 where image and target are equal. The method takes complex steps on every 11th pixel of
+    every 11th row at once. Each window contains one of them, so each entry of the map depends on the one step in its
+    window. 121 rounds reach all pixels.
     """
     x, y = np.asarray(image, dtype=np.float64), np.asarray(target, dtype=np.float64)
     height, width, channels = x.shape

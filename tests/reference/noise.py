@@ -1,4 +1,4 @@
-"""The noise step of 3DGS-MCMC in NumPy, which the kernel must repeat."""
+"""The noise step of 3DGS-MCMC in NumPy, which the kernel must reproduce."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """The reference's kernels that depend on q alone, with a learned falloff.
 
-Powers are written as powers, where the OpenCL kernels take logarithms; see reference_formulas.py for the complex step.
+They compute powers directly, whereas the OpenCL kernels use logarithms. reference/formulas.py explains the complex
+step.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from reference.shape import Array, Geometry, Kernel, ShapeReference, logistic
 
 
 def student_t(arrays: Mapping[str, Array], geometry: Geometry, normalisation: str) -> Kernel:
-    """(1 + q/nu)^-((nu + 2)/2) with an opacity of either sign."""
+    """Return the kernel (1 + q/nu)^-((nu + 2)/2), with an opacity of either sign."""
     nu = arrays["nu"][:, None]
 
     def falloff(q: Array) -> Array:
@@ -23,7 +24,7 @@ def student_t(arrays: Mapping[str, Array], geometry: Geometry, normalisation: st
 
 
 def generalised_exponential(arrays: Mapping[str, Array], geometry: Geometry, normalisation: str) -> Kernel:
-    """exp(-(q/2)^(beta/2)); at q = 0 it is 1 for every beta."""
+    """Return the kernel exp(-(q/2)^(beta/2)). It is 1 at q = 0 for every beta."""
     beta = arrays["beta"][:, None]
 
     def falloff(q: Array) -> Array:
@@ -34,7 +35,7 @@ def generalised_exponential(arrays: Mapping[str, Array], geometry: Geometry, nor
 
 
 def ges_modulation(arrays: Mapping[str, Array], geometry: Geometry, normalisation: str) -> Kernel:
-    """The Gaussian of scales times 2 sigma(0.1 (beta - 2))."""
+    """Return the Gaussian whose scales are multiplied by 2 sigma(0.1 (beta - 2))."""
     size = 2.0 * logistic(0.1 * (arrays["beta"] - 2.0))
     low_pass = geometry.low_pass * np.eye(2)
     scale2d = (size * size)[:, None, None] * (geometry.matrix2d() - low_pass) + low_pass

@@ -1,4 +1,4 @@
-"""An independent float64 renderer, slow and simple, which tests compare the OpenCL kernels with.
+"""An independent float64 renderer, slow and simple. Tests compare the OpenCL kernels with it.
 
 It avoids the methods of the kernels. Skewed splats are in the direct form (location, scale matrix, slope), and every
 pixel evaluates every splat. Bisection finds the peak. Gradients come from the complex step instead of adjoints. The
@@ -26,7 +26,7 @@ from reference.skewed import SKEWED
 NEAR_PLANE = 0.01  # splats with a camera z below this are skipped
 REFERENCES = SKEWED | RADIAL
 FIELDS = {name: ("mean", "quat", "log_scale", "opacity_logit", *own.fields, "sh") for name, own in REFERENCES.items()}
-STEP = 1e-20  # of the complex step; its square must vanish beside 1
+STEP = 1e-20  # the complex step; its square must vanish compared with 1
 
 
 class Rendered(NamedTuple):
@@ -39,8 +39,14 @@ class Rendered(NamedTuple):
 
 @dataclass(frozen=True)
 class Screen:
-    """B projected splats: their kernels, where the projected point falls (B, 2) [px], color (B, 3) >= 0 and
-    depth (B,), its camera z.
+    """B projected splats.
+
+    Attributes
+    ----------
+    kernel : the splats' kernels on the screen.
+    mean_px : (B, 2) images of the projected points [px].
+    color : (B, 3), at least 0.
+    depth : (B,) camera z of the projected points.
     """
 
     kernel: Kernel
@@ -50,7 +56,7 @@ class Screen:
 
 
 def projected_point(arrays: Mapping[str, Array], shape: str) -> Array:
-    """(B, 3) world positions of the points that are projected."""
+    """Return the (B, 3) world positions of the points that are projected."""
     centre = REFERENCES[shape].centre
     if centre is None:
         return arrays["mean"]
@@ -58,7 +64,7 @@ def projected_point(arrays: Mapping[str, Array], shape: str) -> Array:
 
 
 def axes_of(arrays: Mapping[str, Array]) -> Array:
-    """R S (B, 3, 3), world from splat frame."""
+    """Return R S (B, 3, 3), which maps the splat's unit frame to the world."""
     return rotation(arrays["quat"]) * np.exp(arrays["log_scale"])[:, None, :]
 
 
@@ -67,7 +73,7 @@ def plain_kernel(arrays: Mapping[str, Array], geometry: Geometry, shape: str, no
 
 
 def antialiased_kernel(arrays: Mapping[str, Array], geometry: Geometry, shape: str, normalisation: str) -> Kernel:
-    """The kernel with the volume that it has without the low-pass: height times root of the determinant."""
+    """Return the kernel with the same volume as without the low-pass: its height times the root of the determinant."""
     make = REFERENCES[shape].kernel
     kernel, own = (make(arrays, each, normalisation) for each in (geometry, replace(geometry, low_pass=0.0)))
     factor = np.sqrt(determinant(own.scale2d) / determinant(kernel.scale2d))
@@ -83,7 +89,7 @@ def project(
     sh_degree: int | None = None,
     antialiased: bool = False,
 ) -> Screen:
-    """Raw splats (fields as stored, real or complex) to the screen; `sh_degree` None means all stored."""
+    """Project raw splats (fields as stored, real or complex) to the screen. `sh_degree` None means all degrees."""
     world = projected_point(arrays, shape)
     point = world @ camera.rotation.T + camera.translation
     z = point[:, 2]
@@ -102,7 +108,7 @@ def project(
 
 
 def kernel_values(kernel: Kernel, pixels: Array) -> Array:
-    """(B, P) alphas before clamp and cutoff at the points `pixels` (2, P) or (B, 2, P) [px]."""
+    """Return (B, P) alphas before clamp and cutoff, at the points `pixels` (2, P) or (B, 2, P) [px]."""
     d = pixels - kernel.location[:, :, None]
     conic = inverse_2x2(kernel.scale2d)
     q = conic[:, 0, 0, None] * d[:, 0] ** 2 + conic[:, 1, 1, None] * d[:, 1] ** 2
@@ -116,7 +122,7 @@ def kernel_values(kernel: Kernel, pixels: Array) -> Array:
 
 
 def alpha_maps(screen: Screen, camera: Camera, alpha_min: float = 1 / 255, alpha_max: float = 0.99) -> Array:
-    """(B, H W) alphas at the pixel centres, |alpha| clamped to alpha_max and 0 where it is below alpha_min."""
+    """Return (B, H W) alphas at the pixel centres. |alpha| is clamped to alpha_max, and is 0 below alpha_min."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     alpha = kernel_values(screen.kernel, np.stack([x.ravel(), y.ravel()]))
     alpha = np.where(np.abs(alpha.real) > alpha_max, np.copysign(alpha_max, alpha.real), alpha)
@@ -126,10 +132,10 @@ def alpha_maps(screen: Screen, camera: Camera, alpha_min: float = 1 / 255, alpha
 def blend(
     alphas: Sequence[Array], colors: Sequence[Array], depths: Sequence[Array], background: ArrayLike, t_min: float
 ) -> Rendered:
-    """Front-to-back blending of B variants at once: per splat alphas (B, P), colors (B, 3), depths (B,).
+    """Blend B variants front to back, given alphas (B, P), colors (B, 3) and depths (B,) for each splat.
 
-    A pixel is finished for good by the splat that would take its transmittance to <= t_min; that splat
-    is not blended. B may be 1 for splats that are alike in all variants. Returns (B, P, ...) images.
+    A pixel is finished if the next splat would reduce its transmittance to t_min or less. That splat and later ones are
+    not blended. B may be 1 for splats that are equal in all variants. Returns (B, P, ...) images.
     """
     pixels = alphas[0].shape[-1]
     transmittance: Array = np.ones((1, pixels))
@@ -148,12 +154,12 @@ def blend(
 
 
 def prepared(arrays: Mapping[str, ArrayLike], shape: str) -> dict[str, Array]:
-    """The shape's fields as float64 arrays."""
+    """Return the shape's fields as float64 arrays."""
     return {name: np.asarray(arrays[name], dtype=np.float64) for name in FIELDS[shape]}
 
 
 def visible_order(values: Mapping[str, Array], camera: Camera, shape: str) -> NDArray[np.intp]:
-    """Indices of the splats not in front of the near plane, nearest first; equal depths keep their order."""
+    """Return the indices of splats at or beyond the near plane, nearest first. Equal depths keep their order."""
     z = projected_point(values, shape) @ camera.rotation[2] + camera.translation[2]
     order = np.argsort(z, kind="stable")
     return order[z[order] >= NEAR_PLANE]
@@ -171,8 +177,10 @@ def render_reference(
     sh_degree: int | None = None,
     antialiased: bool = False,
 ) -> Rendered:
-    """Render raw splats: `arrays` holds mean (N, 3), quat (N, 4), log_scale (N, 3), opacity_logit (N,),
-    sh (N, K, 3) and the shape's own.
+    """Render raw splats.
+
+    `arrays` holds mean (N, 3), quat (N, 4), log_scale (N, 3), opacity_logit (N,), sh (N, K, 3) and the additional
+    fields of the shape.
     """
     values = prepared(arrays, shape)
     order = visible_order(values, camera, shape)
@@ -201,11 +209,11 @@ def reference_gradients(
     fields: Sequence[str] | None = None,
     antialiased: bool = False,
 ) -> dict[str, Array]:
-    """Gradient of sum(v_color * color) + sum(v_alpha * alpha) with respect to the raw values.
+    """Return the gradient of sum(v_color * color) + sum(v_alpha * alpha) with respect to the raw values.
 
-    Clamps and thresholds count as constant where they act. `v_color` is (H, W, 3), `v_alpha` (H, W) or
-    None; `fields` None means all of the shape's. Returns arrays shaped like the inputs. One splat at a
-    time: only its own alpha map is computed anew, in one batch with one complex step per parameter.
+    Active clamps and thresholds count as constant. `v_color` is (H, W, 3), `v_alpha` (H, W) or None. `fields` None
+    means all fields of the shape. Returned arrays have the shapes of the inputs. The method treats one splat at a time:
+    it recomputes only that splat's alpha map, in one batch with one complex step per parameter.
     """
     values = prepared(arrays, shape)
     names = FIELDS[shape] if fields is None else tuple(fields)
@@ -243,7 +251,7 @@ def reference_gradients(
 
 
 def one_step_each(values: Mapping[str, Array], splat: int, names: Sequence[str]) -> dict[str, Array]:
-    """As many copies of one splat as `names` have parameters, each with the imaginary step on another one."""
+    """Copy one splat once for each parameter in `names`. Each copy has the imaginary step on a different parameter."""
     count = sum(values[name][splat].size for name in names)
     one = [splat] * count
     copies = {name: array[one].astype(np.complex128) for name, array in values.items()}

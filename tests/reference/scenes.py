@@ -1,4 +1,4 @@
-"""Random splats and cameras for tests: small, off-centre, non-square, all from one seed."""
+"""Random splats and cameras for tests. The images are small and not square. Each scene comes from one seed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Arrays = dict[str, NDArray[np.float64]]
 
 
 def random_camera(seed: int = 0, width: int = 23, height: int = 17) -> Camera:
-    """A camera some 4 units from the origin that looks near it, fx != fy principal point off centre."""
+    """A camera about 4 units from the origin that looks near it. fx and fy differ, and the centre is shifted."""
     rng = np.random.default_rng(seed)
     pose = np.eye(4)
     pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
@@ -25,7 +25,7 @@ def random_camera(seed: int = 0, width: int = 23, height: int = 17) -> Camera:
 
 
 def random_splats(seed: int = 0, n: int = 6, sh_degree: int = 2, dtype: type = np.float64) -> Arrays:
-    """`n` splats around the origin: anisotropic, of every opacity and skew, quaternions of any norm."""
+    """`n` splats around the origin: anisotropic, of every opacity and skew, with quaternions of any norm."""
     rng = np.random.default_rng(seed)
     sh = rng.normal(0.0, 0.3, (n, (sh_degree + 1) ** 2, 3))
     sh[:, 0] += rng.uniform(-0.5, 1.5, (n, 3))
@@ -43,10 +43,10 @@ def random_splats(seed: int = 0, n: int = 6, sh_degree: int = 2, dtype: type = n
 
 
 def for_shape(arrays: Mapping[str, NDArray[np.floating]], shape: str) -> Arrays:
-    """`arrays` as the fields of `shape`: its own that are missing are random, skew and opacity take its form.
+    """Convert `arrays` to the fields of `shape`. Fields of the shape that are missing become random.
 
-    The other side's opacities are those of the splats before, so what is dim in all stays so. `skew` is m and
-    becomes the slant of the same skewness; every third opacity becomes negative where the sign is free.
+    The other side's opacity is that of the previous splat, so a scene of dim splats stays dim. `skew` holds m and
+    becomes the slant of the same skewness. If the shape allows both signs, every third opacity becomes negative.
     """
     own, rng, n = REFERENCES[shape], np.random.default_rng(11), len(arrays["mean"])
     normal, nu, beta = rng.normal(size=(n, 3)), 10.0 ** rng.uniform(0.0, 4.0, n), 0.5 * 16.0 ** rng.uniform(0.0, 1.0, n)
@@ -62,8 +62,10 @@ def for_shape(arrays: Mapping[str, NDArray[np.floating]], shape: str) -> Arrays:
 
 
 def slant_of(shift: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Slants eta (N, 3) of the shifts m (N, 3): |eta|² = k / (1 - k), k = (pi/2) t / (1 + t), t = |m|²; a little
-    below SLANT_MAX at most, where a finite difference has room.
+    """Return the slants eta (N, 3) of the shifts m (N, 3).
+
+    |eta|² = k / (1 - k), k = (pi/2) t / (1 + t), t = |m|². The slant stays a little below SLANT_MAX, so that a finite
+    difference does not cross the bound.
     """
     t = (shift.astype(np.float64) ** 2).sum(1, keepdims=True)
     most = (0.99 * SLANT_MAX) ** 2

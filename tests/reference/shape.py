@@ -1,6 +1,6 @@
-"""What a shape's own part of the reference renderer is: one `ShapeReference` in a table by the shape's name.
+"""Interface between a shape and the reference renderer: one `ShapeReference` for each name of a shape.
 
-Every function accepts complex arrays (see reference_formulas.py: the complex step).
+Every function accepts complex arrays (reference/formulas.py explains the complex step).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LOW_PASS = 0.3  # added to the screen covariance [px²]
 
 
 def logistic(raw: Array) -> Array:
-    """Opacity of a shape whose opacities lie in (0, 1)."""
+    """Return the opacity of a shape whose opacities lie in (0, 1)."""
     return 1.0 / (1.0 + np.exp(-raw))
 
 
@@ -31,12 +31,12 @@ class Kernel(NamedTuple):
 
     Parameters
     ----------
-    location : (B, 2), where it is centred [px]; d = pixel - location.
+    location : (B, 2) centre of the kernel [px]; d = pixel - location.
     scale2d : (B, 2, 2), low-pass included [px²]; q = d' inverse(scale2d) d.
     amplitude : (B,), factor before the falloff: opacity and normalisation.
-    slope : (B, 2) [1/px], or None for shapes without sides (no Phi then).
-    amplitude_minus : (B,), or None for 0: the factor where slope' d is far below 0.
-    falloff : rho of the q's (B, P), with the splats' own parameters bound in it.
+    slope : (B, 2) [1/px], or None for shapes without sides, which have no Phi.
+    amplitude_minus : (B,) the factor where slope' d is far below 0, or None for 0.
+    falloff : rho of q (B, P); it includes the splats' own parameters.
     """
 
     location: Array
@@ -53,8 +53,10 @@ class Geometry:
 
     Attributes
     ----------
-    point_px : (B, 2) image of the projected point. affine : (B, 2, 3) affine map about it [px per world unit].
-    axes : (B, 3, 3) the matrices R S, from the unit frame to the world. low_pass : added variance [px²].
+    point_px : (B, 2) image of the projected point [px].
+    affine : (B, 2, 3) affine map about that point [px per world unit].
+    axes : (B, 3, 3) matrices R S, from the unit frame to the world.
+    low_pass : added variance [px²].
     """
 
     point_px: Array
@@ -63,25 +65,25 @@ class Geometry:
     low_pass: float = field(default_factory=lambda: LOW_PASS)
 
     def matrix2d(self, inner: Array | None = None) -> Array:
-        """Screen matrix A R S inner S R' A' + low-pass of the (B, 3, 3) `inner`, the identity by default."""
+        """Return the screen matrix A R S inner S R' A' + low-pass. `inner` is (B, 3, 3); None is the identity."""
         b = self.affine @ self.axes
         half = b if inner is None else b @ inner
         return half @ np.swapaxes(b, 1, 2) + self.low_pass * np.eye(2)
 
     def vector2d(self, inner: Array) -> Array:
-        """A R S inner (B, 2) of the (B, 3) `inner`."""
+        """Return A R S inner (B, 2), for `inner` (B, 3)."""
         return np.einsum("bij,bjk,bk->bi", self.affine, self.axes, inner)
 
 
 @dataclass(frozen=True)
 class ShapeReference:
-    """One shape.
+    """The reference's description of one shape.
 
     Parameters
     ----------
-    fields : its own fields, beside mean, quat, log_scale, opacity_logit and sh.
+    fields : the shape's fields in addition to mean, quat, log_scale, opacity_logit and sh.
     kernel : (arrays, geometry, normalisation) -> Kernel.
-    centre : the point that is projected, in the unit frame from (x, y, z): arrays -> (B, 3); None for (x, y, z).
+    centre : arrays -> (B, 3), the projected point in the unit frame, relative to (x, y, z); None for (x, y, z) itself.
     direct : whether the field `skew` is the slant eta, and not the centred m.
     signed : whether opacities are tanh of the raw values, and not the logistic function.
     """

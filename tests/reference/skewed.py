@@ -1,8 +1,8 @@
-"""The reference's Gaussian and skewed kernels. Unlike the OpenCL ones they are all in location, scale matrix and slope.
+"""The reference's Gaussian and skewed kernels. All have location, scale matrix and slope, unlike the OpenCL kernels.
 
-With delta the skew displacement in the unit frame (|delta| < 1, or = 1 for a plane), delta2d = A R S delta and
-C = A R S S R' A' + low-pass: slope = C^-1 delta2d / sqrt(1 - k), 1 - k = det(C - delta2d delta2d') / det(C) by the
-matrix determinant lemma, where C - delta2d delta2d' = A R S (I - delta delta') S R' A' + low-pass.
+delta is the skew displacement in the unit frame (|delta| < 1, or = 1 for a plane). With delta2d = A R S delta and
+C = A R S S R' A' + low-pass, slope = C^-1 delta2d / sqrt(1 - k). The matrix determinant lemma gives
+1 - k = det(C - delta2d delta2d') / det(C), and C - delta2d delta2d' = A R S (I - delta delta') S R' A' + low-pass.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from reference.shape import Array, Geometry, Kernel, ShapeReference, logistic
 
 
 def normalised(opacity: Array, c: Array, normalisation: str) -> Array:
-    """Factor before exp and Phi of a skew-normal."""
+    """Return the factor before exp and Phi of a skew-normal."""
     return opacity * {"peak": 1.0 / peak(c), "pdf": 2.0, "none": 1.0}[normalisation]
 
 
 def displacement(slant: Array) -> Array:
-    """delta = eta / sqrt(1 + |eta|²) of slants (B, 3), bounded first."""
+    """Return delta = eta / sqrt(1 + |eta|²) for slants (B, 3), which are bounded first."""
     slant = bounded(slant, SLANT_MAX)
     return slant / np.sqrt(1.0 + (slant * slant).sum(-1, keepdims=True))
 
@@ -31,7 +31,7 @@ def unit(vector: Array) -> Array:
 
 
 def slope_and_c(geometry: Geometry, delta: Array) -> tuple[Array, Array]:
-    """Slope (B, 2) and c = k / (1 - k) of the skew displacement `delta` (B, 3) in the unit frame."""
+    """Return slope (B, 2) and c = k / (1 - k), for the skew displacement `delta` (B, 3) in the unit frame."""
     scale2d = geometry.matrix2d()
     rest = geometry.matrix2d(np.eye(3) - delta[:, :, None] * delta[:, None, :])
     one_minus_k = determinant(rest) / determinant(scale2d)
@@ -44,7 +44,7 @@ def gaussian(arrays: Mapping[str, Array], geometry: Geometry, normalisation: str
 
 
 def skew_normal(arrays: Mapping[str, Array], geometry: Geometry, normalisation: str) -> Kernel:
-    """From mean and covariance to the direct form in 3D, projected there."""
+    """Convert mean and covariance to the direct form in 3D, and project that."""
     shift = bounded(arrays["skew"])
     identity = np.broadcast_to(np.eye(3), (len(shift), 3, 3))
     inner, delta = direct_form(identity, shift)
@@ -55,7 +55,7 @@ def skew_normal(arrays: Mapping[str, Array], geometry: Geometry, normalisation: 
 
 
 def skew_normal_direct(arrays: Mapping[str, Array], geometry: Geometry, normalisation: str) -> Kernel:
-    """Linearised at the centroid, which is sqrt(2/pi) delta from the location in 3D and on the screen."""
+    """Linearise at the centroid, which is sqrt(2/pi) delta from the location, in 3D and on the screen."""
     delta = displacement(arrays["skew"])
     slope, c = slope_and_c(geometry, delta)
     amplitude = normalised(logistic(arrays["opacity_logit"]), c, normalisation)

@@ -30,12 +30,12 @@ BACKGROUND = (0.2, 0.5, 0.9)
 
 
 def scene(shape, *args, **options):
-    """`random_splats` as the fields of `shape`."""
+    """Return `random_splats` with the fields of `shape`."""
     return for_shape(random_splats(*args, **options), shape)
 
 
 def weights(camera, seed=0):
-    """Random v_color and v_alpha for a camera's image."""
+    """Return random v_color and v_alpha for a camera's image."""
     rng = np.random.default_rng(seed)
     return rng.normal(size=(camera.height, camera.width, 3)), rng.normal(size=(camera.height, camera.width))
 
@@ -52,7 +52,7 @@ def assert_same(got, want, tolerance=ROUNDING):
 
 @EVERY
 def test_scenes_show_something(shape):
-    """Guards the other tests: images neither empty nor full, with thresholds at work."""
+    """Images are neither empty nor full, and thresholds are active. The other tests need this."""
     arrays, camera = scene(shape, 0), random_camera(0)
     image = render_reference(arrays, camera, shape)
     assert 0.05 < np.abs(image.alpha).mean() < 0.9
@@ -131,7 +131,7 @@ def test_a_transparent_splat_is_as_good_as_absent(shape, seed):
 @given(seed=SEEDS)
 def test_a_crop_is_a_shift_of_the_principal_point(shape, seed):
     arrays, camera = scene(shape, seed), random_camera(seed, 31, 27)
-    arrays["mean"] *= 0.2  # well inside the crop's tangent clamp, which depends on the image's size
+    arrays["mean"] *= 0.2  # well inside the tangent clamp of the crop, which depends on the image size
     x, y, width, height = 7, 5, 14, 17
     crop = Camera(width, height, camera.fx, camera.fy, camera.cx - x, camera.cy - y, camera.cam_from_world)
     image = render_reference(arrays, camera, shape)
@@ -163,7 +163,7 @@ def test_a_skew_beyond_the_bound_acts_as_the_bound(seed):
 
 
 def test_one_round_splat_by_hand():
-    """On the axis: sigma² = (f s / z)² + 0.3, alpha = o exp(-r²/(2 sigma²)), over the background."""
+    """On the axis, sigma² = (f s / z)² + 0.3 and alpha = o exp(-r²/(2 sigma²)), over the background."""
     camera = Camera(5, 3, 10.0, 10.0, 2.5, 1.5, np.eye(4))
     arrays = {
         "mean": np.array([[0.0, 0.0, 2.0]]),
@@ -183,7 +183,7 @@ def test_one_round_splat_by_hand():
 
 
 def test_a_finished_pixel_stays_finished():
-    """The splat that would take T to <= t_min is not blended, nor any after it, however thin."""
+    """A splat that would reduce T to t_min or less is not blended, and no later splat is, however faint."""
     alphas = [np.array([[a]]) for a in (0.9, 0.95, 0.1, 0.2)]
     colors = [np.array([[c, 0.0, 0.0]]) for c in (1.0, 2.0, 4.0, 8.0)]
     depths = [np.array([z]) for z in (1.0, 2.0, 3.0, 4.0)]
@@ -240,9 +240,9 @@ def test_alpha_gradient_is_zero_where_clamped():
 @pytest.mark.parametrize("seed", [1, 2])
 def test_gradients_agree_with_central_differences(shape, normalisation, seed):
     arrays, camera = random_splats(seed, 3, sh_degree=3), random_camera(seed)
-    arrays["skew"][0] = 0.0  # where a square root or a division by |m| would break
-    arrays["mean"][1] = camera.position + camera.rotation.T @ [-2.2, 0.3, 3.0]  # left of the tangent clamp
-    arrays["log_scale"][1] = [0.1, -0.3, -0.1]  # wide enough to be seen all the same
+    arrays["skew"][0] = 0.0  # a square root or a division by |m| could fail here
+    arrays["mean"][1] = camera.position + camera.rotation.T @ [-2.2, 0.3, 3.0]  # to the left of the tangent clamp
+    arrays["log_scale"][1] = [0.1, -0.3, -0.1]  # wide enough to be visible nevertheless
     arrays["nu"] = np.array([2.0, 3.0, 50.0])
     arrays = for_shape(arrays, shape)
     v_color, v_alpha = weights(camera, seed)
@@ -264,7 +264,7 @@ def test_gradients_agree_with_central_differences(shape, normalisation, seed):
 
 @EVERY
 def test_gradients_with_thresholds_are_those_of_the_pixels_that_stay(shape):
-    """Default thresholds, where no pixel crosses one within the step."""
+    """Thresholds have their default values. No pixel crosses one within the step."""
     arrays, camera = scene(shape, 4), random_camera(4)
     v_color, v_alpha = weights(camera)
     direction = {name: np.random.default_rng(9).normal(size=arrays[name].shape) for name in FIELDS[shape]}

@@ -1,4 +1,4 @@
-"""The reference loss against SSIM by loops over windows, and its gradient against differences."""
+"""The reference loss agrees with SSIM by loops over windows, and its gradient agrees with differences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from reference.tolerances import DIFFERENCES
 
 
 def random_pair(height: int, width: int):
-    """An image and its target, correlated, in 0..1."""
+    """Return an image and a correlated target, both in 0..1."""
     rng = np.random.default_rng(height * 1000 + width)
     target = rng.uniform(0.0, 1.0, (height, width, 3))
     return np.clip(target + rng.normal(0.0, 0.2, target.shape), 0.0, 1.0), target

@@ -26,11 +26,11 @@ from clsplat.splats.transform import joined
 from clsplat.training.config import TrainConfig
 from clsplat.training.run import train
 
-SIZES = (0.3, 3.0)  # rough standard deviations on the screen [px]
+SIZES = (0.3, 3.0)  # approximate standard deviations on the screen [px]
 
 
 def small_splats(n: int = 24) -> Arrays:
-    """Splats about as large as a pixel, for which the mode matters."""
+    """Splats about as large as a pixel, where antialiasing changes the image."""
     arrays = random_splats(5, n, 2)
     px = 1.1 * 41 / 4
     arrays["log_scale"] = np.log(np.random.default_rng(5).uniform(*SIZES, (n, 3)) / px)
@@ -66,7 +66,7 @@ def test_image_and_gradients_equal_the_reference(
     ],
 )
 def test_double_precision_and_differences(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """Shapes with one opacity, with two, with a displacement, and with a learned size."""
+    """Test one shape of each kind: one opacity, two opacities, a skew displacement, and a learned size."""
     case_of(shape, dtype=np.float64).check(make_renderer(device, "float64"), ROUNDING, ROUNDING)
     few = Case(small_splats(4), random_camera(5, 23, 17), shape, dtype=np.float64, thresholds=SMOOTH, antialiased=True)
     renderer = make_renderer(device, "float64", **SMOOTH)
@@ -79,7 +79,7 @@ def test_double_precision_and_differences(make_renderer: MakeRenderer, device: D
 
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])
 def test_a_small_splat_keeps_its_volume(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """The sum of alpha is proportional to the area of the image, also for very small splats."""
+    """The sum of alpha is proportional to the area of the splat's image, even for very small splats."""
     arrays = {
         "mean": [[0.0, 0.0, 0.0]],
         "quat": [[1.0, 0.0, 0.0, 0.0]],
@@ -118,10 +118,10 @@ def test_exact_conversions_stay_exact(make_renderer: MakeRenderer, device: Devic
 
 @pytest.mark.parametrize("shape", ["skew-normal"])
 def test_edges_stay_finite(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """Flat splats seen from the side, needles, points and giants."""
+    """Test flat splats seen from the side, needles, points and giants."""
     arrays = random_splats(7, 32, 1)
     arrays["log_scale"] = np.random.default_rng(7).choice([-40.0, -12.0, -3.0, 2.0], (32, 3))
-    case = Case(arrays, random_camera(5, 41, 27), shape, antialiased=True, thresholds=SMOOTH)  # without a reference
+    case = Case(arrays, random_camera(5, 41, 27), shape, antialiased=True, thresholds=SMOOTH)  # needs no reference
     renderer = make_renderer(device)
     assert np.isfinite(case.render(renderer).color).all()
     for name, value in case.backward(renderer).items():
@@ -129,7 +129,7 @@ def test_edges_stay_finite(make_renderer: MakeRenderer, device: Device, shape: s
 
 
 def test_files_and_operations_keep_the_mode(tmp_path: Path) -> None:
-    """Full and compact files, and every operation that returns new splats."""
+    """Test full and compact files, and every operation that returns new splats."""
     splats = _model(True)
     assert splats.antialiased
     assert not _model(False).antialiased
@@ -153,7 +153,7 @@ def _model(antialiased: bool) -> Splats:
 
 
 def test_training_and_the_command_line(tmp_path: Path, capture_folder: Path) -> None:
-    """Training renders like the renderer, and its file records the mode."""
+    """Training renders in the same mode as the renderer, and its file records the mode."""
     folder = capture_folder
     clsplat(
         "train", folder, "-m", tmp_path / "model", "--iterations", 20, "--cap-max", 200, "--antialiased", "-q", "--eval"

@@ -1,4 +1,4 @@
-"""Images and gradients in bands of tiles equal those of a single band; binning equals NumPy's."""
+"""Images and gradients in bands of tiles equal those of a single band, and binning equals NumPy's."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ WIDTH, HEIGHT, N = 103, 71, 300  # 7 x 5 tiles
 IMAGES = ("color", "transmittance", "depth")
 CULLED = 0xFFFFFFFF
 
-# Bands do not change the order of sums. But Intel's compiler adds the records of a splat in groups, which bands cut at
-# other places. The tolerance is relative to the largest entry of a field; the largest measured error is 4e-6 (skew).
+# Bands do not change the order of sums. But Intel's compiler adds the records of a splat in groups, and bands divide
+# these groups differently. The tolerance is relative to the largest entry of a field. The largest error is 4e-6 (skew).
 REGROUPED = 2e-5
 POCL = "Portable Computing Language"
 
@@ -42,14 +42,14 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def as_kind(device: Device, kind: str) -> Device:
-    """Return the device opened once more and labelled as this kind."""
+    """Return the device opened once more, with this type."""
     other = open_device(device.info.index)
     other.info = replace(other.info, type=kind)
     return other
 
 
 def rendered(device: Device, shape: str, schedule: str, max_isects: int | None) -> tuple[Pipeline, Frame, Arrays]:
-    """Frame, images and gradients of a random scene under random weights; images are read after the gradient."""
+    """Render a random scene and differentiate it with random weights. Images are read after the gradient."""
     arrays = for_shape(random_splats(4, N, 1), shape)
     splats = Splats(shape, {name: value.astype(np.float32) for name, value in arrays.items()})
     kernels = KernelBuild(shape, 1, SCHEDULES[schedule]).for_rendering()
@@ -65,14 +65,14 @@ def rendered(device: Device, shape: str, schedule: str, max_isects: int | None) 
 
 
 def assert_same(got: Arrays, want: Arrays, tolerance: float = 0.0) -> None:
-    """Images bit for bit; gradients within the tolerance."""
+    """Images are equal bit for bit, and gradients within the tolerance."""
     assert set(got) == set(want)
     for name, values in want.items():
         assert np.abs(values).max() > 0, name
         assert relative_error(got[name], values) <= (0.0 if name in IMAGES else tolerance), name
 
 
-# The smallest limit cuts rows of tiles.
+# The smallest limit divides rows of tiles.
 @pytest.mark.parametrize(
     ("kind", "shape", "schedule"),
     [
@@ -104,7 +104,7 @@ def test_bands_give_what_one_band_gives(device: Device, kind: str, shape: str, s
 
 
 def test_both_binners_give_the_same(device: Device) -> None:
-    """A compiler may also add in another order for another group size."""
+    """A compiler may also add in a different order for a different group size."""
     assert_same(
         rendered(as_kind(device, "GPU"), "gaussian", "cpu16", None)[2],
         rendered(as_kind(device, "CPU"), "gaussian", "cpu16", None)[2],
@@ -142,7 +142,7 @@ def test_cutting_halves_rows_first() -> None:
 @pytest.mark.parametrize("n", [1, 300, 2049, 40_000])
 @pytest.mark.parametrize("kind", ["CPU", "GPU"])
 def test_binning_is_that_of_numpy(device: Device, kind: str, n: int) -> None:
-    """Random and equal depths, culled splats, rectangles up to the whole image; all tiles and bands of them."""
+    """Test random and equal depths, culled splats, and rectangles up to the whole image, for all tiles and bands."""
     device = as_kind(device, kind)
     tiles_x, tiles_y, rng = 9, 6, np.random.default_rng(n)
     binner = (ChunkBinner if kind == "CPU" else GroupBinner)(Pool(device))
@@ -161,7 +161,7 @@ def test_binning_is_that_of_numpy(device: Device, kind: str, n: int) -> None:
 
 
 def projected(device: Device, keys: NDArray[np.uint32], rect: NDArray[np.int32]) -> ProjectedSplats:
-    """Splats of these depth keys and tile rectangles; camera and records are not used by binners."""
+    """Return splats with these depth keys and tile rectangles. Binners do not use the camera and the records."""
     unused, depth_key, tile_rect = (device.alloc(nbytes) for nbytes in (4, keys.nbytes, rect.nbytes))
     to_device(device, depth_key, keys)
     to_device(device, tile_rect, rect)
@@ -177,7 +177,7 @@ def check_band(
     end: int,
     tiles_x: int,
 ) -> None:
-    """Compare the lists of each tile, front to back, and the isects of each splat, in order of its tiles."""
+    """Compare the list of each tile, front to back, and the isects of each splat, in the order of its tiles."""
     order = np.argsort(keys, kind="stable")
     tiles = np.arange(first, end)
     x, y = tiles % tiles_x, tiles // tiles_x
@@ -207,7 +207,7 @@ def check_band(
 
 
 def test_counts_beyond_32_bits(device: Device) -> None:
-    """70 000 splats over 65 536 tiles: more than 2^32 isects are counted without overflow."""
+    """70 000 splats over 65 536 tiles: the count of more than 2^32 isects does not overflow."""
     n, side = 70_000, 256
     for kind, binner_of in (("CPU", ChunkBinner), ("GPU", GroupBinner)):
         other = as_kind(device, kind)
@@ -231,7 +231,7 @@ def test_the_limit_follows_the_device(devices: list[Device]) -> None:
 
 
 def test_isects_alone_refuse_no_run(devices: list[Device]) -> None:
-    """1000 MB of isects are cut into bands if splats and images leave 300 MB, and refused if they leave 60 MB."""
+    """1000 MB of isects need bands if splats and images leave 300 MB, and are refused if they leave 60 MB."""
     device, needed = as_kind(devices[0], "CPU"), Estimate(500 * 10**6, 10**9, 200 * 10**6, 60, 10**6)
     device.info = replace(device.info, max_alloc_bytes=1 << 30, global_mem_bytes=10**9)
     check(needed, device)

@@ -24,7 +24,7 @@ REALS = ("float", "double")
 
 
 def all_builds() -> Iterator[KernelBuild]:
-    """The product of all that changes a program; degrees, as only projection knows them, for two shapes."""
+    """Yield all options that change a program. Only two shapes vary the degree, because only projection uses it."""
     for (shape, normalisation), schedule, real in itertools.product(KERNELS, SCHEDULES.values(), REALS):
         yield KernelBuild(shape, 3, schedule, normalisation, real).for_rendering()
     for shape, degree, schedule in itertools.product(("gaussian", DEFAULT_SHAPE), (0, 1, 2, 3), SCHEDULES.values()):
@@ -34,7 +34,7 @@ def all_builds() -> Iterator[KernelBuild]:
 
 
 def some_builds() -> Iterator[KernelBuild]:
-    """Shapes x precisions on a CPU's and a GPU's schedule, and each other option at each of its values."""
+    """Yield all shapes and precisions on one CPU and one GPU schedule, and each other option at each of its values."""
     cpu = SCHEDULES["cpu16"]
     for shape, schedule, real in itertools.product(SHAPES, (cpu, SCHEDULES["gpu256"]), REALS):
         yield KernelBuild(shape, 3, schedule, real=real).for_rendering()
@@ -48,7 +48,7 @@ def some_builds() -> Iterator[KernelBuild]:
 
 @pytest.fixture(scope="module")
 def compiler(devices: list[Device]) -> Device:
-    """One device: PoCL, whose front end is the quickest, where it is there."""
+    """Return one device: PoCL if it is present, because its front end is the fastest."""
     if not devices:
         pytest.skip("no OpenCL device")
     return min(devices, key=lambda device: device.info.platform != "Portable Computing Language")
@@ -65,7 +65,7 @@ def build_all(device: Device, kernels: KernelBuild) -> None:
 
 
 def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
-    """And every file in cl/ is part of some program."""
+    """Every kernel builds without warnings, and every file in cl/ is part of a program."""
     for kernels in some_builds():
         build_all(compiler, kernels)
     KernelBuild(DEFAULT_SHAPE, 3, SCHEDULES["cpu16"]).count_program(compiler)

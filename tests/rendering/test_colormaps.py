@@ -1,4 +1,4 @@
-"""Pictures of renders: an even colour map, depth over a background, counts of splats, skew as colour."""
+"""Pictures of renders: an even colour map, depth over a background, counts of splats, and skew as colour."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from clsplat.splats.shapes import SHAPES, SKEW_LIMIT
 from clsplat.splats.splats import Splats
 
 BACKGROUND = (0.25, 0.5, 1.0)
-WIDTH, HEIGHT = 41, 27  # not a multiple of tiles or blocks
+WIDTH, HEIGHT = 41, 27  # not a multiple of the tile or block size
 
 
 def model(shape: str = "skew-normal", n: int = 40) -> Splats:
@@ -43,7 +43,7 @@ def camera() -> Camera:
 
 
 def one_splat(**fields: object) -> Splats:
-    """A large, nearly opaque splat, two units in front of the camera of `facing`."""
+    """A large, nearly opaque splat, two units in front of the camera `facing`."""
     arrays = {
         "mean": [[0, 0, 2]],
         "quat": [[1, 0, 0, 0]],
@@ -59,7 +59,7 @@ def facing() -> Camera:
 
 
 def lightness(colours: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """CIELAB L* of sRGB bytes."""
+    """Return CIELAB L* of sRGB bytes."""
     values = colours / 255.0
     linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
     y = linear @ [0.2126, 0.7152, 0.0722]
@@ -105,7 +105,7 @@ def test_stray_depths_do_not_stretch_the_range() -> None:
 
 @pytest.mark.parametrize("depth", [0.0, 5.0, np.nan])
 def test_any_render_has_a_depth_picture(depth: float) -> None:
-    """An empty image, a flat wall, a broken pixel."""
+    """Test an empty image, a flat wall, and a pixel that is not finite."""
     for alpha in (0.0, 1.0, -0.2):
         image = Rendered(np.zeros((2, 2, 3)), np.full((2, 2), alpha), np.full((2, 2), depth))
         assert depth_picture(image).shape == (2, 2, 3)
@@ -166,7 +166,7 @@ def test_counts_of_blocks_are_the_means_of_their_pixels(make_renderer: MakeRende
         for y in range(0, HEIGHT, high):
             for x in range(0, WIDTH, 4):
                 block = counts[name][y : y + high, x : x + 4]
-                # A pair at the cutoff may be counted or not.
+                # A pair at the cutoff may or may not be counted.
                 assert abs(block - pixels[y : y + high, x : x + 4].mean()).max() <= 2.01 / block.size
 
 

@@ -1,4 +1,4 @@
-"""Blocks of a tile that the forward looks at: all in which a splat shows, and few others."""
+"""The forward pass visits all blocks of a tile where a splat is visible, and few others."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from clsplat.rendering.splat_buffers import SplatBuffers
 from clsplat.splats.shapes import SHAPES, shape_named
 
 WIDTH, HEIGHT = 83, 61
-# Blocks looked at, as a multiple of those in which something shows: measured 1.02 to 1.04, with a skew 1.18 to 1.24.
+# Visited blocks per block where a splat is visible. The measured ratios are 1.02 to 1.04, and 1.18 to 1.24 with a skew.
 MOST, MOST_SKEWED = 1.08, 1.3
 
 
 def one_splat(shape: str, seed: int, needle: bool) -> Case:
-    """A splat of any size and opacity; needles are 100 times as long as wide."""
+    """A splat of any size and opacity. A needle is 100 times as long as wide."""
     arrays = strongly_skewed(seed, 1) | {"nu": np.array([3.0 + seed]), "beta": np.array([0.7 + 0.1 * seed])}
     if needle:
         arrays["log_scale"] = np.array([[-0.7, -5.3, -5.3]])
@@ -33,7 +33,7 @@ def one_splat(shape: str, seed: int, needle: bool) -> Case:
     return Case(wanted, random_camera(seed, WIDTH, HEIGHT), shape, "peak", np.float32)
 
 
-# One of each kind of bound; the others with -m slow.
+# One shape for each kind of bound. The other shapes run with -m slow.
 FAMILIES = ("gaussian", "skew-normal", "half-gaussian", "generalised-exponential")
 
 

@@ -1,6 +1,6 @@
-"""Boxes of splats: no pixel is lost to them, and they are not much larger than what they hold.
+"""Boxes of splats lose no pixel, and they are not much larger than their contents.
 
-The reference has no boxes: every pixel meets every splat.
+The reference has no boxes: every pixel evaluates every splat.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.splat_buffers import SplatBuffers
 from clsplat.splats.splats import Splats
 
-SHAPES = list(SKEWED)  # those of another falloff: test_shapes_radial.py
+SHAPES = list(SKEWED)  # test_shapes_radial.py tests the shapes with another falloff
 QUICK = ("gaussian", "skew-normal")
 SOME_SLOW = [shape if shape in QUICK else pytest.param(shape, marks=pytest.mark.slow) for shape in SHAPES]
 
 
 def strongly_skewed(seed: int, n: int) -> Arrays:
-    """Splats of every size, anisotropy and opacity (many just above the cutoff), skew near the bound."""
+    """Splats of every size, anisotropy and opacity (many just above the cutoff), with skews near the bound."""
     rng = np.random.default_rng(seed)
     arrays = random_splats(seed, n, 3)
     arrays["log_scale"] = rng.uniform(-4.0, -0.5, (n, 3))
@@ -43,14 +43,14 @@ def strongly_skewed(seed: int, n: int) -> Arrays:
     length = rng.uniform(0.8, 0.999, n) * SKEW_MAX
     arrays["skew"] *= (length / np.linalg.norm(arrays["skew"], axis=1))[:, None]
     arrays["opacity_minus_logit"] = rng.permutation(arrays["opacity_logit"])
-    arrays["opacity_minus_logit"][::4] = -20.0  # a side that is not there
+    arrays["opacity_minus_logit"][::4] = -20.0  # this side is transparent
     arrays["normal"] = rng.normal(size=(n, 3))
     return arrays
 
 
 @cache
 def single_splats(shape: str, normalisation: str, dtype: type) -> list[Case]:
-    """One splat an image, so that nothing hides a missing pixel; tile borders fall anywhere on them."""
+    """One splat per image, so that no other splat hides a missing pixel. Tile borders cross the splats anywhere."""
     many = strongly_skewed(0, 50)
     cases = []
     for i in range(50):
@@ -72,7 +72,7 @@ def single_splats(shape: str, normalisation: str, dtype: type) -> list[Case]:
 def test_no_pixel_is_lost(
     make_renderer: MakeRenderer, device: Device, shape: str, precision: str, tolerance: float
 ) -> None:
-    """A pixel lost would miss an alpha of 1/255 at least."""
+    """A lost pixel would be an error of at least 1/255 in alpha."""
     renderer = make_renderer(device, precision)
     covered = 0
     for case in single_splats(shape, "peak", np.dtype(precision).type):
@@ -92,10 +92,10 @@ def test_no_pixel_is_lost_in_other_normalisations(
 
 
 def true_boxes(kernel: Kernel) -> NDArray[np.float64]:
-    """(N, 4) lowest x, y and highest x, y [px] where alpha >= ALPHA_MIN; NaN where it is nowhere.
+    """Return (N, 4): lowest x, y and highest x, y [px] where alpha >= ALPHA_MIN. A splat with no such pixel has NaN.
 
-    With scale2d = L L' and d = L y, alpha rises and then falls along every ray from y = 0: it leaves the level set
-    once, which bisection finds beyond the ray's highest alpha, in 1440 directions.
+    With scale2d = L L' and d = L y, alpha rises and then falls along every ray from y = 0. Each ray therefore leaves
+    the level set once. Bisection finds this point beyond the ray's highest alpha, in 1440 directions.
     """
     factor = np.linalg.cholesky(kernel.scale2d)
     angle = np.linspace(0.0, 2.0 * np.pi, 1440, endpoint=False)
@@ -122,7 +122,7 @@ def true_boxes(kernel: Kernel) -> NDArray[np.float64]:
 def kernel_boxes(
     device: Device, shape: str, arrays: Arrays, camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """First and last pixel row of each splat (N, 2), and its tiles (N, 4): first x, y, past-the-end x, y."""
+    """Return the first and last pixel row of each splat (N, 2), and its tiles (N, 4): first x, y and end x, y."""
     kernels = KernelBuild(shape, 3, default_schedule(device.info)).for_rendering()
     pipeline = Pipeline(device, kernels)
     values = {name: value.astype(np.float32) for name, value in arrays.items()}
@@ -136,9 +136,9 @@ def kernel_boxes(
 @pytest.mark.parametrize("shape", SOME_SLOW)
 @pytest.mark.parametrize("turned", [False, True])
 def test_boxes_hold_their_splats_and_little_else(device: Device, shape: str, turned: bool) -> None:
-    """Splats of hundreds of pixels, so that rounding to pixels (rows) and tiles (columns) weighs little.
+    """Splats are hundreds of pixels large, so that rounding to pixels (rows) and tiles (columns) matters little.
 
-    Turning the camera by 90 degrees lets the exact side, the rows, measure the other axis too.
+    Rows are exact. In a camera turned by 90 degrees the rows measure the other axis too.
     """
     n, size = 200, 1024
     arrays = strongly_skewed(5, n)
@@ -159,7 +159,7 @@ def test_boxes_hold_their_splats_and_little_else(device: Device, shape: str, tur
     assert truth.max() < size, "the scene is to lie inside the image"
     rows, tiles = (boxes[seen] for boxes in kernel_boxes(device, shape, arrays, camera))
 
-    slack = 1e-3  # px: float32 rounding of an extent
+    slack = 1e-3  # float32 rounding of an extent [px]
     assert (rows[:, 0] <= np.ceil(truth[:, 1] - 0.5 + slack)).all()
     assert (rows[:, 1] >= np.floor(truth[:, 3] - 0.5 - slack)).all()
     first, last = np.ceil(truth[:, :2] - 0.5 + slack) // TILE, np.floor(truth[:, 2:] - 0.5 - slack) // TILE
@@ -170,10 +170,10 @@ def test_boxes_hold_their_splats_and_little_else(device: Device, shape: str, tur
     height, true_height = rows[:, 1] - rows[:, 0] + 1, truth[:, 3] - truth[:, 1]
     area = (tiles[:, 2:] - tiles[:, :2]).prod(1)
     true_area = (np.floor(truth[:, 2:] / TILE) - np.floor(truth[:, :2] / TILE) + 1).prod(1)
-    if shape == "gaussian":  # exact but for rounding
+    if shape == "gaussian":  # exact except for rounding
         assert (height <= true_height + 1.0 + slack).all()
         assert area.sum() <= 1.01 * true_area.sum()
-    else:  # measured, height and tiles: skew-normals 8 and 11 %, two-sided 3 and 5 %
+    else:  # measured excess of height and tiles: skew-normals 8 and 11 %, two-sided shapes 3 and 5 %
         most = (1.10, 1.14) if kernel.amplitude_minus is None else (1.04, 1.08)
         assert height.sum() <= most[0] * true_height.sum()
         assert area.sum() <= most[1] * true_area.sum()

@@ -1,4 +1,4 @@
-"""The closed forms of the skew-normal splat, by brute force: quadrature, grids, other libraries."""
+"""Brute-force checks of the closed forms of the skew-normal splat: quadrature, grids, and other libraries."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FEW = settings(max_examples=7, deadline=None)
 
 
 def random_moments(seed: int, largest: float = SKEW_MAX):
-    """Axes R S (3, 3), skew m (3,) and an affine map (2, 3) to pixels, scales within a factor of 4."""
+    """Return axes R S (3, 3), skew m (3,) and an affine map (2, 3) to pixels. Scales are within a factor of 4."""
     rng = np.random.default_rng(seed)
     axes = Rotation.random(rng=rng).as_matrix() * rng.uniform(0.5, 2.0, 3)
     skew = rng.normal(size=3)
@@ -43,14 +43,14 @@ def random_moments(seed: int, largest: float = SKEW_MAX):
 
 
 def direct_density(x, scale, slope):
-    """2 N(x; 0, scale) Phi(slope' x) at points x (..., D)."""
+    """Return 2 N(x; 0, scale) Phi(slope' x) at points x (..., D)."""
     q = np.einsum("...i,ij,...j->...", x, np.linalg.inv(scale), x)
     norm = np.sqrt(np.linalg.det(2.0 * np.pi * scale))
     return 2.0 * np.exp(-0.5 * q) / norm * ndtr(x @ slope)
 
 
 def slope_3d(scale, delta):
-    """Slope of a 3D skew-normal with scale matrix and skew displacement."""
+    """Return the slope of a 3D skew-normal with this scale matrix and skew displacement."""
     weighted = np.linalg.solve(scale, delta)
     return weighted / np.sqrt(1.0 - delta @ weighted)
 
@@ -68,9 +68,9 @@ def test_direct_form_has_the_given_moments_in_3d(seed):
     grid = np.stack(np.meshgrid(fine, coarse, coarse, indexing="ij"), -1).reshape(-1, 3)
     length = np.linalg.norm(skew)
     turn = np.linalg.qr(np.column_stack([skew, np.eye(3)[:, :2]]))[0]
-    turn[:, 0] = skew / length  # the fine axis follows the skew
+    turn[:, 0] = skew / length  # the fine axis is parallel to the skew
     y = grid @ turn.T
-    x = (y + skew) @ axes.T  # the density is about the location
+    x = (y + skew) @ axes.T  # relative to the location, where the density is centred
     weight = direct_density(x, scale, slope_3d(scale, delta)) * abs(np.linalg.det(axes)) * 0.1 * 0.7**2
     assert weight.sum() == pytest.approx(1.0, abs=1e-8)
     assert np.abs(weight @ y).max() < 1e-8
@@ -85,7 +85,7 @@ def test_projection_is_the_integral_along_lines(seed):
     scale, delta = direct_form(axes @ axes.T, axes @ skew)
     scale2d = affine @ scale @ affine.T
     slope, _ = slope_of(scale2d, affine @ delta)
-    line = np.linalg.svd(affine)[2][2]  # the direction that projects to nothing
+    line = np.linalg.svd(affine)[2][2]  # direction that projects to 0
     lift = np.linalg.pinv(affine)
     d = np.random.default_rng(seed + 1).multivariate_normal([0.0, 0.0], scale2d, 6)
     s = np.arange(-30.0, 30.0, 0.02)
@@ -113,7 +113,7 @@ def test_low_pass_only_adds_to_the_scale_matrix(seed):
 @FEW
 @given(SEEDS)
 def test_screen_kernel_has_the_gaussian_s_moments(seed):
-    """Mean at the projected mean and covariance A Sigma A' + low-pass, whatever the skew."""
+    """The projection has the projected mean and the covariance A Sigma A' + low-pass, for every skew."""
     arrays = random_splats(seed, 1, 0)
     screen = project(arrays, random_camera(seed), "skew-normal", "pdf")
     gaussian = project(arrays, random_camera(seed), "gaussian")
@@ -131,7 +131,7 @@ def test_screen_kernel_has_the_gaussian_s_moments(seed):
 @FEW
 @given(SEEDS, st.sampled_from(["peak", "pdf", "none"]))
 def test_centred_pixel_formula_is_the_direct_form(seed, normalisation):
-    """alpha = o/peak exp(-(d'Cd + (2a + t - a²)/(1 + t))/2) Phi(h (a + t)), all about the mean."""
+    """alpha = o/peak exp(-(d'Cd + (2a + t - a²)/(1 + t))/2) Phi(h (a + t)), with quantities relative to the mean."""
     arrays, camera = random_splats(seed, 4, 0), random_camera(seed)
     screen = project(arrays, camera, "skew-normal", normalisation)
     gaussian = project(arrays, camera, "gaussian")
@@ -165,7 +165,7 @@ def test_zero_skew_is_the_gaussian(seed):
 @FEW
 @given(SEEDS)
 def test_peak_normalised_splat_reaches_its_opacity(seed):
-    """The highest alpha over the plane is the opacity: on the line through the mode, and on a grid."""
+    """The highest alpha in the plane equals the opacity, on the line through the mode and on a grid."""
     screen = project(random_splats(seed, 1, 0), random_camera(seed), "skew-normal")
     opacity = project(random_splats(seed, 1, 0), random_camera(seed), "gaussian").kernel.amplitude[0]
     conic, slope = inverse_2x2(screen.kernel.scale2d)[0], screen.kernel.slope[0]
@@ -183,7 +183,7 @@ def test_peak_normalised_splat_reaches_its_opacity(seed):
 
 
 def test_peak_is_the_highest_value_of_a_dense_search():
-    """Also 1/2 at no slope, and 1/2 + c/(2 pi) to first order."""
+    """The peak is also 1/2 for slope 0, and 1/2 + c/(2 pi) to first order."""
     slopes = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 10.0])
     x = np.linspace(0.0, 1.0, 200_001)
     dense = [(np.exp(-0.5 * x * x) * ndtr(slope * x)).max() for slope in slopes]
@@ -214,7 +214,7 @@ def test_rotation_is_scipy_s(seed):
 
 
 def test_sh_basis_is_built_from_legendre_functions():
-    """Y_lm = sqrt(2) K P_l^m(cos theta) cos(m phi), sin(|m| phi) for m < 0, Condon-Shortley phase in P."""
+    """Y_lm = sqrt(2) K P_l^m(cos theta) cos(m phi), with sin(|m| phi) for m < 0. P has the Condon-Shortley phase."""
     direction = np.random.default_rng(5).normal(size=(40, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     phi = np.arctan2(direction[:, 1], direction[:, 0])

@@ -1,11 +1,11 @@
-"""Gradients of every raw parameter against finite differences, through the whole chain on the device.
+"""Gradients of every raw parameter agree with finite differences of the whole chain on the device.
 
-No formula is shared between the two sides: the differences use forward renders of the double build only.
-Thresholds are off (alpha_min 0, alpha_max 1, t_min 0), as an image is smooth only then. The loss weighs every
-pixel of colour and alpha at random; the image is not square and its principal point off centre.
+The two sides share no formula: the differences use only forward renders of the double build. Thresholds are off
+(alpha_min 0, alpha_max 1, t_min 0), because the image is smooth only without them. The loss weights every pixel of
+colour and alpha at random. The image is not square, and its principal point is off centre.
 
-Error: largest difference over the entries of a field, relative to the field's largest entry, and likewise
-with Euclidean norms; both below DIFFERENCES = 1e-6.
+The error is the largest difference in a field, relative to the field's largest entry. A second error uses Euclidean
+norms. Both must be below DIFFERENCES = 1e-6.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from clsplat.device.schedule import SCHEDULES
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 
-# Schedules differ in the raster only, normalisations in the projection only: not all of their products, and
-# normalisations on the first device only.
+# Schedules change only the raster kernels, and normalisations only the projection. So not all combinations are
+# tested, and normalisations run on the first device only.
 BUILDS = [(0, *kernel, "cpu16") for kernel in KERNELS] + [(0, "skew-normal", "peak", "gpu256")]
 BUILDS += [on_place(place, place, *kernel, "cpu16") for place in range(1, len(USABLE)) for kernel in KERNELS[:2]]
 
 
 def awkward_splats(camera: Camera) -> Arrays:
-    """Four splats: no skew, in the clamped margin of the Jacobian, skew beyond the bound, a black channel."""
+    """Four splats: no skew, in the clamped margin of the Jacobian, skew beyond the bound, and a black channel."""
     arrays = random_splats(1, 4, 3)
     arrays["skew"][0] = 0.0
     arrays["mean"][1] = camera.position + camera.rotation.T @ [-2.2, 0.3, 3.0]
@@ -51,7 +51,7 @@ def test_gradients_are_those_of_the_image(
     camera = random_camera(1, 23, 17)
     arrays = awkward_splats(camera)
     if normalisation == "pdf":
-        arrays["opacity_logit"] -= 3.0  # alpha reaches twice the opacity: stay clear of 1
+        arrays["opacity_logit"] -= 3.0  # alpha reaches twice the opacity: keep it below 1
     case = Case(arrays, camera, shape, normalisation, np.float64, thresholds=SMOOTH)
     renderer = make_renderer(devices[place], "float64", SCHEDULES[schedule], **SMOOTH)
     case.render(renderer)
@@ -69,7 +69,7 @@ def test_gradients_are_those_of_the_image(
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_gradients_through_the_default_thresholds(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """One direction, with a step so small that no pixel crosses a threshold."""
+    """Return one direction with a step so small that no pixel crosses a threshold."""
     camera = random_camera(4, 41, 27)
     case = Case(random_splats(4, 24, 3), camera, shape, dtype=np.float64)
     renderer = make_renderer(device, "float64")

@@ -1,4 +1,4 @@
-"""Compact gradients of training: multiplied out, they equal the full gradients of the backward pass."""
+"""Compact gradients of training, once expanded, equal the full gradients of the backward pass."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_the_basis(degree: int) -> None:
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_multiplied_out_they_equal_the_full_gradients(device: Device, degree: int) -> None:
-    """Colour is compared to rounding, all else to the bit. Some colours are clamped, and 36 splats are not visible."""
+    """Colour is equal up to rounding, and the other fields bit for bit. Some colours are clamped, 36 splats hidden."""
     arrays = random_splats(3, 80, 3, np.float32)
     arrays["sh"][::5, 0] -= 3
     unseen = np.r_[:4, 32:64]

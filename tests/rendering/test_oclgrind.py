@@ -1,4 +1,4 @@
-"""Kernels on a simulated device that reports stray accesses, data races and reads of unwritten memory."""
+"""A simulated device checks the kernels for stray accesses, data races and reads of unwritten memory."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ CHILD = Path(__file__).parents[1] / "support" / "oclgrind_child.py"
 
 pytestmark = pytest.mark.skipif(OCLGRIND is None, reason="oclgrind is not installed (apt install oclgrind)")
 
-# Uninitialised values are followed in unoptimised kernels, as Oclgrind 21.10 stops at LLVM's `freeze`; races
-# and stray accesses are looked for in optimised ones.
+# Oclgrind 21.10 stops at LLVM's `freeze`, so uninitialised values are tracked in unoptimised kernels. Races and
+# stray accesses are checked in optimised kernels.
 MODES = {
     "races": (["--data-races"], ""),
     "uninitialized": (["--uninitialized"], "-O0"),
@@ -26,7 +26,7 @@ MODES = {
 
 
 def run_under_oclgrind(tmp_path: Path, what: str, mode: str) -> str:
-    """Everything that Oclgrind reported while oclgrind_child.py ran; the child must get to its end."""
+    """Return all that Oclgrind reported while oclgrind_child.py ran. The child must finish."""
     flags, build_options = MODES[mode]
     log = tmp_path / "oclgrind.log"
     assert OCLGRIND is not None
@@ -49,7 +49,7 @@ def test_kernels_are_clean(tmp_path: Path, what: str, mode: str) -> None:
 
 
 def test_faults_are_found(tmp_path: Path) -> None:
-    """Guards the test above: planted faults of each kind are reported by the same calls."""
+    """The same calls report planted faults of each kind. This checks the test above."""
     races = run_under_oclgrind(tmp_path, "faults", "races")
     assert "Invalid write of size 4 at global memory" in races
     assert "data race at local memory" in races

@@ -1,4 +1,4 @@
-"""Coefficients of exp, log and Phi in cl/math/approx.clh have the stated error and are close to the best ones."""
+"""Coefficients of exp, log and Phi in cl/math/approx.clh have the documented error and are close to optimal."""
 
 from __future__ import annotations
 

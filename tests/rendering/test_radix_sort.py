@@ -1,4 +1,4 @@
-"""Sort and scan on the device against NumPy."""
+"""Sorting and scanning on the device equal NumPy's."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ SIZES = [
     16384,
     16385,
     100_003,
-]  # around every boundary of runs, groups, blocks and chunks
+]  # sizes around every boundary of runs, groups, blocks and chunks
 ALL_BITS = 32
 UINT32, UINT64 = np.uint32, np.uint64
 
-MACHINES: dict[Device, SortMachine] = {}  # kept from example to example
+MACHINES: dict[Device, SortMachine] = {}  # kept between examples
 
 Array = NDArray[np.uint32]
 
 
 class SortMachine:
-    """A sorter with buffers that are reused from call to call."""
+    """A sorter whose buffers are reused between calls."""
 
     def __init__(self, device: Device) -> None:
         pool = Pool(device)
@@ -55,7 +55,7 @@ class SortMachine:
         self.values, self.scanned, self.total = (pool.buffer(dtype) for dtype in (UINT32, UINT32, UINT64))
 
     def sort(self, keys: Array, key_bits: int) -> tuple[Array, Array]:
-        """Sorted keys, and the index that each one had."""
+        """Return the sorted keys and the original index of each."""
         device, n = self.device, len(keys)
         to_device(device, self.pairs.keys.reserve(n), keys)
         self.sorter.iota(self.pairs.values.reserve(n), n)
@@ -63,7 +63,7 @@ class SortMachine:
         return to_host(device, sorted_keys, np.empty(n, UINT32)), to_host(device, order, np.empty(n, UINT32))
 
     def scan(self, values: Array) -> tuple[Array, int]:
-        """Exclusive scan and total."""
+        """Return the exclusive scan and the total."""
         n = len(values)
         to_device(self.device, self.values.reserve(n), values)
         self.sorter.scan(self.values.buffer, self.scanned.reserve(n), n, self.total.reserve(1))
@@ -90,7 +90,7 @@ def check_scan(sorter: SortMachine, values: Array) -> None:
 
 @pytest.mark.parametrize("n", SIZES)
 def test_sort_is_numpy_s_stable_sort(sorter: SortMachine, n: int) -> None:
-    """Keys of all 32 bits, with the largest one, which marks culled splats; and many equal keys."""
+    """Keys use all 32 bits and include the largest key, which marks culled splats. Many keys are equal."""
     rng = np.random.default_rng(n)
     keys = rng.integers(0, 2**32, n, UINT32)
     keys[rng.random(n) < 0.1] = 0xFFFFFFFF
@@ -100,7 +100,7 @@ def test_sort_is_numpy_s_stable_sort(sorter: SortMachine, n: int) -> None:
 
 @pytest.mark.parametrize("key_bits", [1, 4, 5, 8, 11, 12, 13, 16, 22, 23, 31, 32])
 def test_any_number_of_bits(sorter: SortMachine, key_bits: int) -> None:
-    """Odd and even numbers of passes, and digits that are cut at the top. Keys have no higher bits."""
+    """Test odd and even numbers of passes, and a shorter last digit. Higher bits of the keys are zero."""
     keys = np.random.default_rng(key_bits).integers(0, 2**key_bits, 5000, UINT32)
     check_sort(sorter, keys, key_bits)
 
@@ -116,14 +116,14 @@ def test_sorted_reversed_and_equal_keys(sorter: SortMachine) -> None:
 def test_scan_is_numpy_s_cumulative_sum(sorter: SortMachine, n: int) -> None:
     rng = np.random.default_rng(n)
     check_scan(sorter, rng.integers(0, 9, n, UINT32))
-    check_scan(sorter, rng.integers(0, 2**32, n, UINT32))  # wraps
+    check_scan(sorter, rng.integers(0, 2**32, n, UINT32))  # the sum wraps around
 
 
 @pytest.mark.skipif(not USABLE, reason="no OpenCL device")
 @settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_any_keys(devices: list[Device], data: st.DataObject) -> None:
-    """Sizes come in any order, so buffers are larger than their contents."""
+    """Sizes come in any order, so some buffers are larger than their contents."""
     keys = np.array(data.draw(st.lists(st.integers(0, 2**32 - 1), max_size=700)), UINT32)
     sorter = MACHINES.setdefault(devices[0], SortMachine(devices[0]))
     check_sort(sorter, keys)

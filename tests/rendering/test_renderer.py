@@ -1,4 +1,4 @@
-"""The renderer against the reference: images, depths and gradients, on every device and schedule."""
+"""The renderer agrees with the reference in images, depths and gradients, on every device and schedule."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 
 SKEWED = "skew-normal"
-# Tests of the rasterizer, not of formulas: two shapes; the other shapes are slow tests.
+# These tests check the rasterizer, not the formulas: two shapes are enough. The other shapes are slow tests.
 BOTH = pytest.mark.parametrize(
     "shape", [pytest.param(name, marks=[] if name in ("gaussian", SKEWED) else pytest.mark.slow) for name in SHAPES]
 )
@@ -37,7 +37,7 @@ EVERY = pytest.mark.parametrize("shape", SHAPES)
 
 @cache
 def cloud(shape: str, normalisation: str = "peak", dtype: type = np.float32) -> Case:
-    """24 splats of every kind in 3 x 2 tiles; the last tiles are cut by the edge."""
+    """24 splats of every kind in 3 x 2 tiles. The image's edge cuts the last tiles."""
     return Case(random_splats(1, 24, 3), random_camera(1, 41, 27), shape, normalisation, dtype)
 
 
@@ -53,7 +53,7 @@ def test_every_schedule_agrees_with_the_reference(
 
 @BOTH
 def test_one_lane_agrees_with_the_reference(make_renderer: MakeRenderer, devices: list[Device], shape: str) -> None:
-    """One lane uses other forms of the formulas; the default schedules of CPUs have 16 lanes."""
+    """A schedule of one lane uses other forms of the formulas. The default schedules of CPUs have 16 lanes."""
     if not devices:
         pytest.skip("no OpenCL device")
     renderer = make_renderer(devices[0], schedule=SCHEDULES["gpu256"])
@@ -106,7 +106,7 @@ def test_the_same_again_gives_the_same_bits(
 
 @cache
 def thin_cases(shape: str) -> dict[str, Case]:
-    """Odd image sizes, and numbers of splats around the batch and the lanes; gradients of two fields."""
+    """Test odd image sizes, numbers of splats around the batch and lane sizes, and gradients of two fields."""
     fields = ("mean", "log_scale")
     cases = {}
     for width, height in ((1, 1), (TILE, TILE), (TILE + 1, TILE - 1), (200, 5), (5, 130), (33, 64)):
@@ -114,7 +114,7 @@ def thin_cases(shape: str) -> dict[str, Case]:
         cases[f"{width} x {height}"] = Case(random_splats(5, 12, 3), camera, shape, fields=fields)
     for n in (1, 7, 8, 9, 15, 16, 17, BATCH - 1, BATCH, BATCH + 1, 2 * BATCH + 1):
         arrays = random_splats(n, n, 3)
-        arrays["opacity_logit"] -= 2.0  # faint, so that every splat counts
+        arrays["opacity_logit"] -= 2.0  # splats are faint, so that every one contributes
         cases[f"{n} splats"] = Case(arrays, random_camera(3, 13, 11), shape, fields=fields)
     return cases
 
@@ -126,7 +126,7 @@ def test_sizes_and_counts(make_renderer: MakeRenderer, device: Device, shape: st
 
 
 def changed(**fields: object) -> Arrays:
-    """12 splats, with some fields replaced (a number, an array, or a function of the old value)."""
+    """12 splats with some fields replaced by a number, an array, or a function of the old value."""
     arrays = random_splats(7, 12, 3)
     for name, value in fields.items():
         new = value(arrays[name]) if callable(value) else value
@@ -162,9 +162,9 @@ def test_edges(make_renderer: MakeRenderer, device: Device, shape: str, name: st
 
 @EVERY
 def test_points_and_giants(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """Splats without size show the low-pass only; splats far larger than the image are a haze.
+    """Splats of size 0 show only the low-pass. Splats far larger than the image are a haze.
 
-    Rotation and scale hardly matter for them, so only gradients of mean, opacity and colour are compared.
+    Rotation and scale hardly affect them, so only gradients of mean, opacity and colour are compared.
     """
     fields = ("mean", "opacity_logit", "sh")
     for log_scale in (-12.0, 3.0):
@@ -174,7 +174,7 @@ def test_points_and_giants(make_renderer: MakeRenderer, device: Device, shape: s
 
 @EVERY
 def test_needles(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """A condition number of 3e3 costs float32 accuracy: 3e3 * 6e-8 in images, ten times that in gradients."""
+    """A condition number of 3e3 reduces float32 accuracy to 3e3 * 6e-8 in images and ten times that in gradients."""
     arrays, camera = changed(log_scale=[-6.0, -6.0, 1.0]), random_camera(7, 41, 27)
     single, double = (Case(arrays, camera, shape, dtype=dtype) for dtype in (np.float32, np.float64))
     single.check(make_renderer(device), 3e3 * 6e-8, 10 * 3e3 * 6e-8)
@@ -185,7 +185,7 @@ def test_needles(make_renderer: MakeRenderer, device: Device, shape: str) -> Non
 def test_opaque_stack_ends_for_good(
     make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule], shape: str
 ) -> None:
-    """Some pixels finish in the first batch, others later. Splats behind them do not contribute."""
+    """Some pixels finish in the first batch and others later. Splats behind them do not contribute."""
     case = stack(shape)
     order = visible_order(prepared(case.values, shape), case.camera, shape)
     assert not case.gradients["mean"][order[-20:]].any(), "the last ones should be hidden"
@@ -197,11 +197,11 @@ def test_opaque_stack_ends_for_good(
 
 @cache
 def stack(shape: str) -> Case:
-    """192 wide splats, a few of them opaque: pixels finish after some 40 to 140 splats."""
+    """192 wide splats, a few of them opaque: pixels finish after about 40 to 140 splats."""
     arrays = random_splats(7, 3 * BATCH, 3)
     arrays["mean"] *= 0.5
     arrays["log_scale"] = np.minimum(arrays["log_scale"] + 3.0, 0.8)
-    opaque = np.arange(3 * BATCH) % 21 == 1  # not those whose sign may be flipped
+    opaque = np.arange(3 * BATCH) % 21 == 1  # exclude opacities whose sign may be flipped
     arrays["opacity_logit"][:] = np.where(opaque, 7.0, -3.0)
     fields = ("mean", "skew") if shape == SKEWED else ("mean",)
     return Case(arrays, random_camera(7, 18, 8), shape, fields=fields)
@@ -209,7 +209,7 @@ def stack(shape: str) -> Case:
 
 @BOTH
 def test_nothing_to_see(make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule], shape: str) -> None:
-    """No splats, or all of them behind the camera, too dim, or outside the image."""
+    """Test no splats, and splats that are all behind the camera, too dim, or outside the image."""
     camera = random_camera(2, 19, 17)
     to_world = camera.rotation.T
     scenes = {
@@ -232,12 +232,12 @@ def test_nothing_to_see(make_renderer: MakeRenderer, scheduled: tuple[Device, Sc
 
 @EVERY
 def test_near_plane(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """A splat at the near plane is drawn; one at the next smaller number is not."""
+    """A splat at the near plane is drawn. A splat at the next smaller z is not."""
     camera = Camera(9, 7, 8.0, 8.0, 4.3, 3.6, np.eye(4))
     for z, seen in ((NEAR, True), (np.nextafter(NEAR, 0.0), False), (-1.0, False)):
         arrays = random_splats(3, 1, 3)
         arrays["mean"], arrays["log_scale"] = np.array([[0.0, 0.0, z]]), np.full((1, 3), -6.0)
-        arrays["skew"][:] = 0.0  # all shapes project (x, y, z) then
+        arrays["skew"][:] = 0.0  # all shapes then project (x, y, z)
         case = Case(arrays, camera, shape, dtype=np.float64)
         assert case.image.alpha.any() == seen
         case.check(make_renderer(device, "float64"), ROUNDING, ROUNDING)
@@ -274,11 +274,11 @@ def test_not_a_number_is_refused_before_it_reaches_a_device() -> None:
             Splats(SKEWED, arrays)
 
 
-# ---- the public face ---------------------------------------------------------------------------------------
+# ---- the public interface ----------------------------------------------------------------------------------
 
 
 def test_an_overwritten_frame_raises(device: Device) -> None:
-    """Two frames share their buffers: the first one must not return data of the second one."""
+    """Two frames share their buffers. The first frame must not return data of the second one."""
     case = cloud(SKEWED)
     pipeline = Pipeline(device, KernelBuild(SKEWED, 3, default_schedule(device.info)).for_rendering())
     splats = SplatBuffers.of(device, case.splats, pipeline.kernels.dtype)
@@ -298,7 +298,7 @@ def test_an_overwritten_frame_raises(device: Device) -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_fewer_sh_bands_in_use(device: Device, degree: int) -> None:
-    """Kernels of degree 3 can use the lower bands only, as training does. The other rows stay zero."""
+    """Kernels of degree 3 can use only the lower bands, as training does. The other rows stay zero."""
     case = cloud(SKEWED)
     pipeline = Pipeline(device, KernelBuild(SKEWED, 3, default_schedule(device.info)).for_rendering())
     splats = SplatBuffers.of(device, case.splats, pipeline.kernels.dtype)
@@ -325,7 +325,7 @@ def test_splats_without_sh_bands(make_renderer: MakeRenderer, device: Device) ->
 
 
 def test_one_renderer_serves_changing_scenes_and_sizes(make_renderer: MakeRenderer, device: Device) -> None:
-    """Buffers are reused and grow; an earlier frame must not change a later one."""
+    """Buffers are reused and grow. An earlier frame must not change a later one."""
     renderer = make_renderer(device)
     cases = [cloud("gaussian"), *thin_cases(SKEWED).values(), cloud(SKEWED), *thin_cases("gaussian").values()]
     for case in (*cases, *reversed(cases)):

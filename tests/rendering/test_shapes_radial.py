@@ -1,6 +1,6 @@
-"""The laws of the kernels that depend on q alone: student-t, generalised exponential and GES's modulation.
+"""Kernels that depend on q alone obey their laws: student-t, generalised exponential and GES's modulation.
 
-Images and gradients of these shapes are also held against the reference by test_render.py and test_gradients.py.
+test_renderer.py and test_gradients.py also compare images and gradients of these shapes with the reference.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ FACING = Camera(31, 23, 300.0, 300.0, 15.3, 11.6, np.eye(4))
 
 
 def one_splat(shape: str, opacity: float = 0.8, **fields: object) -> Arrays:
-    """A splat some 4 pixels wide on the axis of FACING, for `shape`; `fields` replace others."""
+    """A splat of `shape` about 4 pixels wide on the axis of FACING. `fields` replace its default values."""
     arrays = random_splats(4, 1, 0)
     arrays["mean"], arrays["log_scale"] = np.array([[0.0, 0.0, 5.0]]), np.log([[0.05, 0.09, 0.07]])
     arrays = for_shape(arrays, shape)
@@ -51,7 +51,7 @@ def one_splat(shape: str, opacity: float = 0.8, **fields: object) -> Arrays:
 
 
 def render(renderer: Renderer, shape: str, arrays: Arrays, camera: Camera = FACING) -> NDArray[np.float64]:
-    """Alpha (H, W), before a black background."""
+    """Return alpha (H, W), over a black background."""
     return np.float64(renderer.render(Splats(shape, arrays), camera).alpha)
 
 
@@ -71,7 +71,7 @@ kernel void logarithms(global const real *restrict x, global real *restrict out,
 
 @pytest.mark.parametrize("lanes", [1, 8, 16])
 def test_logarithms_in_float32(device: Device, lanes: int) -> None:
-    """Relative errors. log(x) near 1 is x - 1 up to rounding; the gap log(1+x) - x/(1+x) is about x^2/2 near 0."""
+    """Check relative errors. log(x) is near x - 1 at 1, up to rounding; log(1+x) - x/(1+x) is near x^2/2 at 0."""
     x = np.float32(np.concatenate([np.geomspace(1e-30, 1e30, 8000), np.geomspace(0.5, 2.0, 8192)]))
     program = build_text(device, source("math/lanes.clh", "math/approx.clh") + LOGARITHMS, {"LANES": lanes})
     buffers = [device.alloc(size) for size in (x.nbytes, 3 * x.nbytes)]
@@ -96,9 +96,9 @@ def test_logarithms_in_float32(device: Device, lanes: int) -> None:
 def test_student_t_is_the_line_integral_of_its_3d_kernel(
     make_renderer: MakeRenderer, device: Device, nu: float
 ) -> None:
-    """(1 + q3/nu)^-((nu+3)/2) integrated along z, relative to the integral through the centre.
+    """Return (1 + q3/nu)^-((nu+3)/2) integrated along z, relative to the integral through the centre.
 
-    On the axis the projection's linearisation is f/z times x and y; the low-pass belongs to the 3D scale matrix.
+    On the axis, the linearised projection is f/z times x and y. The low-pass belongs to the 3D scale matrix.
     """
     arrays = one_splat("student-t", nu=nu)
     axes = rotation(arrays["quat"])[0] * np.exp(arrays["log_scale"][0])
@@ -108,9 +108,9 @@ def test_student_t_is_the_line_integral_of_its_3d_kernel(
     inverse = np.linalg.inv(scale)
     y, x = np.mgrid[: FACING.height, : FACING.width] + 0.5
     across = np.stack([x.ravel() - FACING.cx, y.ravel() - FACING.cy]) / to_px
-    across = np.concatenate([across, [[0.0], [0.0]]], axis=1)  # the last one through the centre
+    across = np.concatenate([across, [[0.0], [0.0]]], axis=1)  # the last one passes through the centre
 
-    # q3 = least + inverse_zz (z - z_least)^2; z - z_least = width sinh(t) makes the integrand doubly exponential
+    # q3 = least + inverse_zz (z - z_least)^2. z - z_least = width sinh(t) makes the integrand decay doubly exponentially.
     least = np.einsum("ip,ij,jp->p", across, np.linalg.inv(scale[:2, :2]), across)
     t, step = np.linspace(-14.0, 14.0, 1401, retstep=True)
     width = np.sqrt(1.0 / inverse[2, 2])
@@ -123,7 +123,7 @@ def test_student_t_is_the_line_integral_of_its_3d_kernel(
 
 @pytest.mark.parametrize("nu", [1.5, 3.0, 30.0, 100.0, 3000.0])
 def test_the_derivative_of_nu_changes_its_sign(make_renderer: MakeRenderer, device: Device, nu: float) -> None:
-    """More mass in the shoulders and less in the tails as nu grows: differences see both, and so does the gradient."""
+    """As nu grows, the shoulders hold more mass and the tails less. Differences and the gradient both show it."""
     double, single = (make_renderer(device, precision, **SMOOTH) for precision in ("float64", "float32"))
     steps = [(k, render(double, "student-t", one_splat("student-t", nu=nu * (1.0 + 1e-3 * k)))) for k in (-2, -1, 1, 2)]
     weights = {-2: 1, -1: -8, 1: 8, 2: -1}
@@ -142,7 +142,7 @@ def test_the_derivative_of_nu_changes_its_sign(make_renderer: MakeRenderer, devi
 
 
 def test_negative_alpha_is_clamped_cut_off_and_takes_light_away(make_renderer: MakeRenderer, device: Device) -> None:
-    """Transmittance rises above 1: to 1.99 at most for one splat; what is behind is brightened by it."""
+    """Transmittance rises above 1, to at most 1.99 for one splat. The splat brightens everything behind it."""
     renderer = make_renderer(device, "float64")
     hole = one_splat("student-t", -(1.0 - 1e-9), nu=3.0)
     alpha = render(renderer, "student-t", hole)
@@ -167,7 +167,7 @@ def test_negative_alpha_is_clamped_cut_off_and_takes_light_away(make_renderer: M
 def test_stacks_of_both_signs_agree_with_the_reference(
     make_renderer: MakeRenderer, device: Device, precision: str
 ) -> None:
-    """Saturated opacities of both signs, transmittances far above 1 and down to the end."""
+    """Test saturated opacities of both signs, transmittances far above 1, and pixels that finish."""
     arrays = for_shape(random_splats(3, 40, 1), "student-t")
     arrays["opacity_logit"] = np.where(np.arange(40) % 3, 1.0, -1.0) * np.tile([0.2, 1.0, 2.8, 3.5], 10)
     arrays["mean"] *= 0.5
@@ -180,7 +180,7 @@ def test_stacks_of_both_signs_agree_with_the_reference(
 
 
 class SignedCase(Case):
-    """A case whose opacities have their signs already."""
+    """A case whose opacities already have their signs."""
 
     @cached_property
     def values(self) -> Arrays:
@@ -188,7 +188,7 @@ class SignedCase(Case):
 
 
 def test_an_opacity_of_zero_has_a_gradient(make_renderer: MakeRenderer, device: Device) -> None:
-    """Where the sign changes: alpha is 0 and its derivative is the kernel itself."""
+    """At opacity 0 the sign changes: alpha is 0 and its derivative is the kernel."""
     renderer = make_renderer(device, "float64", **SMOOTH)
     full = render(renderer, "student-t", one_splat("student-t", 0.5, nu=4.0))
     assert not render(renderer, "student-t", one_splat("student-t", 0.0, nu=4.0)).any()
@@ -202,14 +202,14 @@ def test_an_opacity_of_zero_has_a_gradient(make_renderer: MakeRenderer, device: 
 
 @EVERY
 def test_neutral_values_are_the_gaussian(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """At nu = 1e4 to |alpha| (q^2/4 - q) / nu < 1e-4, at beta = 2 to rounding."""
+    """At nu = 1e4 they differ by |alpha| (q^2/4 - q) / nu < 1e-4, and at beta = 2 only by rounding."""
     field = SHAPES[shape].fields[0]
     arrays, camera = random_splats(2, 24, 1), random_camera(2, 41, 27)
     gaussian = Splats("gaussian", {name: arrays[name] for name in ("mean", "quat", "log_scale", "opacity_logit", "sh")})
     arrays = for_shape({**arrays, field.name: np.full(24, field.neutral[0])}, shape)
     arrays["opacity_logit"] = SHAPES[shape].raw_opacity(SHAPES["gaussian"].opacity(gaussian.opacity_logit))
     for precision, tolerance in (("float32", SAME_FLOAT32), ("float64", 1e-12)):
-        renderer = make_renderer(device, precision, **SMOOTH)  # a pixel at a threshold would jump
+        renderer = make_renderer(device, precision, **SMOOTH)  # a pixel at a threshold would change abruptly
         want = renderer.render(gaussian, camera, BACKGROUND).color
         got = renderer.render(Splats(shape, arrays), camera, BACKGROUND).color
         assert np.abs(got - want).max() < (1e-4 if shape == "student-t" else tolerance)
@@ -230,7 +230,7 @@ def test_modulation_is_the_gaussian_of_other_scales(make_renderer: MakeRenderer,
     gradients = renderer.backward(v_color)
     renderer.render(Splats("ges-modulation", arrays), camera, BACKGROUND)
     for name, value in renderer.backward(v_color).items():
-        if name == "beta":  # the same as all three log scales at once
+        if name == "beta":  # beta acts as all three log scales together
             by_beta = gradients["log_scale"].sum(1) * 0.1 * (1.0 - 0.5 * factor)
             assert relative_error(value, by_beta) < ROUNDING
         else:
@@ -240,7 +240,7 @@ def test_modulation_is_the_gaussian_of_other_scales(make_renderer: MakeRenderer,
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("beta", [0.5, 1.0, 1.9, 2.0, 8.0])
 def test_nothing_breaks_at_the_centre(make_renderer: MakeRenderer, device: Device, beta: float, precision: str) -> None:
-    """A pixel exactly on the mean: alpha is the opacity, nothing moves it to first order, no shape changes it."""
+    """At a pixel exactly on the mean, alpha is the opacity. Only the opacity has a gradient there."""
     camera = Camera(3, 3, 300.0, 300.0, 1.5, 1.5, np.eye(4))
     renderer = make_renderer(device, precision)
     alpha = render(renderer, "generalised-exponential", one_splat("generalised-exponential", beta=beta), camera)
@@ -256,7 +256,7 @@ def test_nothing_breaks_at_the_centre(make_renderer: MakeRenderer, device: Devic
 
 
 def of_every_falloff(shape: str, n: int) -> Arrays:
-    """Splats of every opacity above the cutoff (many just above it), nu or beta over their whole ranges."""
+    """Splats of every opacity above the cutoff (many just above it), with nu or beta over its whole range."""
     rng = np.random.default_rng(8)
     name, values = OWN[shape]
     arrays = random_splats(8, n, 3)
@@ -270,7 +270,7 @@ def of_every_falloff(shape: str, n: int) -> Arrays:
 
 @cache
 def single_splats(shape: str, dtype: type) -> list[SignedCase]:
-    """One splat an image, so that nothing hides a missing pixel; tile borders fall anywhere on them."""
+    """One splat per image, so that no other splat hides a missing pixel. Tile borders cross the splats anywhere."""
     many = of_every_falloff(shape, 54)
     many["log_scale"] -= 1.0
     ones = [{name: value[i : i + 1] for name, value in many.items()} for i in range(54)]
@@ -282,7 +282,7 @@ def single_splats(shape: str, dtype: type) -> list[SignedCase]:
 def test_no_pixel_is_lost(
     make_renderer: MakeRenderer, device: Device, shape: str, precision: str, tolerance: float
 ) -> None:
-    """A pixel lost would miss an alpha of 1/255 at least."""
+    """A lost pixel would be an error of at least 1/255 in alpha."""
     renderer, covered = make_renderer(device, precision), 0
     for case in single_splats(shape, np.dtype(precision).type):
         case.check_image(case.render(renderer), tolerance)
@@ -292,7 +292,7 @@ def test_no_pixel_is_lost(
 
 @EVERY
 def test_boxes_are_exact(device: Device, shape: str) -> None:
-    """Level sets are ellipses q = const: bisection of the falloff gives their size, and boxes are no larger."""
+    """Level sets are ellipses q = const. Bisection of the falloff gives their size, and boxes are no larger."""
     n, size = 180, 1024
     arrays = of_every_falloff(shape, n)
     arrays["mean"] *= 0.2
@@ -311,7 +311,7 @@ def test_boxes_are_exact(device: Device, shape: str) -> None:
     inner = (reach[:, 1] < 500.0) & (first > 1.0).all(1) & (last < size - 1.0).all(1)
     assert inner.mean() > 0.6
     rows, tiles = kernel_boxes(device, shape, arrays, camera)
-    slack = 1e-5 * np.maximum(reach, 100.0)  # px: float32 rounding of an extent
+    slack = 1e-5 * np.maximum(reach, 100.0)  # float32 rounding of an extent [px]
     assert (rows[:, 0] <= np.ceil(first[:, 1] - 0.5 + slack[:, 1]))[inner].all()
     assert (rows[:, 1] >= np.floor(last[:, 1] - 0.5 - slack[:, 1]))[inner].all()
     assert (rows[:, 0] >= np.ceil(first[:, 1] - 0.5 - slack[:, 1]))[inner].all()
@@ -319,4 +319,4 @@ def test_boxes_are_exact(device: Device, shape: str) -> None:
     some = inner & (np.floor(last - 0.5) >= np.ceil(first - 0.5)).all(1)
     exact = np.ceil(first[:, 0] - 0.5) // 16, np.floor(last[:, 0] - 0.5) // 16 + 1
     columns = np.abs(tiles[:, 0] - exact[0])[some], np.abs(tiles[:, 2] - exact[1])[some]
-    assert np.count_nonzero(columns) <= 2  # a border within rounding
+    assert np.count_nonzero(columns) <= 2  # a tile border may lie within rounding

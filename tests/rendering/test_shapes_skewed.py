@@ -1,4 +1,4 @@
-"""Laws of the skewed and two-sided shapes: each is the projection of its 3D kernel, and their limits are each other."""
+"""Each skewed or two-sided shape is the projection of its 3D kernel, and the shapes are limits of one another."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ Reals = NDArray[np.float64]
 
 
 def one_splat(seed: int, shape: str) -> Arrays:
-    """A splat whose sides differ."""
+    """A splat whose two sides differ."""
     arrays = random_splats(seed, 2, 0)
     arrays["opacity_logit"] = np.array([1.5, -1.0])
     return {name: value[:1] for name, value in for_shape(arrays, shape).items()}
 
 
 def side_of(arrays: Arrays, shape: str) -> tuple[Reals, Reals, Reals]:
-    """Opacity on either side of the splat, and the vector of its unit frame that points to the first."""
+    """Return both sides' opacities, and the vector in the splat's unit frame that points to the first side."""
     plus = 1.0 / (1.0 + np.exp(-arrays["opacity_logit"][0]))
     if shape == "skew-normal-direct":
         return plus, 0.0, arrays["skew"][0]
@@ -44,8 +44,10 @@ def side_of(arrays: Arrays, shape: str) -> tuple[Reals, Reals, Reals]:
 @SIDED
 @SEEDS
 def test_screen_kernel_is_the_integral_along_rays(monkeypatch: pytest.MonkeyPatch, shape: str, seed: int) -> None:
-    """Parallel rays through the 3D kernel exp(-y'y/2) (o_minus + (o_plus - o_minus) Phi(eta'y)), y in the unit frame;
-    for the half-Gaussian a step at n'y = 0. Relative to the integral of the Gaussian through the location.
+    """Screen kernels are integrals of the 3D kernel exp(-y'y/2) (o_minus + (o_plus - o_minus) Phi(eta'y)) along rays.
+
+    The rays are parallel, and y is in the unit frame. The half-Gaussian has a step at n'y = 0 in place of Phi.
+    Integrals are relative to the Gaussian's integral through the location.
     """
     monkeypatch.setattr(reference_shape, "LOW_PASS", 0.0)
     arrays, camera = one_splat(seed, shape), random_camera(seed)
@@ -55,7 +57,7 @@ def test_screen_kernel_is_the_integral_along_rays(monkeypatch: pytest.MonkeyPatc
     d = np.random.default_rng(seed).multivariate_normal([0.0, 0.0], kernel.scale2d[0], 8)
     got = kernel_values(kernel, kernel.location[0][:, None] + d.T)[0]
 
-    start = d @ np.linalg.pinv(affine).T @ np.linalg.inv(axes).T  # the rays' points and direction in the unit frame
+    start = d @ np.linalg.pinv(affine).T @ np.linalg.inv(axes).T  # points and direction of the rays in the unit frame
     line = np.linalg.inv(axes) @ np.linalg.svd(affine)[2][2]
     line /= np.linalg.norm(line)
     plus, minus, along = side_of(arrays, shape)
@@ -77,7 +79,7 @@ def test_screen_kernel_is_the_integral_along_rays(monkeypatch: pytest.MonkeyPatc
 @SIDED
 @SEEDS
 def test_low_pass_is_a_convolution(monkeypatch: pytest.MonkeyPatch, shape: str, seed: int) -> None:
-    """With the normal of its variance, but that a Gaussian's peak stays 1."""
+    """The low-pass convolves with the normal of its variance, scaled so that the peak of a Gaussian stays 1."""
     arrays, camera = one_splat(seed, shape), random_camera(seed)
     arrays["log_scale"] = arrays["log_scale"] + 1.0
     soft = project(arrays, camera, shape, "none").kernel
@@ -96,7 +98,7 @@ def test_low_pass_is_a_convolution(monkeypatch: pytest.MonkeyPatch, shape: str, 
 
 
 def images(shape: str, arrays: Arrays, camera: Camera, normalisation: str = "peak") -> Reals:
-    """Alphas of each splat alone, (N, H W), without thresholds."""
+    """Return the alphas of each splat alone, (N, H W), without thresholds."""
     kernel = project(arrays, camera, shape, normalisation).kernel
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     return kernel_values(kernel, np.stack([x.ravel(), y.ravel()]))
@@ -122,7 +124,10 @@ def test_equal_opacities_are_the_gaussian(make_renderer: MakeRenderer, device: D
 
 
 def test_bisected_skew_of_one_side_is_the_direct_skew_normal() -> None:
-    """Its published form, `none`; from afar, as one linearises at the location, the other at the centroid."""
+    """The published form has normalisation `none`.
+
+    The camera is far away, as one shape is linearised at the location and the other at the centroid.
+    """
     near = random_camera(3, 41, 27)
     pose = near.cam_from_world.copy()
     pose[2, 3] += 4e6
@@ -136,7 +141,7 @@ def test_bisected_skew_of_one_side_is_the_direct_skew_normal() -> None:
 
 
 def test_growing_slants_converge_to_the_half_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the reference's bound out of the way: the difference falls as the slant's square, the band's width."""
+    """The difference falls as the square of the slant, the width of the band. The reference's bound is lifted."""
     monkeypatch.setattr(reference_skewed, "SLANT_MAX", 1e9)
     camera, half = random_camera(3, 41, 27), scene("half-gaussian")
     want = images("half-gaussian", half, camera)
@@ -152,7 +157,7 @@ def test_growing_slants_converge_to_the_half_gaussian(monkeypatch: pytest.Monkey
 
 @SIDED
 def test_sides_are_those_of_the_field(shape: str) -> None:
-    """Seen from the side, more is on the side that the vector points to."""
+    """Seen from the side, alpha is higher on the side that the vector points to."""
     camera = Camera(41, 27, 400.0, 400.0, 20.5, 13.5, np.eye(4))
     arrays = one_splat(0, shape)
     arrays |= {
@@ -171,7 +176,7 @@ def test_sides_are_those_of_the_field(shape: str) -> None:
 
 
 def test_long_slants_act_as_the_bound(make_renderer: MakeRenderer, device: Device) -> None:
-    """The kernel's own bound: training may step past it in float32's last digits."""
+    """The kernel limits the slant itself, because training may exceed the bound in float32's last digits."""
     camera, arrays = random_camera(3, 41, 27), scene("bisected-skew")
     unit = arrays["skew"] / np.linalg.norm(arrays["skew"], axis=1, keepdims=True)
     renderer = make_renderer(device, "float64")
@@ -189,7 +194,7 @@ def test_long_slants_act_as_the_bound(make_renderer: MakeRenderer, device: Devic
 def test_splats_without_skew_take_the_short_way_and_get_the_same(
     device: Device, make_renderer: MakeRenderer, shape: str
 ) -> None:
-    """Half of the splats have no skew. The reference has one formula for all splats; results are equal."""
+    """Half of the splats have no skew. The reference has one formula for all splats, and the results are equal."""
     arrays = random_splats(11, 16, 2)
     arrays["skew"][::2] = 0.0
     case = Case(arrays, random_camera(11, 37, 29), shape)
