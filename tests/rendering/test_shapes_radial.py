@@ -110,7 +110,8 @@ def test_student_t_is_the_line_integral_of_its_3d_kernel(
     across = np.stack([x.ravel() - FACING.cx, y.ravel() - FACING.cy]) / to_px
     across = np.concatenate([across, [[0.0], [0.0]]], axis=1)  # the last one passes through the centre
 
-    # q3 = least + inverse_zz (z - z_least)^2. z - z_least = width sinh(t) makes the integrand decay doubly exponentially.
+    # q3 = least + inverse_zz (z - z_least)^2. The substitution z - z_least = width sinh(t) makes the integrand decay
+    # doubly exponentially.
     least = np.einsum("ip,ij,jp->p", across, np.linalg.inv(scale[:2, :2]), across)
     t, step = np.linspace(-14.0, 14.0, 1401, retstep=True)
     width = np.sqrt(1.0 / inverse[2, 2])
