@@ -1,4 +1,4 @@
-"""Importance of splats: against images without the splat, without its skew, with other colours, rendered one by one."""
+"""Importance of splats agrees with images rendered without each splat, without its skew, or with other colours."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def renderer(devices: list[Device], make_renderer: MakeRenderer) -> Renderer:
 
 
 def some_splats(scene: Scene, shape: str) -> Splats:
-    """A few large splats in front of the cameras, of bright colours that no clamp touches."""
+    """A few large splats in front of the cameras, with bright colours that are not clamped."""
     rng = np.random.default_rng(5)
     points = scene.points.xyz[rng.choice(len(scene.points.xyz), N, replace=False)]
     splats = Splats.from_points(points, np.full((N, 3), 0.6), shape=shape, sh_degree=1)
@@ -39,7 +39,7 @@ def some_splats(scene: Scene, shape: str) -> Splats:
 
 
 def mean_importance(renderer: Renderer, splats: Splats, scene: Scene) -> Importance:
-    """Return the mean over many seeds, which a single seed estimates."""
+    """Return the mean over many seeds. A single seed gives an estimate of it."""
     every = [measure_importance(renderer, splats, scene.train[:2], seed=seed) for seed in range(SEEDS)]
     colour = np.mean([importance.colour for importance in every if importance.colour is not None], axis=0)
     fields = {name: np.mean([importance.fields[name] for importance in every], axis=0) for name in every[0].fields}
@@ -47,7 +47,7 @@ def mean_importance(renderer: Renderer, splats: Splats, scene: Scene) -> Importa
 
 
 def change(renderer: Renderer, splats: Splats, scene: Scene, without: Callable[[int], Splats]) -> np.ndarray:
-    """(N,) squared change of the images by each splat's other form."""
+    """Return (N,) squared changes of the images, if one splat at a time has its other form."""
     views = scene.train[:2]
     whole = [renderer.render(splats, view.camera).color.astype(np.float64) for view in views]
     return np.array(
@@ -75,7 +75,7 @@ def test_removal_is_the_change_of_the_images(renderer: Renderer, scene: Scene, s
     found = mean_importance(renderer, splats, scene).removal
     shown = true > 1e-3 * true.max()
     assert shown.sum() >= N // 2
-    # 48 seeds: each estimate has a relative deviation of sqrt(2 / 48) = 0.2 at most.
+    # 48 seeds: each estimate has a relative deviation of at most sqrt(2 / 48) = 0.2.
     np.testing.assert_allclose(found[shown], true[shown], rtol=0.6)
     assert np.median(found[shown] / true[shown]) == pytest.approx(1, abs=0.2)
 
@@ -132,7 +132,7 @@ def test_lower_degrees_lose_what_they_say(renderer: Renderer, scene: Scene) -> N
 
 
 def test_lower_degrees_are_least_squares() -> None:
-    """Against a solver that knows the views one by one."""
+    """The result agrees with a least-squares solver that uses every view separately."""
     rng = np.random.default_rng(1)
     n, views, coefficients = 5, 40, 9
     basis, weight = rng.normal(size=(n, views, coefficients)), rng.random((n, views))
@@ -143,7 +143,7 @@ def test_lower_degrees_are_least_squares() -> None:
     for i in range(n):
         root = np.sqrt(weight[i])[:, None]
         best, left, *_ = np.linalg.lstsq(root * basis[i, :, :4], root * (basis[i] @ sh[i].astype(np.float64)))
-        np.testing.assert_allclose(lower[1][i], best, atol=0.02)  # the ridge
+        np.testing.assert_allclose(lower[1][i], best, atol=0.02)  # tolerance for the ridge
         assert lost[i, 1] == pytest.approx(left.sum(), rel=1e-3)
     assert (lost[:, 0] >= lost[:, 1]).all()
 

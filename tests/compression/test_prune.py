@@ -1,4 +1,4 @@
-"""Pruning stays within the validation tolerance, removes the least important parts first and keeps the other bits."""
+"""Pruning stays within the validation tolerance and removes the least important parts first. Other bits stay."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def scene(capture_folder: Path) -> Scene:
 
 @pytest.fixture(scope="module")
 def splats(model_folder: Path) -> Splats:
-    """A trained model, to which are added 40 splats that hide behind the cameras or are transparent."""
+    """A trained model and 40 more splats, which are behind the cameras or transparent."""
     arrays = Splats.load(ModelFolder(model_folder).latest_ply()[0]).to_numpy()
     more = {name: np.concatenate([values, values[:40]]) for name, values in arrays.items()}
     more["mean"][-20:] += 1e4

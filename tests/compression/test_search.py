@@ -1,4 +1,4 @@
-"""The search for the smallest model: its rules, its stages, its targets, and going on after an interruption."""
+"""The search for the smallest model: its rules, its stages, its targets, and resuming after an interruption."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_a_search_finds_a_smaller_model(searched: clsplat.Budgeted) -> None:
 
 
 class Stop:
-    """A progress that stops the search when a stage begins for the `number`th time in all."""
+    """A progress callback that stops the search at the start of its `number`th stage."""
 
     def __init__(self, number: int) -> None:
         self.left = number
@@ -176,7 +176,7 @@ class Stop:
 
 
 def test_an_interrupted_search_goes_on(scene: Scene, searched: clsplat.Budgeted, tmp_path: Path) -> None:
-    """Stopped at the start of every stage in turn, it ends with the same bits."""
+    """A search that stops at the start of every stage in turn ends with the same bits."""
     resume, stops = False, 0
     while True:
         try:

@@ -1,4 +1,4 @@
-"""optim_reference.py: Adam against its definition written out."""
+"""NumPy's Adam (training/optim/adam.py) agrees with its definition."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from clsplat.training.optim.adam import NumpyAdam
 
 
 def adam_by_definition(grads: list[np.ndarray], start: np.ndarray, lr: float) -> np.ndarray:
-    """Kingma & Ba's algorithm 1 with the moments as explicit weighted sums over the whole history."""
+    """Compute Kingma & Ba's algorithm 1. The moments are explicit weighted sums over the whole history."""
     param = start.astype(np.float64)
     for t in range(1, len(grads) + 1):
         m = sum(0.1 * 0.9 ** (t - i) * grads[i - 1] for i in range(1, t + 1)) / (1 - 0.9**t)

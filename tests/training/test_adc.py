@@ -1,4 +1,4 @@
-"""adc.py: the laws of cloning, splitting, pruning and resetting, for every shape."""
+"""Adaptive density control (training/density/adc.py) clones, splits, prunes and resets every shape by its rules."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ THRESHOLD = 2e-4
 
 
 def stats_of(gradient: np.ndarray, depth: np.ndarray | None = None, seen: int = 4) -> np.ndarray:
-    """Statistics with these means."""
+    """Return statistics with these means."""
     n = len(gradient)
     rows = [gradient * seen, (np.zeros(n) if depth is None else depth) * seen, np.full(n, seen)]
     return np.array(rows, np.float32)
@@ -79,9 +79,9 @@ def test_laws_of_a_plan(n: int, seed: int, dead: float, spare: int, by_axis: boo
     kept = shape.strength(arrays) >= MIN_OPACITY
     if large:
         kept &= np.exp(arrays["log_scale"].max(axis=1)) <= WORLD_SIZE * EXTENT
-    if kept.any() and not by_axis:  # an opacity beyond a plane may be faint: it goes the next time
+    if kept.any() and not by_axis:  # a side's opacity may be faint: the next action removes it
         assert (shape.strength(moved) >= MIN_OPACITY * (1 - 1e-6)).all()
-    # Survivors first, in order, as they were and with their optimizer state; then new rows, with none.
+    # Survivors are first: they keep their order, values and optimizer states. New rows follow without state.
     old = np.flatnonzero(~edit.fresh)
     np.testing.assert_array_equal(old, np.arange(len(old)))
     assert (np.diff(edit.source[old]) > 0).all()
@@ -116,7 +116,7 @@ def test_the_mean_gradient_counts_not_the_sum() -> None:
     arrays = plain(2, 1e-3)
     stats = stats_of(np.array([0.9, 1.1]) * THRESHOLD, seen=50)
     assert edited(arrays, shapes.GAUSSIAN, stats).source.tolist() == [0, 1, 1]
-    assert edited(arrays, shapes.GAUSSIAN, np.zeros((3, 2))).source.tolist() == [0, 1]  # never seen
+    assert edited(arrays, shapes.GAUSSIAN, np.zeros((3, 2))).source.tolist() == [0, 1]  # never visible
 
 
 def test_halves_are_drawn_from_the_parents_gaussian() -> None:
@@ -141,7 +141,7 @@ def test_pruning_by_opacity_and_after_a_reset_by_size() -> None:
     quiet = stats_of(np.zeros(4))
     assert edited(arrays, shapes.GAUSSIAN, quiet).source.tolist() == [1, 2, 3]
     assert edited(arrays, shapes.GAUSSIAN, quiet, prune_large=True).source.tolist() == [1, 3]
-    # A too large one whose halves are small enough is split instead, a splat too faint never.
+    # A splat that is too large is split if its halves are small enough. A splat that is too faint is never split.
     loud = stats_of(np.array([1.0, 0.0, 1.0, 0.0]))
     assert edited(arrays, shapes.GAUSSIAN, loud, prune_large=True).source.tolist() == [1, 3, 2, 2]
     arrays["log_scale"][2, 1] += math.log(SPLIT_SHRINK)
@@ -166,7 +166,7 @@ def test_the_cap_holds_exactly_and_the_largest_gradients_come_first(scale: float
     assert np.flatnonzero(np.bincount(edit.source) == 2).tolist() == [1, 4]
     for cap in (1, 6):
         assert edited(arrays, shapes.GAUSSIAN, stats_of(gradient), cap=cap).source.tolist() == list(range(6))
-    # Pruning makes room in the same action.
+    # Pruning frees rows for densification in the same action.
     arrays["opacity_logit"][3] = -9
     assert len(edited(arrays, shapes.GAUSSIAN, stats_of(gradient), cap=6).source) == 6
 
@@ -195,7 +195,7 @@ def test_either_gradient_splits_along_the_longest_axis_and_keeps_mean_and_varian
     arrays["mean"][:] = (0.1, 0.2, 0.3)
     stats = stats_of(np.array([gradient * THRESHOLD]), np.array([depth * 0.1]))
     if not gradient:
-        assert edited(arrays, shapes.GAUSSIAN, stats).source.tolist() == [0]  # not looked at
+        assert edited(arrays, shapes.GAUSSIAN, stats).source.tolist() == [0]  # not densified
     moved = edited(arrays, shapes.GAUSSIAN, stats, depth_threshold=0.1).apply(arrays)
     r = rotations(arrays["quat"].astype(np.float64))[0]
 
@@ -226,7 +226,7 @@ def test_halves_of_a_skewed_splat_keep_the_skew_across_the_axis_and_half_of_it_a
 
 @pytest.mark.parametrize("depth_threshold", [0.0, 0.1])
 def test_the_centroid_of_the_direct_form_stays(depth_threshold: float) -> None:
-    """The stored location is beside the mass; halves that kept it would shift what was learnt."""
+    """The stored location is not the centroid. Halves that kept the location would shift the learned splat."""
     shape = shapes.SKEW_NORMAL_DIRECT
     arrays = {name: np.repeat(array, 20_000, axis=0) for name, array in random_model(shape, 1, 3, dead=0).items()}
 
@@ -267,10 +267,10 @@ def test_a_half_beyond_the_plane_takes_that_sides_opacity(facing: float) -> None
         arrays["normal"][:] = normal
         return opacities(shape, edited(arrays, shape, stats, depth_threshold=0.1).apply(arrays))
 
-    # The first half lies at +s/2 along y: the plane's + side, where the normal faces it.
+    # The first half lies at +s/2 along y. That is the plane's + side if the normal points there.
     own = [[plus, plus], [minus, minus]]
     np.testing.assert_allclose(halves((0, 3 * facing, 0)), own if facing > 0 else own[::-1], rtol=1e-6)
-    np.testing.assert_allclose(halves((1, 0, 2)), [[plus, minus]] * 2, rtol=1e-6)  # the axis lies in the plane
+    np.testing.assert_allclose(halves((1, 0, 2)), [[plus, minus]] * 2, rtol=1e-6)  # the plane contains the axis
     slanted = halves((1, facing, 0))
     assert (slanted >= minus * (1 - 1e-6)).all()
     assert (slanted <= plus * (1 + 1e-6)).all()

@@ -1,4 +1,4 @@
-"""`TrainConfig`: groups and flat options are the same, defaults of strategies, ranges, and files."""
+"""`TrainConfig`: equal groups and flat options, defaults of strategies, and checks of ranges and files."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_file_of_another_order_of_keys_is_the_same_config() -> None:
 
 
 def test_a_file_of_an_earlier_version_loads() -> None:
-    """Such a file has options of both strategies, null for defaults, and options that were removed since."""
+    """An old file has options of both strategies, null for defaults, and options that were removed since."""
     file = {"strategy": "adc", "growth": 1.2, "relocation": "length", "sampling": "opacity", "init_scale": None}
     assert TrainConfig.from_json(file) == TrainConfig(strategy="adc")
     with pytest.raises(InputError, match="config: unknown option 'sampling'"):

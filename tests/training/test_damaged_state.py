@@ -17,7 +17,7 @@ from clsplat.training.config import TrainConfig
 
 
 def rewritten(path: Path, **changes: Any) -> None:
-    """Write the checkpoint with other arrays or other values in its `meta`; None removes one."""
+    """Write the checkpoint with changed arrays or changed values in its `meta`. None removes a value."""
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in stored.files}
     meta = json.loads(arrays["meta"].tobytes())

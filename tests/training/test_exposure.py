@@ -1,4 +1,4 @@
-"""Exposure, masks and transparency in training: the kernels against a float64 form of them, and what is learned."""
+"""Exposure, masks and transparency in training: kernels agree with float64 formulas, and exposures are learned."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from clsplat.training.run import train
 from clsplat.training.targets import Targets, target_channels
 from clsplat.training.trainer import Trainer
 
-SIZES = [(3, 2), (40, 5), (13, 14), (150, 3)]  # width, height: less than a vector, several items a row
-# Backgrounds of photos and of a render.
+SIZES = [(3, 2), (40, 5), (13, 14), (150, 3)]  # width, height: less than a vector, and several work-items a row
+# Background colours of the photos and of the render.
 BEHIND, NEW = (0.2137, 0.4071, 0.6113), (0.9059, 0.1011, 0.5023)
 
 
 def laid_over(image: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """A photo over the render's background in the place of its own, 0..255."""
+    """Replace the background of a photo by that of the render, 0..255."""
     through = 1 - alpha[:, :, None] / 255
     return np.clip(image + 255 * through * (np.array(NEW) - np.array(BEHIND)), 0, 255)
 
@@ -48,7 +48,7 @@ def views_of(masks: bool, alphas: bool) -> list[View]:
         image = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
         mask = rng.random((height, width)) < 0.7 if masks and i != 1 else None
         alpha = rng.integers(0, 256, (height, width)).astype(np.uint8) if alphas and i != 2 else None
-        if alpha is not None:  # no colour shall lie halfway between two bytes
+        if alpha is not None:  # no colour may lie halfway between two bytes
             halfway = np.abs(laid_over(image, alpha) % 1 - 0.5) < 1e-3
             alpha[halfway.any(axis=2)] = 255
         views.append(
@@ -69,7 +69,7 @@ def exposure_loss(device: Device, schedule: Schedule, real: Real, views: list[Vi
 def wanted_of(
     color: NDArray[np.float64], exposure: NDArray[np.float64], view: View
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The render as the photo, and the photo over the render's background; both (H, W, 3)."""
+    """Return the render with the photo's exposure, and the photo over the render's background; both (H, W, 3)."""
     shown = color @ exposure[:, :3].T + exposure[:, 3]
     opaque = np.full(view.image.shape[:2], 255, np.uint8)
     laid = np.rint(laid_over(view.image, opaque if view.alpha is None else view.alpha)) / 255
@@ -77,13 +77,13 @@ def wanted_of(
 
 
 def gradient_of(color: NDArray[np.float64], exposure: NDArray[np.float64], view: View) -> NDArray[np.float64]:
-    """Gradient of the loss with respect to the render (H, W, 3)."""
+    """Return the gradient of the loss with respect to the render (H, W, 3)."""
     v = reference_loss_gradient(*wanted_of(color, exposure, view))
     return (v if view.mask is None else v * view.mask[:, :, None]) @ exposure[:, :3]
 
 
 def best_exposure(color: NDArray[np.float64], view: View, pull: float) -> NDArray[np.float64]:
-    """(3, 4) of least squares, with rows for the pull to the identity."""
+    """Return the (3, 4) least-squares exposure. Additional rows pull it to the identity."""
     laid = wanted_of(color, np.eye(3, 4), view)[1]
     counts = laid.max(axis=2) < 0.98
     if view.mask is not None:
@@ -102,7 +102,7 @@ def some_exposures(n: int) -> NDArray[np.float64]:
 
 
 def test_the_reference_gradient_is_that_of_differences() -> None:
-    """Through exposure, mask and background, at a pixel that counts and at one that does not."""
+    """Test exposure, mask and background at a pixel inside the mask and at one outside."""
     view = views_of(True, True)[0]
     assert view.mask is not None
     color, exposure = np.random.default_rng(0).random((*view.image.shape[:2], 3)), some_exposures(1)[0]
@@ -125,7 +125,7 @@ def test_the_reference_gradient_is_that_of_differences() -> None:
 def test_gradients_and_step_equal_the_reference(
     scheduled: tuple[Device, Schedule], real: Real, tolerance: float, masks: bool, alphas: bool
 ) -> None:
-    """A target without mask or opacity lies among those with them."""
+    """One target has no mask and one no opacity, among others that have them."""
     views = views_of(masks, alphas)
     device, schedule = scheduled
     exposure = exposure_loss(device, schedule, real, views, exposure=True)
@@ -144,7 +144,7 @@ def test_gradients_and_step_equal_the_reference(
         v = gradient_of(color.astype(np.float64), exposures[i], view)
         found = layout.unpack(planes)
         assert relative_error(found, v) < tolerance
-        np.testing.assert_array_equal(planes, layout.pack(found, dtype))  # a margin of zeros
+        np.testing.assert_array_equal(planes, layout.pack(found, dtype))  # the margin contains zeros
         if view.mask is not None:
             assert not found[~view.mask].any()
             assert found[view.mask].any()
@@ -168,14 +168,14 @@ def test_without_any_of_it_no_kernel_runs(device: Device) -> None:
     assert exposure.state() == {}
 
 
-# --- what is learned -----------------------------------------------------------------------
+# --- learning ------------------------------------------------------------------------------
 
 
 CONFIG = TrainConfig(iterations=200, cap_max=2500, sh_degree=0, coarse_to_fine=False, seed=1)
 
 
 def exposed(scene: Scene, gains: NDArray[np.float64]) -> Scene:
-    """Training photos with gains around 0.75, the test photos' own."""
+    """Return a scene whose training photos have gains around 0.75. The test photos have gain 0.75."""
     of = dict(zip([view.name for view in scene.train], 0.75 * gains, strict=True))
     views = [
         replace(view, image=np.rint(of.get(view.name, 0.75) * view.image).astype(np.uint8)) for view in scene.views
@@ -184,7 +184,7 @@ def exposed(scene: Scene, gains: NDArray[np.float64]) -> Scene:
 
 
 def test_exposures_of_photos_are_found(scene: Scene) -> None:
-    """Photos of known gains, of mean 1: the gains are learned, and views of gain 1 are better for it."""
+    """The known gains of the photos have mean 1. Training learns the gains and improves views of gain 1."""
     n = len(scene.train)
     gains = np.random.default_rng(2).permutation(np.linspace(0.7, 1.3, n))
     changed = exposed(scene, gains)
@@ -201,7 +201,7 @@ def test_exposures_of_photos_are_found(scene: Scene) -> None:
 
 
 def test_what_a_mask_hides_is_not_learned(scene: Scene) -> None:
-    """A magenta block at the left or the right of each photo, masked and not."""
+    """Add a magenta block at the left or the right of each photo, with and without a mask."""
 
     def blotted(view: View, side: int, masked: bool) -> View:
         height, width = view.image.shape[:2]
@@ -234,7 +234,7 @@ def test_what_a_mask_hides_is_not_learned(scene: Scene) -> None:
 
 
 def test_random_backgrounds_show_through_nothing_opaque(scene: Scene) -> None:
-    """Photos of a black object on transparent ground: black splats and none look the same over black only."""
+    """Photos show a black object on transparent ground. Only over black, black splats and no splats look equal."""
 
     def on_nothing(view: View) -> View:
         height, width = view.image.shape[:2]
@@ -270,7 +270,7 @@ def test_a_resumed_run_has_the_same_exposures(scene: Scene, tmp_path: Path) -> N
 
 
 def test_exposure_json_multiplies_from_the_left() -> None:
-    """As 3DGS uses it: colour (3,) times the first three columns, plus the last."""
+    """3DGS multiplies the colour (3,) by the first three columns and adds the last."""
     exposure, colour = some_exposures(1), np.array([0.2, 0.5, 0.7])
     stored = np.array(exposures_json(["a"], exposure)["a"])
     np.testing.assert_allclose(colour @ stored[:, :3] + stored[:, 3], exposure[0, :, :3] @ colour + exposure[0, :, 3])

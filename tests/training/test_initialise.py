@@ -1,4 +1,4 @@
-"""initialise.py: where the first splats come from, under a cap, and that they can learn skew."""
+"""The initial splats come from the scene's points, respect the cap, and can learn skew."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ initial_splats = partial(initial_splats_of, opacity=0.5, scale_factor=0.1)
 
 
 def scene(n_points: int, extent: float = 2.0) -> Any:
-    """The parts of a Scene that `initial_splats` reads: points, training cameras around (5, 0, 0), extent."""
+    """The parts of a Scene that `initial_splats` reads: points, training cameras around (5, 0, 0), and extent."""
     rng = np.random.default_rng(0)
     views = []
     for x in (4.0, 6.0):
@@ -58,7 +58,7 @@ def test_scale_factor_and_opacity_are_passed_on() -> None:
 
 
 def test_a_cap_keeps_the_longest_tracks() -> None:
-    """At least half of the cap goes by track length alone; equal tracks by index."""
+    """Track length alone selects at least half of the points. Points of equal track length are selected by index."""
     source = scene(70)
     splats, message = initial_splats(source, cap=15)
     order = sorted(range(70), key=lambda i: (-source.points.track_length[i], i))
@@ -70,7 +70,7 @@ def test_a_cap_keeps_the_longest_tracks() -> None:
 
 
 def test_a_cap_leaves_no_part_of_the_scene_empty() -> None:
-    """A textured mat has all the long tracks; three far groups of badly observed points are kept too."""
+    """A textured mat has all the long tracks. Three distant points with short tracks are kept too."""
     source = scene(103)
     source.points.xyz[:100] *= 0.05
     source.points.xyz[100:] = [[40.0, 0.0, 0.0], [0.0, 40.0, 0.0], [0.0, 0.0, -40.0]]
@@ -204,7 +204,10 @@ def test_a_scene_before_the_near_plane_is_refused() -> None:
 
 
 def test_random_points_are_added_to_few() -> None:
-    """A fraction of the cap. By default a tenth, if the scene has fewer points. Their colours are the neighbours'."""
+    """Random points fill a fraction of the cap.
+
+    The default is a tenth, if the scene has fewer points. Their colours are those of their neighbours.
+    """
     source = scene(60)
     for share, cap, ours, placed in (
         (None, 500, 60, 0),

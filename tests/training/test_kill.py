@@ -1,4 +1,4 @@
-"""kill -9 at random moments, then --resume: benchmarks/kill.py with few kills."""
+"""A run survives kill -9 at random moments and continues with --resume: benchmarks/kill.py with few kills."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Adam for visible splats equals dense Adam once it is settled, in NumPy and on the device."""
+"""Adam for visible splats, once settled, equals dense Adam, in NumPy and on the device."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from clsplat.training.trainer import Trainer
 
 STEPS = 36
 CULLED = 0xFFFFFFFF
-TOLERANCE = 1e-5  # float32 steps: some ulp of the value each, in the dense form also where gradients are 0
+TOLERANCE = 1e-5  # some ulp of each value in float32 steps; the dense form has them also where gradients are 0
 
 VISIBLE = [
     *CASES,
@@ -52,7 +52,7 @@ VISIBLE = [
 
 
 def keys(buffers: SplatBuffers, seen: np.ndarray) -> Any:
-    """The depth keys of an image in which these splats are visible."""
+    """Return the depth keys of an image in which these splats are visible."""
     buffer = buffers.device.alloc(4 * len(seen))
     to_device(buffers.device, buffer, np.where(seen, 1000, CULLED).astype(np.uint32))
     return buffer
@@ -66,14 +66,14 @@ def step(
     iteration: int,
     sh_degree: int = 2,
 ) -> None:
-    """Make a step with gradients of the visible splats only, at a falling rate of the positions."""
+    """Take a step with gradients of the visible splats only. The learning rate of the positions falls."""
     on_device = CompactGradients(buffers.device, buffers.schema, CAPACITY, buffers.dtype)
     on_device.upload({name: np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), a, 0) for name, a in grads.items()})
     optimizer.step(on_device, MEAN_LR * 0.95**iteration, sh_degree, iteration, keys(buffers, seen))
 
 
 def some_seen(n: int, rng: np.random.Generator) -> np.ndarray:
-    """Visible splats as a camera sees them in Morton order: a few intervals with holes, sometimes none."""
+    """Return random visibility, like that of a camera and splats in Morton order: few intervals with holes, or none."""
     seen = np.zeros(n, bool)
     for _ in range(rng.integers(0, 3)):
         first = rng.integers(0, n)
@@ -88,7 +88,7 @@ def assert_near(got: dict[str, np.ndarray], wanted: dict[str, np.ndarray], toler
 
 @pytest.mark.parametrize("options", VISIBLE, ids=words)
 def test_lazy_steps_equal_dense_ones(device: Device, options: dict[str, object]) -> None:
-    """All fields of all shapes, read and settled at any time, with growth and shrinking."""
+    """Test all fields of all shapes, read and settled at random steps, with growth and shrinking."""
     config = config_of(**options)
     splats = some_splats(config.shape)
     dense = started(device, config, splats)
@@ -120,15 +120,15 @@ def test_lazy_steps_equal_dense_ones(device: Device, options: dict[str, object])
     states = [optimizer.state() for _, optimizer in lazy.values()]
     assert set(states[0]) == set(states[1]) == set(dense[1].state()) | {"waiting.last", "waiting.drifts"}
     for name, expected in states[1].items():
-        near = 1e-4 if name == "momentum" else 1e-5  # its gate takes an opacity's rounding a hundred times
+        near = 1e-4 if name == "momentum" else 1e-5  # the gate amplifies the rounding of an opacity a hundred times
         np.testing.assert_allclose(states[0][name], expected, near, 3e-6 * np.abs(expected).max(), err_msg=name)
 
 
 def test_drifts_are_those_of_dense_adam() -> None:
-    """In float64: corrections of the first steps, a falling rate, any number of steps without gradient."""
+    """Test in float64: bias corrections of the first steps, a falling rate, and many steps without gradient."""
     rng = np.random.default_rng(0)
     adam, drifts, values = NumpyAdam({"x": np.zeros(40)}), Drifts(), np.zeros(40)
-    started_at, state = rng.integers(1, 30, 40), np.zeros((3, 40))  # values and moments after each one's last gradient
+    started_at, state = rng.integers(1, 30, 40), np.zeros((3, 40))  # values and moments after the last gradient
     for step_count in range(1, WAITS + 1):
         rate = 0.01 * 0.97**step_count
         gradient = np.where(step_count <= started_at, rng.standard_normal(40) * 10.0 ** rng.integers(-6, 2, 40), 0)
@@ -157,7 +157,7 @@ def test_vectors_wake_by_a_splat_or_when_the_tables_end() -> None:
 
 @pytest.mark.parametrize("name", ["fused", "numpy"])
 def test_nothing_waits_longer_than_the_tables_go(devices: list[Device], name: str) -> None:
-    """At the maximum age a vector steps without being visible; values and moments stay those of dense steps."""
+    """At the maximum age an invisible vector takes a step. Its values and moments equal those of dense steps."""
     config = config_of(shape="gaussian", optimizer=name)
     splats = some_splats("gaussian", 40, 0)
     dense, lazy = started(devices[0], config, splats), started(devices[0], replace(config, visible_adam=True), splats)
@@ -171,7 +171,7 @@ def test_nothing_waits_longer_than_the_tables_go(devices: list[Device], name: st
 
 
 def test_a_state_continues_to_the_same_bits(devices: list[Device]) -> None:
-    """Skipped steps are part of the state, also from one optimizer to the other."""
+    """Skipped steps are part of the state, even if another optimizer loads it."""
     config = config_of(shape="bisected-skew", visible_adam=True)
     rng = np.random.default_rng(3)
     buffers, optimizer = started(devices[0], config, some_splats(config.shape))
@@ -198,11 +198,11 @@ def test_a_plan_in_another_order_makes_the_same_splats(make_edit: Callable[..., 
     permuted, state = edited.permuted(order, 300), rng.standard_normal((300, 4))
     for name, expected in edited.apply(arrays).items():
         np.testing.assert_array_equal(permuted.apply(arrays)[name], expected[order])
-    for name in ("quat", "opacity_logit"):  # the second is reset when it shrinks
+    for name in ("quat", "opacity_logit"):  # shrinking resets the opacity
         np.testing.assert_array_equal(permuted.apply_state(state, name), edited.apply_state(state, name)[order])
 
 
-# --- in training -----------------------------------------------------------------------------
+# --- training --------------------------------------------------------------------------------
 
 CONFIG = TrainConfig(
     shape="skew-normal",
@@ -219,7 +219,7 @@ CONFIG = TrainConfig(
 
 @pytest.fixture(scope="module")
 def wide(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, TrainConfig]:
-    """A scene whose images each show a part of it, and a config."""
+    """Return a scene in which each image shows only a part, and a config."""
     scene, splats = synthetic_scene(500, 48, 32, sh_degree=1, n_views=5)
 
     def nearer(view: View) -> View:
@@ -234,7 +234,7 @@ def wide(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, TrainConfig]:
 def test_training_steps_what_was_seen_and_settles_before_each_action(
     wide: tuple[Scene, TrainConfig], devices: list[Device], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every splat with a gradient is stepped, others wait, and the strategy edits from settled splats."""
+    """Every splat with a gradient takes a step, and the others wait. The strategy edits settled splats."""
     trainer = Trainer(*wide, device=devices[0])
     sparse, edited = 0, []
 
@@ -265,7 +265,7 @@ def test_training_steps_what_was_seen_and_settles_before_each_action(
 
 
 def test_actions_leave_splats_in_morton_order(wide: tuple[Scene, TrainConfig], devices: list[Device]) -> None:
-    """Also after growth, by the places of that moment."""
+    """The order uses the current positions, also after growth."""
     trainer = Trainer(*wide, device=devices[0])
     for _ in range(20):
         trainer.step()
@@ -276,7 +276,7 @@ def test_actions_leave_splats_in_morton_order(wide: tuple[Scene, TrainConfig], d
 
 
 def test_what_reads_a_run_does_not_change_it(wide: tuple[Scene, TrainConfig], tmp_path: Path) -> None:
-    """Evaluations, saved files and an interruption at any time: the same bits."""
+    """Evaluations, saved files and an interruption at any time do not change a bit of the result."""
     scene, config = wide
     quiet = train(scene, config).splats.to_numpy()
     read = replace(config, test_iterations=(7, 33), save_iterations=(11, 45), checkpoint_interval=37)
@@ -300,4 +300,4 @@ def test_numpy_trains_the_same_model(wide: tuple[Scene, TrainConfig]) -> None:
     fused, numpy = (train(scene, replace(config, optimizer=name)).splats.to_numpy() for name in ("fused", "numpy"))
     for name, expected in numpy.items():
         difference = np.abs(fused[name] - expected)
-        assert np.quantile(difference, 0.95) < 1e-4, name  # gradients that are all rounding go either way
+        assert np.quantile(difference, 0.95) < 1e-4, name  # gradients that are only rounding have random signs

@@ -1,4 +1,4 @@
-"""log.jsonl across interruptions: no line is repeated or lost, whatever the file holds."""
+"""log.jsonl after interruptions: no line is repeated or lost, whatever the file contains."""
 
 from __future__ import annotations
 

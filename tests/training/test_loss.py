@@ -1,4 +1,4 @@
-"""The loss and its gradient against the reference: any size of image, every schedule, both precisions."""
+"""The loss and its gradient agree with the reference, for any image size, every schedule and both precisions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.frame import DeviceImage, ImageLayout
 from clsplat.training.loss import ImageLoss, LossValue
 
-# Height and width: below the window, beside a tile and a strip of vectors, several segments of rows.
+# Heights and widths: below the window, near a tile and a strip of vectors, and several segments of rows.
 SIZES = [(1, 1), (2, 3), (7, 40), (19, 27), (16, 16), (5, 97), (70, 37)]
 
 
@@ -33,7 +33,7 @@ def loss_of(
 def compared(
     loss: ImageLoss, color: NDArray[np.floating], truth: NDArray[np.uint8]
 ) -> tuple[LossValue, NDArray[np.floating]]:
-    """Value, and gradient (H, W, 3), of an image against a truth."""
+    """Return the value and the gradient (H, W, 3) of the loss of an image against a truth."""
     device, dtype = loss.device, loss.kernels.dtype
     layout = ImageLayout(truth.shape[1], truth.shape[0])
     rendered = DeviceImage(loss.pool, dtype, 3).write(layout, color)
@@ -48,7 +48,7 @@ def compared(
 
 
 def pair(height: int, width: int, noise: float = 0.2) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """An image and a truth of noise with a flat block; single precision, as both devices' reals hold it."""
+    """Return a noisy image and truth with a flat block. The image has single precision, which both builds hold."""
     rng = np.random.default_rng(height * 1000 + width)
     truth = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
     truth[: height // 2, : width // 2] = 128
@@ -58,13 +58,13 @@ def pair(height: int, width: int, noise: float = 0.2) -> tuple[NDArray[np.float3
 
 @cache
 def expected_of_ssim(height: int, width: int) -> NDArray[np.float64]:
-    """The reference's gradient of `pair` with nothing but SSIM."""
+    """Return the reference's gradient of `pair` for SSIM alone."""
     color, truth = pair(height, width)
     return reference_loss_gradient(color, truth / 255, 1.0)
 
 
 def expected(height: int, width: int, weight: float) -> tuple[float, NDArray[np.float64]]:
-    """The reference's loss and gradient of `pair`."""
+    """Return the reference's loss and gradient of `pair`."""
     color, truth = pair(height, width)
     of_l1 = np.sign(color - truth / 255) / color.size
     return (reference_loss(color, truth / 255, weight), (1 - weight) * of_l1 + weight * expected_of_ssim(height, width))
@@ -76,7 +76,7 @@ def expected(height: int, width: int, weight: float) -> tuple[float, NDArray[np.
 def test_loss_and_gradient_equal_the_reference(
     scheduled: tuple[Device, Schedule], real: Real, weight: float, tolerance: float
 ) -> None:
-    """One object for all sizes: buffers are used again."""
+    """One object computes all sizes, so its buffers are reused."""
     loss = loss_of(*scheduled, real, weight)
     for height, width in SIZES:
         color, truth = pair(height, width)
@@ -89,7 +89,7 @@ def test_loss_and_gradient_equal_the_reference(
 
 
 def test_segments_of_rows_change_no_gradient(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A device of many units cuts an image into more of them; only the order of the value's sums is another."""
+    """A device of many units divides an image into more segments. This changes only the order of sums in the value."""
     color, truth = pair(101, 50)
     found = []
     for rows in (101, 50, 33, 7):
@@ -101,7 +101,7 @@ def test_segments_of_rows_change_no_gradient(device: Device, monkeypatch: pytest
 
 
 def test_strips_change_no_gradient(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A strip is 640 px wide; here five vectors are cut into strips of 1, 2 and 3."""
+    """A strip is 640 px wide by default. Here strips of 1, 2 and 3 vectors divide an image of five vectors."""
     color, truth = pair(21, 75)
     whole = compared(loss_of(device), color, truth)
     for strip in (1, 2, 3):
@@ -123,14 +123,16 @@ def test_work_for_every_unit_and_no_segment_too_short(devices: list[Device]) -> 
 def test_equal_images_have_no_loss(device: Device) -> None:
     truth = pair(40, 30)[1]
     value, gradient = compared(loss_of(device), truth.astype(np.float32) * np.float32(1 / 255), truth)
-    assert value.l1 < 1e-7  # x - b / 255 may be rounded once, b / 255 was before
+    assert value.l1 < 1e-7  # x - b / 255 may be rounded once, and b / 255 was rounded before
     assert value.ssim == pytest.approx(1, abs=1e-6)
     assert np.abs(gradient).max() < 1e-7
 
 
 def test_float32_keeps_digits_near_the_truth(device: Device) -> None:
-    """Variances of sum and difference: in the usual form, E[xx] - E[x]^2 beside E[yy] - E[y]^2, this image of small
-    differences has errors above 2e-4."""
+    """The kernel uses variances of sum and difference.
+
+    The usual form, E[xx] - E[x]^2 and E[yy] - E[y]^2, has errors above 2e-4 on this image of small differences.
+    """
     rng = np.random.default_rng(0)
     truth = np.full((22, 30, 3), 200, np.uint8)
     color = np.clip(truth / 255 + 0.002 * rng.normal(size=truth.shape), 0, 1).astype(np.float32)

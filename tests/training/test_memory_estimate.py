@@ -1,4 +1,4 @@
-"""The memory estimate covers what a run allocates."""
+"""The memory estimate covers all allocations of a run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RUNS: dict[str, dict[str, Any]] = {
 def test_a_run_allocates_at_most_its_estimate(
     device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """All allocations are added up, also those whose buffers are released again."""
+    """The test adds up all allocations, including those of buffers that are released again."""
     alloc, sizes = Device.alloc, []
 
     def counted(self: Device, nbytes: int) -> Buffer:

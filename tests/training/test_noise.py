@@ -1,4 +1,4 @@
-"""noise.py: Philox's published vectors, the law of the normals, and Sigma xi by hand."""
+"""Noise: Philox's published vectors, the distribution of the normals, and Sigma xi in NumPy."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_opaque_splats_stay_and_the_dtype_is_kept() -> None:
 
 
 def test_noise_grows_with_the_scene_and_not_faster() -> None:
-    """The step is covariance times amount, and the rate of the means has the extent in it."""
+    """The step is covariance times amount, and the learning rate of the means contains the extent."""
 
     def step(extent: float) -> float:
         return extent**2 * noise_amount(5e5, 1e-4 * extent, extent)

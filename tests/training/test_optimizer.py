@@ -1,4 +1,4 @@
-"""Optimizers: the kernels against NumPy step by step, edits, bounded fields, frozen groups, state."""
+"""Optimizers: kernels agree with NumPy step by step. Edits, bounded fields, frozen groups and states are tested too."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from clsplat.training.programs import optim_program
 
 CAPACITY = 400
 EXTENT = 3.0
-ITERATIONS = 30_000  # at which rates have no factor
+ITERATIONS = 30_000  # rates have no factor at this number
 MEAN_LR = 1e-3
 TOLERANCE = 3e-6  # ten float32 steps: some ulp of the value or vector, and of ten steps of at most the rate
 
@@ -51,7 +51,7 @@ CASES = [
 
 
 def some_directions() -> np.ndarray:
-    """Unit vectors in which no function of the basis is near 0: Adam divides its rounding by its size."""
+    """Unit vectors with no basis function near 0, because Adam divides the rounding of a gradient by its size."""
     found = np.random.default_rng(2).standard_normal((4000, 3))
     found /= np.linalg.norm(found, axis=1, keepdims=True)
     return found[np.abs(sh_basis(found, 3)).min(axis=1) > 0.05]
@@ -61,7 +61,7 @@ DIRECTIONS = some_directions()
 
 
 def some_splats(shape: str, n: int = 300, sh_degree: int = 2) -> Splats:
-    """Random splats, some nearly transparent; bounded fields all over their range."""
+    """Random splats, some nearly transparent. Bounded fields cover their whole range."""
     rng = np.random.default_rng(5)
     arrays: dict[str, np.ndarray] = {"sh": 0.5 * rng.standard_normal((n, (sh_degree + 1) ** 2, 3))}
     for field in shape_named(shape).schema(sh_degree).group(Group.GEOM):
@@ -77,7 +77,7 @@ def some_splats(shape: str, n: int = 300, sh_degree: int = 2) -> Splats:
             values = rng.uniform(-3.5, -1.5, size)
         elif "opacity" in field.name:
             values = rng.uniform(-7, 3, size)
-            values[: n // 4] = 1e-2 * rng.standard_normal(n // 4)  # of a signed shape these are transparent
+            values[: n // 4] = 1e-2 * rng.standard_normal(n // 4)  # with a signed shape these are transparent
         arrays[field.name] = values
     return Splats(shape, {name: array.astype(np.float32) for name, array in arrays.items()})
 
@@ -106,13 +106,13 @@ def gradients(buffers: SplatBuffers, rng: np.random.Generator) -> dict[str, np.n
         for name, array in buffers.download(buffers.n).items()
         if name != "sh"
     }
-    colour = rng.standard_normal((buffers.n, 2, 3)).astype(np.float32)  # its gradient, and the direction
+    colour = rng.standard_normal((buffers.n, 2, 3)).astype(np.float32)  # the gradient of the colour, and the direction
     colour[:, 1] = rng.choice(DIRECTIONS, buffers.n)
     return grads | {"sh": colour}
 
 
 def ones(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Gradients of 1 everywhere; directions in which all coefficients have some."""
+    """Return gradients of 1 everywhere, with directions that give every SH coefficient a gradient."""
     colour = np.ones((len(arrays["mean"]), 2, 3), np.float32)
     colour[:, 1] = np.sqrt([0.15, 0.25, 0.6])
     return {key: np.ones_like(value) for key, value in arrays.items()} | {"sh": colour}
@@ -127,19 +127,19 @@ def step(
 
 
 def growing(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> DensifyEdit:
-    """As a relocation: some rows become copies, 40 are added, states stay where they are."""
+    """Edit as a relocation does: some rows become copies, 40 are added, and states do not move."""
     n = len(arrays["mean"])
     source = np.concatenate([np.arange(n), rng.integers(0, n, 40)])
     source[: n // 5] = rng.integers(n // 2, n, n // 5)
     fresh = np.zeros(n + 40, bool)
     fresh[rng.integers(0, n, 30)] = True
-    fresh[n : n + 20] = True  # the other new rows have no state either
+    fresh[n : n + 20] = True  # the other new rows start without state too
     values = {"opacity_logit": arrays["opacity_logit"][source] - 1, "log_scale": arrays["log_scale"][source] - 0.1}
     return DensifyEdit(source, values, fresh)
 
 
 def shrinking(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> DensifyEdit:
-    """As pruning with a reset: 100 rows go, states move along, some rows are turned or given another skew."""
+    """Edit as pruning with a reset does: 100 rows are removed and states move. Some rows change rotation or skew."""
     n = len(arrays["mean"])
     source = rng.permutation(n)[: n - 100]
     fresh = np.zeros(n - 100, bool)
@@ -156,7 +156,7 @@ def shrinking(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> Densif
 
 @pytest.mark.parametrize("options", CASES, ids=words)
 def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> None:
-    """The same gradients into both; growth, shrinking and growth again between the steps."""
+    """Both optimizers get the same gradients. Growth, shrinking and another growth come between the steps."""
     config = config_of(**options)
     splats = some_splats(config.shape)
     both = {name: started(device, replace(config, optimizer=name), splats) for name in ("fused", "numpy")}
@@ -169,7 +169,7 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
         for target, optimizer in both.values():
             step(target, optimizer, grads, iteration, degree)
         if iteration in edits:
-            for target, optimizer in both.values():  # each from its own values: copies must be equal to the bit
+            for target, optimizer in both.values():  # each edits its own values: copies must be equal to the bit
                 optimizer.apply(edits[iteration](target.download(target.n), np.random.default_rng(iteration)))
         else:
             moved = buffers.download(buffers.n)
@@ -178,7 +178,7 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
                 skew_turn = (iteration - 3) % 3 >= 2
                 learns = {True: skew_turn, False: not skew_turn}
             for name in moved:
-                turns = name == "skew" and config.skew_map == "coupled"  # moves with the rotation, too
+                turns = name == "skew" and config.skew_map == "coupled"  # the coupled skew also moves with the rotation
                 assert np.any(moved[name] != start[name]) == (learns[name == "skew"] or turns), name
     fused, numpy = (target.download(target.n) for target, _ in both.values())
     for name, expected in numpy.items():
@@ -187,7 +187,7 @@ def test_fused_steps_equal_numpy(device: Device, options: dict[str, object]) -> 
     states = [optimizer.state() for _, optimizer in both.values()]
     assert set(states[0]) == set(states[1])
     for name, expected in states[1].items():
-        near = 3e-5 if name == "momentum" else 1e-6  # its gate takes an opacity's rounding a hundred times
+        near = 3e-5 if name == "momentum" else 1e-6  # the gate amplifies the rounding of an opacity a hundred times
         np.testing.assert_allclose(states[0][name], expected, near, 1e-6 * np.abs(expected).max(), err_msg=name)
 
 
@@ -220,7 +220,7 @@ def test_an_edit_moves_parameters_and_states(devices: list[Device], name: str) -
 def test_a_frozen_group_keeps_values_moments_and_count(devices: list[Device], name: str) -> None:
     config = config_of(
         shape="skew-normal-direct", optimizer=name, alternation="cyclic", alternation_warmup=0, alternation_cycle=4
-    )  # two iterations each
+    )  # two iterations for each group
     buffers, optimizer = started(devices[0], config, some_splats(config.shape))
     rng = np.random.default_rng(3)
     for iteration in range(1, 7):
@@ -248,7 +248,7 @@ def test_bounded_fields_move_by_factors_and_stay_within(
     grads[field][1] = -1
     step(buffers, optimizer, grads, 1)
     got = buffers.download(buffers.n)[field]
-    np.testing.assert_allclose(got[:3], [low, high, 2 * np.exp(-0.05)], rtol=1e-6)  # Adam's first step is the rate
+    np.testing.assert_allclose(got[:3], [low, high, 2 * np.exp(-0.05)], rtol=1e-6)  # Adam's first step equals the rate
     for iteration in range(2, 30):
         step(buffers, optimizer, grads, iteration)
     got = buffers.download(buffers.n)[field]
@@ -278,7 +278,7 @@ def test_a_state_continues_to_the_same_bits_and_goes_from_one_optimizer_to_the_o
 
 
 def test_every_field_has_a_rate(devices: list[Device]) -> None:
-    """All fields of all shapes move, the second opacity at the rate of the first."""
+    """All fields of all shapes move. The second opacity has the learning rate of the first."""
     for shape in SHAPES:
         config = config_of(shape=shape, opacity_lr=0.03)
         splats = some_splats(shape, 20, 0)
@@ -291,12 +291,12 @@ def test_every_field_has_a_rate(devices: list[Device]) -> None:
                 np.testing.assert_allclose(change, 0.03, rtol=1e-4)
 
 
-# --- what goes into the step, and beside it --------------------------------------------------
+# --- regularisers and other parts of the step -------------------------------------------------
 
 
 @pytest.mark.parametrize("shape", ["gaussian", "bisected-skew", "student-t"])
 def test_regularisers_are_the_gradients_of_their_penalties(shape: str) -> None:
-    """Mean |opacity| of a splat's sides, scale, and the squared difference of two sides."""
+    """Penalties are the mean |opacity| of a splat's sides, the scale, and the squared difference of two sides."""
     kind = shape_named(shape)
 
     def penalty(arrays: dict[str, np.ndarray]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Presets: each is a usable config of one strategy, has its own constants, and flags may not contradict it."""
+"""Presets: each is a valid config of one strategy, has its own constants, and refuses flags that contradict it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.training.config import OPTIONS, TrainConfig
 from clsplat.training.optim.skew_map import map_named
 from clsplat.training.presets import IDENTITY, PRESETS, preset, with_preset
 
-# The options in which a system differs from the one that it is built on, as its paper describes it.
+# Options in which a system differs from the system it is based on, as its paper describes it.
 DIFFERENCES = {
     ("3dgs", "ges"): {"shape", "beta_lr", "grad_threshold", "densify_from", "densify_until", "opacity_reset"},
     ("3dgs", "3d-hgs"): {"shape", "densify_until"},
@@ -48,7 +48,7 @@ def test_a_preset_has_only_options_with_an_effect(name: str) -> None:
     assert ("normalisation" in values) == shape.normalised
     if "skew_map" in values:
         assert map_named(values["skew_map"], shape.skew_form) == values["skew_map"]
-    # What belongs to the comparison, or to clsplat alone, is not a preset's.
+    # A preset does not set options of the comparison, or options that only clsplat has.
     assert not values.keys() & {"iterations", "cap_max", "seed", "coarse_to_fine", "sh_degree", "background", "init"}
 
 
@@ -65,7 +65,7 @@ def test_a_system_differs_from_its_base_in_what_it_publishes(base: str, name: st
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_strategy_decides_about_noise_and_resets(name: str) -> None:
-    """Noise explores in place of gradients (3DGS-MCMC), unless SGHMC has noise of its own; resets belong to ADC."""
+    """Noise replaces gradients for exploration (3DGS-MCMC), unless SGHMC has its own noise. Only ADC has resets."""
     config = TrainConfig(**preset(name))
     adam = config.sghmc.position_optimizer == "adam"
     assert (config.density.noise_lr > 0) == (config.strategy == "mcmc" and adam)
@@ -80,7 +80,7 @@ def test_densification_ends_before_the_run_does() -> None:
 
 
 def test_resets_are_as_far_apart_as_published() -> None:
-    """Every 3000 iterations: of 30 000 in 3DGS, and of 40 000 in GES."""
+    """A reset occurs every 3000 iterations: of 30 000 in 3DGS, and of 40 000 in GES."""
     for name, iterations in (("3dgs", 30_000), ("ges", 40_000)):
         assert iterations // preset(name)["opacity_reset"] == pytest.approx(3000, rel=0.03)
 
@@ -95,7 +95,7 @@ def test_docstrings_name_paper_and_source(name: str) -> None:
 def test_flags_replace_constants() -> None:
     values = with_preset("3dgs", {"opacity_lr": 0.025, "cap_max": 7})
     assert (values["opacity_lr"], values["cap_max"], values["grad_threshold"]) == (0.025, 7, 2e-4)
-    assert preset("3dgs")["opacity_lr"] == 0.05  # a fresh dictionary each time
+    assert preset("3dgs")["opacity_lr"] == 0.05  # each call returns a new dictionary
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -1,4 +1,4 @@
-"""Progress on terminals of any width, in files, in notebooks, and without support for carriage returns."""
+"""Progress in terminals of any width, in files, in notebooks, and without support for carriage returns."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def at(iteration: int, message: str = "") -> Progress:
 
 
 class Terminal:
-    """A pseudo-terminal that shows what was written to it."""
+    """A pseudo-terminal that shows its output."""
 
     def __init__(self) -> None:
         self.master, slave = pty.openpty()
@@ -46,8 +46,8 @@ class Terminal:
         self.columns = columns
 
     def seen(self) -> list[str]:
-        """Lines written since the last call, as a terminal of the present width shows them."""
-        self.stream.write("\0")  # the kernel passes text on with a delay; this marks its end
+        """Return the lines written since the last call, as a terminal of the present width shows them."""
+        self.stream.write("\0")  # the kernel delays text; this marks its end
         self.stream.flush()
         raw = b""
         while not raw.endswith(b"\0"):

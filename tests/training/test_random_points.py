@@ -1,4 +1,4 @@
-"""Random points: where the cameras look, denser where more of them do."""
+"""Random points lie where the cameras look, and are denser where more cameras look."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clsplat.training.random_points import random_points, seen
 
 
 def looking(places: np.ndarray, at: np.ndarray, field: float = 0.7) -> list[Camera]:
-    """Square cameras of an angle of view [rad] that look at a point, y down."""
+    """Square cameras with an angle of view [rad] that look at a point, y down."""
     cameras = []
     for place in places:
         forward = (at - place) / np.linalg.norm(at - place)
@@ -62,7 +62,7 @@ def test_the_scale_of_the_world_does_not_matter() -> None:
 
 
 def test_parallel_cameras_look_ahead() -> None:
-    """A row of them along x, looking along z."""
+    """The cameras form a row along x and look along z."""
     cameras = []
     for x in (4.0, 5.0, 6.0):
         pose = np.eye(4)

@@ -1,4 +1,4 @@
-"""Limits of learning rates: high rates are refused, defaults and presets never are."""
+"""Limits of learning rates: high rates are refused, and defaults and presets are always accepted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_defaults_and_presets_pass(iterations: int) -> None:
 @pytest.mark.parametrize("name", LIMITS)
 def test_a_hundred_times_the_rate_is_refused_and_a_usable_one_named(name: str) -> None:
     rate = 100 * getattr(TrainConfig().optim, name)
-    if name == "position_lr_final":  # 100 times is the rate at the start
+    if name == "position_lr_final":  # its limit is 100 times as high: the rate at the start
         rate *= 100
     with pytest.raises(InputError, match=rf"^{name} .* of 200 iterations .*: use at most [\d.e-]+$") as caught:
         check_rates(TrainConfig(iterations=200, **{name: rate}))

@@ -1,4 +1,4 @@
-"""Relocation against adaptive quadrature and published numbers, and the laws of an edit, for every shape."""
+"""Relocation agrees with adaptive quadrature and published numbers. Its edits obey their rules for every shape."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TWO_SIDED = [s for s in ALL_SHAPES if any(f.name == "opacity_minus_logit" for f 
 
 
 def one(shape: Shape, opacity: float, own: float = 0.0, minus: float = 0.0) -> Arrays:
-    """A splat of given opacity; `own` is its beta, nu, or length of skew."""
+    """One splat of this opacity; `own` is its beta, its nu, or the length of its skew."""
     arrays = {field.name: np.zeros(1 if field.width == 1 else (1, field.width)) for field in shape.fields}
     if "skew" in arrays:
         arrays["skew"][0, 1] = own
@@ -36,12 +36,12 @@ def one(shape: Shape, opacity: float, own: float = 0.0, minus: float = 0.0) -> A
 
 
 def integral(f: Callable[[float], float]) -> float:
-    """Over the line, in pieces: heavy tails, cusps and steps at 0."""
+    """Integrate over the line in pieces, because of heavy tails, cusps and steps at 0."""
     edges = [-np.inf, -100, -10, -3, -1, -0.1, 0, 0.1, 1, 3, 10, 100, np.inf]
     return sum(quad(f, a, b, limit=400, epsabs=1e-10, epsrel=1e-9)[0] for a, b in itertools.pairwise(edges))
 
 
-# Shape, its own parameter, relative error (see densify._NODES).
+# Shape, its own parameter, relative error (see _NODES in training/density/relocation.py).
 KERNELS = [
     (shapes.GAUSSIAN, 0.0, 1e-9),
     (shapes.GES_MODULATION, 3.0, 1e-9),
@@ -81,7 +81,7 @@ def test_a_stack_absorbs_as_much_as_the_splat_it_replaces(
 
 
 def test_gaussian_formula_as_published() -> None:
-    """3DGS-MCMC's double sum with explicit binomials."""
+    """Compute 3DGS-MCMC's double sum with explicit binomials."""
     for opacity, ratio in [(0.5, 2), (0.3, 5), (0.97, 12)]:
         new = 1 - (1 - opacity) ** (1 / ratio)
         total = sum(
@@ -96,7 +96,10 @@ def test_gaussian_formula_as_published() -> None:
 
 @pytest.mark.parametrize(("slant", "published"), [(0, 0.900), (1, 0.911), (3, 0.931), (10, 0.945)])
 def test_skewed_factors_against_the_table_for_half_the_opacity(slant: float, published: float) -> None:
-    """exp(-z^2/2) Phi(slant z) as published, without a factor, o = 0.5, N = 2: opacities (0.5, 0) of the bisected."""
+    """The table is for exp(-z^2/2) Phi(slant z) without a factor, o = 0.5, N = 2.
+
+    This is the bisected shape with opacities (0.5, 0).
+    """
     shape = shapes.BISECTED_SKEW
     _, factor = relocation(shape, one(shape, 0.5, slant, minus=1e-12), np.array([2]))
     _, whole = relocation(shapes.GAUSSIAN, one(shapes.GAUSSIAN, 0.5), np.array([2]))
@@ -190,7 +193,7 @@ def test_laws_of_a_plan(n: int, seed: int, dead: float, growth: float, spare: in
     assert all(len(a) == n_new and a.dtype == np.float32 and np.isfinite(a).all() for a in moved.values())
     assert (shape.strength(moved) >= MIN_OPACITY * (1 - 1e-6)).all() or not alive.any()
 
-    # Every member of a stack has the same values; their number decides them; the rest is untouched.
+    # All members of a stack have equal values, which their number determines. The other splats do not change.
     size = np.bincount(edit.source, minlength=n)[edit.source]
     names = opacity_names(arrays)
     for name, values in moved.items():
@@ -206,7 +209,7 @@ def test_laws_of_a_plan(n: int, seed: int, dead: float, growth: float, spare: in
     expected = rows["log_scale"] + RULES[rule] * np.log(factor)[:, None]
     np.testing.assert_allclose(moved["log_scale"][stack], expected, rtol=1e-5, atol=1e-5)
 
-    # Optimizer state: the live row of each stack and the added rows start afresh, relocated rows keep theirs.
+    # Optimizer states: the live row of each stack and the added rows have new states. Relocated rows keep theirs.
     np.testing.assert_array_equal(edit.fresh[:n], stack[:n] & (edit.source[:n] == np.arange(n)))
     assert edit.fresh[n:].all()
 

@@ -1,4 +1,4 @@
-"""Training: the same bits twice and across interruptions, fused steps against NumPy, the loss, the cap."""
+"""Training: the same bits twice and after interruptions, fused steps equal to NumPy's, the loss, and the cap."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from clsplat.training.optim.noise import noise_reach
 from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
 
-# Every part of the strategy acts: growth from 2252 points to the cap, noise, all resolutions and SH degrees.
+# Every part of the strategy is active: growth from 2252 points to the cap, noise, all resolutions and SH degrees.
 CONFIG = TrainConfig(
     iterations=80, cap_max=2400, sh_degree=1, densify_interval=10, checkpoint_interval=30, strategy="mcmc"
 )
@@ -38,7 +38,7 @@ CAMERA = clsplat.Camera(27, 19, 25.0, 26.0, 13.0, 9.0, np.eye(4))
 
 @pytest.fixture(scope="session")
 def uninterrupted(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of CONFIG's model."""
+    """Return the folder of CONFIG's model."""
     folder = tmp_path_factory.mktemp("run")
     train(scene, CONFIG, output=folder)
     return folder
@@ -54,7 +54,7 @@ def ply(folder: Path) -> bytes:
 
 
 def some_splats(n: int = 300, shape: str = "skew-normal", sh_degree: int = 2) -> Splats:
-    """Random splats before CAMERA; some nearly transparent, so that noise and relocation act."""
+    """Random splats in front of CAMERA. Some are nearly transparent, so that noise and relocation act on them."""
     rng = np.random.default_rng(5)
     arrays = {
         "mean": rng.uniform((-1, -1, 2), (1, 1, 4), (n, 3)),
@@ -103,7 +103,10 @@ def press_ctrl_c_at_50(progress: Progress) -> None:
 def test_a_crashed_run_resumes_to_the_same_model(
     scene: Scene, uninterrupted: Path, tmp_path: Path, optimizer: str, changes: dict[str, Any], interval: int
 ) -> None:
-    """A crash at 50 leaves an earlier checkpoint; relocation and growth lie on both sides, and sums lie open at 37."""
+    """A crash at iteration 50 leaves an earlier checkpoint.
+
+    Relocation and growth occur both before and after it. At iteration 37, unfinished sums exist.
+    """
     config = replace(CONFIG, optimizer=optimizer, checkpoint_interval=interval, **changes)
     whole = uninterrupted
     if optimizer != "fused" or changes:
@@ -130,7 +133,7 @@ def test_ctrl_c_saves_and_resumes_to_the_same_model(scene: Scene, uninterrupted:
     assert ply(tmp_path / "m") == ply(uninterrupted)
 
 
-# --- what training does ----------------------------------------------------------------------
+# --- training --------------------------------------------------------------------------------
 
 
 def test_training_improves_the_training_views_and_never_exceeds_the_cap(
@@ -181,7 +184,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(scene: Scene, tmp_path: Path, m
 
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])
 def test_noise_equals_numpy(scene: Scene, default_device: Device, tmp_path: Path, shape: str) -> None:
-    """One iteration whose rates are 0 (the mean's next to it) moves splats by the noise alone."""
+    """One iteration at learning rates of 0 (that of the mean is nearly 0) moves splats by the noise alone."""
     splats = some_splats(shape=shape, sh_degree=1)
     splats.save(tmp_path / "start.ply")
     rate = 1e-9
@@ -224,13 +227,13 @@ def test_noise_equals_numpy(scene: Scene, default_device: Device, tmp_path: Path
 
 
 def test_regularisers_pull_opacity_and_scale_down(scene: Scene, default_device: Device) -> None:
-    """Gradients of the mean opacity and the mean scale, added to those of the image."""
+    """The regularisers add gradients of the mean opacity and the mean scale to those of the image."""
     grads: list[dict[str, NDArray[Any]]] = []
     for weight in (0.0, 10.0):
         trainer = Trainer(scene, replace(CONFIG, opacity_reg=weight, scale_reg=2 * weight), device=default_device)
         first = trainer.snapshot()
         trainer.step()
-        moments = trainer.optimizer.state()  # a tenth of the gradients after one step
+        moments = trainer.optimizer.state()  # a tenth of the gradients, after one step
         grads.append({name: 10 * moments[f"first.{name}"] for name in ("opacity_logit", "log_scale")})
     opacity = 1 / (1 + np.exp(-first.opacity_logit.astype(float)))
     added = grads[1]["opacity_logit"] - grads[0]["opacity_logit"]
@@ -242,7 +245,7 @@ def test_regularisers_pull_opacity_and_scale_down(scene: Scene, default_device: 
 
 
 def test_rows_of_the_schema_fit_both_buffers() -> None:
-    """The optimizer steps all of geom but the skew by table: the skew must come last."""
+    """A table steps all fields of geom except the skew, so the skew must be last."""
     schema = some_splats().schema
     assert schema.group(Group.GEOM)[-1].name == "skew"
 
@@ -250,7 +253,10 @@ def test_rows_of_the_schema_fit_both_buffers() -> None:
 def test_splats_that_are_not_finite_are_mended_or_left_out(
     scene: Scene, tmp_path: Path, default_device: Device
 ) -> None:
-    """Broken between two actions of the strategy: saved without them, resumed with them, then relocated."""
+    """Splats become non-finite between two actions of the strategy.
+
+    Saved models omit these splats, checkpoints keep them, and the next action relocates them.
+    """
     config = replace(CONFIG, iterations=40)
     trainer = Trainer(scene, config, device=default_device)
     for _ in range(12):
@@ -263,7 +269,7 @@ def test_splats_that_are_not_finite_are_mended_or_left_out(
     trainer.checkpoint().save(tmp_path / "broken.npz")
     resumed = Trainer(scene, config, Checkpoint.load(tmp_path / "broken.npz"), device=default_device)
     for run in (trainer, resumed):
-        while run.iteration < 20:  # acts at 20
+        while run.iteration < 20:  # the strategy acts at 20
             run.step()
         assert len(run.snapshot()) == run.splats.n
     for name, array in trainer.snapshot().arrays.items():

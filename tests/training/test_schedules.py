@@ -1,4 +1,4 @@
-"""schedules.py: end points, monotony, and short runs."""
+"""Schedules: end points, monotony, and short runs."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ def test_resolution_schedule_rejects(stages: list[tuple[float, int]]) -> None:
 
 def test_few_splats_stay_longer_with_small_images() -> None:
     schedule, pixels = resolution_schedule(1000), 160_000
-    for many in (20_000, 10**6):  # 8 pixels a splat and fewer
+    for many in (20_000, 10**6):  # 8 pixels per splat, or fewer
         assert [downscale_for(schedule, i, many, pixels) for i in (0, 199, 200, 499, 500)] == [4, 4, 2, 2, 1]
-    for few in (10_000, 1, 0):  # 16 and more
+    for few in (10_000, 1, 0):  # 16 pixels per splat, or more
         assert [downscale_for(schedule, i, few, pixels) for i in (0, 259, 260, 649, 650)] == [4, 4, 2, 2, 1]
-    # 12 pixels a splat: half of the way
+    # 12 pixels per splat, halfway between
     assert [downscale_for(schedule, i, 13_333, pixels) for i in (0, 229, 231, 574, 576)] == [4, 4, 2, 2, 1]
     assert downscale_for([(0, 1)], 0, 10, 1) == 1
 

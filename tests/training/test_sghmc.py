@@ -1,4 +1,4 @@
-"""sghmc.py: SSS's formula, the stable form's laws, and both against what theory says of them."""
+"""SGHMC: SSS's formula, properties of the stable form, and both forms against their theory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.training.methods.sss import PublishedSghmc
 from clsplat.training.optim.noise import covariance_times, noise_gate, normal3
 from clsplat.training.optim.sghmc import SSS_EXTENT, STREAM, Coefficients, Sghmc, step
 
-RATE = 1.6e-4  # of positions, times the extent
+RATE = 1.6e-4  # learning rate of positions; the extent multiplies it
 FRICTION, BURN_IN_FRICTION = 120.0, 5e5
 
 
@@ -21,7 +21,7 @@ def sghmc(extent: float = SSS_EXTENT, literal: bool = False, friction: float = F
 
 
 def ends(options: Sghmc, iterations: int = 300, factor: float = 1.0, n: int = 64) -> np.ndarray:
-    """(n, 3) means, in a scene of that extent, of nearly transparent splats pushed about by unit directions."""
+    """Return (n, 3) means of nearly transparent splats after steps in random directions. Options have the extent."""
     rng = np.random.default_rng(0)
     extent = options.extent
     mean, momentum = extent * rng.standard_normal((n, 3)), np.zeros((n, 3))
@@ -41,10 +41,10 @@ def test_literal_coefficients_are_sss() -> None:
     noise = math.sqrt(2 * length * BURN_IN_FRICTION)
     assert options.coefficients(5, rate, 1.0) == pytest.approx((length, length, 0, noise, True))
     noise = math.sqrt(2 * length * FRICTION)
-    assert options.coefficients(6, rate, 1.0) == pytest.approx((length, length, 0, noise, False))  # p starts at 0
+    assert options.coefficients(6, rate, 1.0) == pytest.approx((length, length, 0, noise, False))  # p is 0 at first
     keep = 1 - length * FRICTION
     assert options.coefficients(7, rate, 1.0) == pytest.approx((length, length, keep, noise, False))
-    # The factor of short runs multiplies the gradient alone.
+    # The factor of short runs multiplies only the gradient.
     assert options.coefficients(7, rate, 4.0) == pytest.approx((length, 4 * length, keep, noise, False))
 
 
@@ -72,7 +72,7 @@ def test_a_visible_splat_takes_adams_step(iteration: int) -> None:
 
 
 def test_both_forms_agree_at_the_extent_of_sss() -> None:
-    for rate in (1e-4, 1e-6):  # l C < 1 in the second
+    for rate in (1e-4, 1e-6):  # the second rate gives l C < 1
         for iteration in (1, 6, 7):
             forms = [sghmc(literal=literal).coefficients(iteration, rate, 3.0) for literal in (True, False)]
             assert forms[1]._replace(keep=0) == pytest.approx(forms[0]._replace(keep=0))
@@ -110,7 +110,10 @@ def test_no_extent_is_no_motion() -> None:
 
 
 def test_the_variance_in_a_quadratic_well_is_the_stationary_one() -> None:
-    """x' = x + l p', p' = s keep p - drive x / width^2 + s noise xi, a linear recurrence: its Lyapunov equation."""
+    """The stationary variance solves the Lyapunov equation of this linear recurrence.
+
+    x' = x + l p', p' = s keep p - drive x / width^2 + s noise xi
+    """
     n, width = 6000, 0.05
     c = sghmc(3.0, friction=20.0).coefficients(100, 2e-3, 1.0)
     gate = noise_gate(np.zeros(1))[0]

@@ -1,4 +1,4 @@
-"""skew_map.py: bounds, round trips, and gradients against central differences."""
+"""Skew maps: bounds, round trips, and gradients against central differences."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from clsplat.training.optim.skew_map import MAPS, R_FLOOR, SKEW_MAPS, SkewMap, c
 
 maps = pytest.mark.parametrize("skew_map", [SkewMap(name) for name in SKEW_MAPS], ids=SKEW_MAPS)
 vectors = hnp.arrays(np.float64, (4, 3), elements=st.floats(-50, 50, allow_subnormal=False))
-LENGTH = {  # of the skew at |s| = 0.7
+LENGTH = {  # length of the skew at |s| = 0.7
     "cube-root": SKEW_MAX * np.tanh(0.7) ** (1 / 3),
     "coupled": SLANT_MAX * np.tanh(0.7 / SLANT_MAX),
 }
@@ -26,7 +26,7 @@ def some_quats(n: int) -> np.ndarray:
 
 
 def with_length(skew_map: SkewMap, s: np.ndarray, length: float) -> np.ndarray:
-    """s scaled to a magnitude; of "polar" the magnitude is the first component, and the direction is not scaled."""
+    """Return s with this magnitude. With "polar", the first component is the magnitude and the direction stays."""
     if skew_map.name == "polar":
         return np.concatenate([np.full((len(s), 1), length), s[:, 1:]], axis=1)
     return s * (length / np.linalg.norm(s, axis=1, keepdims=True))
@@ -61,7 +61,7 @@ def test_polar_is_a_magnitude_and_a_direction_of_any_length() -> None:
 
 
 def test_coupled_is_a_slant_in_the_worlds_frame() -> None:
-    """Turning the splat leaves the vector in the world where it was."""
+    """A rotation of the splat does not change the skew vector in the world."""
     s, quat = np.random.default_rng(1).standard_normal((6, 3)), some_quats(6)
     eta = SkewMap("coupled").forward(s, quat)
     r = np.linalg.norm(s, axis=1, keepdims=True)
@@ -109,8 +109,8 @@ def test_zero_and_extremes_are_finite(skew_map: SkewMap, dtype: type) -> None:
     np.testing.assert_array_equal(skew[0], 0)
     np.testing.assert_array_equal(skew_map.forward(skew_map.inverse(0 * skew, quat), quat), 0)
     if skew_map.name != "polar":
-        assert v_s[0].all()  # a zero vector can leave zero
-    else:  # the magnitude can, given a direction
+        assert v_s[0].all()  # a zero vector has a gradient, so it can change
+    else:  # the magnitude has a gradient, if there is a direction
         assert skew_map.vjp(skew_map.inverse(0 * skew, quat), quat, v_skew)[0][:, 0].all()
 
 

@@ -1,4 +1,4 @@
-"""Alternating optimisation: the warm-up, the cycle, and the runs without alternation."""
+"""Alternating optimisation: the warm-up, the cycle, and runs without alternation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CONFIG = TrainConfig(
 
 
 def pattern(config: TrainConfig) -> str:
-    """One letter an iteration: B base, S skew, J both."""
+    """Return one letter for each iteration: B base, S skew, J both."""
     letters = {(True, True): "J", (True, False): "B", (False, True): "S"}
     return "".join(letters[learning_groups(it, config)] for it in range(1, config.iterations + 1))
 

@@ -1,4 +1,4 @@
-"""Faults that hazards found stay fixed: a small version of the tables of benchmarks/stability.py."""
+"""Fixed faults of hazardous inputs stay fixed: a small version of the tables of benchmarks/stability.py."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from hazards import crafted, static
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal", "skew-normal-direct"])
 @pytest.mark.parametrize("hazard", crafted.STATIC)
 def test_crafted_splats(hazard: str, shape: str, devices: list[Device], make_renderer: MakeRenderer) -> None:
-    """Finite, and the double build's image and gradients; or refused with a line that names the splat."""
+    """The result is finite and equals the double build's image and gradients, or one line names the refused splat."""
     arrays = crafted.STATIC[hazard](SHAPES[shape])
     if not arrays:
         pytest.skip("nothing of this shape is at risk")
     row = static.judged(shape, arrays, make_renderer(devices[0]), *[make_renderer(devices[0], "float64")] * 2)
-    # Float32 loses the gradient of the scale for needles as long as ten images (benchmarks/STABILITY.md).
+    # Float32 loses the gradient of the scale if needles are as long as ten images (benchmarks/STABILITY.md).
     expected = "stops" if "beyond" in hazard or "NaN" in hazard else "loses" if "400 px" in hazard else "survives"
     assert row["verdict"] == expected, row
     assert row["finite"]
@@ -40,7 +40,7 @@ def test_crafted_splats(hazard: str, shape: str, devices: list[Device], make_ren
 
 
 def test_splats_out_of_sight_leave_their_colour_alone(devices: list[Device], make_renderer: MakeRenderer) -> None:
-    """A scale that overflows float32 gives a NaN mean, whose product with 0 must not reach the colour."""
+    """A scale that overflows float32 gives a NaN mean. Its product with 0 must not reach the colour."""
     arrays = crafted.benign(SHAPES["skew-normal-direct"])
     arrays["log_scale"][::3] = 90.0
     renderer = make_renderer(devices[0])
@@ -52,7 +52,7 @@ def test_splats_out_of_sight_leave_their_colour_alone(devices: list[Device], mak
 
 
 def test_scales_are_held_down_alike_in_all_large_scenes() -> None:
-    """The weight of the mean scale, in units of the scene's extent."""
+    """The test compares the weight of the mean scale, in units of the scene's extent."""
     config = TrainConfig(scale_reg=0.01)
     small, published, large = (
         Rules(config, extent).penalty(10).scale * extent for extent in (1.0, PUBLISHED_EXTENT, 1e4)
@@ -78,7 +78,7 @@ def test_training_refuses_rates_that_it_does_not_survive(scene: Scene, devices: 
 
 
 def test_the_units_of_the_scene_do_not_matter(scene: Scene, devices: list[Device]) -> None:
-    """3DGS-MCMC as published throws splats out of large scenes."""
+    """The published 3DGS-MCMC throws splats out of large scenes. clsplat does not."""
     config = TrainConfig(
         shape="gaussian", sh_degree=0, iterations=40, cap_max=300, strategy="mcmc", densify_interval=10
     )

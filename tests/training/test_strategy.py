@@ -1,4 +1,4 @@
-"""strategy.py: which edit the options ask for, and when."""
+"""Strategy: which edit the options request, and at which iteration."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_adc_resets_when_3dgs_does() -> None:
     at = [it for it in range(100, 15_001, 100) if action(config, it)[1].reset_fields]
     assert at == [3000, 6000, 9000, 12_000]
     assert not any(action(adc(opacity_reset=0), it)[1].reset_fields for it in at)
-    # A multiple that no action falls on is made up for at the next action, once.
+    # If no action occurs at a multiple, the next action resets instead, once.
     odd = adc(iterations=7000, opacity_reset=7, densify_interval=300, densify_until=0.8)
     assert [it for it in range(300, 5601, 300) if action(odd, it)[1].reset_fields] == [1200, 2100, 3000, 4200, 5100]
 

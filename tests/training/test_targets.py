@@ -1,4 +1,4 @@
-"""The training images on the device: what is there, what stays, what is uploaded again."""
+"""Training images on the device: which are present, which stay, and which are uploaded again."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def targets_of(device: Device, budget: int) -> Targets:
 
 
 def image_of(targets: Targets, target: Target) -> NDArray[np.uint8]:
-    """(H, W, 3), read back; the margin must be zero."""
+    """Read back the image (H, W, 3). Its margin must be zero."""
     layout = target.layout
     planes = to_host(targets.device, targets.planes(target), np.empty((3, layout.rows, layout.stride), np.uint8))
     image = layout.unpack(planes)
@@ -50,7 +50,7 @@ def image_of(targets: Targets, target: Target) -> NDArray[np.uint8]:
 
 @pytest.mark.parametrize("budget", [10**9, 20_000, 0])
 def test_images_arrive_whatever_stays(device: Device, budget: int) -> None:
-    """Twice through all views at each of three sizes; what stays is uploaded once."""
+    """The test reads all views twice at each of three sizes. An image that stays is uploaded once."""
     targets = targets_of(device, budget)
     for downscale in (4, 2, 1):
         for again in range(2):
@@ -68,7 +68,7 @@ def test_images_arrive_whatever_stays(device: Device, budget: int) -> None:
 
 
 def test_part_of_the_images_stays(device: Device) -> None:
-    """The first ones drawn, within the budget."""
+    """The images that are drawn first stay, within the budget."""
     targets = targets_of(device, 20_000)
     for i in range(4):
         image_of(targets, targets.get(i, 1))
@@ -91,14 +91,14 @@ def test_images_of_the_last_size_are_given_back(device: Device) -> None:
 @pytest.mark.parametrize("budget", [10**9, 20_000, 0])
 def test_what_is_promised_is_enough(device: Device, budget: int) -> None:
     targets = targets_of(device, budget)
-    for i in (2, 0, 1, 3):  # the largest first: buffers then need no room to grow
+    for i in (2, 0, 1, 3):  # the largest first, so that buffers need not grow
         image_of(targets, targets.get(i, 1))
     assert targets.nbytes <= target_bytes(targets.views, budget)
     assert target_budget(device) == device.info.global_mem_bytes // 4
 
 
 def test_training_does_not_depend_on_what_stays(devices: list[Device], capture_folder: Path) -> None:
-    """The same bits with all images on the device and with none."""
+    """The results are equal to the bit with all images on the device and with none."""
     scene = load_scene(capture_folder)
     config = TrainConfig(iterations=10, cap_max=300, sh_degree=1)
     models = []

@@ -1,4 +1,4 @@
-"""view_sampler.py: every view once before any comes again, at a size that suits the splats."""
+"""View sampler: every view is drawn once before any is drawn again, at a size that suits the number of splats."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_size_goes_with_iteration_and_splats(views: list[View]) -> None:
         View(view.name, Camera(480, 360, 400, 400, 240, 180, view.camera.cam_from_world), view.image) for view in views
     ]
     sampler = ViewSampler(large, 1000, True, np.random.default_rng(0), [])
-    # 480 x 360 px: 8 pixels a splat, and many more
+    # 480 x 360 px: 8 pixels per splat, and then many more
     assert [sampler.next(iteration, 21_600)[1] for iteration in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
     assert [sampler.next(iteration, 100)[1] for iteration in (1, 260, 261, 650, 651)] == [4, 4, 2, 2, 1]
     assert ViewSampler(large, 1000, False, np.random.default_rng(0), []).next(1, 1)[1] == 1
