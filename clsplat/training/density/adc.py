@@ -1,22 +1,24 @@
 """Adaptive density control of 3DGS (Kerbl et al. 2023), and the depth criterion of 3DSGS, as edits made on the host.
 
-Splats with a high mean screen gradient are densified. Small ones are cloned: a copy in the same place. Large ones are
-split: two halves are drawn from the Gaussian, smaller by a factor of 1.6. Faint splats are pruned, after the first
-opacity reset large ones too. Size is measured in the world. The limit of 3DGS on the screen (20 px) has no effect in
-its released code (graphdeco-inria/gaussian-splatting#123, #643). With few splats it would remove most of them.
+Splats with a high mean screen gradient are densified. A small splat is cloned: it gets a copy in the same place. A
+large splat is split into two halves, which are drawn from its Gaussian and smaller by a factor of 1.6. Nearly
+transparent splats are pruned. After the first opacity reset, very large splats are pruned too. Sizes are in world
+units. 3DGS also has a limit on the screen (20 px), which has no effect in its released code
+(graphdeco-inria/gaussian-splatting#123, #643). With few splats that limit would remove most of them.
 
 With a depth threshold (3DSGS, arXiv 2605.18334) a splat is split if either gradient is high, always along its longest
 axis. The paper does not define the two halves. Here they preserve these properties of the parent:
 
-    place    mean +- s/2 along the axis, where s is the deviation of the parent along it
-    scale    s sqrt(3)/2 along the axis: the pair has the variance of the parent
-    skew     the part across the axis stays. The part along it is halved: a piece of a skewed density is less skewed
-             than the whole. Their own opacities and colours learn how the halves differ.
-    two opacities    a half on one side of the plane takes the opacity of that side, as far as the plane faces the axis:
-             the optical depths are mixed by the square of the axis' component of delta. delta is the unit normal of
-             the plane, or eta / sqrt(1 + |eta|^2) for a soft plane, which at no skew changes neither opacity.
+    place    mean +- s/2 along the axis, where s is the parent's standard deviation along it
+    scale    s sqrt(3)/2 along the axis, so that the pair has the variance of the parent
+    skew     the part across the axis stays. The part along it is halved, because a piece of a skewed density is less
+             skewed than the whole. The opacities and colours of the halves learn the difference.
+    two opacities    each half takes the opacity of its side of the plane, if the plane faces the axis. In general,
+             the optical depths are mixed, with the square of delta's component along the axis as the weight. delta is
+             the unit normal of the plane, or eta / sqrt(1 + |eta|^2) for a soft plane. A soft plane without skew
+             changes neither opacity.
 
-In the direct form of skew, the place is that of the centroid, location + sqrt(2/pi) R S delta.
+In the direct form of skew, "mean" is the centroid, location + sqrt(2/pi) R S delta.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from ...splats.shapes import Shape
 from .edit import DensifyEdit
 
 # 3DGS's constants.
-MIN_OPACITY = 0.005  # splats below are pruned
+MIN_OPACITY = 0.005  # fainter splats are pruned
 SPLIT_SHRINK = 1.6
 WORLD_SIZE = 0.1  # larger splats are pruned, in scene extents
 RESET_OPACITY = 0.01
@@ -57,11 +59,11 @@ def plan_adc(
     dense_size: float = 0.01,
     prune_large: bool = False,
 ) -> DensifyEdit:
-    """Clone, split and prune.
+    """Return the edit that clones, splits and prunes.
 
-    Each clone and each split adds one splat. If the cap has no room for all, those with the highest gradient (over its
-    threshold) come first. Splats that are not finite are removed. If the rules would prune all splats, only those are
-    removed.
+    Each clone and each split adds one splat. If the cap has no room for all, the splats with the highest gradient over
+    its threshold come first. Splats that are not finite are removed. If the rules would prune all splats, only the
+    non-finite ones are removed.
 
     Parameters
     ----------
@@ -72,7 +74,7 @@ def plan_adc(
     extent : extent of the scene [world units].
     grad_threshold : threshold of the mean screen gradient.
     depth_threshold : threshold of the mean depth gradient times the extent; 0: not used.
-    dense_size : splats larger than this fraction of the extent are split, others cloned.
+    dense_size : splats larger than this fraction of the extent are split, the others are cloned.
     prune_large : whether splats larger than WORLD_SIZE are pruned.
 
     Raises
@@ -113,7 +115,10 @@ def plan_adc(
 
 
 def with_reset(edit: DensifyEdit, arrays: Mapping[str, Array], shape: Shape) -> DensifyEdit:
-    """Return the edit with 3DGS's opacity reset: |opacity| at most RESET_OPACITY, and its optimizer state zero."""
+    """Return the edit with 3DGS's opacity reset.
+
+    The reset limits |opacity| to RESET_OPACITY and sets the optimizer state of the opacity to zero.
+    """
     names = opacity_names(arrays)
     after = {name: edit.values.get(name, arrays[name][edit.source]) for name in names}
     low = {
@@ -147,13 +152,13 @@ def _best(
 
 
 def _drawn_halves(parents: Mapping[str, Array], shape: Shape, rng: np.random.Generator) -> dict[str, Array]:
-    """Return the changed fields of halves as in 3DGS: places drawn from the parents' Gaussians, smaller scales."""
+    """Return the changed fields of the halves of 3DGS: smaller scales, and places drawn from the parents' Gaussians."""
     shift = rng.standard_normal(parents["mean"].shape)
     return _placed(parents, shape, shift, {"log_scale": parents["log_scale"] - math.log(SPLIT_SHRINK)})
 
 
 def _halves_along_axis(parents: Mapping[str, Array], shape: Shape) -> dict[str, Array]:
-    """Return the changed fields of halves as in 3DSGS; the first half of the rows is at +s/2, the second at -s/2."""
+    """Return the changed fields of the halves of 3DSGS. The first half of the rows is at +s/2, the second at -s/2."""
     n = len(parents["mean"])
     row, axis = np.arange(n), parents["log_scale"].argmax(axis=1)
     side = np.where(row < n // 2, 1.0, -1.0)
@@ -177,7 +182,7 @@ def _halves_along_axis(parents: Mapping[str, Array], shape: Shape) -> dict[str, 
 def _placed(
     parents: Mapping[str, Array], shape: Shape, shift: DoubleArray, changed: dict[str, Array]
 ) -> dict[str, Array]:
-    """Return `changed` with the means. Centroids move by `shift`, in deviations along the axes of the parents."""
+    """Return `changed` with the means. Centroids move by `shift`, in the parents' deviations along their axes."""
     old, new = (np.exp(of["log_scale"].astype(np.float64)) for of in (parents, changed))
     step = old * (shift + _centroid(parents, shape)) - new * _centroid({**parents, **changed}, shape)
     step = np.einsum("nij,nj->ni", rotations(parents["quat"].astype(np.float64)), step)
@@ -198,7 +203,7 @@ def _delta(arrays: Mapping[str, Array]) -> DoubleArray:
 def _centroid(arrays: Mapping[str, Array], shape: Shape) -> DoubleArray:
     """Return the vector from the stored position to the centroid, (N, 3), in deviations along the axes of the splat.
 
-    With two opacities, the halves on both sides of the plane are placed relative to the plane, not to the centroid.
+    It is zero for splats with two opacities, because their halves are placed relative to the plane.
     """
     if shape.skew_form != "direct" or len(opacity_names(arrays)) == 2:
         return np.zeros((len(arrays["mean"]), 3))

@@ -18,7 +18,7 @@ from .strategy import StepInfo, next_edit
 
 
 class DensityControl:
-    """Applies the densification strategy of a run.
+    """The densification strategy of a run, applied to its splats.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class DensityControl:
         return first <= iteration <= last and iteration % self.config.density.densify_interval == 0
 
     def densify(self, iteration: int) -> None:
-        """Add, move and remove splats, and start the statistics anew.
+        """Add, move and remove splats, and set the statistics to zero.
 
         Raises
         ------
@@ -66,7 +66,7 @@ class DensityControl:
 
 
 class ExplorationNoise:
-    """Moves nearly transparent splats at random after each step of the base parameters (3DGS-MCMC)."""
+    """The noise of 3DGS-MCMC: random moves of nearly transparent splats after each step of the base parameters."""
 
     def __init__(self, config: TrainConfig, kernels: KernelBuild, splats: SplatBuffers, extent: float) -> None:
         self.config, self.kernels, self.splats, self.extent = config, kernels, splats, extent

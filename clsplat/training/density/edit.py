@@ -13,15 +13,15 @@ from ...splats.fields import Array
 
 @dataclass(frozen=True, slots=True)
 class DensifyEdit:
-    """The splats after a densification: a gather of the old ones, and new values of some fields.
+    """The splats after a densification: copies of old splats, with new values of some fields.
 
     Attributes
     ----------
     source : (N_new,) int64, the old row that each new row copies.
-    values : by field, public arrays of N_new splats that replace the copies.
-    fresh : (N_new,) bool, the rows whose optimizer state (moments, momentum) becomes zero.
-    state_source : (N_new,) int64, the old row whose optimizer state each new row copies before that. None: the state
-        stays in its row, and additional rows start at zero.
+    values : new values by field, as public arrays of N_new splats.
+    fresh : (N_new,) bool, whether the optimizer state (moments, momentum) of a row becomes zero.
+    state_source : (N_new,) int64, the old row that each new row copies its optimizer state from, before `fresh` is
+        applied. None: the state stays in its row, and additional rows start at zero.
     reset_fields : fields whose optimizer state becomes zero in all rows.
     relocated, added, removed : numbers of splats.
     """
@@ -40,7 +40,7 @@ class DensifyEdit:
 
         Parameters
         ----------
-        order : rows of the edit.
+        order : rows of the edit in their new order.
         n_old : number of splats before the edit.
         """
         states, fresh = self.state_source, self.fresh
@@ -51,7 +51,7 @@ class DensifyEdit:
         return replace(self, source=self.source[order], values=values, fresh=fresh[order], state_source=states[order])
 
     def apply(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
-        """Return copies of the parameters after the edit; the gather on the device must do the same."""
+        """Return copies of the parameters after the edit. The device must produce the same values."""
         moved = {name: array[self.source] for name, array in arrays.items()}
         for name, values in self.values.items():
             moved[name] = values.astype(arrays[name].dtype)

@@ -1,14 +1,14 @@
 """Relocation and growth of 3DGS-MCMC (Kheradmand et al. 2024) for every shape, as edits made on the host.
 
-A splat of opacity o is replaced by N copies, of opacity o' and another scale. Along a line through it, the
-stack of copies absorbs as much as the one splat did. With g the profile of the kernel (splats/profiles.py):
+N copies with opacity o' and another scale replace a splat of opacity o. Along a line through the splat, the stack of
+copies absorbs as much as the splat did. With g the profile of the kernel (splats/profiles.py):
 
     1 - (1 - o')^N = o
     length factor = integral of o g  /  integral of 1 - (1 - o' g)^N
 
-Both integrals are numerical, so they hold for every profile. For the Gaussian this is the published double sum. The
-factor applies to lengths (ubc-vision/3dgs-mcmc#37). Student splatting squares it: the rule "length-squared". If a splat
-has two opacities, each becomes its own o', and the line crosses the plane between them. For negative opacities
+Both integrals are numerical, so they exist for every profile. For the Gaussian they equal the published double sum. The
+factor applies to lengths (ubc-vision/3dgs-mcmc#37). Student splatting squares it, which is the rule "length-squared".
+If a splat has two opacities, each has its o', and the line crosses the plane between them. For negative opacities
 (the scooping of Student splatting) the formula applies to |o|, and the sign stays.
 """
 
@@ -29,11 +29,11 @@ from ..methods import sss
 from .edit import DensifyEdit
 
 # 3DGS-MCMC's constants.
-MIN_OPACITY = 0.005  # splats at or below are dead: they are relocated
-GROWTH = 1.05  # factor per call
-N_MAX = 51  # larger numbers of copies count as this
+MIN_OPACITY = 0.005  # splats with at most this opacity are dead: they are relocated
+GROWTH = 1.05  # growth factor of the number of splats per call
+N_MAX = 51  # largest number of copies in the formula; it also replaces larger numbers
 
-# Power of the length factor by which scales are multiplied. "opacity-only" is the rule of Deformable Beta Splatting.
+# Scales are multiplied by this power of the length factor. "opacity-only" is the rule of Deformable Beta Splatting.
 RULES = {"length": 1.0, "length-squared": sss.RELOCATION_POWER, "opacity-only": 0.0}
 
 # The nodes on each side of 0 are z = _KNEE sinh(asinh(_FARTHEST / _KNEE) u^3), with u the midpoints of equal cells. A
@@ -42,7 +42,7 @@ RULES = {"length": 1.0, "length-squared": sss.RELOCATION_POWER, "opacity-only": 
 _NODES = 96
 _KNEE = 3.0
 _FARTHEST = 4e3
-_CHUNK = 2048  # splats that are integrated at once; they need some megabytes
+_CHUNK = 2048  # number of splats that are integrated at once, to limit the memory to some megabytes
 
 
 def plan_relocation(
@@ -56,11 +56,11 @@ def plan_relocation(
     rule: str = "length",
     limit: float = 1.0,
 ) -> DensifyEdit:
-    """Move dead splats onto live ones and grow towards the cap.
+    """Return the edit that moves dead splats onto live ones and grows towards the cap.
 
     Splats with a parameter that is not finite are relocated like dead ones. All copies are drawn at once, with
     replacement, in proportion to strength (the larger |opacity|). The edit depends only on the arguments and the state
-    of the generator. If no splat is alive, the number does not grow and dead splats stay.
+    of the generator. If no splat is alive, the number of splats does not grow and dead splats stay.
 
     Parameters
     ----------
@@ -68,10 +68,12 @@ def plan_relocation(
     rng : generator; one number is drawn for each copy.
     cap : largest number of splats after growth. A larger number of splats is kept.
     growth : new count over old count, at least 1.
-    min_opacity : splats at or below are dead. It is also the minimum of new opacities (of the larger of two).
+    min_opacity : splats with at most this opacity are dead. New opacities are at least this large (with two opacities,
+        the larger one).
     rule : "length" (opacity and scale, as above), "length-squared" (Student splatting as released), or "opacity-only"
         (the scale does not change; Deformable Beta Splatting).
-    limit : largest number of relocated dead splats, the weakest, as a fraction of all. Non-finite splats always move.
+    limit : largest number of dead splats that are relocated, the weakest first, as a fraction of all splats. Non-finite
+        splats are always relocated.
 
     Raises
     ------
@@ -128,12 +130,13 @@ def plan_relocation(
 def relocation(
     shape: Shape, arrays: Mapping[str, Array], ratio: NDArray[np.integer], min_opacity: float = 0.0
 ) -> tuple[dict[str, DoubleArray], DoubleArray]:
-    """Return opacities and length factor of the copies if `ratio` equal splats replace one.
+    """Return the opacities and the length factor of the copies if `ratio` equal splats replace one.
 
     Parameters
     ----------
-    arrays : public arrays of N splats. ratio : (N,) at least 1, counted up to N_MAX.
-    min_opacity : minimum of the new |opacity|; of the larger one of two, whose ratio stays.
+    arrays : public arrays of N splats. ratio : (N,) number of copies, at least 1; numbers above N_MAX count as N_MAX.
+    min_opacity : minimum of the new |opacity|. With two opacities, it is the minimum of the larger one, and the ratio
+        of the two stays.
 
     Returns
     -------
@@ -161,7 +164,7 @@ def _length_factor(
     new_opacity: DoubleArray,
     count: NDArray[np.integer],
 ) -> DoubleArray:
-    """Return the integral of one splat over the integral of the stack; opacities are (N, S)."""
+    """Return the integral of one splat divided by the integral of the stack; opacities are (N, S)."""
     z, weight = _nodes()
     profile = shape.profile(z, arrays)  # (N, S, K)
     one = np.einsum("nsk,ns,k->n", profile, opacity, weight)

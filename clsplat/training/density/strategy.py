@@ -15,14 +15,14 @@ from .adc import plan_adc, with_reset
 from .edit import DensifyEdit
 from .relocation import plan_relocation
 
-# Minimum interval of opacity resets, also in short runs. The rate of opacities does not grow in short runs, so they
-# need this many iterations to recover.
+# Minimum number of iterations between opacity resets. The learning rate of opacities is the same in short runs, so
+# opacities always need this time to recover.
 RESET_INTERVAL_MIN = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class StepInfo:
-    """The iteration of a densification.
+    """The iteration of a densification, and values that depend on it.
 
     Parameters
     ----------
@@ -83,14 +83,14 @@ def next_edit(
 
 
 def reset_interval(density: Adc, iterations: int) -> int:
-    """Return the iterations from one opacity reset to the next; 0: no resets."""
+    """Return the number of iterations from one opacity reset to the next; 0 means no resets."""
     return density.opacity_reset and max(iterations // density.opacity_reset, RESET_INTERVAL_MIN)
 
 
 def resets(density: Adc, iterations: int, info: StepInfo) -> bool:
-    """Whether this densification resets opacities: the first one at or after a multiple of the interval.
+    """Return whether this densification resets opacities: the first one at or after a multiple of the interval does.
 
-    The last densification does not. 3DGS resets at 3000, 6000, 9000 and 12 000 of 30 000 iterations, and densifies
+    The last densification never resets. 3DGS resets at 3000, 6000, 9000 and 12 000 of 30 000 iterations, and densifies
     until 15 000.
     """
     every = reset_interval(density, iterations)

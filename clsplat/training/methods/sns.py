@@ -1,7 +1,8 @@
 """3D Skew-Normal Splatting (SNS, 2026): alternating optimisation of the skew and of all other parameters.
 
-SNS trains all parameters jointly at first and then in cycles. In the first part of a cycle the skew is frozen, in the
-rest all other parameters are. The paper does not give the lengths; they are options here (alternation_*).
+SNS trains all parameters together at first and then in cycles. In the first part of a cycle the skew is frozen. In the
+second part all other parameters are frozen. The paper does not give the lengths, which are options here
+(alternation_*).
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ from ..config import TrainConfig
 
 
 class ParameterGroups(NamedTuple):
-    """The groups that learn. A frozen group keeps its values, its moments and its step count."""
+    """Whether each parameter group learns. A frozen group keeps its values, its moments and its step count."""
 
-    base: bool  # all parameters but the skew
+    base: bool  # all parameters except the skew
     skew: bool
 
 
 def learning_groups(iteration: int, config: TrainConfig) -> ParameterGroups:
     """Return the groups that learn at `iteration` (from 1).
 
-    Both learn without alternation, for shapes without a skew, and during the warm-up of `alternation_warmup *
-    iterations`. After that, each cycle of `alternation_cycle` iterations trains the base in its first
-    `alternation_split` and the skew in the rest.
+    Both groups learn without alternation, for shapes without a skew, and during the warm-up of `alternation_warmup *
+    iterations`. After that, a cycle has `alternation_cycle` iterations. The fraction `alternation_split` of them trains
+    the base, the rest trains the skew.
     """
     phases = config.phases
     since = iteration - 1 - int(phases.alternation_warmup * config.iterations)

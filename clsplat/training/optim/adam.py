@@ -1,7 +1,7 @@
-"""Adam in NumPy: the reference of the kernels.
+"""Adam in NumPy (Kingma & Ba 2015) with the constants of 3DGS: the reference of the kernels.
 
-Kingma & Ba 2015 with the constants of 3DGS. All splats share one step count, as in 3DGS: relocated splats get moments
-of zero, but their bias correction does not restart.
+All splats share one step count, as in 3DGS. So relocated splats get moments of zero, but their bias correction does not
+restart.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ DECAY_ROWS = 2  # rows before the drifts in the table of lazy.py
 
 
 class NumpyAdam:
-    """Adam over named arrays whose first axis is the splat.
+    """Adam over named arrays with one row per splat.
 
     Parameters
     ----------
@@ -42,11 +42,11 @@ class NumpyAdam:
         self.second = {name: np.zeros_like(param) for name, param in params.items()}
 
     def advance(self) -> None:
-        """Begin a step; the bias corrections depend on the count."""
+        """Begin a step: raise the count, which the bias corrections depend on."""
         self.step_count += 1
 
     def direction(self, name: str, grad: Array, rows: slice | NDArray[np.int64] = slice(None)) -> Array:
-        """Update the moments of `name` with a gradient of the splats `rows`.
+        """Update the moments of `name` with a gradient of the splats `rows`, and return the direction of the step.
 
         Returns
         -------

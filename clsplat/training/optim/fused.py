@@ -22,7 +22,7 @@ from .skew_map import SkewMap
 
 
 class StateRows:
-    """A buffer [width, capacity] of optimizer state, zero at first. On the host, arrays are (n, width)."""
+    """A buffer [width, capacity] of optimizer state, which starts at zero. Its arrays on the host are (n, width)."""
 
     def __init__(self, splats: SplatBuffers, width: int) -> None:
         self.device, self.width, self.capacity, self.dtype = splats.device, width, splats.capacity, splats.dtype
@@ -35,7 +35,7 @@ class StateRows:
         return self.width * self.capacity * self.dtype.itemsize
 
     def set(self, array: Array) -> None:
-        """Write the first columns; the others become zero."""
+        """Write an array into the first columns, and zeros into the others."""
         rows = np.zeros((self.width, self.capacity), self.dtype)
         rows[:, : len(array)] = array.T
         to_device(self.device, self.buffer, rows)
@@ -189,7 +189,7 @@ class FusedOptimizer:
             **corrections,
             **self._selection("color"),
         )
-        first_part = int(self.rules.sghmc is not None)  # SGHMC has moved the means
+        first_part = int(self.rules.sghmc is not None)  # 1 skips the means, which SGHMC has moved already
         self._kernel("geometry")(
             (self._columns, len(PARTS) - first_part),
             (GROUP_ITEMS, 1),
@@ -269,7 +269,7 @@ class FusedOptimizer:
         return state if self.momentum is None else [*state, self.momentum]
 
     def _set_values(self, edit: DensifyEdit, source: Any) -> None:
-        """Write the new values of the edit. The trainable skew follows them."""
+        """Write the new values of the edit, and the trainable skew that belongs to them."""
         if self.skew is None:
             self.splats.upload(edit.values)
             return
@@ -330,7 +330,7 @@ def bias_corrections(steps: int) -> dict[str, float]:
 
 
 def _rate_table(schema: Schema, rules: Rules, dtype: np.dtype[np.floating]) -> Array:
-    """Return the rate and the bounds of each row of geom, (3, G); bounds are 0 and 0 for fields without."""
+    """Return the rate, lower bound and upper bound of each row of geom, (3, G). Fields without bounds have 0 and 0."""
     fields = schema.group(Group.GEOM)
     columns = [
         (rules.rates.get(field.name, 0.0), *(field.bounds or (0.0, 0.0)))

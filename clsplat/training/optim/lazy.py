@@ -10,9 +10,9 @@ exact. Two things differ from dense Adam. Rounding happens once instead of k tim
 falling v; the relative error of the drift is at most eps / sqrt(v). Fields in log space drift there. Their drift is
 monotonic, so one clamp at the end equals a clamp at every step.
 
-A vector of splats, LANES of them, skips its steps until one of its splats is visible or until it reaches the maximum
-age, WAITS - 1 steps. Then it does the skipped steps and the present one. An image is rendered before that: a splat that
-becomes visible shows its drift one iteration late.
+A vector of LANES splats skips its steps until one of its splats is visible or until it reaches the maximum age of
+WAITS - 1 steps. Then it does the skipped steps and the present one. The image is rendered before the step. So a splat
+that becomes visible shows its drift one iteration late.
 
 Positions with regularisers, noise or SGHMC change in every step, also without a gradient. Then only the colour is lazy.
 """
@@ -45,7 +45,7 @@ _RATIO = (BETA1 / np.sqrt(BETA2)) ** _AGES
 
 
 class Drifts:
-    """The sums of the formula up to the present step.
+    """Sums of the formula up to the present step.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Drifts:
 
     @property
     def table(self) -> NDArray[np.float64]:
-        """(2 + 3, WAITS): factors of m and of v, and the sums; `decays` of cl/train/lazy.cl."""
+        """Return the array `decays` of cl/train/lazy.cl, (2 + 3, WAITS): factors of m and of v, and the sums."""
         return np.concatenate([_DECAYS, self.sums])
 
     def _add(self, kind: int, step: int, rate: float) -> None:
@@ -82,7 +82,7 @@ class Drifts:
 
 
 def in_morton_order(edit: DensifyEdit, splats: SplatBuffers) -> DensifyEdit:
-    """Return the edit with its rows along a Morton curve: splats that are visible together share vectors."""
+    """Return the edit with its rows along a Morton curve, so that splats that are visible together share vectors."""
     mean = edit.values.get("mean")
     if mean is None:
         mean = splats.download(splats.n, ("mean",))["mean"][edit.source]
@@ -94,7 +94,7 @@ class VisibleOptimizer(FusedOptimizer):
 
     Attributes
     ----------
-    ages, table : buffers of the latest selection: `ages` and `decays` of cl/train/lazy.cl.
+    ages, table : buffers of the latest selection; `ages` and `decays` in cl/train/lazy.cl.
     """
 
     def __init__(self, device: Device, kernels: KernelBuild, splats: SplatBuffers, rules: Rules) -> None:
@@ -153,7 +153,7 @@ class VisibleOptimizer(FusedOptimizer):
 
     @property
     def _used(self) -> int:
-        """Vectors that hold splats."""
+        """Number of vectors that hold splats."""
         return -(-self.splats.n // self.kernels.lanes)
 
     def _table(self) -> NDArray[np.floating]:
@@ -164,7 +164,7 @@ class VisibleOptimizer(FusedOptimizer):
         to_device(self.device, self._last, np.repeat(np.array(self.counts, np.uint32), self._vectors))
 
     def _select(self, kernel: str, **arguments: Any) -> None:
-        """Select vectors with wake_visible or wake_all; the counts are those before the coming step."""
+        """Select vectors with the kernel wake_visible or wake_all. The step counts are those before the next step."""
         self._sent = send_to_device(self.device, self.table, self._table())  # kept: releasing it waits for the transfer
         self.program[kernel](
             (-(-self._vectors // GROUP_ITEMS) * GROUP_ITEMS,),
@@ -179,7 +179,7 @@ class VisibleOptimizer(FusedOptimizer):
         )
 
     def _catch_up(self, splats: SplatBuffers, skew_s: Any, keeps_moments: bool = False) -> None:
-        """Do the skipped steps of the selected vectors, on these values."""
+        """Do the skipped steps of the selected vectors on `splats` and `skew_s`."""
         common: dict[str, Any] = {
             "ages": self.ages,
             "decays": self.table,

@@ -24,7 +24,7 @@ class VisibleReferenceOptimizer(ReferenceOptimizer):
 
     Attributes
     ----------
-    last : (2, V) step counts up to which each vector of `lanes` splats is done.
+    last : (2, V) step count of base and skew that each vector of `lanes` splats has reached.
     """
 
     def __init__(self, splats: SplatBuffers, rules: Rules, lanes: int) -> None:
@@ -84,7 +84,7 @@ class VisibleReferenceOptimizer(ReferenceOptimizer):
         self.last = np.repeat(np.array([self.counts]).T, -(-self.splats.n // self.lanes), axis=1)
 
     def _caught_up(self, params: dict[str, Array], rows: SplatIndices, keeps_moments: bool = False) -> Array:
-        """Do the skipped steps of the splats `rows`, in `params`; return the trainable skew after them."""
+        """Return the trainable skew after the skipped steps of the splats `rows`, which also change `params`."""
         rules, skew_map, dtype = self.rules, self.rules.map, self.splats.dtype
         skipped = np.repeat(np.array([self.counts]).T - self.last, self.lanes, axis=1)[:, : self.splats.n]
         base, skew = skipped[0][rows], skipped[1][rows]
@@ -113,12 +113,12 @@ class VisibleReferenceOptimizer(ReferenceOptimizer):
 
 
 def awake(visible: NDArray[np.bool_], last: NDArray[np.integer], counts: StepCounts, lanes: int) -> NDArray[np.bool_]:
-    """Return which vectors of splats step, (V,); wake_visible of cl/train/lazy.cl.
+    """Return which vectors of splats step, (V,); the kernel wake_visible in NumPy.
 
     Parameters
     ----------
-    visible : (N,) splats. last : (2, V) step counts up to which each vector is done. counts : the present step counts.
-    lanes : splats of a vector.
+    visible : (N,) whether the image shows each splat. last : (2, V) step count that each vector has reached.
+    counts : the present step counts. lanes : number of splats of a vector.
     """
     padded = np.zeros(last.shape[1] * lanes, bool)
     padded[: len(visible)] = visible
@@ -137,7 +137,7 @@ def _drift(
     rate: Array,
     keeps_moments: bool,
 ) -> Array:
-    """Return the drift of a field; the moments decay, unless they are kept."""
+    """Return the drift of a field. Its moments decay unless `keeps_moments` is set."""
     first, second = adam.first[name][rows], adam.second[name][rows]
     decay1, decay2, drift = (row[skipped].reshape(-1, *[1] * (first.ndim - 1)) for row in (table[0], table[1], sums))
     moved: Array = rate * drift * (first / (np.sqrt(second) + first.dtype.type(EPS)))

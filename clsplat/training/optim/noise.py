@@ -1,8 +1,8 @@
 """The exploration noise of 3DGS-MCMC, with random numbers that a kernel can repeat (cl/math/noise.clh).
 
-Random integers come from Philox4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"), a pure
-function of (seed, iteration, splat). So order, device and thread count do not change them. The uniform numbers are
-exact in float32. Only log, sqrt and sin/cos may differ by some ulp between devices.
+Random integers come from Philox4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"). They are a
+pure function of (seed, iteration, splat), so they do not depend on order, device or number of threads. The uniform
+numbers are exact in float32. Only log, sqrt and sin/cos may differ by some ulp between devices.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ _WEYL = (0x9E3779B9, 0xBB67AE85)  # added to the key after each round: golden ra
 _ROUNDS = 10
 _MASK = 0xFFFFFFFF
 
-# 3DGS-MCMC (ubc-vision/3dgs-mcmc): sigmoid(100 ((1 - o) - 0.995)) = sigmoid(0.5 - 100 o). Only nearly transparent
-# splats move.
+# The gate of 3DGS-MCMC (ubc-vision/3dgs-mcmc): sigmoid(100 ((1 - o) - 0.995)) = sigmoid(0.5 - 100 o). It is open only
+# for nearly transparent splats.
 GATE_SHARPNESS = 100.0
 GATE_OFFSET = 0.5
 # Extent of the scenes for which 3DGS-MCMC and SSS publish their constants [world units].
@@ -59,7 +59,7 @@ def normal3(seed: int, iteration: int, n: int, stream: int = 0) -> NDArray[np.fl
     Parameters
     ----------
     seed : 0 <= seed < 2^64. iteration : 0 <= iteration < 2^32.
-    stream : independent numbers for each use in an iteration: 0 for this noise, 1 for SGHMC (sghmc.py).
+    stream : number of the use in an iteration, for independent numbers: 0 for this noise, 1 for SGHMC (sghmc.py).
     """
     index = np.arange(n, dtype=np.uint32)
     rest = [np.asarray(word, np.uint32) for word in (iteration, stream, 0)]
@@ -74,8 +74,9 @@ def normal3(seed: int, iteration: int, n: int, stream: int = 0) -> NDArray[np.fl
 def noise_amount(noise_lr: float, mean_lr: float, extent: float) -> float:
     """Return the factor of the noise, from its rate and the rate of positions (which includes the extent).
 
-    The published product of both rates and the covariance grows with the third power of the extent. In large units,
-    splats would leave the scene. So the displacement grows with the extent alone above PUBLISHED_EXTENT.
+    The published displacement is the product of both rates and the covariance. It grows with the third power of the
+    extent, so splats would leave a scene in large units. Above PUBLISHED_EXTENT it grows only in proportion to the
+    extent here.
     """
     return noise_lr * mean_lr * min(PUBLISHED_EXTENT / extent, 1.0) ** 2
 

@@ -20,31 +20,33 @@ from .rules import Rules
 
 
 class Optimizer(Protocol):
-    """Steps the splats. Owns their moments, their momentum and the trainable skew s; the splats hold the kernel's skew.
+    """The optimizer of the splats. It holds their moments, their momentum and the trainable skew s.
 
     Positions move by Adam or SGHMC (sghmc.py). Fields with bounds move by Adam in log space. The skew moves by Adam on
-    s (skew_map.py). All other fields move by Adam. A frozen parameter group keeps its values, moments and step count.
+    s; the splats hold the skew of the kernel, which follows from s (skew_map.py). All other fields move by Adam. A
+    frozen parameter group keeps its values, moments and step count.
     """
 
     def step(
         self, grads: CompactGradients, mean_lr: float, sh_degree: int, iteration: int, depth_key: Any = None
     ) -> None:
-        """Step all splats, or with `visible_adam` the visible ones (lazy.py); includes the regularisers.
+        """Step all splats, or with `visible_adam` the visible ones (lazy.py). The regularisers are included.
 
         Parameters
         ----------
         grads : gradients of the stored parameters; the optimizer may change them.
         mean_lr : Adam's rate of the means at this iteration, with scene extent and rate factor [world units].
-        sh_degree : higher SH bands do not change.
-        iteration : counts from 1; decides which parameter groups learn, and the noise.
-        depth_key : buffer of the image of the gradients (cl/render/project.cl); needed with `visible_adam`.
+        sh_degree : highest SH band that changes.
+        iteration : counts from 1. The parameter groups that learn and the noise depend on it.
+        depth_key : depth keys of the image that the gradients belong to (cl/render/project.cl); required with
+            `visible_adam`.
         """
 
     def settle(self) -> None:
         """Do all skipped steps, so that the buffers hold the values that `read` returns."""
 
     def arranged(self, edit: DensifyEdit) -> DensifyEdit:
-        """Return the edit with its rows in the order that suits this optimizer. The splats must be settled."""
+        """Return the edit with its rows in the best order for this optimizer. Call `settle` before."""
 
     def read(self) -> dict[str, Array]:
         """Return the public arrays of the splats with all skipped steps done; the state does not change."""
@@ -56,7 +58,7 @@ class Optimizer(Protocol):
         """Return the state for a checkpoint, without the splats. Both optimizers use the same keys."""
 
     def load_state(self, state: dict[str, NDArray[Any]]) -> None:
-        """Continue from `state`; raises InputError if an entry is missing or unknown."""
+        """Continue from `state`. Raise InputError if an entry is missing or unknown."""
 
 
 def make_optimizer(

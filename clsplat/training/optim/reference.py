@@ -116,7 +116,7 @@ class ReferenceOptimizer:
     def _select(
         self, params: dict[str, Array], groups: ParameterGroups, depth_key: Any
     ) -> tuple[SplatIndices, SplatIndices]:
-        """Return the splats whose geometry steps and the splats whose colour steps: all."""
+        """Return the splats with a step of the geometry and those with a step of the colour: all splats in both."""
         return slice(None), slice(None)
 
     def _step_field(
@@ -129,7 +129,7 @@ class ReferenceOptimizer:
         sh_degree: int,
         iteration: int,
     ) -> None:
-        """Step a base field. `mean` comes first, so that SGHMC uses the old covariance."""
+        """Step a base field. The caller steps `mean` first, because SGHMC uses the old covariance."""
         name, value, grad = field.name, params[field.name][rows], grad[rows]
         if field.bounds is not None:  # in log space
             rise = self.base.direction(name, grad * value, rows)

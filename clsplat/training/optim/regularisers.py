@@ -13,9 +13,9 @@ from ...splats.shapes import Shape
 
 
 class Penalty(NamedTuple):
-    """opacity * sum(|o|) + scale * sum(scales) (3DGS-MCMC's regularisers) + bisect * sum((o_plus - o_minus)^2) (3DSGS).
+    """Weights of the penalty opacity * sum(|o|) + scale * sum(scales) + bisect * sum((o_plus - o_minus)^2).
 
-    If a splat has two opacities, |o| is their mean.
+    The first two terms come from 3DGS-MCMC, the third from 3DSGS. If a splat has two opacities, |o| is their mean.
     """
 
     opacity: float

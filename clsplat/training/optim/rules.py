@@ -39,7 +39,7 @@ _RATE_OPTIONS = {
 def rate_option(field: Field) -> str:
     """Return the name of the option with a field's learning rate.
 
-    A field NAME of a shape has the option NAME_lr; a field of a registered shape may have none.
+    The option of a field NAME of a shape is NAME_lr. It may not exist if the shape was registered.
     """
     return _RATE_OPTIONS.get(field.name, f"{field.name}_lr")
 
@@ -52,7 +52,7 @@ def field_rate(config: TrainConfig, field: Field) -> float:
 
 @dataclass(frozen=True)
 class Rules:
-    """The config as the optimizers use it. extent : extent of the scene [world units]."""
+    """Values of the config that the optimizers use. extent : extent of the scene [world units]."""
 
     config: TrainConfig
     extent: float
@@ -63,7 +63,7 @@ class Rules:
 
     @cached_property
     def rates(self) -> dict[str, float]:
-        """Adam's rate of each field but the mean, whose rate changes with the iteration and is passed to each step."""
+        """Adam's rate of each field except the mean. The rate of the mean is an argument of each step."""
         fields = [field for field in self.shape.schema(0) if field.name != "mean"]
         return {field.name: field_rate(self.config, field) * self.config.rate_factor(field.name) for field in fields}
 
@@ -76,8 +76,8 @@ class Rules:
     def penalty(self, n: int) -> Penalty:
         """Return the regularisers of n splats. The weights of the config belong to means over splats.
 
-        Scales are in world units, as published. In scenes larger than the published ones they are in units of the
-        extent; otherwise the regulariser would outweigh the image loss.
+        Scales are in world units, as published. In scenes larger than the published ones, they are in units of the
+        extent. Otherwise the regulariser would be larger than the image loss.
         """
         config = self.config
         scale = config.density.scale_reg * min(PUBLISHED_EXTENT / self.extent, 1.0)
@@ -85,7 +85,7 @@ class Rules:
 
     @cached_property
     def map(self) -> SkewMap | None:
-        """The map of the trainable skew; None for shapes without a skew."""
+        """Map of the trainable skew; None for shapes without a skew."""
         return SkewMap(self.config.skew_map) if self.config.skew_map else None
 
     @cached_property
@@ -107,12 +107,12 @@ class Rules:
         return sghmc.coefficients(iteration, mean_lr / factor, factor)
 
     def groups(self, iteration: int) -> ParameterGroups:
-        """The parameter groups that learn at `iteration`. Shapes without a skew do not have the second group."""
+        """Return the parameter groups that learn at `iteration`. The skew never learns in shapes without a skew."""
         base, skew = learning_groups(iteration, self.config)
         return ParameterGroups(base, skew and self.map is not None)
 
     def base_fields(self, schema: Schema) -> tuple[Field, ...]:
-        """Return all fields but the skew."""
+        """Return all fields except the skew."""
         return tuple(field for field in schema if field.name != "skew")
 
     @property

@@ -1,24 +1,24 @@
 """Stochastic gradient Hamiltonian Monte Carlo for positions (Chen, Fox & Guestrin 2014; SSS 2025), in a stable form.
 
-Student Splatting and Scooping (SSS) moves the means x with a momentum p:
+Student Splatting and Scooping (SSS) steps the means x with a momentum p:
 
     burn-in   p <- -l g + Sigma s sqrt(2 l C_b) xi                x <- x + l p
     after     p <- s (1 - l C) p - l g + s sqrt(2 l C) xi         x <- x + l p     (p = 0 before the first)
 
 g is the bias-corrected direction of Adam, l the square root of Adam's rate and xi a standard normal. The gate s =
-sigmoid(0.5 - 100 |opacity|) is open only for nearly transparent splats (noise.py). So a visible splat takes Adam's
-steps, l^2 g. Momentum and noise move nearly transparent splats.
+sigmoid(0.5 - 100 |opacity|) is open only for nearly transparent splats (noise.py). Only such splats move by momentum
+and noise; all other splats take Adam's steps l^2 g.
 
 The published form is methods/sss.py ("sghmc-sss"). It diverges if s |1 - l C| > 1. That happens in large scenes,
-because l grows with the square root of the extent E. Its noise does not scale with the scene.
+because l grows with the square root of the extent E. The noise of this form does not scale with the scene.
 
 The stable form ("sghmc") removes E from l. With l' = l / sqrt(E), the friction per step is f = min(l' C', 1), so
-s (1 - f) < 1 always. The displacement by noise grows as E, also in the burn-in. C' = C sqrt(E_SSS), where E_SSS is the
-extent that the constants of SSS belong to. At E = E_SSS both forms have the same noise, and the same friction up to the
-bound.
+s (1 - f) < 1 always. The displacement by noise is proportional to E, also in the burn-in. C' = C sqrt(E_SSS), where
+E_SSS is the extent that the constants of SSS belong to. At E = E_SSS both forms have the same noise. Their frictions
+are equal there if l' C' <= 1.
 
-The rates here are larger in runs shorter than those of SSS (TrainConfig.rate_factor). That factor multiplies only g.
-Friction and noise keep the published rate at the same fraction of the run.
+Runs shorter than those of SSS have larger rates (TrainConfig.rate_factor). That factor multiplies only g. Friction and
+noise have the rate that SSS has at the same fraction of its run.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from ...splats.fields import Array
 from .noise import PUBLISHED_EXTENT as SSS_EXTENT
 from .noise import covariance_times, noise_gate
 
-STREAM = 1  # of noise.normal3
+STREAM = 1  # argument `stream` of noise.normal3
 _SMALLEST_EXTENT = 1e-6  # for cameras in one place, whose extent is 0
 
 
 class Coefficients(NamedTuple):
-    """One step: p <- s keep p - drive g + s noise (Sigma if by_covariance) xi, x <- x + length p."""
+    """Coefficients of a step p <- s keep p - drive g + s noise (Sigma if by_covariance) xi, x <- x + length p."""
 
     length: float
     drive: float
@@ -70,7 +70,7 @@ class Sghmc:
         Parameters
         ----------
         rate : Adam's rate, without the factor of short runs.
-        factor : that factor (TrainConfig.rate_factor).
+        factor : the factor of short runs (TrainConfig.rate_factor).
         """
         length = math.sqrt(rate)
         burning = iteration <= self.burn_in

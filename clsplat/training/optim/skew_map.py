@@ -3,17 +3,18 @@
 Kernels and files hold only the vector: m in the centred form, the slant eta in the direct form (splats/shapes.py).
 With r = |s| and n = s / r:
 
-    cube-root   m = n SKEW_MAX tanh(r)^(1/3)                  the skewness index is cubic in |m|: linear in r near 0
+    cube-root   m = n SKEW_MAX tanh(r)^(1/3)                  the skewness index, cubic in |m|, is linear in r near 0
     polar       eta = u/|u| SLANT_MAX tanh(rho / SLANT_MAX)   s = (rho, u): a magnitude and a free direction
     coupled     eta = R' a, a = n SLANT_MAX tanh(r / SLANT_MAX)
 
 "polar" follows 3D Skew-Normal Splatting (SNS, 2026), which does not give the activation of the magnitude. "coupled" is
-the textbook form that SNS improves: a slant a in the world's frame with Omega^(1/2) = R S R'. It turns and deforms with
-rotation and scale, so its chain rule also adds to the gradient of the rotation.
+the textbook form that SNS improves. Its slant a is in the world's frame, with Omega^(1/2) = R S R'. The kernel's skew
+then depends on the rotation, so the chain rule also adds to the gradient of the rotation.
 
 The slope of the cube root is infinite at s = 0, and u = 0 has no direction. So the factors use lengths of at least
-R_FLOOR: below it the map is linear, and every gradient is finite. m = 0 is a stationary point of the kernel, because
-its change is of third order in m. So training starts from a small m of random direction (training/initialise.py).
+R_FLOOR. Below it the map is linear, and every gradient is finite. m = 0 is a stationary point of the kernel, because
+the kernel changes only in third order of m. So training starts from a small m of random direction
+(training/initialise.py).
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from ...splats.shapes import SKEW_MAX, SLANT_MAX
 MAPS = {"centred": ("cube-root",), "direct": ("polar", "coupled")}
 SKEW_MAPS = tuple(name for names in MAPS.values() for name in names)
 R_FLOOR = 1e-6  # skew_map.clh has the same constant
-R_CEILING = 20.0  # cosh(r)^2 stays in the range of float32; tanh is 1 there
-TANH_CEILING = 1.0 - 1e-4  # bound of the inverse, so that the map has a slope at s
+R_CEILING = 20.0  # bound of r that keeps cosh(r)^2 in the range of float32; tanh is 1 there
+TANH_CEILING = 1.0 - 1e-4  # largest tanh of the inverse map, so that the slope of the map is not zero
 
 _F = TypeVar("_F", np.float32, np.float64)
 
 
 def map_named(name: str, form: str | None) -> str:
-    """Return `name`, or the default map of the form for "auto". Shapes without a skew (form None) give ""."""
+    """Return `name`, or for "auto" the default map of the form. The result is "" for shapes without a skew (None)."""
     if form is None:
         return ""
     return MAPS[form][0] if name == "auto" else name
@@ -59,8 +60,8 @@ def check_map(name: str, form: str | None) -> None:
 class SkewMap:
     """One parameterisation of the skew.
 
-    Arrays are s (N, width), skew and its gradient (N, 3), quat (N, 4) of any norm above 0. All are float32 or all are
-    float64, and so is the result. Only "coupled" depends on the rotation.
+    Arrays are s (N, width), skew and its gradient (N, 3), and quat (N, 4) of any norm above 0. All arrays and results
+    have one dtype, float32 or float64. Only "coupled" depends on the rotation.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ class SkewMap:
 
     @property
     def width(self) -> int:
-        """Trainable reals per splat."""
+        """Number of trainable reals per splat."""
         return 4 if self.name == "polar" else 3
 
     @property
@@ -103,7 +104,7 @@ class SkewMap:
     def vjp(self, s: NDArray[_F], quat: NDArray[_F], v_skew: NDArray[_F]) -> tuple[NDArray[_F], Array]:
         """Return the gradient of s and the addition to the gradient of the rotation (N, 4).
 
-        With n = s / r, f = length / r and g = d length / dr the Jacobian is f I + (g - f) n n', symmetric.
+        With n = s / r, f = length / r and g = d length / dr, the Jacobian is the symmetric f I + (g - f) n n'.
         """
         if self.name == "polar":
             return self._polar_vjp(s, v_skew), np.zeros_like(quat)
@@ -123,7 +124,7 @@ class SkewMap:
         return v_s, v_quat
 
     def inverse(self, skew: NDArray[_F], quat: NDArray[_F]) -> NDArray[_F]:
-        """Return the s of `skew`. A length at or above the limit is replaced by one just below it."""
+        """Return the s that gives `skew`. A length at or above the limit is replaced by one just below it."""
         if self.rotates:
             skew = _turned(skew, rotations(quat))
         length = np.sqrt(np.sum(skew * skew, axis=-1, keepdims=True))
@@ -141,9 +142,10 @@ class SkewMap:
         return s
 
     def follow(self, s: NDArray[_F], before: Mapping[str, Array], after: Mapping[str, Array]) -> NDArray[_F]:
-        """Return s after changes of the fields `skew` and `quat`: the inverse in rows that changed.
+        """Return s after changes of the fields `skew` and `quat`.
 
-        The other rows keep their s, because the inverse loses digits near the limit.
+        Changed rows get the inverse of the map. The other rows keep their s, because the inverse loses digits near the
+        limit.
         """
         names = ("skew", "quat") if self.rotates else ("skew",)
         changed = np.zeros(len(s), bool)

@@ -1,6 +1,6 @@
-"""Options of the two densification strategies. The defaults of a strategy are the defaults of its class.
+"""Options of the two densification strategies. Each strategy is a class with its defaults.
 
-The defaults were the best ones on validation views (benchmarks/SYSTEMS.md), if they differ from the papers'.
+Defaults that differ from those of the papers were the best ones on validation views (benchmarks/SYSTEMS.md).
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class Adc(DensityConfig):
     noise_lr: float = 0.0
     grad_threshold: float = option(
         2e-4,
-        help="Splats are cloned or split if the mean gradient of their screen position is above this value.",
+        help="Threshold of the mean gradient of the screen position. Splats above it are cloned or split.",
         at_least=0,
     )
     depth_threshold: float = option(
         0.0,
-        help="The same threshold for the gradient along the viewing ray, times the scene extent (3DSGS). 0: not used.",
+        help="Threshold of the mean gradient along the viewing ray, times the scene extent (3DSGS). 0: not used.",
         at_least=0,
     )
     dense_size: float = option(
@@ -86,8 +86,8 @@ class Mcmc(DensityConfig):
     )
     relocation: str = option(
         "length",
-        help="What relocation changes in the copies of a splat. length: opacity and scale, so that the absorption "
-        "along a line is kept. length-squared: the square of that scale factor (SSS). opacity-only: not the scale.",
+        help="Rule for the copies of a relocated splat. length: change opacity and scale so that the absorption along "
+        "a line stays equal. length-squared: use the square of that scale factor (SSS). opacity-only: keep the scale.",
         choices=RELOCATIONS,
     )
     relocation_limit: float = option(

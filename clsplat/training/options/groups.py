@@ -49,7 +49,7 @@ class ScheduleConfig(OptionGroup):
 
 @dataclass(frozen=True, kw_only=True)
 class LossConfig(OptionGroup):
-    """The loss. The regularisers of opacity and scale are in `DensityConfig`: their defaults depend on the strategy."""
+    """The loss, except for regularisers whose defaults depend on the strategy (`DensityConfig`)."""
 
     title: ClassVar[str] = "Loss"
 
@@ -79,7 +79,7 @@ class OptimConfig(OptionGroup):
     )
     skew_lr: float | None = option(
         None,
-        help="Learning rate of the skew. By default the shape's: 2.5e-3 (centred form) or 1.25e-2 (direct form).",
+        help="Learning rate of the skew. By default that of the shape: 2.5e-3 (centred) or 1.25e-2 (direct form).",
         at_least=0,
     )
     normal_lr: float = option(3e-3, help="Learning rate of the plane's normal (half-gaussian).", at_least=0)
@@ -87,7 +87,8 @@ class OptimConfig(OptionGroup):
     nu_lr: float = option(1e-2, help="Learning rate of nu, as a logarithm (student-t).", at_least=0)
     skew_map: str = option(
         "auto",
-        help="Map from the trained skew to the kernel's. auto: cube-root for the centred form, polar for the direct.",
+        help="Map from the trained skew to the kernel's skew. auto: cube-root in the centred form, polar in the direct "
+        "form.",
         choices=("auto", *SKEW_MAPS),
     )
     visible_adam: bool = option(
@@ -152,7 +153,7 @@ class AppearanceConfig(OptionGroup):
     )
     exposure_rate: float = option(
         0.2,
-        help="Step of a photo's map towards the best fit, each time the photo is trained, as a fraction.",
+        help="Fraction of the way to the best fit that a photo's map moves each time the photo is trained.",
         at_least=0,
         at_most=1,
     )
@@ -163,7 +164,7 @@ class AppearanceConfig(OptionGroup):
 
 @dataclass(frozen=True, kw_only=True)
 class OutputConfig(OptionGroup):
-    """What a run writes and logs on the way. These options do not change the model."""
+    """Files and log entries during a run. These options do not change the model."""
 
     title: ClassVar[str] = "Checkpoints and files"
 
@@ -171,7 +172,7 @@ class OutputConfig(OptionGroup):
         1000, help="Iterations between two checkpoints. 0: only one at the end.", at_least=0
     )
     save_iterations: tuple[int, ...] = option(
-        (), help="Iterations after which a PLY file is saved. The last one always is.", metavar="N,N,..."
+        (), help="Iterations after which a PLY file is saved, besides the last one.", metavar="N,N,..."
     )
     test_iterations: tuple[int, ...] = option(
         (), help="Iterations after which the test views are measured, for the log only.", metavar="N,N,..."

@@ -33,7 +33,7 @@ class Range:
     below: float | None = None
 
     def allows(self, number: float) -> bool:
-        """Whether a number is in the range. NaN never is."""
+        """Whether a number is in the range. NaN is not in any range."""
         return (
             (self.at_least is None or number >= self.at_least)
             and (self.at_most is None or number <= self.at_most)
@@ -61,10 +61,10 @@ class Option:
     Parameters
     ----------
     name : name in config.json, and with dashes on the command line.
-    type : Python type of its values, such as `float | None`.
-    default : its default value, `dataclasses.MISSING` if the subclasses define it.
+    type : Python type of the values, such as `float | None`.
+    default : default value; `dataclasses.MISSING` if the subclasses define it.
     help : one or two sentences for `--help`.
-    range : the range of numbers. choices : allowed words, empty if any value is allowed; a registry such as
+    range : the range of numbers. choices : allowed words, empty if there are none; a registry such as
         SHAPES may grow.
     metavar : placeholder for the value in `--help`. aliases : further flags.
     """
@@ -80,13 +80,13 @@ class Option:
 
     @property
     def value_type(self) -> Any:
-        """The type without None: `float` for `float | None`."""
+        """Type without None: `float` for `float | None`."""
         if isinstance(self.type, UnionType):
             return next(part for part in get_args(self.type) if part is not NoneType)
         return self.type
 
     def check(self, value: Any) -> None:
-        """Raise InputError if a value is not one of the choices, or out of range."""
+        """Raise InputError if a value is not one of the choices, or is out of range."""
         if self.choices and value not in self.choices:
             raise InputError(f"{self.name} {value!r}: choose one of {', '.join(self.choices)}")
         if self.range is not None and value is not None and not self.range.allows(value):
@@ -117,7 +117,7 @@ def option(
     metavar: str | None = None,
     aliases: Sequence[str] = (),
 ) -> Any:
-    """Declare a dataclass field that is a training option; see `Option` and `Range` for the parameters."""
+    """Return a dataclass field that is a training option; see `Option` and `Range` for the parameters."""
     allowed = Range(at_least, at_most, above, below)
     metadata = {
         "help": help,
@@ -129,7 +129,7 @@ def option(
     return dataclasses.field(default=default, metadata=metadata)
 
 
-_TABLES: dict[type, dict[str, Option]] = {}  # by class; each table is made once
+_TABLES: dict[type, dict[str, Option]] = {}  # tables by class; each table is made once
 
 
 def option_table(group: type[Any]) -> dict[str, Option]:
