@@ -1,9 +1,9 @@
-"""Runs in a Python with bpy: the add-on's scenes, one after the other.
+"""Test scenes for the add-on, rendered one after the other by a Python with bpy.
 
     python blender_child.py FOLDER [viewport]
 
-FOLDER holds model.ply, other.ply, cameras.json, camera_path.json and addon.zip; facts go to out.json, those of the
-viewport, which needs OpenGL, to viewport.json.
+FOLDER contains model.ply, other.ply, cameras.json, camera_path.json and addon.zip. The script writes its results to
+out.json, or to viewport.json for the viewport, which needs OpenGL.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from types import SimpleNamespace
 from typing import Any
 
 FOLDER = Path(sys.argv[1])
-os.environ["BLENDER_USER_RESOURCES"] = str(FOLDER / "user")  # before bpy is loaded: nothing of the user's is touched
+os.environ["BLENDER_USER_RESOURCES"] = str(FOLDER / "user")  # before bpy loads: it changes no user file
 
 import bpy  # noqa: E402, I001  # first: it brings the others
 import addon_utils  # noqa: E402
@@ -32,19 +32,19 @@ Facts = dict[str, Any]
 
 
 def scene() -> Any:
-    """Start an empty file with the engine chosen."""
+    """Start an empty file with the chosen engine."""
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
     made = bpy.context.scene
     made.render.engine = "CLSPLAT"
     made.view_settings.view_transform = "Standard"
     made.render.image_settings.file_format = "PNG"
     made.render.film_transparent = False
-    made.render.dither_intensity = 0.0  # noise of one step, which Blender adds by default
+    made.render.dither_intensity = 0.0  # dithering noise of one step, which Blender adds by default
     return made
 
 
 def rendered(name: str, **extra: Any) -> str:
-    """Return the file of a frame, or the message in the report area of Blender."""
+    """Return the file of a frame, or the message in Blender's report area."""
     file = FOLDER / f"{name}.png"
     bpy.context.scene.render.filepath = str(file)
     try:
@@ -130,7 +130,7 @@ def frames() -> Facts:
 
 
 def together() -> Facts:
-    """Render two objects; one of them is turned, scaled and moved."""
+    """Render two objects. One of them is rotated, scaled and moved."""
     scene()
     splats(upright=False)
     other = splats("other.ply", upright=False)
@@ -275,7 +275,7 @@ def gone() -> Facts:
 
 
 def viewport() -> Facts:
-    """The engine's own drawing, in Blender's offscreen buffer: still, moving, and of an orthographic view."""
+    """Draw with the engine in Blender's offscreen buffer: a still view, a moving view, and an orthographic view."""
     import gpu
 
     engine = sys.modules[f"{ADDON}.engine"]
@@ -304,7 +304,7 @@ def viewport() -> Facts:
                 gpu.matrix.load_projection_matrix(across)
                 buffer = gpu.state.active_framebuffer_get()
                 for index in range(4):
-                    if index == 2:  # one step to the side on a machine so slow that it must be coarse
+                    if index == 2:  # move aside, with a speed so low that the engine must draw coarsely
                         data.view_matrix = Matrix.Translation((0.1, 0, 0)) @ view
                         self._speed = 1.0
                     buffer.clear(color=(0, 0, 0, 0))

@@ -1,4 +1,4 @@
-"""Scene for the Blender tests: cameras around a cloud of splats."""
+"""A scene for the Blender tests: cameras around a cloud of splats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run the command line in tests; sizes of the small capture (tests/conftest.py) that most of them run on."""
+"""Helpers that run the command line in tests, and sizes of the small capture (tests/conftest.py)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from clsplat_cli.main import main
 WIDTH, HEIGHT, N_VIEWS = 48, 36, 10
 TEST_NAMES = ["view_000.png", "view_008.png"]  # every 8th of ten
 CAP, ITERATIONS = 400, 60
-# Small and short, with every part of the strategy at work.
+# A small, short training that uses every part of the strategy.
 SHORT = [
     "--iterations",
     str(ITERATIONS),
@@ -22,19 +22,19 @@ SHORT = [
 
 
 def run(*args: object) -> Result:
-    """`clsplat ARGS` in this process."""
+    """Run `clsplat ARGS` in this process."""
     return CliRunner().invoke(main, [str(arg) for arg in args], prog_name="clsplat")
 
 
 def clsplat(*args: object) -> str:
-    """Standard output of a `clsplat ARGS` that must end well."""
+    """Return the standard output of a `clsplat ARGS` that must succeed."""
     result = run(*args)
     assert result.exit_code == 0, result.output
     return result.stdout
 
 
 def error_of(*args: object, code: int = 1) -> str:
-    """The message of a `clsplat ARGS` that must fail: one line, no traceback, nothing on standard output."""
+    """Return the message of a `clsplat ARGS` that must fail: one line, no traceback, nothing on standard output."""
     result = run(*args)
     assert isinstance(result.exception, SystemExit), repr(result.exception)
     assert result.exit_code == code, result.output

@@ -1,6 +1,6 @@
-"""The style guide of CONTRIBUTING.md as a program: long sentences and private phrases in comments and documents.
+"""Checker of the style guide in CONTRIBUTING.md. It finds long sentences and private phrases in comments and documents.
 
-python tests/support/english.py [PATH ...]      # print what to rewrite; all of the repository without a path
+python tests/support/english.py [PATH ...]      # print findings; all of the repository without a path
 python tests/support/english.py --count [PATH ...]
 """
 
@@ -27,8 +27,8 @@ FOLDERS = (
     "ARCHITECTURE.md",
     "CONTRIBUTING.md",
 )
-MAX_WORDS = 25  # of a sentence
-# Words that the first texts of this project used in a sense of their own, and what to write instead.
+MAX_WORDS = 25  # words in a sentence
+# Words that the first texts of this project used with a private meaning, and their replacements.
 PRIVATE = {
     r"(?<!there )\bis no (?!longer|more|need)\w+": "is not a ...",
     r"(?<!there )\b(?:is|are) none\b|\bhas none\b|\bhave none\b": "there is no ..., does not have ...",
@@ -46,12 +46,12 @@ PRIVATE = {
     r"\bnought\b|\bthereby\b|\btherein\b|\bwhereof\b|\bhence\b|\bthus\b": "so",
     r"^Of [a-z]": "begin with the noun",
 }
-# Identifiers that name a role in a sentence and never the thing.
+# Identifiers that describe a role in a sentence and do not name the thing.
 ROLES = {"own", "most", "told", "given", "said", "wanted", "past", "least", "mine", "theirs", "asked"}
 
 
 def sentences(text: str) -> Iterator[str]:
-    """Sentences of prose: code, formulas, tables and headings are left out."""
+    """Yield the sentences of prose. Code, formulas, tables and headings are omitted."""
     text = re.sub(r"(?ms)^\s*```.*?^\s*```", "\n\n", text)
     text = re.sub(r"(?ms)<!--.*?-->", "", text)
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
@@ -64,7 +64,7 @@ def sentences(text: str) -> Iterator[str]:
 
 
 def prose_of_python(source: str) -> Iterator[tuple[int, str]]:
-    """Docstrings and comments with their lines."""
+    """Yield docstrings and comments with their line numbers."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             text = ast.get_docstring(node)
@@ -87,7 +87,7 @@ def prose_of_python(source: str) -> Iterator[tuple[int, str]]:
 
 
 def prose_of_kernel(source: str) -> Iterator[tuple[int, str]]:
-    """Comments of OpenCL C with their lines."""
+    """Yield comments of OpenCL C with their line numbers."""
     block, first = [], 0
     for number, line in enumerate(source.splitlines(), 1):
         match = re.search(r"//+ ?(.*)$", line)
@@ -104,7 +104,7 @@ def prose_of_kernel(source: str) -> Iterator[tuple[int, str]]:
 
 
 def identifiers(path: Path, source: str) -> Iterator[tuple[int, str]]:
-    """Names of variables, parameters and attributes with their lines."""
+    """Yield names of variables, parameters and attributes with their line numbers."""
     if path.suffix == ".py":
         for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.Name):
@@ -120,7 +120,7 @@ def identifiers(path: Path, source: str) -> Iterator[tuple[int, str]]:
 
 
 def findings(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines and complaints of one file."""
+    """Yield line numbers and complaints of one file."""
     source = path.read_text()
     if path.suffix == ".py":
         parts = prose_of_python(source)
@@ -143,7 +143,7 @@ def findings(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def files(paths: list[Path]) -> list[Path]:
-    """Texts below these paths."""
+    """Return the texts below these paths."""
     found = [file for path in paths for file in ([path] if path.is_file() else sorted(path.rglob("*")))]
     return [file for file in found if file.suffix in (".py", ".cl", ".clh", ".md") and file.name != "english.py"]
 

@@ -1,4 +1,4 @@
-"""All readers of external files: a sound sample to damage, and the function that reads it."""
+"""All readers of external files, each with an intact sample to damage and the function that reads it."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Sample:
     Parameters
     ----------
     make : writes the files into an empty folder.
-    read : reads them; it raises InputError or checks the result.
-    damaged : a part of the paths of the files to damage.
+    read : reads them, and raises InputError or checks the result.
+    damaged : parts of the paths of the files to damage.
     """
 
     make: Callable[[Path], object]
@@ -169,7 +169,7 @@ def make_checkpoint(folder: Path) -> None:
 
 
 def read_checkpoint(folder: Path) -> None:
-    """Do the steps of resuming that need no device."""
+    """Take the steps of resuming that need no device."""
     from clsplat.device.schedule import Schedule
     from clsplat.training.folder import ModelFolder
     from clsplat.training.run import _fitting_checkpoint
@@ -234,7 +234,7 @@ def make_images(folder: Path) -> None:
 
 
 def read_images(folder: Path) -> None:
-    """Read all images; raise the error of the first that cannot be read."""
+    """Read all images. Raise the error of the first one that cannot be read."""
     failed: InputError | None = None
     for path in sorted(folder.iterdir()):
         try:
@@ -263,7 +263,7 @@ def make_photographs(folder: Path) -> None:
 
 
 def read_photographs(folder: Path) -> None:
-    """Do the steps of a reconstruction before the search for features."""
+    """Take the steps of a reconstruction before the search for features."""
     import tempfile
 
     from clsplat.scenes.reconstruct.photo_files import (
@@ -285,7 +285,7 @@ def read_photographs(folder: Path) -> None:
         ]
     group_by_camera([photo for photo in ready if not isinstance(photo, str)], "auto")
     for line in ready:
-        if isinstance(line, str):  # a reconstruction leaves such photos out with this line
+        if isinstance(line, str):  # a reconstruction skips such photos and prints this line
             raise InputError(line)
 
 

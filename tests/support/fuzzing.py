@@ -1,8 +1,8 @@
-"""Damaged files for every reader, and a campaign in worker processes that survives crashes of the readers.
+"""Damaged files for every reader. Worker processes try them, so that crashes of the readers do not end the campaign.
 
     python tests/support/fuzzing.py TABLE READER,... FIRST COUNT SEED   # the worker
 
-For each input, a sound reader raises a ClsplatError with one line, or returns a result that its check accepts. Faults
+For each input, a correct reader raises a ClsplatError of one line or returns a result that its check accepts. Faults
 are other exceptions, messages of several lines, a reader that takes longer than SECONDS, and a worker that dies. The
 worker's address space is limited, so that MemoryError is a fault too. An input depends only on its reader, its number
 and the seed.
@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 SECONDS = 10
-ROOM = 1 << 30  # address space that the worker may use in addition [bytes]; samples have a few kB
+ROOM = 1 << 30  # additional address space for the worker [bytes]; samples have a few kB
 _ODD_BYTES = [
     b"\0" * 8,
     b"\xff" * 8,
@@ -88,12 +88,12 @@ _ODD_VALUES: list[Any] = [
 
 
 class TooLong(BaseException):
-    """Raised by the worker's timer; no reader catches it."""
+    """Error that the worker's timer raises. No reader catches it."""
 
 
 @dataclass
 class Campaign:
-    """Results of a reader: numbers of inputs and refused inputs, and faults."""
+    """Results of a reader: the numbers of inputs and of refused inputs, and the faults."""
 
     reader: str
     inputs: int = 0
@@ -139,7 +139,7 @@ def campaign(readers: Sequence[str], count: int, seed: int = 0, table: str = "fu
 
 
 def work(table: str, readers: str, first: int, count: int, seed: int) -> None:
-    """Try inputs in this process; the first reader starts at input `first`."""
+    """Try inputs in this process. The first reader starts at input `first`."""
     warnings.simplefilter("ignore")
     signal.signal(signal.SIGALRM, _too_long)
     for reader in readers.split(","):
@@ -170,7 +170,7 @@ def work(table: str, readers: str, first: int, count: int, seed: int) -> None:
 
 
 def _fault(sample: Any, folder: Path) -> str | None:
-    """Return the reader's fault, "" if it read a sound result, or None if it refused the input."""
+    """Return the reader's fault, "" if it returned a correct result, or None if it refused the input."""
     from clsplat.errors import ClsplatError
 
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
@@ -309,7 +309,7 @@ def _odd_npz(path: Path, rng: np.random.Generator) -> None:
 
 
 def _replace(path: Path, rng: np.random.Generator) -> None:
-    """Replace a file by nothing, an empty file, a folder, a link to itself, a broken link, or another name."""
+    """Delete a file, or replace it by an empty file, a folder, a link to itself, a broken link, or another name."""
     path.unlink()
     kind = rng.integers(6)
     if kind == 1:
@@ -324,7 +324,7 @@ def _replace(path: Path, rng: np.random.Generator) -> None:
         os.rename(path.parent, path.parent.with_name("moved"))
         path.parent.mkdir()
         for other in path.parent.with_name("moved").iterdir():
-            # The file is gone, and a file whose name is not text is beside the others.
+            # The file is gone, and another file with a name that is not text is in its folder.
             other.rename(path.parent / other.name)
         path.parent.with_name("moved").rmdir()
         (Path(os.fsdecode(os.fsencode(path.parent) + b"/\xff\xfe" + os.fsencode(path.suffix)))).write_bytes(b"x")

@@ -1,4 +1,4 @@
-"""Kernels against the reference: cases computed once, and the comparison."""
+"""Comparison of the kernels with the reference. Cases are computed once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from clsplat.splats.splats import Splats
 
 Arrays = dict[str, NDArray[np.floating]]
 
-# (shape, normalisation) of every kernel there is.
+# (shape, normalisation) of every kernel.
 KERNELS = [
     (shape.name, normalisation)
     for shape in SHAPES.values()
@@ -37,19 +37,18 @@ KERNELS = [
 BACKGROUND = (0.2, 0.5, 0.9)
 SMOOTH = {"alpha_min": 0.0, "alpha_max": 1.0, "t_min": 0.0}
 
-STEP = 1e-3  # with the five-point rule: truncation STEP^4 f'''''/30, rounding 1e-16 |f| / STEP
+STEP = 1e-3  # for the five-point rule: truncation STEP^4 f'''''/30, rounding 1e-16 |f| / STEP
 FIVE_POINTS = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
-TWO_POINTS = ((1, 0.5), (-1, -0.5))  # exact where the image is linear: in the colour
+TWO_POINTS = ((1, 0.5), (-1, -0.5))  # exact if the image is linear, as in the colour
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One scene, one view, one loss, and what the reference says of them. `arrays` may lack the shape's own fields
-    (see `reference_scenes.for_shape`).
+    """One scene, one view, one loss, and the reference's results. `arrays` may omit fields of the shape.
 
-    The values are rounded to `dtype` first, so that both sides see the same ones. A pixel is *decided* if no
-    alpha and no transmittance in it lies so close to a threshold that float32 may fall on the other side;
-    the loss is blind to the others and comparisons leave them out.
+    `reference.scenes.for_shape` adds the omitted fields. The values are rounded to `dtype` first, so that both sides
+    get the same values. A pixel is *decided* if float32 cannot move any of its alphas and transmittances across a
+    threshold. The loss ignores the other pixels, and comparisons exclude them.
     """
 
     arrays: Arrays
@@ -57,7 +56,7 @@ class Case:
     shape: str
     normalisation: str = "peak"
     dtype: type = np.float32
-    fields: tuple[str, ...] | None = None  # gradients wanted; None = all
+    fields: tuple[str, ...] | None = None  # fields whose gradients are compared; None = all
     seed: int = 0
     thresholds: dict[str, float] = field(default_factory=dict)
     antialiased: bool = False
@@ -98,7 +97,7 @@ class Case:
 
     @cached_property
     def decided(self) -> NDArray[np.bool_]:
-        """(H, W)."""
+        """Return (height, width)."""
         shape = (self.camera.height, self.camera.width)
         values = prepared(self.values, self.shape)
         order = visible_order(values, self.camera, self.shape)
@@ -115,7 +114,7 @@ class Case:
 
     @cached_property
     def weights(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Random v_color (H, W, 3) and v_alpha (H, W)."""
+        """Return random v_color (H, W, 3) and v_alpha (H, W)."""
         rng = np.random.default_rng(self.seed)
         v_color, v_alpha = rng.normal(size=(*self.decided.shape, 3)), rng.normal(size=self.decided.shape)
         return v_color * self.decided[..., None], v_alpha * self.decided
@@ -127,11 +126,12 @@ class Case:
         return renderer.backward(*self.weights)
 
     def check(self, renderer: render.Renderer, image_tolerance: float, gradient_tolerance: float) -> None:
-        """Render and differentiate; assert that both agree with the reference.
+        """Render and differentiate, and assert that both results agree with the reference.
 
-        Images: largest absolute difference (depth: relative to the largest camera z). Gradients: largest
-        difference of a field relative to that field's largest entry, or to 1e-3 of the largest of all fields
-        where that is more: below it a field is the rounding of others (rotation of a ball, skew of m = 0).
+        Images: the largest absolute difference (depth: relative to the largest camera z). Gradients: the largest
+        difference in a field, relative to the field's largest entry. That entry counts as at least 1e-3 of the
+        largest entry of all fields. A smaller field only contains the rounding of others (rotation of a ball, skew of
+        m = 0).
         """
         got = self.render(renderer)
         self.check_image(got, image_tolerance)

@@ -1,4 +1,4 @@
-"""Random models of any shape, live or not yet, for the tests of strategies."""
+"""Random models of any shape, some with dead splats, for the tests of strategies."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ALL_SHAPES = [
 
 
 def random_model(shape: Shape, n: int, seed: int, dead: float = 0.3, sh_degree: int = 1) -> Arrays:
-    """Public float32 arrays; about a fraction `dead` of the splats has opacities below 0.005."""
+    """Public float32 arrays. A fraction `dead` of the splats, on average, has opacities below 0.005."""
     rng = np.random.default_rng(seed)
     arrays = {}
     faint = rng.random(n) < dead

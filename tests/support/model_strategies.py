@@ -1,4 +1,4 @@
-"""Hypothesis strategies for splat models, shared by the tests of files and of `Splats`."""
+"""Hypothesis strategies for splat models, which the tests of files and of `Splats` share."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Arrays = dict[str, np.ndarray]
 
 
 def random_arrays(shape: str, n: int, degree: int, seed: int, dtype: type = np.float32) -> Arrays:
-    """A usable model of any size, wide in range."""
+    """A valid model of any size, with a wide range of values."""
     rng = np.random.default_rng(seed)
     arrays = {}
     for field in SHAPES[shape].schema(degree):
@@ -27,7 +27,7 @@ def random_arrays(shape: str, n: int, degree: int, seed: int, dtype: type = np.f
 
 @st.composite
 def models(draw: st.DrawFn) -> tuple[str, str, Arrays]:
-    """(shape, normalisation, arrays); 0 to 6 splats, any SH degree."""
+    """(shape, normalisation, arrays) with 0 to 6 splats and any SH degree."""
     shape = draw(st.sampled_from(sorted(SHAPES)))
     normalisation = draw(st.sampled_from(["peak", "pdf", "none"]))
     n, degree, seed = draw(st.integers(0, 6)), draw(st.integers(0, 3)), draw(st.integers(0, 2**32 - 1))

@@ -1,9 +1,9 @@
-"""The process that test_oclgrind.py runs under Oclgrind: `python oclgrind_child.py WHAT uninitialized|races`.
+"""Process that test_oclgrind.py runs under Oclgrind: `python oclgrind_child.py WHAT uninitialized|races`.
 
-`main` lists the values of WHAT. Oclgrind 21.10 tracks writes of kernels and writes of whole buffers from the host. It
-does not track host writes at an offset, fills, and buffers in memory that another buffer had before. So this process
+`main` lists the values of WHAT. Oclgrind 21.10 tracks writes by kernels, and writes of whole buffers by the host. It
+does not track host writes at an offset, fills, or buffers in memory that another buffer used before. So this process
 replaces the first two by kernels and frees no buffer. Oclgrind also misreads the halves of a vector (`v.hi`), so sums,
-ORs and blocks go lane by lane. It does not support prefetch.
+ORs and blocks use one lane at a time. It does not support prefetch.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests/, which pytest adds by itself
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests/, which only pytest adds automatically
 
 from reference.scenes import for_shape, random_camera, random_splats
 
@@ -98,7 +98,7 @@ kernel void race(global uint *restrict x) {
 
 
 def append_to_sources(more: dict[str, str]) -> None:
-    """Text to follow files of these names wherever they are built in."""
+    """Append text to the sources of these names in every build."""
     join = program.source
 
     def source(*names: str) -> str:
@@ -108,7 +108,7 @@ def append_to_sources(more: dict[str, str]) -> None:
 
 
 def make_traceable(device: Device) -> None:
-    """Host writes that Oclgrind can follow; sums that it does not misread."""
+    """Replace host writes that Oclgrind cannot track, and sums that it misreads."""
     kept: list[Any] = []
     alloc = device.alloc
 
@@ -140,17 +140,17 @@ def make_traceable(device: Device) -> None:
 
 
 def render_some(device: Device, mode: str) -> None:
-    """A skewed and a two-sided shape on a schedule of lanes and one of groups."""
+    """Test a skewed and a two-sided shape on one schedule of lanes and one of groups."""
     render_and_back(device, (DEFAULT_SHAPE, "bisected-skew"), ("1x16x16", "64x4x1"))
 
 
 def render_all(device: Device, mode: str) -> None:
-    """All shapes on every kind of schedule."""
+    """Test all shapes on every kind of schedule."""
     render_and_back(device, tuple(SHAPES), SCHEDULES[mode])
 
 
 def render_and_back(device: Device, shapes: tuple[str, ...], schedules: tuple[str, ...]) -> None:
-    """5 splats, a 20 x 18 image in 4 tiles."""
+    """Render 5 splats in a 20 x 18 image of 4 tiles."""
     camera = random_camera(1, 20, 18)
     arrays = random_splats(3, 5, 1, np.float32)
     rng = np.random.default_rng(0)
@@ -167,7 +167,7 @@ def render_and_back(device: Device, shapes: tuple[str, ...], schedules: tuple[st
 
 
 def render_hazards(device: Device, mode: str) -> None:
-    """Crafted splats (benchmarks/hazards), whatever their images and gradients are."""
+    """Render crafted splats (benchmarks/hazards). The values of images and gradients do not matter."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
     from hazards import crafted
 
@@ -182,7 +182,7 @@ def render_hazards(device: Device, mode: str) -> None:
 
 
 def sort_and_scan(device: Device, mode: str) -> None:
-    """The sorter, over a block boundary; the order by depth of few work-items, over one of chunks and small buckets."""
+    """Sort across a block boundary, and order by depth with few work-items and with chunks and small buckets."""
     rng = np.random.default_rng(0)
     for n in (300, 4100):
         pool = memory.Pool(device)
@@ -204,7 +204,7 @@ def sort_and_scan(device: Device, mode: str) -> None:
 
 
 def faults(device: Device, mode: str) -> None:
-    """What must be found."""
+    """Run kernels with planted faults, which Oclgrind must report."""
     built = program.build_text(device, FAULTS)
     for kernel in (built.beyond, built.unwritten):
         kernel((1,), None, x=device.alloc(64)).wait()

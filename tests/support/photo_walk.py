@@ -1,4 +1,4 @@
-"""Photos of a textured corner with known poses, small enough for structure from motion in seconds."""
+"""Photos of a textured corner with known poses. They are so small that structure from motion takes seconds."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def picture(index: int, count: int = N_PHOTOS, fisheye: bool = False) -> NDArray
     centre, directions = -pose[:3, :3].T @ pose[:3, 3], rays @ pose[:3, :3]
     image, nearest = np.zeros(x.shape), np.full(x.shape, np.inf)
     for side in (-1.0, 1.0):
-        normal = np.array([side, 0.0, -1.0]) / np.sqrt(2)  # the wall through (0, 0, 1)
+        normal = np.array([side, 0.0, -1.0]) / np.sqrt(2)  # the wall that contains (0, 0, 1)
         with np.errstate(divide="ignore"):
             depth = (normal @ (np.array([0.0, 0.0, 1.0]) - centre)) / (directions @ normal)
         hit = (depth > 0) & (depth < nearest)
@@ -60,7 +60,7 @@ def picture(index: int, count: int = N_PHOTOS, fisheye: bool = False) -> NDArray
 
 
 def write_walk(folder: Path, count: int = N_PHOTOS, fisheye: bool = False) -> Path:
-    """Write all photos as PNG and return their folder."""
+    """Write all photos as PNG files and return their folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for index, name in enumerate(names(count)):
         Image.fromarray(picture(index, count, fisheye)).save(folder / name)
@@ -68,7 +68,7 @@ def write_walk(folder: Path, count: int = N_PHOTOS, fisheye: bool = False) -> Pa
 
 
 def _texture(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return smooth noise 0..1 of three scales."""
+    """Return smooth noise in 0..1, at three scales."""
     rng = np.random.default_rng(3)
     total = np.zeros(u.shape)
     for cells, weight in ((2.5, 0.3), (6.0, 0.4), (13.0, 0.3)):

@@ -15,7 +15,7 @@ NAMES = [f"shot_{index}.png" for index in range(N_VIEWS)]
 
 
 def model_views() -> list[ModelView]:
-    """Return nine views from a moving and turning camera, each with 8 of the points."""
+    """Return nine views of a moving and rotating camera, each with 8 of the points."""
     rng = np.random.default_rng(1)
     views = []
     for index, name in enumerate(NAMES):
@@ -43,7 +43,7 @@ def photo_of(index: int, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray
 
 
 def write_garden(parent: Path) -> Path:
-    """Write the scene and return its folder. Images are written backwards, so that they are not sorted by name."""
+    """Write the scene and return its folder. Images are in reverse order, so they are not sorted by name."""
     root = parent / "garden"
     for index, name in enumerate(NAMES):
         write_png(root / "images" / name, photo_of(index))
@@ -52,7 +52,7 @@ def write_garden(parent: Path) -> Path:
 
 
 def as_text(model: Path, target: Path) -> None:
-    """Write the model in folder `model` as text files to folder `target`."""
+    """Write the model in folder `model` to folder `target`, as text files."""
     import pycolmap
 
     target.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Records of a sweep as training would have made them, with round numbers."""
+"""Records of a sweep in the form that training writes, with round numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def run_record(
     scene: str = "yard",
     **values: Any,
 ) -> Record:
-    """A run of `cap` splats that took cap / 100 ms to render."""
+    """A run of `cap` splats with a rendering time of cap / 100 ms."""
     config = TrainConfig(shape=shape, cap_max=cap, seed=seed, iterations=iterations)
     return {
         "scene": {"name": scene, "width": 8, "height": 6, "train": 3, "test": 1},
@@ -48,12 +48,15 @@ def run_record(
 
 
 def curve_points(last: float) -> list[dict[str, float]]:
-    """Four points along a run that ends at `last` dB."""
+    """Four points of a run that ends at `last` dB."""
     return [{"iteration": n, "seconds": n / 10, "psnr": last - 8 / n, "ssim": 0.5 + n / 500} for n in (1, 4, 20, 100)]
 
 
 def sweep_records(scene: str = "yard") -> list[Record]:
-    """Two systems at three caps, the second half a doubling better; an automatic run; five seeds and two repeats."""
+    """Runs of two systems at three caps, and an automatic run.
+
+    The second system with n splats is as good as the first one with sqrt(2) n splats.
+    """
     runs = [
         run_record("gaussian", cap, psnr, scene=scene, curve=curve_points(psnr))
         for cap, psnr in ((1000, 20.0), (2000, 21.0), (4000, 22.0))
@@ -66,7 +69,7 @@ def sweep_records(scene: str = "yard") -> list[Record]:
 
 
 def seed_records() -> list[Record]:
-    """Five seeds of two systems, and two repeats of the first."""
+    """Five seeds of two systems, and two repeats of the first one."""
     runs = [
         run_record(system, 500, 20 + seed / 10, seed, scene="attic")
         for system in ("gaussian", "3dgs")

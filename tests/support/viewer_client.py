@@ -1,4 +1,4 @@
-"""A browser's part of a viewer, without a browser: sends its camera, receives pictures and the panel."""
+"""Client of a viewer that replaces a browser: it sends its camera and receives pictures and the panel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ class Client:
 
     Attributes
     ----------
-    panel : properties of the panel's elements by uuid. pictures : JPEG bytes received so far.
+    panel : properties of the panel's elements, by uuid.
+    pictures : JPEG bytes received so far.
     """
 
     def __init__(self, port: int) -> None:
@@ -43,11 +44,11 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Hang up as a browser does."""
+        """Close the connection as a browser does."""
         self._socket.close()
 
     def vanish(self) -> None:
-        """The line is cut."""
+        """Cut the connection without closing it."""
         self._socket.socket.close()
 
     def look(
@@ -58,7 +59,7 @@ class Client:
         width: int = 96,
         height: int = 64,
     ) -> None:
-        """Tell of a camera."""
+        """Send a camera."""
         self.send(
             {
                 "type": "ViewerCameraMessage",
@@ -75,11 +76,11 @@ class Client:
         )
 
     def set(self, label: str, value: Any) -> None:
-        """Change an element of the panel (a button: press it)."""
+        """Change an element of the panel. For a button, press it."""
         self.send({"type": "GuiUpdateMessage", "uuid": self.uuid(label), "updates": {"value": value}})
 
     def uuid(self, label: str) -> str:
-        """Of the element with a label; waits for it."""
+        """Return the uuid of the element with this label. Wait until it exists."""
         end = time.monotonic() + 10
         while time.monotonic() < end:
             for uuid, props in self.panel.items():
@@ -89,7 +90,7 @@ class Client:
         raise AssertionError(f"no {label!r} in the panel")
 
     def texts(self) -> list[str]:
-        """What the panel's lines say."""
+        """Return the texts of the panel."""
         return [props["_markdown"] for props in self.panel.values() if "_markdown" in props]
 
     def send(self, message: dict[str, Any]) -> None:
@@ -99,7 +100,7 @@ class Client:
         self._socket.send(data)
 
     def receive(self, timeout: float) -> bool:
-        """One bundle of messages; False when none comes in time."""
+        """Receive one bundle of messages. Return False if none arrives in time."""
         try:
             data = self._socket.recv(timeout)
         except TimeoutError:
@@ -121,12 +122,12 @@ class Client:
         return True
 
     def drain(self, seconds: float) -> None:
-        """Receive until nothing comes for that long."""
+        """Receive until no message arrives for this time."""
         while self.receive(seconds):
             pass
 
     def picture(self, timeout: float = 10.0) -> NDArray[np.uint8]:
-        """The next picture, (H, W, 3)."""
+        """Return the next picture, (H, W, 3)."""
         before, end = len(self.pictures), time.monotonic() + timeout
         while len(self.pictures) == before:
             if time.monotonic() > end:
@@ -135,11 +136,11 @@ class Client:
         return decoded(self.pictures[-1])
 
     def last(self) -> NDArray[np.uint8]:
-        """The picture received last, (H, W, 3)."""
+        """Return the last received picture, (H, W, 3)."""
         return decoded(self.pictures[-1])
 
     def still(self, shape: tuple[int, int] = (64, 96), timeout: float = 10.0) -> NDArray[np.uint8]:
-        """The next picture of full size (height, width)."""
+        """Return the next picture of full size (height, width)."""
         end = time.monotonic() + timeout
         while time.monotonic() < end:
             shown = self.picture(max(end - time.monotonic(), 0.1))
@@ -148,7 +149,7 @@ class Client:
         raise AssertionError("no picture of full size came")
 
     def until(self, text: str, timeout: float = 10.0) -> None:
-        """Wait for a line of the panel that holds a text."""
+        """Wait until a line of the panel contains this text."""
         end = time.monotonic() + timeout
         while not any(text in line for line in self.texts()):
             if time.monotonic() > end:
@@ -157,5 +158,5 @@ class Client:
 
 
 def decoded(picture: bytes) -> NDArray[np.uint8]:
-    """Pixels of a JPEG."""
+    """Return the pixels of a JPEG."""
     return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"))
