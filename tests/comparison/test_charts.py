@@ -1,4 +1,4 @@
-"""Charts: what they show, in what colours, and that a missing matplotlib or a bad row is one line."""
+"""Charts: data, colours, and messages of one line if matplotlib is missing or a row is invalid."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CURVE: list[dict[str, Any]] = [
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The figures that are drawn; they are written as well, small."""
+    """Collect the drawn figures. They are also written, at a small size."""
     figures: list[Any] = []
     context = charts.drawing
 

@@ -1,4 +1,4 @@
-"""Comparisons: each run is the training it names, is done once, and makes a row with mean and spread."""
+"""Comparisons: each run trains the system it names, is done once, and makes a row with mean and spread."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def done(folder: Path) -> list[Record]:
 
 @pytest.fixture(scope="session")
 def compared(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished comparison; read only."""
+    """A finished comparison. Tests must not write to it."""
     folder = tmp_path_factory.mktemp("compared")
     compare([scene], parse_methods("gaussian,default"), folder, [CAP], [0, 1], SHORT, save_models=True)
     return folder
@@ -81,7 +81,7 @@ def test_the_files_have_all_runs(compared: Path) -> None:
 
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int, int]]:
-    """The runs that are trained, which here takes no time."""
+    """Collect the runs that are trained. A stub replaces the training."""
     trained = []
 
     def train_and_measure(scene: Scene, config: TrainConfig, *more: object) -> Record:
@@ -94,7 +94,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int, int]]:
 
 
 def recorded(config: TrainConfig, system: str, **values: object) -> Record:
-    """A line of runs.jsonl as training would have made it."""
+    """Return a line of runs.jsonl in the form that training writes."""
     measured = dict.fromkeys(MEASURED, 1.0) | {"psnr": 20.0 + config.seed, "ssim": 0.5, "splats": 10}
     return {
         "scene": {"name": "yard", "width": 8, "height": 6, "train": 3, "test": 1},
@@ -122,7 +122,7 @@ def test_runs_are_done_once(scene: Scene, counted: list[Any], tmp_path: Path) ->
     systems = parse_methods("gaussian,default")
     compare([scene], systems, tmp_path, [CAP], [0], SHORT, on_run=on_run)
     assert seen == [(1, False), (1, True), (2, False), (2, True)]
-    # The device and what is saved on the way make no other run; a seed, an option, a system do.
+    # Another device and other saved files do not make a new run. Another seed, option or system does.
     compare([scene], systems, tmp_path, [CAP], [0, 1], SHORT | {"device": "0:0"}, on_run=on_run)
     compare([scene], parse_methods("gaussian"), tmp_path, [CAP], [0], SHORT | {"opacity_lr": 0.01})
     compare([scene], parse_methods("gaussian:opacity_lr=0.01"), tmp_path, [CAP], [0], SHORT)
@@ -147,7 +147,7 @@ def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp
         compare([scene], systems, tmp_path, [CAP], [0], SHORT, on_run=interrupt)
     assert len(done(tmp_path)) == 2
     assert len((tmp_path / "table.md").read_text().split("| yard ")) == 3
-    # A crash in the middle of a line: that run is done again, the others are not.
+    # After a crash in the middle of a line, that run is repeated and the others are not.
     whole = (tmp_path / "runs.jsonl").read_text()
     (tmp_path / "runs.jsonl").write_text(whole[:-20])
     records = compare([scene], systems, tmp_path, [CAP], [0], SHORT)

@@ -1,4 +1,4 @@
-"""The picture of benchmarks/stability.py shows each verdict and counts the survivors."""
+"""The picture of benchmarks/stability.py shows each verdict and the number of survivors."""
 
 from __future__ import annotations
 

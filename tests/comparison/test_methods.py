@@ -1,4 +1,4 @@
-"""Lists of systems: how they are written, what they become, and what is refused."""
+"""Lists of systems: their syntax, the resulting configs, and refused entries."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_common_options_hold_for_all_but_changes_win() -> None:
     assert plain.config(1, 0, common).optim.opacity_lr == 0.5
     assert changed.config(1, 0, common).optim.opacity_lr == 0.25
     assert changed.config(1, 0, common).iterations == 11
-    # A change of what a preset is stands in its name; a common option does not.
+    # The name of a system contains changes of its preset, but no common options.
     (other,) = parse_methods("3dgs:strategy=mcmc")
     assert other.config(1, 0, common).strategy == "mcmc"
     with pytest.raises(InputError, match="preset 3dgs has strategy adc, which contradicts strategy mcmc"):

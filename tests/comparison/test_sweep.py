@@ -1,4 +1,4 @@
-"""Sweeps: what the charts show is what the runs measured, and every run is made once."""
+"""Sweeps: charts show what the runs measured, and every run is done once."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from clsplat.scenes.scene import load_scene
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No matplotlib: quicker, where only the data count."""
+    """Disable matplotlib to save time, if a test needs only the data."""
     monkeypatch.setattr(chart_style, "available", lambda: False)
 
 
-# --- what is drawn -----------------------------------------------------------------------------
+# --- charts ------------------------------------------------------------------------------------
 
 
 def test_pareto_keeps_what_nothing_beats() -> None:
