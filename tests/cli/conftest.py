@@ -1,4 +1,4 @@
-"""Fixtures of the tests of commands: the shared scene and model as folders."""
+"""Fixtures for the commands' tests: the shared scene and model as folders."""
 
 from __future__ import annotations
 

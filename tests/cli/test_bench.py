@@ -1,4 +1,4 @@
-"""`clsplat bench`: the table names every stage, the file holds the numbers, and errors are one line."""
+"""`clsplat bench`: the table names every stage, the file contains the numbers, and errors are one line."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ SEARCH = ("--eval", "--iterations", 20, "--cap-max", 150, "--sh-degree", 0, "--d
 
 @pytest.fixture(scope="module")
 def found(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Folder of a model from a search, and the output of the command."""
+    """Folder of a model from a search, and the command's output."""
     folder = tmp_path_factory.mktemp("search") / "model"
     return folder, clsplat("train", scene, "-m", folder, "--budget", "auto", "--budget-tolerance", "1dB", *SEARCH)
 

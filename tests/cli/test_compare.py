@@ -1,4 +1,4 @@
-"""`clsplat compare` and `clsplat train --preset`: files, output, and one line for each mistake."""
+"""`clsplat compare` and `clsplat train --preset`: files, output, and a message of one line for each mistake."""
 
 from __future__ import annotations
 

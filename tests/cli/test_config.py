@@ -1,4 +1,4 @@
-"""`clsplat train --config`: options from a file, under those of the command line."""
+"""`clsplat train --config`: options from a file, which options of the command line override."""
 
 from __future__ import annotations
 

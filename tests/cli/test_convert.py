@@ -1,4 +1,4 @@
-"""`clsplat convert`: its file shows the same image; conversions that are not exact are refused."""
+"""`clsplat convert`: its file gives the same image, and inexact conversions are refused."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_nearest_gaussians_are_measured(model: Path, tmp_path: Path) -> None:
 
 
 def test_files_for_viewers_are_measured_as_written(model: Path, tmp_path: Path) -> None:
-    """Files of .spz and .splat are measured as they were rounded, and can be read back as models."""
+    """Files of .spz and .splat are measured with their rounded values, and can be read back as models."""
     named, renderer = read_cameras(model / "cameras.json"), Renderer()
     truths = [renderer.render(Splats.load(ModelFolder(model).latest_ply()[0]), entry.camera).color for entry in named]
     for name in ("out.spz", "out.splat"):

@@ -1,4 +1,4 @@
-"""Bad input to every command: an exit code other than 0, one line that names file and remedy, no traceback."""
+"""Invalid input to every command: an exit code other than 0, and one line that names file and remedy."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_a_loss_that_is_not_finite(scene: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def with_value(vertex: int, properties: list[str], value: float) -> Callable[[Path], None]:
-    """Return a function that overwrites properties of a vertex in a file."""
+    """Return a function that overwrites properties of one vertex in a file."""
 
     def damage(path: Path) -> None:
         header, body = path.read_bytes().split(b"end_header\n", 1)
@@ -236,7 +236,7 @@ def test_views_of_one_file(copied: Path, tmp_path: Path, names: tuple[str, str])
     assert "both" in error_of("render", copied, "--cameras", tmp_path / "c.json", "-o", tmp_path / "r", "--alpha")
 
 
-# --- places that cannot be written, failures of the machine ------------------------------------
+# --- unwritable places, failures of the machine ------------------------------------------------
 
 
 def test_output_below_a_file(scene: Path, model: Path, tmp_path: Path) -> None:

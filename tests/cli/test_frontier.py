@@ -1,4 +1,4 @@
-"""`clsplat frontier`: a sweep from the command line, its files, and one line for each mistake."""
+"""`clsplat frontier`: a sweep from the command line, its files, and a message of one line for each mistake."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_frontier_sweeps_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert (out / "report.html").read_text().count("<svg") >= 2
     curves = json.loads((out / "charts" / "time.json").read_text())
     assert [row["iteration"] for row in curves] == [1, 3, 8] * 2
-    # The same charts are drawn again from the runs, together with those of another folder.
+    # The command draws the same charts again from these runs and those of another folder.
     monkeypatch.setattr(chart_style, "available", lambda: False)
     shutil.copytree(out, tmp_path / "other")
     shutil.rmtree(out / "charts")

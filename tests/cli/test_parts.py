@@ -118,7 +118,7 @@ def test_look_at() -> None:
 
 
 def test_orbit_of_a_half_ring_closes_it() -> None:
-    """The cameras are on half a ring around (1, 2, 0.5), z up. The orbit is the whole ring."""
+    """The cameras are on half a ring around (1, 2, 0.5), with z up. The orbit is the whole ring."""
     target, angles = np.array([1.0, 2.0, 0.5]), np.linspace(0, np.pi, 7)
     ring = [facing([1 + 4 * math.cos(a), 2 + 4 * math.sin(a), 1.5], [1, 2, 0.5], [0, 0, 1]) for a in angles]
     made = orbit(cloud(), ring, 12)

@@ -1,4 +1,4 @@
-"""`clsplat render` and `clsplat eval`: their files against the images that Python renders."""
+"""`clsplat render` and `clsplat eval`: their files equal the images that Python renders."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_render_png_of_test_views_with_alpha_and_depth(model: Path, tmp_path: Pa
 
 
 def test_render_npy_of_given_cameras_is_the_renderers_image(model: Path, tmp_path: Path) -> None:
-    """A PLY alone with --cameras: every camera gives the float32 image that Python gives."""
+    """With only a PLY and --cameras, every camera gives the float32 image that Python gives."""
     clsplat(
         "render",
         ply(model, 40),
@@ -100,7 +100,7 @@ def test_render_orbit_looks_at_the_scene(model: Path, tmp_path: Path) -> None:
     clsplat("render", model, "--path", "orbit", "--frames", "4", "-o", tmp_path / "r")
     assert files(tmp_path / "r") == {"cameras.json", *(f"orbit_{n:03}.png" for n in range(4))}
     cameras = [named.camera for named in read_cameras(tmp_path / "r" / "cameras.json")]
-    for camera in cameras:  # the capture's cameras look at (0, 0, 0.5) from 3.6 away, z up
+    for camera in cameras:  # the capture's cameras look at (0, 0, 0.5) from a distance of 3.6, with z up
         assert np.hypot(*camera.position[:2]) == pytest.approx(3.6, rel=0.05)
         assert camera.rotation[1] @ [0, 0, 1] < -0.8
     clsplat("render", ply(model), "--path", "orbit", "--frames", "1", "-o", tmp_path / "alone")
@@ -114,7 +114,7 @@ def test_render_other_paths(model: Path, tmp_path: Path, kind: str) -> None:
 
 
 def test_render_between_chosen_cameras_and_along_the_saved_path(model: Path, tmp_path: Path) -> None:
-    """Frames at the keys are the images of those cameras. The path's file gives the same frames, or another number."""
+    """Frames at the keys equal the images of those cameras. The path's file gives the same frames or another number."""
     named = {item.name: item.camera for item in read_cameras(model / "cameras.json")}
     clsplat(
         "render",
@@ -282,7 +282,7 @@ def test_eval_writes_3dgs_files_with_the_protocol(copied_model: Path, scene: Pat
     assert set(per_view) == {"SSIM", "PSNR"}
     assert list(per_view["PSNR"]) == TEST_NAMES
     assert f"{entry['PSNR']:.3f}" in out
-    for view in load_scene(scene).test:  # from the saved images, by the metrics module
+    for view in load_scene(scene).test:  # computed from the saved images by the metrics module
         rendered = np.asarray(Image.open(tmp_path / "r" / view.name))
         measured = protocol_named("clsplat").measure(rendered, view.image)
         assert per_view["PSNR"][view.name] == pytest.approx(measured["PSNR"], abs=1e-6)
@@ -303,7 +303,7 @@ def test_eval_of_several_models_protocols_and_iterations(model: Path, tmp_path: 
 
 
 def test_eval_of_a_model_trained_from_python(scene: Path, tmp_path: Path) -> None:
-    """The folder records the scene and the test views without the command line."""
+    """The folder records the scene and the test views, so the command line need not name them."""
     import clsplat as package
 
     names = tmp_path / "names.txt"
@@ -327,4 +327,4 @@ def test_eval_of_a_moved_scene(model: Path, scene: Path, tmp_path: Path) -> None
     (copy / "config.json").write_text(json.dumps(stored))
     assert "with -s" in error_of("eval", copy)
     clsplat("eval", copy, "-s", moved)
-    clsplat("render", copy, "-o", tmp_path / "r")  # needs no photos
+    clsplat("render", copy, "-o", tmp_path / "r")  # rendering needs no photos

@@ -75,7 +75,7 @@ def test_without_viser_both_say_what_to_install(
 
 
 class Command:
-    """A process that runs `clsplat ...` and serves a page."""
+    """Run `clsplat ...` in a process that serves a page."""
 
     def __init__(self, *args: object) -> None:
         command = [sys.executable, "-u", "-c", "from clsplat_cli.main import main; main()", *(str(arg) for arg in args)]
@@ -91,7 +91,7 @@ class Command:
         self.port = int(found[1] or found[2])
 
     def end(self) -> int:
-        """Send Ctrl-C."""
+        """Send Ctrl-C to a process."""
         self.process.send_signal(signal.SIGINT)
         assert self.process.stdout is not None
         self.said += self.process.stdout.read()
