@@ -1,4 +1,4 @@
-"""The benchmarks run, on a capture of a few pixels: they cannot rot."""
+"""The benchmarks run on a capture of a few pixels, so that changes cannot break them unnoticed."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_systems(tmp_path: Path, capture_folder: Path) -> None:
     runs = [json.loads(line) for line in file.read_text().splitlines()]
     assert len(runs) == len({run["system"] for run in runs}) == 12, "each once, also when it is called again"
     assert all(run["commit"] and run["finite"] and run["cap_held"] for run in runs)
-    for run in runs:  # as if they were the real ones
+    for run in runs:  # give them the sizes of the real runs
         run["config"] |= {"cap_max": 5000, "iterations": 1000}
     file.write_text("".join(json.dumps(run) + "\n" for run in runs))
     page = subprocess.run([*command, "--page"], env=environment, capture_output=True, text=True, check=True).stdout

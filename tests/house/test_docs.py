@@ -1,8 +1,8 @@
-"""Documents are right: their commands and Python run, their links work, and the messages they quote are in the source.
+"""Documents are correct: commands and Python run, links work, and quoted messages are in the source.
 
 Each `clsplat` command of a code block runs alone, in a folder with stand-ins for the names in it (SCENE, MODEL, ...).
-`shortened` gives it few iterations and splats. Other commands are checked for the files and options that they name;
-`NOT_RUN` has the reason why each is not run. A command that is neither run nor in `NOT_RUN` fails.
+`shortened` gives it few iterations and splats. Other commands are checked for the files and options that they name.
+`NOT_RUN` contains the reason why a command is not run. A command that is neither run nor in `NOT_RUN` fails.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TEXTS = {page.relative_to(ROOT).as_posix(): page.read_text() for page in PAGES}
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.M | re.S)
 INDENTED = re.compile(r"^    ((?:clsplat|python|pytest|pip) .*)$", re.M)
 
-# Commands that are not run here: pattern, why.
+# Commands that are not run here: pattern and reason.
 NOT_RUN = (
     (r"python3 -m venv|(\.venv/bin/)?pip install", "installs from the network; the extras it names are checked"),
     (r"(\.venv/bin/)?pytest|\.venv/bin/(ruff|clang-format|mypy)|\.ci/run", "the checks; files they name are checked"),
@@ -52,7 +52,7 @@ SLOW = re.compile(
     r"|PHOTOS|-r 2|\.splat|gaussians\.ply|-direct"
 )
 REAL_PHOTOS = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data") / "sceaux_castle"
-# Options that every training command gets, in the place of its own values.
+# Values that replace those of every training command's options.
 FEW = {"--iterations": "8", "--cap-max": "60", "--seeds": "0", "--seed": "1"}
 
 
@@ -61,7 +61,7 @@ def blocks(text: str, language: str) -> list[str]:
 
 
 def commands() -> dict[str, str]:
-    """Return all commands of code blocks, without comments, each with its page."""
+    """Return all commands of code blocks with their pages, without comments."""
     found: dict[str, str] = {}
     for page, text in TEXTS.items():
         lines = [line for body in blocks(text, "sh") for line in body.splitlines()]
@@ -84,7 +84,7 @@ RUN = [command for command in COMMANDS_SEEN if reason_not_run(command) is None]
 
 
 def shortened(command: str) -> list[str]:
-    """Return the arguments of a command with few iterations, splats, seeds and images."""
+    """Return the command's arguments, with few iterations, splats, seeds and images."""
     words = shlex.split(command.removeprefix(".venv/bin/"))[1:]
     for place, word in enumerate(words[:-1]):
         words[place + 1] = FEW.get(word, words[place + 1])
@@ -160,14 +160,14 @@ def test_other_commands_name_existing_files_and_options(command: str) -> None:
 
 
 def options_of(name: str) -> set[str]:
-    """Return all options of a command, and those of the group."""
+    """Return all options of a command and of the group."""
     command = main.get_command(click.Context(main), name)
     assert command is not None
     return {option for param in (*command.params, *main.params) for option in (*param.opts, *param.secondary_opts)}
 
 
 def test_options_in_the_text_exist() -> None:
-    """Every `--option` of the guide and the README in backticks is one of some command."""
+    """Every `--option` in backticks in the guide and the README is an option of some command."""
     known = set().union(*(options_of(name) for name in COMMANDS)) | {"--help"}
     for script in (ROOT / "benchmarks").glob("*.py"):
         known |= set(re.findall(r'"(--[a-z-]+)"', script.read_text()))
@@ -193,7 +193,7 @@ def test_every_command_is_in_the_guide() -> None:
 
 @pytest.mark.parametrize("page", [page for page, text in TEXTS.items() if blocks(text, "python")])
 def test_python_runs(page: str, tmp_path: Path, capture_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All Python of a page runs as one program, in the folder of the demo."""
+    """All Python of a page runs as one program, in the demo's folder."""
     shutil.copytree(capture_folder, tmp_path / "out" / "scene")
     monkeypatch.chdir(tmp_path)
     source = "\n".join(blocks(TEXTS[page], "python"))
@@ -206,7 +206,7 @@ def test_readme_stays_short() -> None:
 
 
 def test_evidence_is_there() -> None:
-    """Each test file of the table "Evidence" exists, and so does each module and kernel that ARCHITECTURE.md names."""
+    """Each test file in the table "Evidence" exists, and so does each module and kernel that ARCHITECTURE.md names."""
     text = TEXTS["ARCHITECTURE.md"]
     evidence = text[text.index("## Evidence") :]
     files = re.findall(r"`(\w+/test_\w+\.py)`", evidence)
@@ -218,7 +218,7 @@ def test_evidence_is_there() -> None:
 
 
 def test_the_pipeline_drawing_names_kernels() -> None:
-    """The names at the head of each step in the drawing are kernels."""
+    """The names at the start of each step in the drawing are names of kernels."""
     steps = re.findall(r"^      │ (\w+_\w+(?:, \w+)*|rasterize)(?= )", TEXTS["ARCHITECTURE.md"], re.M)
     sources = "".join(path.read_text() for path in (ROOT / "cl").rglob("*.cl"))
     kernels = {name for step in steps for name in step.split(", ")}
@@ -251,7 +251,7 @@ def test_links_work() -> None:
 
 
 def source_texts() -> list[str]:
-    """Return the text constants of the source, with a NUL for each value that is filled in."""
+    """Return the text constants of the source, with a NUL for each inserted value."""
     found = []
     for path in [file for folder in ("clsplat", "cli", "blender") for file in (ROOT / folder).rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
@@ -265,7 +265,7 @@ def source_texts() -> list[str]:
 
 
 def test_messages_are_those_of_the_source() -> None:
-    """Tables headed "message" quote messages of clsplat; `...`, N, M, WxH and numbers stand for values."""
+    """Tables headed "message" quote messages of clsplat. `...`, N, M, WxH and numbers represent inserted values."""
     texts = source_texts()
     quoted = 0
     for page, text in TEXTS.items():

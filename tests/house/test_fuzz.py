@@ -1,4 +1,4 @@
-"""Damaged files: every reader refuses them in one line or reads something sound; benchmarks/fuzz.py tries many more."""
+"""Damaged files: every reader refuses them in one line or reads a valid result. benchmarks/fuzz.py tries many more."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pytest
 from fuzz_readers import READERS
 from fuzzing import campaign
 
-INPUTS = 15  # of each reader
+INPUTS = 15  # inputs of each reader
 
 
 def test_a_share_of_every_reader_s_inputs() -> None:
-    """Another share each day would be another test each day: the seed stays."""
+    """The seed is fixed, so that every run tests the same inputs."""
     readers = list(READERS)
     with ThreadPoolExecutor(2) as pool:
         results = [

@@ -1,4 +1,4 @@
-"""A notebook can do all that a shell can: Python writes the same files as the commands."""
+"""A notebook can do everything that a shell can: Python writes the same files as the commands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clsplat.evaluation.metrics import protocol_named
 from clsplat.scenes.demo.scene import write_capture
 
 ITERATIONS, CAP = 30, 60
-VARIABLE = ("render_ms",)  # of results.json: times differ from run to run
+VARIABLE = ("render_ms",)  # keys of results.json whose times differ between runs
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +39,13 @@ def small_config(**options: Any) -> package.TrainConfig:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files below a folder by their names."""
+    """Return all files below a folder by name."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 def entries(path: Path) -> dict[str, Any]:
-    """Entries of a results.json without times."""
+    """Return the entries of a results.json without times."""
     stored = json.loads(path.read_text())
     return {name: {k: v for k, v in entry.items() if k not in VARIABLE} for name, entry in stored.items()}
 
@@ -69,7 +69,7 @@ def test_demo(tmp_path: Path) -> None:
 
 
 def test_train_and_evaluate_with_other_photos(scene: Path, tmp_path: Path) -> None:
-    """The folder records how the scene was read, so that evaluation reads the same photos."""
+    """The folder records how the scene was read, so evaluation reads the same photos."""
     shell, notebook = tmp_path / "shell", tmp_path / "notebook"
     clsplat("train", scene, "-m", shell, "-r", 2, "--test-every", 3, *SHORT, "-q")
     options = {"iterations": 60, "cap_max": 400, "sh_degree": 1, "densify_interval": 10}

@@ -1,4 +1,4 @@
-"""The order of packages, and what only certain files may name: libraries, shapes, LANES, GROUP."""
+"""The order of packages, and the files that may name certain things: libraries, shapes, LANES, GROUP."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from clsplat.splats.shapes import SHAPES
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# The rule: a package imports only packages to its left, and inside a package no import runs in a circle.
+# The rule: a package imports only packages to its left, and a package has no circular imports.
 PACKAGES = (
     "errors",
     "_version",
@@ -33,7 +33,7 @@ PACKAGES = (
     "profiling",
     "viewer",
 )
-# These three stand side by side: none imports another.
+# These three are independent: none imports another.
 LAST = ("comparison", "profiling", "viewer")
 
 # Libraries that only these modules import.
@@ -48,10 +48,10 @@ OWNERS = {
     "lpips": {"evaluation.perceptual"},
     "torch": {"evaluation.perceptual"},
     "flip_evaluator": {"evaluation.perceptual"},
-    "click": set(),  # the command line's
+    "click": set(),  # only the command line imports it
 }
 
-# Files beside shapes.py and cl/shape/ that may name a shape, and why.
+# Files other than shapes.py and cl/shape/ that may name a shape, and the reason.
 SHAPE_NAMES_IN = {
     "splats/convert.py": "which shape's splats are Gaussians of other scales",
     "training/presets.py": "a published system has its kernel",
@@ -62,7 +62,7 @@ COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*", re.S)
 
 
 def kernel_sources() -> dict[str, str]:
-    """Sources below cl/ by name, without comments."""
+    """Return the sources below cl/ by name, without comments."""
     folder = ROOT / "cl"
     return {
         str(path.relative_to(folder)): COMMENT.sub(" ", path.read_text())
@@ -72,7 +72,7 @@ def kernel_sources() -> dict[str, str]:
 
 
 def foreign_imports(tree: ast.AST) -> set[str]:
-    """Top-level packages from elsewhere that a module imports."""
+    """Return the external top-level packages that a module imports."""
     found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -83,7 +83,7 @@ def foreign_imports(tree: ast.AST) -> set[str]:
 
 
 def code_strings(tree: ast.AST) -> Iterator[str]:
-    """String constants that are not docstrings."""
+    """Return the string constants that are not docstrings."""
     documents = {
         id(node.body[0].value)
         for node in ast.walk(tree)
@@ -138,7 +138,7 @@ def test_no_two_classes_have_one_name() -> None:
 
 
 def test_the_packages_are_installed() -> None:
-    """Each folder with modules is in pyproject.toml."""
+    """pyproject.toml lists each folder that contains modules."""
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
     folders = {path.parent.relative_to(ROOT) for path in (ROOT / "clsplat").rglob("*.py")}
     assert {".".join(folder.parts) for folder in folders} == {
@@ -188,25 +188,25 @@ def test_kernels_use_no_atomics_and_no_includes() -> None:
 
 
 def test_files_stay_small() -> None:
-    """About 300 lines a file, 400 at most."""
+    """A file has about 300 lines and at most 400."""
     for path in [*modules().values(), *(ROOT / "cl").rglob("*.cl*"), *(ROOT / "cli").glob("*.py")]:
         assert len(path.read_text().splitlines()) <= 400, path.name
 
 
-# Files of the command line that write a file, and why.
+# Files of the command line that write a file, and the reason.
 COMMANDS_THAT_WRITE = {"blender_addon.py": "the add-on is a part of the command line's package, not of a model"}
 WRITERS = {"atomic_writer", "write_text", "write_bytes", "write_json", "savez", "save", "mkdir"}
 
 
 def names_used(tree: ast.AST) -> set[str]:
-    """Names of variables, attributes and imports."""
+    """Return the names of variables, attributes and imports."""
     names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
     names |= {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     return names | {a.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for a in node.names}
 
 
 def test_commands_only_parse_call_and_print() -> None:
-    """The command line computes nothing and writes nothing itself: a notebook can do all that it does."""
+    """The command line computes and writes nothing itself, so a notebook can do everything that it does."""
     writing = set()
     for path in sorted((ROOT / "cli").glob("*.py")):
         tree = ast.parse(path.read_text())
