@@ -234,7 +234,7 @@ def test_what_a_mask_hides_is_not_learned(scene: Scene) -> None:
 
 
 def test_random_backgrounds_show_through_nothing_opaque(scene: Scene) -> None:
-    """Photos show a black object on transparent ground. Only over black, black splats and no splats look equal."""
+    """Photos show a black object on transparent ground. Black splats match an empty render only over black."""
 
     def on_nothing(view: View) -> View:
         height, width = view.image.shape[:2]

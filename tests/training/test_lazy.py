@@ -73,7 +73,7 @@ def step(
 
 
 def some_seen(n: int, rng: np.random.Generator) -> np.ndarray:
-    """Return random visibility, like that of a camera and splats in Morton order: few intervals with holes, or none."""
+    """Return random visible splats as a camera sees them in Morton order: a few intervals with holes, or none."""
     seen = np.zeros(n, bool)
     for _ in range(rng.integers(0, 3)):
         first = rng.integers(0, n)

@@ -1,4 +1,4 @@
-"""Schedules: end points, monotony, and short runs."""
+"""Schedules: end points, monotonic change, and short runs."""
 
 from __future__ import annotations
 
