@@ -1,12 +1,13 @@
 // count.cl: the number of useful pairs of splat and pixel in a frame, for benchmarks and overdraw images.
 //
-// A pair is useful if |alpha| reaches the cutoff and no splat before has finished the pixel. The pair that finishes the pixel
-// counts. This is the loop of rasterize.cl for one block, without batches and without culled blocks.
+// A pair is useful if |alpha| reaches the cutoff and no earlier splat has finished the pixel. The pair that finishes
+// the pixel counts. This is the loop of rasterize.cl for one block, without batches and without culled blocks.
 
 #define BLOCKS_PER_TILE (TILE * TILE / LANES)
 #define BLOCKS_X (TILE / BLOCK_W)
 
-// Overwrites counts [tiles, BLOCKS_PER_TILE] with the useful pairs of each block of LANES pixels. Global size: the counts.
+// Overwrites counts [tiles, BLOCKS_PER_TILE] with the number of useful pairs in each block of LANES pixels. Global
+// size: the number of counts.
 kernel void count_pairs(
     global const uint2 *restrict tile_ranges,
     global const uint *restrict lists,

@@ -1,4 +1,4 @@
-// roofline.cl: the peak rates of a device: bytes copied, and fused multiply-adds on CHAINS independent vectors.
+// roofline.cl: kernels that measure the peak rates of a device: a copy, and fused multiply-adds on CHAINS vectors.
 
 // Copies n vectors of LANES reals. Global size: n.
 kernel void copy_vectors(global const real *restrict values, global real *restrict copied, ulong n) {
@@ -6,8 +6,8 @@ kernel void copy_vectors(global const real *restrict values, global real *restri
     if (i < n) lanes_store(lanes_load(values + i * LANES), copied + i * LANES);
 }
 
-// Overwrites sums [items]. Each chain starts at its number plus that of the lane and makes `rounds` times 16 steps
-// x -> a x + b; the results are added. A round has 2 * 16 * CHAINS * LANES flops.
+// Overwrites sums [items] with the sum of all chains of a work-item. A chain starts at its number plus the number of
+// the lane. It then makes 16 * rounds steps x -> a x + b. A round has 2 * 16 * CHAINS * LANES flops.
 kernel void fma_chains(global real *restrict sums, real a, real b, uint rounds) {
     vreal x[CHAINS];
     for (int c = 0; c < CHAINS; ++c) x[c] = (vreal)c + lanes_iota();

@@ -1,4 +1,4 @@
-// smoke.cl: a test that a device computes: y = exp(-x^2) + erfc(x), one work-item per value.
+// smoke.cl: a test of a device: y = exp(-x^2) + erfc(x) with one work-item per value.
 
 kernel void smoke(
     global const float *restrict x,  // [n]

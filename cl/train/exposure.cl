@@ -1,17 +1,18 @@
-// exposure.cl: the differences between a render and a photo of the scene: exposure, masks, and transparent pixels.
+// exposure.cl: exposure, masks and transparent pixels of photos.
 //
-// The exposure E of a photo is 12 reals, three rows of three factors and an offset: photo = E (r, g, b, 1) of the render.
-// A pixel that a mask hides has neither an error nor a gradient. A transparent pixel of a photo is laid over the background
-// of the render. The planes of bytes of a truth are r, g, b, and with 5 channels also the mask (0 hides) and the opacity.
-// A work-item has PHOTO_VECS vectors of a row. Images are planar with a zero margin (rasterize.cl).
+// The exposure E of a photo is 12 reals, three rows with three factors and an offset: photo = E (r, g, b, 1), where r,
+// g and b are colours of the render. A pixel that a mask hides has neither an error nor a gradient. A transparent pixel
+// of a photo is composited over the background of the render. The truth has planes of bytes: r, g, b, and with 5
+// channels also the mask (0 hides) and the opacity. A work-item computes PHOTO_VECS vectors of a row. Images are planar
+// with a zero margin (rasterize.cl).
 
 #define EXPOSURE 12
-#define SQUARES 10  // of the upper triangle of a 4 x 4 matrix, by rows
-// SUMS is a define of clsplat/training/programs.py, which sizes the buffer of the sums by it.
+#define SQUARES 10  // entries of the upper triangle of a 4 x 4 matrix, by rows
+// clsplat/training/programs.py defines SUMS, and uses it for the size of the buffer of the sums.
 typedef char there_are_SUMS_sums[SUMS == SQUARES + EXPOSURE ? 1 : -1];
-#define SATURATED R(0.98)  // a brighter pixel of a photo does not depend on the exposure
+#define SATURATED R(0.98)  // pixels of a photo that are brighter than this do not count for the exposure
 
-// Vectors of a row, and those of a work-item: from `first` to before `end`.
+// The number of vectors of a row. A work-item computes those from `first` up to, but not including, `end`.
 typedef struct {
     int vecs, first, end;
 } row_part;
@@ -21,14 +22,15 @@ static inline row_part item_part(int width) {
     return (row_part){vecs, first, min(first + PHOTO_VECS, vecs)};
 }
 
-// Pixels of a vector inside the image that no mask hides.
+// Mask of the pixels of a vector that are inside the image and not hidden.
 static inline vmask counted(global const uchar *truth, ulong plane, int channels, int vec, int width) {
     const vmask inside = lanes_before(vec * LANES, width);
     return channels > 3 ? inside & (lanes_uchar_to_real(truth + 3 * plane) > (vreal)0) : inside;
 }
 
-// Overwrites photo [3 planes] with the render under the exposure of the photo. With 5 channels it also overwrites target
-// [3 planes of bytes] with the truth over the background of the render. shift: that background less the truth's, times 255.
+// Overwrites photo [3 planes] with the render under the exposure of the photo. With 5 channels it also overwrites
+// target [3 planes of bytes] with the truth over the background of the render. shift: background of the render minus
+// background of the truth, times 255.
 // Global size: (at least the vectors of a row / PHOTO_VECS, height).
 kernel void photo_of_render(
     global const real *restrict color,
@@ -74,9 +76,9 @@ kernel void photo_of_render(
     }
 }
 
-// Changes v [3 planes] from the gradient of the photo to that of the render. Overwrites partial [SUMS, parts]: with
-// x = (r, g, b, 1) of the render and y the target, sums of x x' and y x' over the pixels that count and are not saturated.
-// With 3 channels the target is the truth. Global size: that of photo_of_render.
+// Changes v [3 planes] from the gradient of the photo to the gradient of the render. Overwrites partial [SUMS, parts]
+// with the sums of x x' and y x'. Here x is (r, g, b, 1) of the render and y is the target. The sums include the pixels
+// that are neither hidden nor saturated. With 3 channels the target is the truth. Global size: that of photo_of_render.
 kernel void photo_of_render_vjp(
     global const real *restrict color,
     global const uchar *restrict truth,
@@ -128,7 +130,8 @@ kernel void photo_of_render_vjp(
     for (int j = 0; j < SUMS; ++j) partial[j * parts + part] = lanes_sum(sums[j]);
 }
 
-// The least-squares exposure: solves S E' = T' by Cholesky, where S and T are those sums plus `pull` times the identity.
+// Computes the least-squares exposure: solves S E' = T' by Cholesky's method. S is the sum of x x' and T the sum of y
+// x', each plus `pull` times the identity.
 static inline void solve_exposure(local const real *sums, real pull, real *exposure) {
     real l[4][4];
     int j = 0;
@@ -153,9 +156,10 @@ static inline void solve_exposure(local const real *sums, real pull, real *expos
     }
 }
 
-// Moves the exposure of a view by the fraction `rate` towards that of least squares; `pull`, a fraction of the pixels, draws
-// the latter to the identity. Then it shifts all exposures so that their mean stays: a gain of all photos and its inverse in
-// all splats give the same images, and views without a photo are shown with the mean.
+// Moves the exposure of a view by the fraction `rate` towards the least-squares exposure. `pull`, a fraction of the
+// pixels, draws the latter to the identity. Then all exposures are shifted so that their mean stays. The mean must be
+// fixed, because a gain of all photos and its inverse in all splats give the same images. Views without a photo have
+// the mean exposure.
 // exposures [views, EXPOSURE], in place. One group of EXPOSURE_GROUP work-items.
 kernel void step_exposure(
     global real *restrict exposures,

@@ -1,21 +1,22 @@
 // lazy.cl: Adam for visible splats (clsplat/training/optim/lazy.py has the formula). A vector of splats skips its steps
 // while none of its splats is visible. Before its next step, the skipped steps are done in closed form.
 
-// Effect of a number of skipped steps: factors of both moments, and the drift of the value for each unit of rate and of
-// m / sqrt(v). `keeps_moments`: only the value is updated.
+// Effect of a number of skipped steps: factors of both moments, and the drift of the value per unit of rate and of
+// m / sqrt(v). With `keeps_moments`, only the value changes.
 typedef struct {
     real decay1, decay2, drift;
     bool keeps_moments;
 } adam_skip;
 
-// decays [5, ADAM_WAITS] by the number of skipped steps: factors of m and v, then in the rows DRIFT, DRIFT_MEAN and
-// DRIFT_SKEW the drift of most rows, of the means (rate included) and of the trainable skew.
+// Returns the effect of `steps` skipped steps. decays is [5, ADAM_WAITS]: its rows hold the factors of m and v, and
+// three drifts. DRIFT is the drift of most rows, DRIFT_MEAN that of the means (with the rate), DRIFT_SKEW that of the
+// skew.
 static inline adam_skip skipped_steps(constant real *decays, int steps, int drift, bool keeps_moments) {
     return (adam_skip){decays[steps], decays[ADAM_WAITS + steps], decays[drift * ADAM_WAITS + steps], keeps_moments};
 }
 
-// Does the skipped steps of a row. `high` > 0 marks fields that are optimised in log space. Their drift is monotonic, so
-// one clamp at the end equals a clamp at every step.
+// Does the skipped steps of a row. `high` > 0 marks fields that are optimised in log space. Their drift is monotonic,
+// so one clamp at the end equals a clamp at every step.
 static inline void
 adam_catch_up(adam_skip skip, real lr, real low, real high, global real *value, adam_moments adam, const ulong at) {
     const vreal m = lanes_load(adam.m + at), v = lanes_load(adam.v + at), old = lanes_load(value + at);
@@ -26,10 +27,11 @@ adam_catch_up(adam_skip skip, real lr, real low, real high, global real *value, 
     lanes_store(v * skip.decay2, adam.v + at);
 }
 
-// Selects the vectors that step now. For each vector, writes ages = (skipped steps of the base parameters, skipped steps of
-// the skew), or (-1, -1) if the vector is not updated. A vector is updated if one of its splats is visible (depth_key [n],
-// cl/render/project.cl) or if it reached the maximum age. last [2, vectors] holds the step counts up to which a vector is
-// done. It becomes the counts after the coming step; base_steps and skew_steps are the counts before it.
+// Selects the vectors that step now. A vector steps if one of its splats is visible (depth_key [n],
+// cl/render/project.cl) or if it has the maximum age. ages gets the numbers of skipped steps of the base parameters and
+// of the skew, or (-1, -1) if the vector does not step. last [2, vectors] holds the step counts that each vector has
+// reached; those of selected vectors become the counts after the next step. base_steps and skew_steps are the counts
+// before the next step.
 kernel void wake_visible(
     global const uint *restrict depth_key,
     global uint *restrict last,
@@ -48,7 +50,7 @@ kernel void wake_visible(
     const int2 age = {(int)(base_steps - last[v]), (int)(skew_steps - last[vectors + v])};
     uint awake = max(age.x, age.y) >= ADAM_WAITS - 1;
     if (!awake) {
-        uint key = CULLED_KEY;  // all bits are set
+        uint key = CULLED_KEY;  // all bits are set, so `&` keeps it only if all splats are culled
         for (uint l = 0; l < LANES; ++l) key &= depth_key[min(first + l, n_splats - 1)];
         awake = key != CULLED_KEY;
     }
@@ -58,7 +60,7 @@ kernel void wake_visible(
     last[vectors + v] = skew_steps + skew_learns;
 }
 
-// Selects all vectors; no step follows. `last` is not changed.
+// Selects all vectors to do their skipped steps only. `last` does not change.
 kernel void wake_all(
     global const uint *restrict last,
     global int2 *restrict ages,
@@ -73,8 +75,8 @@ kernel void wake_all(
     ages[v] = v * LANES < n_splats ? age : (int2)(-1, -1);
 }
 
-// Does the skipped steps of the selected vectors: of the colour, of the geometry except the skew, and of the skew.
-// Global sizes are those of step_color, step_geometry (with first_part = 0) and step_skew.
+// The three settle kernels do the skipped steps of the selected vectors: of the colour, of the geometry except the
+// skew, and of the skew. Global sizes are those of step_color, step_geometry (with first_part = 0) and step_skew.
 kernel void settle_color(
     global real *restrict sh,
     global real *restrict sh_m,
@@ -140,7 +142,7 @@ kernel void settle_skew(
 }
 #endif
 
-// The kernels of optim.cl for the selected vectors.
+// The step kernels of optim.cl for the selected vectors only.
 kernel void step_visible_color(
     global real *restrict sh,
     global const real *restrict grad_sh,

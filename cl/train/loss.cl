@@ -1,15 +1,16 @@
 // loss.cl: (1 - lambda) L1 + lambda (1 - SSIM), its value and gradient with respect to the rendered image.
 //
 // SSIM: 11 x 11 Gaussian window, sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, zero padding, mean over pixels and channels
-// (Wang et al. 2004, as 3DGS uses it), written in sum s = x + y and difference d = x - y of rendered x and truth y.
-// With means m of the window and half variances h = (E[s^2] - m_s^2) / 2, likewise for d:
+// (Wang et al. 2004, with the constants of 3DGS). The formulas use the sum s = x + y and the difference d = x - y of
+// the rendered image x and the truth y. m is the mean over the window and h half the variance, (E[s^2] - m_s^2) / 2:
 //   2 m_x m_y = (m_s^2 - m_d^2) / 2    m_x^2 + m_y^2 = (m_s^2 + m_d^2) / 2
 //   2 cov = h_s - h_d                  var_x + var_y = h_s + h_d
-// Four maps to blur instead of five, and where x is close to y less cancels.
+// So four maps are blurred instead of five, and fewer digits cancel if x is close to y.
 //
-// A work-item goes down `segment` rows of a strip of up to STRIP vectors (one vector if LANES is 1). It blurs each row, keeps
-// the last 11 rows in a ring, and blurs the columns from there. So no blurred map is stored. Global size: (at least the
-// strips, segments, 3 channels). Images are planar with a zero margin (rasterize.cl); the truth has bytes.
+// A work-item computes `segment` rows of a strip, from the top. A strip has up to STRIP vectors (one vector if LANES is
+// 1). The work-item blurs each row, keeps the last 11 rows in a ring, and blurs the columns of the ring. So no blurred
+// map is stored. Global size: (at least the strips, segments, 3 channels). Images are planar with a zero margin
+// (rasterize.cl); the truth has bytes.
 
 #define SSIM_C1 R(0.0001)
 #define SSIM_C2 R(0.0009)
@@ -18,8 +19,8 @@
 #define TAPS 11
 #define SIDE ((REACH + LANES - 1) / LANES)  // vectors that the window reaches beyond a strip
 
-// The ring [RING][STRIP][maps]. Each row is written twice, 11 slots apart, so the last 11 rows are always contiguous. With
-// one lane the rows move up instead: then every index is a constant and the ring fits into registers.
+// The ring is [RING][STRIP][maps]. Each row is written twice, 11 slots apart, so the last 11 rows are always
+// contiguous. With one lane the rows move up instead. Then every index is a constant, and the ring fits into registers.
 #define SHIFT (LANES == 1)
 #define RING (SHIFT ? TAPS : 2 * TAPS)
 #define SLOT (SHIFT ? TAPS - 1 : slot)
@@ -31,19 +32,19 @@
 
 #define truth_load(p) (lanes_uchar_to_real(p) * (real)(1.0 / 255.0))
 
-// pair(weight, k) for the two pixels at distance k from the centre; written out because not every compiler unrolls.
+// Expands to pair(weight, k) for each distance k of two pixels from the centre. Not every compiler unrolls a loop here.
 #define PAIRS_OF_WINDOW(pair) pair(WINDOW_4, 1) pair(WINDOW_3, 2) pair(WINDOW_2, 3) pair(WINDOW_1, 4) pair(WINDOW_0, 5)
 
-// The part of the image of a work-item.
+// The part of the image that a work-item computes.
 typedef struct {
     int first, n;  // vectors of a row
     int top, end;  // rows
-    ulong at;      // place of the strip in row 0
+    ulong at;      // index of the strip's first pixel in row 0
 } strip;
 
 static inline int strips_of(int stride) { return ((stride - 2 * MARGIN_X) / LANES + STRIP - 1) / STRIP; }
 
-// The strip of this work-item. The widths of strips differ by one vector at most.
+// Returns the strip of this work-item. The widths of strips differ by one vector at most.
 static inline strip item_strip(int height, int stride, ulong plane, int segment) {
     const int vecs = (stride - 2 * MARGIN_X) / LANES, strips = strips_of(stride), i = get_global_id(0);
     strip item;
@@ -55,7 +56,8 @@ static inline strip item_strip(int height, int stride, ulong plane, int segment)
     return item;
 }
 
-// Overwrites planes of bytes with a zero margin, from 8-bit interleaved rows of `channels`. Global size: (stride, rows).
+// Overwrites planes of bytes with a zero margin, from 8-bit interleaved rows of `channels`.
+// Global size: (stride, rows).
 kernel void unpack_image(
     global const uchar *restrict bytes,
     global uchar *restrict truth,
@@ -166,7 +168,7 @@ kernel void image_loss(
     partial[2 * n_parts + part] = lanes_sum(squares);
 }
 
-// Overwrites v_color with the gradient of the loss. It blurs v_maps: the window is symmetric, so it is its own adjoint.
+// Overwrites v_color with the gradient of the loss. It blurs v_maps, because a symmetric window is its own adjoint.
 // l1_scale = (1 - lambda) / count, ssim_scale = lambda / count.
 kernel void image_loss_vjp(
     global const real *restrict rendered,

@@ -1,9 +1,9 @@
 // optim.cl: one Adam step of colour, geometry and skew, with regularisers and the chain rule of the skew map.
-// The NumPy form is clsplat/training/optim/reference.py; a test compares both step by step.
-// All buffers are [rows, capacity], one column for each splat. A work-item steps LANES splats.
+// The NumPy form is clsplat/training/optim/reference.py; a test compares both after each step.
+// All buffers are [rows, capacity] with one column for each splat. A work-item steps LANES splats.
 
-// One step of coefficient k of the colour. grad_sh [6, capacity] holds the gradient of the colour and the view direction
-// (cl/render/project.cl); the gradient of the coefficient is the product of both with the basis.
+// Steps coefficient k of the colour. grad_sh [6, capacity] holds the gradient of the colour and the view direction
+// (cl/render/project.cl). The gradient of the coefficient is the gradient of the colour times the basis function.
 static inline void step_coefficient(
     uint k,
     int degree,
@@ -53,8 +53,8 @@ kernel void step_color(
     color_step(sh, grad_sh, sh_m, sh_v, capacity, sh_degree, lr, rest_lr, correct1, correct2);
 }
 
-// A geometry step has four parts. Each part reads and writes its own rows, so that few streams of memory are open at a
-// time. PART_OWN holds the opacities and the fields of the shape, except the skew.
+// A geometry step has four parts. Each part reads and writes different rows, so that few memory streams are open at the
+// same time. PART_OWN holds the opacities and the fields of the shape, except the skew.
 static inline uint2 part_rows(uint part) {
     switch (part) {
     case PART_MEAN:
@@ -73,7 +73,7 @@ static inline uint2 part_rows(uint part) {
     }
 }
 
-// Adds the gradients of the regularisers to g, the gradients of the rows of a part.
+// Adds the gradients of the regularisers to g, which holds the gradients of the rows of a part.
 // 3DGS-MCMC: opacity_scale * sum(|opacity|) + scale_scale * sum(scale). With two opacities, |opacity| is their mean.
 // 3DSGS: bisect_scale * sum((one opacity - other opacity)^2).
 static inline void regularise(
@@ -101,9 +101,9 @@ static inline void regularise(
     }
 }
 
-// Steps the geometry except the skew. rates [3, GEOM_ROWS]: the rate of each row, and the bounds of fields that are
-// optimised in log space (0, 0 for the others). The rate of the means is mean_lr.
-// Global size: (capacity / LANES, number of parts from first_part on). SGHMC moves the means itself: first_part = 1.
+// Steps the geometry except the skew. rates [3, GEOM_ROWS] holds the rate of each row and two bounds. The bounds are
+// those of fields that are optimised in log space, and 0 for the others. The rate of the means is mean_lr.
+// Global size: (capacity / LANES, number of parts from first_part on). first_part is 1 if SGHMC moves the means.
 static inline void geometry_step(
     global real *geom,
     global const real *grad_geom,
@@ -202,8 +202,8 @@ kernel void step_skew(
 }
 
 #if SKEW_ROTATES
-// For a map that depends on the rotation: turns the gradient of the skew into the world's frame, in place. Adds the part
-// of the rotation to the gradient of the quaternion. Runs before step_geometry.
+// For maps that depend on the rotation. Turns the gradient of the skew into the world's frame, in place. Adds the
+// gradient through the rotation to the gradient of the quaternion. Runs before step_geometry.
 kernel void turn_skew_gradient(
     global const real *restrict geom,
     global real *restrict grad_geom,

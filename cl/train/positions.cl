@@ -1,7 +1,7 @@
-// positions.cl: steps of the means that are not Adam's: SGHMC, and the exploration noise of 3DGS-MCMC.
+// positions.cl: steps of the means besides Adam: SGHMC, and the exploration noise of 3DGS-MCMC.
 // The NumPy forms are clsplat/training/optim/sghmc.py and tests/reference/noise.py.
 
-// One SGHMC step of the means. momentum is [3, capacity]; sghmc.py has the formula and the coefficients.
+// Does one SGHMC step of the means. momentum is [3, capacity]; sghmc.py has the formula and the coefficients.
 kernel void sghmc_step(
     global real *restrict geom,
     global const real *restrict grad_geom,
@@ -38,8 +38,9 @@ kernel void sghmc_step(
     }
 }
 
-// mean += Sigma (xi gate amount), with Sigma = R S S R' and gate = sigmoid(0.5 - 100 opacity) (3DGS-MCMC, Kheradmand et
-// al. 2024). The length of the step is at most `reach`: a longer step could move a large splat out of the scene for good.
+// Adds noise to the means: mean += Sigma (xi gate amount), with Sigma = R S S R' and gate = sigmoid(0.5 - 100 opacity)
+// (3DGS-MCMC, Kheradmand et al. 2024). The length of the step is at most `reach`. A longer step could move a large
+// splat out of the scene, and it would not come back.
 kernel void mcmc_noise(
     global real *restrict geom,
     ulong capacity,
