@@ -1,4 +1,4 @@
-"""The state of a run between two iterations, in one file that is written whole or not at all."""
+"""Checkpoints: the state of a run between two iterations, in one file that is replaced only by a complete one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ VERSION = 2
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Everything that the rest of a run depends on.
+    """The state that the rest of a run depends on.
 
     Parameters
     ----------
@@ -31,10 +31,10 @@ class Checkpoint:
     splats : public arrays by field.
     optimizer : the optimizer's state by key.
     rng : state of the NumPy generator, as JSON.
-    queue : training views left in this epoch.
+    queue : training views that remain in this epoch.
     seconds : training time so far.
     schedule : schedule of the kernels, which their rounding depends on.
-    n_first : number of splats at the start, which the growth depends on.
+    n_first : number of splats at the start of the run, which the growth depends on.
     signals : (3, N) densification statistics (SplatStatistics).
     """
 
@@ -50,7 +50,7 @@ class Checkpoint:
     signals: Array
 
     def save(self, path: Path) -> None:
-        """Write the file. If that fails, raise OutputError and keep the old file."""
+        """Write the checkpoint to a file. If that fails, raise OutputError and keep the old file."""
         meta = {
             "version": VERSION,
             "iteration": self.iteration,
@@ -70,7 +70,7 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:
-        """Read the file; raise InputError if it is missing, damaged or of another version."""
+        """Return the checkpoint in a file. Raise InputError if it is missing, damaged or of another version."""
         try:
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
@@ -105,9 +105,9 @@ class Checkpoint:
         return checkpoint
 
     def _check(self) -> None:
-        """Raise one of _DAMAGE if a value cannot be what `save` wrote.
+        """Raise one of _DAMAGE if `save` cannot have written a value.
 
-        The zip's checksums find damaged bytes. This finds a file that another program made.
+        The zip's checksums find damaged bytes. This check finds files of other programs.
         """
         for name, kind in _KINDS.items():
             value = getattr(self, name)

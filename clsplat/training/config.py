@@ -26,9 +26,9 @@ from .options.groups import (
 )
 from .options.option import Option, OptionGroup, check_options, option, option_table
 
-# Options that change nothing in the result: runs that differ only in these are the same run.
+# Options without an effect on the result. Runs that differ only in these are the same run.
 FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
-REMOVED_OPTIONS = {"sampling": "opacity"}  # options of earlier versions, with the value that old files may have
+REMOVED_OPTIONS = {"sampling": "opacity"}  # options of earlier versions, with the only value that is still accepted
 PUBLISHED_ITERATIONS = 30_000  # run length for which 3DGS's learning rates were published
 
 
@@ -66,8 +66,8 @@ class TrainConfig:
     )
     antialiased: bool = option(
         False,
-        help="Lower the opacity of small splats by as much as the screen filter widens them (Mip-Splatting). The "
-        "model then looks alike at other image sizes.",
+        help="Lower the opacity of small splats by the factor by which the screen filter enlarges them "
+        "(Mip-Splatting). The model then looks similar at other image sizes.",
     )
     background: Color = option(BLACK, help="Colour behind the splats, each part 0 to 1.", metavar="R,G,B")  # noqa: RUF009
     random_background: bool = option(
@@ -117,7 +117,7 @@ class TrainConfig:
 
     @property
     def skew_map(self) -> str:
-        """The skew map in use, with "auto" resolved; "" for shapes without a skew."""
+        """Name of the skew map in use: never "auto", and "" for shapes without a skew."""
         return map_named(self.optim.skew_map, shape_named(self.shape).skew_form)
 
     def rate_factor(self, field: str) -> float:
@@ -130,11 +130,11 @@ class TrainConfig:
         return float(max(1.0, PUBLISHED_ITERATIONS / self.iterations) ** power)
 
     def replace(self, **options: Any) -> TrainConfig:
-        """Return a copy with other values of some options, by the names that the constructor takes."""
+        """Return a copy with other values of some options. The names are those of the constructor."""
         return dataclasses.replace(self, **options)
 
     def without_effect(self, names: Iterable[str]) -> list[str]:
-        """Return those of some options that only the other strategy has."""
+        """Return the options of `names` that have no effect, because only the other strategy has them."""
         return [name for name in names if name in STRATEGY_OPTIONS and name not in option_table(type(self.density))]
 
     def to_json(self) -> dict[str, Any]:
@@ -150,7 +150,7 @@ class TrainConfig:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> TrainConfig:
-        """Return the config of a flat dictionary, as `to_json` gives it. Options that are missing have their defaults.
+        """Return the config of a flat dictionary in the form of `to_json`. Missing options have their defaults.
 
         Raises
         ------
@@ -160,7 +160,7 @@ class TrainConfig:
 
 
 def read_options(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a JSON object as arguments of `TrainConfig`: types are checked, lists become tuples.
+    """Return the options of a JSON object as arguments of `TrainConfig`, with checked types and lists as tuples.
 
     Raises
     ------
@@ -181,9 +181,10 @@ def read_options(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _density_of(options: Mapping[str, Any]) -> Adc | Mcmc:
-    """Return the group `density`: the one in `options` or the default, with the options that are there by name.
+    """Return the group `density` that the arguments of `TrainConfig` describe.
 
-    If `strategy` names another strategy than the group's, the new group keeps the values of the shared options.
+    It is the group in `options`, or the default one, changed by the single options. If `strategy` names another
+    strategy than that of the group, the new group keeps the values of the shared options.
     """
     group: Adc | Mcmc | None = options.get("density")
     name = options.get("strategy", DEFAULT_STRATEGY if group is None else group.strategy)
@@ -197,7 +198,10 @@ def _density_of(options: Mapping[str, Any]) -> Adc | Mcmc:
 
 
 def _run_options() -> dict[str, Option]:
-    """Return the attributes of `TrainConfig`, and the name of the strategy, which the class of its group defines."""
+    """Return the options that are attributes of `TrainConfig`, and the option `strategy`.
+
+    The strategy is not an attribute of its own: the class of the group `density` defines it.
+    """
     strategy = Option(
         "strategy",
         str,
@@ -209,7 +213,7 @@ def _run_options() -> dict[str, Option]:
     return option_table(TrainConfig) | {"strategy": strategy}
 
 
-# The groups besides `density`, by their attribute.
+# All groups except `density`, by the name of their attribute.
 GROUPS: dict[str, type[OptionGroup]] = {
     "start": StartConfig,
     "schedule": ScheduleConfig,
@@ -235,5 +239,5 @@ def _sections() -> dict[str, tuple[Option, ...]]:
 
 
 SECTIONS = _sections()
-# All options by their flat name.
+# All options by name.
 OPTIONS = {definition.name: definition for section in SECTIONS.values() for definition in section}

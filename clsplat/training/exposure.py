@@ -107,7 +107,10 @@ class ExposureLoss:
         return result
 
     def exposures(self) -> NDArray[np.floating]:
-        """Return (views, 3, 4): photo = [:, :3] render + [:, 3]. The identity if exposures are not learned."""
+        """Return the exposures E of all views, (views, 3, 4); the identity if exposures are not learned.
+
+        A photo has the colours E[:, :3] render + E[:, 3].
+        """
         if not self.in_use:
             return np.tile(_IDENTITY, (len(self.targets.views), 1, 1))
         return self._download().reshape(-1, 3, 4)
@@ -117,7 +120,7 @@ class ExposureLoss:
         return {_KEY: self._download()} if self.learns else {}
 
     def load_state(self, state: dict[str, NDArray[Any]]) -> None:
-        """Remove the entries of `state` from a larger state and continue from them.
+        """Continue from the exposures in `state`, and remove them from it.
 
         Raises
         ------
@@ -149,7 +152,7 @@ def exposure_bytes(layout: ImageLayout, itemsize: int, config: TrainConfig, chan
 def exposures_json(names: Sequence[str], exposures: NDArray[np.floating]) -> dict[str, list[list[float]]]:
     """Return the content of 3DGS's exposure.json by photo name.
 
-    The file holds [:, :3] transposed, because 3DGS multiplies colours from the left.
+    The file holds the matrices E[:, :3] transposed, because 3DGS multiplies colours from the left.
     """
     written = np.concatenate([exposures[:, :, :3].transpose(0, 2, 1), exposures[:, :, 3:]], axis=2)
     return dict(zip(names, written.tolist(), strict=True))

@@ -18,7 +18,7 @@ _ITERATION = re.compile(r"iteration_(\d+)")
 
 
 def scene_record(scene: Scene) -> dict[str, Any]:
-    """Values by which a run's scene can be read again: its path, its test views and `load_scene`'s arguments."""
+    """Return what is needed to read a run's scene again: its path, its test views and the arguments of `load_scene`."""
     return {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names), **scene.reading}
 
 
@@ -49,7 +49,7 @@ class ModelFolder:
         return self.path / "checkpoint.npz"
 
     def ply_path(self, iteration: int) -> Path:
-        """File of an iteration's point cloud."""
+        """Return the path of an iteration's point cloud."""
         return self.path / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
     @property
@@ -67,7 +67,7 @@ class ModelFolder:
         return sorted(found)
 
     def latest_ply(self, iteration: int | None = None) -> tuple[Path, int]:
-        """Return the point cloud of an iteration, or the last, and its iteration; raise InputError if there is none."""
+        """Return the file and the iteration of a point cloud, by default the last. Raise InputError without one."""
         found = self.iterations()
         if not found:
             raise InputError(f"{self.path}: no point_cloud/iteration_N/point_cloud.ply in it: train a model first")
@@ -105,7 +105,7 @@ class ModelFolder:
                 ply.parent.rmdir()
 
     def write_run(self, config: dict[str, Any], scene: Scene) -> None:
-        """Write config.json: the run's options and the record of its scene."""
+        """Write the run's options and the record of its scene to config.json."""
         self.write_config({"config": config, "scene": scene_record(scene)})
 
     def write_config(self, values: dict[str, Any]) -> None:
@@ -113,7 +113,7 @@ class ModelFolder:
         write_json(self.config_path, values)
 
     def read_config(self) -> dict[str, Any]:
-        """Read config.json; raise InputError if it is missing or damaged."""
+        """Return the values in config.json. Raise InputError if it is missing or damaged."""
         return read_object(self.config_path)
 
     def write_cameras(self, named: list[NamedCamera]) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..scenes.scene import Scene
 
 RANDOM_POINTS = 100_000  # 3DGS
-MIN_POINT_SHARE = 0.1  # scenes with fewer points than this share of the cap get random points added
+MIN_POINT_SHARE = 0.1  # scenes with fewer points than this share of the cap get additional random points
 MIN_POINTS = 4  # the first scale needs a point and its three neighbours
 _MAX_NEAR_SHARE = 0.1  # largest share of the visible points that may be nearer than the near plane
 _SAMPLED_POINTS = 2000  # points that are tested against the near plane
@@ -39,7 +39,7 @@ def initial_splats(
     opacity: float,
     scale_factor: float,
 ) -> tuple[Splats, str]:
-    """Return the first splats, and one sentence on where they come from.
+    """Return the first splats, and a sentence that names their source.
 
     Splats from points follow a Morton curve. Splats of a model keep their order.
 
@@ -50,14 +50,15 @@ def initial_splats(
     cap : largest number of splats. The points with the longest tracks are kept, or the most opaque splats of a model.
     init : "sfm", "random", or the path of a .ply model. "sfm" without points becomes "random", with a message.
     seed : seed of random points and of the first skew.
-    random_share : random points that are added to those of "sfm", as a fraction of the cap. None: a tenth if the scene
-        has fewer points than that, otherwise 0.
-    opacity, scale_factor : properties of splats from points; scale = factor * distance to the three nearest points.
+    random_share : number of random points that are added to those of "sfm", as a fraction of the cap. None: a tenth if
+        the scene has fewer points than that, otherwise 0.
+    opacity, scale_factor : properties of splats from points. The scale is the factor times the mean distance to the
+        three nearest points.
 
     Raises
     ------
-    InputError : cap below 1, or an unknown `init`; a model that is unreadable, or whose normalisation or antialiasing
-        differs; a scene so small that it is nearer than the near plane.
+    InputError : the cap is below 1; `init` is unknown; the model is unreadable, or has another normalisation or
+        antialiasing; or the scene is so small that it is nearer than the near plane.
     """
     if cap < 1:
         raise InputError(f"cap {cap}: at least 1 splat is needed")
@@ -86,7 +87,7 @@ def initial_splats(
 def _points(
     scene: Scene, init: str, cap: int, rng: np.random.Generator, random_share: float | None
 ) -> tuple[Array, NDArray[np.uint8], str]:
-    """Return positions, colours and the message."""
+    """Return the positions and colours of the first points, and the message."""
     points = scene.points
     n_points = len(points.xyz)
     apart = distinct(points.xyz)
@@ -136,7 +137,7 @@ def distinct(xyz: Array) -> NDArray[np.int64]:
 
 
 def check_size(scene: Scene) -> None:
-    """Raise InputError if too much of the scene is nearer than the near plane: it cannot be rendered."""
+    """Raise InputError if too much of the scene is nearer than the near plane, where nothing is rendered."""
     xyz = scene.points.xyz[:: -(-len(scene.points.xyz) // _SAMPLED_POINTS) or 1]
     depths = [depth[inside] for depth, inside in (seen(view.camera, xyz) for view in scene.train)]
     depth = np.concatenate(depths) if depths else np.zeros(0)
@@ -152,9 +153,10 @@ def check_size(scene: Scene) -> None:
 def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene: Scene) -> NDArray[np.int64]:
     """Return the indices of `cap` points with long tracks that cover the scene, in rising order.
 
-    Half of them are the best observed points of each cell of a grid. The rest are the longest tracks that remain. Track
-    length alone would take all points from a textured surface and leave the background empty. Space is contracted
-    around the cameras (Barron et al. 2022, Mip-NeRF 360, eq. 10), so that far points share larger cells.
+    Half of them are the points with the longest tracks in the cells of a grid. The others have the longest of the
+    remaining tracks. By track length alone, all points could come from a textured surface, and none from the
+    background. Space is contracted around the cameras (Barron et al. 2022, Mip-NeRF 360, eq. 10), so that far points
+    share larger cells.
     """
     centres = np.array([view.camera.position for view in scene.train])
     from_centre = (xyz - centres.mean(axis=0)) / scene.extent
@@ -179,7 +181,7 @@ def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene
 def _from_model(
     path: str, shape: str, cap: int, sh_degree: int, normalisation: str, antialiased: bool
 ) -> tuple[Splats, str]:
-    """Return the splats of a file with this shape, SH degree and largest number, and a message."""
+    """Return the splats of a file, converted to the shape and SH degree and reduced to the cap, and a message."""
     loaded = Splats.load(path)
     if loaded.skew.any() and loaded.normalisation != normalisation:
         raise InputError(
@@ -203,7 +205,7 @@ def _from_model(
 
 
 def _fit_bands(sh: Array, coefficients: int) -> Array:
-    """Return colour (N, K, 3) with `coefficients` instead of K: higher bands are removed, or zero."""
+    """Return colour (N, K, 3) with `coefficients` instead of K: bands are removed, or added with zeros."""
     fitted = np.zeros((len(sh), coefficients, 3), sh.dtype)
     shared = min(coefficients, sh.shape[1])
     fitted[:, :shared] = sh[:, :shared]
@@ -211,7 +213,10 @@ def _fit_bands(sh: Array, coefficients: int) -> Array:
 
 
 def _started(splats: Splats, rng: np.random.Generator) -> Splats:
-    """Return splats with start values in fields whose neutral value has no gradient, if all splats have that value."""
+    """Return the splats with start values instead of neutral values without a gradient.
+
+    A field changes only if all splats have its neutral value.
+    """
     arrays = splats.to_numpy()
     for field in splats.schema:
         values = arrays[field.name]

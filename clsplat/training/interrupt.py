@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C that lets an iteration end."""
+"""Handling of Ctrl-C: a run ends after the current iteration."""
 
 from __future__ import annotations
 

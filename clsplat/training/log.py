@@ -1,4 +1,4 @@
-"""A run's log.jsonl, and the values for a progress display."""
+"""The log of a run (log.jsonl), and the values for a progress display."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Progress:
 
     Attributes
     ----------
-    iteration, iterations : done, and in all.
-    loss, psnr : of the last training image; PSNR in dB.
+    iteration, iterations : number of iterations done, and their total number.
+    loss, psnr : loss and PSNR [dB] of the last training image.
     seconds : training time, without evaluations.
-    per_second : iterations a second.
+    per_second : iterations per second.
     message : text to show instead of these values.
     """
 
@@ -54,8 +54,8 @@ class RunLog:
                     if json.loads(line)["iteration"] <= iteration:
                         kept.append(line + b"\n")
                 except (ValueError, KeyError, TypeError):
-                    continue  # a crash cut this line short
-        with atomic_writer(path) as stream:  # a crash while it is written loses nothing
+                    continue  # a crash interrupted the writing of this line
+        with atomic_writer(path) as stream:  # keeps the old file if the program crashes here
             stream.writelines(kept)
         self._stream = self._guard(lambda: path.open("a"))
 

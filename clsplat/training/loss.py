@@ -15,7 +15,7 @@ from ..rendering.build import KernelBuild
 from ..rendering.frame import DeviceImage, ImageLayout
 from .programs import loss_program, loss_strip
 
-_MIN_ROWS = 32  # rows of a work-item; it also blurs ten rows outside of them
+_MIN_ROWS = 32  # minimum rows of a work-item, which also blurs ten rows outside of them
 _ITEMS_PER_UNIT = {"CPU": 6, "GPU": 2048}  # enough work-items that no compute unit waits long for the last one
 
 
@@ -80,7 +80,7 @@ class ImageLoss:
         self._evaluations = 0
 
     def evaluate(self, layout: ImageLayout, rendered: Buffer, target: Buffer, unmasked: float = 1.0) -> LossResult:
-        """Compute the loss and its gradient with respect to the image; does not wait for the device.
+        """Return the loss and its gradient with respect to the image, without waiting for the device.
 
         Parameters
         ----------
@@ -119,7 +119,7 @@ class ImageLoss:
         return LossResult(v_color, partial, n_parts, count, unmasked, self._evaluations)
 
     def value(self, result: LossResult) -> LossValue:
-        """Return the values of the latest evaluation; waits for the device.
+        """Return the values of the latest evaluation after waiting for the device.
 
         Raises
         ------
@@ -133,7 +133,7 @@ class ImageLoss:
         return LossValue(total, l1 / result.unmasked, 1 - (1 - ssim) / result.unmasked, mse / result.unmasked)
 
     def _rows(self, strips: int, height: int) -> int:
-        """Return the rows of a work-item: as many as possible while every compute unit still has work."""
+        """Return the number of rows of a work-item: the largest that still leaves work for every compute unit."""
         info = self.device.info
         items = info.compute_units * _ITEMS_PER_UNIT["CPU" if info.type == "CPU" else "GPU"]
         return max(-(-height // -(-items // (3 * strips))), _MIN_ROWS)

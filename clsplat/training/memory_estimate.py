@@ -19,17 +19,17 @@ from .exposure import exposure_bytes
 from .optim.skew_map import SkewMap
 from .targets import target_budget, target_bytes, target_channels
 
-# A parameter has a value, a gradient, two moments and a spare copy. The gradient of colour is compact.
+# A parameter has a value, a gradient, two moments and a spare copy. The colour does not have a gradient of full size.
 _ROLES = 5
-# Planes of an image: colour and transmittance, both once more for bands, gradients of the SSIM maps, v_color.
+# Planes of an image: colour and transmittance, the same for rendering in bands, gradients of the SSIM maps, v_color.
 _IMAGE_PLANES = 4 + 4 + 9 + 3
-# Splat-tile pairs of an image: about 100 for each tile, and 4 for each splat. Runs on real scenes end with fewer.
+# Splat-tile pairs of an image: 100 for each tile and 4 for each splat, more than real scenes have at the end of a run.
 _ISECTS_PER_TILE, _ISECTS_PER_SPLAT = 100, 4
 _MIN_ISECTS = 1 << 20  # isects that must fit; images with more are rendered in bands
 # Words of a splat on the screen: key, order, two rectangles (6), two pairs (4), range of isects (2), statistics (3),
 # tile counts (4).
 _SCREEN_WORDS = 21
-_WAITING_WORDS = 4  # words of a splat with `visible_adam`, if a vector is one splat
+_WAITING_WORDS = 4  # additional words of a splat with `visible_adam`, if a vector has one splat
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def peak_bytes() -> int:
 
 
 def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, target_bytes: int) -> Estimate:
-    """Return the memory at the cap, for the largest image. The number of splat-tile pairs is an estimate."""
+    """Return the memory of a run with the maximum number of splats and the largest image."""
     real, n = kernels.dtype.itemsize, capacity_for(config.cap_max)
     rows = {group: kernels.schema.rows(group) for group in Group}
     screen = (kernels.record + kernels.v_record) * real + 4 * (
@@ -78,7 +78,7 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, tar
     )
     isect = isect_bytes(kernels)
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
-    extra = 6 * SkewMap(config.skew_map).width if config.skew_map else 0  # s, moments, and a spare of each
+    extra = 6 * SkewMap(config.skew_map).width if config.skew_map else 0  # s and two moments, with spare copies
     extra += 0 if config.sghmc.position_optimizer == "adam" else 6  # momentum
     buffers = [rows[Group.SH] * n * real, 9 * layout.plane * real]
     splat = _ROLES * rows[Group.GEOM] + (_ROLES - 1) * rows[Group.SH] + COMPACT_ROWS + extra
@@ -92,7 +92,7 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, tar
 
 
 def run_memory(device: Device, kernels: KernelBuild, config: TrainConfig, views: Sequence[View]) -> Estimate:
-    """Return the memory estimate of a run on these training views; raises DeviceError if the device has too little."""
+    """Return the memory estimate of a run on these views. Raise DeviceError if the device has too little memory."""
     largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
     layout = ImageLayout(largest.width, largest.height)
     channels = target_channels(views, config.random_background)
@@ -105,12 +105,12 @@ def run_memory(device: Device, kernels: KernelBuild, config: TrainConfig, views:
 
 
 def room_for_isects(needed: Estimate, device: Device) -> int:
-    """Return the number of isects that fit next to splats and images. Growing buffers need half as much again."""
+    """Return the number of isects that fit besides splats and images. Buffers may be larger by half as they grow."""
     return max(device.info.global_mem_bytes - needed.splats - needed.images, 0) * 2 // (3 * needed.isect)
 
 
 def check(needed: Estimate, device: Device) -> None:
-    """Raise DeviceError if splats, images and a minimum of isects do not fit the device."""
+    """Raise DeviceError if splats, images and _MIN_ISECTS isects do not fit into the device's memory."""
     info = device.info
     remedy = "lower --cap-max, use smaller images (-r 2, 4, 8), a lower --sh-degree, or another --device"
     if needed.total > info.global_mem_bytes and room_for_isects(needed, device) < _MIN_ISECTS:

@@ -18,10 +18,10 @@ class Model:
     ----------
     iteration : iterations done; fewer than the config's if the run was interrupted.
     seconds : training time, without evaluations.
-    peak_bytes : host memory at its peak. On a CPU device it includes the device memory.
+    peak_bytes : peak of the host memory. On a CPU device it includes the device memory.
     device_bytes : memory of the pools of buffers.
     evaluations : metrics of the test views by iteration, for the config's `test_iterations`.
-    evaluation_seconds : training time at each evaluation.
+    evaluation_seconds : training time before each evaluation.
     path : the model folder, or None.
     """
 

@@ -1,10 +1,10 @@
 """Presets: the published systems as options of `TrainConfig`, each constant with its source.
 
 A preset sets the kernel, the optimizer, the strategy and the published constants. It does not set the cap, the number
-of iterations or the image schedule: these are equal for all systems of a comparison. Published learning rates belong
-to runs of 30 000 iterations, as the defaults do (`TrainConfig.rate_factor`). Times within a run are fractions of the
-published run length. "Code" is the authors' release. It takes precedence over the paper, because the published results
-come from it.
+of iterations or the image schedule, which are equal for all systems of a comparison. Published learning rates and the
+defaults belong to runs of 30 000 iterations (`TrainConfig.rate_factor`). Times within a run are fractions of the
+published run length. "Code" means the constants of the authors' release. They replace those of the paper, because the
+published results come from the release.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..errors import InputError
 
 Values = dict[str, Any]
 
-# The options that make a system what it is: a flag may repeat them, but not change them.
+# Options that define a system: a flag may repeat their values, but not change them.
 IDENTITY = ("shape", "normalisation", "strategy", "position_optimizer", "alternation", "skew_map")
 
 # 3DGS, code: learning rates (opacity 0.025 since October 2024), and the loss 0.8 L1 + 0.2 (1 - SSIM).
@@ -31,7 +31,7 @@ _RATES = {
     "bisect_reg": 0.0,
     "random_points": 0.0,
 }
-# 3DGS, code: every 100 iterations from 500 to 15 000 of 30 000, opacities are reset every 3000 iterations.
+# 3DGS, code: densification every 100 iterations from 500 to 15 000 of 30 000, opacity reset every 3000 iterations.
 _CLONE_AND_SPLIT = {
     "strategy": "adc",
     "densify_from": 500 / 30_000,
@@ -47,7 +47,7 @@ _CLONE_AND_SPLIT = {
     "scale_reg": 0.0,
     "noise_lr": 0.0,
 }
-# 3DGS-MCMC, code: every 100 iterations from 500 to 25 000 of 30 000.
+# 3DGS-MCMC, code: densification every 100 iterations from 500 to 25 000 of 30 000.
 _RELOCATE = {
     "strategy": "mcmc",
     "densify_from": 500 / 30_000,
@@ -75,7 +75,7 @@ _SGHMC = {
 def _gaussian_splatting() -> Values:
     """3DGS (Kerbl et al., SIGGRAPH 2023), code.
 
-    The position rate is times the scene extent. Colour bands above the constant have a twentieth of the colour rate.
+    The scene extent multiplies the position rate. Colour bands above the constant have a twentieth of the colour rate.
     Regularisers and noise are off. The first opacity is 0.1, the first scale the distance to three neighbours.
     A splat densifies if its mean gradient is above 2e-4: it is cloned below 0.01 of the extent, and split above.
     """
@@ -120,7 +120,7 @@ def _mcmc() -> Values:
     Learning rates are those of 3DGS. The regularisers of opacity and scale have weight 0.01 each (opacity 0.001 for
     drjohnson), the noise is 5e5 times the position rate. The first opacity is 0.5, the first scale a tenth of the
     distance to the neighbours. Each step relocates all dead splats, with the Gaussian's coefficient for opacity and
-    scale, and adds 5 %.
+    scale, and adds 5 % of the splats.
     """
     return {"shape": "gaussian"} | _ADAM | _RATES | _RELOCATE
 
@@ -131,14 +131,14 @@ def _student_t() -> Values:
     The opacity rate is 5e-3. The regularisers have weight 0.01 each (opacity 0.005 for Deep Blending). The first
     opacity is 0.5, the first scale a tenth of the distance to the neighbours.
 
-    SGHMC is as written: C = 120 (100 for Deep Blending) after a burn-in of 7000 iterations with 5e5. Bicycle and stump
-    use 15 000 iterations with 5e8. Fractions are of 30 000 iterations, over which its rate decays, though most scenes
-    ran 40 000. Each step relocates at most 5 % of the splats, their scale by the square of the coefficient, and adds
-    5 %.
+    SGHMC has the published form: C = 120 (100 for Deep Blending) after a burn-in of 7000 iterations with C = 5e5.
+    Bicycle and stump use a burn-in of 15 000 iterations with 5e8. Times are fractions of 30 000 iterations, over which
+    the rate decays, though most scenes ran for 40 000. Each step relocates at most 5 % of the splats and adds 5 %. The
+    scale changes by the square of the coefficient.
 
-    The rate of nu is 10, halved every 5000 iterations, from nu = 100. Here it is the constant rate of log nu: 0.033,
-    the mean of 10 / 100 and its halves. Two things differ from the release: the derivative by nu is the correct one,
-    and the low-pass of 0.3 px^2 stays on.
+    In the release, nu starts at 100 and its rate is 10, halved every 5000 iterations. Here log nu has the constant rate
+    0.033, the mean of 10 / 100 and its halves. Two things differ from the release: the derivative by nu is the correct
+    one, and the low-pass of 0.3 px^2 stays on.
     """
     return (
         _mcmc()
@@ -157,17 +157,19 @@ def _student_t() -> Values:
 def _skew_normal() -> Values:
     """SNS (Wu et al. 2026), paper: the skew-normal about its location, unnormalised, SGHMC and alternating blocks.
 
-    The kernel is exp times Phi without a factor. The skew is a bounded magnitude and a free direction. Positions are
-    trained by SGHMC and the rest by Adam: first together, then in cycles of one block after the other. Regularisers are
-    off.
+    The kernel is exp times Phi without a factor. The skew is a bounded magnitude and a free direction. SGHMC trains the
+    positions, and Adam all other parameters. The skew and all other parameters learn together at first, and then in
+    turns. Regularisers are off.
 
     Not published, and chosen here:
 
-    - The rate of the skew is 1.25e-2: 5 times that of the centred form, the best one in 2D trials. The bound is 10.
+    - The rate of the skew is 1.25e-2, which is 5 times the rate of the centred form, after trials in 2D. The bound is
+      10.
     - Warm-up, cycle and split of the alternation are clsplat's defaults.
     - First opacity and scale are clsplat's defaults with "mcmc".
     - SGHMC has the constants of SSS, in the stable form.
-    - The strategy is the relocation of SSS without its square: training times and baselines suggest the code of SSS.
+    - The strategy is the relocation of SSS without its square. The paper's training times and baselines suggest that
+      SNS builds on the code of SSS.
     - All other rates are clsplat's defaults, which are those of 3DGS.
     """
     return {
@@ -200,8 +202,8 @@ def _bisected_skew() -> Values:
 
     Not published, and chosen here:
 
-    - The second threshold is 1e-5 of a gradient times the scene extent. On two captures of 50 to 100 px, about as many
-      splats exceed it as the first one.
+    - The threshold of the depth gradient times the scene extent is 1e-5. About the same number of splats exceeds it and
+      the first threshold.
     - The weight of the regulariser is 0.001, as for clsplat's other regularisers.
     - The rate of the skew is 1.25e-2, as for SNS. All other rates and the first threshold are those of 3DGS.
     """
@@ -225,7 +227,7 @@ PRESETS: dict[str, Callable[[], Values]] = {
 
 
 def preset(name: str) -> Values:
-    """Return the options of a published system, by the names of `TrainConfig`.
+    """Return the options of a published system by their names in `TrainConfig`.
 
     Raises
     ------
@@ -237,11 +239,11 @@ def preset(name: str) -> Values:
 
 
 def with_preset(name: str, options: Mapping[str, Any]) -> Values:
-    """Return the options of a preset, replaced by other options.
+    """Return the options of a preset, with some of them replaced.
 
     Parameters
     ----------
-    options : values by the names of `TrainConfig`, such as the flags of a command line.
+    options : values that replace those of the preset, such as the flags of a command line.
 
     Raises
     ------

@@ -32,16 +32,16 @@ def kernel_build(config: TrainConfig, schedule: Schedule) -> KernelBuild:
 
 
 def loss_strip(kernels: KernelBuild) -> int:
-    """Vectors of a row that one work-item of the loss blurs.
+    """Return the number of vectors of a row that one work-item of the loss blurs.
 
-    Narrow strips of wide images touch a new page of memory in each row. So strips are as wide as the second cache of a
-    CPU allows: it holds 22 rows of four maps, 225 kB.
+    Narrow strips of wide images touch a new page of memory in each row. So strips are as wide as the second-level cache
+    of a CPU allows. It must hold 22 rows of four maps, which are 225 kB.
     """
     return 1 if kernels.lanes == 1 else 2560 // (kernels.lanes * kernels.dtype.itemsize)
 
 
 def loss_program(device: Device, kernels: KernelBuild) -> Program:
-    """L1, SSIM and their gradients. The program depends on lanes and precision only."""
+    """Return the program of L1, SSIM and their gradients. It depends on lanes and precision only."""
     window = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
     window /= window.sum()
     defines: dict[str, Define] = {f"WINDOW_{i}": float(window[i]) for i in range(6)}
@@ -50,7 +50,7 @@ def loss_program(device: Device, kernels: KernelBuild) -> Program:
 
 
 def exposure_program(device: Device, kernels: KernelBuild) -> Program:
-    """Exposure, masks and transparency. The program depends on lanes and precision only."""
+    """Return the program of exposure, masks and transparency. It depends on lanes and precision only."""
     defines: dict[str, Define] = {
         "LANES": kernels.lanes,
         "MARGIN_X": MARGIN_X,
@@ -80,12 +80,12 @@ _OPTIM_FILES = (
 
 
 def optim_program(device: Device, kernels: KernelBuild) -> Program:
-    """The optimizer: steps of colour, geometry and skew, SGHMC, noise, and the kernels that move columns."""
+    """Return the program of the optimizer: steps of colour, geometry and skew, SGHMC, noise, and moves of columns."""
     return build(device, _OPTIM_FILES, _optim_defines(kernels), kernels.real)
 
 
 def lazy_program(device: Device, kernels: KernelBuild) -> Program:
-    """The optimizer with the kernels of visible splats (optim/lazy.py)."""
+    """Return the program of the optimizer with the kernels for visible splats (optim/lazy.py)."""
     defines = _optim_defines(kernels) | {
         "ADAM_WAITS": adam.WAITS,
         "CULLED_KEY": f"{CULLED_KEY:#x}u",

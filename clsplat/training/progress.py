@@ -1,4 +1,4 @@
-"""Progress of a long run: one line that is rewritten on a terminal or in a notebook; elsewhere a line at intervals."""
+"""Progress of a long run: one line that is rewritten on a terminal or in a notebook, otherwise lines at intervals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class LiveLine:
     """A line of text that changes.
 
     The carriage return is its only control character. If the stream does not support it (a file, a pipe, TERM=dumb),
-    whole lines are written, PLAIN_INTERVAL apart.
+    a whole line is written every PLAIN_INTERVAL seconds.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class LiveLine:
         self._length = 0
 
     def show(self, text: str | Callable[[int], str], last: bool = False) -> None:
-        """Replace the line.
+        """Show a text instead of the present one.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class LiveLine:
         self._write(text + "\n")
 
     def clear(self) -> None:
-        """Remove the line until it is shown again, so that others can write."""
+        """Remove the line until it is shown again, so that other output can be written."""
         if LiveLine._open is self:
             self._write("\r" + " " * self._length + "\r")
             self._length, LiveLine._open = 0, None
@@ -89,7 +89,7 @@ class LiveLine:
 
 
 class TrainingDisplay:
-    """A `progress` callback for `train`, `train_budget` and others. As a context manager it ends the line.
+    """A `progress` callback for `train`, `train_budget` and others; a context manager that ends the line.
 
     Parameters
     ----------
@@ -166,6 +166,6 @@ def _columns(stream: TextIO) -> int:
 
 
 def _in_notebook() -> bool:
-    """Whether this is the kernel of a notebook. Its output supports carriage returns, but is not a terminal."""
+    """Return whether this is the kernel of a notebook. Its output supports carriage returns, but is not a terminal."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return getattr(shell, "kernel", None) is not None

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..scenes.scene import Scene
 
 SEEN_BY = 2  # smallest number of cameras that see a point: one camera alone does not determine its place
-CENTRAL_SHARE = 0.75  # half of the points are where this share of the cameras looks, if there is such a region
+CENTRAL_SHARE = 0.75  # half of the points are in the region that this share of the cameras sees, if it exists
 _FARTHEST = 9.0  # largest distance from the centre, in median distances of the cameras
 _AHEAD = 3.0  # distance of the centre in front of parallel cameras, in scene extents
 _DRAWS = 16  # number of draws of `count` points; points that cameras see are kept
@@ -24,10 +24,10 @@ _TESTED_CAMERAS = 32  # cameras that the points are tested against
 
 
 def random_points(scene: Scene, count: int, rng: np.random.Generator) -> Array:
-    """Return (count, 3) points: half of them where nearly all cameras look, the others where at least two look.
+    """Return (count, 3) points: half of them where most cameras look, the others where at least two cameras look.
 
     The points are uniform in a contracted space around the point nearest to all optical axes (Barron et al. 2022,
-    Mip-NeRF 360, eq. 10). Its unit is the median distance of the cameras, so far points are rare.
+    Mip-NeRF 360, eq. 10). The unit of this space is the median distance of the cameras, so far points are rare.
     """
     cameras = [view.camera for view in scene.train[:: -(-len(scene.train) // _TESTED_CAMERAS)]]
     centres = np.array([view.camera.position for view in scene.train])

@@ -1,8 +1,7 @@
-"""Upper limits of learning rates: a rate that no training survives is refused before the run starts.
+"""Upper limits of learning rates: rates that make every run diverge are refused before the run starts.
 
-The size of Adam's step is about its rate and does not depend on the gradient. So each rate has a size that one can
-judge: a fraction of the scene, a factor of the scale, an angle. benchmarks/STABILITY.md has the measurements behind
-the limits.
+The size of Adam's step is about its rate and does not depend on the gradient. So each rate has a meaning: a fraction of
+the scene, a factor of the scale, an angle. benchmarks/STABILITY.md has the measurements of the limits.
 """
 
 from __future__ import annotations
@@ -12,14 +11,14 @@ import math
 from ..errors import InputError
 from .config import OPTIONS, TrainConfig
 
-# By option: the field whose `rate_factor` applies, and the largest step per iteration.
+# By option: the field with the `rate_factor` that applies, and the largest step per iteration.
 LIMITS = {
     "position_lr_init": ("mean", 0.03),  # scene extents
     "position_lr_final": ("mean", 0.03),
-    "scaling_lr": ("log_scale", 0.1),  # of a logarithm
-    "rotation_lr": ("quat", 0.1),  # of a quaternion, about half the angle [rad]
-    "opacity_lr": ("opacity_logit", 0.4),  # of a logit
-    "feature_lr": ("sh", 0.08),  # of a colour's coefficient
+    "scaling_lr": ("log_scale", 0.1),  # change of a logarithm
+    "rotation_lr": ("quat", 0.1),  # change of a quaternion, about half the angle [rad]
+    "opacity_lr": ("opacity_logit", 0.4),  # change of a logit
+    "feature_lr": ("sh", 0.08),  # change of a colour coefficient
 }
 
 
@@ -36,7 +35,7 @@ def check_rates(config: TrainConfig) -> None:
         highest = max(limit / factor, default)
         if rate > highest:
             digit = 10.0 ** (math.floor(math.log10(highest)) - 1)
-            usable = digit * math.floor(highest / digit)  # rounded down, so that it passes
+            usable = digit * math.floor(highest / digit)  # rounded down, so that this check accepts it
             raise InputError(
                 f"{name} {rate:g}: each of {config.iterations} iterations would take steps of "
                 f"{rate * factor:.2g}, and training falls apart above {limit:g}: use at most {usable:.2g}"

@@ -1,4 +1,4 @@
-"""The public function that trains. It checks what may be overwritten, and that a resumed run has its first options."""
+"""Training of a model: checks that no model is lost and that a resumed run has its options, then runs the trainer."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def train(
     overwrite: bool = False,
     visit: Visit | None = None,
 ) -> Model:
-    """Learn a splat model of a scene's training views.
+    """Train a splat model on a scene's training views and return it.
 
     Parameters
     ----------
     config : options of the run; by default those of TrainConfig.
     progress : called about every 50 iterations.
-    output : model folder. Without it nothing is written, and Ctrl-C raises as usual.
+    output : model folder. Without it, no file is written and Ctrl-C raises KeyboardInterrupt.
     resume : continue from the folder's checkpoint. The config must be the same, except for options without an effect
         on the result, such as `device`.
     overwrite : replace a model in `output`.
@@ -76,7 +76,7 @@ def train(
 
 
 def evaluate_test_views(splats: Splats, scene: Scene, config: TrainConfig) -> Evaluation | None:
-    """Measure a trained model on the scene's test views, on the device and with the background of its run.
+    """Return the metrics of a trained model on the scene's test views, with the device and background of its run.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def evaluate_test_views(splats: Splats, scene: Scene, config: TrainConfig) -> Ev
 
 
 def _fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:
-    """The folder's checkpoint; raise InputError if its run had another config."""
+    """Return the folder's checkpoint. Raise InputError if its run had another config."""
     checkpoint = Checkpoint.load(folder.checkpoint_path)
     stored = TrainConfig.from_json(checkpoint.config).to_json()
     for key, value in config.to_json().items():

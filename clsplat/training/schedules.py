@@ -89,7 +89,10 @@ def exponential_decay(start: float, end: float, steps: int) -> Callable[[int], f
 
 
 def sh_degree_at(iteration: int, interval: int, max_degree: int) -> int:
-    """Return the SH degree: one more every `interval` iterations up to `max_degree`, or that if `interval` is 0."""
+    """Return the SH degree of an iteration.
+
+    It rises by one every `interval` iterations up to `max_degree`. If `interval` is 0, it is always `max_degree`.
+    """
     if interval <= 0:
         return max_degree
     return min(max_degree, max(iteration, 0) // interval)
@@ -106,14 +109,14 @@ def resolution_schedule(
     Parameters
     ----------
     iterations : length of the run.
-    stages : (fraction of the run in [0, 1), integer downscale). The first fraction is 0 and fractions rise. Downscales
-        fall and the last one is 1, so that a run always ends at full resolution.
+    stages : (fraction of the run in [0, 1), integer downscale). The fractions rise from 0. The downscales fall to 1, so
+        that a run always ends at full resolution.
     image_side : shorter side of the smallest image [px]. A downscale to less than `smallest_side` is replaced by the
         next finer one of the schedule.
 
     Returns
     -------
-    List of (first iteration, downscale) from iteration 0 on, without empty or repeated stages.
+    List of (first iteration, downscale), which begins at iteration 0 and has no empty or repeated stages.
 
     Raises
     ------
@@ -150,8 +153,8 @@ def downscale_at(schedule: Sequence[tuple[int, int]], iteration: int) -> int:
 def downscale_for(schedule: Sequence[tuple[int, int]], iteration: int, n_splats: int, pixels: float) -> int:
     """Return the image downscale at `iteration`. With few splats per pixel, coarse stages last longer.
 
-    Few splats learn as much from small images. Between MANY_PIXELS and twice as many pixels per splat, the length of
-    the coarse stages grows up to the factor LONGEST.
+    Few splats learn as much from small images as from large ones. Above MANY_PIXELS pixels per splat the coarse stages
+    become longer. From 2 * MANY_PIXELS on, their length is multiplied by LONGEST.
 
     Parameters
     ----------

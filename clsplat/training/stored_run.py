@@ -1,4 +1,4 @@
-"""A stored run: its options and the record of its scene, for resuming it or repeating it."""
+"""Stored runs: the options and the record of the scene that are needed to resume or repeat a run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .folder import ModelFolder
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
 
-# What made a stored run unreadable.
+# Exceptions that mean that a stored run is damaged.
 DAMAGE = (InputError, KeyError, TypeError, ValueError, AttributeError)
 
 
@@ -37,7 +37,7 @@ class StoredRun:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> StoredRun:
-        """Read config.json's values; raise one of DAMAGE if they are not those of a run."""
+        """Return the run that the values of config.json describe. Raise one of DAMAGE if they do not describe one."""
         TrainConfig.from_json(values["config"])
         scene = dict(values["scene"])
         scene["path"] = str(scene["path"])
@@ -45,7 +45,7 @@ class StoredRun:
 
     @property
     def scene_path(self) -> Path:
-        """Where the scene was."""
+        """Path of the scene at the time of the run."""
         return Path(self.scene["path"])
 
 
@@ -67,7 +67,9 @@ def stored_run(path: str | os.PathLike[str]) -> StoredRun:
 
 
 def read_options_file(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the training options in a config.json, or in a JSON object of some options, as arguments of TrainConfig.
+    """Return the training options in a file as arguments of TrainConfig.
+
+    The file is a config.json, or a JSON object with some options.
 
     Raises
     ------
@@ -87,14 +89,14 @@ def read_options_file(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def load_recorded_scene(path: str | os.PathLike[str], record: Mapping[str, Any], background: Color = BLACK) -> Scene:
-    """Load a scene with the recorded arguments of `load_scene`.
+    """Return a scene, loaded with the recorded arguments of `load_scene`.
 
     Parameters
     ----------
-    record : arguments by name; None stands for a default. Without "eval", test views are held out only if another
-        argument chooses them, or if the record names some.
+    record : arguments by name; None means the default. Without "eval", the scene has test views only if another
+        argument selects them, or if the record names some.
     """
-    from ..scenes.scene import load_scene  # imports an image library, which --help must not wait for
+    from ..scenes.scene import load_scene  # imported late: it loads an image library, which would slow down --help
 
     arguments = {key: record[key] for key in READING_OPTIONS if record.get(key) is not None}
     chosen = "test_every" in arguments or "test_list" in arguments

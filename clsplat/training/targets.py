@@ -1,4 +1,4 @@
-"""Target images on the device: the training photos, as 8-bit planes that stay there if they fit a memory budget.
+"""Target images: the training photos as 8-bit planes, which stay on the device if they fit a memory budget.
 
 The planes are r, g, b. Two more planes follow if any view has a mask, or transparency with random backgrounds: the mask
 and the opacity.
@@ -23,7 +23,7 @@ from .programs import loss_program
 
 _COLOR, _WITH_MASKS = 3, 5  # planes
 _MASKED, _UNMASKED, _OPAQUE = 0, 255, 255
-_SLOTS = 2  # buffers for transfers: a transfer does not wait for the iteration before
+_SLOTS = 2  # number of buffers for transfers, so that a transfer does not wait for the previous iteration
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,13 @@ class Target:
 class Targets:
     """Target images of the training views, at the image size of the current stage.
 
-    An image is uploaded when it is first requested, while the device is busy with the iteration before. It stays until
-    the size changes. Images that do not fit the budget are uploaded each time.
+    An image is uploaded at its first request, while the device works on the previous iteration. It stays until the size
+    changes. Images that do not fit the budget are uploaded each time.
 
     Parameters
     ----------
     views : training views.
-    budget : bytes of device memory for images that stay.
+    budget : bytes of device memory for images that stay on the device.
     channels : planes of each image, from `target_channels`.
     """
 
@@ -90,7 +90,7 @@ class Targets:
         return self._kept_bytes + self.pool.nbytes
 
     def get(self, index: int, downscale: int) -> Target:
-        """Return view `index` at 1/downscale of its size. If necessary, start its upload; do not wait for it."""
+        """Return view `index` at 1/downscale of its size. If necessary, start its upload without waiting for it."""
         if downscale != self._downscale:
             self._downscale, self._kept_bytes = downscale, 0
             self._kept, self._reduced, self._uploads = {}, {}, {}
@@ -114,7 +114,7 @@ class Targets:
         return target
 
     def planes(self, target: Target) -> Buffer:
-        """Return the buffer of the target. The image is there for all later commands in the device's queue."""
+        """Return the buffer of the target. All later commands in the device's queue may use it."""
         layout = target.layout
         upload = self._uploads.pop(target.index, None)
         if upload is not None:

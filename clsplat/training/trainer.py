@@ -55,7 +55,8 @@ class Trainer:
 
     Raises
     ------
-    InputError : no training views, rates too high, or a checkpoint that does not fit. DeviceError : too little memory.
+    InputError : there are no training views, rates are too high, or the checkpoint does not fit.
+    DeviceError : the device has too little memory.
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class Trainer:
         self.evaluation_seconds: dict[int, float] = {}
 
     def _first_splats(self) -> tuple[Mapping[str, Array], str]:
-        """Return the public arrays of the first splats, and a message on where they come from."""
+        """Return the public arrays of the first splats, and a message that names their source."""
         config = self.config
         splats, message = initial_splats(
             self.scene,
@@ -218,7 +219,7 @@ class Trainer:
         return sh_degree_at(self.iteration, self.schedule.sh_interval, self.config.sh_degree)
 
     def step(self) -> Frame:
-        """Do one iteration: one image, one optimizer step, and the strategy's action if it is due. Return the frame."""
+        """Do one iteration and return its frame: one image, one optimizer step, and a densification if it is due."""
         config = self.config
         self.iteration += 1
         it = self.iteration
@@ -239,7 +240,7 @@ class Trainer:
         return frame
 
     def snapshot(self) -> Splats:
-        """Return the present splats on the host, without splats that are not finite."""
+        """Return the present splats on the host, except splats that are not finite."""
         arrays = self.optimizer.read()
         sound = finite_rows(arrays)
         if len(sound) and not sound.any():

@@ -11,12 +11,12 @@ from .schedules import downscale_for, resolution_schedule
 
 
 class ViewSampler:
-    """Draws training views: one random permutation of the views after another.
+    """Training views in random order: one random permutation of the views after another.
 
     Parameters
     ----------
     iterations : length of the run.
-    coarse_to_fine : False: always full size.
+    coarse_to_fine : whether the first images are smaller.
     queue : rest of the permutation of a resumed run.
     """
 
