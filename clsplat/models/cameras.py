@@ -42,10 +42,10 @@ def export_cameras(
     iteration: int | None = None,
     overwrite: bool = False,
 ) -> ExportedCameras:
-    """Write the cameras of a scene or a model for another program, with points beside them.
+    """Write the cameras and points of a scene or a model for another program, and return their numbers.
 
-    Cameras of a scene keep their lenses. Cameras of a model are those of its training images: without distortion, at
-    the size that they were reduced to.
+    Cameras of a scene keep their lenses. Cameras of a model are those of its training images: without distortion, and
+    at the reduced size.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def export_cameras(
 
 
 def _of_scene(scene: Path, images: str | None) -> tuple[list[RegisteredImage], list[Path], Points]:
-    """Photos, their files, and points. If all photos lie in one folder, their names lose it."""
+    """Return the photos, their files, and points. Names of photos omit a folder that all photos are in."""
     posed = read_posed_images(scene, images)
     folders = {photo.name.partition("/")[0] if "/" in photo.name else None for photo in posed.photos}
     cut = len(folders.pop() or "") + 1 if len(folders) == 1 and None not in folders else 0
@@ -97,7 +97,7 @@ def _of_scene(scene: Path, images: str | None) -> tuple[list[RegisteredImage], l
 
 
 def _of_model(source: Path, iteration: int | None) -> tuple[list[RegisteredImage], Points]:
-    """Photos of a model's or a file's cameras, and a model's opaque splats as points."""
+    """Return the cameras of a model or a file as photos, and the opaque splats of a model as points."""
     if source.is_file() and source.suffix == ".json":
         named, points = _of_file(source), _points(np.empty((0, 3)), np.empty((0, 3), np.uint8))
     else:

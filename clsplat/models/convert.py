@@ -1,4 +1,4 @@
-"""Conversion of a model to another shape or file format, and what that costs in image quality."""
+"""Conversion of a model to another shape or file format, and its loss of image quality."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ConvertedModel:
 
     @property
     def removed(self) -> int:
-        """Number of splats left out, because the shape does not support negative opacity."""
+        """Number of splats that were removed because the shape does not support negative opacity."""
         return len(self.source.splats) - len(self.splats)
 
     @property
@@ -52,7 +52,7 @@ class ConvertedModel:
 
 @dataclass(frozen=True)
 class ConversionCost:
-    """PSNR of the file's images against the model's own: mean and worst [dB] over a number of cameras."""
+    """PSNR of the file's images against the model's images: mean and worst [dB] over a number of cameras."""
 
     mean: float
     worst: float
@@ -69,21 +69,21 @@ def convert_model(
     iteration: int | None = None,
     overwrite: bool = False,
 ) -> ConvertedModel:
-    """Write a model as another shape, or in another file format.
+    """Write a model as another shape or in another file format, and return the conversion.
 
     Parameters
     ----------
     model : a model folder or a file of splats, or what `load_model` returned.
     output : a .ply file with all columns, or a .splat or .spz file.
     shape : the shape to convert to; by default the model's, for .splat and .spz files Gaussian.
-    approximate : take the nearest Gaussian for splats without an equal one, instead of raising.
+    approximate : use the nearest Gaussian for splats without an equal one, instead of raising.
     sh_degree : remove the SH bands above, or add bands of zeros.
     iteration : as for `load_model`.
     overwrite : replace an existing file.
 
     Raises
     ------
-    InputError : splats have no equal in the shape, or the format does not support the shape.
+    InputError : some splats cannot be converted exactly, or the format does not support the shape.
     OutputError : the file exists, has an unknown ending or cannot be written.
     """
     output = Path(output)
@@ -104,7 +104,7 @@ def convert_model(
 def conversion_cost(
     converted: ConvertedModel, cameras: Path | None = None, device: str | None = None
 ) -> ConversionCost | None:
-    """Compare images of the written file with images of the model.
+    """Return the PSNR between images of the written file and images of the model.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def conversion_cost(
 
 
 def _as_shape(splats: Splats, target: str, approximate: bool) -> tuple[Splats, bool]:
-    """The splats as `target`, and whether they are only the nearest Gaussians."""
+    """Return the splats as `target`, and whether they are only the nearest Gaussians."""
     try:
         return convert(splats, target), False
     except InputError as error:
@@ -142,7 +142,7 @@ def _as_shape(splats: Splats, target: str, approximate: bool) -> tuple[Splats, b
 
 
 def _of_degree(splats: Splats, degree: int) -> Splats:
-    """The splats with colours cut to an SH degree, or with bands of zeros up to it."""
+    """Return the splats with an SH degree: higher bands are removed, missing bands are zero."""
     sh = splats.sh[:, : sh_coefficients(degree)]
     sh = np.pad(sh, ((0, 0), (0, sh_coefficients(degree) - sh.shape[1]), (0, 0)))
     return splats.with_arrays(splats.to_numpy() | {"sh": sh})

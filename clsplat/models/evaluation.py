@@ -26,23 +26,23 @@ from .measurements import ModelEvaluation, ViewRecorder
 from .model import LoadedModel, SceneChoice, load_model, model_at
 
 REPORT = "report.html"
-UNIT_RANGE_PROTOCOL = "3dgs"  # 3DGS's script feeds LPIPS with images in 0..1
+UNIT_RANGE_PROTOCOL = "3dgs"  # 3DGS's script passes images in 0..1 to LPIPS
 
 
 @dataclass(frozen=True)
 class EvaluationOptions:
-    """What to measure.
+    """Options of an evaluation: views, metrics and report.
 
     Parameters
     ----------
-    view_set : "test", "train" or "all" views.
+    view_set : views to measure: "test", "train" or "all".
     protocol : how PSNR and SSIM are computed. If `protocol.corrected`, LPIPS, FLIP and the report's images use
         colour-corrected renders too.
-    lpips, flip : also measure these; each needs its extra.
-    background : colour 0..1; None takes the model's.
+    lpips, flip : whether to measure these too. Each requires the extra of its name.
+    background : colour 0..1; None means the model's background.
     scene : replaces parts of the scene's record.
-    report : write a page with the images.
-    scene_name : name of the scene in the report; None takes the scene's own.
+    report : whether to write a page with the images.
+    scene_name : name of the scene in the report; None means `Scene.name`.
     """
 
     view_set: str = "test"
@@ -69,11 +69,11 @@ def evaluate(
     Parameters
     ----------
     model : a model folder, or what `load_model` returned for one.
-    options : what to measure; by default PSNR and SSIM of the test views.
+    options : views and metrics; by default PSNR and SSIM of the test views.
     iteration : as for `load_model`.
-    renders : folder for the rendered images as PNG; None writes none.
+    renders : folder for the rendered images as PNG; None writes no images.
     device : OpenCL device, as for `Renderer`.
-    progress : called as each view begins.
+    progress : called before each view.
 
     Raises
     ------
@@ -98,14 +98,14 @@ def evaluate_models(
     device: str | None = None,
     progress: ViewProgress | None = None,
 ) -> list[ModelEvaluation]:
-    """Measure several models, each as `evaluate` does.
+    """Measure several models like `evaluate`, and return their measurements.
 
-    A model whose result files cannot be written is measured all the same; see `ModelEvaluation.write_error`.
+    A model is also measured if its result files cannot be written; see `ModelEvaluation.write_error`.
 
     Parameters
     ----------
-    comparison : file of one report that compares the models; it replaces the reports of the models.
-    renders : folder of the images; several models get a folder each inside it.
+    comparison : file of a report that compares the models. It replaces the reports of the single models.
+    renders : folder of the images. If there are several models, each has a subfolder.
     """
     write = options.report and comparison is None
     evaluator = Evaluator(options, Renderer(device), write_reports=write)
@@ -119,11 +119,11 @@ def evaluate_models(
 
 
 class Evaluator:
-    """Measures one model after another on one device.
+    """Evaluation of several models on one device.
 
     Parameters
     ----------
-    write_reports : write each model's own report if the options ask for one.
+    write_reports : whether each model gets a report if the options request reports.
 
     Raises
     ------
@@ -138,7 +138,7 @@ class Evaluator:
     def __call__(
         self, model: LoadedModel, renders: Path | None = None, progress: ViewProgress | None = None
     ) -> ModelEvaluation:
-        """Measure a model; parameters and errors as for `evaluate`."""
+        """Return the measurements of a model. Parameters and errors are those of `evaluate`."""
         if model.folder is None:
             raise InputError(f"{model.path}: is a file; eval takes model folders (render takes any PLY)")
         options = self.options
@@ -200,15 +200,15 @@ class Evaluator:
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
-    """Names of the folders, or whole paths if two folders have the same name."""
+    """Return the names of the folders, or whole paths if two folders have the same name."""
     names = [path.resolve().name for path in paths]
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
 
 def _add_entry(path: Path, key: str, entry: dict[str, Any]) -> None:
-    """Add an entry to a JSON object, which may hold those of other iterations."""
+    """Add an entry to the JSON object in a file, which may hold entries of other iterations."""
     try:
         known = read_object(path)
-    except InputError:  # An absent or damaged file loses nothing: it holds only measurements.
+    except InputError:  # A missing or damaged file is replaced: it holds only measurements.
         known = {}
     write_json(path, known | {key: entry})

@@ -1,4 +1,4 @@
-"""The report of evaluated models: what `evaluation/report` shows, taken from their measurements and folders."""
+"""Reports of evaluated models: the content of the page of `evaluation/report`, from measurements and folders."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _ALWAYS_SHOWN = ("iterations", "cap_max", "seed")
 
 
 def write_model_report(path: Path, scene: str, measured: Sequence[ModelEvaluation], labels: Sequence[str]) -> Path:
-    """Write the report of one model, or one that compares several. Return its path.
+    """Write the report of one model or the comparison of several, and return its path.
 
     Parameters
     ----------
-    scene : the scene's name. labels : of the models, one each.
+    scene : the scene's name. labels : one name for each model.
 
     Raises
     ------
@@ -75,13 +75,13 @@ def _facts(measured: ModelEvaluation) -> list[tuple[str, str]]:
 
 
 def _options(model: LoadedModel) -> list[tuple[str, str]]:
-    """Training options from config.json: the usual ones, and those that are not the defaults."""
+    """Return training options from config.json: those that a report always shows, and all that are not defaults."""
     if model.folder is None or not model.folder.config_path.is_file():
         return []
     try:
         config = TrainConfig.from_json(model.folder.read_config()["config"]).to_json()
     except (InputError, KeyError, TypeError, ValueError, AttributeError):
-        return []  # The file is 3DGS's or was edited; the report does not need it.
+        return []  # 3DGS wrote the file, or a user edited it; the report does not need it.
     defaults = TrainConfig().to_json()
     shown = {key: value for key, value in config.items() if key in _ALWAYS_SHOWN or value != defaults.get(key)}
     return [("options", ", ".join(f"{key.replace('_', '-')} {value}" for key, value in shown.items()))]

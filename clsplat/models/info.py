@@ -1,4 +1,4 @@
-"""Contents of a model or a scene, without rendering or decoding anything."""
+"""Contents of a model or a scene, without rendering it or decoding photos."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class ModelInfo:
 
     Attributes
     ----------
-    model : what was loaded. complexity : how much of it is in use.
+    model : the loaded model. complexity : numbers of splats and parameters in use.
     """
 
     model: LoadedModel
     complexity: Complexity
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, as `clsplat info --json` prints them."""
+        """Return plain values, which `clsplat info --json` prints."""
         splats = self.model.splats
         return {
             "shape": splats.shape,
@@ -43,12 +43,12 @@ class ModelInfo:
 def inspect(
     path: str | os.PathLike[str], *, iteration: int | None = None, images: str | None = None
 ) -> ModelInfo | SceneInfo:
-    """Report the contents of a model folder, a file of splats or a scene.
+    """Return the contents of a model folder, a file of splats or a scene.
 
     Parameters
     ----------
-    iteration : of a model folder, as for `load_model`.
-    images : of a scene, the folder of its photos.
+    iteration : iteration of a model folder, as for `load_model`.
+    images : folder of the photos of a scene.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Measurements of one model, and what is measured of each view besides PSNR and SSIM."""
+"""Measurements of one model, and the recorder of LPIPS, FLIP and images of its views."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class ModelEvaluation:
 
     Attributes
     ----------
-    model : what was measured. scene : whose views.
+    model : the model that was measured. scene : the scene of the views.
     result : the entry of results.json: means of the metrics, render time, bytes, complexity and protocol.
     per_view : values by metric and view.
-    images : by view, what a report shows; empty without a report.
+    images : images for a report by view; empty without a report.
     report : file of the model's report, if one was written.
-    write_error : why results.json or per_view.json could not be written; None if they were.
+    write_error : reason why results.json or per_view.json could not be written; None if they were written.
     """
 
     model: LoadedModel
@@ -54,18 +54,18 @@ class ModelEvaluation:
 
 @dataclass
 class ViewRecorder:
-    """Called with each view and its render: measures LPIPS and FLIP, and keeps the images of the report.
+    """A callback for each view and its render that measures LPIPS and FLIP, and keeps the images of the report.
 
     Parameters
     ----------
-    lpips, flip : metrics to measure; None measures none.
-    report : keep images.
-    corrected : bring renders into their photos' exposure.
+    lpips, flip : functions of the metrics; None if the metric is not measured.
+    report : whether to keep images.
+    corrected : whether to adapt the exposure of renders to that of their photos.
 
     Attributes
     ----------
     per_view : values by metric and view.
-    images : by view.
+    images : images by view.
     """
 
     lpips: Lpips | None = None
@@ -89,6 +89,6 @@ class ViewRecorder:
             self.images[view.name] = compare_images(view.image, color, view.mask, flip_map)
 
     def describe(self) -> dict[str, str]:
-        """How LPIPS and FLIP are computed, if they are."""
+        """Return texts on how LPIPS and FLIP are computed; empty if neither is measured."""
         metrics = (("LPIPS", self.lpips), ("FLIP", self.flip))
         return {name: metric.describe() for name, metric in metrics if metric is not None}

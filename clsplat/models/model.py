@@ -1,4 +1,4 @@
-"""A trained model with what its folder records: iteration, background, cameras and scene."""
+"""A trained model with the record in its folder: iteration, background, cameras and scene."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SceneChoice:
-    """A scene to use instead of the one that a model's folder records. None keeps the record.
+    """Changes of the scene that a model's folder records. None keeps the recorded value.
 
     Parameters
     ----------
     path : the scene's folder or transforms file.
     images : the folder of photos inside the scene.
-    resolution : as for `load_scene`.
+    resolution : size of the photos, as for `load_scene`.
     """
 
     path: str | Path | None = None
@@ -64,18 +64,18 @@ class LoadedModel:
 
     @property
     def test_names(self) -> frozenset[str] | None:
-        """Names of the views held out from training; None if the folder does not record them."""
+        """Names of the views that were held out from training; None if the folder does not record them."""
         names = self.scene_record.get("test_names")
         return None if names is None else frozenset(names)
 
     def read_cameras(self) -> list[NamedCamera]:
-        """Read the folder's cameras.json. Return an empty list if there is none."""
+        """Return the cameras in the folder's cameras.json; an empty list if there is no such file."""
         if self.folder is None or not self.folder.cameras_path.is_file():
             return []
         return read_cameras(self.folder.cameras_path)
 
     def load_scene(self, choice: SceneChoice | None = None) -> Scene:
-        """Load the scene that the model was trained on, with the same test views.
+        """Return the scene that the model was trained on, with the same test views.
 
         Parameters
         ----------
@@ -84,9 +84,9 @@ class LoadedModel:
 
         Raises
         ------
-        InputError : the scene is unknown, is missing, or lacks a test view of the run.
+        InputError : the scene is unknown, does not exist, or lacks a test view of the run.
         """
-        from ..scenes.scene import load_scene  # imports an image library, which --help must not wait for
+        from ..scenes.scene import load_scene  # imported late: it loads an image library, which would slow down --help
 
         choice, record = choice or SceneChoice(), self.scene_record
         path = choice.path or record.get("path")
@@ -115,11 +115,11 @@ class LoadedModel:
 
 
 def load_model(path: str | os.PathLike[str], iteration: int | None = None) -> LoadedModel:
-    """Load a model folder of clsplat or 3DGS, or a file of splats (.ply, .splat, .spz).
+    """Return the model in a folder of clsplat or 3DGS, or in a file of splats (.ply, .splat, .spz).
 
     Parameters
     ----------
-    iteration : point cloud to load from a folder; the last by default.
+    iteration : iteration of the point cloud in a folder; by default the last.
 
     Raises
     ------
@@ -139,17 +139,17 @@ def load_model(path: str | os.PathLike[str], iteration: int | None = None) -> Lo
 
 
 def model_at(model: str | os.PathLike[str] | LoadedModel, iteration: int | None = None) -> LoadedModel:
-    """Return a loaded model as it is; load any other."""
+    """Return the model; load it unless it is a `LoadedModel`."""
     return model if isinstance(model, LoadedModel) else load_model(model, iteration)
 
 
 def in_both_forms(names: frozenset[str]) -> frozenset[str]:
-    """Names of images, and the same names without extension, as cameras.json has them."""
+    """Return the names of images, and the same names without extension, which cameras.json uses."""
     return names | {bare_name(name) for name in names}
 
 
 def _read_record(folder: ModelFolder) -> tuple[Color, dict[str, Any]]:
-    """Background and scene of config.json. Each value is checked, because people edit the file."""
+    """Return the background and the scene in config.json. Each value is checked, because people edit the file."""
     file = folder.config_path
     if not file.is_file():
         return BLACK, {}

@@ -26,7 +26,7 @@ class PrunedModel:
     Attributes
     ----------
     source : the model before. output : the file that was written.
-    pruned : the smaller model, and what it cost.
+    pruned : the smaller model, and its loss of quality.
     """
 
     source: LoadedModel
@@ -47,17 +47,17 @@ def prune_model(
     device: str | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> PrunedModel:
-    """Write a model without the splats, fields and SH bands that its images do not need.
+    """Write a model without the splats, fields and SH bands that its images do not need, and return it.
 
-    Some of the training views are held out to measure the loss; test views are never used.
+    Some of the training views are held out to measure the loss. Test views are never used.
 
     Parameters
     ----------
     model : a model folder or a file of splats, or what `load_model` returned.
     output : the PLY file to write.
-    tolerance : PSNR that the held-out views may lose [dB].
-    iterations : length of the training after each round that removes a quarter of the splats; 0 does not train.
-    compact : omit columns that are not in use; False writes all columns of 3DGS.
+    tolerance : largest loss of PSNR on the held-out views [dB].
+    iterations : iterations of training after each round that removes a quarter of the splats; 0 means no training.
+    compact : whether to omit columns that are not in use, instead of writing all columns of 3DGS.
     scene : replaces parts of the scene's record. A file needs the scene's path.
     iteration : as for `load_model`.
     overwrite : replace an existing file.

@@ -1,4 +1,4 @@
-"""Renders of a model: which views, along which path, into which files."""
+"""Renders of a model: views or a camera path, written as images and videos."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class ViewChoice:
 
     Parameters
     ----------
-    cameras : a cameras.json; None takes the cameras of the scene, or those in the model's folder.
-    scene : a scene whose cameras are rendered.
-    view_set : one of VIEW_SETS; None takes the test views, or all views if there are none.
+    cameras : a cameras.json; None means the cameras of the scene, or those in the model's folder.
+    scene : the scene that the cameras come from.
+    view_set : one of VIEW_SETS; None means the test views, or all views if there are no test views.
     path : a camera path through or around these cameras, instead of the cameras themselves.
     size : (width, height) of the images [px]; the vertical field of view is kept.
     """
@@ -48,8 +48,8 @@ class ModelRenders:
     Attributes
     ----------
     views : the cameras by name.
-    fps : frames a second of the path or the video.
-    render_ms : median wall time of a render after the first [ms].
+    fps : frames per second of the path or the video.
+    render_ms : median wall time of a render, without the first [ms].
     depth_scales : see `RenderedViews`.
     """
 
@@ -70,7 +70,7 @@ def render_views(
     device: str | None = None,
     progress: ViewProgress | None = None,
 ) -> ModelRenders:
-    """Render views of a model into images, a video, or both.
+    """Render views of a model into images, a video, or both, and return their description.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def render_views(
     save_path : file for the camera path.
     iteration : as for `load_model`.
     device : OpenCL device, as for `Renderer`.
-    progress : called as each view begins.
+    progress : called before each view.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def render_views(
     """
     choice = choice or ViewChoice()
     if output.video is not None:
-        VideoWriter(Path(output.video), DEFAULT_FPS)  # reports a wrong ending before the work begins
+        VideoWriter(Path(output.video), DEFAULT_FPS)  # raises now if the ending is wrong, not after the work
     loaded = model_at(model, iteration)
     views, path = choose_views(loaded, choice)
     fps = output.fps or (path.fps if path is not None else DEFAULT_FPS)
@@ -138,7 +138,7 @@ def choose_views(model: LoadedModel, choice: ViewChoice) -> tuple[list[NamedCame
 def _select(
     views: Sequence[NamedCamera], test_names: frozenset[str] | None, view_set: str | None, source: Path
 ) -> list[NamedCamera]:
-    """The test, train or all views; by default the test views, or all if there are none."""
+    """Return the test, train or all views; by default the test views, or all if there are no test views."""
     if not views:
         raise InputError(
             f"{source}: no cameras to render: give --cameras cameras.json, a scene with -s, or --path orbit"

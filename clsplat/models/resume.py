@@ -1,4 +1,4 @@
-"""Resuming of an interrupted run or search, from what its folder holds."""
+"""Resuming of an interrupted run or search from its folder."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Unfinished:
 
 
 def find_unfinished(path: str | os.PathLike[str]) -> Unfinished:
-    """Return what a model folder holds to resume.
+    """Return the run or the search that can be resumed in a model folder.
 
     Raises
     ------
@@ -45,12 +45,12 @@ def resume(
     progress: Callable[[Progress], None] | None = None,
     **options: Any,
 ) -> Model | Budgeted:
-    """Continue the run or the search in a model folder to its end, with the options and the scene of its start.
+    """Continue the run or the search in a model folder with its options and scene, and return the result.
 
     Parameters
     ----------
     path : the model folder.
-    scene : the scene's folder; by default where it was.
+    scene : the scene's folder; by default the recorded one.
     progress : as for `train`.
     options : arguments of TrainConfig to change. Only those without an effect on the result may change, such as
         `device`.
@@ -58,7 +58,7 @@ def resume(
     Raises
     ------
     InputError : there is nothing to resume, or an option must not change.
-    Others as for `train`.
+    Other exceptions : see `train`.
     """
     from ..compression.search import train_budget
     from ..training.run import train
