@@ -1,1 +1,1 @@
-"""The clsplat command line: each module parses flags, calls one library function, prints."""
+"""The clsplat command line. Each module parses flags, calls one library function and prints its result."""

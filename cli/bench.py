@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 SPLATS, WIDTH, HEIGHT = 30_000, 640, 480
 HEAD = ("stage", "ms", "share", "MB", "of copy limit", "Mflop", "of FMA limit")
-_DOMINANT = 0.1  # share of an iteration from which a stage gets a sentence
-_NEAR = 0.5  # fraction of a limit from which it counts as the limit of a stage
+_DOMINANT = 0.1  # smallest share of an iteration for which a stage gets a sentence
+_NEAR = 0.5  # smallest fraction of a limit that counts as the limit of a stage
 
 
 @click.command()
@@ -78,8 +78,8 @@ def bench(
     """Time each stage of a training step and of an image, and compare it with the limits of the device.
 
     The limits are measured on the same device: bytes per second of a copy, and operations per second of fused
-    multiply-adds. The bytes and operations of a stage are the least that it needs. Pairs of splat and pixel count only
-    if they change the image. Other programs on the machine make all numbers worse.
+    multiply-adds. The bytes and operations of a stage are the minimum that it needs. Pairs of splat and pixel count
+    only if they change the image. Other programs on the machine make all numbers worse.
     """
     from clsplat.device.device import open_device
     from clsplat.profiling.bench import bench_trainer, measure_render, measure_training, write_reports
@@ -112,7 +112,7 @@ def bench(
 
 
 def describe(report: Report, scene: str) -> list[str]:
-    """Return lines of text: the task, the table, and a sentence on each stage that takes much of the time."""
+    """Return the lines of the report: the task, the table, and a sentence on each stage that takes much of the time."""
     sizes = report.sizes
     lines = [
         f"{report.task}: {report.wall_ms:.1f} ms ({1e3 / report.wall_ms:.3g} a second), median of {report.iterations}",
@@ -126,7 +126,7 @@ def describe(report: Report, scene: str) -> list[str]:
 
 
 def cells(stage: StageTime) -> tuple[str, ...]:
-    """Return a row of the table; cells are empty if nothing is counted."""
+    """Return the cells of a stage in the table. A cell is empty if its number is not counted."""
     return (
         stage.stage,
         f"{stage.ms:.3f}",

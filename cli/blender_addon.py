@@ -1,4 +1,4 @@
-"""`clsplat blender-addon`: the Blender add-on as a zip that Blender installs."""
+"""`clsplat blender-addon`: the Blender add-on as a zip file that Blender installs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .options import PATH
 
 _MANIFEST = "blender_manifest.toml"
 _WHEN = (1980, 1, 1, 0, 0, 0)  # a fixed date, so that the same files make the same zip
-# Blender's names of platforms, by patterns of the tags of wheels.
+# Blender's names of platforms, by patterns for the platform tags of wheels.
 _PLATFORMS = {
     r"linux.*x86_64": "linux-x64",
     r"win_amd64": "windows-x64",
@@ -36,8 +36,8 @@ _PLATFORMS = {
     "--wheels",
     type=PATH,
     metavar="DIR",
-    help="Put the wheels of this folder inside, which Blender then installs with the add-on; all but "
-    "NumPy's, which Blender brings along.",
+    help="Folder of wheels to put into the zip, except NumPy's. Blender installs them with the add-on, and already "
+    "has NumPy.",
 )
 def build_addon(output: Path, wheels: Path | None) -> None:
     """Build the Blender add-on as a zip: in Blender, Edit > Preferences > Get Extensions > Install from Disk.
@@ -57,7 +57,7 @@ def build_addon(output: Path, wheels: Path | None) -> None:
 
 
 def addon_zip(wheels: list[Path]) -> bytes:
-    """The zip's bytes; the same for the same sources and wheels."""
+    """Return the bytes of the zip. Equal sources and wheels give equal bytes."""
     contents = {
         entry.name: entry.read_bytes() for entry in files("clsplat_blender").iterdir() if entry.name.endswith(".py")
     }
@@ -77,7 +77,7 @@ def addon_zip(wheels: list[Path]) -> bytes:
 
 
 def manifest(wheels: list[Path]) -> str:
-    """The add-on's manifest, of clsplat's version, with the wheels and the platforms that they are for."""
+    """Return the add-on's manifest with clsplat's version, the wheels and their platforms."""
     text = (files("clsplat_blender") / _MANIFEST).read_text("utf-8")
     text = re.sub(r'^version = ".*"$', f'version = "{__version__}"', text, count=1, flags=re.M)
     lines = ""
@@ -99,7 +99,7 @@ def manifest(wheels: list[Path]) -> str:
 
 
 def wheels_in(folder: Path) -> list[Path]:
-    """Wheels of a folder, less NumPy's.
+    """Return the wheels of a folder, except NumPy's.
 
     Raises
     ------

@@ -56,7 +56,7 @@ def budget_options(function: F) -> F:
 
 
 def search_options(values: dict[str, Any]) -> BudgetOptions | None:
-    """Take the options of the search out of `values` and return them; None if the user wants no search."""
+    """Remove the options of the search from `values` and return them; None if no search was requested."""
     search = {key: values.pop(key) for key in KEYS}
     if all(value is None for value in search.values()):
         return None
@@ -74,7 +74,7 @@ def run_search(
     overwrite: bool,
     quiet: bool,
 ) -> None:
-    """Search with a live display, and print what was found."""
+    """Run the search with a live display, and print its result."""
     from clsplat.comparison.growth import draw_growth
     from clsplat.compression.search import train_budget
     from clsplat.training.run import evaluate_test_views
@@ -102,7 +102,7 @@ def run_search(
 
 
 def result_lines(result: Budgeted) -> list[str]:
-    """Return the lines that describe what the search found."""
+    """Return the lines that describe the result of the search."""
     report, final = result.report, result.report["final"]
     held_out = report["held_out"]
     lines = [

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.option(
     "--approximate",
     is_flag=True,
-    help="Take the nearest Gaussian for splats without an equal one, and measure what that costs.",
+    help="Use the nearest Gaussian for splats without an equal one, and measure the loss.",
 )
 @click.option(
     "--sh-degree",
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     "--cameras",
     type=PATH,
     metavar="FILE",
-    help="A cameras.json to measure from.  [default: that of the model folder]",
+    help="A cameras.json with the cameras of the measurement.  [default: that of the model folder]",
 )
 @iteration_option
 @click.option("--overwrite", is_flag=True, help="Replace OUTPUT.")
@@ -58,9 +58,9 @@ def convert_model(
 ) -> None:
     """Write MODEL, a folder or a file of splats, into OUTPUT: a .ply with all columns, or a .splat or .spz file.
 
-    Without --approximate the shape is only converted exactly: if a splat has no equal in the other shape, nothing is
-    written. With --shape gaussian a .ply has 3DGS's columns and no others. A .splat file has no SH bands above 0; .spz
-    files round everything to about a byte. The loss of a file is measured on images.
+    Without --approximate, nothing is written if a splat cannot be converted exactly. With --shape gaussian, a .ply has
+    only 3DGS's columns. A .splat file has no SH bands above 0; .spz files round each value to about a byte. The loss
+    of such files is measured on images.
     """
     from clsplat.models.convert import conversion_cost
     from clsplat.models.convert import convert_model as convert

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def devices(ctx: click.Context) -> None:
     """List the OpenCL devices, test each with a small kernel, and suggest fixes for known faults.
 
-    The first call measures the fastest schedule of each device, which takes some seconds.
+    The first call finds the fastest schedule of each device, which takes some seconds.
 
     The default device of the other commands is marked. --device takes an index such as 0:1, "cpu", "gpu", or a part
     of a platform's or device's name. The exit code is 1 if no device works.

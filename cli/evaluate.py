@@ -49,7 +49,7 @@ _DIGITS = {"PSNR": 3, "SSIM": 4, "LPIPS": 4, "FLIP": 4}
 )
 @click.option("--lpips", is_flag=True, help="Also measure LPIPS, with VGG16 (pip install 'clsplat[lpips]').")
 @click.option(
-    "--flip", is_flag=True, help="Also measure FLIP, and show its maps on the page (pip install 'clsplat[flip]')."
+    "--flip", is_flag=True, help="Also measure FLIP, and show its maps in the report (pip install 'clsplat[flip]')."
 )
 @click.option(
     "--report",
@@ -120,7 +120,7 @@ def evaluate_models(
 
 
 def describe(protocol: MetricProtocol) -> str:
-    """One line on how the numbers were computed."""
+    """Return one line on how the numbers were computed."""
     texts = protocol.describe()
     return f"protocol {texts['name']}: PSNR {texts['PSNR']}; SSIM {texts['SSIM']}"
 

@@ -40,7 +40,7 @@ INTERRUPTED = 130  # exit code after Ctrl-C: 128 + SIGINT, as in shells
 
 
 class Commands(click.Group):
-    """Subcommands that are imported when they are used, with one-line errors."""
+    """A group of subcommands that are imported when they are used, with one-line errors."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)

@@ -78,7 +78,7 @@ class Decibels(click.ParamType):  # type: ignore[type-arg]
 
 
 class ConfigOption(click.Option):
-    """A training option, which `--help` lists in its section."""
+    """A training option, which `--help` lists in the section of its group."""
 
     def __init__(self, *args: Any, section: str, **extra: Any) -> None:
         super().__init__(*args, **extra)
@@ -104,7 +104,7 @@ class TrainingCommand(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         lists = {name for param in self.params if isinstance(param.type, Numbers) for name in param.opts}
         joined: list[str] = []
-        in_list = False  # whether the last argument is in a list that may continue
+        in_list = False  # whether the previous argument belongs to a list that may continue
         for arg in args:
             if in_list and arg.isdecimal() and joined[-1].isdecimal():
                 joined += [next(opt for opt in reversed(joined) if opt.startswith("--")), arg]
@@ -223,7 +223,7 @@ def warn_without_effect(configs: Sequence[TrainConfig], names: Iterable[str]) ->
 
 
 def config_values(ctx: click.Context, values: dict[str, Any]) -> dict[str, Any]:
-    """Take the training options that stand on the command line out of `values` and return them by name."""
+    """Remove the training options from `values` and return by name those that are on the command line."""
     background = background_of(values.pop("background"), values.pop("white_background"))
     chosen = {name: values.pop(name) for name in OPTIONS if name in values and is_given(ctx, name)}
     for name in OPTIONS:
@@ -235,7 +235,7 @@ def config_values(ctx: click.Context, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def is_given(ctx: click.Context, name: str) -> bool:
-    """Whether the option stands on the command line."""
+    """Return whether the option is on the command line."""
     return ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
 
 

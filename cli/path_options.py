@@ -1,4 +1,4 @@
-"""`--path` and the flags that shape it."""
+"""The flag `--path` and the flags that change the path."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Range(click.ParamType):  # type: ignore[type-arg]
 
 
 def path_options(function: F) -> F:
-    """Add `--path` and the flags that shape it; `path_request` reads them."""
+    """Add `--path` and the flags that change the path; `path_request` reads them."""
     for option in reversed(
         (
             click.option(
@@ -66,7 +66,7 @@ def path_options(function: F) -> F:
                 "--frames",
                 type=click.IntRange(min=1),
                 metavar="N",
-                help=f"Number of images on the path.  [default: {FRAMES}, or what the file has]",
+                help=f"Number of images on the path.  [default: {FRAMES}, or the number in the file]",
             ),
             click.option(
                 "--seconds",
@@ -78,7 +78,7 @@ def path_options(function: F) -> F:
                 "--fps",
                 type=click.FloatRange(min=0, min_open=True, max=1000),
                 metavar="N",
-                help="Frames a second.  [default: 30, or what the file has]",
+                help="Frames per second.  [default: 30, or the number in the file]",
             ),
             click.option("--size", type=Size(), help="Size of the images [px]; the vertical field of view is kept."),
             click.option("--save-path", type=PATH, metavar="FILE", help="Also write the path as camera_path.json."),
@@ -89,7 +89,7 @@ def path_options(function: F) -> F:
 
 
 def path_request(values: dict[str, Any]) -> PathRequest | None:
-    """Take the flags that `path_options` added, except `save_path`, out of `values`.
+    """Remove the flags of `path_options`, except `save_path`, from `values` and return the path that they request.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What commands show while they run, and their tables."""
+"""Progress displays and tables of the commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["TrainingDisplay", "ViewCount", "duration", "table"]
 
 
 class ViewCount:
-    """A `progress` callback that shows how many views are done; a context manager that removes the line at the end.
+    """A `progress` callback that shows the number of finished views; a context manager that removes its line.
 
     Without a terminal it writes a line every PLAIN_INTERVAL seconds.
 
@@ -41,7 +41,7 @@ class ViewCount:
 
     def __call__(self, number: int, total: int) -> None:
         self.done, self.total = number - 1, total
-        # A log needs no line about work that ends within the interval.
+        # Work that ends within the interval does not need a line in a log.
         if not self.quiet and (self._line.live or self._line.clock() - self._start >= PLAIN_INTERVAL):
             self._line.show(f"{self.label} {number}/{total}")
 
@@ -51,7 +51,7 @@ class ViewCount:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Columns under their heads; the first is aligned to the left, the others to the right."""
+    """Return a table as text. The first column is aligned to the left, the others to the right."""
     lines = [head, *rows]
     widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
 

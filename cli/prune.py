@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help="Train this long after each round that removes a quarter of the splats; 0: do not train.",
+    help="Iterations of training after each round that removes a quarter of the splats. 0: no training.",
 )
 @click.option("--whole", is_flag=True, help="Write all columns of 3DGS, for programs that read no other files.")
 @iteration_option
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 def prune_model(model: Path, output: Path, whole: bool, quiet: bool, **values: Any) -> None:
     """Write MODEL, a folder or any splat PLY, without the splats, skew and SH bands that its images do not need.
 
-    Some training views are held out to measure the loss: their PSNR falls by no more than the tolerance. Test views
-    are never used. A PLY needs the scene, -s; every eighth of its views is then a test view.
+    Some training views are held out to measure the loss. Their PSNR falls by no more than the tolerance. Test views are
+    never used. A PLY file needs the scene (-s); every eighth of its views is then a test view.
     """
     from clsplat.models.prune import prune_model as prune
 
@@ -51,7 +51,7 @@ def prune_model(model: Path, output: Path, whole: bool, quiet: bool, **values: A
 
 
 def _summary(result: PrunedModel) -> list[str]:
-    """Lines on what was removed, and what it cost."""
+    """Return lines on the removed parts and the loss of quality."""
     from clsplat.splats.stats import complexity
 
     pruned, output = result.pruned, result.output

@@ -81,7 +81,7 @@ def reconstruct_scene(photos: Path, scene: Path, overwrite: bool, quiet: bool, *
 def run_reconstruction(
     photos: Path, scene: Path, options: ReconstructOptions, overwrite: bool, quiet: bool
 ) -> ReconstructionResult:
-    """Reconstruct a scene with a live display."""
+    """Reconstruct a scene with a live display, and return the result."""
     from clsplat.scenes.reconstruct.reconstruct import reconstruct
 
     with StepDisplay(quiet) as display:
@@ -97,7 +97,7 @@ def report(result: ReconstructionResult) -> None:
 
 
 def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> Path:
-    """Return the scene to train on for photographs without poses, and make it if it does not exist."""
+    """Return the scene of photographs without poses. Reconstruct it if it does not exist."""
     from clsplat.scenes.reconstruct.beside_model import plan_scene
 
     options = ReconstructOptions()
@@ -118,16 +118,16 @@ def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> 
 
 
 def _minutes(seconds: float) -> str:
-    """Return the duration in minutes; an estimate is not more accurate."""
+    """Return an estimated duration as text, in whole minutes."""
     return "about a minute" if seconds < 90 else f"about {round(seconds / 60)} min"
 
 
 class StepDisplay:
-    """A display of Steps: one line per kind of work, updated on a terminal.
+    """A display of the steps of a reconstruction: one line per kind of work, updated on a terminal.
 
     Parameters
     ----------
-    quiet : whether to show nothing.
+    quiet : whether to show no output.
     """
 
     def __init__(self, quiet: bool = False) -> None:
@@ -151,6 +151,6 @@ class StepDisplay:
             self._line, self._label = LiveLine(), step.label
             self._begun = self._line.clock()
         last = step.done == step.total
-        # In a log, work that takes less than the interval gets a single line.
+        # In a log, work that takes less time than the interval gets a single line.
         if last or self._line.live or self._line.clock() - self._begun >= PLAIN_INTERVAL:
             self._line.show(f"{step.label} {step.done}" + (f"/{step.total}" if step.total else ""), last)

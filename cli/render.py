@@ -1,4 +1,4 @@
-"""`clsplat render`: images, alpha and depth of a model or of a splat file, and videos of them."""
+"""`clsplat render`: images, alpha, depth and videos of a model or of a file of splats."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 @click.option(
     "--depth-colours", "--depth-colors", is_flag=True, help="Write mean depth in colours, not in 16 bits of grey."
 )
-@click.option("--depth-range", type=Range(), help="Depths at the ends of the colours.  [default: those seen]")
+@click.option("--depth-range", type=Range(), help="Depths at the ends of the colours.  [default: from the images]")
 @background_options
 @iteration_option
 @device_option
@@ -126,7 +126,7 @@ def _interrupted(output: RenderOutput, progress: ViewCount) -> str:
 
 
 def _summary(output: RenderOutput, rendered: ModelRenders) -> list[str]:
-    """Lines on what was written."""
+    """Return lines on the files that were written."""
     from clsplat.rendering.outputs import extra_video
 
     lines = [f"{name}: 65535 = {depth:.6g} world units" for name, depth in rendered.depth_scales.items()]

@@ -25,19 +25,19 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def server_options(function: F) -> F:
-    """`--port` and `--host` of a viewer."""
+    """Add `--port` and `--host` of a viewer."""
     function = click.option(
         "--host",
         default="127.0.0.1",
         show_default=True,
-        help="Address of the viewer; 0.0.0.0 lets every machine that reaches this one look.",
+        help="Address of the viewer. With 0.0.0.0, every machine that reaches this one can open it.",
     )(function)
     return click.option(
         "--port",
         type=click.IntRange(0, 65535),
         default=8080,
         show_default=True,
-        help="Port of the viewer; 0 takes any free one.",
+        help="Port of the viewer. 0: any free port.",
     )(function)
 
 
