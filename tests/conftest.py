@@ -28,12 +28,14 @@ USABLE.sort(key=lambda info: info.index != DEFAULT)
 NAMES = [info.platform.split()[0] for info in USABLE]
 
 
-def on_place(place: int, *values: object) -> object:
+def on_place(place: int, *values: object, slow: bool = False) -> object:
     """Parameters of a test on the device in this place of USABLE."""
-    return pytest.param(*(values or (place,)), marks=[pytest.mark.slow] if place else [])
+    return pytest.param(*(values or (place,)), marks=[pytest.mark.slow] if place or slow else [])
 
 
-# All schedules on the first device; on others one of lanes and one of groups, as building them takes seconds.
+# All schedules are tested on the first device, two of them on the others. Each combination builds kernels for seconds,
+# so the default run has one schedule of each kind: wide vectors, single lanes, and groups.
+FAST_SCHEDULES = ("cpu16", "scalar", "gpu256")
 DEVICE_SCHEDULES = [
     (place, name) for place in range(len(USABLE)) for name in SCHEDULES if place == 0 or name in ("cpu16", "gpu256")
 ]
@@ -61,7 +63,7 @@ def device(request: pytest.FixtureRequest, devices: list[Device]) -> Device:
 
 @pytest.fixture(
     scope="session",
-    params=[on_place(place, (place, name)) for place, name in DEVICE_SCHEDULES],
+    params=[on_place(place, (place, name), slow=name not in FAST_SCHEDULES) for place, name in DEVICE_SCHEDULES],
     ids=[f"{NAMES[place]}-{name}" for place, name in DEVICE_SCHEDULES],
 )
 def scheduled(request: pytest.FixtureRequest, devices: list[Device]) -> tuple[Device, Schedule]:

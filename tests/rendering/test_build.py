@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from importlib.resources import files
+from pathlib import Path
 
 import pytest
 from kernel_checks import KERNELS
@@ -79,7 +80,8 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
         if folder.is_dir()
         for file in folder.iterdir()
     }
-    used = {name for names, *_ in compiler.programs for name in names}
+    # Shapes that a test has registered lie in other folders, with absolute paths.
+    used = {name for names, *_ in compiler.programs for name in names if not Path(name).is_absolute()}
     assert used == {name for name in there if name.endswith((".cl", ".clh"))}
 
 

@@ -68,7 +68,7 @@ def test_training_stops_when_nothing_shows(scene: Scene, devices: list[Device], 
         shape="gaussian", sh_degree=0, iterations=20, densify_interval=5, cap_max=50, init=str(tmp_path / "start.ply")
     )
     trainer = Trainer(scene, config, device=devices[0])
-    with pytest.raises(TrainingError, match=r"iteration 5: no image shows any splat .*check what training starts from"):
+    with pytest.raises(TrainingError, match=r"iteration 5: no image shows any splat .*check the start \(init\)"):
         trainer.run()
 
 
