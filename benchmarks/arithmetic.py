@@ -57,12 +57,11 @@ class Variant:
 
 def variants() -> list[Variant]:
     """The default first."""
-    found = [Variant("default", "default")]
+    found = [Variant("default", "default"), Variant("8 lanes", "lanes", {"schedule": Schedule(1, 32, 8)})]
     fine = {"alpha_min": FINE}
     found.append(Variant("cutoff 1/255", "cutoff", {}, fine))
     found += [Variant(f"cutoff 1/{part}", "cutoff", {"alpha_min": 1 / part}, fine) for part in (1000, 128, 64, 32)]
     found += [Variant(f"finished at {t:g}", "finish", {"t_min": t}, {"t_min": 1e-6}) for t in (1e-4, 1e-3, 1e-2)]
-    found.append(Variant("8 lanes", "lanes", {"schedule": Schedule(1, 32, 8)}))
     return found
 
 
