@@ -229,7 +229,7 @@ kernel void project_splats_vjp(
     const vec3 v_c = camera_project_vjp(cam, s.c, v_px);
     vec3 v_mean = mat3_apply_transposed(w, v_c);
 
-    const vreal half_x = g.mean_x * (vreal)(real)(0.5 * width), half_y = g.mean_y * (vreal)(real)(0.5 * height);
+    const vreal half_x = g.mean_x * (vreal)(R(0.5) * (real)width), half_y = g.mean_y * (vreal)(R(0.5) * (real)height);
     const vreal along_ray = fabs(dot3(v_c, s.c)) / sqrt(dot3(s.c, s.c));
     global real *signal = signals + first;
     lanes_store(lanes_load(signal) + lanes_if(seen, sqrt(half_x * half_x + half_y * half_y), zero), signal);

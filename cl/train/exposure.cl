@@ -60,8 +60,7 @@ kernel void photo_of_render(
                     counts = counted(truth + at, plane, channels, vec, width);
         const vreal r = lanes_load(color + at), g = lanes_load(color + at + plane),
                     b = lanes_load(color + at + 2 * plane);
-        const vreal through =
-            channels > 3 ? (vreal)1 - lanes_uchar_to_real(truth + at + 4 * plane) * (real)(1.0 / 255.0) : zero;
+        const vreal through = channels > 3 ? (vreal)1 - lanes_uchar_to_real(truth + at + 4 * plane) * BYTE_STEP : zero;
         for (int c = 0; c < 3; ++c) {
             global const real *e = row + 4 * c;
             vreal shown = lanes_mad(r, (vreal)e[0], lanes_mad(g, (vreal)e[1], lanes_mad(b, (vreal)e[2], (vreal)e[3])));
@@ -69,7 +68,7 @@ kernel void photo_of_render(
                 vreal aim = lanes_mad(through, (vreal)shift[c], lanes_uchar_to_real(truth + at + c * plane));
                 aim = lanes_if(inside, rint(lanes_clamp(aim, 0, 255)), zero);
                 lanes_real_to_uchar(aim, target + at + c * plane);
-                shown = lanes_if(counts, shown, aim * (real)(1.0 / 255.0));
+                shown = lanes_if(counts, shown, aim * BYTE_STEP);
             }
             lanes_store(lanes_if(inside, shown, zero), photo + at + c * plane);
         }
@@ -106,7 +105,7 @@ kernel void photo_of_render_vjp(
         vreal x[4], v_photo[3], aim[3], brightest = zero;
         for (int c = 0; c < 3; ++c) {
             x[c] = lanes_load(color + at + c * plane);
-            aim[c] = lanes_uchar_to_real(target + at + c * plane) * (real)(1.0 / 255.0);
+            aim[c] = lanes_uchar_to_real(target + at + c * plane) * BYTE_STEP;
             brightest = max(brightest, aim[c]);
             v_photo[c] = lanes_if(counts, lanes_load(v + at + c * plane), zero);
         }

@@ -24,13 +24,14 @@
 #define SHIFT (LANES == 1)
 #define RING (SHIFT ? TAPS : 2 * TAPS)
 #define SLOT (SHIFT ? TAPS - 1 : slot)
+#define MID ((SHIFT ? 0 : slot) + REACH)  // slot of the row in the middle of the window
 #define PUT(map, value) (ring[SLOT][v][map] = ring[SHIFT ? SLOT : SLOT + TAPS][v][map] = (value))
 #define MOVE_UP(maps) \
     if (SHIFT) \
         for (int k = 0; k < TAPS - 1; ++k) \
             for (int map = 0; map < maps; ++map) ring[k][0][map] = ring[k + 1][0][map];
 
-#define truth_load(p) (lanes_uchar_to_real(p) * (real)(1.0 / 255.0))
+#define truth_load(p) (lanes_uchar_to_real(p) * BYTE_STEP)
 
 // Expands to pair(weight, k) for each distance k of two pixels from the centre. Not every compiler unrolls a loop here.
 #define PAIRS_OF_WINDOW(pair) pair(WINDOW_4, 1) pair(WINDOW_3, 2) pair(WINDOW_2, 3) pair(WINDOW_1, 4) pair(WINDOW_0, 5)
@@ -131,14 +132,13 @@ kernel void image_loss(
         if (row < item.top + REACH) continue;
         const ulong centre = item.at + (long)(row - REACH) * stride;
         for (int v = 0; v < item.n; ++v) {
-            const vreal(*mid)[4] = &ring[slot + REACH][v];
-            vreal ms = WINDOW_5 * mid[0][0], md = WINDOW_5 * mid[0][1];
-            vreal ms2 = WINDOW_5 * mid[0][2], md2 = WINDOW_5 * mid[0][3];
+            vreal ms = WINDOW_5 * ring[MID][v][0], md = WINDOW_5 * ring[MID][v][1];
+            vreal ms2 = WINDOW_5 * ring[MID][v][2], md2 = WINDOW_5 * ring[MID][v][3];
 #define ADD_PAIR(w, k) \
-    ms = lanes_mad(w, mid[-k * STRIP][0] + mid[k * STRIP][0], ms); \
-    md = lanes_mad(w, mid[-k * STRIP][1] + mid[k * STRIP][1], md); \
-    ms2 = lanes_mad(w, mid[-k * STRIP][2] + mid[k * STRIP][2], ms2); \
-    md2 = lanes_mad(w, mid[-k * STRIP][3] + mid[k * STRIP][3], md2);
+    ms = lanes_mad(w, ring[MID - k][v][0] + ring[MID + k][v][0], ms); \
+    md = lanes_mad(w, ring[MID - k][v][1] + ring[MID + k][v][1], md); \
+    ms2 = lanes_mad(w, ring[MID - k][v][2] + ring[MID + k][v][2], ms2); \
+    md2 = lanes_mad(w, ring[MID - k][v][3] + ring[MID + k][v][3], md2);
             PAIRS_OF_WINDOW(ADD_PAIR)
 #undef ADD_PAIR
             const vreal half_s = R(0.5) * ms * ms, half_d = R(0.5) * md * md;
@@ -214,12 +214,12 @@ kernel void image_loss_vjp(
         if (row < item.top + REACH) continue;
         const ulong centre = item.at + (long)(row - REACH) * stride;
         for (int v = 0; v < item.n; ++v) {
-            const vreal(*mid)[3] = &ring[slot + REACH][v];
-            vreal v_mean = WINDOW_5 * mid[0][0], v_hs = WINDOW_5 * mid[0][1], v_hd = WINDOW_5 * mid[0][2];
+            vreal v_mean = WINDOW_5 * ring[MID][v][0];
+            vreal v_hs = WINDOW_5 * ring[MID][v][1], v_hd = WINDOW_5 * ring[MID][v][2];
 #define ADD_PAIR(w, k) \
-    v_mean = lanes_mad(w, mid[-k * STRIP][0] + mid[k * STRIP][0], v_mean); \
-    v_hs = lanes_mad(w, mid[-k * STRIP][1] + mid[k * STRIP][1], v_hs); \
-    v_hd = lanes_mad(w, mid[-k * STRIP][2] + mid[k * STRIP][2], v_hd);
+    v_mean = lanes_mad(w, ring[MID - k][v][0] + ring[MID + k][v][0], v_mean); \
+    v_hs = lanes_mad(w, ring[MID - k][v][1] + ring[MID + k][v][1], v_hs); \
+    v_hd = lanes_mad(w, ring[MID - k][v][2] + ring[MID + k][v][2], v_hd);
             PAIRS_OF_WINDOW(ADD_PAIR)
 #undef ADD_PAIR
             const ulong at = centre + v * LANES;

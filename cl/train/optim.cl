@@ -93,8 +93,8 @@ static inline void regularise(
 #ifdef ROW_OPACITY_MINUS_LOGIT
         const vreal o_minus = opacity_of(lanes_load(geom + ROW_OPACITY_MINUS_LOGIT * capacity));
         const vreal gap = (real)2 * bisect_scale * (o - o_minus);
-        const vreal v_minus = (real)0.5 * opacity_scale * sign(o_minus) - gap;
-        v_o = (real)0.5 * v_o + gap;
+        const vreal v_minus = R(0.5) * opacity_scale * sign(o_minus) - gap;
+        v_o = R(0.5) * v_o + gap;
         g[ROW_OPACITY_MINUS_LOGIT - ROW_OPACITY_LOGIT] += v_minus * opacity_slope(o_minus);
 #endif
         g[0] += v_o * opacity_slope(o);

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import DeviceError
+from ..errors import FEWER_SPLATS, OTHER_DEVICE, SMALLER_IMAGES, DeviceError
+from ..files.host_memory import available_bytes
+from .caches import ensure_caches
 from .opencl import Buffer, Event, first_line, is_out_of_memory
 from .pip_runtime import register_pip_runtime
 
@@ -27,7 +29,9 @@ BROKEN_POCL = (
     "PoCL 3.0-rc2 (the wheel behind pyopencl[pocl]) cannot build kernels on recent CPUs: "
     "`apt install pocl-opencl-icd` or `pip install clsplat[cpu]`"
 )
-LESS_MEMORY = "use fewer splats (--cap-max), smaller images (-r 2, 4, 8) or another --device"
+_CLANG_PLATFORMS = ("Portable Computing Language", "Intel(R) OpenCL")  # they compile CPU kernels by clang alone
+_SCALAR_PLATFORMS = ("rusticl", "Clover")  # of Mesa: their compilers take vectors apart
+LESS_MEMORY = (FEWER_SPLATS, SMALLER_IMAGES, OTHER_DEVICE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +58,16 @@ class DeviceInfo:
         if self.platform == "Portable Computing Language" and "3.0-rc2" in self.platform_version:
             return BROKEN_POCL
         return None
+
+    @property
+    def has_prefetch(self) -> bool:
+        """Whether kernels may call clang's __builtin_prefetch. Compilers with SPIR-V end the process at it (Mesa)."""
+        return self.type == "CPU" and self.platform in _CLANG_PLATFORMS
+
+    @property
+    def has_wide_lanes(self) -> bool:
+        """Whether a work-item may compute wide vectors: on CPUs, except with Mesa, which compiles them for minutes."""
+        return self.type == "CPU" and self.platform not in _SCALAR_PLATFORMS
 
     def __str__(self) -> str:
         return f"{self.index} {self.name} ({self.platform})"
@@ -125,7 +139,7 @@ class Device:
             return self.info.max_alloc_bytes, "for one buffer"
         if nbytes >= _EAGER_BYTES and self.info.type == "CPU":
             # A CPU's buffers are lazy pages: without this check the system would kill the process later.
-            return _available_host_bytes(), "free in this machine"
+            return available_bytes(), "free in this machine"
         return self.info.max_alloc_bytes, "for one buffer"
 
     def __repr__(self) -> str:
@@ -174,6 +188,7 @@ def open_device(spec: str | None = None) -> Device:
 
 
 def _all_devices() -> list[_DevicePair]:
+    ensure_caches()  # before pyopencl opens its cache and the loader opens PoCL's
     register_pip_runtime()  # before the loader reads the vendors' folder
     try:
         import pyopencl as cl
@@ -257,19 +272,7 @@ def _from_environment(pairs: list[_DevicePair]) -> list[_DevicePair]:
     return [pair for pair in pairs if pair[0] == chosen[0]]
 
 
-def _available_host_bytes() -> int:
-    """Free memory of the machine on Linux; on other systems a number that never limits."""
-    try:
-        with open("/proc/meminfo", encoding="ascii") as file:
-            for line in file:
-                if line.startswith("MemAvailable:"):
-                    return int(line.split()[1]) * 1024
-    except OSError:
-        pass
-    return 1 << 62
-
-
 def _out_of_memory(needed: int, limit: int, scope: str) -> DeviceError:
     return DeviceError(
-        f"device out of memory: needs {needed / _MIB:.0f} MB, has {limit / _MIB:.0f} MB {scope}: {LESS_MEMORY}"
+        f"device out of memory: needs {needed / _MIB:.0f} MB, has {limit / _MIB:.0f} MB {scope}", *LESS_MEMORY
     )

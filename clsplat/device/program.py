@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import DeviceError
+from .. import activity
+from ..errors import OTHER_DEVICE, DeviceError, Remedy
 from .device import BROKEN_POCL, LESS_MEMORY, Device
 from .kernel_args import Parameter, parse_signatures
 from .kernel_args import Real as Real  # of this module's interface
@@ -62,7 +63,7 @@ def build(
     ----------
     files : names as for `source`; a file stands after those that it uses.
     defines : become `#define` lines before the text; floats become literals of type `real`.
-    real : type of the kernels' real numbers; REAL_DOUBLE is defined as 0 or 1.
+    real : type of the kernels' real numbers; REAL_DOUBLE is defined as 0 or 1, and so is HAS_PREFETCH of the device.
 
     Raises
     ------
@@ -71,6 +72,7 @@ def build(
     defines = dict(defines or {})
     key = (files, tuple(sorted(defines.items())), real, os.environ.get(OPTIONS_VARIABLE, ""))
     if key not in device.programs:
+        activity.report(f"compiling kernels: {Path(files[-1]).stem}")
         device.programs[key] = build_text(device, source(*files), defines, real)
     return device.programs[key]
 
@@ -80,8 +82,8 @@ def build_text(device: Device, text: str, defines: Mapping[str, Define] | None =
     import pyopencl as cl
 
     if real == "double" and not device.has_fp64:
-        raise DeviceError(f"device {device.info} has no double precision: use float32 or another --device")
-    lines = [f"#define REAL_DOUBLE {int(real == 'double')}"]
+        raise DeviceError(f"device {device.info} has no double precision", Remedy("use float32"), OTHER_DEVICE)
+    lines = [f"#define REAL_DOUBLE {int(real == 'double')}", f"#define HAS_PREFETCH {int(device.info.has_prefetch)}"]
     lines += [f"#define {name} {_literal(name, value, real)}" for name, value in (defines or {}).items()]
     options = [*OPTIONS, *os.environ.get(OPTIONS_VARIABLE, "").split()]
     try:
@@ -180,8 +182,10 @@ class Kernel:
         try:
             event = self._enqueue(self._queue, self._kernel, global_size, local_size)
         except self._cl_error as error:
-            remedy = f": {LESS_MEMORY}" if is_out_of_memory(error) else f", sizes {global_size} {local_size}"
-            raise DeviceError(f"kernel {self.name} on {self._device.info}: {first_line(error)}{remedy}") from error
+            failed = f"kernel {self.name} on {self._device.info}: {first_line(error)}"
+            if is_out_of_memory(error):
+                raise DeviceError(failed, *LESS_MEMORY) from error
+            raise DeviceError(f"{failed}, sizes {global_size} {local_size}") from error
         self._device.observe(self.name, global_size, event)
         return event
 
@@ -226,8 +230,13 @@ def smoke_test(device: Device) -> tuple[float, float]:
     expected = np.array([math.exp(-v * v) + math.erfc(v) for v in x.tolist()])
     worst = float(np.max(np.abs(computed - expected) / expected))
     if not worst < SMOKE_TOLERANCE:
-        raise DeviceError(f"device {device.info} computes wrong numbers (off by {worst:.1e}): update its driver")
+        raise wrong_numbers(device, f"off by {worst:.1e}")
     return build_ms, run_ms
+
+
+def wrong_numbers(device: Device, what: str) -> DeviceError:
+    """Return the error for a device whose results are wrong."""
+    return DeviceError(f"device {device.info} computes wrong numbers ({what}): update its driver or use another device")
 
 
 def _compiled(device: Device, text: str, options: list[str]) -> pyopencl.Program:

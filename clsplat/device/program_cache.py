@@ -16,6 +16,7 @@ from pathlib import Path
 
 from ..errors import OutputError
 from ..files.atomic import atomic_writer
+from .caches import user_cache
 from .device import DeviceInfo
 
 # Platforms whose drivers cache programs. PoCL also caches each kernel by its group size.
@@ -27,8 +28,7 @@ _DIGEST = hashlib.sha256().digest_size
 
 def cache_folder() -> Path:
     """Return clsplat's folder in the user's cache, which may not exist; RuntimeError if the user has no home."""
-    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
-    return Path(home) / "clsplat"
+    return user_cache() / "clsplat"
 
 
 def binary_path(info: DeviceInfo, text: str, options: list[str]) -> Path | None:

@@ -66,7 +66,7 @@ SCHEDULES = {
 
 
 def default_schedule(info: DeviceInfo) -> Schedule:
-    """Return the schedule of an unmeasured device: wide lanes on CPUs, one pixel per work-item on others."""
-    if info.type == "CPU":
+    """Return the schedule of an unmeasured device: wide lanes where they are fast, else one pixel per work-item."""
+    if info.has_wide_lanes:
         return SCHEDULES["cpu16"]
     return SCHEDULES["gpu256"] if info.max_group >= SCHEDULES["gpu256"].group else SCHEDULES["gpu64"]
