@@ -2,9 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
+
+class Remedy:
+    """One way to fix an error, for example "use fewer splats".
+
+    Parameters
+    ----------
+    text : what to do. It names no option, because functions do not have options.
+    flags : options of commands that do it, such as "--cap-max" or "-r 2, 4, 8". Each command has some or none of them.
+    """
+
+    def __init__(self, text: str, *flags: str) -> None:
+        self.text, self.flags = text, flags
+
+    def for_command(self, options: Collection[str]) -> str | None:
+        """Return the text with the flags that a command has; None if the remedy needs a flag that it lacks."""
+        known = [flag for flag in self.flags if flag.split()[0] in options]
+        if not self.flags:
+            return self.text
+        return f"{self.text} ({' or '.join(known)})" if known else None
+
 
 class ClsplatError(Exception):
-    """Base of all errors that clsplat raises on purpose. The command line prints one line and exits with code 1."""
+    """Base of all errors that clsplat raises on purpose. The command line prints one line and exits with code 1.
+
+    Parameters
+    ----------
+    message : what is wrong, and where. An error without `remedies` also says here how to fix it.
+    remedies : ways to fix it. Each command shows those that it has options for.
+    """
+
+    def __init__(self, message: str = "", *remedies: Remedy) -> None:
+        super().__init__(message, *remedies)
+        self.message, self.remedies = message, remedies
+
+    def __str__(self) -> str:
+        return _sentence(self.message, [remedy.text for remedy in self.remedies])
+
+    def for_command(self, options: Collection[str]) -> str:
+        """Return the message with the remedies of a command, which has these options."""
+        texts = (remedy.for_command(options) for remedy in self.remedies)
+        return _sentence(self.message, [text for text in texts if text is not None])
 
 
 class InputError(ClsplatError):
@@ -21,6 +61,19 @@ class DeviceError(ClsplatError):
 
 class TrainingError(ClsplatError):
     """Training cannot go on. The model trained so far is saved."""
+
+
+FEWER_SPLATS = Remedy("use fewer splats", "--cap-max", "--splats")
+SMALLER_IMAGES = Remedy("use smaller images", "-r 2, 4, 8", "--size WxH", "--width N", "--max-size PX")
+OTHER_DEVICE = Remedy("choose another device", "--device")
+
+
+def _sentence(message: str, remedies: list[str]) -> str:
+    """Return "message: remedy, remedy or remedy"."""
+    if not remedies:
+        return message
+    *others, last = remedies
+    return f"{message}: {', '.join(others)} or {last}" if others else f"{message}: {last}"
 
 
 def reason_of(error: Exception, max_length: int = 200) -> str:

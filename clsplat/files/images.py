@@ -8,21 +8,30 @@ from __future__ import annotations
 
 import io
 import os
+import threading
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 # Pillow must be loaded before pycolmap, or writing PNG corrupts the heap. So this import stays at the top.
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageOps, PngImagePlugin
 
 from ..errors import InputError, OutputError
 from .atomic import atomic_writer
-from .image_names import JPEG_SUFFIXES
+from .image_names import CONVERTERS, JPEG_SUFFIXES
 
 ImageU8 = NDArray[np.uint8]
 
+_MARK = ("Software", "clsplat render")  # text in the PNG of a render
+_MARK_BYTES = 256  # the mark is before the pixels, within this number of bytes
+# Formats that photos have. Pillow starts other programs for some of the others, such as Ghostscript for EPS.
+_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "AVIF", "JPEG2000")
+MAX_PIXELS = 400_000_000  # larger than the photo of any camera; a file that claims more is damaged or an attack
+_HEIC = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1")  # brands of ISO/IEC 23008-12
 _PHOTO_QUALITY = 97  # of a JPEG made from another JPEG: the second compression adds little error to the first
 _ALPHA_MODES = ("RGBA", "RGBa", "LA", "La", "PA")
 _SIXTEEN_BIT_MODES = ("I", "I;16", "I;16B", "I;16L", "I;16N")
@@ -78,6 +87,20 @@ def read_image(path: str | os.PathLike[str], upright: bool = False) -> ImageU8:
     raise InputError(f"{path}: float pixels are not supported; convert it to 8-bit PNG or JPEG")
 
 
+def decode_pixels(data: bytes, name: str) -> ImageU8:
+    """Return the pixels (H, W, 4) of an image in memory.
+
+    Raises
+    ------
+    InputError : the data are not an image. The message names it `name`.
+    """
+    try:
+        with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
+            return np.array(image.convert("RGBA"), dtype=np.uint8)
+    except Exception:  # decoders of damaged files raise nearly anything
+        raise InputError(f"{name}: cannot be read as an image; export it again") from None
+
+
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """Return (width, height) [px], read from the file's header alone.
 
@@ -120,12 +143,24 @@ def read_photo_header(path: str | os.PathLike[str]) -> PhotoHeader:
         return PhotoHeader(width, height, plain, tuple(str(value) for value in camera if value), exif_bytes)
 
 
-def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU8) -> None:
+def is_render(path: Path) -> bool:
+    """Return whether a file is a PNG that `write_png` or `write_grey16` wrote as a render."""
+    if not path.is_file():  # opening a pipe would wait for ever
+        return False
+    try:
+        with path.open("rb") as stream:
+            return "\0".join(_MARK).encode() in stream.read(_MARK_BYTES)
+    except OSError:
+        return False
+
+
+def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU8, render: bool = False) -> None:
     """Write an image as 8-bit PNG, atomically.
 
     Parameters
     ----------
     array : (H, W), (H, W, 3) or (H, W, 4), uint8 or real; real numbers are clipped to 0..1 and rounded.
+    render : mark the file as a render, so that it is never taken for a photo.
 
     Raises
     ------
@@ -139,7 +174,18 @@ def write_png(path: str | os.PathLike[str], array: NDArray[np.floating] | ImageU
             raise OutputError(f"{path}: the image contains NaN; the render that made it failed")
         pixels = np.rint(np.clip(pixels, 0.0, 1.0) * 255.0).astype(np.uint8)
     with atomic_writer(path) as stream:
-        Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="PNG")
+        _save_png(stream, pixels, render)
+
+
+def encode_render(pixels: ImageU8) -> bytes:
+    """Return (H, W, 3) as the bytes of the file that `write_png` writes for a render."""
+    stream = io.BytesIO()
+    _save_png(stream, pixels, render=True)
+    return stream.getvalue()
+
+
+def _save_png(stream: BinaryIO, pixels: ImageU8, render: bool) -> None:
+    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, format="PNG", pnginfo=_mark() if render else None)
 
 
 def write_photo(path: str | os.PathLike[str], pixels: ImageU8, exif: bytes = b"") -> None:
@@ -167,14 +213,14 @@ def encode_jpeg(pixels: ImageU8, quality: int = 88) -> bytes:
 
 
 def write_grey16(path: str | os.PathLike[str], array: NDArray[np.uint16]) -> None:
-    """Write (H, W) as 16-bit grey PNG, atomically.
+    """Write (H, W) as 16-bit grey PNG, atomically, and mark it as a render.
 
     Raises
     ------
     OutputError : the file cannot be written.
     """
     with atomic_writer(path) as stream:
-        Image.fromarray(np.ascontiguousarray(array, np.uint16)).save(stream, format="PNG")
+        Image.fromarray(np.ascontiguousarray(array, np.uint16)).save(stream, format="PNG", pnginfo=_mark())
 
 
 def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -207,17 +253,64 @@ def resize_area(image: ImageU8, width: int, height: int) -> ImageU8:
     return np.array(pillow.resize((width, height), Image.Resampling.BICUBIC), dtype=np.uint8)
 
 
+def _mark() -> PngImagePlugin.PngInfo:
+    info = PngImagePlugin.PngInfo()
+    info.add_text(*_MARK)
+    return info
+
+
 def _open(path: str | os.PathLike[str]) -> Image.Image:
-    if not Path(path).exists():
+    # os.path answers False for impossible names, where pathlib raises. Opening a pipe would wait for ever.
+    if not os.path.isfile(path):
+        if os.path.exists(path):
+            kind = "a folder" if os.path.isdir(path) else "not a regular file"
+            raise InputError(f"{path}: is {kind}, not an image; replace or remove it")
         raise InputError(f"{path}: no such image file; check the name and the folder")
     try:
-        return Image.open(path)
+        image = _open_unlimited(Path(path))
     except Exception as error:  # header parsers of damaged files raise nearly anything
         raise _unreadable(path, error) from error
+    width, height = image.size
+    if width * height > MAX_PIXELS:
+        image.close()
+        raise InputError(
+            f"{path}: has {width}x{height} px, more than {MAX_PIXELS // 1_000_000} megapixels; replace or reduce it"
+        )
+    return image
+
+
+_limit_lock = threading.Lock()
+
+
+def _open_unlimited(file: Path) -> Image.Image:
+    """Open a file without Pillow's limit of pixels, which warns at 89 megapixels. The limit is a global variable."""
+    with _limit_lock:
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            return Image.open(file, formats=_known_formats())
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
+
+
+@cache
+def _known_formats() -> tuple[str, ...]:
+    """Return the formats of photos that this Pillow can read."""
+    Image.init()
+    return tuple(name for name in _FORMATS if name in Image.OPEN)
 
 
 def _unreadable(path: str | os.PathLike[str], error: Exception) -> InputError:
     reason = (str(error).splitlines() or [type(error).__name__])[0]
     if "cannot identify" in reason:  # Pillow's message would repeat the path
         reason = "not an image of a supported format"
+        if _is_heic(Path(path)):
+            return InputError(
+                f"{path}: is a HEIC image, which is not supported; convert it to JPEG with {CONVERTERS['.heic']}"
+            )
     return InputError(f"{path}: cannot be read as an image ({reason}); replace or remove the file")
+
+
+def _is_heic(file: Path) -> bool:
+    with file.open("rb") as stream:
+        head = stream.read(12)
+    return head[4:8] == b"ftyp" and head[8:] in _HEIC

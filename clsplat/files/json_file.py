@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .atomic import atomic_writer
+from .whole_file import read_whole
 
 
 def read_json(path: str | os.PathLike[str], expected: str) -> Any:
@@ -28,7 +29,7 @@ def read_json(path: str | os.PathLike[str], expected: str) -> Any:
     """
     path = Path(path)
     try:
-        return json.loads(path.read_bytes())
+        return json.loads(read_whole(path))
     except OSError as error:
         reason = error.strerror or str(error)
         raise InputError(f"{path}: cannot be read ({reason}); check its name and permissions") from error
@@ -94,6 +95,8 @@ def describe(value: object) -> str:
         return f"the text {ascii(value)[:40]}"
     if isinstance(value, (list, dict)):
         return "a list" if isinstance(value, list) else "an object"
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"{value}"
     return "a number"
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..errors import OutputError
 from .atomic import remove_leftovers
+from .real_path import real_path
 
 try:
     import fcntl
@@ -34,7 +35,7 @@ def folder_lock(folder: Path | None) -> Iterator[None]:
     ------
     OutputError : another run writes into the folder.
     """
-    path = None if folder is None else folder.resolve()
+    path = None if folder is None else real_path(folder)
     if path is None or path in _held or fcntl is None:
         yield
         return

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -16,19 +18,30 @@ NO_MASKS = "none"  # the user's word for using no masks, in place of a folder's 
 _THRESHOLD = 127.5  # smallest mean of the channels of a pixel that counts
 
 
-def mask_files(folder: Path, names: list[str]) -> dict[str, Path]:
+def mask_files(folder: Path, photos: Mapping[str, Path]) -> dict[str, Path]:
     """Return the mask files in a folder by the names of their photos.
 
     The mask of `sub/a.jpg` is the first existing file of `sub/a.jpg.png` (COLMAP's form), `sub/a.png`,
-    `sub/a.mask.png` and `sub/a.jpg`.
+    `sub/a.mask.png` and `sub/a.jpg`. A photo is never its own mask.
+
+    Parameters
+    ----------
+    photos : file of each photo by name.
     """
-    return {name: file for name in names for file in [_mask_of(folder, name)] if file is not None}
+    found = {name: _mask_of(folder, name, file) for name, file in photos.items()}
+    return {name: mask for name, mask in found.items() if mask is not None}
 
 
-def _mask_of(folder: Path, name: str) -> Path | None:
+def _mask_of(folder: Path, name: str, file: Path) -> Path | None:
     photo = PurePosixPath(name)
     candidates = (f"{name}.png", str(photo.with_suffix(".png")), str(photo.with_suffix(".mask.png")), name)
-    return next((folder / candidate for candidate in candidates if (folder / candidate).is_file()), None)
+    masks = (folder / candidate for candidate in candidates)
+    return next((mask for mask in masks if os.path.isfile(mask) and not is_same_file(mask, file)), None)
+
+
+def is_same_file(a: Path, b: Path) -> bool:
+    """Return whether two paths lead to one existing file."""
+    return a.exists() and b.exists() and a.samefile(b)
 
 
 def read_mask(path: Path) -> Mask:

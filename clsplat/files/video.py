@@ -102,7 +102,7 @@ class VideoWriter:
             macro_block_size=2,
             quality=None,
             output_params=_OUTPUT,
-            ffmpeg_log_level="error",
+            ffmpeg_log_level="quiet",  # a failure is found below, and becomes one line
         )
 
     def _finish(self, complete: bool) -> None:
@@ -116,9 +116,12 @@ class VideoWriter:
                 return
             if not self.frames:
                 raise OutputError(f"{self.path}: the video has no frames; render at least one")
-            written, _ = imageio_ffmpeg.count_frames_and_secs(str(self._temporary))
         except (OSError, RuntimeError) as error:
             raise self._failed(error) from error
+        try:
+            written, _ = imageio_ffmpeg.count_frames_and_secs(str(self._temporary))
+        except (OSError, RuntimeError):
+            raise OutputError(f"{self.path}: the encoder wrote no whole video; check the disk's free space") from None
         if written != self.frames:  # imageio does not report the encoder's exit code
             raise OutputError(f"{self.path}: holds {written} of {self.frames} frames; check the disk's free space")
 

@@ -1,0 +1,21 @@
+"""Standard streams that the caller closed."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+
+def open_closed_streams() -> None:
+    """Open the null device for each standard stream that the caller closed, as services and `2>&-` do.
+
+    Otherwise Python has None in its place. The next file that is opened gets its number, so that messages of libraries
+    go into that file.
+    """
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the smallest free number
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, mode, closefd=False))
