@@ -1,61 +1,87 @@
-"""Files of splats of any format that clsplat knows, chosen by the file's ending."""
+"""Files of splats in any format that clsplat knows: the content decides, and for .splat files the ending."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-from ..errors import OutputError
-from .splats import Splats
+from ..errors import InputError, OutputError
+from .dot_splat import read_splat, write_splat
+from .ply import read_ply, write_ply
+from .sog import META, is_sog, read_sog
+from .spz import VERSIONS as SPZ_VERSIONS
+from .spz import read_spz, write_spz
+from .spz_streams import is_spz
+from .stored import StoredSplats
 
 PLY_ENDING = ".ply"
-GAUSSIAN_ENDINGS = (".splat", ".spz")  # formats that hold Gaussians only
+SPZ_ENDING = ".spz"
+GAUSSIAN_ENDINGS = (".splat", SPZ_ENDING)  # formats that hold Gaussians only
+READ_ENDINGS = (PLY_ENDING, *GAUSSIAN_ENDINGS, ".sog")
+
+_ELSEWHERE = (".ksplat", ".lcc", ".lcc2")  # formats that splat-transform of PlayCanvas reads
 
 
-def load_splats(path: str | os.PathLike[str]) -> Splats:
-    """Read a .splat or .spz file, or else a PLY.
+def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
+    """Read a PLY of splats (whole, compact or compressed), an .spz, .sog or .splat file, or the meta.json of a SOG.
+
+    Splats and columns that cannot be used are left out, with a warning.
 
     Raises
     ------
-    InputError : the file is missing or damaged.
+    InputError : the file is missing or damaged, or has another format.
     """
     path = Path(path)
-    if path.suffix.lower() == ".splat":
-        from .dot_splat import read_splat
-
+    suffix = path.suffix.lower()
+    if suffix in _ELSEWHERE:
+        raise InputError(
+            f"{path}: {suffix} files are not read: convert it with `splat-transform {path.name} {path.stem}.ply` "
+            "(npm install @playcanvas/splat-transform)"
+        )
+    if suffix == ".splat":
         return read_splat(path)
-    if path.suffix.lower() == ".spz":
-        from .spz import read_spz
-
+    start = _start(path)
+    if suffix == SPZ_ENDING or is_spz(start):
         return read_spz(path)
-    return Splats.load(path)
+    return read_sog(path) if suffix == ".sog" or path.name == META or is_sog(start) else read_ply(path)
 
 
-def save_splats(path: str | os.PathLike[str], splats: Splats) -> None:
-    """Write a .ply file with all columns, or a .splat or .spz file.
+def write_splats(
+    path: str | os.PathLike[str], splats: StoredSplats, compact: bool = False, spz_version: int = SPZ_VERSIONS[0]
+) -> None:
+    """Write a .splat or .spz file, or else a PLY.
+
+    Parameters
+    ----------
+    compact : as for `write_ply`.
+    spz_version : version of an .spz file, 3 or 4.
 
     Raises
     ------
-    OutputError : the ending is not one of these, or the file cannot be written.
+    OutputError : the file cannot be written.
     InputError : the format does not support the shape of the splats.
     """
-    path = Path(path)
-    suffix = check_ending(path)
+    suffix = Path(path).suffix.lower()
     if suffix == ".splat":
-        from .dot_splat import write_splat
-
         write_splat(path, splats)
-    elif suffix == ".spz":
-        from .spz import write_spz
-
-        write_spz(path, splats)
+    elif suffix == SPZ_ENDING:
+        write_spz(path, splats, spz_version)
     else:
-        splats.save(path)
+        write_ply(path, splats.shape, splats.normalisation, splats.arrays, compact, splats.antialiased)
 
 
 def check_ending(path: Path) -> str:
-    """Return the file's ending in lower case; raise OutputError if `save_splats` does not know it."""
+    """Return the file's ending in lower case; raise OutputError if it is not that of a format that is written."""
     suffix = path.suffix.lower()
     if suffix not in (PLY_ENDING, *GAUSSIAN_ENDINGS):
         raise OutputError(f"{path}: writes .ply, {' and '.join(GAUSSIAN_ENDINGS)} files: choose one of these endings")
     return suffix
+
+
+def _start(path: Path) -> bytes:
+    """Return the first bytes of a file; none if it cannot be read, which its reader reports."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(8)
+    except OSError:
+        return b""

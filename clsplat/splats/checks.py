@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from .fields import MAX_SH_DEGREE, Array, Field, Schema, public_shape, sh_coefficients
@@ -64,6 +65,24 @@ def first_fault(field: Field, values: Array) -> Fault | None:
         return None
     index = int(bad[0])
     return Fault(index, (), f"norm is {norms[index]:.6g}, must be {rule}")
+
+
+def unusable(schema: Schema, arrays: Mapping[str, Array]) -> NDArray[np.bool_]:
+    """Return (N,) whether a splat has a value that is not finite, or a rotation or direction without one.
+
+    Parameters
+    ----------
+    arrays : every field of the schema, in its public shape.
+    """
+    bad = np.zeros(len(arrays["mean"]), bool)
+    for field in schema:
+        values = arrays[field.name]
+        bad |= ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+        if field.nonzero:
+            with np.errstate(invalid="ignore"):
+                norms = np.linalg.norm(values.astype(np.float64), axis=1)
+            bad |= ~((norms >= QUAT_NORM_MIN) & (norms <= QUAT_NORM_MAX))
+    return bad
 
 
 def sh_degree_for(arrays: Mapping[str, Array]) -> int:

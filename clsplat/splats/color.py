@@ -5,3 +5,4 @@ from __future__ import annotations
 Color = tuple[float, float, float]
 
 BLACK: Color = (0.0, 0.0, 0.0)  # the background unless another is chosen, as in 3DGS
+WHITE: Color = (1.0, 1.0, 1.0)

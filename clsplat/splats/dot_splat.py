@@ -16,34 +16,31 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
+from .harmonics import SH_C0
 from .shapes import GAUSSIAN
-from .splats import SH_C0, Splats
+from .stored import StoredSplats, check_gaussian, gaussians
 
 RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("quaternion", "u1", 4)])
 
-_LOGIT_MAX = 15.0  # the logit of a stored opacity of 255; its negative is that of 0
-_MIN_SCALE = 1e-30  # some files have zeros
 
-
-def write_splat(path: str | os.PathLike[str], splats: Splats) -> None:
+def write_splat(path: str | os.PathLike[str], splats: StoredSplats) -> None:
     """Write Gaussians without their SH bands above 0.
 
     Raises
     ------
     InputError : the shape is not Gaussian. OutputError : the file cannot be written.
     """
-    if splats.shape != GAUSSIAN.name:
-        raise InputError(f"{path}: .splat files hold Gaussians, not {splats.shape} splats; convert them first")
+    check_gaussian(path, splats.shape, ".splat")
     with atomic_writer(path) as stream:
         stream.write(records(splats).tobytes())
 
 
-def read_splat(path: str | os.PathLike[str]) -> Splats:
+def read_splat(path: str | os.PathLike[str]) -> StoredSplats:
     """Read Gaussians of SH degree 0.
 
     Raises
     ------
-    InputError : the file cannot be read, has a wrong length, or holds an unusable value.
+    InputError : the file cannot be read, has a wrong length, or most of its splats are unusable.
     """
     path = Path(path)
     try:
@@ -55,30 +52,26 @@ def read_splat(path: str | os.PathLike[str]) -> Splats:
             f"{path}: is not a .splat file ({len(data)} bytes is not a multiple of {RECORD.itemsize}); export it again"
         )
     table = np.frombuffer(data, RECORD)
-    with np.errstate(all="ignore"):  # the check finds and names values that are not finite
-        logit = np.clip(GAUSSIAN.raw_opacity(table["colour"][:, 3] / 255.0), -_LOGIT_MAX, _LOGIT_MAX)
+    with np.errstate(all="ignore"):  # `gaussians` treats values that are not finite
         arrays = {
             "mean": table["position"],
-            "log_scale": np.log(np.maximum(table["scale"], _MIN_SCALE)),
+            "log_scale": np.log(table["scale"]),
             "quat": table["quaternion"] / 128.0 - 1.0,
-            "opacity_logit": logit,
+            "opacity_logit": GAUSSIAN.raw_opacity(table["colour"][:, 3] / 255.0),
             "sh": ((table["colour"][:, :3] / 255.0 - 0.5) / SH_C0)[:, None],
         }
-    try:
-        return Splats(GAUSSIAN.name, {name: values.astype(np.float32) for name, values in arrays.items()})
-    except InputError as error:
-        raise InputError(f"{path}: {error}; remove that splat or export again") from None
+    return gaussians(path, arrays)
 
 
-def records(splats: Splats) -> NDArray[np.void]:
+def records(splats: StoredSplats) -> NDArray[np.void]:
     """Return (N,) values of RECORD, the most important splats first."""
-    opacity: NDArray[np.float64] = GAUSSIAN.opacity(splats.opacity_logit.astype(np.float64)).astype(np.float64)
-    scale = np.exp(np.clip(splats.log_scale.astype(np.float64), -80.0, 80.0))
-    quat = splats.quat.astype(np.float64)
-    unit = np.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True), np.float64)
-    table = np.empty(len(splats), RECORD)
-    table["position"], table["scale"] = splats.mean, scale
-    table["colour"][:, :3] = _bytes(0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64), 255.0)
+    wide = {name: values.astype(np.float64) for name, values in splats.arrays.items()}
+    opacity: NDArray[np.float64] = GAUSSIAN.opacity(wide["opacity_logit"]).astype(np.float64)
+    scale = np.exp(np.clip(wide["log_scale"], -80.0, 80.0))
+    unit = np.asarray(wide["quat"] / np.linalg.norm(wide["quat"], axis=1, keepdims=True), np.float64)
+    table = np.empty(len(opacity), RECORD)
+    table["position"], table["scale"] = wide["mean"], scale
+    table["colour"][:, :3] = _bytes(0.5 + SH_C0 * wide["sh"][:, 0], 255.0)
     table["colour"][:, 3] = _bytes(opacity, 255.0)
     table["quaternion"] = _bytes(0.5 + 0.5 * unit, 256.0)
     return table[np.argsort(-scale.prod(axis=1) * opacity, kind="stable")]

@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+SH_C0 = 0.28209479177387814  # the constant harmonic, 1 / (2 sqrt(pi))
+
 
 def sh_basis(direction: NDArray[Any], degree: int) -> NDArray[Any]:
     """Return the basis (N, (degree + 1)^2) in unit directions (N, 3), with the same dtype."""
     x, y, z = direction.T
     xx, yy, zz = x * x, y * y, z * z
     bands = [
-        [np.full_like(x, 0.28209479177387814)],
+        [np.full_like(x, SH_C0)],
         [-0.48860251190291992 * y, 0.48860251190291992 * z, -0.48860251190291992 * x],
         [
             1.0925484305920792 * x * y,
@@ -33,3 +35,16 @@ def sh_basis(direction: NDArray[Any], degree: int) -> NDArray[Any]:
         ],
     ]
     return np.stack([values for band in bands[: degree + 1] for values in band], axis=1)
+
+
+def axis_flip_signs(signs: NDArray[Any], degree: int) -> NDArray[np.float64]:
+    """Return the factors (K,), 1 or -1, of coefficients when axes change their signs.
+
+    Each function of the basis is odd or even in each of x, y and z. One direction without zeros shows which.
+
+    Parameters
+    ----------
+    signs : (3,) the sign of each axis, 1 or -1.
+    """
+    direction = np.array([[0.36, 0.48, 0.8]])
+    return np.sign(sh_basis(direction * signs, degree) / sh_basis(direction, degree))[0]

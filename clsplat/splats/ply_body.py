@@ -20,6 +20,8 @@ _CODES = REAL_TYPES | INTEGER_TYPES
 def read_body(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[str, NDArray[Any]]]:
     """Return, for each element name, its columns by name, in their types and the byte order of the machine.
 
+    Elements with lists, and those after them, are not read.
+
     Parameters
     ----------
     stream : the file, at the first byte after the header.
@@ -36,21 +38,21 @@ def read_body(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[
 def _read_binary(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[str, NDArray[Any]]]:
     order = BYTE_ORDER[header.encoding]
     dtypes = [
-        np.dtype([(name, order + _CODES[kind]) for kind, name in element.properties]) for element in header.elements
+        np.dtype([(name, order + _CODES[kind]) for kind, name in element.properties]) for element in header.tables
     ]
-    expected = sum(element.count * dtype.itemsize for element, dtype in zip(header.elements, dtypes, strict=True))
+    expected = sum(element.count * dtype.itemsize for element, dtype in zip(header.tables, dtypes, strict=True))
     available = os.fstat(stream.fileno()).st_size - stream.tell()
-    if available != expected:
+    if _is_wrong(header, available, expected):
         raise _wrong_size(path, header, f"{expected} bytes", f"{available}", available < expected)
     body = {}
-    for element, dtype in zip(header.elements, dtypes, strict=True):
+    for element, dtype in zip(header.tables, dtypes, strict=True):
         table: NDArray[Any] = np.frombuffer(stream.read(element.count * dtype.itemsize), dtype=dtype)
         body[element.name] = {name: table[name].astype(_CODES[kind]) for kind, name in element.properties}
     return body
 
 
 def _read_ascii(path: object, stream: BinaryIO, header: Header) -> dict[str, dict[str, NDArray[Any]]]:
-    expected = sum(element.count * len(element.properties) for element in header.elements)
+    expected = sum(element.count * len(element.properties) for element in header.tables)
     text = stream.read()
     # Every value takes a digit and a separator, so the file size bounds the count.
     if 2 * expected > len(text) + 1:
@@ -61,10 +63,10 @@ def _read_ascii(path: object, stream: BinaryIO, header: Header) -> dict[str, dic
             values = np.fromstring(text, dtype=np.float64, sep=" ") if text.strip() else np.empty(0)
         except (DeprecationWarning, ValueError):
             raise InputError(f"{path}: the ascii body holds text that is not a number; export again") from None
-    if values.size != expected:
+    if _is_wrong(header, values.size, expected):
         raise _wrong_size(path, header, f"{expected} values", f"{values.size}", values.size < expected)
     body, at = {}, 0
-    for element in header.elements:
+    for element in header.tables:
         width = len(element.properties)
         table = values[at : at + element.count * width].reshape(element.count, width)
         at += table.size
@@ -89,6 +91,11 @@ def _cast(path: object, element: Element, name: str, values: NDArray[np.float64]
             )
     with np.errstate(over="ignore"):  # the check of the model finds and names values that overflow
         return values.astype(dtype)
+
+
+def _is_wrong(header: Header, found: int, expected: int) -> bool:
+    """Return whether the length of a body differs from that of its tables. Lists may follow them."""
+    return found < expected or (found > expected and len(header.tables) == len(header.elements))
 
 
 def _wrong_size(path: object, header: Header, expected: str, found: str, short: bool) -> InputError:

@@ -141,7 +141,7 @@ def side_fields(path: object, header: Header, schema: Schema) -> dict[str, Field
     by_element = {SIDE_PREFIX + field_.name: field_ for field_ in movable(schema)}
     found = {}
     base = schema.sh_degree
-    for element in header.elements[1:]:
+    for element in header.side_elements:
         expected: tuple[str, ...]
         if element.name in by_element:
             found[element.name] = by_element[element.name]
@@ -180,14 +180,14 @@ def filled_in(
     """
     n, base = header.count, schema.sh_degree
     moved = side_fields(path, header, schema)
-    degree = max((int(e.name[len(_SH) :]) for e in header.elements if e.name.startswith(_SH)), default=base)
+    degree = max((int(e.name[len(_SH) :]) for e in header.side_elements if e.name.startswith(_SH)), default=base)
     sh = arrays["sh"]
     if degree > base:
         sh = np.zeros((n, sh_coefficients(degree), 3), sh.dtype)
         sh[:, : arrays["sh"].shape[1]] = arrays["sh"]
     taken = np.zeros(n, bool)
     full = dict(arrays)
-    for element in header.elements[1:]:
+    for element in header.side_elements:
         columns = body[element.name]
         rows = _index(path, element.name, columns[INDEX], n)
         if element.name in moved:

@@ -1,4 +1,4 @@
-"""Strict parser of PLY headers: a wrong file gives an error before memory is allocated.
+"""Parser of PLY headers: a wrong file gives an error before memory is allocated.
 
 Format: Greg Turk, "The PLY Polygon File Format" (1994).
 """
@@ -26,18 +26,26 @@ INTEGER_TYPES = {
     "int32": "i4",
     "uint32": "u4",
 }
-SIDE_PREFIX = "clsplat_"  # begins the names of elements that may follow the vertices (ply_compact.py)
+SIDE_PREFIX = "clsplat_"  # begins the names of elements that follow the vertices (ply_compact.py)
+VERTEX = "vertex"
 _MAX_LINE = 4096
 _MAX_LINES = 4096
 
 
 @dataclass
 class Element:
-    """One table of the body: its number of rows, and (type, name) of its properties in file order."""
+    """One table of the body.
+
+    Parameters
+    ----------
+    count : number of rows. properties : (type, name) in file order, without lists.
+    has_lists : whether rows have lists too, so that their lengths are unknown. Such tables are not read.
+    """
 
     name: str
     count: int
     properties: list[tuple[str, str]] = field(default_factory=list)
+    has_lists: bool = False
 
     @property
     def names(self) -> list[str]:
@@ -46,26 +54,42 @@ class Element:
 
 @dataclass
 class Header:
-    """The content of a PLY header: encoding, the element `vertex`, and the elements of clsplat that follow it."""
+    """The content of a PLY header: encoding and elements. The element `vertex` exists and has no lists."""
 
     encoding: str = ""
     elements: list[Element] = field(default_factory=list)
     comments: list[str] = field(default_factory=list)
 
     @property
+    def vertex(self) -> Element:
+        """The element with the splats or points."""
+        return next(element for element in self.elements if element.name == VERTEX)
+
+    @property
+    def tables(self) -> list[Element]:
+        """The elements that can be read: those before the first one with lists."""
+        end = next((i for i, element in enumerate(self.elements) if element.has_lists), len(self.elements))
+        return self.elements[:end]
+
+    @property
+    def side_elements(self) -> list[Element]:
+        """The elements of clsplat that follow the vertices."""
+        return [element for element in self.elements if element.name.startswith(SIDE_PREFIX)]
+
+    @property
     def count(self) -> int:
         """Number of vertices."""
-        return self.elements[0].count
+        return self.vertex.count
 
     @property
     def properties(self) -> list[tuple[str, str]]:
         """(type, name) of the properties of a vertex."""
-        return self.elements[0].properties
+        return self.vertex.properties
 
     @property
     def names(self) -> list[str]:
         """Names of the properties of a vertex."""
-        return self.elements[0].names
+        return self.vertex.names
 
 
 def read_header(path: object, stream: BinaryIO) -> Header:
@@ -73,8 +97,8 @@ def read_header(path: object, stream: BinaryIO) -> Header:
 
     Raises
     ------
-    InputError : the file is not a PLY file, a line is wrong, or the elements are not one `vertex` of scalars and
-        elements of clsplat after it. The message names the file (`path`) and the line.
+    InputError : the file is not a PLY file, a line is wrong, or no element `vertex` can be read. The message names the
+        file (`path`) and the line.
     """
     if stream.readline(_MAX_LINE).rstrip(b"\r\n") != b"ply":
         raise InputError(f"{path}: not a PLY file (its first line is not 'ply'); choose a splat .ply")
@@ -96,8 +120,12 @@ def read_header(path: object, stream: BinaryIO) -> Header:
         raise InputError(f"{path}: no end_header within {_MAX_LINES} lines; the header is damaged")
     if not header.encoding:
         raise InputError(f"{path}: header has no format line; add 'format binary_little_endian 1.0'")
-    if not header.elements:
+    if all(element.name != VERTEX for element in header.elements):
         raise InputError(f"{path}: header has no element 'vertex'; choose a splat .ply")
+    names = [element.name for element in header.tables]
+    for element in (header.vertex, *header.side_elements):
+        if element.name not in names or names.index(element.name) < names.index(VERTEX):
+            raise InputError(f"{path}: element {element.name!r} comes before 'vertex' or after lists; export it again")
     return header
 
 
@@ -112,8 +140,10 @@ def _take(header: Header, keyword: str, words: list[str], line: str) -> None:
         header.encoding = words[1]
     elif keyword == "element" and len(words) == 3:
         _take_element(header, words[1], words[2])
-    elif keyword == "property" and len(words) >= 2 and words[1] == "list":
-        raise InputError(f"property {words[-1]!r} is a list; a splat file has plain float properties")
+    elif keyword == "property" and len(words) == 5 and words[1] == "list" and header.elements:
+        if header.elements[-1].name == VERTEX:
+            raise InputError(f"property {words[-1]!r} is a list; a splat file has plain float properties")
+        header.elements[-1].has_lists = True
     elif keyword == "property" and len(words) == 3:
         if not header.elements:
             raise InputError(f"property {words[2]!r} comes before any element; the header is damaged")
@@ -128,12 +158,6 @@ def _take(header: Header, keyword: str, words: list[str], line: str) -> None:
 
 def _take_element(header: Header, name: str, count: str) -> None:
     """Begin an element; the InputError does not name the line."""
-    side = bool(header.elements) and name.startswith(SIDE_PREFIX)
-    if not side and (name != "vertex" or header.elements):
-        raise InputError(
-            f"element {name!r}: a splat file has one element, 'vertex' "
-            "(meshes and compressed PLY files are not read; export plain splats)"
-        )
     if any(element.name == name for element in header.elements):
         raise InputError(f"element {name!r} occurs twice; rename or remove one")
     if not (count.isascii() and count.isdigit() and len(count) <= 15):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .fields import Array
 
 NORM_FLOOR = 1e-15  # lower bound of |q|, as in cl/math/algebra.clh
+OTHER_PLACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the places that are not the largest
 
 
 def rotations(quat: Array) -> Array:
@@ -18,6 +20,21 @@ def rotations(quat: Array) -> Array:
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+
+
+def from_smallest_three(others: NDArray[np.float64], largest: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return unit quaternions (N, 4), from which many formats leave the largest component out.
+
+    Parameters
+    ----------
+    others : (N, 3) the other components, in their order.
+    largest : (N,) place of the largest component, 0 to 3.
+    """
+    quat = np.empty((len(others), 4))
+    np.put_along_axis(quat, OTHER_PLACES[largest], others, axis=1)
+    # If the three others are at their maximum, rounding can make the largest negative under the root.
+    quat[np.arange(len(quat)), largest] = np.sqrt(np.maximum(1.0 - np.sum(others**2, axis=1), 0.0))
+    return quat
 
 
 def rotations_vjp(quat: Array, v: Array) -> Array:

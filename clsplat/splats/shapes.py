@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..files.real_path import real_path
 from . import profiles
 from .fields import CORE, Array, Field, Schema, make_schema
 from .flops import DENSITY, EXP, LOG, LOG1P, MOMENTS, PHI, QUADRATIC
@@ -235,7 +236,7 @@ def register_shape(shape: Shape, sources: str | Path | None = None) -> Shape:
         if known.get(field.name, (field.width, field.ply)) != (field.width, field.ply):
             raise InputError(f"shape {shape.name!r}: another shape has a field {field.name!r}: choose another name")
     if sources is not None:
-        folder = Path(sources).resolve()
+        folder = real_path(sources)
         if not (folder / shape.source).is_file():
             raise InputError(f"{folder / shape.source}: no such kernel file: write the shape's formulas there")
         found = tuple(str(folder / name) if (folder / name).is_file() else name for name in shape.lower)

@@ -11,12 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..files.stop_signals import held
+from .any_file import read_splats, write_splats
 from .checks import check_arrays, sh_degree_for
 from .fields import MAX_SH_DEGREE, Array, Schema, public_shape, sh_coefficients
-from .ply import read_ply, write_ply
+from .harmonics import SH_C0
 from .shapes import DEFAULT_SHAPE, check_normalisation, shape_named
+from .spz import VERSIONS as SPZ_VERSIONS
+from .stored import StoredSplats
 
-SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 _MIN_SQUARED_DISTANCE = 1e-7  # the floor of 3DGS, for points that coincide
 _MIN_OF_TYPICAL = 1e-2  # the floor of small scenes, as a share of the median squared distance
 _OPACITIES = (1e-12, 1.0 - 1e-7)  # the range of opacities with finite raw values
@@ -76,19 +79,33 @@ class Splats:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Splats:
-        """Read a splat PLY file; a plain 3DGS file gives Gaussians. Raises InputError (see `ply.read_ply`)."""
-        model = read_ply(path)
-        return cls(model.shape, model.arrays, model.normalisation, model.antialiased)
+        """Read a file of splats: a PLY (also of 3DGS, or compressed), .spz or .splat. The content decides.
 
-    def save(self, path: str | os.PathLike[str], compact: bool = False) -> None:
-        """Write a PLY file in float32, atomically. Raises OutputError if the file cannot be written.
+        Splats and columns that cannot be used are left out, with a warning. `load_model` reads model folders.
+
+        Raises
+        ------
+        InputError : the file is missing or damaged, or has another format.
+        """
+        found = read_splats(path)
+        return cls(found.shape, found.arrays, found.normalisation, found.antialiased)
+
+    def save(self, path: str | os.PathLike[str], compact: bool = False, *, spz_version: int = SPZ_VERSIONS[0]) -> None:
+        """Write a .splat or .spz file, or else a PLY file in float32, atomically.
 
         Parameters
         ----------
         compact : leave out the values that the splats do not use (see ply_compact.py). Do not set it for other
             programs: some read only the first element, and no other program reads the columns of the later elements.
+        spz_version : version of an .spz file, 3 or 4. Version 4 needs the extra `spz`.
+
+        Raises
+        ------
+        InputError : the file holds Gaussians only, and these splats have another shape.
+        OutputError : the file cannot be written.
         """
-        write_ply(path, self._shape, self._normalisation, self._arrays, compact, self._antialiased)
+        stored = StoredSplats(self._shape, self._normalisation, self._antialiased, self._arrays)
+        write_splats(path, stored, compact, spz_version)
 
     @classmethod
     def from_points(
@@ -285,5 +302,6 @@ def _squared_spacing(points: NDArray[np.floating]) -> NDArray[np.float64]:
         return np.ones(n)
     neighbours = min(3, n - 1)
     # The nearest hit is the point itself (or one that coincides, at the same distance 0).
-    distances, _ = cKDTree(points).query(points, k=neighbours + 1, workers=-1)
+    with held():
+        distances, _ = cKDTree(points).query(points, k=neighbours + 1, workers=-1)
     return np.asarray(np.mean(np.asarray(distances)[:, 1:] ** 2, axis=1))
