@@ -14,12 +14,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
 from ..files.image_names import bare_name
 from ..files.json_file import describe, get_matrix, get_number, get_size, get_value, read_json
 from .camera import Camera
+from .rotations import NearestRotation, NotARotation, nearest_rotation, warn_of_corrections
 
 _REMEDY = "add it as 3DGS writes it"
 
@@ -49,6 +51,10 @@ def named_cameras(names: Sequence[str], cameras: Sequence[Camera]) -> list[Named
 def read_cameras(path: str | os.PathLike[str]) -> list[NamedCamera]:
     """Return the cameras of a file in file order. `id` and unknown keys are ignored.
 
+    Warns
+    -----
+    UserWarning : rotations in the file are rounded or have a scale.
+
     Raises
     ------
     InputError : the file is not a JSON list, or an entry lacks a key or has an unusable value. The message names
@@ -58,10 +64,10 @@ def read_cameras(path: str | os.PathLike[str]) -> list[NamedCamera]:
 
 
 def cameras_of(entries: Any, path: str | os.PathLike[str]) -> list[NamedCamera]:
-    """Return the cameras in a list that was read from `path`; raises InputError as `read_cameras`."""
+    """Return the cameras in a list that was read from `path`; warns and raises InputError as `read_cameras`."""
     if not isinstance(entries, list):
         raise InputError(f"{path}: holds {describe(entries)}; expected a list of cameras, as 3DGS writes it")
-    named = []
+    named, rotations = [], {}
     for index, entry in enumerate(entries):
         place = f"{path}: entry {index}"
         if not isinstance(entry, dict):
@@ -69,9 +75,12 @@ def cameras_of(entries: Any, path: str | os.PathLike[str]) -> list[NamedCamera]:
         if isinstance(entry.get("img_name"), str):
             place += f" ({ascii(entry['img_name'])[:80]})"
         try:
-            named.append(_named_camera(entry))
+            rotation = _rotation(entry)
+            named.append(_named_camera(entry, rotation.matrix))
+            rotations[f"entry {index}"] = rotation
         except InputError as error:
             raise InputError(f"{place}: {error}") from None
+    warn_of_corrections(path, rotations)
     return named
 
 
@@ -102,8 +111,16 @@ def write_cameras(path: str | os.PathLike[str], named: Sequence[NamedCamera]) ->
         stream.write(("[\n" + ",\n".join(lines) + "\n]\n").encode("utf-8"))
 
 
-def _named_camera(entry: dict[str, Any]) -> NamedCamera:
-    """Return the camera of one entry; raises InputError that names the key."""
+def _rotation(entry: dict[str, Any]) -> NearestRotation:
+    """Return the camera-to-world rotation of one entry; raises InputError that names the key."""
+    try:
+        return nearest_rotation(get_matrix(entry, "rotation", (3, 3), _REMEDY))
+    except NotARotation as error:
+        raise InputError(f"key 'rotation' {error}; write the cameras again") from None
+
+
+def _named_camera(entry: dict[str, Any], rotation: NDArray[np.float64]) -> NamedCamera:
+    """Return the camera of one entry with a camera-to-world rotation; raises InputError that names the key."""
     name = get_value(entry, "img_name", _REMEDY)
     if not isinstance(name, str) or not name:
         raise InputError(f"key 'img_name' is {describe(name)}; expected a name")
@@ -112,6 +129,6 @@ def _named_camera(entry: dict[str, Any]) -> NamedCamera:
     cx = get_number(entry, "cx", _REMEDY) if "cx" in entry else width / 2
     cy = get_number(entry, "cy", _REMEDY) if "cy" in entry else height / 2
     cam_from_world = np.zeros((3, 4))
-    cam_from_world[:, :3] = get_matrix(entry, "rotation", (3, 3), _REMEDY).T
+    cam_from_world[:, :3] = rotation.T
     cam_from_world[:, 3] = -cam_from_world[:, :3] @ get_matrix(entry, "position", (3,), _REMEDY)
     return NamedCamera(name, Camera(width, height, fx, fy, cx, cy, cam_from_world))

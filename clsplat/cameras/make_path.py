@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,8 @@ from .path import DEFAULT_FPS, CameraPath, read_path
 AROUND = ("orbit", "ellipse", "spiral")
 BETWEEN = "interpolate"
 FRAMES = 60  # default number of frames
+MAX_FRAMES = 100_000  # an hour at 30 frames a second
+_MAX_UNSEEN = 0.05  # share of frames from unseen sides that needs no warning
 _NAMES_IN_MESSAGE = 8  # longest list of camera names in a message
 
 
@@ -35,7 +39,7 @@ class PathRequest:
 
     Raises
     ------
-    InputError : `frames` and `seconds` are both set.
+    InputError : `frames` and `seconds` are both set, or a number is not above 0 and finite.
     """
 
     kind: str
@@ -49,10 +53,22 @@ class PathRequest:
     def __post_init__(self) -> None:
         if self.frames is not None and self.seconds is not None:
             raise InputError("camera path: give frames or seconds, not both")
+        for name, value in (("seconds", self.seconds), ("fps", self.fps)):
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"camera path: {name} {value}: must be above 0 and finite")
 
     def frame_count(self, fps: float) -> int | None:
-        """Return the number of frames at a frame rate; None if the request sets neither frames nor seconds."""
-        return self.frames if self.seconds is None else max(1, round(self.seconds * fps))
+        """Return the number of frames at a frame rate; None if the request sets neither frames nor seconds.
+
+        Raises
+        ------
+        InputError : more than MAX_FRAMES.
+        """
+        count = self.frames if self.seconds is None else max(1, round(min(self.seconds * fps, 2.0 * MAX_FRAMES)))
+        if count is not None and count > MAX_FRAMES:
+            length = f"{self.frames} frames" if self.seconds is None else f"{self.seconds:g} s at {fps:g} a second"
+            raise InputError(f"camera path: {length} are more than {MAX_FRAMES} frames: make it shorter")
+        return count
 
 
 def make_path(
@@ -67,6 +83,10 @@ def make_path(
     views : cameras that the path goes around or between.
     source : origin of the views, for messages.
 
+    Warns
+    -----
+    UserWarning : a part of the path around the scene looks from sides that no camera saw.
+
     Raises
     ------
     InputError : the path file is missing or damaged, a key is not among the views, or there are no views to
@@ -77,7 +97,15 @@ def make_path(
     if request.kind in AROUND:
         from . import orbits
 
-        cameras = getattr(orbits, request.kind)(splats, [view.camera for view in views], count)
+        known = [view.camera for view in views]
+        cameras = getattr(orbits, request.kind)(splats, known, count)
+        unseen = orbits.share_unseen(cameras, splats, known)
+        if unseen > _MAX_UNSEEN:
+            warnings.warn(
+                f"--path {request.kind}: {unseen:.0%} of the frames look from sides that no camera saw: "
+                f"--path spiral and --path {BETWEEN} stay near the cameras",
+                stacklevel=2,
+            )
         path = CameraPath(tuple(cameras), fps, closed=True)
     elif request.kind == BETWEEN:
         keys = _chosen(views, source, request.keys)

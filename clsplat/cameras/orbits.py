@@ -26,6 +26,9 @@ _FOCAL = 0.87  # focal length over the image width
 _DISTANCE = 2.5  # distance over the splats' radius
 _LIFT = 0.3  # height above the centre over the distance
 _N_DEFAULT = 8  # number of default cameras
+# A model shows what its photos show, and little more: past this angle a one-sided capture falls apart into blobs.
+# Cameras around a scene are closer together than twice this angle.
+SEEN_ANGLE = np.radians(30.0)
 # The spiral of LLFF (Mildenhall et al. 2019).
 _SPIRAL_TURNS = 2
 _SPIRAL_QUANTILE = 0.9  # quantile of the cameras' offsets that becomes the radius
@@ -146,6 +149,25 @@ def spiral(splats: Splats, cameras: Sequence[Camera] = (), frames: int = 60) -> 
     local = radii * np.stack([np.cos(turn), np.sin(turn), np.sin(turn / _SPIRAL_TURNS)], axis=1)
     up = -centre.rotation[1]
     return [centre.posed(look_at(place, target, up)) for place in centre.position + local @ centre.rotation]
+
+
+def share_unseen(path: Sequence[Camera], splats: Splats, cameras: Sequence[Camera]) -> float:
+    """Return the share of a path's frames that look at the scene from a side that no camera saw.
+
+    Sides are directions from the middle of the scene. A frame's side counts as seen if a camera's direction is within
+    `SEEN_ANGLE`.
+
+    Parameters
+    ----------
+    path : at least one camera. splats, cameras : those that the path was made of.
+    """
+    if not cameras:
+        return 0.0
+    middle = _capture("path", splats, cameras, len(path)).middle
+    sides, seen = (
+        np.array([_unit(camera.position - middle, -camera.rotation[2]) for camera in part]) for part in (path, cameras)
+    )
+    return float(np.mean((sides @ seen.T).max(axis=1) < np.cos(SEEN_ANGLE)))
 
 
 def where_axes_meet(cameras: Sequence[Camera]) -> DoubleArray | None:

@@ -28,6 +28,7 @@ from ..files.atomic import atomic_writer
 from ..files.json_file import describe, get_matrix, get_number, get_size, get_value, read_json
 from .camera import Camera
 from .cameras_json import cameras_of
+from .rotations import NearestRotation, NotARotation, nearest_rotation, warn_of_corrections
 
 DEFAULT_FPS = 30.0
 _REMEDY = "add it as nerfstudio's camera_path.json has it"
@@ -148,8 +149,11 @@ def path_of(content: Any, source: str | os.PathLike[str]) -> CameraPath:
         if not frames:
             raise InputError("key 'camera_path' is empty; a path needs at least one frame")
         fps = get_number(content, "fps", _REMEDY) if "fps" in content else _fps_of(content, len(frames))
-        cameras = _cameras(frames, "camera_path", "camera_to_world", width, height)
-        keys = _cameras(_entries(content.get("keyframes", []), "keyframes"), "keyframes", "matrix", width, height)
+        rotations: dict[str, NearestRotation] = {}
+        cameras = _cameras(frames, "camera_path", "camera_to_world", width, height, rotations)
+        entries = _entries(content.get("keyframes", []), "keyframes")
+        keys = _cameras(entries, "keyframes", "matrix", width, height, rotations)
+        warn_of_corrections(source, rotations)
         return CameraPath(cameras, fps, keys, content.get("is_cycle") is True)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
@@ -193,28 +197,49 @@ def _entries(value: Any, key: str) -> list[dict[str, Any]]:
     return value
 
 
-def _cameras(entries: Sequence[dict[str, Any]], key: str, pose_key: str, width: int, height: int) -> tuple[Camera, ...]:
+def _cameras(
+    entries: Sequence[dict[str, Any]],
+    key: str,
+    pose_key: str,
+    width: int,
+    height: int,
+    rotations: dict[str, NearestRotation],
+) -> tuple[Camera, ...]:
+    """Return the cameras of frames or keyframes, and add their rotations to `rotations`."""
     cameras = []
     for index, entry in enumerate(entries):
         try:
-            cameras.append(_camera(entry, pose_key, width, height))
+            pose, rotation = _pose(entry, pose_key)
+            cameras.append(_camera(entry, pose, width, height))
+            rotations[f"{key}[{index}]"] = rotation
         except InputError as error:
             raise InputError(f"{key}[{index}]: {error}") from None
     return tuple(cameras)
 
 
-def _camera(entry: dict[str, Any], pose_key: str, width: int, height: int) -> Camera:
-    """Return the camera of one frame or keyframe; raises InputError that names the key."""
+def _pose(entry: dict[str, Any], pose_key: str) -> tuple[NDArray[np.float64], NearestRotation]:
+    """Return the camera-to-world matrix, (4, 4), of one frame or keyframe, and its rotation as it is in the file."""
     if isinstance(entry.get(pose_key), str):  # nerfstudio's older viewer writes the list as text
         try:
             entry = entry | {pose_key: json.loads(entry[pose_key])}
-        except ValueError:
+        except (ValueError, RecursionError):
             raise InputError(f"key {pose_key!r} is {describe(entry[pose_key])}; expected 16 numbers") from None
     numbers = get_value(entry, pose_key, _REMEDY)
     nested = isinstance(numbers, list) and len(numbers) == 4
     pose = get_matrix(entry, pose_key, (4, 4) if nested else (16,), _REMEDY).reshape(4, 4)
     if np.any(pose[3, :3] != 0.0) and np.all(pose[:3, 3] == 0.0):
         pose = pose.T  # the older viewer writes keyframes column by column
+    try:
+        if np.any(pose[3] != [0.0, 0.0, 0.0, 1.0]):
+            raise NotARotation("has another last row than 0 0 0 1")
+        rotation = nearest_rotation(pose[:3, :3])
+    except NotARotation as error:
+        raise InputError(f"key {pose_key!r} {error}; expected a rigid 4 x 4 matrix, row by row") from None
+    return np.vstack([np.hstack([rotation.matrix, pose[:3, 3:]]), pose[3]]), rotation
+
+
+def _camera(entry: dict[str, Any], pose: NDArray[np.float64], width: int, height: int) -> Camera:
+    """Return the camera of one frame or keyframe with a camera-to-world pose; raises InputError that names the key."""
     fov = get_number(entry, "fov", _REMEDY)
     if not 0 < fov < 180:
         raise InputError(f"key 'fov' is {fov:g}; expected degrees between 0 and 180")
@@ -222,14 +247,7 @@ def _camera(entry: dict[str, Any], pose_key: str, width: int, height: int) -> Ca
     pixels = (focal, focal, width / 2, height / 2)
     if all(name in entry for name in _PIXELS):
         pixels = tuple(get_number(entry, name, _REMEDY) for name in _PIXELS)  # type: ignore[assignment]
-    try:
-        if np.any(pose[3] != [0.0, 0.0, 0.0, 1.0]):
-            raise InputError("last row")
-        return Camera(width, height, *pixels, cam_from_world_of(pose))
-    except InputError:
-        raise InputError(
-            f"key {pose_key!r} is not a rotation and translation; expected a rigid 4 x 4 matrix, row by row"
-        ) from None
+    return Camera(width, height, *pixels, cam_from_world_of(pose))
 
 
 def _fov(camera: Camera) -> float:
