@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, reason_of
+from ..splats.quaternions import rotations
 from .colmap_binary import check_binary_model, count_registered
 from .undistort import RegisteredImage, colmap_library
 
 _FILES = ("cameras", "images", "points3D")
+_WORDS_BEFORE_NAME = 9  # words before the name in a line of images.txt
+_UNIT = 1e-6  # largest error of the norm of a quaternion that pycolmap turns into a rotation as it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +93,8 @@ def read_model(folder: Path) -> SparseReconstruction:
     try:
         with _complete(folder, suffix) as whole:
             reconstruction = pycolmap.Reconstruction(str(whole))
-        photos, points = read_registered(reconstruction), read_points(reconstruction)
+        names = _names_with_spaces(folder / "images.txt") if suffix == ".txt" else {}
+        photos, points = read_registered(reconstruction, names), read_points(reconstruction)
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
         raise InputError(
             f"{folder}: COLMAP cannot read the model ({reason_of(error)}); the files are "
@@ -117,32 +122,68 @@ def _suffix(folder: Path) -> str:
 def _complete(folder: Path, suffix: str) -> Iterator[Path]:
     """Yield the model's folder, or a copy with an empty points3D file if this file is missing.
 
-    pycolmap refuses a model without that file.
+    pycolmap refuses a model without that file. Pipes are left out, because opening one would wait for ever.
     """
-    if (folder / f"points3D{suffix}").is_file():
+    points = folder / f"points3D{suffix}"
+    if points.is_file():
         yield folder
         return
     with tempfile.TemporaryDirectory() as temporary:
         whole = Path(temporary)
-        for file in folder.glob(f"*{suffix}"):
+        for file in filter(Path.is_file, folder.glob(f"*{suffix}")):
             (whole / file.name).write_bytes(file.read_bytes())
-        (whole / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
+        (whole / points.name).write_bytes(bytes(8) if suffix == ".bin" else b"")
         yield whole
 
 
-def read_registered(reconstruction: Any) -> list[RegisteredImage]:
-    """Return the registered photos of a pycolmap.Reconstruction, sorted by name."""
-    photos = []
+def _names_with_spaces(images: Path) -> dict[int, str]:
+    """Return the names with spaces in images.txt, by image id.
+
+    COLMAP ends a name at the first space, but other programs write whole names. An image has two lines: its pose and
+    name, then its observations, which may be empty.
+    """
+    names = {}
+    with images.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            words = line.strip().split(maxsplit=_WORDS_BEFORE_NAME)
+            if not words or words[0].startswith("#"):
+                continue
+            if len(words) > _WORDS_BEFORE_NAME and words[0].isdecimal() and len(words[-1].split()) > 1:
+                names[int(words[0])] = words[-1]
+            next(lines, None)
+    return names
+
+
+def read_registered(reconstruction: Any, names: Mapping[int, str] | None = None) -> list[RegisteredImage]:
+    """Return the registered photos of a pycolmap.Reconstruction, sorted by name.
+
+    Parameters
+    ----------
+    names : names that replace those of the reconstruction, by image id.
+    """
+    photos, names = [], names or {}
     for image_id in reconstruction.reg_image_ids():
         image = reconstruction.images[image_id]
         pose = image.cam_from_world
         pose = pose() if callable(pose) else pose  # before pycolmap 3.12 this is an attribute
-        photos.append(
-            RegisteredImage(
-                image.name, np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]]), reconstruction.cameras[image.camera_id]
-            )
-        )
+        name = names.get(image_id, image.name)
+        matrix = np.vstack([_rigid(name, pose), [0.0, 0.0, 0.0, 1.0]])
+        photos.append(RegisteredImage(name, matrix, reconstruction.cameras[image.camera_id]))
     return sorted(photos, key=lambda photo: photo.name)
+
+
+def _rigid(name: str, pose: Any) -> NDArray[np.float64]:
+    """Return a pycolmap.Rigid3d as a matrix, (3, 4); its quaternion may have any norm above 0."""
+    quaternion = np.asarray(pose.rotation.quat, np.float64)
+    largest = float(np.abs(quaternion).max())
+    if not 0.0 < largest < math.inf or not np.isfinite(pose.translation).all():
+        fault = "a quaternion of norm 0" if largest == 0.0 else "a pose that is not finite"
+        raise InputError(f"image {name!r} has {fault}; rebuild the model, or remove the image from it")
+    matrix: NDArray[np.float64] = pose.matrix()
+    if abs(largest * float(np.linalg.norm(quaternion / largest)) - 1.0) > _UNIT:
+        x, y, z, w = quaternion / largest
+        matrix[:, :3] = rotations(np.array([[w, x, y, z]]))[0]
+    return matrix
 
 
 def read_points(reconstruction: Any) -> Points:

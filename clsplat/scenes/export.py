@@ -17,6 +17,7 @@ import numpy as np
 from ..cameras.path import opengl_pose
 from ..errors import InputError
 from ..files.atomic import atomic_writer
+from ..files.real_path import real_path
 from .colmap import Points
 from .colmap_binary import ModelView, write_binary_model
 from .point_cloud import write_point_cloud
@@ -88,6 +89,7 @@ def write_colmap(folder: Path, photos: Sequence[RegisteredImage], points: Points
 
     Raises
     ------
+    InputError : the name of a photo has a space, which COLMAP's text files cannot store.
     OutputError : a file cannot be written.
     """
     views, names = [], {}
@@ -106,6 +108,12 @@ def write_colmap(folder: Path, photos: Sequence[RegisteredImage], points: Points
             )
         )
     if text:
+        spaced = next((photo.name for photo in photos if len(photo.name.split()) != 1), None)
+        if spaced is not None:
+            raise InputError(
+                f"image {spaced!r}: a name ends at the first space in COLMAP's text files; write a binary model, or "
+                "rename the photo"
+            )
         _write_text(folder, views, names, points)
     else:
         write_binary_model(folder, views, points.xyz, points.rgb)
@@ -116,9 +124,9 @@ def relative_files(files: Sequence[Path], folder: Path) -> list[str]:
 
     def relative(file: Path) -> str:
         try:
-            return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+            return Path(os.path.relpath(real_path(file), real_path(folder))).as_posix()
         except ValueError:
-            return file.resolve().as_posix()
+            return real_path(file).as_posix()
 
     return [relative(file) for file in files]
 

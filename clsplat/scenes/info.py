@@ -14,12 +14,14 @@ import numpy as np
 
 from ..errors import InputError
 from ..files.image_names import IMAGE_SUFFIXES
-from ..files.images import image_size
 from ..files.json_file import read_json, to_real
-from .nerfstudio import find_transforms
+from ..files.real_path import real_path
+from .photo_listing import list_images
+from .pose_checks import check_lenses
 from .posed_images import PosedImages
-from .reconstruct.reconstruct import RECORD
+from .reconstruct.options import RECORD
 from .scene import find_masks, read_posed_images, select_test_names
+from .transforms_files import find_transforms
 from .undistort import is_pinhole
 
 _DIGITS = 6  # significant digits of a focal length; lenses that agree to these digits count as one
@@ -57,9 +59,9 @@ class SceneInfo:
     kind : "COLMAP" or the names of the transforms files.
     photos : number of photos with poses.
     unregistered : names of photos in the same folder without a pose.
-    unreadable : names of photos that cannot be read.
+    left_out : reason why a photo with a pose is missing or cannot be read, by name. Pixels are not decoded.
     sizes : number of photos by (width, height) as stored [px], the most frequent size first.
-    photo_bytes : total size of the posed photos' files.
+    photo_bytes : total size of the files of the photos that can be used.
     lenses : lenses, the most used first.
     points : number of points.
     track_mean, track_median : number of photos that see a point; 0 without points.
@@ -72,7 +74,7 @@ class SceneInfo:
     kind: str
     photos: int
     unregistered: tuple[str, ...]
-    unreadable: tuple[str, ...]
+    left_out: dict[str, str]
     sizes: tuple[tuple[tuple[int, int], int], ...]
     photo_bytes: int
     lenses: tuple[LensUse, ...]
@@ -89,7 +91,7 @@ class SceneInfo:
             "kind": self.kind,
             "photos": self.photos,
             "unregistered": list(self.unregistered),
-            "unreadable": list(self.unreadable),
+            "left_out": self.left_out,
             "photo_bytes": self.photo_bytes,
             "sizes": [{"width": size[0], "height": size[1], "photos": n} for size, n in self.sizes],
             "lenses": [asdict(lens) for lens in self.lenses],
@@ -112,44 +114,47 @@ def scene_info(path: str | os.PathLike[str], images: str | None = None, test_eve
 
     Raises
     ------
-    InputError : a folder or photo is missing, or the model is damaged.
+    InputError : a folder is missing, the model is damaged, or too few photos can be used.
     """
     root = Path(path)
     posed = read_posed_images(root, images)
-    sizes: Counter[tuple[int, int]] = Counter()
-    unreadable = []
-    for name, file in posed.files.items():
-        try:
-            sizes[image_size(file)] += 1
-        except InputError:
-            unreadable.append(name)
+    check_lenses(root, posed)
+    sizes = Counter(posed.sizes.values())
     tracks = posed.points.track_length
     masks = find_masks(root, posed, None)
+    held_out = select_test_names(posed, test_every, None) if len(posed.listed) > 1 else frozenset()
     transforms = [] if (root / "sparse").is_dir() else find_transforms(root)
     return SceneInfo(
         " and ".join(file.name for file in transforms) or "COLMAP",
-        len(posed.photos),
-        _unregistered(posed, masks.values()),
-        tuple(unreadable),
+        len(posed.listed),
+        _unregistered(root, posed, masks.values()),
+        posed.left_out,
         tuple(sizes.most_common()),
-        sum(file.stat().st_size for file in posed.files.values()),
+        sum(posed.files[name].stat().st_size for name in posed.names),
         _lenses(posed),
         len(posed.points),
         float(tracks.mean()) if len(tracks) else 0.0,
         float(np.median(tracks)) if len(tracks) else 0.0,
-        tuple(sorted(select_test_names(posed, test_every, None))) if len(posed.photos) > 1 else (),
+        tuple(sorted(held_out - set(posed.left_out))),
         len(masks),
         _placed(root),
     )
 
 
-def _unregistered(posed: PosedImages, masks: Iterable[Path]) -> tuple[str, ...]:
-    """Return photos without a pose, as paths relative to the common folder of all posed photos."""
-    files = {file.resolve() for file in posed.files.values()}
-    known = files | {file.resolve() for file in masks}
-    folder = Path(os.path.commonpath([file.parent for file in files]))
-    others = (file for file in sorted(folder.rglob("*")) if file.suffix.lower() in IMAGE_SUFFIXES)
-    return tuple(file.relative_to(folder).as_posix() for file in others if file not in known)
+def _unregistered(root: Path, posed: PosedImages, masks: Iterable[Path]) -> tuple[str, ...]:
+    """Return photos without a pose, as paths relative to the common folder of the posed photos in the scene's folder.
+
+    Other folders are not looked into, even if the scene has photos there.
+    """
+    home = Path(os.path.abspath(root.parent if root.is_file() else root))
+    places = [Path(os.path.abspath(file)).parent for file in posed.files.values()]
+    inside = [place for place in places if place.is_relative_to(home)]
+    if not inside:
+        return ()
+    folder = Path(os.path.commonpath(inside))
+    known = {real_path(file) for file in (*posed.files.values(), *masks)}
+    names = list_images(folder, IMAGE_SUFFIXES).names
+    return tuple(name for name in names if real_path(folder / name) not in known)
 
 
 def _placed(root: Path) -> tuple[int, int, float] | None:
@@ -169,8 +174,6 @@ def _lenses(posed: PosedImages) -> tuple[LensUse, ...]:
     for photo in posed.photos:
         lens = photo.lens
         focal = float(f"{lens.params[0]:.{_DIGITS}g}")  # every supported model has it first
-        if not 0.0 < focal < math.inf:
-            raise InputError(f"image {photo.name!r}: its camera has a focal length of {focal:g} px; rebuild the model")
         angle = math.degrees(2.0 * math.atan(lens.width / (2.0 * focal)))
         uses[LensUse(lens.model.name, is_pinhole(lens), lens.width, lens.height, focal, round(angle, 1))] += 1
     return tuple(replace(lens, photos=n) for lens, n in uses.most_common())

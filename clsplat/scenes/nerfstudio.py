@@ -14,49 +14,35 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.camera import is_rotation
 from ..cameras.path import cam_from_world_of
+from ..cameras.rotations import NearestRotation, NotARotation, nearest_rotation, warn_of_corrections
 from ..errors import InputError
 from ..files.image_names import IMAGE_SUFFIXES
-from ..files.images import image_size
 from ..files.json_file import read_json, to_real
+from ..files.masks import is_same_file
 from .colmap import Points, read_model
 from .point_cloud import read_point_cloud
-from .posed_images import PosedImages
+from .posed_images import PosedImages, read_sizes
 from .undistort import Lens, RegisteredImage, make_lens
-
-FILE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _MAX_SIDE = 1 << 20  # largest side of an image [px]
 _MAX_NAME, _MAX_PATH = 240, 2000  # longest names and paths [bytes]; file systems allow 255 and 4096
+_LAST_ROW = 1e-6  # largest error of the last row of a pose
 _MAX_NUMBER = 1e30  # numbers are smaller than this, so that float32 can store them
+_LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists of photos
 _COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0")  # where nerfstudio and COLMAP put a COLMAP model
 _SUFFIXES = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
-
-
-def find_transforms(path: Path) -> list[Path]:
-    """Return the transforms files of a scene: the training and test files, the single file, or an empty list.
-
-    Parameters
-    ----------
-    path : the scene's folder or a transforms file. `transforms_train.json` includes `transforms_test.json` beside it.
-    """
-    if path.is_file():
-        return find_transforms(path.parent) if path.name == TRAIN else [path]
-    pair = [path / TRAIN, path / TEST]
-    if pair[0].is_file():
-        return [file for file in pair if file.is_file()]
-    return [path / FILE] if (path / FILE).is_file() else []
 
 
 def read_transforms(files: list[Path], images: str | None = None) -> PosedImages:
@@ -69,12 +55,12 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
 
     Warns
     -----
-    UserWarning : photos of some frames are missing; these frames are left out.
+    UserWarning : the lists of training and test photos name photos without a frame, or rotations were corrected.
 
     Raises
     ------
-    InputError : a file is damaged or has no frames, a key is missing or unusable, no photo exists, or the points
-        cannot be read. The message names file, frame and key.
+    InputError : a file is damaged or has no frames, a key is missing or unusable, no photo of a list has a frame, or
+        the points cannot be read. The message names file, frame and key.
     """
     documents = [_Document.read(file) for file in files]
     frames = [frame for document in documents for frame in document.frames(images)]
@@ -83,38 +69,32 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
         if frame.name in photos:
             raise InputError(f"{frame.place}: {frame.name!r} has a frame already; remove one")
         photos[frame.name] = frame
-    kept = {name: frame for name, frame in sorted(photos.items()) if frame.file.is_file()}
-    missing = [name for name in photos if name not in kept]
-    if not kept:
-        raise InputError(
-            f"{files[0]}: none of its {len(photos)} photos exists, for example {missing[0]!r}; "
-            "copy them beside it, or name their folder"
-        )
-    if missing:
-        warnings.warn(
-            f"{files[0]}: {len(missing)} of {len(photos)} frames name photos that do not exist, for example "
-            f"{missing[0]!r}; they are left out",
-            stacklevel=3,
-        )
-    test_names = _held_out(documents, kept)
-    used = set().union(*(document.listed_names() or kept for document in documents))
-    kept = {name: frame for name, frame in kept.items() if name in used}
+    used = set().union(*(document.listed_frames(photos) for document in documents))
+    listed = {name: frame for name, frame in sorted(photos.items()) if name in used}
+    photo_files = {name: frame.file for name, frame in listed.items()}
+    sizes, left_out = read_sizes(photo_files)
+    kept = {name: listed[name] for name in sizes}
+    for document in documents:
+        of_file = (frame for frame in kept.values() if frame.document is document)
+        warn_of_corrections(document.path, {f"frame {frame.index}": frame.rotation for frame in of_file})
     return PosedImages(
-        [frame.photo() for frame in kept.values()],
-        {name: frame.file for name, frame in kept.items()},
+        [frame.photo(sizes[name]) for name, frame in kept.items()],
+        photo_files,
+        sizes,
         documents[0].points(),
-        test_names,
+        _held_out(documents, listed),
         {name: mask for name, frame in kept.items() for mask in [frame.mask_file()] if mask is not None},
+        left_out,
     )
 
 
-def _held_out(documents: list[_Document], kept: dict[str, _Frame]) -> frozenset[str] | None:
+def _held_out(documents: list[_Document], frames: dict[str, _Frame]) -> frozenset[str] | None:
     """Return the names of the test views that the files hold out; None if they hold none out."""
     if len(documents) == 2:
-        return frozenset(name for name, frame in kept.items() if frame.document is documents[1])
+        return frozenset(name for name, frame in frames.items() if frame.document is documents[1])
     for key in ("test_filenames", "val_filenames"):
         if documents[0].listed_names(key):
-            return frozenset(documents[0].listed_names(key) & set(kept))
+            return frozenset(documents[0].listed_names(key) & set(frames))
     return None
 
 
@@ -132,8 +112,9 @@ class _Frame:
     def place(self) -> str:
         return f"{self.document.path}: frame {self.index}"
 
-    def photo(self) -> RegisteredImage:
-        return RegisteredImage(self.name, self.pose(), self.lens())
+    def photo(self, size: tuple[int, int]) -> RegisteredImage:
+        """Return the photo, whose file has this size [px], with its pose and lens."""
+        return RegisteredImage(self.name, self.pose(), self.lens(size))
 
     def mask_file(self) -> Path | None:
         """Return the mask file named by nerfstudio's `mask_path`, or None."""
@@ -142,23 +123,45 @@ class _Frame:
             return None
         if not isinstance(mask, str) or not mask.isprintable() or not _can_be_name(mask):
             raise InputError(f"{self.place}: mask_path {mask!r} is not the name of a file; name a mask, or remove it")
-        return self.document.path.parent / mask.replace("\\", "/")
+        file = self.document.path.parent / mask.replace("\\", "/")
+        if not file.is_file():
+            raise InputError(f"{self.place}: mask_path {mask!r} is not a file; copy the mask there, or remove the key")
+        if is_same_file(file, self.file):
+            raise InputError(f"{self.place}: mask_path {mask!r} is the photo itself; name a mask, or remove it")
+        return file
 
-    def pose(self) -> NDArray[np.float64]:
-        """Return the world-to-camera matrix, (4, 4), with OpenCV's axes."""
+    @cached_property
+    def matrix(self) -> NDArray[np.float64]:
+        """The transform_matrix as it is in the file, (4, 4)."""
         matrix = _matrix(self.values.get("transform_matrix"))
         if matrix is None:
             raise InputError(f"{self.place}: transform_matrix must be 4 x 4 finite numbers; write the poses again")
-        if not is_rotation(matrix[:3, :3]):
+        if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > _LAST_ROW:
+            row = " ".join(f"{value:g}" for value in matrix[3])
             raise InputError(
-                f"{self.place}: transform_matrix has no rotation in its left 3 x 3 block; write the "
-                "poses again, without a scale"
+                f"{self.place}: the last row of transform_matrix is {row}, not 0 0 0 1; write camera-to-world "
+                "poses, row by row"
             )
-        return cam_from_world_of(matrix)
+        return matrix
 
-    def lens(self) -> Lens:
+    @cached_property
+    def rotation(self) -> NearestRotation:
+        """The rotation of the pose."""
+        try:
+            return nearest_rotation(self.matrix[:3, :3])
+        except NotARotation as error:
+            raise InputError(
+                f"{self.place}: the left 3 x 3 block of transform_matrix {error}; write the poses again"
+            ) from None
+
+    def pose(self) -> NDArray[np.float64]:
+        """Return the world-to-camera matrix, (4, 4), with OpenCV's axes."""
+        pose = self.matrix.copy()
+        pose[:3, :3] = self.rotation.matrix
+        return cam_from_world_of(pose)
+
+    def lens(self, size: tuple[int, int]) -> Lens:
         """Return the lens, with the size in the file, or else the photo's size."""
-        size = image_size(self.file)
         width, height = int(self.number("w", size[0])), int(self.number("h", size[1]))
         if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
             raise InputError(f"{self.place}: w x h is {width} x {height}; both must be 1 to {_MAX_SIDE}")
@@ -252,14 +255,34 @@ class _Document:
         folder, plain = (Path(os.path.normpath(path)) for path in (self.path.parent, file))
         return plain.relative_to(folder).as_posix() if plain.is_relative_to(folder) else plain.name
 
-    def listed_names(self, key: str | None = None) -> set[str]:
-        """Return the photo names in nerfstudio's list `key`, or in all of its lists."""
-        keys = ("train_filenames", "val_filenames", "test_filenames") if key is None else (key,)
-        lists = [self.values.get(key) or [] for key in keys]
-        if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
-            raise InputError(f"{self.path}: {' or '.join(keys)} is not a list of photos; remove it or name files")
-        names = [name for names in lists for name in names]
+    def listed_names(self, key: str) -> set[str]:
+        """Return the photo names in nerfstudio's list `key`; an empty set without the list."""
+        names = self.values.get(key) or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{self.path}: {key} is not a list of photos; remove it or name files")
         return {self.name_of(self.photo_file(name)) for name in names}
+
+    def listed_frames(self, frames: Iterable[str]) -> set[str]:
+        """Return the names of the frames that nerfstudio's lists name; all frames without such lists."""
+        known, listed = set(frames), set()
+        for key in _LISTS:
+            names = self.listed_names(key)
+            if not names:
+                continue
+            unknown = sorted(names - known)
+            if len(unknown) == len(names):
+                raise InputError(
+                    f"{self.path}: {key} names no photo of a frame, for example {unknown[0]!r}; name photos such as "
+                    f"{min(known)!r}, or remove the list"
+                )
+            if unknown:
+                warnings.warn(
+                    f"{self.path}: {key} names {len(unknown)} of {len(names)} photos that have no frame, for example "
+                    f"{unknown[0]!r}; they are left out",
+                    stacklevel=5,
+                )
+            listed |= names & known
+        return listed or known
 
     def points(self) -> Points:
         """Return the file's points, or the points of the COLMAP model behind it, or an empty point cloud."""

@@ -29,6 +29,8 @@ def read_point_cloud(path: str | os.PathLike[str]) -> Points:
     InputError : the file is missing or damaged, or a position is missing or not finite.
     """
     path = Path(path)
+    if path.exists() and not path.is_file() and not path.is_dir():  # opening a pipe would wait for ever
+        raise InputError(f"{path}: is not a regular file; give a PLY file of points")
     try:
         with path.open("rb") as stream:
             header = read_header(path, stream)

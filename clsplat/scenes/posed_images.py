@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..errors import InputError
 from ..files.image_names import IMAGE_SUFFIXES
+from ..files.images import image_size
 from .colmap import Points, find_model, read_model
+from .photo_listing import list_images
+from .photo_names import place_photos
 from .undistort import RegisteredImage
 
 _FEW_REGISTERED = 0.8  # share of registered photos below which a warning is issued
+MIN_USABLE = 0.25  # smallest share of usable photos; a set of NeRF without its test photos has a third
+_MAX_REASONS = 3  # largest number of photos that a warning names
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,23 +27,67 @@ class PosedImages:
 
     Parameters
     ----------
-    photos : registered images, sorted by name.
-    files : file of each photo, by name.
+    photos : registered images with a readable header, sorted by name.
+    files : file of each photo, by name, with those left out.
+    sizes : (width, height) of each photo as stored [px], by name.
     points : point cloud, may be empty.
-    test_names : names of the photos that the scene's files hold out for evaluation; None if they do not specify any.
+    test_names : names of the photos that the scene's files hold out for evaluation, with those left out; None if the
+        files do not specify any.
     masks : mask files named in the scene's files, by photo name.
+    left_out : reason why a photo with a pose cannot be used, by name.
     """
 
     photos: list[RegisteredImage]
     files: dict[str, Path]
+    sizes: dict[str, tuple[int, int]]
     points: Points
     test_names: frozenset[str] | None = None
     masks: dict[str, Path] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
-        """Names of all photos."""
+        """Names of the usable photos."""
         return [photo.name for photo in self.photos]
+
+    @property
+    def listed(self) -> list[str]:
+        """Names of all photos with poses, sorted, with those left out. Splits follow these names."""
+        return sorted([*self.names, *self.left_out])
+
+
+def read_sizes(files: Mapping[str, Path]) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
+    """Return the size of each photo [px] from its header, and the reasons why other photos cannot be used, by name."""
+    sizes, left_out = {}, {}
+    for name, file in files.items():
+        try:
+            sizes[name] = image_size(file)
+        except InputError as error:
+            left_out[name] = str(error)
+    return sizes, left_out
+
+
+def check_left_out(root: Path, left_out: Mapping[str, str], n: int) -> None:
+    """Raise InputError if fewer than a quarter of a scene's `n` photos can be used."""
+    used = n - len(left_out)
+    if left_out and used < max(1, MIN_USABLE * n):
+        number = f"only {used}" if used else "none"
+        raise InputError(
+            f"{root}: {number} of its {n} photos can be used, at least {math.ceil(MIN_USABLE * n)} must be; "
+            f"copy them there, or name another folder of photos ({next(iter(left_out.values()))})"
+        )
+
+
+def warn_of_left_out(root: Path, left_out: Mapping[str, str], n: int) -> None:
+    """Warn if some of a scene's `n` photos are left out; `left_out` has the reasons by name."""
+    if left_out:
+        reasons = list(left_out.values())
+        warnings.warn(
+            f"{root}: {len(reasons)} of {n} photos are left out ({math.ceil(100 * len(reasons) / n)} %): "
+            + "; ".join(reasons[:_MAX_REASONS])
+            + ("; ..." if len(reasons) > _MAX_REASONS else ""),
+            stacklevel=3,
+        )
 
 
 def read_colmap(root: Path, images: str | None) -> PosedImages:
@@ -53,13 +104,17 @@ def read_colmap(root: Path, images: str | None) -> PosedImages:
 
     Raises
     ------
-    InputError : a folder or photo is missing, or the model is damaged.
+    InputError : a folder is missing, or the model is damaged.
     """
     model = read_model(find_model(root))
     folder = _photo_folder(root, images or "images")
-    files = _photo_files(folder, [photo.name for photo in model.photos])
-    _warn_of_unregistered(folder, len(files))
-    return PosedImages(model.photos, files, model.points)
+    placed = place_photos(folder, [photo.name for photo in model.photos])
+    files = dict(placed.values())
+    sizes, left_out = read_sizes(files)
+    _warn_of_unregistered(folder, len(model.photos))
+    named = sorted((replace(photo, name=placed[photo.name][0]) for photo in model.photos), key=lambda photo: photo.name)
+    photos = [photo for photo in named if photo.name in sizes]
+    return PosedImages(photos, files, sizes, model.points, left_out=left_out)
 
 
 def _photo_folder(root: Path, images: str) -> Path:
@@ -73,20 +128,8 @@ def _photo_folder(root: Path, images: str) -> Path:
     return folder
 
 
-def _photo_files(folder: Path, names: list[str]) -> dict[str, Path]:
-    files = {name: folder / name for name in names}
-    missing = [name for name, file in files.items() if not file.is_file()]
-    if missing:
-        some = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
-        raise InputError(
-            f"{folder}: {len(missing)} of the model's {len(names)} images are missing: {some}; "
-            "copy them there, or name another folder of photos"
-        )
-    return files
-
-
 def _warn_of_unregistered(folder: Path, registered: int) -> None:
-    photos = sum(1 for file in folder.rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
+    photos = len(list_images(folder, IMAGE_SUFFIXES).names)
     if registered < _FEW_REGISTERED * photos:
         warnings.warn(
             f"{folder}: the model registers only {registered} of {photos} photos; parts of the "

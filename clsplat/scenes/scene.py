@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import os
-import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,21 +14,28 @@ from typing import Any
 
 import numpy as np
 
+from .. import activity
 from ..cameras.camera import Camera
 from ..errors import InputError
+from ..files.digest import file_digest
 from ..files.images import ImageU8, read_image, resize_area
 from ..files.masks import MASK_FOLDER, NO_MASKS, Mask, mask_files, read_mask, resize_mask
+from ..files.real_path import real_path
+from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
 from .colmap import Points
-from .nerfstudio import find_transforms, read_transforms
+from .nerfstudio import read_transforms
 from .options import ALPHA_USES
-from .posed_images import PosedImages, read_colmap
+from .photo_size import check_memory, target_size
+from .pose_checks import check_lenses, check_poses, without_far_points
+from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
+from .transforms_files import find_transforms
 from .undistort import RegisteredImage
+from .wrong_folder import describe_file, scene_hint
 
-MAX_WIDTH = 1600  # with resolution -1, wider images are reduced to this width [px], as in 3DGS
 _EXTENT_MARGIN = 1.1  # extent over the largest distance of a camera from the cameras' mean, as in 3DGS
 
-__all__ = ["MAX_WIDTH", "Points", "Scene", "View", "load_scene"]
+__all__ = ["Points", "Scene", "View", "load_scene"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +80,12 @@ class Scene:
     path : the scene's folder, or its transforms file.
     views : all views, sorted by name.
     points : point cloud, may be empty.
-    test_names : names of the views held out for evaluation.
+    test_names : names of the views held out for evaluation, with those left out.
     background : colour 0..1 under photos with transparency.
     reading : arguments of `load_scene` that a run records to read the scene again; None stands for a default.
+    left_out : reason why a photo with a pose is not among the views, by name.
+    photo_digests : digest of each photo's file and its mask's file (`file_digest`) by name; empty without files.
+    photo_files : files of the photos and their masks.
     """
 
     name: str
@@ -85,6 +95,9 @@ class Scene:
     test_names: frozenset[str] = frozenset()
     background: Color = BLACK
     reading: Mapping[str, Any] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    photo_digests: Mapping[str, str] = field(default_factory=dict)
+    photo_files: Sequence[Path] = ()
 
     @property
     def cameras(self) -> list[Camera]:
@@ -142,8 +155,9 @@ def load_scene(
         are reduced (images_4), the cameras are scaled.
     resolution : 3DGS's -r. The values 1, 2, 4 and 8 divide the size; -1 keeps the size but reduces images wider than
         1600 px to that width; another number is the width [px].
-    test_every : every n-th name of the sorted names, from the first on, is a test view. If the scene's files hold views
-        out (transforms_test.json, nerfstudio's lists), those are the test views instead.
+    test_every : every n-th name of the sorted names, from the first on, is a test view. Names of photos that are left
+        out count, so a missing photo moves no other photo between training and test views. If the scene's files hold
+        views out (transforms_test.json, nerfstudio's lists), those are the test views instead.
     test_list : text file with the names of the test views, one per line; replaces `test_every`.
     eval : whether to hold out test views; if False, all views are training views.
     background : colour 0..1 under transparent pixels.
@@ -155,12 +169,12 @@ def load_scene(
     Warns
     -----
     UserWarning : the model registers fewer than 80 % of the photos in the folder. Photos that are missing, unreadable
-        or hidden by their masks are left out.
+        or hidden by their masks are left out. Rotations, poses or lenses look wrong (`check_poses`).
 
     Raises
     ------
-    InputError : a folder or photo is missing, a model or mask is damaged, no photo can be read, sizes do not fit, or
-        an option has a bad value.
+    InputError : a folder is missing, a model or mask is damaged, sizes do not fit, or an option has a bad value.
+        Fewer than a quarter of the photos can be used, no training view is left, or memory is too small.
     """
     root = Path(path)
     if alpha not in ALPHA_USES:
@@ -168,23 +182,38 @@ def load_scene(
     if resolution < 1 and resolution != -1:
         raise InputError(f"resolution {resolution}: use 1, 2, 4, 8, a width in pixels, or -1")
     posed = read_posed_images(root, images)
+    check_lenses(root, posed)
     test_names = select_test_names(posed, test_every, test_list) if eval else frozenset()
     mask_of = find_masks(root, posed, masks)
+    check_memory(root, posed.sizes.values(), resolution)
+
+    numbers = itertools.count(1)
 
     def view(photo: RegisteredImage) -> View | str:
+        activity.report(f"reading photo {next(numbers)} of {len(posed.photos)}")
         return _view(photo, posed.files[photo.name], resolution, background, mask_of.get(photo.name), alpha == "mask")
 
     with ThreadPoolExecutor() as pool:  # decoding and resizing release the interpreter lock
         results = list(pool.map(view, posed.photos))
+        names = [result.name for result in results if isinstance(result, View)]
+        digests = list(pool.map(lambda name: file_digest(*_files_of(name, posed, mask_of)), names))
     views = [view for view in results if isinstance(view, View)]
-    _warn_of_left_out(root, [reason for reason in results if isinstance(reason, str)], len(results))
-    folder = root.resolve()
+    unusable = {photo.name: view for photo, view in zip(posed.photos, results, strict=True) if isinstance(view, str)}
+    left_out, n = dict(sorted((posed.left_out | unusable).items())), len(posed.listed)
+    check_left_out(root, left_out, n)
+    warn_of_left_out(root, left_out, n)
+    if all(view.name in test_names for view in views):
+        raise InputError(
+            f"{root}: no training view is left: all {len(views)} photos that can be used are test views; "
+            "add photos, or turn eval off"
+        )
+    folder = real_path(root)
     return Scene(
         (folder.parent if root.is_file() else folder).name,
         root,
         views,
         posed.points,
-        test_names & {view.name for view in views},
+        test_names,
         background,
         _reading(
             images=images,
@@ -192,10 +221,18 @@ def load_scene(
             masks=masks,
             alpha=alpha,
             test_every=test_every,
-            test_list=None if test_list is None else str(Path(test_list).resolve()),
+            test_list=None if test_list is None else str(real_path(test_list)),
             eval=eval,
         ),
+        left_out,
+        dict(zip(names, digests, strict=True)),
+        [file for name in names for file in _files_of(name, posed, mask_of)],
     )
+
+
+def _files_of(name: str, posed: PosedImages, mask_of: Mapping[str, Path]) -> list[Path]:
+    """Return the file of a photo, and the file of its mask if it has one."""
+    return [posed.files[name], *([mask_of[name]] if name in mask_of else [])]
 
 
 def _reading(*, eval: bool, **arguments: Any) -> dict[str, Any]:
@@ -221,34 +258,31 @@ def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, 
     path = (root.parent if root.is_file() else root) / (folder or MASK_FOLDER)
     if folder is not None and not path.is_dir():
         raise InputError(f"{path}: no such folder of masks; name another, or {NO_MASKS!r} for no masks")
-    masks = mask_files(path, posed.names)
-    if folder is not None and not masks:
+    masks = mask_files(path, {name: posed.files[name] for name in posed.names})
+    if folder is not None and posed.names and not masks:
         raise InputError(f"{path}: no mask of any photo in it; a mask of {posed.names[0]!r} is {posed.names[0]}.png")
     return posed.masks | masks
 
 
-def _warn_of_left_out(root: Path, reasons: list[str], n: int) -> None:
-    if len(reasons) == n:
-        raise InputError(f"{root}: none of its {n} photos can be used: {reasons[0]}")
-    if reasons:
-        warnings.warn(
-            f"{root}: {len(reasons)} of {n} photos are left out: {'; '.join(reasons[:3])}"
-            + ("; ..." if len(reasons) > 3 else ""),
-            stacklevel=3,
-        )
-
-
 def read_posed_images(root: Path, images: str | None) -> PosedImages:
     """Read a scene's photos with poses, without decoding them; parameters and errors as `load_scene`."""
-    transforms = find_transforms(root)
-    if transforms and not (root / "sparse").is_dir():
-        return read_transforms(transforms, images)
-    return read_colmap(root, images)
+    if root.is_file() and root.suffix.lower() != ".json":
+        raise InputError(f"{root}: {describe_file(root)}")
+    transforms, has_model = find_transforms(root), (root / "sparse").is_dir()
+    if transforms and not has_model:
+        posed = read_transforms(transforms, images)
+    elif root.is_dir() and not has_model and (hint := scene_hint(root)) is not None:
+        raise InputError(hint)
+    else:
+        posed = read_colmap(root, images)
+    check_left_out(root, posed.left_out, len(posed.listed))
+    check_poses(root, posed)
+    return replace(posed, points=without_far_points(root, posed.points))
 
 
 def select_test_names(posed: PosedImages, test_every: int, test_list: str | os.PathLike[str] | None) -> frozenset[str]:
     """Return the names of the test views; parameters as `load_scene`, raises InputError."""
-    names = posed.names
+    names = posed.listed
     if test_list is None and posed.test_names is not None:
         chosen = sorted(posed.test_names)
     elif test_list is None:
@@ -272,11 +306,11 @@ def select_test_names(posed: PosedImages, test_every: int, test_list: str | os.P
 
 def _read_names(path: Path) -> list[str]:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_whole(path).decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
         raise InputError(
-            f"{path}: cannot be read as a list of names ({type(error).__name__}); "
-            "give a text file with one image name per line"
+            f"{path}: cannot be read as a list of names ({reason}); give a text file with one image name per line"
         ) from None
     return [line.strip() for line in lines if line.strip()]
 
@@ -305,7 +339,7 @@ def _view(
     mask = np.logical_and.reduce(fitted) if fitted else None
     alpha = None if alpha is None else photo.fit_alpha(alpha)
     view = View(photo.name, camera, image, mask, alpha)
-    view = view.resized(*_target_size(camera.width, camera.height, resolution))
+    view = view.resized(*target_size(camera.width, camera.height, resolution))
     if view.mask is None:
         return view
     if not view.mask.any():
@@ -321,13 +355,3 @@ def _opaque(image: ImageU8, background: Color) -> ImageU8:
     under = 255.0 * np.clip(np.asarray(background, np.float32), 0.0, 1.0)
     blended = alpha * image[:, :, :3].astype(np.float32) + (1.0 - alpha) * under
     return np.rint(blended).astype(np.uint8)
-
-
-def _target_size(width: int, height: int, resolution: int) -> tuple[int, int]:
-    """Return (width, height) [px] by 3DGS's rule: divisors round, widths truncate."""
-    if resolution in (1, 2, 4, 8):
-        return max(1, round(width / resolution)), max(1, round(height / resolution))
-    if resolution == -1 and width <= MAX_WIDTH:
-        return width, height
-    target = MAX_WIDTH if resolution == -1 else resolution
-    return target, max(1, int(height * target / width))

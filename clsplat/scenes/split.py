@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ..errors import InputError
+from ..errors import InputError, Remedy
 from .scene import Scene
 
 STRIDE = 7  # hold out every 7th training view, or every 3rd, ... of a scene with few views
@@ -24,8 +24,9 @@ def hold_out(scene: Scene) -> Scene:
     views = scene.train
     if len(views) < MIN_TRAIN_VIEWS:
         raise InputError(
-            f"{scene.path}: has {len(views)} training views; at least {MIN_TRAIN_VIEWS} are needed to hold one "
-            "out: add photos, or choose the number of splats yourself (--cap-max)"
+            f"{scene.path}: has {len(views)} training views; at least {MIN_TRAIN_VIEWS} are needed to hold one out",
+            Remedy("add photos"),
+            Remedy("choose the number of splats yourself", "--cap-max"),
         )
     stride = max(2, min(STRIDE, len(views) // MIN_TRAIN_VIEWS))
     held_out = views[stride // 2 :: stride]

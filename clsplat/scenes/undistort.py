@@ -16,6 +16,7 @@ from ..errors import InputError, reason_of
 # This import loads Pillow before pycolmap (see images.py). For the same reason functions import pycolmap late.
 from ..files import images as _images
 from ..files.masks import resize_mask
+from ..files.stop_signals import kept_from_libraries
 
 Lens = Any  # a pycolmap.Camera
 
@@ -58,9 +59,16 @@ class RegisteredImage:
         lens = _scaled(self.lens, width, height, self.name)
         if not is_pinhole(lens):
             image, lens = _undistorted(image, lens, self.name)
-            height, width = image.shape[:2]
+        return image, self._camera(lens)
+
+    def fitted_camera(self, width: int, height: int) -> Camera:
+        """Return the camera of the image that `fit` makes of a photo of this size [px]; raises as `fit`."""
+        lens = _scaled(self.lens, width, height, self.name)
+        return self._camera(lens if is_pinhole(lens) else _pinhole_of(lens, self.name))
+
+    def _camera(self, lens: Lens) -> Camera:
         try:
-            return image, pinhole_camera(lens, self.cam_from_world, width, height)
+            return pinhole_camera(lens, self.cam_from_world, lens.width, lens.height)
         except InputError as error:
             raise InputError(f"image {self.name!r}: {error}; rebuild the model") from None
 
@@ -125,7 +133,8 @@ def pinhole_camera(lens: Lens, cam_from_world: NDArray[np.float64], width: int, 
 
 def colmap_library() -> ModuleType:
     """Import pycolmap without its log messages; its errors reach the user as exceptions."""
-    import pycolmap
+    with kept_from_libraries():
+        import pycolmap
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     return pycolmap

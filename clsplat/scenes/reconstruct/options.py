@@ -22,7 +22,10 @@ CAMERA_MODELS = (
 CAMERA_MODES = ("auto", "single", "per-image", "per-folder")
 MATCHERS = ("auto", "exhaustive", "sequential")
 N_FRAMES = 120  # default number of frames to take from a video
+RECORD = "reconstruct.json"  # file in the scene that records its photos, options and result
 MIN_PHOTOS = 3  # smallest number of photos for structure from motion
+# Smallest and largest numbers. COLMAP's are C integers.
+RANGES = {"max_size": (64, 65_535), "frames": (MIN_PHOTOS, 100_000), "seed": (0, 2**31 - 1)}
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,6 @@ class ReconstructOptions:
         for name, allowed in (("camera_model", CAMERA_MODELS), ("camera_mode", CAMERA_MODES), ("matcher", MATCHERS)):
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name} {getattr(self, name)!r}: use one of {', '.join(allowed)}")
-        for name, minimum in (("max_size", 64), ("frames", MIN_PHOTOS)):
-            if getattr(self, name) < minimum:
-                raise InputError(f"{name} {getattr(self, name)}: must be at least {minimum}")
+        for name, (minimum, maximum) in RANGES.items():
+            if not minimum <= getattr(self, name) <= maximum:
+                raise InputError(f"{name} {getattr(self, name)}: must be {minimum} to {maximum}")

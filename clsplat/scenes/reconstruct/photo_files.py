@@ -12,7 +12,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ...errors import InputError
-from ...files.image_names import IMAGE_SUFFIXES, JPEG_SUFFIXES
+from ...files.digest import file_digest
+from ...files.image_names import CONVERTERS, IMAGE_SUFFIXES, JPEG_SUFFIXES
 from ...files.images import (
     ImageU8,
     PhotoHeader,
@@ -23,12 +24,11 @@ from ...files.images import (
     write_png,
 )
 from ...files.masks import MASK_FOLDER, Mask, mask_files, read_mask, resize_mask
+from ...files.real_path import real_path
+from ..photo_listing import Listing, list_images
+from ..wrong_folder import describe_scenes, scene_hint
 
 VIDEO_SUFFIXES = frozenset((".mp4", ".m4v", ".mov", ".mkv", ".avi", ".webm", ".mts", ".mpg", ".mpeg"))
-# Formats of photos that Pillow does not read.
-_UNSUPPORTED = frozenset(
-    (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".jxl", ".exr")
-)
 _MIN_ALPHA = 128  # features are not searched for in pixels with a smaller alpha
 
 
@@ -75,66 +75,71 @@ def is_photographs(path: Path) -> bool:
     if not path.is_dir():
         return is_video(path)
     posed = (path / "sparse").exists() or any(path.glob("transforms*.json"))
-    return not posed and bool(_photo_names(_photo_folder(path)))
+    return not posed and bool(list_images(_photo_folder(path), IMAGE_SUFFIXES).names)
 
 
 def find_photos(path: Path) -> list[PhotoFile]:
     """Return the photos in a folder and its subfolders, sorted by name, with their masks.
 
     If the folder `images` inside it has photos, only those are returned. Masks are in the folder `masks`. Hidden files
-    and folders are ignored.
+    and folders are ignored. Scenes, models and renders below the folder are left out; `left_out_below` names them.
 
     Raises
     ------
-    InputError : the folder does not exist, or has no photo of a supported format.
+    InputError : the folder does not exist, has no photo of a supported format, or is a folder of scenes.
     """
     if not path.is_dir():
-        raise InputError(
-            f"{path}: no such folder; give a folder of photos, or a video file ({', '.join(sorted(VIDEO_SUFFIXES))})"
-        )
+        known = ", ".join(sorted(VIDEO_SUFFIXES))
+        kind = "is a file" if path.is_file() else "no such folder"
+        raise InputError(f"{path}: {kind}; give a folder of photos, or a video file ({known})")
     home = _photo_folder(path)
-    names = _photo_names(home)
+    listing = list_images(home, IMAGE_SUFFIXES)
+    names = listing.names
+    if listing.scenes and listing.in_subfolders:
+        raise InputError(f"{home}: {describe_scenes(home, listing.scenes)}")
     if not names:
+        if (hint := scene_hint(path)) is not None:
+            raise InputError(hint)
         unsupported = _count_unsupported(home)
         suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
-        remedy = f"{unsupported}: convert them to JPEG" if unsupported else f"looked for {suffixes}"
+        remedy = unsupported or f"looked for {suffixes}"
         raise InputError(f"{home}: no photos in this folder or below; {remedy}")
     for name in names:
         if not name.isprintable():  # a model's files cannot store line ends and names that are not UTF-8
             raise InputError(f"{home}: the name {name!a} cannot be written into a model; rename the photo")
     folder = path / MASK_FOLDER
-    masks = mask_files(folder, names) if folder.is_dir() else {}
+    masks = mask_files(folder, {name: home / name for name in names}) if folder.is_dir() else {}
     return [
         PhotoFile(scene_name, home / name, masks.get(name))
         for name, scene_name in zip(names, _scene_names(names), strict=True)
     ]
 
 
+def left_out_below(path: Path) -> str:
+    """Return a text that names the scenes, models and renders below a folder of photos, or an empty text."""
+    listing = list_images(_photo_folder(path), IMAGE_SUFFIXES) if path.is_dir() else Listing(())
+    folders = [*listing.outputs, *listing.scenes]
+    return ", ".join(folders[:5]) + (", ..." if len(folders) > 5 else "")
+
+
 def unsupported_photos(path: Path) -> str:
-    """Return the number and kinds of a folder's unsupported photos, such as "3 files .heic", or an empty text."""
+    """Return the number and kinds of a folder's unsupported photos and how to convert them, or an empty text."""
     return _count_unsupported(_photo_folder(path)) if path.is_dir() else ""
 
 
 def fingerprint(path: Path) -> str:
-    """Return a hex digest of the names, sizes and modification times of a video, or of photos and masks.
+    """Return a hex digest of the names and contents of a video, or of photos and masks (see `file_digest`).
 
     Raises
     ------
     InputError : as `find_photos`.
     """
-    files = (
-        [path]
-        if is_video(path)
-        else [file for photo in find_photos(path) for file in (photo.file, photo.mask) if file is not None]
-    )
+    if is_video(path):
+        return file_digest(path)
+    files = [file for photo in find_photos(path) for file in (photo.file, photo.mask) if file is not None]
     digest = hashlib.sha256()
     for file in files:
-        try:
-            stat = file.stat()
-            state = f"{stat.st_size}\0{stat.st_mtime_ns}"
-        except OSError as error:  # a broken link; reading the photo later names it and leaves it out
-            state = str(error.errno)
-        digest.update(os.fsencode(os.path.relpath(file, path)) + f"\0{state}\0".encode())
+        digest.update(os.fsencode(os.path.relpath(file, path)) + f"\0{file_digest(file)}\0".encode())
     return digest.hexdigest()
 
 
@@ -158,13 +163,17 @@ def stage_photo(photo: PhotoFile, number: int, photos: Path, masks: Path) -> Sta
         mask = result.mask()
     except InputError as error:
         return str(error)
+    if pixels.shape[2] == 4:
+        opaque = pixels[:, :, 3] >= _MIN_ALPHA
+        mask = opaque if mask is None else mask & opaque
+    if mask is not None and not mask.any():
+        return f"{photo.file}: " + (
+            "every pixel is transparent" if photo.mask is None else f"its mask {photo.mask} hides every pixel"
+        )
     if header.plain and photo.file.suffix.lower() in (*JPEG_SUFFIXES, ".png"):
         _link(photo.file, photos / staged)
     else:
         write_photo(photos / staged, pixels[:, :, :3], header.exif)
-    if pixels.shape[2] == 4:
-        opaque = pixels[:, :, 3] >= _MIN_ALPHA
-        mask = opaque if mask is None else mask & opaque
     if mask is not None:
         _write_mask(masks, staged, mask)
     return result
@@ -219,36 +228,20 @@ def group_by_camera(photos: Sequence[StagedPhoto], mode: str) -> list[list[Stage
 def _photo_folder(path: Path) -> Path:
     """Return the folder `images` inside a folder if it has photos, or else the folder itself."""
     images = path / "images"
-    return images if images.is_dir() and _photo_names(images) else path
-
-
-def _photo_names(home: Path) -> list[str]:
-    return _names(home, IMAGE_SUFFIXES)
-
-
-def _names(home: Path, suffixes: frozenset[str]) -> list[str]:
-    """Return files below the folder with one of the suffixes, as names with `/` between folders."""
-    names = []
-    for folder, folders, files in os.walk(home):
-        below = Path(folder).relative_to(home)
-        folders[:] = [
-            name for name in folders if not name.startswith(".") and not (below == Path() and name == MASK_FOLDER)
-        ]
-        names += [
-            (below / name).as_posix()
-            for name in files
-            if not name.startswith(".") and Path(name).suffix.lower() in suffixes
-        ]
-    return sorted(names)
+    return images if images.is_dir() and list_images(images, IMAGE_SUFFIXES).names else path
 
 
 def _count_unsupported(home: Path) -> str:
-    names = _names(home, _UNSUPPORTED)
+    names = list_images(home, CONVERTERS.keys()).names
+    if not names:
+        return ""
     kinds = sorted({Path(name).suffix.lower() for name in names})
-    return f"{len(names)} file{'s' if len(names) > 1 else ''} {', '.join(kinds)}" if names else ""
+    tools = " or ".join(dict.fromkeys(CONVERTERS[kind] for kind in kinds))
+    count = f"{len(names)} file{'s' if len(names) > 1 else ''} {', '.join(kinds)}"
+    return f"{count}: convert them to JPEG, for example with {tools}"
 
 
-def _scene_names(names: list[str]) -> list[str]:
+def _scene_names(names: Sequence[str]) -> list[str]:
     """Return the names in the scene: suffixes other than JPEG and PNG become .png, in a way that keeps names unique."""
     kept = {name for name in names if Path(name).suffix.lower() in (*JPEG_SUFFIXES, ".png")}
     renamed: list[str] = []
@@ -277,6 +270,6 @@ def _write_mask(folder: Path, staged: str, mask: Mask) -> None:
 def _link(file: Path, target: Path) -> None:
     """Make a link to a file, or a copy if the system does not allow links."""
     try:
-        target.symlink_to(file.resolve())
+        target.symlink_to(real_path(file))
     except OSError:
         shutil.copyfile(file, target)

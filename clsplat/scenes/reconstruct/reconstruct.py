@@ -17,7 +17,8 @@ from ...errors import InputError, OutputError
 from ...files.images import PhotoHeader, read_photo_header
 from ...files.json_file import read_json, write_json
 from ...files.lock import folder_lock
-from .options import MIN_PHOTOS, ReconstructOptions
+from ...files.real_path import real_path
+from .options import MIN_PHOTOS, RECORD, ReconstructOptions
 from .photo_files import (
     PhotoFile,
     StagedPhoto,
@@ -26,6 +27,7 @@ from .photo_files import (
     fingerprint,
     group_by_camera,
     is_video,
+    left_out_below,
     stage_photo,
     unsupported_photos,
 )
@@ -37,7 +39,6 @@ from .video_frames import extract_frames
 T = TypeVar("T")
 R = TypeVar("R")
 
-RECORD = "reconstruct.json"  # file in the scene that records its photos, options and result
 MAX_EXHAUSTIVE = 150  # largest number of photos for which "auto" matches all pairs
 SMALL = 640  # photos with a shorter longest side [px] are also searched at twice their size, which takes longer
 _OVERLAP = 10  # number of following photos that each photo of a sequence is matched with
@@ -153,8 +154,8 @@ def reconstruct(
         write_json(
             work / "scene" / RECORD,
             {
-                "source": str(source.resolve()),
-                "fingerprint": source_digest,
+                "source": str(real_path(source)),
+                "photo_digest": source_digest,
                 "options": asdict(options),
                 **{key: value for key, value in asdict(result).items() if key != "scene"},
             },
@@ -166,14 +167,15 @@ def reconstruct(
 def estimate_seconds(photos: Sequence[PhotoFile], options: ReconstructOptions | None = None) -> float:
     """Return a rough estimate of the duration of `reconstruct` [s].
 
-    The estimate follows from the first photo's header, constants measured on one CPU core, and the number of cores.
+    The estimate follows from the header of the first photo that can be read, constants measured on one CPU core, and
+    the number of cores.
 
     Raises
     ------
-    InputError : the first photo cannot be read.
+    InputError : no photo can be read.
     """
     options = options or ReconstructOptions()
-    header = read_photo_header(photos[0].file)
+    header = _first_header(photos)
     side = _longest_side(header, options)
     megapixels = header.width * header.height * (side / max(header.width, header.height)) ** 2 / 1e6
     features = min(1.0, 3.0 * megapixels)  # number of features over their limit
@@ -182,17 +184,31 @@ def estimate_seconds(photos: Sequence[PhotoFile], options: ReconstructOptions | 
     return (search + 0.2 * pairs * features**2 + 0.5 * len(photos)) / (os.cpu_count() or 1)
 
 
+def _first_header(photos: Sequence[PhotoFile]) -> PhotoHeader:
+    for photo in photos[:-1]:
+        try:
+            return read_photo_header(photo.file)
+        except InputError:  # reading the photos later names it and leaves it out
+            continue
+    return read_photo_header(photos[-1].file)
+
+
 def is_made_from(scene: Path, photos: Path) -> bool | None:
-    """Return whether the scene was reconstructed from exactly these photos; None if there is no such record.
+    """Return whether the scene was reconstructed from exactly these photos; None if it does not record its photos.
+
+    Scenes of earlier versions record times of modification instead, under another key.
 
     Raises
     ------
-    InputError : the record is damaged.
+    InputError : the record is damaged, or there are no photos.
     """
     if not (scene / RECORD).is_file():
         return None
     record = read_json(scene / RECORD, "another folder")
-    return isinstance(record, dict) and record.get("fingerprint") == fingerprint(photos)
+    if not isinstance(record, dict):
+        raise InputError(f"{scene / RECORD}: expected a JSON object; remove the file")
+    digest = record.get("photo_digest")
+    return None if digest is None else digest == fingerprint(photos)
 
 
 def _refuse_used(scene: Path, overwrite: bool) -> None:
@@ -244,16 +260,18 @@ def _stage_all(photos: Sequence[PhotoFile], source: Path, work: Path, report: St
     results = list(_map_in_order("photos read", stage, jobs, report))
     reasons = [result for result in results if isinstance(result, str)]
     ready = [result for result in results if not isinstance(result, str)]
+    if below := left_out_below(source):
+        warnings.warn(f"left out: {below} in {source}: scenes, models and renders are not photos", stacklevel=3)
     unsupported = unsupported_photos(source)
     if unsupported:
-        warnings.warn(f"left out: {unsupported} in {source}; convert to JPEG to use them", stacklevel=3)
+        warnings.warn(f"left out in {source}: {unsupported}", stacklevel=3)
     if reasons:
         more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         warnings.warn(f"left out: {reasons[0]}{more}", stacklevel=3)
     if len(ready) < MIN_PHOTOS:
         raise InputError(
-            f"{source}: {len(ready)} photos that can be read; at least {MIN_PHOTOS} are needed, and 30 or more "
-            "overlapping photos are better"
+            f"{source}: {len(ready)} photos that can be used; at least {MIN_PHOTOS} are needed, and 30 or more "
+            f"overlapping photos are better{f' ({reasons[0]})' if reasons else ''}"
         )
     return ready
 

@@ -15,7 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...errors import InputError
+from ...errors import InputError, Remedy
+from ...files.masks import MASK_FOLDER
+from ...files.real_path import real_path
 
 _POLL = 0.3  # time between two queries of the database [s]
 # The number of rows of these tables shows the progress of a stage.
@@ -53,7 +55,7 @@ def run_sfm(work: Path, job: dict[str, Any], report: StepCallback, source: str) 
     ------
     InputError : the photos give no model, or pycolmap failed.
     """
-    work = work.resolve()
+    work = real_path(work)
     database = work / "database.db"
     whole = job | {
         "database": str(database),
@@ -82,14 +84,16 @@ def run_sfm(work: Path, job: dict[str, Any], report: StepCallback, source: str) 
                 stream.close()
     if "models" not in last:
         raise InputError(
-            f"{source}: structure from motion failed ({_reason(last, child.returncode, log)}); try other "
-            "photos, or a smaller --max-size"
+            f"{source}: structure from motion failed ({_reason(last, child.returncode, log)})",
+            Remedy("try other photos"),
+            Remedy("look for features on smaller photos", "--max-size PX"),
         )
     models: dict[str, int] = last["models"]
     if not models:
         raise InputError(
             f"{source}: no two photos fit together, so none has a pose; take sharp photos that overlap by "
             "more than half, of a scene at rest and with texture"
+            + (f", and look at the masks in {Path(source) / MASK_FOLDER}: black hides" if job["masks"] else "")
         )
     return models
 

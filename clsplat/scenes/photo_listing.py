@@ -1,0 +1,113 @@
+"""Image files below a folder, without those that clsplat wrote there and without those of other scenes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import InputError
+from ..files.images import is_render
+from ..files.json_file import read_json
+from ..files.masks import MASK_FOLDER
+from .reconstruct.options import RECORD
+from .transforms_files import find_transforms
+
+_MODEL_FILES, _ENDS = ("cameras", "images"), (".bin", ".txt")  # of COLMAP
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Image files below a folder.
+
+    Parameters
+    ----------
+    names : files as paths relative to the folder, with `/` between folders, sorted.
+    outputs : folders that clsplat wrote, and the number of renders in other folders, as texts; left out.
+    scenes : other folders with poses; left out.
+    """
+
+    names: tuple[str, ...]
+    outputs: tuple[str, ...] = ()
+    scenes: tuple[str, ...] = ()
+
+    @property
+    def in_subfolders(self) -> bool:
+        """Whether every file is in a subfolder."""
+        return all("/" in name for name in self.names)
+
+
+def list_images(home: Path, suffixes: Collection[str]) -> Listing:
+    """Return the files below a folder that have one of the suffixes. Hidden files and folders and masks are ignored.
+
+    Scenes, models and comparisons that clsplat wrote are left out, and so are other scenes. They are known by their
+    contents, not by their names. Renders are left out beside photos; a folder with nothing else is taken as it is.
+    """
+    names: list[str] = []
+    outputs: list[str] = []
+    scenes: list[str] = []
+    for folder, folders, files in os.walk(home):
+        below = Path(folder).relative_to(home)
+        kept = []
+        for name in sorted(folders):
+            path, shown = Path(folder) / name, (below / name).as_posix()
+            if name.startswith(".") or (below == Path() and name == MASK_FOLDER):
+                continue
+            if is_output(path):
+                outputs.append(shown)
+            elif is_posed(path):
+                scenes.append(shown)
+            else:
+                kept.append(name)
+        folders[:] = kept
+        names += [
+            (below / name).as_posix()
+            for name in files
+            if not name.startswith(".") and Path(name).suffix.lower() in suffixes
+        ]
+    photos = [name for name in names if not (name.lower().endswith(".png") and is_render(home / name))]
+    renders = len(names) - len(photos)
+    if photos and renders:
+        outputs.append(f"{renders} render{'s' if renders > 1 else ''}")
+        names = photos
+    return Listing(tuple(sorted(names)), tuple(outputs), tuple(scenes))
+
+
+def is_output(folder: Path) -> bool:
+    """Return whether a folder is a scene of `reconstruct`, a model, or a comparison."""
+    return _is_made_scene(folder) or _is_model(folder) or _are_files(folder, "runs.jsonl", "results.json")
+
+
+def is_posed(folder: Path) -> bool:
+    """Return whether a folder holds poses: a COLMAP model in `sparse`, or a transforms file."""
+    if find_transforms(folder):
+        return True
+    sparse = folder / "sparse"
+    try:
+        places = [sparse, *sparse.iterdir()] if sparse.is_dir() else []
+    except OSError:
+        return False
+    return any(_are_files(place, *(f"{stem}{end}" for stem in _MODEL_FILES)) for place in places for end in _ENDS)
+
+
+def _is_made_scene(folder: Path) -> bool:
+    return (folder / RECORD).is_file() and (folder / "sparse").is_dir()
+
+
+def _is_model(folder: Path) -> bool:
+    """Return whether a folder is a model or a search of clsplat, or a model of 3DGS."""
+    if (folder / "point_cloud").is_dir() and (folder / "cameras.json").is_file():
+        return True
+    for file in (folder / "config.json", folder / "budget.json"):
+        try:
+            values = read_json(file, "") if file.is_file() else None
+        except InputError:
+            continue
+        if isinstance(values, dict) and all(isinstance(values.get(key), dict) for key in ("config", "scene")):
+            return True
+    return False
+
+
+def _are_files(folder: Path, *names: str) -> bool:
+    return all((folder / name).is_file() for name in names)

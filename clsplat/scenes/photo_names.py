@@ -1,0 +1,61 @@
+"""Names of photos that a COLMAP model stores as absolute paths, or as paths that lead out of the folder of photos."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from ..errors import InputError
+
+
+def place_photos(folder: Path, stored: Sequence[str]) -> dict[str, tuple[str, Path]]:
+    """Return a name and a file for each stored name.
+
+    A name below the folder stays as it is. Other names become paths below the common folder of all such photos, because
+    masks and renders have the names of their photos. An absolute path that does not exist is looked for in the folder
+    by its last parts: models are often copied from another computer.
+
+    Parameters
+    ----------
+    folder : folder of the photos.
+    stored : names in the model.
+
+    Raises
+    ------
+    InputError : two photos get the same name.
+    """
+    home = os.path.normpath(folder.absolute())
+    files = {name: _file_of(folder, name) for name in stored}
+    inside, outside = {}, {}
+    for name, file in files.items():
+        path = Path(os.path.normpath(file.absolute()))
+        if path.is_relative_to(home):
+            inside[name] = path.relative_to(home).as_posix()
+        else:
+            outside[name] = path
+    if outside:
+        try:
+            common = Path(os.path.commonpath([path.parent for path in outside.values()]))
+        except ValueError:  # several drives of Windows
+            common = Path()
+        inside |= {
+            name: path.relative_to(common).as_posix() if common.parts else path.name for name, path in outside.items()
+        }
+    owners: dict[str, str] = {}
+    for name, new in inside.items():
+        if new in owners:
+            raise InputError(f"{folder}: images {owners[new]!r} and {name!r} of the model are both called {new!r}")
+        owners[new] = name
+    return {name: (inside[name], files[name]) for name in stored}
+
+
+def _file_of(folder: Path, name: str) -> Path:
+    """Return the file of a stored name. A foreign absolute path is found by its last parts."""
+    file = folder / name
+    absolute = PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()
+    if not absolute or file.is_file():
+        return file
+    parts = PureWindowsPath(name).parts[1:]  # takes both kinds of slashes
+    tails = [folder.joinpath(*parts[start:]) for start in range(len(parts))]
+    return next((tail for tail in tails if tail.is_file()), file)

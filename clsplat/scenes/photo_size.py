@@ -1,0 +1,45 @@
+"""Sizes that photos are read at, and the memory that they need."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from ..errors import SMALLER_IMAGES, InputError
+from ..files.host_memory import available_bytes
+
+MAX_WIDTH = 1600  # with resolution -1, wider images are reduced to this width [px], as in 3DGS
+_CHANNELS = 3
+_DECODING = 2  # copies of a photo at its stored size while it is read: decoded, and as an array
+
+
+def target_size(width: int, height: int, resolution: int) -> tuple[int, int]:
+    """Return (width, height) [px] by 3DGS's rule: divisors round, widths truncate."""
+    if resolution in (1, 2, 4, 8):
+        return max(1, round(width / resolution)), max(1, round(height / resolution))
+    if resolution == -1 and width <= MAX_WIDTH:
+        return width, height
+    target = MAX_WIDTH if resolution == -1 else resolution
+    return target, max(1, int(height * target / width))
+
+
+def check_memory(source: object, sizes: Collection[tuple[int, int]], resolution: int) -> None:
+    """Raise InputError if photos cannot fit into the free memory of the machine. No photo is decoded for that.
+
+    Parameters
+    ----------
+    source : where the photos come from, for the message.
+    sizes : (width, height) of the photos as stored [px]. resolution : as for `load_scene`.
+    """
+    if not sizes:
+        return
+    targets = [target_size(width, height, resolution) for width, height in sizes]
+    kept = _CHANNELS * sum(width * height for width, height in targets)
+    largest = _DECODING * _CHANNELS * max(width * height for width, height in sizes)
+    needed, free = kept + largest, available_bytes()
+    if needed > free:
+        width, height = max(targets)
+        raise InputError(
+            f"{source}: {len(sizes)} photos of {width}x{height} px need at least {needed / 1e6:.0f} MB of memory, "
+            f"{free / 1e6:.0f} MB are free",
+            SMALLER_IMAGES,
+        )

@@ -1,0 +1,132 @@
+"""Poses, lenses and points that can be read but cannot be right. They are named before a run trains to garbage."""
+
+from __future__ import annotations
+
+import filecmp
+import warnings
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .colmap import Points
+from .posed_images import PosedImages
+
+_MAX_POINT = 1e30  # the largest coordinate of a point; float32 ends at 3e38
+_MAX_POSITION = 1e12  # training in float32 breaks between this and 1e15
+# Largest distance of a camera from the origin, in units of the scene's size. Training in float32 loses image quality
+# from the first number on. At the second, steps of float32 are a twentieth of the scene.
+_FAR, _TOO_FAR = 1e4, 1e6
+_DIGITS = 9  # poses that agree to these decimals count as equal
+_SHRUNK, _GROWN = 0.21, 1.99  # COLMAP's undistortion scales a side by 0.2 to 2; such sides are at the limits
+
+
+def check_poses(root: Path, posed: PosedImages) -> None:
+    """Refuse a scene that float32 cannot hold, and warn of poses that cannot be right.
+
+    Warns
+    -----
+    UserWarning : the scene is far from the origin for its size, or different photos have equal poses.
+
+    Raises
+    ------
+    InputError : a camera is further from the origin than float32 can hold, as such or for the scene's size.
+    """
+    if posed.photos:
+        _check_positions(root, posed)
+        _warn_of_equal_poses(root, posed)
+
+
+def without_far_points(root: Path, points: Points) -> Points:
+    """Return the points that float32 can hold, and warn if there are others."""
+    near = (np.abs(points.xyz) <= _MAX_POINT).all(axis=1)
+    if near.all():
+        return points
+    warnings.warn(
+        f"{root}: {int((~near).sum())} of {len(points)} points are further away than {_MAX_POINT:g}; they are left out",
+        stacklevel=4,
+    )
+    return Points(points.xyz[near], points.rgb[near], points.track_length[near])
+
+
+def _check_positions(root: Path, posed: PosedImages) -> None:
+    poses = np.array([photo.cam_from_world for photo in posed.photos])
+    distances = np.abs(poses[:, :3, 3]).max(axis=1)  # squares could overflow
+    farthest = int(distances.argmax())
+    name, distance = posed.names[farthest], float(distances[farthest])
+    if distance > _MAX_POSITION:
+        raise InputError(
+            f"{root}: the translation of {name!r} is {distance:.2g}, more than {_MAX_POSITION:g}; "
+            "scale the poses down, or correct this one"
+        )
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    size = _spread(posed.points.xyz) or _spread(centres) or 1.0
+    ratio = distance / size
+    if ratio < _FAR:
+        return
+    text = (
+        f"{root}: the translation of {name!r} is {distance:.2g}, {ratio:.1g} times the size of the scene ({size:.2g})"
+    )
+    if ratio >= _TOO_FAR:
+        raise InputError(f"{text}, so float32 cannot hold it; move the scene to the origin, or correct the pose")
+    warnings.warn(f"{text}; images lose sharpness in float32. Move the scene to the origin", stacklevel=4)
+
+
+def _spread(xyz: NDArray[np.float64]) -> float:
+    """Return the median distance of points from their median, which outliers do not change."""
+    if not len(xyz):
+        return 0.0
+    with np.errstate(over="ignore"):  # outliers may be at any distance
+        return float(np.median(np.abs(xyz - np.median(xyz, axis=0)).max(axis=1)))
+
+
+def _warn_of_equal_poses(root: Path, posed: PosedImages) -> None:
+    groups: defaultdict[bytes, list[str]] = defaultdict(list)
+    for photo in posed.photos:
+        groups[(np.round(photo.cam_from_world, _DIGITS) + 0.0).tobytes()].append(photo.name)
+    pairs = [
+        (names[0], other)
+        for names in groups.values()
+        for other in names[1:]
+        if not filecmp.cmp(posed.files[names[0]], posed.files[other], shallow=False)
+    ]
+    if pairs:
+        warnings.warn(
+            f"{root}: {len(pairs)} of {len(posed.photos)} photos have the pose of another photo but show something "
+            f"else, for example {pairs[0][1]!r} and {pairs[0][0]!r}; correct their poses",
+            stacklevel=4,
+        )
+
+
+def check_lenses(root: Path, posed: PosedImages) -> None:
+    """Check that every photo has a lens that fits it and can be undistorted, without decoding the photo.
+
+    Warns
+    -----
+    UserWarning : a lens distorts more than undistortion can follow.
+
+    Raises
+    ------
+    InputError : as `RegisteredImage.fit`.
+    """
+    scales: dict[tuple[object, ...], tuple[float, float]] = {}
+    strange = []
+    for photo in posed.photos:
+        lens, (width, height) = photo.lens, posed.sizes[photo.name]
+        key = (lens.model, lens.width, lens.height, *lens.params, width, height)
+        if key not in scales:  # undistortion takes milliseconds
+            camera = photo.fitted_camera(width, height)
+            scales[key] = camera.width / width, camera.height / height
+        if min(scales[key]) <= _SHRUNK or min(scales[key]) >= _GROWN:
+            strange.append((photo, width, height, scales[key]))
+    if strange:
+        photo, width, height, (across, down) = strange[0]
+        values = ", ".join(f"{value:g}" for value in photo.lens.params)
+        warnings.warn(
+            f"{root}: the lens of {len(strange)} of {len(posed.photos)} photos distorts too much to be undistorted, "
+            f"for example that of {photo.name!r}: {width}x{height} px become {width * across:.0f}x{height * down:.0f} "
+            f"px. Check its {photo.lens.model.name} parameters ({values})",
+            stacklevel=3,
+        )
