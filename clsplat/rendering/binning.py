@@ -17,7 +17,7 @@ from ..device.device import Device
 from ..device.memory import Pool, copy
 from ..device.opencl import Buffer
 from ..device.program import Define, build
-from ..errors import DeviceError
+from ..errors import FEWER_SPLATS, OTHER_DEVICE, DeviceError
 from .build import CULLED_KEY
 from .frame import Band, ProjectedSplats, TileLists
 from .radix_sort import Sorter, SortPairs
@@ -74,8 +74,7 @@ def cut_bands(count: Callable[[int, int], int], tiles_x: int, tiles_y: int, limi
             return (Band(first, end, n_isects),)
         if n_tiles == 1:
             raise DeviceError(
-                f"{n_isects} splats over one tile, and buffers for {limit} at most: "
-                "use fewer splats (--cap-max) or another --device"
+                f"{n_isects} splats over one tile, and buffers for {limit} at most", FEWER_SPLATS, OTHER_DEVICE
             )
         unit = tiles_x if n_tiles > tiles_x else 1
         middle = first + n_tiles // unit // 2 * unit

@@ -14,8 +14,9 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..splats.color import BLACK
 from ..splats.fields import Array
+from ..splats.harmonics import SH_C0
 from ..splats.shapes import SKEW_LIMIT, shape_named
-from ..splats.splats import SH_C0, Splats
+from ..splats.splats import Splats
 from .renderer import Rendered, Renderer
 
 Picture = NDArray[np.uint8]

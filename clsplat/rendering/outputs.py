@@ -65,6 +65,11 @@ def extra_video(video: str | Path, extra: str) -> Path:
     return path.with_name(f"{path.stem}_{extra}{path.suffix}")
 
 
+def image_file(folder: Path, stem: str, ending: str, form: str) -> Path:
+    """The file of a view's colour (ending "") or of one of its extras (ending "_alpha", ...)."""
+    return folder / f"{stem}{ending}.{form}"
+
+
 class ImageWriter:
     """Writes each view's colour, and its alpha and depth if they are among the extras.
 
@@ -102,14 +107,14 @@ class ImageWriter:
         """
         planes = {"": image.color} | {f"_{name}": getattr(image, name) for name in self.extras}
         for ending, plane in planes.items():
-            path = self.folder / f"{stem}{ending}.{self.format}"
+            path = image_file(self.folder, stem, ending, self.format)
             if self.format == "npy":
                 with atomic_writer(path) as stream:
                     np.save(stream, np.ascontiguousarray(plane, np.float32))
             elif ending != "_depth":
-                write_png(path, plane)
+                write_png(path, plane, render=True)
             elif self.near_far is not None:
-                write_png(path, depth_picture(image, self.near_far, self.background))
+                write_png(path, depth_picture(image, self.near_far, self.background), render=True)
             else:
                 farthest = float(plane.max()) or 1.0
                 write_grey16(path, np.rint(plane * (_FULL_SCALE / farthest)).astype(np.uint16))

@@ -82,6 +82,7 @@ class Pipeline:
         if previous is not None:
             previous.expire()
         layout = ImageLayout(camera.width, camera.height)
+        self._images.reserve(layout)  # an image that does not fit is refused before its tiles are counted
         degree = self.kernels.sh_degree if sh_degree is None else min(sh_degree, self.kernels.sh_degree)
         projected = self._project(splats, camera, layout, degree)
         frame = Frame(layout, degree, splats, projected, self._images, self._bands(projected, layout))

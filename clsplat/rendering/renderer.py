@@ -12,7 +12,7 @@ from ..device.device import Device, open_device
 from ..device.memory import Pool
 from ..device.program import Real
 from ..device.schedule import Schedule
-from ..errors import DeviceError, InputError
+from ..errors import OTHER_DEVICE, DeviceError, InputError, Remedy
 from ..splats.color import BLACK
 from ..splats.fields import Array
 from ..splats.splats import Splats
@@ -74,7 +74,7 @@ class Renderer:
         self.device = device if isinstance(device, Device) else open_device(device)
         self.precision = precision
         if precision == "float64" and not self.device.has_fp64:
-            raise DeviceError(f"device {self.device.info} has no double precision: use float32 or another --device")
+            raise DeviceError(f"device {self.device.info} has no double precision", Remedy("use float32"), OTHER_DEVICE)
         self.schedule = schedule
         self._thresholds = (alpha_min, alpha_max, t_min)
         self._pipelines: dict[KernelBuild, Pipeline] = {}

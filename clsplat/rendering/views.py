@@ -16,7 +16,7 @@ from ..cameras.path import DEFAULT_FPS
 from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from .colormaps import depth_range
-from .outputs import ImageWriter, VideoFiles, output_stems
+from .outputs import ImageWriter, VideoFiles, extra_video, image_file, output_stems
 from .renderer import Renderer
 
 _QUARTILES = (0.25, 0.75)  # quantiles over the frames of the near and of the far end
@@ -62,6 +62,18 @@ class RenderedViews:
 
     render_ms: float
     depth_scales: dict[str, float] = field(default_factory=dict)
+
+
+def files_of(output: RenderOutput, names: Sequence[str]) -> list[Path]:
+    """Return all files that `render_to_files` writes for views of these names. Raises InputError as `output_stems`."""
+    files: list[Path] = []
+    if output.folder is not None:
+        folder, endings = Path(output.folder), ("", *(f"_{extra}" for extra in output.extras))
+        stems = output_stems(names, output.extras, keep_suffix=output.format == "npy")
+        files += [image_file(folder, stem, ending, output.format) for stem in stems for ending in endings]
+    if output.video is not None:
+        files += [Path(output.video), *(extra_video(output.video, extra) for extra in output.extras)]
+    return files
 
 
 def render_to_files(
