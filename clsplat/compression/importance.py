@@ -26,11 +26,11 @@ from ..rendering.renderer import Renderer
 from ..scenes.scene import View
 from ..splats.color import BLACK, Color
 from ..splats.fields import Array, DoubleArray, Field, sh_coefficients, sh_degree_of
-from ..splats.harmonics import sh_basis
+from ..splats.harmonics import SH_C0, sh_basis
 from ..splats.optical_depth import opacity_names
 from ..splats.ply_compact import movable
 from ..splats.shapes import Shape, shape_named
-from ..splats.splats import SH_C0, Splats
+from ..splats.splats import Splats
 
 _RIDGE = 1e-3  # share of the mean diagonal of A_ll: coefficients that no view determines keep their values
 _CHUNK = 8192  # splats whose linear systems are solved together

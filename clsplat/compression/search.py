@@ -21,7 +21,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,7 @@ from .rules import (
 )
 from .state import BudgetState
 
+PHASES = 5  # growth, whole runs, rounds, parts, refit
 GROWTH_PART, ROUND_PART = 4, 10  # iterations of the run over those of a growth run, and of a round
 
 ProgressCallback = Callable[[Progress], None]
@@ -123,7 +124,7 @@ def train_budget(
     with folder_lock(folder.path):
         if not resume:
             folder.clear()
-            state.begin(config, options, scene_record(scene))
+            state.begin(config, options, scene_record(scene, folder.path))
         return _Search(scene, config, options, progress, state, folder).run()
 
 
@@ -139,7 +140,9 @@ class _Search:
         state: BudgetState,
         folder: ModelFolder,
     ) -> None:
-        self.scene, self.config, self.options, self.progress = scene, config, options, progress
+        self.scene, self.config, self.options, self.report = scene, config, options, progress
+        self.progress: ProgressCallback | None = progress and self._with_phase
+        self.phase = 1
         self.state, self.folder = state, folder
         self.split = hold_out(scene)
         self.device: Device = open_device(config.device)
@@ -162,7 +165,9 @@ class _Search:
         if "refit" not in values:
             resume = self.folder.checkpoint_path.is_file()
             config = self.config.replace(cap_max=values["knee"])
-            self.report_message(f"refit: all {len(self.scene.train)} training views, at most {values['knee']} splats")
+            self.report_message(
+                5, f"refit: all {len(self.scene.train)} training views, at most {values['knee']} splats"
+            )
             model = train(
                 self.scene,
                 config,
@@ -187,7 +192,7 @@ class _Search:
                 continue
             if growth_is_over(rows, self.options):
                 break
-            self.report_message(f"growth: at most {cap} splats, {iterations} iterations")
+            self.report_message(1, f"growth: at most {cap} splats, {iterations} iterations")
             config = self.config.replace(
                 cap_max=cap,
                 iterations=iterations,
@@ -219,8 +224,9 @@ class _Search:
             if any(row["cap"] == cap for row in rows):
                 continue
             self.report_message(
+                2,
                 f"held out: at most {cap} splats, {len(self.split.train)} training views, "
-                f"{len(self.split.test)} validation views"
+                f"{len(self.split.test)} validation views",
             )
             splats, seconds = self.run_of(self.config.replace(cap_max=cap, save_iterations=(), test_iterations=()))
             self.state.save(f"whole_{cap}", splats)
@@ -303,14 +309,18 @@ class _Search:
         fewer = without_quarter(
             splats, scene.train, self.renderer, self.config.background, self.config.seed, MIN_SPLATS
         )
-        self.report_message(f"round {number}: {len(fewer)} splats, {self.part} iterations")
+        self.report_message(
+            5 if scene is self.scene else 3, f"round {number}: {len(fewer)} splats, {self.part} iterations"
+        )
         return fine_tune(scene, fewer, self.config, self.part, self.device, self.progress)
 
     def final_part(self, scene: Scene, splats: Splats, rounds: int) -> Splats:
         """Fine-tune at lower rates; without rounds the end of the run did that already."""
         if not rounds:
             return splats
-        self.report_message(f"last part: {len(splats)} splats, {self.part} iterations at lower rates")
+        self.report_message(
+            5 if scene is self.scene else 4, f"last part: {len(splats)} splats, {self.part} iterations at lower rates"
+        )
         return fine_tune(scene, splats, self.config, self.part, self.device, self.progress, FINAL_RATE)
 
     def run_of(self, config: TrainConfig) -> tuple[Splats, float]:
@@ -346,7 +356,14 @@ class _Search:
             sentences.append(f"{nbytes} bytes are more than {options.max_bytes}: the smallest model tried is kept")
         return "; ".join(sentences) or None
 
-    def report_message(self, message: str) -> None:
-        """Send a message to the display."""
-        if self.progress is not None:
-            self.progress(Progress(0, self.config.iterations, math.nan, math.nan, 0, 0.0, 0.0, message))
+    def report_message(self, phase: int, message: str) -> None:
+        """Send a message to the display, and name the phase of the search (from 1) in all that follows."""
+        self.phase = phase
+        if self.report is not None:
+            text = f"step {phase} of {PHASES}, {message}"
+            self.report(Progress(0, self.config.iterations, math.nan, math.nan, 0, 0.0, 0.0, text))
+
+    def _with_phase(self, report: Progress) -> None:
+        """Send a report of one run to the display, with the phase of the search."""
+        if self.report is not None:
+            self.report(replace(report, phase=f"step {self.phase} of {PHASES}"))

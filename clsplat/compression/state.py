@@ -98,7 +98,7 @@ def stored_search(output: Path) -> tuple[StoredRun, BudgetOptions] | None:
     state = BudgetState(output)
     state.load()
     try:
-        stored, options = StoredRun.from_json(state.values), BudgetOptions(**state.values["options"])
+        stored, options = StoredRun.from_json(state.values, output), BudgetOptions(**state.values["options"])
     except DAMAGE as error:
         raise InputError(f"{state.path}: damaged ({error}): start again with --overwrite") from None
     if "final" in state.values:

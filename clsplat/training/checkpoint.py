@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import lzma
 import math
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,25 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
-from ..splats.fields import Array
+from ..splats.fields import MAX_SH_DEGREE, Array
 
-VERSION = 2
+VERSION = 3
+READABLE = (2, VERSION)  # version 2 has no `reached`
+
+
+@dataclass(frozen=True)
+class Reached:
+    """Limits of the schedules of a run that was made longer.
+
+    The schedules depend on the length of the run. Those of a longer run are at an earlier stage in the same iteration.
+
+    Attributes
+    ----------
+    sh_degree : lowest SH degree. downscale : largest downscale of the images.
+    """
+
+    sh_degree: int
+    downscale: int
 
 
 @dataclass(frozen=True)
@@ -36,6 +53,7 @@ class Checkpoint:
     schedule : schedule of the kernels, which their rounding depends on.
     n_first : number of splats at the start of the run, which the growth depends on.
     signals : (3, N) densification statistics (SplatStatistics).
+    reached : limits of the schedules, if the run was made longer.
     """
 
     iteration: int
@@ -48,6 +66,7 @@ class Checkpoint:
     schedule: str
     n_first: int
     signals: Array
+    reached: Reached | None = None
 
     def save(self, path: Path) -> None:
         """Write the checkpoint to a file. If that fails, raise OutputError and keep the old file."""
@@ -60,6 +79,7 @@ class Checkpoint:
             "seconds": self.seconds,
             "schedule": self.schedule,
             "n_first": self.n_first,
+            "reached": self.reached and asdict(self.reached),
         }
         arrays = {f"splats.{k}": v for k, v in self.splats.items()}
         arrays |= {f"optimizer.{k}": v for k, v in self.optimizer.items()}
@@ -79,8 +99,8 @@ class Checkpoint:
         except FileNotFoundError:
             raise InputError(f"{path}: no checkpoint to resume from: start with --overwrite") from None
         except _DAMAGE as error:
-            raise _unreadable(path, str(error)) from None
-        if version != VERSION:
+            raise _unreadable(path, "no archive of NumPy" if "pickle" in str(error) else str(error)) from None
+        if version not in READABLE:
             raise InputError(f"{path}: checkpoint version {str(version)[:20]!r}, this clsplat reads {VERSION}")
 
         def part(prefix: str) -> dict[str, Any]:
@@ -98,6 +118,7 @@ class Checkpoint:
                 meta["schedule"],
                 meta["n_first"],
                 arrays["signals"],
+                Reached(**meta["reached"]) if meta.get("reached") else None,
             )
             checkpoint._check()
         except _DAMAGE as error:
@@ -115,6 +136,10 @@ class Checkpoint:
                 raise ValueError(f"its {name} is of another kind")
         if self.iteration < 0 or self.n_first < 1 or not 0 <= self.seconds < math.inf:
             raise ValueError("its iteration, n_first or seconds are out of range")
+        if self.reached is not None:
+            degree, downscale = self.reached.sh_degree, self.reached.downscale
+            if not (type(degree) is type(downscale) is int and 0 <= degree <= MAX_SH_DEGREE and downscale >= 1):
+                raise ValueError("its reached is not a degree and a downscale")
         if not all(type(place) is int and place >= 0 for place in self.queue):
             raise ValueError("its queue is not a list of views")
         np.random.default_rng().bit_generator.state = self.rng
@@ -142,7 +167,8 @@ _DAMAGE = (
     TypeError,
     OverflowError,
     EOFError,
-    RecursionError,
+    RuntimeError,  # also an encrypted archive, and NotImplementedError for a later version of zip files
+    lzma.LZMAError,
     zipfile.BadZipFile,
     zlib.error,
 )

@@ -27,7 +27,7 @@ from .options.groups import (
 from .options.option import Option, OptionGroup, check_options, option, option_table
 
 # Options without an effect on the result. Runs that differ only in these are the same run.
-FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval")
+FREE_OPTIONS = ("device", "save_iterations", "test_iterations", "checkpoint_interval", "checkpoint_minutes")
 REMOVED_OPTIONS = {"sampling": "opacity"}  # options of earlier versions, with the only value that is still accepted
 PUBLISHED_ITERATIONS = 30_000  # run length for which 3DGS's learning rates were published
 
@@ -54,10 +54,21 @@ class TrainConfig:
     InputError : a value is out of range. TypeError : an unknown option.
     """
 
-    shape: str = option(DEFAULT_SHAPE, help="Splat kernel.", choices=SHAPES)
-    iterations: int = option(7000, help="Number of optimizer steps, one image each.", at_least=1, aliases=["--steps"])
-    cap_max: int = option(100_000, help="Largest number of splats.", at_least=1)
-    sh_degree: int = option(3, help="Highest degree of spherical harmonics, 0 to 3.", at_least=0, at_most=MAX_SH_DEGREE)
+    shape: str = option(DEFAULT_SHAPE, help="Kernel of the splats: the form of a single splat.", choices=SHAPES)
+    iterations: int = option(
+        7000, help="Number of training steps. Each one learns from a single photo.", at_least=1, aliases=["--steps"]
+    )
+    cap_max: int = option(
+        100_000,
+        help="Largest number of splats. More splats show finer detail, and take more time and memory.",
+        at_least=1,
+    )
+    sh_degree: int = option(
+        3,
+        help="Degree of the spherical harmonics, 0 to 3: how much a colour may change with the viewing direction.",
+        at_least=0,
+        at_most=MAX_SH_DEGREE,
+    )
     normalisation: str = option(
         "peak",
         help="Meaning of the opacity of a skewed kernel. peak: its maximum is 1. pdf: its integral is the Gaussian's. "
@@ -96,6 +107,8 @@ class TrainConfig:
         unknown = [name for name in options if name not in OPTIONS and name not in ("density", *GROUPS)]
         if unknown:
             raise TypeError(f"TrainConfig has no option {unknown[0]!r}")
+        for name in options.keys() & OPTIONS.keys():  # also those that only the other strategy has
+            OPTIONS[name].check(options[name])
         values = {name: options.get(name, definition.default) for name, definition in option_table(TrainConfig).items()}
         values["density"] = _density_of(options)
         for name, group in GROUPS.items():

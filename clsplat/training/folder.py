@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..cameras.cameras_json import NamedCamera, write_cameras
 from ..errors import InputError, OutputError
 from ..files.json_file import read_object, write_json
+from ..files.real_path import real_path
 from ..splats.splats import Splats
 
 if TYPE_CHECKING:
@@ -17,9 +18,19 @@ if TYPE_CHECKING:
 _ITERATION = re.compile(r"iteration_(\d+)")
 
 
-def scene_record(scene: Scene) -> dict[str, Any]:
-    """Return what is needed to read a run's scene again: its path, its test views and the arguments of `load_scene`."""
-    return {"path": str(scene.path.resolve()), "test_names": sorted(scene.test_names), **scene.reading}
+def scene_record(scene: Scene, folder: Path) -> dict[str, Any]:
+    """Return what is needed to read a run's scene again: its path, its test views and the arguments of `load_scene`.
+
+    Digests of the photos show later whether they have changed. The path of a scene in the model's folder is relative to
+    that folder, so that both can be moved together.
+    """
+    path, home = real_path(scene.path), real_path(folder)
+    return {
+        "path": path.relative_to(home).as_posix() if path.is_relative_to(home) else str(path),
+        "test_names": sorted(scene.test_names),
+        **scene.reading,
+        **({"photos": dict(scene.photo_digests)} if scene.photo_digests else {}),
+    }
 
 
 class ModelFolder:
@@ -31,6 +42,11 @@ class ModelFolder:
     @property
     def config_path(self) -> Path:
         return self.path / "config.json"
+
+    @property
+    def cfg_args_path(self) -> Path:
+        """3DGS's record of a run."""
+        return self.path / "cfg_args"
 
     @property
     def cameras_path(self) -> Path:
@@ -106,7 +122,7 @@ class ModelFolder:
 
     def write_run(self, config: dict[str, Any], scene: Scene) -> None:
         """Write the run's options and the record of its scene to config.json."""
-        self.write_config({"config": config, "scene": scene_record(scene)})
+        self.write_config({"config": config, "scene": scene_record(scene, self.path)})
 
     def write_config(self, values: dict[str, Any]) -> None:
         """Write config.json."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..files.stop_signals import held
 from ..rendering.camera_block import NEAR
+from ..splats.any_file import READ_ENDINGS
 from ..splats.fields import Array, sh_coefficients
 from ..splats.morton import morton_order
 from ..splats.shapes import DEFAULT_SHAPE, shape_named
@@ -48,7 +51,7 @@ def initial_splats(
     scene : scene with points and training cameras.
     shape, sh_degree, normalisation, antialiased : properties of the result.
     cap : largest number of splats. The points with the longest tracks are kept, or the most opaque splats of a model.
-    init : "sfm", "random", or the path of a .ply model. "sfm" without points becomes "random", with a message.
+    init : "sfm", "random", or the path of a file of splats. "sfm" without points becomes "random", with a message.
     seed : seed of random points and of the first skew.
     random_share : number of random points that are added to those of "sfm", as a fraction of the cap. None: a tenth if
         the scene has fewer points than that, otherwise 0.
@@ -64,9 +67,7 @@ def initial_splats(
         raise InputError(f"cap {cap}: at least 1 splat is needed")
     check_size(scene)
     rng = np.random.default_rng(seed)
-    if init.lower().endswith(".ply"):
-        splats, message = _from_model(init, shape, cap, sh_degree, normalisation, antialiased)
-    elif init in ("sfm", "random"):
+    if init in ("sfm", "random"):
         xyz, rgb, message = _points(scene, init, cap, rng, random_share)
         order = morton_order(xyz)
         xyz, rgb = xyz[order], rgb[order]
@@ -79,8 +80,10 @@ def initial_splats(
             opacity=opacity,
             scale_factor=scale_factor,
         )
+    elif init.lower().endswith(READ_ENDINGS) or Path(init).is_file():
+        splats, message = _from_model(init, shape, cap, sh_degree, normalisation, antialiased)
     else:
-        raise InputError(f"init {init!r}: choose sfm, random, or the path of a .ply model")
+        raise InputError(f"init {init!r}: choose sfm, random, or the path of a file of splats")
     return _started(splats, rng), message
 
 
@@ -122,7 +125,8 @@ def nearest_of(xyz: Array, to: Array) -> NDArray[np.int64]:
     """Return the index of the point of `xyz` (P, 3) that is nearest to each point of `to`."""
     from scipy.spatial import cKDTree  # imported late: slow to import
 
-    return np.asarray(cKDTree(xyz).query(to, workers=-1)[1], np.int64)
+    with held():
+        return np.asarray(cKDTree(xyz).query(to, workers=-1)[1], np.int64)
 
 
 def distinct(xyz: Array) -> NDArray[np.int64]:
@@ -183,6 +187,8 @@ def _from_model(
 ) -> tuple[Splats, str]:
     """Return the splats of a file, converted to the shape and SH degree and reduced to the cap, and a message."""
     loaded = Splats.load(path)
+    if not len(loaded):
+        raise InputError(f"{path}: has no splats: start from another file, or from points (init sfm or random)")
     if loaded.skew.any() and loaded.normalisation != normalisation:
         raise InputError(
             f"{path}: its normalisation is {loaded.normalisation}, not {normalisation}: "

@@ -24,6 +24,8 @@ class Progress:
     seconds : training time, without evaluations.
     per_second : iterations per second.
     message : text to show instead of these values.
+    forecast : time that the rest takes [s]; None if it is not known. `seconds_left` then uses `per_second`.
+    phase : part of a longer operation that this run is, such as "2/5 whole runs".
     """
 
     iteration: int
@@ -34,9 +36,14 @@ class Progress:
     seconds: float
     per_second: float
     message: str = ""
+    forecast: float | None = None
+    phase: str = ""
 
     @property
     def seconds_left(self) -> float:
+        """Time that the rest of the run takes [s]; infinite if it is not known."""
+        if self.forecast is not None:
+            return self.forecast
         return (self.iterations - self.iteration) / self.per_second if self.per_second > 0 else math.inf
 
 
@@ -53,7 +60,7 @@ class RunLog:
                 try:
                     if json.loads(line)["iteration"] <= iteration:
                         kept.append(line + b"\n")
-                except (ValueError, KeyError, TypeError):
+                except (ValueError, KeyError, TypeError, RecursionError):
                     continue  # a crash interrupted the writing of this line
         with atomic_writer(path) as stream:  # keeps the old file if the program crashes here
             stream.writelines(kept)

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..device.memory import Pool, to_host
 from ..device.opencl import Buffer, KernelArgument
@@ -117,6 +118,11 @@ class ImageLoss:
         )
         self._evaluations += 1
         return LossResult(v_color, partial, n_parts, count, unmasked, self._evaluations)
+
+    def gradient(self, result: LossResult, layout: ImageLayout) -> NDArray[np.floating]:
+        """Return the gradient (H, W, 3) of an evaluation in this layout after waiting for the device."""
+        planes = np.empty((3, layout.rows, layout.stride), self.kernels.dtype)
+        return layout.unpack(to_host(self.device, result.v_color, planes))
 
     def value(self, result: LossResult) -> LossValue:
         """Return the values of the latest evaluation after waiting for the device.

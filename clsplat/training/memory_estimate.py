@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..device.device import Device
-from ..errors import DeviceError
+from ..errors import FEWER_SPLATS, OTHER_DEVICE, SMALLER_IMAGES, DeviceError, Remedy
 from ..rendering.build import KernelBuild
 from ..rendering.frame import ImageLayout
 from ..rendering.pipeline import isect_bytes
@@ -30,6 +30,8 @@ _MIN_ISECTS = 1 << 20  # isects that must fit; images with more are rendered in 
 # tile counts (4).
 _SCREEN_WORDS = 21
 _WAITING_WORDS = 4  # additional words of a splat with `visible_adam`, if a vector has one splat
+
+_REMEDIES = (FEWER_SPLATS, SMALLER_IMAGES, Remedy("use fewer spherical harmonics", "--sh-degree"), OTHER_DEVICE)
 
 
 @dataclass(frozen=True)
@@ -112,11 +114,11 @@ def room_for_isects(needed: Estimate, device: Device) -> int:
 def check(needed: Estimate, device: Device) -> None:
     """Raise DeviceError if splats, images and _MIN_ISECTS isects do not fit into the device's memory."""
     info = device.info
-    remedy = "lower --cap-max, use smaller images (-r 2, 4, 8), a lower --sh-degree, or another --device"
     if needed.total > info.global_mem_bytes and room_for_isects(needed, device) < _MIN_ISECTS:
-        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, the run needs about {needed}: {remedy}")
+        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, the run needs about {needed}", *_REMEDIES)
     if needed.largest_buffer > info.max_alloc_bytes:
         raise DeviceError(
             f"{info} allows {info.max_alloc_bytes / 1e6:.0f} MB in one buffer, "
-            f"the run needs about {needed.largest_buffer / 1e6:.0f} MB: {remedy}"
+            f"the run needs about {needed.largest_buffer / 1e6:.0f} MB",
+            *_REMEDIES,
         )

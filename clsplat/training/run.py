@@ -6,14 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..cameras.cameras_json import named_cameras
-from ..errors import InputError, OutputError
+from ..errors import OutputError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..files.lock import folder_lock
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
 from ..splats.splats import Splats
-from .checkpoint import Checkpoint
-from .config import FREE_OPTIONS, TrainConfig
+from .config import TrainConfig
+from .extension import fitting_checkpoint
 from .folder import ModelFolder
 from .log import Progress
 from .model import Model
@@ -40,7 +40,7 @@ def train(
     progress : called about every 50 iterations.
     output : model folder. Without it, no file is written and Ctrl-C raises KeyboardInterrupt.
     resume : continue from the folder's checkpoint. The config must be the same, except for options without an effect
-        on the result, such as `device`.
+        on the result, such as `device`, and for more `iterations`.
     overwrite : replace a model in `output`.
     visit : see `Trainer.run`.
 
@@ -60,7 +60,7 @@ def train(
     checkpoint = None
     if folder is not None:
         if resume:
-            checkpoint = _fitting_checkpoint(folder, config)
+            checkpoint = fitting_checkpoint(folder, config)
         elif folder.is_used and not overwrite:
             raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
         folder.prepare()
@@ -83,16 +83,3 @@ def evaluate_test_views(splats: Splats, scene: Scene, config: TrainConfig) -> Ev
     The metrics, or None if the scene has no test views.
     """
     return evaluate(Renderer(config.device), splats, scene.test, config.background) if scene.test else None
-
-
-def _fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:
-    """Return the folder's checkpoint. Raise InputError if its run had another config."""
-    checkpoint = Checkpoint.load(folder.checkpoint_path)
-    stored = TrainConfig.from_json(checkpoint.config).to_json()
-    for key, value in config.to_json().items():
-        if key not in FREE_OPTIONS and stored[key] != value:
-            raise InputError(
-                f"{folder.path}: --resume with {key}={value}, but the run was started with "
-                f"{key}={stored[key]}: use the same options, or --overwrite to start again"
-            )
-    return checkpoint

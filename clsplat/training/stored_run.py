@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ..files.json_file import read_object
-from ..scenes.options import READING_OPTIONS
+from ..files.json_file import describe, read_object, to_real
+from ..scenes.options import ALPHA_USES, READING_OPTIONS
 from ..splats.color import BLACK, Color
 from .config import TrainConfig, read_options
 from .folder import ModelFolder
@@ -29,24 +30,90 @@ class StoredRun:
     Attributes
     ----------
     options : arguments of TrainConfig.
-    scene : the scene's path, its test views, and the arguments of `load_scene`.
+    scene : the scene's path, its test views, digests of its photos, and the arguments of `load_scene`.
     """
 
     options: dict[str, Any]
     scene: dict[str, Any]
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> StoredRun:
-        """Return the run that the values of config.json describe. Raise one of DAMAGE if they do not describe one."""
+    def from_json(cls, values: Mapping[str, Any], folder: Path) -> StoredRun:
+        """Return the run that the values of config.json describe. Raise one of DAMAGE if they do not describe one.
+
+        A relative path of the scene is relative to the model's folder.
+        """
+        for key in ("config", "scene"):
+            if key not in values:
+                raise InputError(f"{key} is missing")
         TrainConfig.from_json(values["config"])
-        scene = dict(values["scene"])
-        scene["path"] = str(scene["path"])
+        scene = checked_record(values["scene"])
+        if "path" not in scene:
+            raise InputError("scene.path is missing")
+        scene["path"] = str(folder / scene["path"])
+        scene.setdefault("photos", {})
         return cls(read_options(values["config"]), scene)
 
     @property
     def scene_path(self) -> Path:
         """Path of the scene at the time of the run."""
         return Path(self.scene["path"])
+
+
+def checked_record(record: object) -> dict[str, Any]:
+    """Return the record of a scene without null values. Each value is checked, because people edit the file.
+
+    Raises
+    ------
+    InputError : names the value that no run can have written.
+    """
+    if not isinstance(record, dict):
+        raise InputError(f"scene is {describe(record)}; expected an object")
+    known = {key: value for key, value in record.items() if value is not None}
+    for key, value in known.items():
+        if expected := _EXPECTED.get(key):
+            words, is_sound = expected
+            if not is_sound(value):
+                raise InputError(f"scene.{key} is {_shown(value)}; expected {words}")
+    return known
+
+
+def _is_text(value: object) -> bool:
+    """Return whether a value can be a file name. JSON may also hold null characters and halves of characters."""
+    if not isinstance(value, str) or "\0" in value:
+        return False
+    try:
+        os.fsencode(value)
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and 1 <= value <= _LARGEST
+
+
+def _shown(value: object) -> str:
+    """Return a number, or a few words on any other value."""
+    return f"{value:.6g}" if (number := to_real(value)) is not None and math.isfinite(number) else describe(value)
+
+
+_LARGEST = 1_000_000  # pixels of a width, and views
+# What each value of the record must be, in words and as a test. load_scene describes the values.
+_EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "path": ("the scene's folder or file", _is_text),
+    "images": ("a folder's name", _is_text),
+    "masks": ("a folder's name", _is_text),
+    "test_list": ("a file's name", _is_text),
+    "alpha": (f"one of {', '.join(ALPHA_USES)}", lambda value: value in ALPHA_USES),
+    "resolution": (f"-1, or 1 to {_LARGEST}", lambda value: _is_count(value) or (type(value) is int and value == -1)),
+    "test_every": (f"a whole number from 1 to {_LARGEST}", _is_count),
+    "eval": ("true or false", lambda value: isinstance(value, bool)),
+    "photos": ("the digest of each photo by name", lambda value: isinstance(value, dict)),
+    "test_names": (
+        "a list of names",
+        lambda value: isinstance(value, list) and all(isinstance(name, str) for name in value),
+    ),
+}
 
 
 def stored_run(path: str | os.PathLike[str]) -> StoredRun:
@@ -61,7 +128,7 @@ def stored_run(path: str | os.PathLike[str]) -> StoredRun:
         raise InputError(f"{folder.path}: no checkpoint to resume from: start with --overwrite")
     stored = folder.read_config()
     try:
-        return StoredRun.from_json(stored)
+        return StoredRun.from_json(stored, folder.path)
     except DAMAGE as error:
         raise InputError(f"{folder.config_path}: damaged ({error}): start again with --overwrite") from None
 

@@ -148,8 +148,13 @@ class Targets:
 
 def reduced(view: View, downscale: int) -> View:
     """Return the view at 1/downscale of its size."""
-    width, height = max(view.camera.width // downscale, 1), max(view.camera.height // downscale, 1)
-    return view.resized(width, height)
+    camera = reduced_camera(view.camera, downscale)
+    return view.resized(camera.width, camera.height)
+
+
+def reduced_camera(camera: Camera, downscale: int) -> Camera:
+    """Return the camera of the view that `reduced` returns."""
+    return camera.resized(max(camera.width // downscale, 1), max(camera.height // downscale, 1))
 
 
 def target_channels(views: Sequence[View], with_alpha: bool) -> int:

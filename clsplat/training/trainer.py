@@ -13,6 +13,7 @@ from ..device.device import Device, open_device
 from ..device.schedule import Schedule
 from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import Evaluation, evaluate
+from ..evaluation.metrics import check_sizes
 from ..rendering.frame import Frame
 from ..rendering.pipeline import Pipeline, isect_limit
 from ..rendering.renderer import Renderer
@@ -23,26 +24,31 @@ from ..splats.fields import Array
 from ..splats.optical_depth import finite_rows
 from ..splats.splats import Splats
 from .checkpoint import Checkpoint
+from .checkpoint_times import CheckpointTimes
 from .config import TrainConfig
 from .density.control import DensityControl, ExplorationNoise
 from .exposure import ExposureLoss, exposures_json
+from .extension import reached_by
 from .folder import ModelFolder
 from .initialise import initial_splats
 from .interrupt import stoppable
 from .log import Progress, RunLog
 from .loss import ImageLoss, LossValue
+from .loss_check import check_loss
 from .memory_estimate import peak_bytes, room_for_isects, run_memory
 from .model import Model
 from .optim.optimizer import make_optimizer
 from .programs import kernel_build
 from .rate_limits import check_rates
+from .run_clock import RunClock
 from .schedules import RunSchedule, sh_degree_at
 from .targets import Targets, target_budget, target_channels
 from .view_sampler import ViewSampler
 
 Visit = Callable[["Trainer", threading.Event], None]
 
-LOG_INTERVAL = 50  # iterations between lines of log.jsonl and calls of `progress`
+LOG_INTERVAL = 50  # iterations between lines of log.jsonl
+DISPLAY_INTERVAL = 0.5  # seconds after which `progress` is called between two lines of log.jsonl
 
 
 class Trainer:
@@ -69,6 +75,7 @@ class Trainer:
     ) -> None:
         if not scene.train:
             raise InputError(f"{scene.path}: no training views: all are test views")
+        check_sizes(((view.name, view.camera.width, view.camera.height) for view in scene.test), scene.path)
         check_rates(config)
         self.scene, self.config, self.progress = scene, config, progress
         self.device = device or open_device(config.device)
@@ -80,6 +87,7 @@ class Trainer:
         self.iteration, self.seconds = 0, 0.0
         first, message = self._first_splats() if checkpoint is None else self._stored_splats(checkpoint)
         self._send(f"{message}; about {self.memory}")
+        self.reached = reached_by(checkpoint, config, scene.train) if checkpoint else None
         self.n_first = checkpoint.n_first if checkpoint else len(first["mean"])
         self._create_device_state(first)
         if checkpoint is not None:
@@ -90,11 +98,13 @@ class Trainer:
             config.schedule.coarse_to_fine,
             self.rng,
             checkpoint.queue if checkpoint else [],
+            self.reached.downscale if self.reached else None,
         )
         self.schedule = RunSchedule.create(config, self.n_first)
         self.density = DensityControl(
             config, self.schedule, self.splats, self.optimizer, self.pipeline.statistics, self.rng, scene.extent
         )
+        self.clock = RunClock(config, self.schedule, self.views, self.pipeline, self.splats, self.iteration)
         self.noise = ExplorationNoise(config, self.kernels, self.splats, scene.extent)
         self.renderer = Renderer(self.device)
         self.evaluations: dict[int, Evaluation] = {}
@@ -122,7 +132,7 @@ class Trainer:
         """Return the arrays of the checkpoint. They may hold non-finite values until the next densification."""
         self.iteration, self.seconds = checkpoint.iteration, checkpoint.seconds
         self.rng.bit_generator.state = checkpoint.rng
-        return checkpoint.splats, f"resumed at iteration {checkpoint.iteration}"
+        return checkpoint.splats, f"resumed at iteration {checkpoint.iteration} of {self.config.iterations}"
 
     def _create_device_state(self, first: Mapping[str, Array]) -> None:
         """Create the pipeline, the splats, the optimizer and the losses."""
@@ -135,6 +145,7 @@ class Trainer:
         self.grads = CompactGradients(self.device, self.splats.schema, capacity, dtype)
         self.optimizer = make_optimizer(self.device, kernels, self.splats, config, self.scene.extent)
         self.loss = ImageLoss(self.pipeline.pool, kernels, config.loss.lambda_dssim)
+        check_loss(self.device, kernels, config.loss.lambda_dssim)
         channels = target_channels(self.scene.train, config.random_background)
         self.targets = Targets(self.device, kernels, self.scene.train, target_budget(self.device), channels)
         self.exposure = ExposureLoss(self.loss, self.targets, config, self.scene.background)
@@ -146,7 +157,7 @@ class Trainer:
         self.pipeline.statistics.write(checkpoint.signals, self.splats.capacity)
 
     def run(self, folder: ModelFolder | None = None, visit: Visit | None = None) -> Model:
-        """Train until the last iteration or Ctrl-C.
+        """Train until the last iteration, or until Ctrl-C or another stop signal.
 
         Parameters
         ----------
@@ -156,12 +167,20 @@ class Trainer:
         """
         config = self.config
         log = RunLog(None if folder is None else folder.log_path, self.iteration)
+        times = CheckpointTimes(config.output)
         started, since = time.perf_counter(), self.iteration
+        shown = started
         with stoppable(folder is not None) as stop:
+            if self.progress is not None and (estimate := self.clock.first_estimate(self.iteration)):
+                self._send(estimate)
             while self.iteration < config.iterations and not stop.is_set():
+                if self.progress is not None:
+                    self.clock.begin(self.iteration + 1)
                 start = time.perf_counter()
                 self.step()
                 it = self.iteration
+                if self.progress is not None:
+                    self.clock.end(it)
                 ends = it == config.iterations
                 measured = it in config.output.test_iterations and bool(self.scene.test)
                 if measured:
@@ -169,38 +188,28 @@ class Trainer:
                 if it % LOG_INTERVAL == 0 or ends:
                     value = self.loss.value(self.loss_result)
                     self.seconds += time.perf_counter() - start
-                    self._report(value, log, since, started)
+                    self._log(value, log)
+                    self._show(value, since, started)
+                    shown = time.perf_counter()
                 else:
                     self.seconds += time.perf_counter() - start
+                    if self.progress is not None and time.perf_counter() - shown >= DISPLAY_INTERVAL:
+                        self._show(self.loss.value(self.loss_result), since, started)
+                        shown = time.perf_counter()
                 if measured:
-                    self.evaluations[it] = self.evaluate(self.scene.test)
-                    self.evaluation_seconds[it] = self.seconds
-                    log.write(
-                        {
-                            "iteration": it,
-                            "seconds": self.seconds,
-                            "test_psnr": self.evaluations[it].psnr,
-                            "test_ssim": self.evaluations[it].ssim,
-                            "splats": self.splats.n,
-                        }
-                    )
+                    self._measure_test_views(log)
                 if folder is not None and (it in config.output.save_iterations or ends):
-                    folder.save(self.snapshot(), it)
-                    if config.appearance.exposure:
-                        names = [view.name for view in self.scene.train]
-                        folder.write_exposures(exposures_json(names, self.exposure.exposures()))
-                if folder is not None and (
-                    ends or (config.output.checkpoint_interval and it % config.output.checkpoint_interval == 0)
-                ):
-                    log.flush()
-                    self.checkpoint().save(folder.checkpoint_path)
+                    self._save_model(folder)
+                if folder is not None and (ends or times.is_due(it)):
+                    self._save_checkpoint(folder, log)
+                    times.saved()
                 if visit is not None:
                     start = time.perf_counter()
                     visit(self, stop)
                     started += time.perf_counter() - start
-        if folder is not None and self.iteration < config.iterations:
-            log.flush()
-            self.checkpoint().save(folder.checkpoint_path)
+            # The file is written inside the block, where a second SIGTERM or SIGHUP does not interrupt it.
+            if folder is not None and self.iteration < config.iterations:
+                self._save_checkpoint(folder, log)
         return Model(
             self.snapshot(),
             config,
@@ -213,10 +222,35 @@ class Trainer:
             None if folder is None else folder.path,
         )
 
+    def _measure_test_views(self, log: RunLog) -> None:
+        it = self.iteration
+        self.evaluations[it] = self.evaluate(self.scene.test)
+        self.evaluation_seconds[it] = self.seconds
+        log.write(
+            {
+                "iteration": it,
+                "seconds": self.seconds,
+                "test_psnr": self.evaluations[it].psnr,
+                "test_ssim": self.evaluations[it].ssim,
+                "splats": self.splats.n,
+            }
+        )
+
+    def _save_model(self, folder: ModelFolder) -> None:
+        folder.save(self.snapshot(), self.iteration)
+        if self.config.appearance.exposure:
+            names = [view.name for view in self.scene.train]
+            folder.write_exposures(exposures_json(names, self.exposure.exposures()))
+
+    def _save_checkpoint(self, folder: ModelFolder, log: RunLog) -> None:
+        log.flush()
+        self.checkpoint().save(folder.checkpoint_path)
+
     @property
     def sh_degree(self) -> int:
         """SH degree in use at the present iteration."""
-        return sh_degree_at(self.iteration, self.schedule.sh_interval, self.config.sh_degree)
+        scheduled = sh_degree_at(self.iteration, self.schedule.sh_interval, self.config.sh_degree)
+        return max(scheduled, self.reached.sh_degree) if self.reached else scheduled
 
     def step(self) -> Frame:
         """Do one iteration and return its frame: one image, one optimizer step, and a densification if it is due."""
@@ -268,19 +302,19 @@ class Trainer:
             str(self.kernels.schedule),
             self.n_first,
             self.pipeline.statistics.read(self.splats.n),
+            self.reached,
         )
 
     def evaluate(self, views: list[View]) -> Evaluation:
         """Return the metrics of the present splats."""
         return evaluate(self.renderer, self.snapshot(), views, self.config.background)
 
-    def _report(self, value: LossValue, log: RunLog, since: int, started: float) -> None:
+    def _log(self, value: LossValue, log: RunLog) -> None:
         if not math.isfinite(value.total):
             raise TrainingError(
                 f"iteration {self.iteration}: the loss is not finite: lower the learning rates; "
                 "the last checkpoint is kept"
             )
-        speed = (self.iteration - since) / (time.perf_counter() - started)
         log.write(
             {
                 "iteration": self.iteration,
@@ -292,10 +326,20 @@ class Trainer:
                 "seconds": self.seconds,
             }
         )
+
+    def _show(self, value: LossValue, since: int, started: float) -> None:
         if self.progress is not None:
+            speed = (self.iteration - since) / (time.perf_counter() - started)
             self.progress(
                 Progress(
-                    self.iteration, self.config.iterations, value.total, value.psnr, self.splats.n, self.seconds, speed
+                    self.iteration,
+                    self.config.iterations,
+                    value.total,
+                    value.psnr,
+                    self.splats.n,
+                    self.seconds,
+                    speed,
+                    forecast=self.clock.forecast.seconds_left(),
                 )
             )
 

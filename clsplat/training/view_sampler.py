@@ -18,18 +18,35 @@ class ViewSampler:
     iterations : length of the run.
     coarse_to_fine : whether the first images are smaller.
     queue : rest of the permutation of a resumed run.
+    largest_downscale : limit of the downscales, of a run that was made longer.
+
+    Attributes
+    ----------
+    stages : (first iteration, downscale) of the image sizes.
+    pixels : median of the pixels of the views.
     """
 
     def __init__(
-        self, views: list[View], iterations: int, coarse_to_fine: bool, rng: np.random.Generator, queue: list[int]
+        self,
+        views: list[View],
+        iterations: int,
+        coarse_to_fine: bool,
+        rng: np.random.Generator,
+        queue: list[int],
+        largest_downscale: int | None = None,
     ) -> None:
         self.views, self.rng, self.queue = views, rng, list(queue)
         side = min(min(view.camera.width, view.camera.height) for view in views)
-        self._pixels = statistics.median(view.camera.width * view.camera.height for view in views)
-        self.stages = resolution_schedule(iterations, image_side=side) if coarse_to_fine else [(0, 1)]
+        self.pixels = statistics.median(view.camera.width * view.camera.height for view in views)
+        stages = resolution_schedule(iterations, image_side=side) if coarse_to_fine else [(0, 1)]
+        self.stages = [(first, min(downscale, largest_downscale or downscale)) for first, downscale in stages]
 
     def next(self, iteration: int, n_splats: int) -> tuple[int, int]:
         """Return the index of the view of an iteration (from 1), and the downscale of its image for `n_splats`."""
         if not self.queue:
             self.queue = self.rng.permutation(len(self.views)).tolist()
-        return self.queue.pop(), downscale_for(self.stages, iteration - 1, n_splats, self._pixels)
+        return self.queue.pop(), self.downscale(iteration, n_splats)
+
+    def downscale(self, iteration: int, n_splats: int) -> int:
+        """Return the downscale of the image of an iteration (from 1)."""
+        return downscale_for(self.stages, iteration - 1, n_splats, self.pixels)

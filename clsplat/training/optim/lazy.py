@@ -135,9 +135,8 @@ class VisibleOptimizer(FusedOptimizer):
         return settled.download(settled.n)
 
     def apply(self, edit: DensifyEdit) -> None:
-        self.settle()
+        self.settle()  # no splat has skipped a step now, so it does not matter which ones move
         super().apply(edit)
-        self._mark_settled()
 
     def state(self) -> dict[str, NDArray[Any]]:
         last = to_host(self.device, self._last, np.empty((2, self._vectors), np.uint32))

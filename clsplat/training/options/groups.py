@@ -21,8 +21,8 @@ class StartConfig(OptionGroup):
 
     init: str = option(
         "sfm",
-        help="Start of training: the scene's points, random points, or the splats of a PLY file.",
-        metavar="sfm|random|FILE.ply",
+        help="Start of training: the scene's points, random points, or a file of splats.",
+        metavar="sfm|random|FILE",
     )
     random_points: float | None = option(
         None,
@@ -169,7 +169,12 @@ class OutputConfig(OptionGroup):
     title: ClassVar[str] = "Checkpoints and files"
 
     checkpoint_interval: int = option(
-        1000, help="Iterations between two checkpoints. 0: only one at the end.", at_least=0
+        1000, help="Iterations between two checkpoints. 0: none by iterations.", at_least=0
+    )
+    checkpoint_minutes: float = option(
+        5.0,
+        help="Minutes after which a checkpoint is saved, if none was saved for the iterations. 0: none by time.",
+        at_least=0,
     )
     save_iterations: tuple[int, ...] = option(
         (), help="Iterations after which a PLY file is saved, besides the last one.", metavar="N,N,..."

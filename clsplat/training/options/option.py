@@ -86,9 +86,11 @@ class Option:
         return self.type
 
     def check(self, value: Any) -> None:
-        """Raise InputError if a value is not one of the choices, or is out of range."""
+        """Raise InputError if a value is not one of the choices, not finite, or out of range."""
         if self.choices and value not in self.choices:
             raise InputError(f"{self.name} {value!r}: choose one of {', '.join(self.choices)}")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"{self.name} {value}: must be finite{f' and {self.range}' if self.range else ''}")
         if self.range is not None and value is not None and not self.range.allows(value):
             raise InputError(f"{self.name} {value}: must be {self.range}")
 
