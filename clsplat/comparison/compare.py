@@ -15,7 +15,7 @@ from ..scenes.scene import Scene
 from ..training.log import Progress
 from .measure import train_and_measure, warm_up
 from .methods import Method
-from .runs import Run, RunFile, scene_identity
+from .runs import Run, RunFile, refuse_foreign, scene_identity
 from .table import Record, markdown, notes, summarise
 
 TABLE, RESULTS, MODELS = "table.md", "results.json", "models"
@@ -58,7 +58,7 @@ def compare(
     Raises
     ------
     InputError : a scene has no test views, or options do not fit a method.
-    OutputError : `output` cannot be written, or another comparison writes there.
+    OutputError : `output` cannot be written, holds files that no comparison wrote, or another comparison writes there.
     DeviceError : no device, or not enough memory.
     A run whose training fails raises nothing: its record has the message ("failed").
     """
@@ -71,6 +71,7 @@ def compare(
         for again in range(repeat if seed == seeds[0] else 1)
         for method in methods
     ]
+    refuse_foreign(folder, (TABLE, RESULTS, MODELS))
     runs = RunFile(folder)
     device: Device | None = None
     warm: set[str] = set()

@@ -101,13 +101,27 @@ class RunFile:
         self.records.append(record)
 
 
+def refuse_foreign(folder: Path, names: Sequence[str]) -> None:
+    """Raise OutputError if a file of a comparison would replace one that no comparison wrote.
+
+    Parameters
+    ----------
+    folder : of the comparison. It is one that a comparison wrote if it has runs.jsonl.
+    names : files and folders in it that will be written.
+    """
+    if not (folder / RUNS).exists():
+        for path in (folder / name for name in names):
+            if path.exists():
+                raise OutputError(f"{path}: exists already, but no {RUNS} beside it: choose another folder")
+
+
 def parse_runs(text: str) -> list[Record]:
     """Return the records of a runs.jsonl. A line that a crash cut short is left out, so that its run is repeated."""
     records = []
     for line in text.splitlines():
         try:
             record = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
         if isinstance(record, dict) and record.keys() >= _KEYS:
             records.append(record)

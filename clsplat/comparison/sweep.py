@@ -15,7 +15,7 @@ from ..training.log import Progress
 from .charts import arithmetic_chart, seeds_chart
 from .compare import compare
 from .methods import Method
-from .runs import RUNS, Run, distinct, read_runs
+from .runs import RUNS, Run, distinct, read_runs, refuse_foreign
 from .sweep_charts import equal_chart, size_chart, time_chart
 from .sweep_rows import (
     ChartRow,
@@ -100,6 +100,7 @@ def sweep(
     """
     if not chart_style.available():
         warnings.warn(f"{chart_style.MISSING}; only the data of the charts are written", stacklevel=2)
+    refuse_foreign(Path(output), (REPORT, CHARTS))
     try:
         return compare(
             scenes,

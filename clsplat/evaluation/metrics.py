@@ -6,6 +6,7 @@ names its `MetricProtocol`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ Padding = Literal["valid", "zero"]
 
 # Wang, Bovik, Sheikh, Simoncelli 2004: 11x11 Gaussian window, sigma 1.5, K1 = 0.01, K2 = 0.03, range 1.
 SSIM_RADIUS = 5
+MIN_SIDE = 2 * SSIM_RADIUS + 1  # smallest side of an image that a window fits into [px]
 SSIM_SIGMA = 1.5
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
@@ -117,6 +119,21 @@ def psnr(a: NDArray[Any], b: NDArray[Any], rounded: bool = True, mask: NDArray[n
     return float("inf") if error == 0.0 else -10.0 * float(np.log10(error))
 
 
+def check_sizes(sizes: Iterable[tuple[str, int, int]], source: object) -> None:
+    """Raise InputError if an image is too small to be measured, before any work is done for it.
+
+    Parameters
+    ----------
+    sizes : name, width and height of each image [px]. source : where they come from, for the message.
+    """
+    for name, width, height in sizes:
+        if min(width, height) < MIN_SIDE:
+            raise InputError(
+                f"{source}: test view {name!r} has {width}x{height} px; SSIM needs at least {MIN_SIDE}x{MIN_SIDE}: "
+                "use larger photos, or no test views"
+            )
+
+
 def ssim(
     a: NDArray[Any],
     b: NDArray[Any],
@@ -141,7 +158,7 @@ def ssim(
     if padding not in ("valid", "zero"):
         raise InputError(f"unknown SSIM padding {padding!r}: choose one of valid, zero")
     x, y = _pair(a, b, rounded)
-    if padding == "valid" and min(x.shape[:2]) < 2 * SSIM_RADIUS + 1:
+    if padding == "valid" and min(x.shape[:2]) < MIN_SIDE:
         size = f"{x.shape[1]}x{x.shape[0]} px"
         raise InputError(f"SSIM: an image of {size} is below its 11x11 window; use zero padding (3dgs)")
     if mask is not None:

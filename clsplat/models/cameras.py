@@ -11,14 +11,17 @@ import numpy as np
 
 from ..cameras.cameras_json import NamedCamera, named_cameras, read_cameras, write_cameras
 from ..cameras.path import read_path
-from ..errors import InputError, OutputError
+from ..errors import InputError
+from ..files.existing import refuse_existing
 from ..files.json_file import read_json
 from ..scenes.colmap import Points
 from ..scenes.export import relative_files, write_colmap, write_transforms
+from ..scenes.posed_images import warn_of_left_out
 from ..scenes.scene import read_posed_images
 from ..scenes.undistort import RegisteredImage, is_pinhole, make_lens, pinhole_camera
+from ..splats.harmonics import SH_C0
 from ..splats.shapes import shape_named
-from ..splats.splats import SH_C0, Splats
+from ..splats.splats import Splats
 from .model import load_model
 
 OPAQUE = 0.5  # splats of at least this opacity become points of a model
@@ -49,7 +52,7 @@ def export_cameras(
 
     Parameters
     ----------
-    source : a scene, a model folder, a file of splats, a cameras.json or a camera path.
+    source : a scene or its transforms.json, a model folder, a file of splats, a cameras.json or a camera path.
     output : a .json file, or the folder of a COLMAP model.
     form : one of `scenes.options.CAMERA_FORMATS`; by default "cameras" for cameras.json, "transforms" for other .json
         files, else "colmap".
@@ -67,9 +70,8 @@ def export_cameras(
         form = "cameras" if output.name == "cameras.json" else "transforms" if output.suffix == ".json" else "colmap"
     suffix = ".txt" if form == "colmap-text" else ".bin"
     files = [output / f"{name}{suffix}" for name in _COLMAP_FILES] if form.startswith("colmap") else [output]
-    if any(path.exists() for path in files) and not overwrite:
-        raise OutputError(f"{output}: exists already: use --overwrite or another name")
-    if source.is_dir() and not (source / "point_cloud").is_dir():
+    refuse_existing(files, overwrite)
+    if _is_scene(source):
         photos, photo_files, points = _of_scene(source, images)
     else:
         photos, points = _of_model(source, iteration)
@@ -84,9 +86,20 @@ def export_cameras(
     return ExportedCameras(len(photos), len(points))
 
 
+def _is_scene(source: Path) -> bool:
+    """Return whether the source is a folder without a model, or a transforms.json with its frames."""
+    if source.is_dir():
+        return not (source / "point_cloud").is_dir()
+    if not source.is_file() or source.suffix != ".json":
+        return False
+    content = read_json(source, "a cameras.json or a transforms.json")
+    return isinstance(content, dict) and "frames" in content
+
+
 def _of_scene(scene: Path, images: str | None) -> tuple[list[RegisteredImage], list[Path], Points]:
     """Return the photos, their files, and points. Names of photos omit a folder that all photos are in."""
     posed = read_posed_images(scene, images)
+    warn_of_left_out(scene, posed.left_out, len(posed.listed))
     folders = {photo.name.partition("/")[0] if "/" in photo.name else None for photo in posed.photos}
     cut = len(folders.pop() or "") + 1 if len(folders) == 1 and None not in folders else 0
     return (

@@ -9,16 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from ..cameras.cameras_json import read_cameras
-from ..errors import InputError, OutputError
+from ..errors import InputError
 from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
+from ..files.existing import refuse_existing
 from ..rendering.renderer import Renderer
-from ..splats.any_file import GAUSSIAN_ENDINGS, PLY_ENDING, check_ending, load_splats, save_splats
+from ..splats.any_file import GAUSSIAN_ENDINGS, PLY_ENDING, SPZ_ENDING, check_ending
 from ..splats.approximate import nearest_gaussians
 from ..splats.convert import convert
 from ..splats.fields import sh_coefficients
 from ..splats.shapes import GAUSSIAN
 from ..splats.splats import Splats
+from ..splats.spz import VERSIONS as SPZ_VERSIONS
 from .model import LoadedModel, model_at
 
 
@@ -66,6 +68,7 @@ def convert_model(
     *,
     approximate: bool = False,
     sh_degree: int | None = None,
+    spz_version: int | None = None,
     iteration: int | None = None,
     overwrite: bool = False,
 ) -> ConvertedModel:
@@ -78,6 +81,7 @@ def convert_model(
     shape : the shape to convert to; by default the model's, for .splat and .spz files Gaussian.
     approximate : use the nearest Gaussian for splats without an equal one, instead of raising.
     sh_degree : remove the SH bands above, or add bands of zeros.
+    spz_version : version of an .spz file, 3 or 4. Version 4 needs the extra `spz`.
     iteration : as for `load_model`.
     overwrite : replace an existing file.
 
@@ -88,8 +92,9 @@ def convert_model(
     """
     output = Path(output)
     suffix = check_ending(output)
-    if output.exists() and not overwrite:
-        raise OutputError(f"{output}: exists already: use --overwrite or another name")
+    if spz_version is not None and suffix != SPZ_ENDING:
+        raise InputError(f"{output}: the version is of .spz files: leave it out, or choose the ending .spz")
+    refuse_existing([output], overwrite)
     source = model_at(model, iteration)
     target = shape or (GAUSSIAN.name if suffix in GAUSSIAN_ENDINGS else source.splats.shape)
     if suffix in GAUSSIAN_ENDINGS and target != GAUSSIAN.name:
@@ -97,7 +102,7 @@ def convert_model(
     converted, is_nearest = _as_shape(source.splats, target, approximate)
     if sh_degree is not None:
         converted = _of_degree(converted, sh_degree)
-    save_splats(output, converted)
+    converted.save(output, spz_version=spz_version or SPZ_VERSIONS[0])
     return ConvertedModel(source, output, converted, is_nearest)
 
 
@@ -119,7 +124,7 @@ def conversion_cost(
     named = source.read_cameras() if cameras is None else read_cameras(cameras)
     if not named:
         return None
-    written, renderer = load_splats(converted.output), Renderer(device)
+    written, renderer = Splats.load(converted.output), Renderer(device)
     values = []
     for entry in named:
         before, after = (

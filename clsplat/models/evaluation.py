@@ -14,10 +14,12 @@ from ..errors import InputError, OutputError
 from ..evaluation.evaluate import evaluate as evaluate_views
 from ..evaluation.metrics import DEFAULT_PROTOCOL, MetricProtocol
 from ..evaluation.perceptual import Flip, Lpips
+from ..files.existing import refuse_existing
 from ..files.json_file import read_object, write_json
+from ..files.real_path import real_path
 from ..rendering.outputs import ImageWriter, output_stems
 from ..rendering.renderer import Rendered, Renderer
-from ..rendering.views import ViewProgress
+from ..rendering.views import RenderOutput, ViewProgress, files_of
 from ..scenes.scene import View
 from ..splats.color import Color
 from ..splats.stats import complexity
@@ -61,27 +63,32 @@ def evaluate(
     *,
     iteration: int | None = None,
     renders: str | Path | None = None,
+    overwrite: bool = False,
     device: str | None = None,
     progress: ViewProgress | None = None,
 ) -> ModelEvaluation:
     """Measure a model on its scene's views, and write results.json, per_view.json and report.html into its folder.
 
+    Nothing is written for a file of splats, which has no folder. In folders of other programs, whose results.json may
+    have entries `ours_N`, ours are called `clsplat_N`.
+
     Parameters
     ----------
-    model : a model folder, or what `load_model` returned for one.
+    model : a model folder, a file of splats, or what `load_model` returned.
     options : views and metrics; by default PSNR and SSIM of the test views.
     iteration : as for `load_model`.
     renders : folder for the rendered images as PNG; None writes no images.
+    overwrite : replace existing files of `renders`. The files in the model's folder are always replaced.
     device : OpenCL device, as for `Renderer`.
     progress : called before each view.
 
     Raises
     ------
     InputError : the model or its scene cannot be read, or the scene has no such views.
-    OutputError : a file cannot be written.
+    OutputError : a file exists or cannot be written.
     """
     options = options or EvaluationOptions()
-    evaluator = Evaluator(options, Renderer(device))
+    evaluator = Evaluator(options, Renderer(device), overwrite=overwrite)
     measured = evaluator(model_at(model, iteration), None if renders is None else Path(renders), progress)
     if measured.write_error is not None:
         raise measured.write_error
@@ -95,6 +102,8 @@ def evaluate_models(
     comparison: Path | None = None,
     iteration: int | None = None,
     renders: Path | None = None,
+    numbers: Path | None = None,
+    overwrite: bool = False,
     device: str | None = None,
     progress: ViewProgress | None = None,
 ) -> list[ModelEvaluation]:
@@ -106,13 +115,19 @@ def evaluate_models(
     ----------
     comparison : file of a report that compares the models. It replaces the reports of the single models.
     renders : folder of the images. If there are several models, each has a subfolder.
+    numbers : JSON file for the numbers of all models, by path: the entries of results.json and per_view.json.
+    overwrite : replace existing files of `comparison`, `numbers` and `renders`.
     """
+    refuse_existing([path for path in (comparison, numbers) if path is not None], overwrite)
     write = options.report and comparison is None
-    evaluator = Evaluator(options, Renderer(device), write_reports=write)
+    evaluator = Evaluator(options, Renderer(device), write_reports=write, overwrite=overwrite)
     measured = []
     for path in paths:
-        folder = renders / path.resolve().name if renders is not None and len(paths) > 1 else renders
+        folder = renders / real_path(path).name if renders is not None and len(paths) > 1 else renders
         measured.append(evaluator(load_model(path, iteration), folder, progress))
+    if numbers is not None:
+        entries = zip(paths, measured, strict=True)
+        write_json(numbers, {str(path): {"results": one.result, "per_view": one.per_view} for path, one in entries})
     if comparison is not None:
         write_model_report(comparison, measured[-1].scene.name, measured, _labels(paths))
     return measured
@@ -124,14 +139,18 @@ class Evaluator:
     Parameters
     ----------
     write_reports : whether each model gets a report if the options request reports.
+    overwrite : whether existing images may be replaced.
 
     Raises
     ------
     InputError : LPIPS or FLIP is not installed.
     """
 
-    def __init__(self, options: EvaluationOptions, renderer: Renderer, write_reports: bool = True) -> None:
+    def __init__(
+        self, options: EvaluationOptions, renderer: Renderer, write_reports: bool = True, overwrite: bool = False
+    ) -> None:
         self.options, self.renderer, self.write_reports = options, renderer, write_reports and options.report
+        self.overwrite = overwrite
         self.lpips = Lpips(unit_range=options.protocol.name == UNIT_RANGE_PROTOCOL) if options.lpips else None
         self.flip = Flip() if options.flip else None
 
@@ -139,19 +158,24 @@ class Evaluator:
         self, model: LoadedModel, renders: Path | None = None, progress: ViewProgress | None = None
     ) -> ModelEvaluation:
         """Return the measurements of a model. Parameters and errors are those of `evaluate`."""
-        if model.folder is None:
-            raise InputError(f"{model.path}: is a file; eval takes model folders (render takes any PLY)")
         options = self.options
-        scene = model.load_scene(options.scene)
+        background = model.background if options.background is None else options.background
+        scene = model.load_scene(options.scene, background=background)
         views = {"test": scene.test, "train": scene.train, "all": scene.views}[options.view_set]
+        if not views and options.view_set == "test" and scene.test_names:
+            raise InputError(
+                f"{model.path}: none of its {len(scene.test_names)} test photos can be used: "
+                "copy them to the scene, or measure training views with --set train"
+            )
         if not views:
             raise InputError(
                 f"{model.path}: was trained on all views, none is left to test it on: "
-                "train with --eval, or measure training views with --set train"
+                "measure training views with --set train, or train with clsplat train --eval"
             )
         recorder = ViewRecorder(self.lpips, self.flip, options.report, options.protocol.corrected)
-        writer = None if renders is None else ImageWriter(renders)
         names, numbers = [view.name for view in views], count(1)
+        refuse_existing(files_of(RenderOutput(renders), names), self.overwrite, scene.photo_files)
+        writer = None if renders is None else ImageWriter(renders)
         stems = dict(zip(names, output_stems(names), strict=True)) if writer else {}
 
         def on_view(view: View, image: Rendered) -> None:
@@ -161,7 +185,6 @@ class Evaluator:
                 writer.write(stems[view.name], image)
             recorder(view, image)
 
-        background = model.background if options.background is None else options.background
         measured = evaluate_views(self.renderer, model.splats, views, background, options.protocol, on_view)
         per_view = {
             metric: {name: values[metric] for name, values in measured.per_view.items()} for metric in ("SSIM", "PSNR")
@@ -182,10 +205,13 @@ class Evaluator:
             "protocol": options.protocol.describe() | recorder.describe(),
         }
         evaluation = ModelEvaluation(model, scene, result, per_view, recorder.images)
+        if model.folder is None:
+            return evaluation
         ending = "" if options.view_set == "test" else f"_{options.view_set}"
+        key = f"{'ours' if model.folder.config_path.is_file() else 'clsplat'}_{model.iteration}"
         try:
             for stem, entry in (("results", result), ("per_view", per_view)):
-                _add_entry(model.folder.path / f"{stem}{ending}.json", f"ours_{model.iteration}", entry)
+                _add_entry(model.folder.path / f"{stem}{ending}.json", key, entry)
         except OutputError as error:
             return replace(evaluation, write_error=error)
         if not self.write_reports:
@@ -194,14 +220,14 @@ class Evaluator:
         return replace(
             evaluation,
             report=write_model_report(
-                file, options.scene_name or scene.name, [evaluation], [model.path.resolve().name]
+                file, options.scene_name or scene.name, [evaluation], [real_path(model.path).name]
             ),
         )
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
     """Return the names of the folders, or whole paths if two folders have the same name."""
-    names = [path.resolve().name for path in paths]
+    names = [real_path(path).name for path in paths]
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from ..errors import InputError
 from ..scenes.info import SceneInfo, is_scene, scene_info
 from ..scenes.reconstruct.photo_files import is_photographs
+from ..scenes.wrong_folder import scene_hint
 from ..splats.stats import Complexity, complexity
 from ..training.folder import ModelFolder
 from .model import LoadedModel, load_model
@@ -68,6 +69,8 @@ def _is_scene(path: Path) -> bool:
         return True
     if ModelFolder(path).is_used:
         return False  # load_model reports that the model has no point cloud yet
+    if (hint := scene_hint(path)) is not None:
+        raise InputError(hint)
     if is_photographs(path):
         raise InputError(f"{path}: photographs without poses: clsplat reconstruct {path} -o SCENE finds them")
     raise InputError(f"{path}: neither a model (point_cloud/) nor a scene (sparse/ or transforms.json)")

@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..cameras.cameras_json import NamedCamera, read_cameras
-from ..errors import InputError
+from ..errors import InputError, Remedy
 from ..files.image_names import bare_name
-from ..files.json_file import to_real
+from ..files.json_file import describe, to_real
 from ..scenes.options import ALPHA_USES
-from ..splats.any_file import load_splats
 from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from ..training.folder import ModelFolder
+from ..training.stored_run import checked_record
+from .cfg_args import read_cfg_args
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
@@ -30,11 +31,19 @@ class SceneChoice:
     path : the scene's folder or transforms file.
     images : the folder of photos inside the scene.
     resolution : size of the photos, as for `load_scene`.
+    masks, alpha : as for `load_scene`.
+    test_every, test_list : as for `load_scene`; only for models that do not record their test views.
+    allow_changed_photos : warn about photos that have changed since the run, instead of an error.
     """
 
     path: str | Path | None = None
     images: str | None = None
     resolution: int | None = None
+    masks: str | None = None
+    alpha: str | None = None
+    test_every: int | None = None
+    test_list: str | Path | None = None
+    allow_changed_photos: bool = False
 
     def __bool__(self) -> bool:
         return self != SceneChoice()
@@ -74,18 +83,24 @@ class LoadedModel:
             return []
         return read_cameras(self.folder.cameras_path)
 
-    def load_scene(self, choice: SceneChoice | None = None) -> Scene:
+    def load_scene(
+        self, choice: SceneChoice | None = None, *, check: bool = True, background: Color | None = None
+    ) -> Scene:
         """Return the scene that the model was trained on, with the same test views.
 
         Parameters
         ----------
         choice : replaces parts of the record. A model without a record needs its `path`; every eighth view is
-            then a test view, as in 3DGS.
+            then a test view, as in 3DGS, if `choice` names no others.
+        background : colour 0..1 under photos with transparency; None means the model's background.
+        check : whether photos must be those of the run. Other `images` or `masks` are not compared.
 
         Raises
         ------
-        InputError : the scene is unknown, does not exist, or lacks a test view of the run.
+        InputError : the scene is unknown, does not exist, lacks a test view of the run, or has other photos; or
+            `choice` names other test views than the record.
         """
+        from ..scenes.changed_photos import check_photos
         from ..scenes.scene import load_scene  # imported late: it loads an image library, which would slow down --help
 
         choice, record = choice or SceneChoice(), self.scene_record
@@ -95,18 +110,26 @@ class LoadedModel:
         if choice.path is None and not Path(path).exists():
             raise InputError(f"{self.path}: its scene {path} does not exist: give the scene's folder with -s")
         test_names = self.test_names
+        if test_names is not None and (choice.test_every or choice.test_list):
+            leave_out = Remedy("leave out the choice of others", "--test-every", "--test-list")
+            raise InputError(f"{self.path}: records its test views", leave_out)
         scene = load_scene(
             path,
             choice.images or record.get("images"),
             record.get("resolution", -1) if choice.resolution is None else choice.resolution,
+            test_every=8 if choice.test_every is None else choice.test_every,
+            test_list=choice.test_list,
             eval=test_names is None,
-            background=self.background,
-            masks=record.get("masks"),
-            alpha=record.get("alpha", ALPHA_USES[0]),
+            background=self.background if background is None else background,
+            masks=choice.masks or record.get("masks"),
+            alpha=choice.alpha or record.get("alpha", ALPHA_USES[0]),
         )
+        as_recorded = all(getattr(choice, name) in (None, record.get(name)) for name in ("images", "masks"))
+        if check and as_recorded:
+            check_photos(scene, record.get("photos"), self.path, allow=choice.allow_changed_photos)
         if test_names is None:
             return scene
-        if missing := sorted(test_names - set(scene.names)):
+        if missing := sorted(test_names - set(scene.names) - set(scene.left_out)):
             raise InputError(
                 f"{path}: lacks view {missing[0]!r}, a test view of {self.path}: "
                 "give the scene it was trained on with -s"
@@ -115,7 +138,7 @@ class LoadedModel:
 
 
 def load_model(path: str | os.PathLike[str], iteration: int | None = None) -> LoadedModel:
-    """Return the model in a folder of clsplat or 3DGS, or in a file of splats (.ply, .splat, .spz).
+    """Return the model in a folder of clsplat or 3DGS, or in a file of splats in any format of `Splats.load`.
 
     Parameters
     ----------
@@ -129,9 +152,9 @@ def load_model(path: str | os.PathLike[str], iteration: int | None = None) -> Lo
     if path.is_file():
         if iteration is not None:
             raise InputError(f"{path}: --iteration is for model folders, this is a file")
-        return LoadedModel(path, path, load_splats(path))
+        return LoadedModel(path, path, Splats.load(path))
     if not path.is_dir():
-        raise InputError(f"{path}: no such model folder or PLY file")
+        raise InputError(f"{path}: no such model folder or file of splats")
     folder = ModelFolder(path)
     ply, number = folder.latest_ply(iteration)
     background, record = _read_record(folder)
@@ -149,23 +172,25 @@ def in_both_forms(names: frozenset[str]) -> frozenset[str]:
 
 
 def _read_record(folder: ModelFolder) -> tuple[Color, dict[str, Any]]:
-    """Return the background and the scene in config.json. Each value is checked, because people edit the file."""
+    """Return the background and the scene in config.json or 3DGS's cfg_args; black and nothing without these files.
+
+    Each value is checked, because people edit the files.
+    """
     file = folder.config_path
     if not file.is_file():
-        return BLACK, {}
+        return read_cfg_args(folder.cfg_args_path) if folder.cfg_args_path.is_file() else (BLACK, {})
     stored = folder.read_config()
-    config, scene = stored.get("config", {}), stored.get("scene", {})
-    if not isinstance(config, dict) or not isinstance(scene, dict):
-        raise InputError(f"{file}: config and scene must be objects: restore the file as it was written")
+    config = stored.get("config", {})
+    if not isinstance(config, dict):
+        raise InputError(f"{file}: config is {describe(config)}; expected an object: restore the file")
     rgb = config.get("background", [0, 0, 0])
     parts = [to_real(part) for part in rgb] if isinstance(rgb, list) else []
     if len(parts) != 3 or not all(part is not None and 0 <= part <= 1 for part in parts):
-        raise InputError(f"{file}: config.background is {rgb!r}: expected three numbers from 0 to 1")
-    kinds = {"path": str, "images": str, "resolution": int, "masks": str, "alpha": str, "test_names": list}
-    for key, kind in kinds.items():
-        if scene.get(key) is not None and not isinstance(scene[key], kind):
-            raise InputError(f"{file}: scene.{key} is {scene[key]!r}: restore the file as it was written")
-    if not all(isinstance(name, str) for name in scene.get("test_names") or []):
-        raise InputError(f"{file}: scene.test_names must be names: restore the file as it was written")
-    known = {key: value for key, value in scene.items() if value is not None}
+        raise InputError(f"{file}: config.background is {describe(rgb)}; expected three numbers from 0 to 1")
+    try:
+        known = checked_record(stored.get("scene", {}))
+    except InputError as error:
+        raise InputError(f"{file}: {error}: restore the file") from None
+    if "path" in known:  # the path of a scene in the model's folder is relative to that folder
+        known["path"] = str(folder.path / known["path"])
     return (float(rgb[0]), float(rgb[1]), float(rgb[2])), known

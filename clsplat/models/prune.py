@@ -11,8 +11,10 @@ from ..compression.prune import SHARES, Pruned, Validation, prune
 from ..compression.prune_and_refine import prune_in_rounds
 from ..device.device import open_device
 from ..errors import InputError, OutputError
+from ..files.existing import refuse_existing
 from ..rendering.renderer import Renderer
 from ..scenes.split import hold_out
+from ..splats.any_file import PLY_ENDING
 from ..training.log import Progress
 from .model import LoadedModel, SceneChoice, model_at
 
@@ -72,8 +74,9 @@ def prune_model(
     output = Path(output)
     if output.is_dir():
         raise OutputError(f"{output}: is a folder: name the PLY file to write")
-    if output.exists() and not overwrite:
-        raise OutputError(f"{output}: exists already: use --overwrite or another name")
+    if output.suffix.lower() != PLY_ENDING:
+        raise OutputError(f"{output}: writes .ply files: choose this ending")
+    refuse_existing([output], overwrite)
     loaded = model_at(model, iteration)
     if not len(loaded.splats):
         raise InputError(f"{loaded.path}: has no splats")

@@ -12,9 +12,10 @@ from ..cameras.interpolate import resized_by_height
 from ..cameras.make_path import PathRequest, make_path, name_frames
 from ..cameras.path import DEFAULT_FPS, CameraPath, write_path
 from ..errors import InputError
+from ..files.existing import refuse_existing
 from ..files.video import VideoWriter
 from ..rendering.renderer import Renderer
-from ..rendering.views import RenderOutput, ViewProgress, render_to_files
+from ..rendering.views import RenderOutput, ViewProgress, files_of, render_to_files
 from ..splats.color import Color
 from .model import LoadedModel, SceneChoice, in_both_forms, model_at
 
@@ -67,6 +68,7 @@ def render_views(
     background: Color | None = None,
     save_path: str | Path | None = None,
     iteration: int | None = None,
+    overwrite: bool = False,
     device: str | None = None,
     progress: ViewProgress | None = None,
 ) -> ModelRenders:
@@ -80,13 +82,14 @@ def render_views(
     background : colour 0..1; by default the model's.
     save_path : file for the camera path.
     iteration : as for `load_model`.
+    overwrite : replace existing files.
     device : OpenCL device, as for `Renderer`.
     progress : called before each view.
 
     Raises
     ------
     InputError : the model or the views do not exist, or two views have the same file.
-    OutputError : a file cannot be written.
+    OutputError : a file exists or cannot be written.
     """
     choice = choice or ViewChoice()
     if output.video is not None:
@@ -94,6 +97,9 @@ def render_views(
     loaded = model_at(model, iteration)
     views, path = choose_views(loaded, choice)
     fps = output.fps or (path.fps if path is not None else DEFAULT_FPS)
+    path_cameras = None if path is None or output.folder is None else Path(output.folder) / "cameras.json"
+    named = [Path(file) for file in (save_path, path_cameras) if file is not None]
+    refuse_existing([*files_of(output, [view.name for view in views]), *named], overwrite)
     if path is not None and save_path is not None:
         write_path(save_path, path)
     rendered = render_to_files(
@@ -104,8 +110,8 @@ def render_views(
         loaded.background if background is None else background,
         progress,
     )
-    if path is not None and output.folder is not None:
-        write_cameras(Path(output.folder) / "cameras.json", views)
+    if path_cameras is not None:
+        write_cameras(path_cameras, views)
     return ModelRenders(views, fps, rendered.render_ms, rendered.depth_scales)
 
 
@@ -120,7 +126,7 @@ def choose_views(model: LoadedModel, choice: ViewChoice) -> tuple[list[NamedCame
     if choice.cameras is not None:
         views, source, view_set = read_cameras(choice.cameras), Path(choice.cameras), view_set or "all"
     elif choice.scene:
-        scene = model.load_scene(choice.scene)
+        scene = model.load_scene(choice.scene, check=False)
         views = named_cameras(scene.names, scene.cameras)
         test_names, source = scene.test_names, scene.path
     else:
@@ -148,5 +154,5 @@ def _select(
     if view_set in (None, "all"):
         return test if test and view_set is None else list(views)
     if not test:
-        raise InputError(f"{source}: no test views are known: train with --eval, or use --set all")
+        raise InputError(f"{source}: no test views are known: use --set all, or train with clsplat train --eval")
     return test if view_set == "test" else [view for view in views if view.name not in names]

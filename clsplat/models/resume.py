@@ -43,6 +43,7 @@ def resume(
     *,
     scene: str | os.PathLike[str] | None = None,
     progress: Callable[[Progress], None] | None = None,
+    allow_changed_photos: bool = False,
     **options: Any,
 ) -> Model | Budgeted:
     """Continue the run or the search in a model folder with its options and scene, and return the result.
@@ -52,20 +53,23 @@ def resume(
     path : the model folder.
     scene : the scene's folder; by default the recorded one.
     progress : as for `train`.
+    allow_changed_photos : warn about photos that have changed since the run, instead of an error.
     options : arguments of TrainConfig to change. Only those without an effect on the result may change, such as
-        `device`.
+        `device`, and the `iterations` of a run may rise.
 
     Raises
     ------
-    InputError : there is nothing to resume, or an option must not change.
+    InputError : there is nothing to resume, an option must not change, or photos have changed.
     Other exceptions : see `train`.
     """
     from ..compression.search import train_budget
+    from ..scenes.changed_photos import check_photos
     from ..training.run import train
 
     stored = find_unfinished(path)
     config = TrainConfig(**(stored.run.options | options))
     loaded = load_recorded_scene(scene or stored.run.scene_path, stored.run.scene, config.background)
+    check_photos(loaded, stored.run.scene["photos"], Path(path), allow=allow_changed_photos, all_views=True)
     if stored.search is not None:
         return train_budget(loaded, config, stored.search, progress, output=Path(path), resume=True)
     return train(loaded, config, progress, output=Path(path), resume=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files.html_page import Section, escape, package_text, write_page
+from ...files.image_names import match_names
 from .histogram import histogram, quantile
 from .images import LONGEST, ComparedImage, colour_stops, data_uri, full_scale, map_of, veiled
 
@@ -51,6 +52,19 @@ class ModelReport:
         return np.sum([image.counts for image in self.images.values()], axis=0)
 
 
+def _with_names_of(first: ModelReport, model: ModelReport, path: Path) -> ModelReport:
+    """Return the model with the names of the first one's views; InputError if it was measured on others."""
+    named = match_names(list(first.images), list(model.images))
+    if named is None or any(image.size != first.images[named[name]].size for name, image in model.images.items()):
+        raise InputError(
+            f"{path}: {model.label} and {first.label} were measured on different views or sizes; "
+            "compare models of one scene, or measure them one by one"
+        )
+    per_view = {metric: {named[name]: values[name] for name in values} for metric, values in model.per_view.items()}
+    images = {named[name]: image for name, image in model.images.items()}
+    return replace(model, per_view=per_view, images=images)
+
+
 def write_report(path: Path, models: Sequence[ModelReport], what: str, protocol: Sequence[str]) -> Path:
     """Write the page and return its path.
 
@@ -66,14 +80,7 @@ def write_report(path: Path, models: Sequence[ModelReport], what: str, protocol:
     OutputError : the page cannot be written.
     """
     names = list(models[0].images)
-    for model in models[1:]:
-        if set(model.images) != set(names) or any(
-            model.images[name].size != models[0].images[name].size for name in names
-        ):
-            raise InputError(
-                f"{path}: {model.label} and {models[0].label} were measured on different views or sizes; "
-                "compare models of one scene, or measure them one by one"
-            )
+    models = [models[0], *(_with_names_of(models[0], model, path) for model in models[1:])]
     psnr = {name: statistics.fmean(model.per_view["PSNR"][name] for model in models) for name in names}
     worst_first = sorted(names, key=lambda name: psnr[name])
     all_images = [image for model in models for image in model.images.values()]
