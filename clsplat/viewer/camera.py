@@ -37,26 +37,32 @@ class Pose:
     height: int
 
 
-def window_of(pose: Pose, longest: int) -> tuple[int, int]:
-    """Return (width, height) of a frame for the window, at most `longest` px; 1 x 1 if the window is unusable."""
+def window_of(pose: Pose, longest: int, enlarge: bool = False) -> tuple[int, int]:
+    """Return (width, height) of a frame for the window, at most `longest` px; 1 x 1 if the window is unusable.
+
+    Parameters
+    ----------
+    enlarge : make the longest side `longest` px also in a smaller window.
+    """
     try:
         width, height = (min(max(int(side), 1), MAX_WINDOW) for side in (pose.width, pose.height))
     except (TypeError, ValueError, OverflowError):
         return 1, 1
-    scale = min(1.0, longest / max(width, height))
+    scale = longest / max(width, height)
+    scale = scale if enlarge else min(1.0, scale)
     return max(round(scale * width), 1), max(round(scale * height), 1)
 
 
-def camera_of(pose: Pose, longest: int) -> Camera | None:
+def camera_of(pose: Pose, longest: int, enlarge: bool = False) -> Camera | None:
     """Return the camera of a frame of at most `longest` px, or None if the pose is unusable.
 
-    The frame has the whole field of view of the window, also if its sides are rounded.
+    The frame has the whole field of view of the window, also if its sides are rounded. `enlarge` as for `window_of`.
     """
     try:
         width, height = window_of(pose, MAX_WINDOW)
         quat = np.asarray(pose.wxyz, np.float64).reshape(1, 4)
         position = np.asarray(pose.position, np.float64).reshape(3)
-        if not 0.0 < pose.fov <= MAX_FOV or not NORM_FLOOR < np.linalg.norm(quat) < math.inf:
+        if not 0.0 < pose.fov <= MAX_FOV or not NORM_FLOOR < math.hypot(*quat[0]) < 1 / NORM_FLOOR:
             return None
         if not np.abs(position).max() <= MAX_COORDINATE:  # this is False for a NaN
             return None
@@ -64,7 +70,7 @@ def camera_of(pose: Pose, longest: int) -> Camera | None:
         focal = 0.5 * height / math.tan(0.5 * pose.fov)
         cam_from_world = np.concatenate([to_world.T, -to_world.T @ position[:, None]], axis=1)
         camera = Camera(width, height, focal, focal, width / 2, height / 2, cam_from_world)
-        return camera.resized(*window_of(pose, longest))
+        return camera.resized(*window_of(pose, longest, enlarge))
     except (InputError, TypeError, ValueError, OverflowError):
         return None
 

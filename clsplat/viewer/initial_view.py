@@ -16,7 +16,7 @@ from ..splats.fields import Array
 Vector = NDArray[np.float64]
 
 _FOV = math.radians(60.0)
-_UP = np.array([0.0, -1.0, 0.0])  # the y axis of a 3DGS world points down, as that of a camera
+UP = np.array([0.0, -1.0, 0.0])  # the y axis of a 3DGS world points down, as that of a camera
 _AWAY = np.array([0.0, -0.7, -2.4])  # camera position in radii of the model
 _FRUSTUM = 0.06  # size of a drawn camera as a share of the spread of all cameras
 
@@ -82,9 +82,10 @@ def initial_view(means: Array, cameras: Sequence[Camera]) -> InitialView:
         )
     middle, radius = np.zeros(3), 1.0
     if len(means):
-        middle = np.median(means, axis=0).astype(np.float64)
-        radius = float(np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)) or 1.0
-    return InitialView(middle + _AWAY * radius, middle, _UP, _FOV)
+        wide = means.astype(np.float64)  # sums and squares of float32 may overflow
+        middle = np.median(wide, axis=0)
+        radius = float(np.quantile(np.linalg.norm(wide - middle, axis=1), 0.9)) or 1.0
+    return InitialView(middle + _AWAY * radius, middle, UP, _FOV)
 
 
 def vertical_fov(camera: Camera, aspect: float | None = None) -> float:

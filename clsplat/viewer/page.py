@@ -1,4 +1,4 @@
-"""The panel of one browser: settings, cameras to jump to, a path to record."""
+"""The panel of one browser: settings, cameras to jump to, and the parts for paths, boxes and help."""
 
 from __future__ import annotations
 
@@ -14,19 +14,41 @@ from viser import transforms
 
 from ..cameras.camera import Camera
 from ..cameras.cameras_json import NamedCamera
-from ..cameras.path import CameraPath
 from ..errors import ClsplatError
+from ..files.images import encode_render
+from ..splats.fields import DoubleArray
 from .camera import Pose, camera_of
-from .initial_view import SceneCameras, vertical_fov
-from .recording import FILE_NAME, MAX_SECONDS, Recording
-from .settings import MAX_SIZE, MIN_SIZE
+from .crop import CropBox
+from .crop_panel import CropPanel
+from .initial_view import UP, SceneCameras, vertical_fov
+from .legend import legend
+from .path_panel import PathPanel
+from .settings import DEFAULT_SIZE, MAX_SIZE, MIN_SIZE
 from .viewer import Viewer, ViewerImage
 
 QUALITY, MOVING_QUALITY = 95, 80  # JPEG quality of still and of moving frames
 _STATUS_INTERVAL = 0.5  # seconds between changes of the status line while moving
 _TRAIN, _TEST = (110, 170, 255), (255, 160, 60)
 _NO_CAMERA = "–"
+_FOVS, _FOV_STEP = (5.0, 150.0), 0.5  # degrees
 _MODES = {"colour": "Colour", "depth": "Depth", "alpha": "Alpha", "splats": "Splats a pixel", "skew": "Skew magnitude"}
+
+# The mouse and the keys are viser's.
+HELP = """
+| | |
+|---|---|
+| **drag** | turn about the point in the middle |
+| **right drag** | move sideways |
+| **wheel** | move nearer or farther |
+| **arrows** | turn |
+| **W S** | forwards, backwards |
+| **A D** | left, right |
+| **E Q** | up, down |
+| **F11** | full screen (the browser's key) |
+
+On a touch screen one finger turns, and two fingers move. Click into the picture before you use the keys. A click on a
+drawn camera jumps to it.
+"""
 
 
 class Page:
@@ -35,7 +57,9 @@ class Page:
     Parameters
     ----------
     reload : reads the model file again and returns a status text, or None if there is no file.
-    folder : folder for saved paths, or None if paths can only be downloaded.
+    folder : folder for saved paths and models, or None if they can only be downloaded.
+    name : of the model, for the files of its pictures.
+    up : upward direction of the scene.
     """
 
     def __init__(
@@ -45,12 +69,13 @@ class Page:
         known: SceneCameras,
         reload: Callable[[], str] | None = None,
         folder: Path | None = None,
+        name: str = "view",
+        up: DoubleArray = UP,
     ) -> None:
         self.client, self.viewer, self.known = client, viewer, known
-        self._reload, self._folder = reload, folder
+        self._reload, self._name = reload, name
         self._cameras = known.by_label
-        self._recording = Recording()
-        self._playing: threading.Event | None = None
+        self._pictures = 0  # sent to this browser
         self._rates: list[float] = []
         self._status_time = 0.0
         self._frusta: list[viser.CameraFrustumHandle] = []
@@ -58,7 +83,12 @@ class Page:
         self._add_settings()
         if known.by_label:
             self._add_cameras()
-        self._add_path()
+        self._path = PathPanel(client, self._here, self._jump, self._try, self.set_status, folder)
+        self._crop = CropPanel(
+            client, lambda: viewer.source.splats, up, self._choose_box, self._try, self.set_status, folder
+        )
+        with client.gui.add_folder("Help", expand_by_default=False):
+            client.gui.add_markdown(HELP)
         viewer.join(client.client_id, self.send)
         self._moved(client.camera)
         client.camera.on_update(self._on_camera)
@@ -66,7 +96,7 @@ class Page:
     def close(self) -> None:
         """Remove the client after the browser has gone."""
         self.viewer.leave(self.client.client_id)
-        self._stop()
+        self._path.stop()
 
     def send(self, frame: ViewerImage) -> None:
         """Show a frame; the serving thread calls this."""
@@ -78,6 +108,7 @@ class Page:
         self._rates = [*(moment for moment in self._rates if now - moment < 1.0), now]
         if frame.still or frame.message or now - self._status_time > _STATUS_INTERVAL:
             self._status_time = now
+            self._show_legend(frame)
             height, width = frame.picture.shape[:2]
             rate = "" if frame.still else f", {len(self._rates)} a second"
             self.set_status(
@@ -93,9 +124,10 @@ class Page:
         """Adapt the slider of splats to the new model."""
         n = self.viewer.source.n_splats
         everything = self._cap.value >= self._cap.max
-        self._cap.max, self._cap.step = max(n, 1), _step(n)
+        self._cap.max, self._cap.step, self._cap.visible = max(n, 1), _step(n), self.viewer.source.partial
         if everything or self._cap.value > n:
             self._cap.value = max(n, 1)
+        self._crop.model_changed()
 
     def _add_settings(self) -> None:
         gui, viewer, source = self.client.gui, self.viewer, self.viewer.source
@@ -104,6 +136,7 @@ class Page:
             labels = {label: mode for mode, label in _MODES.items() if mode in source.modes}
             mode = gui.add_dropdown("Show", tuple(labels), hint="The property of the splats that is shown")
             mode.on_update(lambda _: self._choose("mode", labels.get(mode.value)))
+            self._legend = gui.add_html("", visible=False)
             r, g, b = (round(255 * part) for part in chosen.background)
             ground = gui.add_rgb("Background", (r, g, b))
             ground.on_update(lambda _: self._choose("background", ground.value))
@@ -116,6 +149,10 @@ class Page:
                 hint="Longest side of a still frame in pixels; moving frames adapt",
             )
             size.on_update(lambda _: self._choose("size", size.value))
+            self._fov: Any = gui.add_slider(
+                "Field of view", *_FOVS, _FOV_STEP, 60.0, hint="Vertical angle of the camera in degrees"
+            )
+            self._fov.on_update(lambda _: self._set_fov(self._fov.value))
             if source.sh_degree:
                 degree = gui.add_slider(
                     "SH degree", 0, source.sh_degree, 1, source.sh_degree, hint="Bands of view-dependent colour"
@@ -132,6 +169,13 @@ class Page:
                 visible=source.partial,
             )
             self._cap.on_update(lambda _: self._choose("cap", self._cap.value))
+            longest = gui.add_number(
+                "Picture size", DEFAULT_SIZE, min=MIN_SIZE, max=MAX_SIZE, step=1, hint="Longest side in pixels"
+            )
+            save = gui.add_button(
+                "Download picture", icon=viser.Icon.CAMERA, hint="This view as PNG, with the bytes of clsplat render"
+            )
+            save.on_click(lambda _: self._order_picture(longest.value))
             if self._reload is not None:
                 button = gui.add_button("Read the file again", icon=viser.Icon.REFRESH)
                 button.on_click(lambda _: self._do_reload())
@@ -146,43 +190,50 @@ class Page:
             jump = gui.add_dropdown("Jump to", (_NO_CAMERA, *self._cameras))
             jump.on_update(lambda _: self._jump(self._cameras.get(jump.value)))
 
-    def _add_path(self) -> None:
-        gui, recording = self.client.gui, self._recording
-        with gui.add_folder("Camera path", expand_by_default=False):
-            keys = gui.add_markdown("No keys")
-
-            def changed(done: Callable[[], object]) -> Callable[[object], None]:
-                def on_click(_: object) -> None:
-                    self._try(done)
-                    n = len(recording.keys)
-                    keys.content = f"{n or 'No'} {'key' if n == 1 else 'keys'}"
-
-                return on_click
-
-            gui.add_button("Add a key", icon=viser.Icon.PLUS).on_click(changed(self._add_key))
-            gui.add_button("Remove the last key").on_click(changed(recording.remove_last))
-            gui.add_button("Remove all keys").on_click(changed(recording.clear))
-            seconds = gui.add_slider("Seconds a key", 0.5, 10.0, 0.5, recording.seconds)
-            seconds.on_update(lambda _: self._pace(seconds.value))
-            closed = gui.add_checkbox("Closed", False, hint="Go back to the first key")
-            closed.on_update(lambda _: setattr(recording, "closed", bool(closed.value)))
-            gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY).on_click(lambda _: self._try(self._play))
-            gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP).on_click(lambda _: self._stop())
-            download = gui.add_button(
-                "Download", icon=viser.Icon.DOWNLOAD, hint="As camera_path.json, for clsplat render --path"
-            )
-            download.on_click(lambda _: self._try(self._download))
-            if self._folder is not None:
-                save = gui.add_button(
-                    "Save", icon=viser.Icon.DEVICE_FLOPPY, hint="Into the folder that the command names"
-                )
-                save.on_click(lambda _: self._try(self._save))
-
     async def _on_camera(self, camera: viser.CameraHandle) -> None:
         self._moved(camera)
 
     def _moved(self, camera: viser.CameraHandle) -> None:
         self.viewer.move(self.client.client_id, _pose(camera))
+        degrees = math.degrees(camera.fov) if math.isfinite(camera.fov) else 0.0
+        if _FOVS[0] <= degrees <= _FOVS[1] and abs(degrees - self._fov.value) > 0.5 * _FOV_STEP:
+            self._fov.value = _FOV_STEP * round(degrees / _FOV_STEP)
+
+    def _set_fov(self, degrees: Any) -> None:
+        """Change the angle of the camera. The slider is rounded: it does not change an angle that it shows."""
+        eye = self.client.camera
+        if math.isfinite(degrees) and abs(math.degrees(eye.fov) - degrees) > 0.5 * _FOV_STEP:
+            eye.fov = math.radians(min(max(degrees, _FOVS[0]), _FOVS[1]))
+            self._moved(eye)
+
+    def _here(self) -> Camera | None:
+        return camera_of(_pose(self.client.camera), MAX_SIZE)
+
+    def _choose_box(self, box: CropBox | None) -> None:
+        self.viewer.choose(self.client.client_id, "crop", box)
+
+    def _show_legend(self, frame: ViewerImage) -> None:
+        """Show the colour bar of a frame."""
+        bar = "" if frame.message else legend(self.viewer.settings_of(self.client.client_id).mode, frame.near_far)
+        if bar != self._legend.content:
+            self._legend.content, self._legend.visible = bar, bool(bar)
+
+    def _order_picture(self, size: Any) -> None:
+        """Send the view as a PNG file, as soon as it is rendered."""
+        if isinstance(size, (int, float)) and math.isfinite(size):
+            longest = round(min(max(size, MIN_SIZE), MAX_SIZE))
+            self.viewer.order_picture(self.client.client_id, longest, self._send_picture)
+
+    def _send_picture(self, frame: ViewerImage) -> None:
+        if frame.message:
+            self.set_status(frame.message)
+        else:  # packing a large picture takes longer than a frame
+            threading.Thread(target=self._pack, args=(frame,), daemon=True).start()
+
+    def _pack(self, frame: ViewerImage) -> None:
+        self._pictures += 1
+        name = f"{self._name}_{self._pictures:03}.png"
+        self.client.send_file_download(name, encode_render(frame.picture), save_immediately=True)
 
     def _choose(self, name: str, value: Any) -> None:
         if name == "cap" and isinstance(value, (int, float)) and value >= self._cap.max:
@@ -234,39 +285,6 @@ class Page:
         except ValueError as error:  # the browser has reported an unusable camera
             self.set_status(f"cannot go there: {error}")
         self.client.flush()
-
-    def _add_key(self) -> None:
-        camera = camera_of(_pose(self.client.camera), MAX_SIZE)
-        if camera is not None:
-            self._recording.add(camera)
-
-    def _pace(self, seconds: Any) -> None:
-        if math.isfinite(seconds):
-            self._recording.seconds = min(max(float(seconds), 0.1), MAX_SECONDS)
-
-    def _play(self) -> None:
-        self._stop()
-        path, self._playing = self._recording.path(), threading.Event()
-        threading.Thread(target=self._walk, args=(path, self._playing), daemon=True).start()
-
-    def _walk(self, path: CameraPath, stop: threading.Event) -> None:
-        start = time.monotonic()
-        while not stop.wait(1.0 / path.fps):
-            frame = int((time.monotonic() - start) * path.fps)
-            self._jump(path.cameras[min(frame, len(path.cameras) - 1)])
-            if frame >= len(path.cameras) - 1:
-                return
-
-    def _stop(self) -> None:
-        if self._playing is not None:
-            self._playing.set()
-
-    def _download(self) -> None:
-        self.client.send_file_download(FILE_NAME, self._recording.text().encode())
-
-    def _save(self) -> None:
-        assert self._folder is not None
-        self.set_status(f"saved as {self._recording.save(self._folder).name}")
 
     def _try(self, action: Callable[[], object]) -> None:
         """Run an action and show the message of an error that a user can fix."""

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from ..cameras.camera import Camera
 from ..cameras.interpolate import interpolate
 from ..cameras.path import DEFAULT_FPS, CameraPath, path_text, write_path
 from ..errors import InputError
+from .numbered import save_numbered
 
 MAX_KEYS = 1000
 MAX_SECONDS = 60.0  # between two keys
 FILE_NAME = "camera_path.json"
-_NUMBERED = re.compile(r"camera_path_(\d+)\.json")
 
 
 class Recording:
@@ -65,8 +64,4 @@ class Recording:
     def save(self, folder: Path) -> Path:
         """Write the path into a folder under a free name and return it. Raises InputError and OutputError."""
         path = self.path()
-        found = (_NUMBERED.fullmatch(file.name) for file in folder.glob("camera_path_*.json"))
-        last = max((int(match[1]) for match in found if match), default=0)
-        target = folder / f"camera_path_{last + 1:03}.json"
-        write_path(target, path)
-        return target
+        return save_numbered(folder, "camera_path", ".json", lambda target: write_path(target, path))

@@ -1,25 +1,25 @@
-"""The web server of the viewer: a panel for each browser. Only this module and `page` import viser."""
+"""The web server of the viewer: a panel for each browser. `listen` opens it."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-import logging
 import socket
 import threading
 import time
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import viser
 
-from ..errors import OutputError
+from .access import access_for
 from .initial_view import InitialView, SceneCameras, Vector
+from .listen import open_server
 from .page import Page, plain
 from .viewer import Viewer
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
+ANY_HOST = ("0.0.0.0", "::", "")  # every address of the machine
 _BRAND = (17, 137, 151)
 NO_CAMERAS = SceneCameras()
 _FLUSH_TIME = 0.1  # seconds for the last messages before the server stops
@@ -31,10 +31,12 @@ class Server:
     Parameters
     ----------
     host, port : address of the server; port 0 chooses a free one.
-    title : title of the panel.
+    names : more host names under which browsers reach it, for a proxy.
+    token : require the token of `url` even if only this machine reaches the server. Otherwise it is always required.
+    name : of the model, for the title of the panel and for files.
     start : the first view of a browser.
     reload : reads the model file again and returns a status text, or None if there is no file.
-    folder : folder for saved paths, or None if paths can only be downloaded.
+    folder : folder for saved paths and models, or None if they can only be downloaded.
 
     Raises
     ------
@@ -49,16 +51,20 @@ class Server:
         *,
         host: str = DEFAULT_HOST,
         port: int = DEFAULT_PORT,
-        title: str = "clsplat",
+        names: Sequence[str] = (),
+        token: bool = False,
+        name: str = "view",
         reload: Callable[[], str] | None = None,
         folder: Path | None = None,
     ) -> None:
         self.viewer, self._known, self._reload, self._folder = viewer, known, reload, folder
+        self._name, self._up = name, start.up
         self._pages: dict[int, Page] = {}
         self._lock = threading.Lock()
-        self.server = _opened(host, port)
+        self.access = access_for(host, names, token)
+        self.server = open_server(host, port, self.access)
         self.host, self.port = host, self.server.get_port()
-        self.server.gui.set_panel_label(title)
+        self.server.gui.set_panel_label(f"clsplat: {name}")
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=_BRAND)
         self.server.scene.set_up_direction(_triple(start.up))
         first = self.server.initial_camera
@@ -70,25 +76,37 @@ class Server:
 
     @property
     def url(self) -> str:
-        """Address for a browser."""
-        host = "localhost" if self.host in ("0.0.0.0", "::", "") else self.host
-        return f"http://[{host}]:{self.port}" if ":" in host else f"http://{host}:{self.port}"
+        """Address for a browser on this machine, with the token if one is needed."""
+        return self._url("localhost" if self.host in ANY_HOST else self.host)
 
-    def add_training(self, toggle: Callable[[], bool]) -> None:
-        """Add the status line of a run and a pause button for all browsers.
+    @property
+    def urls(self) -> tuple[str, ...]:
+        """Addresses for browsers: on this machine, and on others if they reach the server under another name."""
+        return (self.url, self._url(socket.gethostname())) if self.host in ANY_HOST else (self.url,)
 
-        `toggle` pauses or resumes the run and returns whether it is paused now.
-        """
+    def _url(self, host: str) -> str:
+        name = f"[{host}]" if ":" in host else host
+        return f"http://{name}:{self.port}{self.access.query}"
+
+    def add_training(self, toggle: Callable[[], None]) -> None:
+        """Add the status line of a run and a button for all browsers, which calls `toggle` to pause or resume it."""
         with self.server.gui.add_folder("Training", order=-1.0):
             label = self.server.gui.add_markdown("")
             button = self.server.gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self._panel = label, button
+        button.on_click(lambda _: toggle())
 
-        @button.on_click
-        def _(_: object) -> None:
-            paused = toggle()
+    def show_paused(self, paused: bool) -> None:
+        """Label the button of a run."""
+        if self._panel is not None:
+            button = self._panel[1]
             button.label = "Resume" if paused else "Pause"
             button.icon = viser.Icon.PLAYER_PLAY if paused else viser.Icon.PLAYER_PAUSE
+
+    def end_training(self) -> None:
+        """Remove the button of a run that has ended."""
+        if self._panel is not None:
+            self._panel[1].visible = False
 
     def set_training_status(self, text: str) -> None:
         """Set the status line of the run."""
@@ -120,7 +138,7 @@ class Server:
             return list(self._pages.values())
 
     def _connect(self, client: viser.ClientHandle) -> None:
-        page = Page(client, self.viewer, self._known, self._reload, self._folder)
+        page = Page(client, self.viewer, self._known, self._reload, self._folder, self._name, self._up)
         with self._lock:
             self._pages[client.client_id] = page
         if client.client_id not in self.server.get_clients():  # the browser left before its panel was complete
@@ -131,42 +149,6 @@ class Server:
             page = self._pages.pop(client.client_id, None)
         if page is not None:
             page.close()
-
-
-class _Private(viser.ViserServer):
-    """A viser server without the relay that would make the page public at the request of a browser."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        return None
-
-
-def _opened(host: str, port: int) -> viser.ViserServer:
-    """Open a server at exactly this address; viser alone would take the next free port."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        with socket.socket(family) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-    except (OSError, OverflowError) as error:
-        raise _refusal(host, port, getattr(error, "strerror", None) or str(error)) from None
-    # Broken connections log noise; the panel shows what matters.
-    for name in ("websockets", "websockets.server"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    for message in ("Queued a .* on a closed connection", r"\[viser\]"):
-        warnings.filterwarnings("ignore", message=message)
-    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a greeting
-        server = _Private(host, port, verbose=False)
-    if port and server.get_port() != port:  # another program took the port in between
-        server.stop()
-        raise _refusal(host, port, "taken by another program")
-    # A malformed message of a browser is dropped without a traceback.
-    loop = server.get_event_loop()
-    loop.call_soon_threadsafe(loop.set_exception_handler, lambda *_: None)
-    return server
-
-
-def _refusal(host: str, port: int, reason: str) -> OutputError:
-    return OutputError(f"{host}:{port}: cannot listen on this address ({reason}); choose another --port or --host")
 
 
 def _triple(values: Vector) -> tuple[float, float, float]:

@@ -6,7 +6,6 @@ import importlib
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,10 +14,12 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.cameras_json import named_cameras
 from ..errors import ClsplatError, InputError
+from ..files.real_path import real_path
 from ..models.model import LoadedModel, SceneChoice, in_both_forms
 from ..splats.color import Color
 from ..training.folder import ModelFolder
 from .initial_view import SceneCameras, initial_view
+from .options import ServerOptions
 from .settings import Settings
 from .source import ModelSource, ModelWatcher
 from .viewer import Viewer
@@ -27,22 +28,6 @@ if TYPE_CHECKING:
     from .server import Server
 
 POLL = 1.0  # seconds between checks of the file
-
-
-@dataclass(frozen=True)
-class ServerOptions:
-    """The address of a viewer.
-
-    Parameters
-    ----------
-    host : address to listen at; 0.0.0.0 lets every machine that reaches this one look.
-    port : port to listen at; 0 takes any free one.
-    paths : folder for recorded camera paths; None only lets browsers download them.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 8080
-    paths: Path | None = None
 
 
 class ViewingSession:
@@ -90,7 +75,9 @@ class ViewingSession:
             known,
             host=options.host,
             port=options.port,
-            title=f"clsplat: {model.path.resolve().name}",
+            names=options.names,
+            token=options.token,
+            name=real_path(model.path).stem,
             reload=self.reload,
             folder=options.paths,
         )
@@ -138,7 +125,7 @@ class ViewingSession:
 def known_cameras(model: LoadedModel, scene: SceneChoice | None = None) -> SceneCameras:
     """Cameras of the scene that is chosen, else those in the model folder. A file alone does not have cameras."""
     if scene:
-        loaded = model.load_scene(scene)
+        loaded = model.load_scene(scene, check=False)
         cameras, test_names = named_cameras(loaded.names, loaded.cameras), loaded.test_names
     else:
         cameras, test_names = model.read_cameras(), model.test_names or frozenset()

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NoReturn
 
 from ..splats.color import BLACK, Color
+from .crop import CropBox
 
 MIN_SIZE, MAX_SIZE = 64, 4096  # longest side of a picture [px]
 DEFAULT_SIZE = 1920
@@ -24,6 +25,7 @@ class Settings:
     size : longest side of a still frame [px]; a smaller window has smaller frames.
     sh_degree : highest SH band that is shown, or None for all.
     cap : number of splats that are shown, or None for all. Those that cover most are shown first.
+    crop : box that hides the splats outside of it, or None.
     """
 
     mode: str = "colour"
@@ -31,6 +33,7 @@ class Settings:
     size: int = DEFAULT_SIZE
     sh_degree: int | None = None
     cap: int | None = None
+    crop: CropBox | None = None
 
     def changed(self, name: str, value: Any, modes: tuple[str, ...]) -> Settings:
         """Return the settings with one value of a browser; the same settings if the value is unusable.
@@ -45,6 +48,7 @@ class Settings:
             "size": lambda size: _whole(size, MIN_SIZE, MAX_SIZE),
             "sh_degree": lambda degree: _whole(degree, 0, 3),
             "cap": lambda cap: _whole(cap, 0, 1 << 31),
+            "crop": lambda box: box if box is None or isinstance(box, CropBox) else _unusable(),
         }
         try:
             return replace(self, **{name: checks[name](value)})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -13,13 +14,22 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..errors import ClsplatError, InputError
-from ..rendering.colormaps import MODES, Picture, model_for, picture
-from ..rendering.renderer import Renderer
+from ..rendering.colormaps import MODES, Picture, depth_picture, depth_range, model_for, picture
+from ..rendering.renderer import Rendered, Renderer
 from ..splats.shapes import shape_named
 from ..splats.splats import Splats
+from .crop import CropBox
 from .settings import Settings
 
 KEPT = 4  # models on the device at once: parts for clients with another cap or mode
+
+
+@dataclass(frozen=True)
+class ViewPicture:
+    """A picture and the depths at the two ends of its colours, None if it does not show depth."""
+
+    picture: Picture
+    near_far: tuple[float, float] | None = None
 
 
 class Source(Protocol):
@@ -29,6 +39,11 @@ class Source(Protocol):
     ----------
     modes : modes from `colormaps.MODES`. partial : whether a part of the splats can be shown.
     """
+
+    @property
+    def splats(self) -> Splats | None:
+        """The model on the host; None during a run."""
+        ...
 
     @property
     def n_splats(self) -> int: ...
@@ -42,7 +57,7 @@ class Source(Protocol):
     @property
     def partial(self) -> bool: ...
 
-    def picture(self, camera: Camera, settings: Settings) -> Picture:
+    def view(self, camera: Camera, settings: Settings) -> ViewPicture:
         """Return the view of a camera, in the size of its image."""
 
 
@@ -81,12 +96,23 @@ class ModelSource:
         return self.splats.sh_degree
 
     def picture(self, camera: Camera, settings: Settings) -> Picture:
-        """Return the view of a camera; with full settings it has the bytes of `clsplat render`."""
+        """Return the picture of a camera; with full settings it has the bytes of `clsplat render`."""
+        return self.view(camera, settings).picture
+
+    def view(self, camera: Camera, settings: Settings) -> ViewPicture:
+        """Return the view of a camera."""
+        mode, background, degree = settings.mode, settings.background, settings.sh_degree
         with self._rendering:
-            splats = self._shown.part(settings.cap, settings.mode)
-            return picture(
-                self.renderer, splats, camera, settings.mode, settings.background, sh_degree=settings.sh_degree
-            )
+            splats = self._shown.part(settings.cap, mode, settings.crop)
+            if mode == "depth":
+                return depth_view(self.renderer.render(splats, camera, background, degree), settings)
+            return ViewPicture(picture(self.renderer, splats, camera, mode, background, sh_degree=degree))
+
+
+def depth_view(image: Rendered, settings: Settings) -> ViewPicture:
+    """Return the depth of a rendered image in colours, with the range of its depths."""
+    near_far = depth_range(image)
+    return ViewPicture(depth_picture(image, near_far, settings.background), near_far)
 
 
 class _Shown:
@@ -95,24 +121,29 @@ class _Shown:
     def __init__(self, splats: Splats, keep: int) -> None:
         self.splats, self._keep = splats, keep
         self._order: NDArray[np.intp] | None = None
-        self._parts: dict[tuple[int, bool], Splats] = {}
+        self._parts: dict[tuple[int, bool, CropBox | None], Splats] = {}
 
-    def part(self, cap: int | None, mode: str) -> Splats:
-        """Return the `cap` splats that cover most, in the order of the file, coloured for the mode."""
+    def part(self, cap: int | None, mode: str, crop: CropBox | None = None) -> Splats:
+        """Return the `cap` splats of the box that cover most, in the order of the file, coloured for the mode."""
         n = len(self.splats) if cap is None else min(cap, len(self.splats))
         skew = mode == "skew"
-        if n == len(self.splats) and not skew:
+        if n == len(self.splats) and not skew and crop is None:
             return self.splats
-        part = self._parts.pop((n, skew), None)
+        part = self._parts.pop((n, skew, crop), None)
         if part is None:
-            if self._order is None:
-                self._order = np.argsort(-coverage(self.splats), kind="stable")
-            part = self.splats if n == len(self.splats) else self.splats.select(np.sort(self._order[:n]))
-            part = model_for(part, mode)
+            part = model_for(self._chosen(n, crop), mode)
             while len(self._parts) >= self._keep - 1:
                 del self._parts[next(iter(self._parts))]
-        self._parts[n, skew] = part
+        self._parts[n, skew, crop] = part
         return part
+
+    def _chosen(self, n: int, crop: CropBox | None) -> Splats:
+        if n == len(self.splats):
+            return self.splats if crop is None else self.splats.select(crop.contains(self.splats.mean))
+        if self._order is None:
+            self._order = np.argsort(-coverage(self.splats), kind="stable")
+        order = self._order if crop is None else self._order[crop.contains(self.splats.mean)[self._order]]
+        return self.splats.select(np.sort(order[:n]))
 
 
 def coverage(splats: Splats) -> NDArray[np.float64]:

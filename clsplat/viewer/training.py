@@ -1,4 +1,4 @@
-"""View of a training run: frames between iterations, within a share of the time."""
+"""ViewPicture of a training run: frames between iterations, within a share of the time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from ..cameras.camera import Camera
 from ..errors import InputError
-from ..rendering.colormaps import MODES, Picture, model_for, picture, picture_of
+from ..rendering.colormaps import MODES, model_for, picture, picture_of
 from ..rendering.overdraw import splats_per_pixel
 from ..rendering.pipeline import Pipeline
 from ..rendering.renderer import read_frame
@@ -17,6 +17,7 @@ from ..training.config import TrainConfig
 from ..training.log import Progress
 from ..training.trainer import Trainer
 from .settings import Settings
+from .source import Source, ViewPicture, depth_view
 from .viewer import FRAME_TIME, Viewer
 
 SHARE = 0.015  # share of the run time for frames; messages of browsers take one or two hundredths more
@@ -24,6 +25,7 @@ TRAINING_FRAME_TIME = 0.025  # seconds for a frame of a moving camera, short so 
 _MAX_CREDIT = 0.2  # seconds of frames that are saved up for a moving camera
 _REFRESH = 2.0  # seconds between frames of a still camera
 _PAUSE_STEP = 0.1  # seconds between checks for Ctrl-C during a pause
+_GRACE = 5.0  # seconds without a browser that end a pause; a page that is loaded again is back before
 
 
 class TrainingSource:
@@ -31,6 +33,7 @@ class TrainingSource:
 
     modes = MODES
     partial = False  # a part would need a copy of the splats
+    splats = None
 
     def __init__(self, config: TrainConfig) -> None:
         self._config = config
@@ -51,21 +54,23 @@ class TrainingSource:
     def sh_degree(self) -> int:
         return self._config.sh_degree
 
-    def picture(self, camera: Camera, settings: Settings) -> Picture:
+    def view(self, camera: Camera, settings: Settings) -> ViewPicture:
         """Return the view of a camera. Raises InputError before the first iteration."""
         trainer, pipeline = self._trainer, self._pipeline
         if trainer is None or pipeline is None:
             raise InputError("training has not begun yet")
         if settings.mode == "skew":
             shown = model_for(trainer.snapshot(), settings.mode)
-            return picture(trainer.renderer, shown, camera, settings.mode, settings.background)
+            return ViewPicture(picture(trainer.renderer, shown, camera, settings.mode, settings.background))
         degree = trainer.sh_degree
         if settings.sh_degree is not None:
             degree = min(degree, settings.sh_degree)
         frame = pipeline.forward(trainer.splats, camera, settings.background, degree)
         image = read_frame(frame)
+        if settings.mode == "depth":
+            return depth_view(image, settings)
         counts = splats_per_pixel(pipeline, frame) if settings.mode == "splats" else None
-        return picture_of(image, settings.mode, settings.background, counts=counts)
+        return ViewPicture(picture_of(image, settings.mode, settings.background, counts=counts))
 
 
 class TrainingView:
@@ -74,28 +79,33 @@ class TrainingView:
     Parameters
     ----------
     share : share of the run time that frames may take.
+    on_pause : called in the trainer's thread with a message when the run is paused (True) or goes on (False).
     """
 
-    def __init__(self, config: TrainConfig, share: float = SHARE, clock: Callable[[], float] = time.monotonic) -> None:
-        self.source = TrainingSource(config)
+    def __init__(
+        self,
+        config: TrainConfig,
+        share: float = SHARE,
+        clock: Callable[[], float] = time.monotonic,
+        on_pause: Callable[[bool, str], None] = lambda paused, message: None,
+    ) -> None:
+        self.source: Source = TrainingSource(config)
         self.viewer = Viewer(self.source, Settings(background=config.background), TRAINING_FRAME_TIME, clock)
+        self.on_pause = on_pause
         self._share, self._clock = share, clock
         self._paused = threading.Event()
         self._credit, self._left, self._refreshed, self._cost = 0.0, math.inf, -math.inf, 0.0
 
-    def toggle(self) -> bool:
-        """Pause or resume the run; return whether it is paused now."""
+    def toggle(self) -> None:
+        """Pause or resume the run at its next iteration."""
         if self._paused.is_set():
             self._paused.clear()
-            self.viewer.set_frame_time(TRAINING_FRAME_TIME)
         else:
             self._paused.set()
-            self.viewer.set_frame_time(FRAME_TIME)
-        return self._paused.is_set()
 
     def visit(self, trainer: Trainer, stop: threading.Event) -> None:
         """Serve a frame between two iterations if one is due and there is time; during a pause serve all of them."""
-        self.source.attach(trainer)
+        self._attach(trainer)
         now = self._clock()
         self._credit = min(self._credit + self._share * max(now - self._left, 0.0), _MAX_CREDIT)
         if self._credit > 0.0:
@@ -111,9 +121,35 @@ class TrainingView:
                 spent = self._clock() - start
                 self._credit -= spent
                 self._cost = min(spent, _MAX_CREDIT) if fresh else self._cost
+        if self._paused.is_set() and not stop.is_set():
+            self._wait(trainer.iteration, stop)
+        self._left = self._clock()
+
+    def finish(self, source: Source) -> None:
+        """Show the result of the run from now on; `viewer.run` serves it."""
+        self.source = self.viewer.source = source
+        self.viewer.set_frame_time(FRAME_TIME)
+
+    def _attach(self, trainer: Trainer) -> None:
+        if isinstance(self.source, TrainingSource):
+            self.source.attach(trainer)
+
+    def _wait(self, iteration: int, stop: threading.Event) -> None:
+        """Serve frames until the pause ends: by its button, by Ctrl-C, or because nobody watches any more."""
+        self.viewer.set_frame_time(FRAME_TIME)
+        self.on_pause(True, f"iteration {iteration}: paused by the viewer")
+        watched = self._clock()
+        reason = "the viewer resumed the run"
         while self._paused.is_set() and not stop.is_set():
             self.viewer.serve(_PAUSE_STEP)
-        self._left = self._clock()
+            if self.viewer.count:
+                watched = self._clock()
+            elif self._clock() - watched > _GRACE:
+                self._paused.clear()
+                reason = "the run goes on, because nobody watches it any more"
+        self.viewer.set_frame_time(TRAINING_FRAME_TIME)
+        if not stop.is_set():
+            self.on_pause(False, f"iteration {iteration}: {reason}")
 
 
 def run_line(progress: Progress) -> str:

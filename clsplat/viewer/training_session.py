@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -10,9 +12,12 @@ from ..cameras.cameras_json import NamedCamera
 from ..scenes.scene import Scene
 from ..training.config import TrainConfig
 from ..training.log import Progress
+from ..training.run import Model
 from ..training.trainer import Visit
 from .initial_view import SceneCameras, initial_view
-from .session import ServerOptions, require_viser
+from .options import ServerOptions
+from .session import POLL, require_viser
+from .source import ModelSource
 from .training import TrainingView, run_line
 
 if TYPE_CHECKING:
@@ -26,7 +31,7 @@ class TrainingSession:
 
     Attributes
     ----------
-    url : the page's address. visit : renders between iterations.
+    urls : addresses of the page, as `Server.urls`. visit : renders between iterations.
 
     Raises
     ------
@@ -44,7 +49,9 @@ class TrainingSession:
             tuple(NamedCamera(view.name, view.camera) for view in scene.test),
         )
         cameras = [item.camera for item in (*known.train, *known.test)]
-        self._training = TrainingView(config)
+        self._config = config
+        self._display: Callable[[Progress], None] = lambda progress: None
+        self._training = TrainingView(config, on_pause=self._say_pause)
         self.visit: Visit = self._training.visit
         self._server: Server = Server(
             self._training.viewer,
@@ -52,10 +59,12 @@ class TrainingSession:
             known,
             host=options.host,
             port=options.port,
-            title=f"clsplat: {name}",
+            names=options.names,
+            token=options.token,
+            name=name,
         )
         self._server.add_training(self._training.toggle)
-        self.url = self._server.url
+        self.urls = self._server.urls
 
     def __enter__(self) -> TrainingSession:
         return self
@@ -69,9 +78,33 @@ class TrainingSession:
 
     def progress(self, display: Callable[[Progress], None]) -> Callable[[Progress], None]:
         """A `progress` callback that passes its argument to `display` and to the page."""
+        self._display = display
+        return self._report
 
-        def report(progress: Progress) -> None:
-            display(progress)
-            self._server.set_training_status(run_line(progress))
+    def stay(self, model: Model) -> None:
+        """Show a finished model, until interrupted or until `stop`."""
+        self._training.finish(ModelSource(model.splats, self._config.device))
+        self._server.end_training()
+        self._server.set_training_status(f"iteration {model.iteration}: the run has finished")
+        self._server.model_changed()
+        worker = threading.Thread(target=self._training.viewer.run, daemon=True)
+        worker.start()
+        try:
+            while worker.is_alive():
+                worker.join(POLL)
+        finally:
+            self._training.viewer.close()
+            worker.join(5.0)
 
-        return report
+    def stop(self) -> None:
+        """End `stay`."""
+        self._training.viewer.close()
+
+    def _report(self, progress: Progress) -> None:
+        self._display(progress)
+        self._server.set_training_status(run_line(progress))
+
+    def _say_pause(self, paused: bool, message: str) -> None:
+        iterations = self._config.iterations
+        self._report(Progress(0, iterations, math.nan, math.nan, 0, 0.0, 0.0, message))
+        self._server.show_paused(paused)

@@ -35,12 +35,14 @@ class ViewerImage:
     ----------
     still : whether the camera rests, so that the frame has full size. seconds : time that the frame took.
     message : the fault if the frame could not be rendered, or "".
+    near_far : depths at the two ends of the colours, None if the picture does not show depth.
     """
 
     picture: Picture
     still: bool
     seconds: float
     message: str = ""
+    near_far: tuple[float, float] | None = None
 
 
 @dataclass
@@ -52,6 +54,7 @@ class ViewerClient:
     pose: Pose | None = None
     moved: float = -math.inf
     resolution: AdaptiveResolution = field(default_factory=lambda: AdaptiveResolution(FRAME_TIME))
+    order: tuple[int, Callable[[ViewerImage], None]] | None = None  # size and receiver of a picture to save
 
 
 class Viewer:
@@ -98,6 +101,13 @@ class Viewer:
         if client is not None:
             self._change(client_id, settings=client.settings.changed(name, value, self.source.modes))
 
+    def order_picture(self, client_id: int, size: int, receive: Callable[[ViewerImage], None]) -> None:
+        """Render a client's view once with a longest side of `size` px. The serving thread calls `receive` with it."""
+        client = self._clients.get(client_id)
+        if client is not None:
+            client.order = size, receive
+            self.queue.request(client_id)
+
     def set_frame_time(self, seconds: float) -> None:
         """Set the time allowed for a frame of a moving camera."""
         with self._lock:
@@ -128,6 +138,10 @@ class Viewer:
             return False
         pose, settings = client.pose, client.settings
         start = self._clock()
+        order, client.order = client.order, None
+        if order is not None:
+            order[1](self._render(pose, settings, order[0], True, start, enlarge=True))
+            start = self._clock()
         resting = start - client.moved
         still = resting >= REST
         size = settings.size if still else max(round(client.resolution.scale * max(window_of(pose, settings.size))), 1)
@@ -165,13 +179,16 @@ class Viewer:
         """Return the number of moving cameras, which share the time, but at least 1."""
         return max(sum(now - client.moved < REST for client in list(self._clients.values())), 1)
 
-    def _render(self, pose: Pose, settings: Settings, size: int, still: bool, start: float) -> ViewerImage:
+    def _render(
+        self, pose: Pose, settings: Settings, size: int, still: bool, start: float, enlarge: bool = False
+    ) -> ViewerImage:
         """Render a frame; return a blank one with a message if that fails."""
         message = ""
         try:
-            camera = camera_of(pose, size)
+            camera = camera_of(pose, size, enlarge)
             if camera is not None:
-                return ViewerImage(self.source.picture(camera, settings), still, self._clock() - start)
+                view = self.source.view(camera, settings)
+                return ViewerImage(view.picture, still, self._clock() - start, near_far=view.near_far)
         except ClsplatError as error:
             message = str(error)
         except Exception as error:  # such as a fault of the driver; the server must go on
