@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from clsplat.errors import InputError
+from clsplat.files.existing import refuse_existing
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
-from .options import PATH, device_option, is_given, scene_options
+from .options import PATH, device_option, is_given, overwrite_option, scene_options
 from .progress import table
 
 if TYPE_CHECKING:
@@ -36,18 +37,39 @@ _NEAR = 0.5  # smallest fraction of a limit that counts as the limit of a stage
 )
 @click.option(
     "--splats",
-    type=click.IntRange(min=1),
+    type=click.IntRange(1, 20_000_000),
     metavar="N",
     help=f"Number of random splats; with -s the maximum number of the scene's points.  [default: {SPLATS}; "
     "with -s all]",
 )
-@click.option("--width", type=click.IntRange(min=16), default=WIDTH, show_default=True, help="Without -s [px].")
-@click.option("--height", type=click.IntRange(min=16), default=HEIGHT, show_default=True, help="Without -s [px].")
 @click.option(
-    "--shape", type=click.Choice(tuple(SHAPES)), help=f"The splat kernel.  [default: {DEFAULT_SHAPE}, or the model's]"
+    "--width",
+    type=click.IntRange(16, 8192),
+    default=WIDTH,
+    show_default=True,
+    metavar="N",
+    help="Width of the image, without -s [px].",
 )
 @click.option(
-    "--sh-degree", type=click.IntRange(0, 3), default=3, show_default=True, help="Degree of spherical harmonics."
+    "--height",
+    type=click.IntRange(16, 8192),
+    default=HEIGHT,
+    show_default=True,
+    metavar="N",
+    help="Height of the image, without -s [px].",
+)
+@click.option(
+    "--shape",
+    type=click.Choice(tuple(SHAPES)),
+    help=f"Kernel of the splats.  [default: {DEFAULT_SHAPE}, or the model's]",
+)
+@click.option(
+    "--sh-degree",
+    type=click.IntRange(0, 3),
+    default=3,
+    show_default=True,
+    metavar="N",
+    help="Degree of the spherical harmonics.",
 )
 @click.option(
     "--iterations",
@@ -55,9 +77,11 @@ _NEAR = 0.5  # smallest fraction of a limit that counts as the limit of a stage
     type=click.IntRange(1, 1000),
     default=10,
     show_default=True,
+    metavar="N",
     help="Number of timed iterations; a few more run before them.",
 )
 @click.option("--json", "json_path", type=PATH, metavar="FILE", help="Also write all numbers to this file.")
+@overwrite_option()
 @device_option
 @click.pass_context
 def bench(
@@ -73,6 +97,7 @@ def bench(
     sh_degree: int,
     iterations: int,
     json_path: Path | None,
+    overwrite: bool,
     device: str | None,
 ) -> None:
     """Time each stage of a training step and of an image, and compare it with the limits of the device.
@@ -91,6 +116,7 @@ def bench(
         raise click.UsageError("--width and --height belong to random scenes: use -r with -s")
     if model_path is not None and splats is not None:
         raise click.UsageError("use -m or --splats, not both")
+    refuse_existing([] if json_path is None else [json_path], overwrite)
     opened = open_device(device)
     if source_path is not None:
         scene, start = _read(source_path, images, resolution, model_path, splats)

@@ -15,8 +15,9 @@ import click
 from clsplat import __version__
 from clsplat.errors import InputError
 from clsplat.files.atomic import atomic_writer
+from clsplat.files.existing import refuse_existing
 
-from .options import PATH
+from .options import PATH, overwrite_option
 
 _MANIFEST = "blender_manifest.toml"
 _WHEN = (1980, 1, 1, 0, 0, 0)  # a fixed date, so that the same files make the same zip
@@ -31,7 +32,16 @@ _PLATFORMS = {
 
 
 @click.command()
-@click.option("-o", "--output", type=PATH, default=Path("clsplat-addon.zip"), show_default=True, metavar="FILE")
+@click.option(
+    "-o",
+    "--output",
+    type=PATH,
+    default=Path("clsplat-addon.zip"),
+    show_default=True,
+    metavar="FILE",
+    help="The zip file to write.",
+)
+@overwrite_option()
 @click.option(
     "--wheels",
     type=PATH,
@@ -39,13 +49,14 @@ _PLATFORMS = {
     help="Folder of wheels to put into the zip, except NumPy's. Blender installs them with the add-on, and already "
     "has NumPy.",
 )
-def build_addon(output: Path, wheels: Path | None) -> None:
+def build_addon(output: Path, overwrite: bool, wheels: Path | None) -> None:
     """Build the Blender add-on as a zip: in Blender, Edit > Preferences > Get Extensions > Install from Disk.
 
     The add-on needs clsplat in Blender's own Python: `PYTHON -m pip install FOLDER_OF_CLSPLAT` with the Python that the
     add-on's preferences name. Or put it into the zip: `pip wheel --wheel-dir DIR .` in clsplat's folder with a
     Python of Blender's version, then `clsplat blender-addon --wheels DIR`.
     """
+    refuse_existing([output], overwrite)
     bundled = wheels_in(wheels) if wheels is not None else []
     with atomic_writer(output) as stream:
         stream.write(addon_zip(bundled))

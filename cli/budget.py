@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from clsplat.compression.rules import TOLERANCE, BudgetOptions
+from clsplat.files.stop_signals import exit_code
 from clsplat.training.config import TrainConfig
 
-from .main import INTERRUPTED
 from .options import Decibels, F
 from .progress import TrainingDisplay
 
@@ -46,9 +46,8 @@ def budget_options(function: F) -> F:
         click.option(
             "--budget",
             type=click.Choice(["auto"]),
-            help="Search for the smallest model that keeps the quality of the largest one, on validation views held "
-            "out of the training set. Test views may lose more. --cap-max is the largest number of splats to try. The "
-            "search takes the time of five to nine runs.",
+            help="Search for the smallest model that is as good as the one with --cap-max splats, on views held out of "
+            "training for it. Test views may lose more. The search takes the time of five to nine runs.",
         ),
     ):
         function = option(function)
@@ -118,4 +117,4 @@ def result_lines(result: Budgeted) -> list[str]:
 
 def _report_interruption(ctx: click.Context, model_path: Path) -> NoReturn:
     click.echo(f"interrupted, finished steps are kept; to continue: clsplat train --resume -m {model_path}", err=True)
-    ctx.exit(INTERRUPTED)
+    ctx.exit(exit_code())

@@ -18,12 +18,12 @@ from .options import PATH, iteration_option, overwrite_option, quiet_option
     "--format",
     "form",
     type=click.Choice(CAMERA_FORMATS),
-    help="nerfstudio's and instant-ngp's transforms.json, a COLMAP model (.bin or .txt), or 3DGS's "
+    help="Format: nerfstudio's and instant-ngp's transforms.json, a COLMAP model (.bin or .txt), or 3DGS's "
     "cameras.json.  [default: by OUTPUT: cameras.json, other .json files transforms, else colmap]",
 )
-@click.option("-i", "--images", help="Folder of the photos inside a scene.")
+@click.option("-i", "--images", metavar="NAME", help="Folder of the photos inside a scene, such as images_4.")
 @iteration_option
-@overwrite_option
+@overwrite_option("the files that are there")
 @quiet_option
 def write_cameras_of(
     source: Path,
@@ -36,9 +36,9 @@ def write_cameras_of(
 ) -> None:
     """Write the cameras and points of SOURCE to OUTPUT, a .json file or the folder of a COLMAP model.
 
-    SOURCE is a scene, a model folder, a cameras.json or a camera path. Cameras of a scene keep their lenses, and the
-    files name its photos. Cameras of a model are those of its training images, undistorted and at their reduced size.
-    Their images are named images/NAME.png, and their points are the centres of opaque splats.
+    SOURCE is a scene or its transforms.json, a model folder, a cameras.json or a camera path. Cameras of a scene keep
+    their lenses, and the files name its photos. Cameras of a model are those of its training images, undistorted and at
+    their reduced size. Their images are named images/NAME.png, and their points are the centres of opaque splats.
     """
     from clsplat.models.cameras import export_cameras
 

@@ -9,14 +9,15 @@ import click
 
 from clsplat.comparison.methods import DEFAULT, Method, parse_methods
 from clsplat.errors import InputError
+from clsplat.files.real_path import real_path
 from clsplat.scenes.options import READING_OPTIONS
 from clsplat.splats.color import BLACK
 from clsplat.training.presets import PRESETS
 from clsplat.training.stored_run import load_recorded_scene
 
+from .comparison_options import comparison_sections, grid_options
 from .options import (
     PATH,
-    Numbers,
     TrainingCommand,
     config_options,
     config_values,
@@ -37,30 +38,28 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 
-@click.command("compare", cls=TrainingCommand)
+CAPS = (5000,)
+SYSTEMS = (DEFAULT, *PRESETS)
+
+
+@click.command("compare", cls=TrainingCommand, sections=comparison_sections("save_models"))
 @click.argument("scenes", nargs=-1, required=True, type=PATH)
-@click.option("-o", "--output", required=True, type=PATH, metavar="DIR", help="Folder of the runs and the table.")
-@click.option(
-    "--systems",
-    default=",".join((DEFAULT, *PRESETS)),
-    show_default=True,
-    metavar="NAME,NAME,...",
-    help='Presets, shapes, or "default". Each may have changes, such as sns:alternation=off,skew_map=coupled.',
+@grid_options(
+    output="Folder of the runs and the table.",
+    systems=SYSTEMS,
+    about_systems=(
+        'Presets, shapes, or "default". Each may have changes, such as sns:alternation=off,skew-map=coupled.'
+    ),
+    caps=CAPS,
 )
-@click.option(
-    "--cap-max",
-    "caps",
-    type=Numbers("caps"),
-    multiple=True,
-    help="Caps on the splats: a run for each.  [default: 5000]",
-)
-@click.option("--seeds", type=Numbers("seeds", 0), multiple=True, help="Seeds: a run for each.  [default: 0]")
 @photo_options
 @hiding_options
 @split_options
 @click.option("--save-models", is_flag=True, help="Keep the splats of each run, in DIR/models.")
 @quiet_option
-@config_options("shape", "cap_max", "seed", "save_iterations", "test_iterations", "checkpoint_interval")
+@config_options(
+    "shape", "cap_max", "seed", "save_iterations", "test_iterations", "checkpoint_interval", "checkpoint_minutes"
+)
 @click.pass_context
 def compare_systems(
     ctx: click.Context,
@@ -90,7 +89,7 @@ def compare_systems(
             loaded,
             methods,
             output,
-            distinct_numbers(caps) or [5000],
+            distinct_numbers(caps) or CAPS,
             distinct_numbers(seeds) or [0],
             common,
             save_models=save_models,
@@ -112,7 +111,7 @@ def options_and_scenes(
     configs = [method.config(1, 0, common) for method in methods]
     warn_without_effect(configs, common)
     reading = {key: values[key] for key in READING_OPTIONS if key in values and is_given(ctx, key)} | {"eval": True}
-    names = [path.resolve().name for path in paths]
+    names = [real_path(path).name for path in paths]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two scenes are called {name}: rename one of the folders")

@@ -9,8 +9,9 @@ import click
 
 from clsplat.splats.fields import MAX_SH_DEGREE
 from clsplat.splats.shapes import SHAPES
+from clsplat.splats.spz import VERSIONS as SPZ_VERSIONS
 
-from .options import PATH, device_option, iteration_option, quiet_option
+from .options import PATH, device_option, iteration_option, overwrite_option, quiet_option
 
 if TYPE_CHECKING:
     from clsplat.models.convert import ConversionCost
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 @click.option(
     "--shape",
     type=click.Choice(list(SHAPES)),
-    help="Splat kernel to convert to.  [default: the model's; for .splat and .spz files gaussian]",
+    help="Kernel of the splats to convert to.  [default: the model's; for .splat and .spz files gaussian]",
 )
 @click.option(
     "--approximate",
@@ -32,7 +33,14 @@ if TYPE_CHECKING:
 @click.option(
     "--sh-degree",
     type=click.IntRange(0, MAX_SH_DEGREE),
-    help="Remove the SH bands above, or add bands of zeros: some programs read degree 3 only.",
+    metavar="N",
+    help="Degree of the spherical harmonics: remove the bands above, or add bands of zeros. Some programs read degree "
+    "3 only.",
+)
+@click.option(
+    "--spz-version",
+    type=click.Choice([str(version) for version in SPZ_VERSIONS]),
+    help="Version of an .spz file. Some programs read only one of them.  [default: 3]",
 )
 @click.option(
     "--cameras",
@@ -41,7 +49,7 @@ if TYPE_CHECKING:
     help="A cameras.json with the cameras of the measurement.  [default: that of the model folder]",
 )
 @iteration_option
-@click.option("--overwrite", is_flag=True, help="Replace OUTPUT.")
+@overwrite_option()
 @device_option
 @quiet_option
 def convert_model(
@@ -50,6 +58,7 @@ def convert_model(
     shape: str | None,
     approximate: bool,
     sh_degree: int | None,
+    spz_version: str | None,
     cameras: Path | None,
     iteration: int | None,
     overwrite: bool,
@@ -71,6 +80,7 @@ def convert_model(
         shape,
         approximate=approximate,
         sh_degree=sh_degree,
+        spz_version=None if spz_version is None else int(spz_version),
         iteration=iteration,
         overwrite=overwrite,
     )

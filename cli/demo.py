@@ -22,11 +22,30 @@ ITERATIONS, CAP = 1500, 6000
 
 @click.command()
 @click.argument("out", type=PATH)
-@click.option("--iterations", "--steps", type=click.IntRange(min=1), default=ITERATIONS, show_default=True)
-@click.option("--cap-max", type=click.IntRange(min=1), default=CAP, show_default=True, help="Maximum number of splats.")
-@click.option("--width", type=click.IntRange(min=32), default=200, show_default=True, help="Width of a photo [px].")
-@click.option("--views", type=click.IntRange(min=4), default=40, show_default=True, help="Number of photos.")
-@overwrite_option
+@click.option(
+    "--iterations",
+    "--steps",
+    type=click.IntRange(min=1),
+    default=ITERATIONS,
+    show_default=True,
+    metavar="N",
+    help="Number of training steps.",
+)
+@click.option(
+    "--cap-max",
+    type=click.IntRange(min=1),
+    default=CAP,
+    show_default=True,
+    metavar="N",
+    help="Largest number of splats.",
+)
+@click.option(
+    "--width", type=click.IntRange(32, 4096), default=200, show_default=True, metavar="N", help="Width of a photo [px]."
+)
+@click.option(
+    "--views", type=click.IntRange(4, 1000), default=40, show_default=True, metavar="N", help="Number of photos."
+)
+@overwrite_option("the model and the renders that are there")
 @device_option
 @quiet_option
 @click.pass_context
@@ -53,8 +72,9 @@ def demo(
 
     start = time.perf_counter()
     folder, renders = ModelFolder(out / "model"), out / "renders"
-    if folder.is_used and not overwrite:
-        raise OutputError(f"{folder.path}: already holds a model: use --overwrite or another folder")
+    for made, used in ((folder.path, folder.is_used), (renders, renders.exists())):
+        if used and not overwrite:
+            raise OutputError(f"{made}: exists already: use --overwrite or another folder")
     if not quiet:
         exists = (out / "scene").exists()
         message = f"{out / 'scene'}: exists and is used" if exists else f"making {views} photos in {out / 'scene'}"
@@ -66,7 +86,12 @@ def demo(
         report_interruption(ctx, model)
     with ViewCount("measuring", quiet) as progress:
         measured = evaluate(
-            folder.path, EvaluationOptions(scene_name="the demo"), renders=renders, device=device, progress=progress
+            folder.path,
+            EvaluationOptions(scene_name="the demo"),
+            renders=renders,
+            overwrite=overwrite,
+            device=device,
+            progress=progress,
         )
     result = measured.result
     if quiet:

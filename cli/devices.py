@@ -87,15 +87,23 @@ def hints(platforms: set[str], has_gpu: bool, root: Path = Path("/")) -> list[st
 
 
 def _try(info: DeviceInfo) -> dict[str, str]:
-    """Return the schedule and the result of the smoke test; DeviceError if the device does not work."""
+    """Return the schedule and the result of the smoke test; DeviceError if the device does not work.
+
+    The loss of training is tested, too.
+    """
     from clsplat.device.device import open_device
     from clsplat.device.program import smoke_test
     from clsplat.device.schedule import SCHEDULES
     from clsplat.rendering.tuning import schedule_for
+    from clsplat.training.config import TrainConfig
+    from clsplat.training.loss_check import check_loss
+    from clsplat.training.programs import kernel_build
 
     device = open_device(info.index)
     build_ms, run_ms = smoke_test(device)
     schedule = schedule_for(device)
+    config = TrainConfig()
+    check_loss(device, kernel_build(config, schedule), config.loss.lambda_dssim)
     name = next((name for name, known in SCHEDULES.items() if known == schedule), "set by hand")
     return {
         "schedule": f"{name} ({schedule})",

@@ -10,14 +10,19 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from clsplat.evaluation.metrics import DEFAULT_PROTOCOL, PROTOCOLS, MetricProtocol, protocol_named
+from clsplat.files.real_path import real_path
 
+from .command import SectionedCommand
 from .models import scene_choice
 from .options import (
     PATH,
     background_of,
     background_options,
+    changed_photos_option,
     device_option,
+    hiding_options,
     iteration_option,
+    overwrite_option,
     quiet_option,
     scene_options,
     set_option,
@@ -30,10 +35,45 @@ if TYPE_CHECKING:
 _DIGITS = {"PSNR": 3, "SSIM": 4, "LPIPS": 4, "FLIP": 4}
 
 
-@click.command("eval")
+SECTIONS = {
+    "Common options": (
+        "source_path",
+        "view_set",
+        "resolution",
+        "white_background",
+        "lpips",
+        "flip",
+        "report",
+        "save_renders",
+        "overwrite",
+        "device",
+        "quiet",
+    ),
+    "Models": ("more_models", "iteration", "background"),
+    "Photos": ("images", "masks", "alpha", "test_every", "test_list", "allow_changed_photos"),
+    "Metrics": ("compat", "color_correct"),
+    "Files": ("no_report", "numbers"),
+}
+
+
+@click.command("eval", cls=SectionedCommand, sections=SECTIONS)
 @click.argument("models", nargs=-1, type=PATH)
 @click.option("-m", "--model-path", "more_models", type=PATH, multiple=True, help="The same as an argument.")
 @scene_options
+@hiding_options
+@click.option(
+    "--test-every",
+    type=int,
+    metavar="N",
+    help="Every Nth of the sorted views is a test view, for models that do not record their test views.  [default: 8]",
+)
+@click.option(
+    "--test-list",
+    type=PATH,
+    metavar="FILE",
+    help="Names of the test views, one per line, for models that do not record their test views.",
+)
+@changed_photos_option
 @set_option
 @click.option(
     "--compat",
@@ -55,12 +95,14 @@ _DIGITS = {"PSNR": 3, "SSIM": 4, "LPIPS": 4, "FLIP": 4}
     "--report",
     type=PATH,
     metavar="FILE",
-    help="File of one page that compares the models.  [default: report.html in each model folder]",
+    help="File of one page with all models.  [default: report.html in each model folder, none for files of splats]",
 )
 @click.option("--no-report", is_flag=True, help="Write no page.")
+@click.option("--json", "numbers", type=PATH, metavar="FILE", help="Also write all numbers to this file.")
 @click.option("--save-renders", type=PATH, metavar="DIR", help="Also write the images as PNG.")
 @background_options
 @iteration_option
+@overwrite_option("the files of --report, --json and --save-renders that are there")
 @device_option
 @quiet_option
 def evaluate_models(
@@ -68,8 +110,10 @@ def evaluate_models(
     more_models: tuple[Path, ...],
     report: Path | None,
     no_report: bool,
+    numbers: Path | None,
     save_renders: Path | None,
     iteration: int | None,
+    overwrite: bool,
     device: str | None,
     quiet: bool,
     **values: Any,
@@ -77,16 +121,17 @@ def evaluate_models(
     """Measure MODELS on the test views of their scenes.
 
     Writes results.json, per_view.json and report.html, a page with the images, into each model folder (with --set
-    train or all: results_train.json and so on).
+    train or all: results_train.json and so on). A model may also be a file of splats: name its scene with -s. Nothing
+    is written for it unless --report, --json or --save-renders name a place.
     """
     from clsplat.models import evaluation
 
     paths = (*more_models, *models)
     if not paths:
-        raise click.UsageError("give at least one model folder")
+        raise click.UsageError("give at least one model folder or file of splats")
     if report is not None and no_report:
         raise click.UsageError("give --report or --no-report, not both")
-    if save_renders is not None and len({path.resolve().name for path in paths}) < len(paths):
+    if save_renders is not None and len({real_path(path).name for path in paths}) < len(paths):
         raise click.UsageError("--save-renders: models in folders of the same name; measure them one by one")
     options = evaluation.EvaluationOptions(
         values["view_set"] or "test",
@@ -94,7 +139,7 @@ def evaluate_models(
         values["lpips"],
         values["flip"],
         background_of(values["background"], values["white_background"]),
-        scene_choice(values),
+        replace(scene_choice(values), **{name: values[name] for name in ("masks", "alpha", "test_every", "test_list")}),
         report=not no_report,
     )
     with ViewCount("measuring", quiet) as progress:
@@ -103,7 +148,9 @@ def evaluate_models(
             options,
             comparison=report,
             iteration=iteration,
+            overwrite=overwrite,
             renders=save_renders,
+            numbers=numbers,
             device=device,
             progress=progress,
         )

@@ -11,9 +11,9 @@ from clsplat.comparison.methods import parse_methods
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
 from .compare import distinct_numbers, options_and_scenes, report_run
+from .comparison_options import comparison_sections, grid_options
 from .options import (
     PATH,
-    Numbers,
     TrainingCommand,
     config_options,
     hiding_options,
@@ -30,32 +30,18 @@ CAPS = (1000, 2500, 5000, 10_000)
 SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 
 
-@click.command("frontier", cls=TrainingCommand)
+@click.command("frontier", cls=TrainingCommand, sections=comparison_sections("curve", "repeat", "add", "charts_only"))
 @click.argument("scenes", nargs=-1, type=PATH)
-@click.option("-o", "--output", required=True, type=PATH, metavar="DIR", help="Folder of the runs, charts and page.")
-@click.option(
-    "--systems",
-    default=",".join(SYSTEMS),
-    show_default=True,
-    metavar="NAME,NAME,...",
-    help="Systems as in `clsplat compare`. The first one is the reference for splats at equal quality.",
-)
-@click.option(
-    "--cap-max",
-    "caps",
-    type=Numbers("caps"),
-    multiple=True,
-    help=f"Caps on the splats: a run for each.  [default: {','.join(map(str, CAPS))}]",
-)
-@click.option(
-    "--seeds",
-    type=Numbers("seeds", 0),
-    multiple=True,
-    help="Seeds: a run for each. Three or more also make a chart of their spread.  [default: 0]",
+@grid_options(
+    output="Folder of the runs, charts and page.",
+    systems=SYSTEMS,
+    about_systems="Systems as in `clsplat compare`. The first one is the reference for splats at equal quality.",
+    caps=CAPS,
+    about_seeds=" Three or more also make a chart of their spread.",
 )
 @click.option(
     "--repeat",
-    type=click.IntRange(min=1),
+    type=click.IntRange(1, 1000),
     default=1,
     show_default=True,
     metavar="N",
@@ -63,7 +49,7 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 )
 @click.option(
     "--curve",
-    type=click.IntRange(min=0),
+    type=click.IntRange(0, 1000),
     default=12,
     show_default=True,
     metavar="N",
@@ -81,7 +67,9 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 @hiding_options
 @split_options
 @quiet_option
-@config_options("shape", "cap_max", "seed", "save_iterations", "test_iterations", "checkpoint_interval")
+@config_options(
+    "shape", "cap_max", "seed", "save_iterations", "test_iterations", "checkpoint_interval", "checkpoint_minutes"
+)
 @click.pass_context
 def draw_frontier(
     ctx: click.Context,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,17 +91,19 @@ def scene_rows(info: SceneInfo) -> list[tuple[str, str]]:
     if info.placed:
         placed, photos, error = info.placed
         rows.append(("reconstructed", f"{placed} of {photos} photos, {error:.2f} px off"))
-    if info.unreadable:
-        rows.append(("unreadable", _list_names(info.unreadable)))
+    if info.left_out:
+        share = math.ceil(100 * len(info.left_out) / info.photos)
+        rows.append(("left out", f"{_list_names(tuple(info.left_out))}, {share} %"))
+        rows += [("", reason) for reason in list(info.left_out.values())[:_MAX_LISTED]]
     rows.append(("without a pose", _list_names(info.unregistered) if info.unregistered else "none"))
     rows += [("lens", _lens(lens)) for lens in info.lenses[:_MAX_LISTED]]
     if len(info.lenses) > _MAX_LISTED:
         rows.append(("", f"and {len(info.lenses) - _MAX_LISTED} more lenses"))
     seen = f", each in {info.track_mean:.1f} photos (median {info.track_median:g})" if info.track_mean > 1 else ""
     rows.append(("points", f"{info.points}{seen}"))
-    rows.append(
-        ("test views", f"with --eval {_list_names(info.test)}; {info.photos - len(info.test)} remain for training")
-    )
+    remaining = info.photos - len(info.left_out) - len(info.test)
+    held_out = f"{_list_names(info.test)} with clsplat train --eval; {remaining} remain for training"
+    rows.append(("test views", held_out if info.photos > 1 else "none: clsplat train --eval needs at least 2 photos"))
     rows.append(("masks", f"of {info.masked} photos" if info.masked else "none"))
     return rows
 

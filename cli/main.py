@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import io
+import re
 import sys
 import warnings
 from typing import Any, TextIO
@@ -10,7 +12,10 @@ from typing import Any, TextIO
 import click
 
 from clsplat import __version__
-from clsplat.errors import ClsplatError
+from clsplat.errors import FEWER_SPLATS, OTHER_DEVICE, SMALLER_IMAGES, ClsplatError, Remedy
+from clsplat.files import stop_signals
+
+from .command import nearest_command
 
 # Each command: (module:attribute, line of --help). The table lets --help work without importing the modules.
 COMMANDS = {
@@ -36,7 +41,7 @@ COMMANDS = {
     ),
     "cameras": ("clsplat_cli.cameras:write_cameras_of", "Write the cameras of a scene or a model for other programs."),
 }
-INTERRUPTED = 130  # exit code after Ctrl-C: 128 + SIGINT, as in shells
+_LONGEST_WORD = 400  # characters of a word that a message shows in full; a path may be that long
 
 
 class Commands(click.Group):
@@ -56,24 +61,49 @@ class Commands(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if not args:  # click 8.2 and later would make an error of the help, and `main` would print it as one line
+            click.echo(ctx.get_help(), err=True)
+            ctx.exit(2)
+        return super().parse_args(ctx, args)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError:
+            if args[0].startswith("-"):
+                raise
+            raise click.UsageError(f"no command {args[0]!r}{nearest_command(args[0], list(COMMANDS))}", ctx) from None
+
     def invoke(self, ctx: click.Context) -> Any:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             try:
                 return super().invoke(ctx)
             except KeyboardInterrupt:
-                _fail(ctx, "interrupted", INTERRUPTED)
+                _fail(ctx, stop_signals.reason(), stop_signals.exit_code())
             except ClsplatError as error:
-                _fail(ctx, str(error))
+                _fail(ctx, error.for_command(self._options(ctx)))
             except Exception as error:
-                message = _known_failure(error)
-                if message is None:
+                known = _known_failure(error)
+                if known is None:
                     raise
-                _fail(ctx, message)
+                _fail(ctx, known.for_command(self._options(ctx)))
+
+    def _options(self, ctx: click.Context) -> set[str]:
+        """Return the options of the command that runs."""
+        command = self.get_command(ctx, ctx.invoked_subcommand or "")
+        return {option for param in command.params for option in param.opts} if command else set()
 
     def main(self, *args: Any, **extra: Any) -> Any:
         """Run as click does, but print a wrong command line as one line too (exit code 2)."""
         extra["standalone_mode"] = False
+        for stream in (sys.stdout, sys.stderr):  # names of files need not be text in the terminal's encoding
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
+        stop_signals.forget()
         try:
             code = super().main(*args, **extra)
         except click.UsageError as error:
@@ -84,7 +114,8 @@ class Commands(click.Group):
             click.echo(f"error: {_one_line(error.format_message())}", err=True)
             code = error.exit_code
         except click.Abort:
-            code = INTERRUPTED
+            click.echo(f"error: {stop_signals.reason()}", err=True)
+            code = stop_signals.exit_code()
         sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -98,7 +129,10 @@ class Commands(click.Group):
 )
 @click.version_option(__version__, prog_name="clsplat", message="%(prog)s %(version)s")
 def main() -> None:
-    """Gaussian and skew-normal splatting on any OpenCL device."""
+    """Gaussian and skew-normal splatting on any OpenCL device.
+
+    For a first trial: clsplat demo out. With your photos: clsplat train PHOTOS -m MODEL, then clsplat view MODEL.
+    """
 
 
 def _fail(ctx: click.Context, message: str, code: int = 1) -> None:
@@ -106,20 +140,20 @@ def _fail(ctx: click.Context, message: str, code: int = 1) -> None:
     ctx.exit(code)
 
 
-def _known_failure(error: Exception) -> str | None:
-    """Return the message for an error from outside clsplat. None for a bug in clsplat."""
+def _known_failure(error: Exception) -> ClsplatError | None:
+    """Return the error of clsplat for one from outside. None for a bug in clsplat."""
     if isinstance(error, MemoryError):
-        return "out of memory: lower --cap-max or use smaller images (-r 2, 4, 8)"
+        return ClsplatError("out of memory", FEWER_SPLATS, SMALLER_IMAGES, Remedy("close other programs"))
     if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
-        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        return ClsplatError(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     cl = sys.modules.get("pyopencl")  # if it is not loaded, the error is not from OpenCL
     if cl is None or not isinstance(error, cl.Error):
         return None
     from clsplat.device.opencl import first_line, is_out_of_memory
 
     if is_out_of_memory(error):
-        return "device out of memory: lower --cap-max, use smaller images (-r 2, 4, 8), or another --device"
-    return f"the OpenCL device failed: {first_line(error)}: try `clsplat devices`, or another --device"
+        return ClsplatError("device out of memory", FEWER_SPLATS, SMALLER_IMAGES, OTHER_DEVICE)
+    return ClsplatError(f"the OpenCL device failed: {first_line(error)}", Remedy("try `clsplat devices`"), OTHER_DEVICE)
 
 
 def _show_warning(
@@ -130,10 +164,16 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    if display := sys.modules.get("clsplat.training.progress"):  # if it is not loaded, no live line is shown
+    if display := sys.modules.get("clsplat.training.live_line"):  # if it is not loaded, no live line is shown
         display.LiveLine.give_way()
     click.echo(f"warning: {_one_line(str(message))}", err=True)
 
 
 def _one_line(text: str) -> str:
-    return " ".join(text.split("\n"))
+    """Return a text in one line. Control characters, which could move the cursor or hide words, are escaped.
+
+    Words of hundreds of characters are shortened.
+    """
+    text = " ".join(text.split("\n"))
+    text = re.sub(rf"\S{{{_LONGEST_WORD},}}", lambda word: f"{word[0][:100]}...{word[0][-50:]}", text)
+    return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in text)

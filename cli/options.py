@@ -12,15 +12,35 @@ from typing import Any, TypeVar
 import click
 
 from clsplat.scenes.options import ALPHA_USES
-from clsplat.splats.color import Color
+from clsplat.splats.color import WHITE, Color
 from clsplat.training.config import OPTIONS, SECTIONS, TrainConfig
 from clsplat.training.options.density import STRATEGIES
 from clsplat.training.options.option import Option, option_table
 
+from .command import SectionedCommand, SectionOption
+
 F = TypeVar("F", bound=Callable[..., Any])
 
-PATH = click.Path(path_type=Path)
 SETS = ("test", "train", "all")
+
+
+class AnyPath(click.Path):
+    """A path. An empty one, such as that of an unset variable of the shell, would mean the working directory."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if isinstance(value, str) and (not value or "\0" in value):
+            self.fail(f"{value!r} is not a path: name a file or a folder", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = AnyPath()
+
+
+_DIGITS = 18  # most digits of a whole number in a list
+_MOST_DECIBELS = 1000.0
 
 
 class ColorType(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
@@ -58,7 +78,10 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]
         if isinstance(value, tuple):
             return value
         parts = [part for part in re.split(r"[,\s]+", value) if part]
-        if not parts or not all(part.isdecimal() and int(part) >= self.smallest for part in parts):
+        # A number of thousands of digits is an error of Python's int.
+        if not parts or not all(
+            part.isdecimal() and len(part) <= _DIGITS and int(part) >= self.smallest for part in parts
+        ):
             self.fail(f"{value!r} is not a list of {self.plural}: give for example 1000,2000", param, ctx)
         return tuple(int(part) for part in parts)
 
@@ -72,34 +95,13 @@ class Decibels(click.ParamType):  # type: ignore[type-arg]
         if isinstance(value, (int, float)):
             return float(value)
         match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(dB)?\s*", value, re.I)
-        if match is None:
+        if match is None or float(match[1]) > _MOST_DECIBELS:
             self.fail(f"{value!r} is not a number of decibels: give for example 0.1 or 0.1dB", param, ctx)
         return float(match[1])
 
 
-class ConfigOption(click.Option):
-    """A training option, which `--help` lists in the section of its group."""
-
-    def __init__(self, *args: Any, section: str, **extra: Any) -> None:
-        super().__init__(*args, **extra)
-        self.section = section
-
-
-class TrainingCommand(click.Command):
-    """A command with training options: `--help` shows them in sections, and lists may have 3DGS's form.
-
-    3DGS's form of a list has spaces: `--save_iterations 1000 2000`.
-    """
-
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        sections: dict[str, list[tuple[str, str]]] = {}
-        for param in self.get_params(ctx):
-            if record := param.get_help_record(ctx):
-                section = param.section if isinstance(param, ConfigOption) else "Options"
-                sections.setdefault(section, []).append(record)
-        for section, records in sections.items():
-            with formatter.section(section):
-                formatter.write_dl(records)
+class TrainingCommand(SectionedCommand):
+    """A command with training options, whose lists may have 3DGS's form: `--save_iterations 1000 2000`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         lists = {name for param in self.params if isinstance(param.type, Numbers) for name in param.opts}
@@ -118,7 +120,6 @@ device_option = click.option(
     "--device", metavar="SPEC", help='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name.'
 )
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print warnings and errors only.")
-overwrite_option = click.option("--overwrite", is_flag=True, help="Replace an existing model.")
 iteration_option = click.option(
     "--iteration",
     type=click.IntRange(min=0),
@@ -130,10 +131,17 @@ set_option = click.option(
 )
 
 
+def overwrite_option(existing: str = "the file that is there") -> Callable[[F], F]:
+    """Add `--overwrite`. `existing`: what it replaces, for its help."""
+    return click.option("--overwrite", is_flag=True, help=f"Replace {existing}.")
+
+
 def background_options(function: F, **extra: Any) -> F:
     """Add `--background R,G,B` and `-w`; read them with `background_of`. `extra`: more arguments of `click.option`."""
     help_text = "Colour behind the splats, each part 0 to 1."
-    white = click.option("-w", "--white-background", is_flag=True, help="The same as --background 1,1,1.", **extra)
+    white = click.option(
+        "-w", "--white-background", is_flag=True, help="White behind the splats: --background 1,1,1.", **extra
+    )
     return click.option("--background", type=ColorType(), metavar="R,G,B", help=help_text, **extra)(white(function))
 
 
@@ -141,7 +149,7 @@ def background_of(background: Color | None, white: bool) -> Color | None:
     """Return the background on the command line, or None."""
     if background is not None and white:
         raise click.UsageError("give --background or --white-background, not both")
-    return (1.0, 1.0, 1.0) if white else background
+    return WHITE if white else background
 
 
 def photo_options(function: F) -> F:
@@ -164,6 +172,11 @@ def scene_options(function: F) -> F:
     return click.option(
         "-s", "--source-path", type=PATH, help="Folder of the scene, with photos and a COLMAP model or transforms.json."
     )(photo_options(function))
+
+
+changed_photos_option = click.option(
+    "--allow-changed-photos", is_flag=True, help="Use photos that have changed since the model was trained."
+)
 
 
 def hiding_options(function: F) -> F:
@@ -205,7 +218,7 @@ def config_options(*without: str) -> Callable[[F], F]:
         for section, definitions in reversed(SECTIONS.items()):
             for definition in reversed(definitions):
                 if definition.name == "background":
-                    function = background_options(function, cls=ConfigOption, section=section)
+                    function = background_options(function, cls=SectionOption, section=section)
                 elif definition.name not in without:
                     function = _flag_of(definition, section)(function)
         return function
@@ -242,7 +255,7 @@ def is_given(ctx: click.Context, name: str) -> bool:
 def _flag_of(definition: Option, section: str) -> Callable[[F], F]:
     """Return the decorator that adds the flag of a training option."""
     flag = "--" + definition.name.replace("_", "-")
-    extra: dict[str, Any] = {"cls": ConfigOption, "section": section, "help": definition.help}
+    extra: dict[str, Any] = {"cls": SectionOption, "section": section, "help": definition.help}
     if definition.value_type is bool:
         return click.option(
             f"{flag}/--no-{flag[2:]}", definition.name, default=definition.default, show_default=True, **extra
@@ -251,12 +264,13 @@ def _flag_of(definition: Option, section: str) -> Callable[[F], F]:
         return click.option(flag, definition.name, type=Numbers(), multiple=True, **extra)
     if definition.default is MISSING:
         extra["help"] += f"  [default: {_strategy_defaults(definition.name)}]"
-    else:
-        extra |= {"default": definition.default, "show_default": definition.default is not None}
+    elif definition.default is not None:
+        # Click's own text would have all digits of a fraction.
+        shown = f"{definition.default:g}" if definition.value_type is float else definition.default
+        extra |= {"default": definition.default, "help": f"{extra['help']}  [default: {shown}]"}
     value_type: Any = click.Choice(tuple(definition.choices)) if definition.choices else definition.value_type
-    return click.option(
-        flag, *definition.aliases, definition.name, type=value_type, metavar=definition.metavar, **extra
-    )
+    metavar = definition.metavar or {int: "N", float: "NUMBER"}.get(definition.value_type)
+    return click.option(flag, *definition.aliases, definition.name, type=value_type, metavar=metavar, **extra)
 
 
 def _strategy_defaults(name: str) -> str:

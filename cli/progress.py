@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from types import TracebackType
 
-from clsplat.training.progress import PLAIN_INTERVAL, LiveLine, TrainingDisplay, duration
+from clsplat.training.live_line import PLAIN_INTERVAL, LiveLine, activity_line, duration
+from clsplat.training.progress import TrainingDisplay
 
-__all__ = ["TrainingDisplay", "ViewCount", "duration", "table"]
+__all__ = ["TrainingDisplay", "ViewCount", "activity_line", "duration", "table"]
 
 
 class ViewCount:
@@ -29,15 +30,18 @@ class ViewCount:
         self.label, self.quiet = label, quiet
         self.done = self.total = 0
         self._line = LiveLine()
+        self._activity = activity_line(quiet, self._line)
         self._start = self._line.clock()
 
     def __enter__(self) -> ViewCount:
+        """Also show what the library reports before the first view, such as the photos that it reads."""
+        self._activity.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.clear()
+        self._activity.__exit__(None, None, None)
 
     def __call__(self, number: int, total: int) -> None:
         self.done, self.total = number - 1, total

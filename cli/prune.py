@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .models import scene_choice
-from .options import PATH, Decibels, device_option, iteration_option, quiet_option, scene_options
+from .options import (
+    PATH,
+    Decibels,
+    changed_photos_option,
+    device_option,
+    iteration_option,
+    overwrite_option,
+    quiet_option,
+    scene_options,
+)
 from .progress import TrainingDisplay
 
 if TYPE_CHECKING:
@@ -18,6 +27,7 @@ if TYPE_CHECKING:
 @click.command("prune")
 @click.argument("model", type=PATH)
 @scene_options
+@changed_photos_option
 @click.option("-o", "--output", required=True, type=PATH, metavar="FILE", help="The PLY file to write.")
 @click.option(
     "--tolerance", type=Decibels(), default=0.1, show_default=True, help="Allowed loss of PSNR on the validation views."
@@ -27,11 +37,12 @@ if TYPE_CHECKING:
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
+    metavar="N",
     help="Iterations of training after each round that removes a quarter of the splats. 0: no training.",
 )
 @click.option("--whole", is_flag=True, help="Write all columns of 3DGS, for programs that read no other files.")
 @iteration_option
-@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+@overwrite_option()
 @device_option
 @quiet_option
 def prune_model(model: Path, output: Path, whole: bool, quiet: bool, **values: Any) -> None:

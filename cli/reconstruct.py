@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.scenes.reconstruct.options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, ReconstructOptions
-from clsplat.training.progress import PLAIN_INTERVAL, LiveLine
+from clsplat.scenes.reconstruct.options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, RANGES, ReconstructOptions
+from clsplat.training.live_line import PLAIN_INTERVAL, LiveLine
 
 from .options import PATH, overwrite_option, quiet_option
 from .progress import duration
@@ -48,7 +48,7 @@ _DEFAULTS = ReconstructOptions()
 )
 @click.option(
     "--max-size",
-    type=click.IntRange(min=64),
+    type=click.IntRange(*RANGES["max_size"]),
     default=_DEFAULTS.max_size,
     show_default=True,
     metavar="PX",
@@ -56,14 +56,21 @@ _DEFAULTS = ReconstructOptions()
 )
 @click.option(
     "--frames",
-    type=click.IntRange(min=3),
+    type=click.IntRange(*RANGES["frames"]),
     default=_DEFAULTS.frames,
     show_default=True,
     metavar="N",
     help="Number of frames to take from a video: the sharpest frame of each of N equal parts.",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=_DEFAULTS.seed, show_default=True)
-@overwrite_option
+@click.option(
+    "--seed",
+    type=click.IntRange(*RANGES["seed"]),
+    default=_DEFAULTS.seed,
+    show_default=True,
+    metavar="N",
+    help="Seed of all random numbers.",
+)
+@overwrite_option("the scene that is there")
 @quiet_option
 def reconstruct_scene(photos: Path, scene: Path, overwrite: bool, quiet: bool, **values: Any) -> None:
     """Make a scene for training from PHOTOS, a folder of photos or a video.
@@ -96,12 +103,15 @@ def report(result: ReconstructionResult) -> None:
     )
 
 
-def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool) -> Path:
-    """Return the scene of photographs without poses. Reconstruct it if it does not exist."""
-    from clsplat.scenes.reconstruct.beside_model import plan_scene
+def scene_of_photos(photos: Path, model: Path, overwrite: bool, quiet: bool, recorded: Path | None = None) -> Path:
+    """Return the scene of photographs without poses. Reconstruct it if it does not exist.
+
+    `recorded` is the scene of a run that is resumed.
+    """
+    from clsplat.scenes.reconstruct.model_scene import plan_scene
 
     options = ReconstructOptions()
-    scene = plan_scene(photos, model, options, overwrite)
+    scene = plan_scene(photos, model, options, overwrite, recorded)
     if scene.exists:
         if not quiet:
             click.echo(f"{photos}: no poses: {scene.path} was reconstructed from it before and is used", err=True)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .command import SectionedCommand
 from .models import one_model, scene_choice
 from .options import (
     PATH,
@@ -14,6 +15,7 @@ from .options import (
     background_options,
     device_option,
     iteration_option,
+    overwrite_option,
     quiet_option,
     scene_options,
     set_option,
@@ -26,7 +28,28 @@ if TYPE_CHECKING:
     from clsplat.rendering.views import RenderOutput
 
 
-@click.command()
+SECTIONS = {
+    "Common options": (
+        "output",
+        "video",
+        "path",
+        "view_set",
+        "frames",
+        "fps",
+        "size",
+        "depth",
+        "white_background",
+        "overwrite",
+        "device",
+        "quiet",
+    ),
+    "Views": ("model_path", "iteration", "cameras", "source_path", "images", "resolution"),
+    "Camera path": ("keys", "closed", "seconds", "save_path"),
+    "Images": ("format", "alpha", "depth_colours", "depth_range", "background"),
+}
+
+
+@click.command(cls=SectionedCommand, sections=SECTIONS)
 @click.argument("model", required=False, type=PATH, metavar="MODEL_OR_PLY")
 @click.option("-m", "--model-path", type=PATH, help="The same as MODEL_OR_PLY.")
 @click.option("-o", "--output", type=PATH, metavar="DIR", help="Folder of the images.")
@@ -55,6 +78,7 @@ if TYPE_CHECKING:
 @click.option("--depth-range", type=Range(), help="Depths at the ends of the colours.  [default: from the images]")
 @background_options
 @iteration_option
+@overwrite_option("files that are there")
 @device_option
 @quiet_option
 def render(
@@ -64,6 +88,7 @@ def render(
     view_set: str | None,
     save_path: Path | None,
     iteration: int | None,
+    overwrite: bool,
     device: str | None,
     quiet: bool,
     **values: Any,
@@ -107,6 +132,7 @@ def render(
                 background=background_of(values["background"], values["white_background"]),
                 save_path=save_path,
                 iteration=iteration,
+                overwrite=overwrite,
                 device=device,
                 progress=progress,
             )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+import sys
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -10,18 +11,21 @@ import click
 
 from clsplat.compression.state import is_search, remove_search
 from clsplat.errors import InputError, OutputError
+from clsplat.files.real_path import real_path
+from clsplat.files.stop_signals import exit_code
 from clsplat.models.resume import find_unfinished
 from clsplat.scenes.options import READING_OPTIONS
 from clsplat.training.config import TrainConfig
 from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
 from clsplat.training.stored_run import load_recorded_scene, read_options_file
+from clsplat.viewer.options import ServerOptions
 
 from .budget import budget_options, run_search, search_options
-from .main import INTERRUPTED
 from .options import (
     PATH,
     TrainingCommand,
+    changed_photos_option,
     config_options,
     config_values,
     hiding_options,
@@ -32,9 +36,9 @@ from .options import (
     split_options,
     warn_without_effect,
 )
-from .progress import TrainingDisplay, duration
+from .progress import TrainingDisplay, activity_line, duration
 from .reconstruct import scene_of_photos
-from .view import server_options
+from .view import addresses, server_options
 
 if TYPE_CHECKING:
     from clsplat.evaluation.evaluate import Evaluation
@@ -43,7 +47,37 @@ if TYPE_CHECKING:
     from clsplat.viewer.training_session import TrainingSession
 
 
-@click.command(cls=TrainingCommand)
+SECTIONS = {
+    "Common options": (
+        "model_path",
+        "iterations",
+        "cap_max",
+        "resolution",
+        "eval",
+        "budget",
+        "white_background",
+        "view",
+        "resume",
+        "overwrite",
+        "device",
+        "quiet",
+    ),
+    "Photos and test views": (
+        "source_path",
+        "images",
+        "masks",
+        "alpha",
+        "test_every",
+        "test_list",
+        "allow_changed_photos",
+    ),
+    "Search for a small model": ("budget_tolerance", "target_psnr", "max_bytes"),
+    "Viewer": ("port", "host", "names", "token", "stay"),
+    "Published systems and files of options": ("preset", "config_file"),
+}
+
+
+@click.command(cls=TrainingCommand, sections=SECTIONS)
 @click.argument("scene", required=False, type=PATH)
 @click.option(
     "-m",
@@ -58,7 +92,8 @@ if TYPE_CHECKING:
 @click.option("--eval", is_flag=True, help="Hold test views out of training, and measure them at the end.")
 @split_options
 @click.option("--resume", is_flag=True, help="Continue from the model's checkpoint, with the options of its run.")
-@overwrite_option
+@changed_photos_option
+@overwrite_option("the model that is there, and start again")
 @quiet_option
 @click.option(
     "--preset",
@@ -74,6 +109,11 @@ if TYPE_CHECKING:
 )
 @click.option("--view", is_flag=True, help="Show the run in the browser while it trains.")
 @server_options
+@click.option(
+    "--stay/--no-stay",
+    default=None,
+    help="Keep the page of --view open after training, until Ctrl-C.  [default: at a terminal without --quiet]",
+)
 @budget_options
 @config_options()
 @click.pass_context
@@ -84,6 +124,7 @@ def train(
     source_path: Path | None,
     model_path: Path | None,
     resume: bool,
+    allow_changed_photos: bool,
     overwrite: bool,
     quiet: bool,
     preset: str | None,
@@ -91,24 +132,35 @@ def train(
     view: bool,
     port: int,
     host: str,
+    names: tuple[str, ...],
+    token: bool,
+    stay: bool | None,
     **values: Any,
 ) -> None:
     """Learn a splat model of SCENE.
 
-    SCENE is a folder with photos in images/ and a COLMAP model in sparse/. It may also have transforms.json or
-    transforms_train.json instead (NeRF's Blender sets, instant-ngp, nerfstudio). A folder with only photographs, or a
-    video, is reconstructed first, into NAME-scene next to the model's folder (see clsplat reconstruct).
+    SCENE is a folder of photos, a video, or a folder of photos with known cameras. Ctrl-C saves a checkpoint, and
+    --resume continues from it.
+
+    Known cameras are a COLMAP model in sparse/ beside the photos in images/, or transforms.json or
+    transforms_train.json (nerfstudio, instant-ngp, NeRF's Blender sets). Without them, the photos or the video are
+    reconstructed first, into MODEL/scene (see clsplat reconstruct).
 
     The model's folder gets config.json, cameras.json, log.jsonl, checkpoint.npz and
-    point_cloud/iteration_N/point_cloud.ply. Ctrl-C saves a checkpoint; --resume continues from it. With --budget auto,
-    the folder also gets budget.json and the growth curve; the small model is the last point cloud.
+    point_cloud/iteration_N/point_cloud.ply. With --budget auto, the folder also gets budget.json and the growth curve;
+    the small model is the last point cloud.
     """
+    from clsplat.scenes.changed_photos import check_photos
     from clsplat.scenes.reconstruct.photo_files import is_photographs
 
     if resume and overwrite:
         raise click.UsageError("give --resume or --overwrite, not both")
     if scene and source_path and scene != source_path:
         raise click.UsageError(f"two scenes: {scene} and {source_path}")
+    if allow_changed_photos and not resume:
+        raise click.UsageError("--allow-changed-photos is for --resume")
+    if stay is not None and not view:
+        raise click.UsageError("--stay and --no-stay need --view")
     path = scene or source_path
     if path is None and not (resume and model_path):
         raise click.UsageError("give the scene's folder")
@@ -121,12 +173,14 @@ def train(
         options = with_preset(preset, options)
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
     model_path = model_path or _default_folder(path)
+    recorded, photos = None, {}
     if resume:
         stored = find_unfinished(model_path)
         if search is not None and stored.search is None:
             raise InputError(f"{model_path}: no search to resume from: start without --resume")
         options, reading = stored.run.options | options, stored.run.scene | reading
-        path, search = path or stored.run.scene_path, search or stored.search
+        recorded, photos = stored.run.scene_path, stored.run.scene["photos"]
+        path, search = path or recorded, search or stored.search
     elif (ModelFolder(model_path).is_used or is_search(model_path)) and not overwrite:
         # The function train checks this too, but only after the scene is read.
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
@@ -134,22 +188,36 @@ def train(
     config = TrainConfig(**options)
     warn_without_effect([config], flags)
     if is_photographs(path):
-        path = scene_of_photos(path, model_path, overwrite, quiet)
-    loaded = load_recorded_scene(path, reading, config.background)
+        path = scene_of_photos(path, model_path, overwrite, quiet, recorded)
+    with activity_line(quiet):
+        loaded = load_recorded_scene(path, reading, config.background)
+    check_photos(loaded, photos, model_path, allow=allow_changed_photos, all_views=True)
     if search is not None:
         if view:
             raise click.UsageError(f"{model_path} is a search of many runs: resume it without --view")
         run_search(ctx, loaded, config, search, model_path, resume, overwrite, quiet)
         return
-    with _viewer(loaded, config, model_path, host, port, quiet) if view else nullcontext() as live:
+    serving = ServerOptions(host, port, names, token)
+    with _viewer(loaded, config, model_path, serving, quiet) if view else nullcontext() as live:
         remove_search(model_path)
         model = run_training(loaded, config, model_path, resume, overwrite, quiet, live)
-    if not model.finished:
-        report_interruption(ctx, model)
-    if not quiet:
-        from clsplat.training.run import evaluate_test_views
+        if not model.finished:
+            report_interruption(ctx, model)
+        if not quiet:
+            from clsplat.training.run import evaluate_test_views
 
-        report(model, model.evaluations.get(model.iteration) or evaluate_test_views(model.splats, loaded, config))
+            report(model, model.evaluations.get(model.iteration) or evaluate_test_views(model.splats, loaded, config))
+        if live is not None and (sys.stderr.isatty() and not quiet if stay is None else stay):
+            _stay(live, model, quiet)
+
+
+def _stay(live: TrainingSession, model: Model, quiet: bool) -> None:
+    """Keep the page of a finished run open until Ctrl-C."""
+    if not quiet:
+        page = f"the page stays open at {addresses(live.urls)} until Ctrl-C"
+        click.echo(f"{page}; later: clsplat view {model.path}", err=True)
+    with suppress(KeyboardInterrupt):
+        live.stay(model)
 
 
 def _default_folder(scene: Path | None) -> Path:
@@ -157,7 +225,7 @@ def _default_folder(scene: Path | None) -> Path:
     from clsplat.scenes.reconstruct.photo_files import is_video
 
     assert scene is not None
-    return Path("output") / (scene.stem if is_video(scene) else scene.resolve().name)
+    return Path("output") / (scene.stem if is_video(scene) else real_path(scene).name)
 
 
 def run_training(
@@ -184,21 +252,22 @@ def run_training(
         )
 
 
-def _viewer(scene: Scene, config: TrainConfig, model_path: Path, host: str, port: int, quiet: bool) -> TrainingSession:
-    from clsplat.viewer.session import ServerOptions
+def _viewer(
+    scene: Scene, config: TrainConfig, model_path: Path, options: ServerOptions, quiet: bool
+) -> TrainingSession:
     from clsplat.viewer.training_session import TrainingSession
 
-    session = TrainingSession(scene, config, model_path.resolve().name, ServerOptions(host, port))
+    session = TrainingSession(scene, config, real_path(model_path).name, options)
     if not quiet:
-        click.echo(f"training can be watched at {session.url}", err=True)
+        click.echo(f"training can be watched at {addresses(session.urls)}", err=True)
     return session
 
 
 def report_interruption(ctx: click.Context, model: Model) -> NoReturn:
-    """Print how to continue after Ctrl-C, and exit."""
+    """Print how to continue after Ctrl-C or another signal, and exit."""
     command = f"clsplat train --resume -m {model.path}"
     click.echo(f"stopped at iteration {model.iteration}, checkpoint saved; to continue: {command}", err=True)
-    ctx.exit(INTERRUPTED)
+    ctx.exit(exit_code())
 
 
 def report(model: Model, metrics: Evaluation | None) -> None:

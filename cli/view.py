@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
+from clsplat.files.stop_signals import exit_code
 from clsplat.splats.color import Color
 
 from .models import one_model, scene_choice
@@ -21,24 +23,57 @@ from .options import (
     scene_options,
 )
 
+CTRL_C = 130  # exit code after Ctrl-C
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+class Address(click.ParamType):  # type: ignore[type-arg]
+    """The name or the number of a network interface."""
+
+    name = "ADDRESS"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        if not re.fullmatch(r"[\w.:%-]{1,255}", value, re.ASCII):
+            self.fail(f"{value!r} is not an address: give for example 127.0.0.1, 0.0.0.0 or localhost", param, ctx)
+        return str(value)
+
+
 def server_options(function: F) -> F:
-    """Add `--port` and `--host` of a viewer."""
-    function = click.option(
-        "--host",
-        default="127.0.0.1",
-        show_default=True,
-        help="Address of the viewer. With 0.0.0.0, every machine that reaches this one can open it.",
-    )(function)
-    return click.option(
-        "--port",
-        type=click.IntRange(0, 65535),
-        default=8080,
-        show_default=True,
-        help="Port of the viewer. 0: any free port.",
-    )(function)
+    """Add `--port`, `--host`, `--allow-host` and `--token` of a viewer."""
+    for option in (
+        click.option("--token", is_flag=True, help="Ask for the token of the printed address also on this machine."),
+        click.option(
+            "--allow-host",
+            "names",
+            multiple=True,
+            metavar="NAME",
+            help="Host name of a proxy under which browsers reach the viewer. Repeat it for more names.",
+        ),
+        click.option(
+            "--host",
+            type=Address(),
+            metavar="ADDRESS",
+            default="127.0.0.1",
+            show_default=True,
+            help="Address of the viewer. With 0.0.0.0, other machines can open it by the printed address.",
+        ),
+        click.option(
+            "--port",
+            type=click.IntRange(0, 65535),
+            default=8080,
+            show_default=True,
+            metavar="N",
+            help="Port of the viewer. 0: any free port.",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def addresses(urls: Sequence[str]) -> str:
+    """Return the addresses of a viewer as a part of a line."""
+    return f"{urls[0]}, from other machines at {urls[1]}" if len(urls) > 1 else urls[0]
 
 
 @click.command()
@@ -51,7 +86,7 @@ def server_options(function: F) -> F:
     "folder",
     type=PATH,
     metavar="DIR",
-    help="Folder for recorded camera paths. Without it they can only be downloaded.",
+    help="Folder for recorded camera paths and cropped models. Without it they can only be downloaded.",
 )
 @background_options
 @iteration_option
@@ -62,6 +97,8 @@ def view(
     model_path: Path | None,
     port: int,
     host: str,
+    names: tuple[str, ...],
+    token: bool,
     folder: Path | None,
     background: Color | None,
     white_background: bool,
@@ -76,20 +113,21 @@ def view(
     that changes is read again.
     """
     from clsplat.models.model import load_model
-    from clsplat.viewer.session import ServerOptions, ViewingSession, known_cameras, require_viser
+    from clsplat.viewer.options import ServerOptions
+    from clsplat.viewer.session import ViewingSession, known_cameras, require_viser
 
     source, scene = one_model(model, model_path), scene_choice(values)
     colour = background_of(background, white_background)
     require_viser()
     loaded = load_model(source, iteration)
-    session = ViewingSession(
-        loaded, known_cameras(loaded, scene), colour, ServerOptions(host, port, folder), iteration, device
-    )
+    options = ServerOptions(host, port, names, token, folder)
+    session = ViewingSession(loaded, known_cameras(loaded, scene), colour, options, iteration, device)
     if not quiet:
-        click.echo(f"{source}: {len(loaded.splats)} splats at {session.server.url} (Ctrl-C ends)")
+        click.echo(f"{source}: {len(loaded.splats)} splats at {addresses(session.server.urls)} (Ctrl-C ends)")
     try:
         session.run()
     except KeyboardInterrupt:
-        pass
+        if exit_code() != CTRL_C:  # Ctrl-C is the usual end
+            raise
     finally:
         session.close()

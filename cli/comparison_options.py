@@ -1,0 +1,64 @@
+"""Options that `clsplat compare` and `clsplat frontier` share: the grid of runs, and the sections of their help."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import click
+
+from .options import PATH, Numbers
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def comparison_sections(*others: str) -> dict[str, tuple[str, ...]]:
+    """Return the sections of a command's help. others : names of the common options that only this command has."""
+    grid = ("output", "systems", "caps", "seeds", "iterations", "resolution")
+    return {
+        "Common options": (*grid, *others, "device", "quiet"),
+        "Photos and test views": ("images", "masks", "alpha", "test_every", "test_list"),
+    }
+
+
+def grid_options(
+    *, output: str, systems: Sequence[str], about_systems: str, caps: Sequence[int], about_seeds: str = ""
+) -> Callable[[F], F]:
+    """Add `--output`, `--systems`, `--cap-max` and `--seeds`.
+
+    Parameters
+    ----------
+    output, about_systems : help texts.
+    systems, caps : defaults.
+    about_seeds : more of the help text of `--seeds`.
+    """
+    options = [
+        click.option("-o", "--output", required=True, type=PATH, metavar="DIR", help=output),
+        click.option(
+            "--systems",
+            default=",".join(systems),
+            show_default=True,
+            metavar="NAME,NAME,...",
+            help=about_systems,
+        ),
+        click.option(
+            "--cap-max",
+            "caps",
+            type=Numbers("caps"),
+            multiple=True,
+            help=f"Caps on the splats: a run for each.  [default: {','.join(map(str, caps))}]",
+        ),
+        click.option(
+            "--seeds",
+            type=Numbers("seeds", 0),
+            multiple=True,
+            help=f"Seeds: a run for each.{about_seeds}  [default: 0]",
+        ),
+    ]
+
+    def add(function: F) -> F:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return add
