@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from cli_runner import HEIGHT, N_VIEWS, SHORT, WIDTH, clsplat
+from device_schedules import schedule_on, suits
 
 from clsplat.device.device import Device, list_devices, open_device
 from clsplat.device.program import OPTIONS_VARIABLE
@@ -33,11 +34,14 @@ def on_place(place: int, *values: object, slow: bool = False) -> object:
     return pytest.param(*(values or (place,)), marks=[pytest.mark.slow] if place or slow else [])
 
 
-# All schedules are tested on the first device, two of them on the others. Each combination builds kernels for seconds,
-# so the default run has one schedule of each kind: wide vectors, single lanes, and groups.
+# All schedules that suit it are tested on the first device, two of them on the others. Each combination builds kernels
+# for seconds, so the default run has one schedule of each kind: wide vectors, single lanes, and groups.
 FAST_SCHEDULES = ("cpu16", "scalar", "gpu256")
 DEVICE_SCHEDULES = [
-    (place, name) for place in range(len(USABLE)) for name in SCHEDULES if place == 0 or name in ("cpu16", "gpu256")
+    (place, name)
+    for place, info in enumerate(USABLE)
+    for name in SCHEDULES
+    if suits(info, name) and (place == 0 or name in ("cpu16", "gpu256"))
 ]
 
 
@@ -69,10 +73,7 @@ def device(request: pytest.FixtureRequest, devices: list[Device]) -> Device:
 def scheduled(request: pytest.FixtureRequest, devices: list[Device]) -> tuple[Device, Schedule]:
     """Each device with each of the schedules that it is tested with."""
     place, name = request.param
-    device, schedule = devices[place], SCHEDULES[name]
-    if schedule.group > device.info.max_group:
-        pytest.skip(f"{device.info} has groups of {device.info.max_group} at most")
-    return device, schedule
+    return devices[place], schedule_on(devices[place], name)
 
 
 @pytest.fixture(scope="session")

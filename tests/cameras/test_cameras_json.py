@@ -110,8 +110,11 @@ def test_keys_are_3dgs_and_the_principal_point(file: Path) -> None:
         ({"rotation": [[1, 0, 0], [0, 1, 0]]}, "'rotation' has the wrong form; expected 3 x 3"),
         ({"rotation": [1, 0, 0]}, "'rotation' has the wrong form"),
         ({"rotation": {}}, "'rotation' has the wrong form"),
-        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "must be a rotation matrix"),
-        ({"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "must be a rotation matrix"),
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "'rotation' is not a rotation: it is mirrored"),
+        (
+            {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]},
+            "'rotation' is not a rotation: it is sheared or has different scales",
+        ),
     ],
 )
 def test_faults_name_entry_and_key(file: Path, changes: dict[str, Any], message: str) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.cameras.camera import Camera
+from clsplat.cameras.cameras_json import NamedCamera
 from clsplat.cameras.interpolate import interpolate, resized_by_height
-from clsplat.cameras.orbits import ellipse, look_at, orbit, spiral
+from clsplat.cameras.make_path import PathRequest, make_path
+from clsplat.cameras.orbits import ellipse, look_at, orbit, share_unseen, spiral
 from clsplat.errors import InputError
 from clsplat.splats.splats import Splats
 
@@ -174,3 +177,37 @@ def test_one_camera_or_two_are_enough(path: object, n: int) -> None:
     made = path(cloud(), [facing((4, 0, 1)), facing((0, 4, 1))][:n], 7)  # type: ignore[operator]
     assert len(made) == 7
     assert np.isfinite(positions(made)).all()
+
+
+# --- sides that no camera saw -------------------------------------------------------------------
+
+
+def arc(degrees: float, n: int = 20, height: float = 1.0) -> list[NamedCamera]:
+    """Return cameras on an arc about the z axis, which look at the origin."""
+    turn = np.radians(degrees) * np.arange(n) / n
+    return [NamedCamera(f"{i}", facing((4 * np.cos(angle), 4 * np.sin(angle), height))) for i, angle in enumerate(turn)]
+
+
+@pytest.mark.parametrize(("degrees", "unseen"), [(360, 0.0), (180, (180 - 60) / 360), (60, (300 - 60) / 360)])
+def test_the_share_of_unseen_sides_is_that_of_the_circle(degrees: float, unseen: float) -> None:
+    """SEEN_ANGLE of 30 degrees is added at both ends of an arc."""
+    cameras = [view.camera for view in arc(degrees, 60, height=0.0)]
+    assert share_unseen(orbit(cloud(), cameras, 360), cloud(), cameras) == pytest.approx(unseen, abs=0.02)
+    assert share_unseen(cameras, cloud(), cameras) == 0.0
+
+
+@pytest.mark.parametrize("kind", ["orbit", "ellipse"])
+def test_a_path_behind_a_scene_that_is_seen_from_one_side_warns(kind: str) -> None:
+    message = rf"^--path {kind}: \d+% of the frames look from sides that no camera saw: --path spiral and --path interp"
+    with pytest.warns(UserWarning, match=message):
+        make_path(PathRequest(kind), cloud(), arc(90))
+
+
+@pytest.mark.parametrize(
+    ("kind", "views"),
+    [("orbit", arc(360)), ("ellipse", arc(360)), ("spiral", arc(90)), ("interpolate", arc(90)), ("orbit", [])],
+)
+def test_a_path_within_seen_sides_does_not_warn(kind: str, views: list[NamedCamera]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_path(PathRequest(kind), cloud(), views)

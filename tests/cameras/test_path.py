@@ -127,6 +127,7 @@ def frame(**changes: Any) -> dict[str, Any]:
         (frame(fov=180), ["camera_path[1]", "'fov' is 180"]),
         (frame(fov=math.inf), ["camera_path[1]", "'fov' is not finite"]),
         (nerfstudio(keyframes=[{"matrix": "[1,", "fov": 50}]), ["keyframes[0]", "16 numbers"]),
+        (nerfstudio(keyframes=[{"matrix": "[" * 100_000, "fov": 50}]), ["keyframes[0]", "16 numbers"]),
         ([], ["no cameras"]),
         (7, ["a number"]),
     ],

@@ -21,8 +21,12 @@ def limits_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_made_up_scene(tmp_path: Path) -> None:
     file = tmp_path / "deep" / "bench.json"
+    file.parent.mkdir()
+    file.write_text("of the user")
+    assert "exists already" in error_of("bench", "--json", file)
     said = clsplat(
         "bench",
+        "--overwrite",
         "--splats",
         200,
         "--width",

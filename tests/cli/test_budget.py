@@ -95,6 +95,9 @@ def test_prune_refuses(model: Path, tmp_path: Path) -> None:
     assert "exists already" in error_of("prune", model, "-o", out)
     assert out.read_text() == "precious"
     assert "is a folder" in error_of("prune", model, "-o", tmp_path)
+    config = (model / "config.json").read_bytes()
+    assert "writes .ply files" in error_of("prune", model, "-o", model / "config.json", "--overwrite")
+    assert (model / "config.json").read_bytes() == config
     assert "not a number of decibels" in error_of(
         "prune", model, "-o", tmp_path / "a.ply", "--tolerance", "much", code=2
     )

@@ -26,7 +26,7 @@ from clsplat.cameras.cameras_json import read_cameras
 from clsplat.scenes.scene import load_scene
 from clsplat.splats.ply import read_ply
 
-PROGRAM = [sys.executable, "-c", "from clsplat_cli.main import main; main()"]
+PROGRAM = [sys.executable, "-c", "from clsplat_cli.start import main; main()"]
 
 
 def files(folder: Path) -> set[str]:
@@ -150,7 +150,7 @@ def test_train_without_eval_learns_from_all_views(scene: Path, tmp_path: Path) -
     camera = read_cameras(tmp_path / "m" / "cameras.json")[0].camera
     assert (camera.width, camera.height) == (WIDTH // 2, HEIGHT // 2)
     error = error_of("eval", tmp_path / "m")
-    assert "train with --eval" in error
+    assert "clsplat train --eval" in error
     clsplat("eval", tmp_path / "m", "--set", "train")
     assert (tmp_path / "m" / "results_train.json").is_file()
     clsplat("render", tmp_path / "m", "-o", tmp_path / "r")
@@ -211,6 +211,7 @@ def test_existing_models_are_kept_unless_overwritten(scene: Path, tmp_path: Path
     clsplat("train", scene, "-m", model, "--iterations", "2", *tiny)
     before = ply(model, 2).read_bytes()
     assert "--overwrite" in error_of("train", scene, "-m", model, "--iterations", "3", *tiny)
+    assert "already holds a model" in error_of("train", tmp_path / "missing", "-m", model), "before the scene is read"
     assert ply(model, 2).read_bytes() == before
     clsplat("train", scene, "-m", model, "--iterations", "3", *tiny, "--overwrite")
     assert {name for name in files(model) if name.endswith(".ply")} == {"point_cloud/iteration_3/point_cloud.ply"}

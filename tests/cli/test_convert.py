@@ -12,7 +12,6 @@ from cli_runner import clsplat, error_of
 from clsplat.cameras.cameras_json import read_cameras
 from clsplat.evaluation.metrics import psnr
 from clsplat.rendering.renderer import Renderer
-from clsplat.splats.any_file import load_splats
 from clsplat.splats.shapes import GAUSSIAN, SHAPES, SKEW_NORMAL, SKEW_NORMAL_DIRECT
 from clsplat.splats.splats import Splats
 from clsplat.training.folder import ModelFolder
@@ -82,13 +81,27 @@ def test_files_for_viewers_are_measured_as_written(model: Path, tmp_path: Path) 
         said = clsplat("convert", model, tmp_path / name, "--approximate")
         told = re.search(r"([\d.]+) dB, worst", said)
         assert told is not None
-        splats = load_splats(tmp_path / name)
+        splats = Splats.load(tmp_path / name)
         shown = [renderer.render(splats, entry.camera).color for entry in named]
         assert float(told[1]) == pytest.approx(
             np.mean([psnr(*pair) for pair in zip(truths, shown, strict=True)]), abs=0.006
         )
         clsplat("convert", tmp_path / name, tmp_path / f"{name}.ply")
         np.testing.assert_array_equal(Splats.load(tmp_path / f"{name}.ply").mean, splats.mean)
+
+
+def test_the_version_of_an_spz_file_is_chosen(model: Path, tmp_path: Path) -> None:
+    pytest.importorskip("zstandard")
+    for version, start in ((3, b"\x1f\x8b"), (4, b"NGSP\4")):
+        out = tmp_path / f"{version}.spz"
+        clsplat("convert", model, out, "--approximate", "--spz-version", version, "-q")
+        assert out.read_bytes().startswith(start)
+    arrays = [Splats.load(tmp_path / f"{version}.spz").to_numpy() for version in (3, 4)]
+    for name, values in arrays[0].items():
+        np.testing.assert_array_equal(values, arrays[1][name])
+    said = "the version is of .spz files: leave it out, or choose the ending .spz"
+    assert said in error_of("convert", model, tmp_path / "out.ply", "--spz-version", "3")
+    assert "'2' is not one of '3', '4'" in error_of("convert", model, tmp_path / "out.spz", "--spz-version", 2, code=2)
 
 
 def test_a_ply_for_other_programs_has_3dgs_s_columns(model: Path, tmp_path: Path) -> None:
@@ -125,7 +138,7 @@ def test_bad_input(model: Path, tmp_path: Path) -> None:
     assert "'cube'" in error_of("convert", model, out, "--shape", "cube", code=2)
     assert "writes .ply, .splat and .spz files" in error_of("convert", model, tmp_path / "out.obj")
     assert "leave --shape out" in error_of("convert", model, tmp_path / "out.splat", "--shape", "skew-normal")
-    assert "no such model folder or PLY" in error_of("convert", tmp_path / "none", out, "--shape", "gaussian")
+    assert "no such model folder or file" in error_of("convert", tmp_path / "none", out, "--shape", "gaussian")
 
 
 @pytest.mark.skipif("student-t" not in SHAPES, reason="the one shape with signed opacities is not there yet")

@@ -9,6 +9,7 @@ import click
 import numpy as np
 import pytest
 from clsplat_cli.options import ColorType, Numbers
+from clsplat_cli.path_options import Range
 from clsplat_cli.progress import TrainingDisplay, duration, table
 
 from clsplat.cameras.camera import Camera
@@ -45,9 +46,9 @@ def test_a_terminal_gets_one_line_rewritten() -> None:
 
 
 def test_a_file_gets_a_line_every_ten_seconds_and_the_last() -> None:
-    stream, seconds = io.StringIO(), iter([0.0, 0.0, 5.0, 11.0, 11.0, 12.0, 12.0])
-    display = TrainingDisplay(stream=stream, clock=lambda: next(seconds))
-    for iteration in (50, 100, 150, 1000):
+    stream, now = io.StringIO(), [0.0]
+    display = TrainingDisplay(stream=stream, clock=lambda: now[0])
+    for now[0], iteration in ((0.0, 50), (5.0, 100), (11.0, 150), (12.0, 1000)):
         display(at(iteration))
     assert [line.split("/")[0] for line in stream.getvalue().splitlines()] == ["50", "150", "1000"]
 
@@ -150,3 +151,10 @@ def test_orbit_without_cameras_sees_the_splats() -> None:
     assert len(orbit(splats.select([0]), (), 2)) == 2  # one splat has no extent
     with pytest.raises(InputError):
         orbit(splats.select([]), (), 2)
+
+
+@pytest.mark.parametrize("text", ["-1,2", "0,2", "2,1", "1,1", "1,inf", "nan,2", "1"])
+def test_a_range_of_depths_is_in_front_of_the_camera(text: str) -> None:
+    assert Range().convert("0.5,20", None, None) == (0.5, 20)
+    with pytest.raises(click.BadParameter, match="is not a range"):
+        Range().convert(text, None, None)

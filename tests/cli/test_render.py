@@ -1,4 +1,4 @@
-"""`clsplat render` and `clsplat eval`: their files equal the images that Python renders."""
+"""`clsplat render`: its files equal the images that Python renders."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from cli_runner import (
 from PIL import Image
 
 from clsplat.cameras.cameras_json import read_cameras
-from clsplat.evaluation.metrics import protocol_named
 from clsplat.rendering.colormaps import depth_picture
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
@@ -104,6 +103,16 @@ def test_render_orbit_looks_at_the_scene(model: Path, tmp_path: Path) -> None:
         assert np.hypot(*camera.position[:2]) == pytest.approx(3.6, rel=0.05)
         assert camera.rotation[1] @ [0, 0, 1] < -0.8
     clsplat("render", ply(model), "--path", "orbit", "--frames", "1", "-o", tmp_path / "alone")
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "1e300", "1e9", "-1", "0"])
+@pytest.mark.parametrize("flag", ["--seconds", "--fps"])
+def test_durations_that_no_path_can_have(model: Path, tmp_path: Path, flag: str, value: str) -> None:
+    args = ["render", model, "--path", "orbit", "-o", tmp_path / "r", *(["--seconds", "9"] if flag == "--fps" else [])]
+    in_range = value in ("inf", "1e300", "1e9") and flag == "--seconds"
+    error = error_of(*args, flag, value, code=1 if in_range or value == "nan" else 2)
+    assert flag[2:] in error or "more than 100000 frames" in error
+    assert not (tmp_path / "r").exists()
 
 
 @pytest.mark.parametrize("kind", ["ellipse", "spiral"])
@@ -262,69 +271,3 @@ def test_plain_3dgs_folders_render(model: Path, tmp_path: Path) -> None:
     shutil.copy(model / "cameras.json", tmp_path / "cameras.json")
     clsplat("render", tmp_path, "-o", tmp_path / "r")
     assert len(files(tmp_path / "r")) == N_VIEWS
-
-
-# --- eval --------------------------------------------------------------------------------------
-
-
-def test_eval_writes_3dgs_files_with_the_protocol(copied_model: Path, scene: Path, tmp_path: Path) -> None:
-    out = clsplat("eval", copied_model, "--save-renders", tmp_path / "r")
-    results = json.loads((copied_model / "results.json").read_text())
-    entry = results[f"ours_{ITERATIONS}"]
-    assert set(results) == {f"ours_{ITERATIONS}"}
-    assert entry["protocol"]["name"] == "clsplat"
-    assert entry["bytes"] == ply(copied_model).stat().st_size
-    splats = Splats.load(ply(copied_model))
-    assert (entry["splats"], entry["shape"], entry["views"]) == (len(splats), "skew-normal", 2)
-    assert entry["parameters"] == len(splats) * (3 + 4 + 3 + 1 + 3 * 4 + 3)
-    assert entry["render_ms"] > 0
-    per_view = json.loads((copied_model / "per_view.json").read_text())[f"ours_{ITERATIONS}"]
-    assert set(per_view) == {"SSIM", "PSNR"}
-    assert list(per_view["PSNR"]) == TEST_NAMES
-    assert f"{entry['PSNR']:.3f}" in out
-    for view in load_scene(scene).test:  # computed from the saved images by the metrics module
-        rendered = np.asarray(Image.open(tmp_path / "r" / view.name))
-        measured = protocol_named("clsplat").measure(rendered, view.image)
-        assert per_view["PSNR"][view.name] == pytest.approx(measured["PSNR"], abs=1e-6)
-        assert per_view["SSIM"][view.name] == pytest.approx(measured["SSIM"], abs=1e-6)
-    assert entry["PSNR"] == pytest.approx(np.mean(list(per_view["PSNR"].values())))
-
-
-def test_eval_of_several_models_protocols_and_iterations(model: Path, tmp_path: Path) -> None:
-    first, second = tmp_path / "a", tmp_path / "b"
-    for copy in (first, second):
-        shutil.copytree(model, copy)
-    out = clsplat("eval", "-m", first, second, "--compat", "3dgs", "--iteration", "20")
-    assert str(first) in out
-    assert str(second) in out
-    clsplat("eval", first)
-    results = json.loads((first / "results.json").read_text())
-    assert [results[f"ours_{n}"]["protocol"]["name"] for n in (20, ITERATIONS)] == ["3dgs", "clsplat"]
-
-
-def test_eval_of_a_model_trained_from_python(scene: Path, tmp_path: Path) -> None:
-    """The folder records the scene and the test views, so the command line need not name them."""
-    import clsplat as package
-
-    names = tmp_path / "names.txt"
-    names.write_text("view_002.png")
-    package.train(
-        package.load_scene(scene, test_list=names),
-        package.TrainConfig(iterations=2, cap_max=50, sh_degree=0),
-        output=tmp_path / "m",
-    )
-    clsplat("eval", tmp_path / "m")
-    per_view = json.loads((tmp_path / "m" / "per_view.json").read_text())
-    assert list(per_view["ours_2"]["PSNR"]) == ["view_002.png"]
-
-
-def test_eval_of_a_moved_scene(model: Path, scene: Path, tmp_path: Path) -> None:
-    moved, copy = tmp_path / "moved", tmp_path / "m"
-    shutil.copytree(scene, moved)
-    shutil.copytree(model, copy)
-    stored = json.loads((copy / "config.json").read_text())
-    stored["scene"]["path"] = str(tmp_path / "gone")
-    (copy / "config.json").write_text(json.dumps(stored))
-    assert "with -s" in error_of("eval", copy)
-    clsplat("eval", copy, "-s", moved)
-    clsplat("render", copy, "-o", tmp_path / "r")  # rendering needs no photos

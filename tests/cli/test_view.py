@@ -14,12 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import ITERATIONS, N_VIEWS, SHORT, TEST_NAMES, clsplat, error_of
+from cli_runner import ITERATIONS, N_VIEWS, SHORT, TEST_NAMES, clsplat, error_of, run
 from PIL import Image
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera, write_cameras
 from clsplat.models.model import SceneChoice, load_model
+from clsplat.training.run import Model
 from clsplat.viewer.camera import Pose, camera_of
 from clsplat.viewer.session import known_cameras
 from clsplat.viewer.settings import Settings
@@ -51,7 +52,7 @@ def test_cameras_are_split_as_the_run_did(capture_folder: Path, model_folder: Pa
 def test_bad_input_is_one_line(tmp_path: Path, capture_folder: Path, model_folder: Path) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
     model, scene = model_folder, capture_folder
-    assert "no such model folder or PLY file" in error_of("view", tmp_path / "none")
+    assert "no such model folder or file of splats" in error_of("view", tmp_path / "none")
     assert "give one model folder" in error_of("view", code=2)
     assert "no iteration 7" in error_of("view", model, "--iteration", "7")
     with socket.socket() as other:
@@ -74,11 +75,44 @@ def test_without_viser_both_say_what_to_install(
     assert not (tmp_path / "run").exists()
 
 
+def test_the_page_stays_after_training_only_where_somebody_can_end_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capture_folder: Path
+) -> None:
+    """Here standard error is not a terminal, as in a script."""
+    pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
+    from clsplat.viewer.training_session import TrainingSession
+
+    stayed: list[int] = []
+
+    def stay(session: TrainingSession, model: Model) -> None:
+        stayed.append(model.iteration)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(TrainingSession, "stay", stay)
+    short = [*SHORT, "--iterations", 12, "--view", "--port", 0]
+    quiet = run("train", capture_folder, "-m", tmp_path / "ends", *short)
+    assert quiet.exit_code == 0
+    assert not stayed
+    result = run("train", capture_folder, "-m", tmp_path / "stays", *short, "--stay")
+    assert result.exit_code == 0
+    assert stayed == [12]
+    assert re.search(
+        r"the page stays open at http://127\.0\.0\.1:\d+ until Ctrl-C; later: clsplat view ", result.stderr
+    )
+    assert "--stay and --no-stay need --view" in error_of("train", capture_folder, "--stay", code=2)
+
+
 class Command:
     """Run `clsplat ...` in a process that serves a page."""
 
     def __init__(self, *args: object) -> None:
-        command = [sys.executable, "-u", "-c", "from clsplat_cli.main import main; main()", *(str(arg) for arg in args)]
+        command = [
+            sys.executable,
+            "-u",
+            "-c",
+            "from clsplat_cli.start import main; main()",
+            *(str(arg) for arg in args),
+        ]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ | {"COLUMNS": "200"}
         )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import MakeRenderer
 
-from clsplat.compression.importance import Importance, lower_bands, measure_importance
+from clsplat.compression.importance import Importance, _per_opacity, lower_bands, measure_importance
 from clsplat.device.device import Device
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
@@ -146,6 +146,28 @@ def test_lower_degrees_are_least_squares() -> None:
         np.testing.assert_allclose(lower[1][i], best, atol=0.02)  # tolerance for the ridge
         assert lost[i, 1] == pytest.approx(left.sum(), rel=1e-3)
     assert (lost[:, 0] >= lost[:, 1]).all()
+
+
+def test_a_lower_degree_never_loses_less() -> None:
+    """The ridge of a degree can cost more than the degree gains, if the weights of its bands differ by far."""
+    rng = np.random.default_rng(0)
+    n, views, coefficients = 50, 7, 9
+    basis = rng.normal(size=(n, views, coefficients)) * 10 ** rng.uniform(-2, 2, (n, 1, coefficients))
+    sh = (rng.normal(size=(n, coefficients, 3)) * 10 ** rng.uniform(-2, 2, (n, coefficients, 1))).astype(np.float32)
+    rows, columns = np.triu_indices(coefficients)
+    products = np.einsum("nvk,nvl->nkl", basis, basis)[:, rows, columns].astype(np.float32)
+    lost = lower_bands(sh, products)[1]
+    assert (np.diff(lost, axis=1) <= 0).all()
+    assert (lost >= 0).all()
+
+
+@pytest.mark.parametrize("shape", ["gaussian", "student-t"])
+def test_the_factor_of_the_opacity_is_its_value_over_its_slope(shape: str) -> None:
+    """I - o dI/do is the image without the splat. So the raw gradient is multiplied by o / (do/draw)."""
+    raw, step = np.linspace(-3, 3, 7), 1e-6
+    opacity = SHAPES[shape].opacity
+    slope = (opacity(raw + step) - opacity(raw - step)) / (2 * step)
+    np.testing.assert_allclose(_per_opacity(SHAPES[shape], raw), opacity(raw) / slope, rtol=1e-6, atol=1e-9)
 
 
 def test_splats_that_no_view_sees_need_nothing_and_keep_their_colour(renderer: Renderer, scene: Scene) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from conftest import MakeRenderer
 from clsplat.compression.prune import (
     Thresholds,
     Validation,
+    _highest_threshold,
     apply_thresholds,
     band_slopes,
     prune,
@@ -18,9 +22,12 @@ from clsplat.compression.prune import (
     within_bytes,
     without_bands,
     without_field,
+    without_splats,
 )
 from clsplat.device.device import Device
 from clsplat.errors import InputError
+from clsplat.evaluation.metrics import psnr
+from clsplat.models.prune import prune_model
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.scenes.split import hold_out
@@ -113,6 +120,8 @@ def test_rules_on_small_arrays() -> None:
     arrays["skew"][:], arrays["sh"][:, 1:] = 0.5, 1.0
     splats = Splats(points.shape, arrays)
     np.testing.assert_array_equal(strongest(splats, np.array([1.0, 3.0, 2.0]), 2).mean, splats.mean[1:])
+    few = without_splats(splats, 2.0, np.array([1.0, 3.0, 2.0]))
+    np.testing.assert_array_equal(few.mean, splats.mean[1:2], err_msg="a score equal to the threshold goes")
     fewer = without_field(splats, 2.0, "skew", np.array([1.0, 3.0, 2.0]))
     assert fewer.skew.any(axis=1).tolist() == [False, True, False]
     lost = np.array([[36.0, 0.0], [72.0, 0.0], [0.0, 0.0]])
@@ -121,6 +130,66 @@ def test_rules_on_small_arrays() -> None:
     np.testing.assert_array_equal(flat.sh[1], splats.sh[1])
     assert not flat.sh[[0, 2], 1:].any()
     assert (flat.sh[[0, 2], 0] == 7).all()
+
+
+def test_splats_without_the_removed_band_keep_their_bits() -> None:
+    points = Splats.from_points(np.eye(3), np.full((3, 3), 0.5), sh_degree=1)
+    arrays = points.to_numpy()
+    arrays["sh"][0, 1:] = 1.0
+    splats = Splats(points.shape, arrays)
+    lost = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
+    flat = without_bands(splats, 100.0, [np.full((3, 1, 3), 7.0, np.float32)], lost)
+    assert (flat.sh[0, 0] == 7).all()
+    np.testing.assert_array_equal(flat.sh[1:], splats.sh[1:])
+
+
+@pytest.mark.parametrize(("floor", "left"), [(4.0, 4), (3.5, 4), (0.0, 0), (10.0, 10), (9.5, 10)])
+def test_bisection_removes_exactly_what_the_floor_allows(floor: float, left: int) -> None:
+    """Here the PSNR of a model is the number of its splats."""
+    points = Splats.from_points(np.arange(30.0).reshape(10, 3), np.full((10, 3), 0.5), sh_degree=0)
+    scores = np.random.default_rng(1).permutation(10) + 1.0
+
+    class CountsSplats:
+        psnr = staticmethod(len)
+
+    judge: Any = CountsSplats()
+    threshold, kept, value = _highest_threshold(
+        scores, points, 10.0, floor, lambda splats, at: without_splats(splats, at, scores), judge
+    )
+    assert value == len(kept) == left
+    assert threshold == (10 - left if left < 10 else 0)
+    assert scores[np.isin(points.mean, kept.mean).all(axis=1)].min(initial=11) == 11 - left
+
+
+def test_the_judge_has_the_background_of_the_model(splats: Splats, scene: Scene, renderer: Renderer) -> None:
+    few = splats.select(np.arange(100))
+    for background in ((0.0, 0.0, 0.0), (1.0, 0.5, 0.25)):
+        want = [psnr(renderer.render(few, view.camera, background).color, view.image) for view in scene.test]
+        assert Validation(renderer, scene.test, background).per_view(few) == want
+
+
+def test_a_model_is_pruned_over_its_background(
+    model_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model of the fixture is that of a black run. Its record is changed to a run over another colour."""
+    folder, judges = tmp_path / "model", []
+    shutil.copytree(model_folder, folder)
+    record = json.loads((folder / "config.json").read_text())
+    record["config"]["background"] = [1.0, 0.5, 0.25]
+    (folder / "config.json").write_text(json.dumps(record))
+    init = Validation.__init__
+
+    def spy(self: Validation, *args: Any) -> None:
+        init(self, *args)
+        judges.append(self)
+
+    monkeypatch.setattr(Validation, "__init__", spy)
+    pruned = prune_model(folder, tmp_path / "small.ply").pruned
+    assert [judge.background for judge in judges] == [(1.0, 0.5, 0.25)]
+    assert [view.name for view in judges[0].views] == [
+        view.name for view in hold_out(load_scene(record["scene"]["path"])).test
+    ]
+    assert pruned.before == judges[0].psnr(Splats.load(ModelFolder(folder).latest_ply()[0]))
 
 
 def test_bad_input(splats: Splats, scene: Scene, validation: Validation) -> None:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import clsplat
+from clsplat.compression import search
 from clsplat.compression.prune_and_refine import fine_tuning
 from clsplat.compression.rules import (
     BudgetOptions,
@@ -23,11 +27,13 @@ from clsplat.compression.rules import (
     rounds_are_over,
     standard_error,
 )
-from clsplat.compression.search import train_budget
+from clsplat.compression.search import _Search, train_budget
+from clsplat.compression.state import BudgetState
 from clsplat.errors import InputError, OutputError
 from clsplat.scenes.scene import Scene
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
+from clsplat.training.folder import ModelFolder
 from clsplat.training.log import Progress
 
 AUTO = BudgetOptions()
@@ -138,6 +144,13 @@ def test_fine_tuning_goes_on_at_the_runs_last_rates() -> None:
 
 
 @pytest.fixture(scope="module")
+def scene(scene: Scene) -> Scene:
+    """The small capture without the photos of its test views: a search that reads one of them fails."""
+    assert scene.test
+    return replace(scene, views=[replace(view, image=None) if view in scene.test else view for view in scene.views])
+
+
+@pytest.fixture(scope="module")
 def searched(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> clsplat.Budgeted:
     return train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path_factory.mktemp("budget") / "model")
 
@@ -149,6 +162,7 @@ def test_a_search_finds_a_smaller_model(searched: clsplat.Budgeted) -> None:
     assert report["rounds"][0]["splats"] == report["refit"]["splats"] == 200
     rounds = report["chosen"]
     assert rounds >= 1
+    assert report["rounds"][1]["splats"] == 150, "a round removes a quarter"
     assert len(searched.splats) == report["rounds"][rounds]["splats"] == report["final"]["splats"]
     assert report["held_out"]["psnr_pruned"] >= report["held_out"]["psnr"] - 0.1
     assert report["final"]["bytes"] == searched.path.stat().st_size
@@ -168,9 +182,7 @@ class Stop:
         self.left = number
 
     def __call__(self, progress: Progress) -> None:
-        self.left -= progress.message.split(":")[0].split()[0:1] in (
-            [word] for word in ("growth", "held", "round", "last", "refit")
-        )
+        self.left -= bool(re.match(r"step \d of 5, (growth|held out|round|last part|refit)", progress.message))
         if not self.left:
             raise KeyboardInterrupt
 
@@ -187,6 +199,51 @@ def test_an_interrupted_search_goes_on(scene: Scene, searched: clsplat.Budgeted,
             assert stops < 20
     assert stops >= 2
     assert again.path.read_bytes() == searched.path.read_bytes()
+
+
+def search_of(scene: Scene, folder: Path, **values: Any) -> _Search:
+    """Return a search with finished stages."""
+    state = BudgetState(folder)
+    state.begin(CONFIG, AUTO, {})
+    state.values |= values
+    return _Search(scene, CONFIG, AUTO, None, state, ModelFolder(folder))
+
+
+def test_held_out_views_are_not_trained_on(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained: list[Scene] = []
+    splats = Splats.from_points(np.eye(3), np.full((3, 3), 0.5), sh_degree=0)
+
+    class Runs:
+        def __init__(self, scene: Scene, *args: Any, **options: Any) -> None:
+            trained.append(scene)
+
+        def run(self) -> Any:
+            return SimpleNamespace(splats=splats, seconds=1.0)
+
+    monkeypatch.setattr(search, "Trainer", Runs)
+    stages = search_of(scene, tmp_path)
+    stages.grow()
+    judges = {view.name for view in stages.validation.views}
+    assert trained
+    for one in trained:
+        names = {view.name for view in one.train}
+        assert names
+        assert not names & (judges | scene.test_names)
+
+
+def test_the_refit_has_all_views_and_the_cap_of_the_knee(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs: list[tuple[Scene, TrainConfig]] = []
+
+    def stops(scene: Scene, config: TrainConfig, *args: Any, **options: Any) -> None:
+        runs.append((scene, config))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(search, "train", stops)
+    with pytest.raises(KeyboardInterrupt):
+        search_of(scene, tmp_path, candidates=[70], knee=70, chosen=0, thresholds={}).run()
+    assert runs == [(scene, CONFIG.replace(cap_max=70))]
 
 
 def test_targets_out_of_reach_keep_the_best(scene: Scene, tmp_path: Path) -> None:

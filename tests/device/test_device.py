@@ -81,6 +81,8 @@ def test_bad_schedule_is_refused_in_one_line(text):
 def test_default_schedule_follows_the_kind_and_the_group_limit():
     for kind, max_group, name in (("CPU", 4096, "cpu16"), ("GPU", 1024, "gpu256"), ("GPU", 128, "gpu64")):
         assert default_schedule(dataclasses.replace(INFO, type=kind, max_group=max_group)) == SCHEDULES[name]
+    mesa = dataclasses.replace(INFO, platform="rusticl", type="CPU", max_group=1024)
+    assert default_schedule(mesa) == SCHEDULES["gpu256"], "Mesa compiles wide lanes for minutes"
 
 
 def test_listed_devices_open_by_index():
@@ -105,6 +107,7 @@ def test_best_device_is_a_gpu_then_pocl_then_intel(choose):
     assert choose("xeon", intel, pocl) == "1:0"
     assert choose("2:0", gpu, pocl, intel) == "2:0"
     assert choose("0", pocl, gpu, big) == "0:0"
+    assert choose("2", gpu, pocl, intel) == "2:0", "a number alone names a platform"
 
 
 def test_an_unknown_device_lists_the_known_ones(choose):
@@ -156,7 +159,7 @@ def test_too_large_a_buffer_is_refused_before_the_driver_sees_it(device):
 def test_host_memory_limits_a_cpu(device, monkeypatch):
     if device.info.type != "CPU":
         pytest.skip("the default device has its own memory")
-    monkeypatch.setattr(device_module, "_available_host_bytes", lambda: 17 << 20)
+    monkeypatch.setattr(device_module, "available_bytes", lambda: 17 << 20)
     device.alloc(17 << 20)
     with pytest.raises(DeviceError, match=r"needs 18 MB, has 17 MB free in this machine: use fewer splats"):
         device.alloc(18 << 20)

@@ -89,10 +89,13 @@ def test_the_smoke_test_passes_and_detects_wrong_numbers(device, monkeypatch):
     build_ms, run_ms = smoke_test(device)
     assert build_ms >= 0
     assert run_ms >= 0
-    wrong = "kernel void smoke(global const float *x, global float *y, int n) { y[0] = x[n - 1]; }"
-    monkeypatch.setattr(program_module, "build", lambda device, files: build_text(device, wrong))
-    with pytest.raises(DeviceError, match="wrong numbers"):
-        smoke_test(device)
+    head = "kernel void smoke(global const float *x, global float *y, int n) "
+    inexact = "{ int i = get_global_id(0); if (i < n) y[i] = 1.0001f * (exp(-x[i] * x[i]) + erfc(x[i])); }"
+    for body in ("{ y[0] = x[n - 1]; }", inexact):
+        wrong = head + body
+        monkeypatch.setattr(program_module, "build", lambda device, files, wrong=wrong: build_text(device, wrong))
+        with pytest.raises(DeviceError, match="wrong numbers"):
+            smoke_test(device)
 
 
 def test_sources_are_joined_with_their_names():
@@ -201,6 +204,29 @@ def test_signatures_are_read_in_the_house_style():
         "b": (),
     }
     assert parse_signatures(text, "float")["a"][3].dtype == np.float32
+
+
+def test_parameters_follow_the_defines():
+    text = """
+    kernel void f(
+        int n,
+    #if WITH_DEPTH
+        global float *depth,
+    #endif
+    #ifdef ROW_SKEW
+        real lr,
+    #endif
+        int m
+    ) {}
+    """
+    for defines, names in (
+        ({"WITH_DEPTH": 0}, "nm"),
+        ({"WITH_DEPTH": 1}, ["n", "depth", "m"]),
+        ({"WITH_DEPTH": 0, "ROW_SKEW": 0}, ["n", "lr", "m"]),
+    ):
+        assert [parameter.name for parameter in parse_signatures(text, "float", defines)["f"]] == list(names)
+    with pytest.raises(DeviceError, match="'WITH_DEPTH', which is not a define"):
+        parse_signatures(text, "float")
 
 
 def test_unreadable_signatures_are_refused():

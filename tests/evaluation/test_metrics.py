@@ -7,12 +7,18 @@ import math
 
 import numpy as np
 import pytest
+from conftest import MakeRenderer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from clsplat.cameras.camera import Camera
+from clsplat.device.device import Device
 from clsplat.errors import InputError
+from clsplat.evaluation.evaluate import evaluate
 from clsplat.evaluation.metrics import PROTOCOLS, color_corrected, protocol_named, psnr, ssim
+from clsplat.scenes.scene import View
+from clsplat.splats.splats import Splats
 
 RNG = np.random.default_rng(5)
 A = RNG.random((17, 14, 3))
@@ -120,3 +126,34 @@ def test_colour_correction_undoes_an_affine_change() -> None:
     protocol = dataclasses.replace(protocol_named("clsplat"), corrected=True)
     assert protocol.measure(A, changed)["PSNR"] > 70
     assert protocol.describe()["name"] == "clsplat, colour-corrected"
+
+
+def test_evaluate_measures_what_no_mask_hides(devices: list[Device], make_renderer: MakeRenderer) -> None:
+    """The hidden half of the photo may hold anything. Without the mask it counts."""
+    camera = Camera(24, 20, 20.0, 20.0, 12.0, 10.0, np.eye(4))
+    splats = Splats.from_points(np.array([[0.0, 0.0, 3.0]]), np.full((1, 3), 0.6), sh_degree=0)
+    renderer, photo = make_renderer(devices[0]), RNG.integers(0, 256, (20, 24, 3)).astype(np.uint8)
+    mask = np.broadcast_to(np.arange(24) < 12, (20, 24))
+    wild = np.where(mask[:, :, None], photo, 255 - photo)
+    views = [View(f"{i}.png", camera, image, mask) for i, image in enumerate((photo, wild))]
+    hidden, shown = (
+        evaluate(renderer, splats, [dataclasses.replace(view, mask=m) for view in views]).per_view for m in (mask, None)
+    )
+    render = np.clip(renderer.render(splats, camera).color, 0, 1)
+    assert hidden["0.png"]["PSNR"] == hidden["1.png"]["PSNR"] == pytest.approx(psnr(render[:, :12], photo[:, :12]))
+    assert hidden["0.png"]["SSIM"] == pytest.approx(ssim(render, photo, mask=mask))
+    assert shown["0.png"]["PSNR"] != shown["1.png"]["PSNR"]
+    assert shown["0.png"]["PSNR"] == pytest.approx(psnr(render, photo))
+
+
+def test_evaluate_returns_means_and_finite_values(devices: list[Device], make_renderer: MakeRenderer) -> None:
+    """A photo that equals the render has 100 dB in place of infinity."""
+    camera = Camera(24, 20, 20.0, 20.0, 12.0, 10.0, np.eye(4))
+    splats = Splats.from_points(np.array([[0.0, 0.0, 3.0]]), np.full((1, 3), 0.6), sh_degree=0)
+    renderer = make_renderer(devices[0])
+    equal = np.rint(255 * np.clip(renderer.render(splats, camera).color, 0, 1)).astype(np.uint8)
+    photos = [equal, np.full_like(equal, 128), np.full_like(equal, 130)]
+    found = evaluate(renderer, splats, [View(f"{i}.png", camera, photo) for i, photo in enumerate(photos)])
+    values = [found.per_view[f"{i}.png"]["PSNR"] for i in range(3)]
+    assert values[0] == 100.0
+    assert found.psnr == pytest.approx(np.mean(values)) != pytest.approx(np.median(values))

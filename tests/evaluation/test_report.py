@@ -6,6 +6,7 @@ import io
 import re
 import shutil
 from base64 import b64decode
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -155,6 +156,19 @@ def test_a_page_of_two_models_compares_them(tmp_path: Path) -> None:
     other = measured("three", n=2)
     with pytest.raises(InputError, match="three and one were measured on different views"):
         write_report(tmp_path / "s.html", [both[0], other], "views", [])
+
+
+def test_models_whose_scenes_name_photos_with_and_without_a_folder(tmp_path: Path) -> None:
+    """COLMAP names a photo 1.jpg, transforms.json images/1.jpg."""
+    one, two = measured("one"), measured("two", error=0.1)
+    for rename in (lambda name: f"images/{name}", lambda name: name.replace(".jpg", ".png")):
+        other = replace(
+            two,
+            per_view={metric: {rename(n): v for n, v in values.items()} for metric, values in two.per_view.items()},
+            images={rename(name): image for name, image in two.images.items()},
+        )
+        text = write_report(tmp_path / "r.html", [one, other], "3 views", []).read_text()
+        assert text == write_report(tmp_path / "s.html", [one, two], "3 views", []).read_text()
 
 
 def test_a_page_is_bounded_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import struct
+import subprocess
+import warnings
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +126,7 @@ def test_damaged_files_raise_input_error_only(tmp_path: Path, kind: str) -> None
 
 def test_missing_empty_and_folder(tmp_path: Path) -> None:
     (tmp_path / "empty.png").write_bytes(b"")
-    for name, what in (("none.png", "no such image"), ("empty.png", "not an image"), (".", "cannot be read")):
+    for name, what in (("none.png", "no such image"), ("empty.png", "not an image"), (".", "is a folder")):
         for reader in (read_image, image_size):
             with pytest.raises(InputError, match=what):
                 reader(tmp_path / name)
@@ -134,3 +138,43 @@ def test_real_photo_and_transparent_render() -> None:
     assert read_image(photo).shape == (713, 400, 3)
     assert image_size(photo) == (400, 713)
     assert read_image(scene_folder("lego") / "train" / "r_0.png").shape == (400, 400, 4)
+
+
+def test_other_formats_start_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow reads EPS with Ghostscript, whatever the name of the file is."""
+    head = "%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n%%EOF\n"
+    (tmp_path / "a.jpg").write_text(head)
+    monkeypatch.setattr(subprocess, "Popen", lambda *command, **options: pytest.fail("a program was started"))
+    with pytest.raises(InputError, match=r"a\.jpg: cannot be read as an image \(not an image of a supported format\)"):
+        image_size(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("form", ["JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "PPM"])
+def test_formats_are_known_by_their_contents(tmp_path: Path, form: str) -> None:
+    Image.new("RGB", (7, 5)).save(tmp_path / "a.jpg", format=form)
+    assert image_size(tmp_path / "a.jpg") == (7, 5)
+
+
+def png_header(width: int, height: int) -> bytes:
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunk = struct.pack(">I", len(header)) + b"IHDR" + header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
+    return b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 4) + b"IDAT"
+
+
+def test_large_photos_are_read_without_a_warning(tmp_path: Path) -> None:
+    """Pillow warns at 89 megapixels, and refuses 179."""
+    limit = Image.MAX_IMAGE_PIXELS
+    (tmp_path / "a.png").write_bytes(png_header(20_000, 20_000))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert image_size(tmp_path / "a.png") == (20_000, 20_000)
+        (tmp_path / "a.png").write_bytes(png_header(20_000, 20_001))
+        with pytest.raises(InputError, match=r"a\.png: has 20000x20001 px, more than 400 megapixels; replace"):
+            image_size(tmp_path / "a.png")
+    assert limit == Image.MAX_IMAGE_PIXELS, "the limit of other programs stays"
+
+
+def test_heic_names_a_converter(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(struct.pack(">I", 24) + b"ftypheic" + bytes(50))
+    with pytest.raises(InputError, match=r"a\.jpg: is a HEIC image, .*; convert it to JPEG with heif-convert"):
+        read_image(tmp_path / "a.jpg")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +74,33 @@ def test_nothing_is_left_of_an_interrupted_video(tmp_path: Path, error: type[Bas
     with pytest.raises(error):
         interrupted()
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("v.mp4", b"old")]
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 100 kB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", folder], capture_output=True).returncode:
+        pytest.skip("file systems cannot be mounted here")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_a_full_disk_is_one_error_and_the_encoder_says_nothing(
+    small_disk: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+
+    def write() -> None:
+        with VideoWriter(small_disk / "v.mp4", 30) as video:
+            for _ in range(60):
+                video.write(rng.integers(0, 256, (96, 128, 3)).astype(np.uint8))
+
+    with pytest.raises(OutputError, match=r"v\.mp4: .*check the disk's free space"):
+        write()
+    assert capfd.readouterr() == ("", "")
+    assert list(small_disk.iterdir()) == []
 
 
 def test_errors_name_the_fault(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ import click
 import draw_imports
 import numpy as np
 import pytest
-from cli_runner import run
+from cli_runner import ITERATIONS, run
 from clsplat_cli.main import COMMANDS, main
 
 import clsplat
@@ -88,6 +88,8 @@ def shortened(command: str) -> list[str]:
     words = shlex.split(command.removeprefix(".venv/bin/"))[1:]
     for place, word in enumerate(words[:-1]):
         words[place + 1] = FEW.get(word, words[place + 1])
+    if "--resume" in words and "--iterations" in words:  # more than those of the model
+        words[words.index("--iterations") + 1] = str(ITERATIONS + 1)
     name = words[0]
     if name in ("train", "demo", "compare", "frontier") and "--resume" not in words:
         options = {"--iterations", "--cap-max"} - set(words)
@@ -108,6 +110,8 @@ def stand_ins(folder: Path, words: list[str], capture: Path, model: Path) -> Non
     for name in ("SCENE", "MODEL", "OTHER", "SMALL"):
         if any(name in word.split("/") for word in words) and name != target:
             shutil.copytree(capture if name == "SCENE" else model, folder / name)
+    if "FILE.ply" in words:
+        shutil.copy(max(model.glob("point_cloud/*/point_cloud.ply")), folder / "FILE.ply")
     if "PHOTOS" in words:
         photos = (REAL_PHOTOS if REAL_PHOTOS.is_dir() else capture) / "images"
         shutil.copytree(photos, folder / "PHOTOS")

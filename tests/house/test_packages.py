@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = (
     "errors",
     "_version",
+    "activity",
     "files",
     "splats",
     "cameras",
@@ -42,12 +43,14 @@ OWNERS = {
     "pycolmap": {"scenes.undistort"},
     "PIL": {"files.images"},
     "matplotlib": {"evaluation.chart_style"},
-    "viser": {"viewer.page", "viewer.server"},
+    "viser": {"viewer.crop_panel", "viewer.listen", "viewer.page", "viewer.path_panel", "viewer.server"},
+    "websockets": {"viewer.listen"},
     "imageio": {"files.video"},
     "imageio_ffmpeg": {"files.video", "scenes.reconstruct.video_frames"},
     "lpips": {"evaluation.perceptual"},
     "torch": {"evaluation.perceptual"},
     "flip_evaluator": {"evaluation.perceptual"},
+    "zstandard": {"files.zstd"},
     "click": set(),  # only the command line imports it
 }
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from device_schedules import schedule_on
 from kernel_checks import Case
 from reference.renderer import alpha_maps, prepared, project, visible_order
 from reference.scenes import random_camera, random_splats
@@ -89,7 +90,7 @@ def test_useful_pairs_are_those_of_the_reference(shape: str, schedule: str, devi
         finished |= (alpha != 0) & (after <= T_MIN)
         transmittance = np.where(finished, transmittance, after)
     assert finished.any() == (shape != "student-t"), "negative alphas increase the transmittance again"
-    kernels = KernelBuild(shape, 2, SCHEDULES[schedule]).for_rendering()
+    kernels = KernelBuild(shape, 2, schedule_on(devices[0], schedule)).for_rendering()
     pipeline = Pipeline(devices[0], kernels)
     frame = pipeline.forward(SplatBuffers.of(devices[0], case.splats, kernels.dtype), case.camera)
     undecided = int((~case.decided).sum())  # each of these pixels may differ by one

@@ -221,33 +221,92 @@ def reference_gradients(
     order = visible_order(values, camera, shape)
     if len(order) == 0:
         return gradients
-    weights = np.asarray(v_color, dtype=np.float64).reshape(-1, 3)
-    weights_alpha = np.zeros(len(weights))
-    if v_alpha is not None:
-        weights_alpha = np.asarray(v_alpha, dtype=np.float64).ravel()
-    screen = project({k: v[order] for k, v in values.items()}, camera, shape, normalisation, sh_degree, antialiased)
-    alphas = list(alpha_maps(screen, camera, alpha_min, alpha_max)[:, None])
-    colors, depths = list(screen.color[:, None]), list(screen.depth[:, None])
-
+    options = (camera, shape, normalisation, sh_degree, antialiased)
+    scene = _Blended(
+        project({k: v[order] for k, v in values.items()}, *options),
+        camera,
+        (alpha_min, alpha_max, t_min),
+        background,
+        v_color,
+        v_alpha,
+    )
     for place, splat in enumerate(order):
-        bumped = project(one_step_each(values, splat, names), camera, shape, normalisation, sh_degree, antialiased)
-        replaced = [
-            [*values_of[:place], new, *values_of[place + 1 :]]
-            for values_of, new in (
-                (alphas, alpha_maps(bumped, camera, alpha_min, alpha_max)),
-                (colors, bumped.color),
-                (depths, bumped.depth),
-            )
-        ]
-        image = blend(*replaced, background=background, t_min=t_min)
-        loss = np.einsum("bpc,pc->b", image.color, weights) + np.einsum("bp,p->b", image.alpha, weights_alpha)
+        slopes = scene.slopes(place, project(one_step_each(values, splat, names), *options))
         start = 0
         for name in names:
             entry = gradients[name][splat]
-            part = loss.imag[start : start + entry.size] / STEP
-            gradients[name][splat] = part.reshape(entry.shape)
+            gradients[name][splat] = slopes[start : start + entry.size].reshape(entry.shape)
             start += entry.size
     return gradients
+
+
+def reference_screen_gradients(
+    arrays: Mapping[str, ArrayLike],
+    camera: Camera,
+    v_color: ArrayLike,
+    v_alpha: ArrayLike | None = None,
+    shape: str = "gaussian",
+    background: ArrayLike = BLACK,
+    alpha_min: float = 1 / 255,
+    alpha_max: float = 0.99,
+    t_min: float = 1e-4,
+) -> Array:
+    """Return the gradient of `reference_gradients`' loss with respect to mean_px, (N, 2) [1/px].
+
+    The kernel on the screen moves as a whole, and the colour of the splat stays. Splats behind the camera have zeros.
+    """
+    values = prepared(arrays, shape)
+    gradients = np.zeros((len(values["mean"]), 2))
+    order = visible_order(values, camera, shape)
+    screen = project({k: v[order] for k, v in values.items()}, camera, shape)
+    scene = _Blended(screen, camera, (alpha_min, alpha_max, t_min), background, v_color, v_alpha)
+    for place, splat in enumerate(order):
+        twice = project({name: array[[splat, splat]] for name, array in values.items()}, camera, shape)
+        moved = twice.kernel._replace(location=twice.kernel.location + 1j * STEP * np.eye(2))
+        gradients[splat] = scene.slopes(place, replace(twice, kernel=moved))
+    return gradients
+
+
+class _Blended:
+    """A projected scene and a loss, sum(v_color * color) + sum(v_alpha * alpha), for derivatives by the complex step.
+
+    Only the alpha map of one splat is computed anew for each set of bumped copies of that splat.
+    """
+
+    def __init__(
+        self,
+        screen: Screen,
+        camera: Camera,
+        thresholds: tuple[float, float, float],
+        background: ArrayLike,
+        v_color: ArrayLike,
+        v_alpha: ArrayLike | None,
+    ) -> None:
+        self.camera, (self.alpha_min, self.alpha_max, self.t_min) = camera, thresholds
+        self.background = background
+        self.weights = np.asarray(v_color, dtype=np.float64).reshape(-1, 3)
+        self.weights_alpha = np.zeros(len(self.weights))
+        if v_alpha is not None:
+            self.weights_alpha = np.asarray(v_alpha, dtype=np.float64).ravel()
+        self.alphas = list(self.alphas_of(screen)[:, None])
+        self.colors, self.depths = list(screen.color[:, None]), list(screen.depth[:, None])
+
+    def alphas_of(self, screen: Screen) -> Array:
+        return alpha_maps(screen, self.camera, self.alpha_min, self.alpha_max)
+
+    def slopes(self, place: int, bumped: Screen) -> Array:
+        """Return the slope of the loss for each of the bumped copies (B,) of the splat at `place` in the order."""
+        replaced = [
+            [*values_of[:place], new, *values_of[place + 1 :]]
+            for values_of, new in (
+                (self.alphas, self.alphas_of(bumped)),
+                (self.colors, bumped.color),
+                (self.depths, bumped.depth),
+            )
+        ]
+        image = blend(*replaced, background=self.background, t_min=self.t_min)
+        loss = np.einsum("bpc,pc->b", image.color, self.weights) + np.einsum("bp,p->b", image.alpha, self.weights_alpha)
+        return loss.imag / STEP
 
 
 def one_step_each(values: Mapping[str, Array], splat: int, names: Sequence[str]) -> dict[str, Array]:

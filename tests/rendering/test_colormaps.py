@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import MakeRenderer
+from device_schedules import schedule_on
 from numpy.typing import NDArray
 from reference.scenes import for_shape, random_camera, random_splats, slant_of
 
 from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device
-from clsplat.device.schedule import SCHEDULES
+from clsplat.device.schedule import default_schedule
 from clsplat.device.trace import recorded
 from clsplat.errors import InputError
 from clsplat.rendering.colormaps import (
@@ -156,7 +157,7 @@ def test_colour_and_alpha_are_the_render(make_renderer: MakeRenderer, device: De
 def test_counts_of_blocks_are_the_means_of_their_pixels(make_renderer: MakeRenderer, device: Device) -> None:
     counts = {}
     for name in ("cpu16", "cpu8", "gpu256"):
-        renderer = make_renderer(device, schedule=SCHEDULES[name])
+        renderer = make_renderer(device, schedule=schedule_on(device, name))
         renderer.render(model(), camera())
         counts[name] = renderer.count_splats()
     pixels = counts["gpu256"]
@@ -213,7 +214,7 @@ def test_a_lower_degree_is_the_model_without_higher_bands(make_renderer: MakeRen
 
 def test_models_in_use_stay_on_the_device(device: Device) -> None:
     first, second, third = model(n=30), model(n=40), model(n=50)
-    renderer = Renderer(device, schedule=SCHEDULES["cpu16"], keep=2)
+    renderer = Renderer(device, schedule=default_schedule(device.info), keep=2)
 
     def uploads(splats: Splats) -> int:
         with recorded(device) as launches:
@@ -228,3 +229,13 @@ def test_models_in_use_stay_on_the_device(device: Device) -> None:
     assert uploads(third) == fresh  # `first` is removed
     assert uploads(second) == again
     assert uploads(first) == fresh
+
+
+def test_faint_pixels_do_not_stretch_the_range_of_depths() -> None:
+    """They count if no pixel is solid."""
+    alpha = np.where(np.arange(100) < 50, 0.6, 0.2).reshape(10, 10)
+    depths = np.where(alpha > 0.5, np.linspace(1, 2, 100).reshape(10, 10), 50.0)
+    image = Rendered(np.zeros((10, 10, 3)), alpha, alpha * depths)
+    near, far = depth_range(image)
+    assert 1 <= near < far < 2
+    assert depth_range(Rendered(image.color, np.full_like(alpha, 0.2), 0.2 * depths))[1] == 50

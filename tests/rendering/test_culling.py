@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from device_schedules import schedule_on
 from kernel_checks import Case
 from reference.scenes import for_shape, random_camera, random_splats
 from reference.skewed import SKEWED
@@ -11,7 +12,7 @@ from rendering.test_footprint import strongly_skewed
 
 from clsplat.device.device import Device
 from clsplat.device.memory import to_host
-from clsplat.device.schedule import TILE, Schedule
+from clsplat.device.schedule import TILE
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.splat_buffers import SplatBuffers
@@ -42,7 +43,7 @@ FAMILIES = ("gaussian", "skew-normal", "half-gaussian", "generalised-exponential
     "shape", [shape if shape in FAMILIES else pytest.param(shape, marks=pytest.mark.slow) for shape in SHAPES]
 )
 def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, schedule: str) -> None:
-    form = Schedule.parse(schedule)
+    form = schedule_on(device, schedule)
     kernels = KernelBuild(shape, 3, form)
     pipeline = Pipeline(device, kernels)
     columns, block_height = TILE // 4, form.lanes // 4

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import USABLE, MakeRenderer, on_place
+from device_schedules import schedule_on
 from kernel_checks import BACKGROUND, KERNELS, SMOOTH, Arrays, Case, differences
 from reference.formulas import SKEW_MAX
 from reference.renderer import FIELDS
@@ -21,14 +22,14 @@ from reference.tolerances import DIFFERENCES, relative_error
 
 from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device
-from clsplat.device.schedule import SCHEDULES
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 
 # Schedules change only the raster kernels, and normalisations only the projection. So not all combinations are
 # tested, and normalisations run on the first device only.
-BUILDS = [(0, *kernel, "cpu16") for kernel in KERNELS] + [(0, "skew-normal", "peak", "gpu256")]
-BUILDS += [on_place(place, place, *kernel, "cpu16") for place in range(1, len(USABLE)) for kernel in KERNELS[:2]]
+WIDEST = ["cpu16" if info.has_wide_lanes else "gpu256" for info in USABLE]
+BUILDS = [(0, *kernel, WIDEST[0]) for kernel in KERNELS if USABLE] + [(0, "skew-normal", "peak", "gpu256")]
+BUILDS += [on_place(place, place, *kernel, WIDEST[place]) for place in range(1, len(USABLE)) for kernel in KERNELS[:2]]
 
 
 def awkward_splats(camera: Camera) -> Arrays:
@@ -53,7 +54,7 @@ def test_gradients_are_those_of_the_image(
     if normalisation == "pdf":
         arrays["opacity_logit"] -= 3.0  # alpha reaches twice the opacity: keep it below 1
     case = Case(arrays, camera, shape, normalisation, np.float64, thresholds=SMOOTH)
-    renderer = make_renderer(devices[place], "float64", SCHEDULES[schedule], **SMOOTH)
+    renderer = make_renderer(devices[place], "float64", schedule_on(devices[place], schedule), **SMOOTH)
     case.render(renderer)
     got = case.backward(renderer)
     assert set(got) == set(FIELDS[shape])

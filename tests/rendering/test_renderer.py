@@ -11,7 +11,7 @@ from conftest import DEVICE_SCHEDULES, MakeRenderer
 from kernel_checks import BACKGROUND, KERNELS, Case
 from reference.formulas import SKEW_MAX
 from reference.renderer import prepared, reference_gradients, render_reference, visible_order
-from reference.scenes import Arrays, random_camera, random_splats
+from reference.scenes import Arrays, for_shape, random_camera, random_splats
 from reference.tolerances import GRADIENT_FLOAT32, IMAGE_FLOAT32, ROUNDING, SAME_FLOAT32, relative_error
 
 from clsplat.cameras.camera import Camera
@@ -294,6 +294,38 @@ def test_an_overwritten_frame_raises(device: Device) -> None:
     ):
         with pytest.raises(RuntimeError, match="the frame is overwritten"):
             use()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_splats_too_wide_for_float32_are_not_seen(make_renderer: MakeRenderer, device: Device, axis: int) -> None:
+    """The limit is a deviation of 1e6 px, along either axis of the image."""
+    camera = Camera(20, 18, 20.0, 20.0, 10.0, 9.0, np.eye(4))
+    arrays = for_shape(random_splats(1, 1, 0), "gaussian")
+    arrays["mean"][:], arrays["quat"][:], arrays["opacity_logit"][:] = (0, 0, 2), (1, 0, 0, 0), 0
+    alphas = []
+    for pixels in (3e5, 3e6):
+        arrays["log_scale"][:] = np.log(0.5)
+        arrays["log_scale"][0, axis] = np.log(pixels * 2 / 20)
+        alphas.append(float(make_renderer(device).render(Splats("gaussian", arrays), camera).alpha.max()))
+    assert alphas == pytest.approx([0.5, 0.0], abs=1e-2)
+
+
+def test_a_finished_corner_does_not_end_its_tile(
+    make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule]
+) -> None:
+    """A batch of near splats finishes the first pixel of the tile. The batches behind it show in the other pixels."""
+    corner, behind = 70, 40  # a batch has 64
+    arrays = random_splats(1, corner + behind, 3)
+    rng = np.random.default_rng(1)
+    arrays["mean"][:corner] = rng.uniform(-0.01, 0.01, (corner, 3)) - np.array([0.97, 0.97, 0])
+    arrays["mean"][corner:] = rng.uniform(-0.5, 0.5, (behind, 3)) + np.array([0.3, 0, 2])
+    arrays["log_scale"][:] = np.where(np.arange(corner + behind) < corner, -4.5, -1.5)[:, None]
+    arrays["opacity_logit"][:corner], arrays["opacity_logit"][corner:] = 2.0, -2.5
+    pose = np.eye(4)
+    pose[2, 3] = 4.0
+    case = Case(arrays, Camera(16, 16, 32.0, 32.0, 8.0, 8.0, pose), "gaussian", fields=("mean", "sh"))
+    assert case.image.alpha[0, 0] > 0.99 > case.image.alpha[8:].max() > 0.3
+    case.check(make_renderer(scheduled[0], schedule=scheduled[1]), IMAGE_FLOAT32, GRADIENT_FLOAT32)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import struct
 from pathlib import Path
 
@@ -312,3 +314,23 @@ def test_damage_gives_a_model_or_a_message(
         message = str(error)
     assert "\n" not in message
     assert message or np.isfinite(model.points.xyz).all()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes")
+def test_a_pipe_in_the_model_s_folder_is_not_opened(folder: Path) -> None:
+    """Opening it would wait for ever. A points file that cannot be read counts as missing."""
+    points = folder / "sparse" / "0" / "points3D.bin"
+    expected = load_scene(folder).names
+    points.unlink()
+    os.mkfifo(points)
+    before = signal.signal(signal.SIGALRM, _too_long)
+    signal.alarm(20)
+    try:
+        assert load_scene(folder).names == expected
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _too_long(number: int, frame: object) -> None:
+    pytest.fail("waits for the content of a pipe")

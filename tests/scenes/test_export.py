@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def with_lens(garden: Path, model: str) -> PosedImages:
         RegisteredImage(photo.name, photo.cam_from_world, make_lens(model, 40, 30, LENSES[model]))
         for photo in posed.photos
     ]
-    return PosedImages(photos, posed.files, posed.points)
+    return replace(posed, photos=photos)
 
 
 def assert_same(photos: list[RegisteredImage], expected: list[RegisteredImage]) -> None:
@@ -149,3 +150,12 @@ def test_missing_cameras_and_unsupported_lenses_are_refused(garden: Path, tmp_pa
         write_transforms(tmp_path / "t.json", [RegisteredImage("a.png", np.eye(4), six)], ["a.png"], posed.points)
     assert not (tmp_path / "t.json").exists()
     assert relative_files([garden / "images" / "a.png"], garden / "out") == ["../images/a.png"]
+
+
+def test_cameras_of_a_transforms_file_are_those_of_its_scene(garden: Path, tmp_path: Path) -> None:
+    """Two objects are in files of this ending: transforms.json has `frames`, a camera path has `camera_path`."""
+    clsplat("cameras", garden, garden / "transforms.json")
+    clsplat("cameras", garden / "transforms.json", tmp_path / "colmap")
+    assert len(read_model(tmp_path / "colmap").photos) == len(NAMES)
+    (tmp_path / "list.json").write_text("{}")
+    assert "render_width" in error_of("cameras", tmp_path / "list.json", tmp_path / "other")

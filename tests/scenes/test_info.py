@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +34,7 @@ def test_a_scene_is_counted_without_decoding(tmp_path: Path, monkeypatch: pytest
     assert (lens.focal, lens.pinhole, lens.photos) == (camera.fx, True, 9)
     assert lens.field_of_view == pytest.approx(62.4, abs=0.05), "2 atan(20 / 33)"
     assert info.photo_bytes == sum(file.stat().st_size for file in (garden / "images").iterdir())
-    assert (info.unregistered, info.unreadable) == ((), ())
+    assert (info.unregistered, info.left_out) == ((), {})
 
 
 def test_faults_are_named(tmp_path: Path) -> None:
@@ -43,11 +45,15 @@ def test_faults_are_named(tmp_path: Path) -> None:
     write_png(garden / "masks" / f"{NAMES[5]}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     info = scene_info(garden)
     assert info.unregistered == ("more/late.png",)
-    assert info.unreadable == (NAMES[2],)
+    assert list(info.left_out) == [NAMES[2]]
     assert info.sizes == (((WIDTH, HEIGHT), 7), ((2 * WIDTH, 2 * HEIGHT), 1))
     assert info.masked == 1
     output = clsplat("info", garden)
-    for text in (f"unreadable      1 ({NAMES[2]})", "without a pose  1 (more/late.png)", "masks           of 1 photos"):
+    for text in (
+        f"left out        1 ({NAMES[2]}), 12 %",
+        "without a pose  1 (more/late.png)",
+        "masks           of 1 photos",
+    ):
         assert text in output
     entry = json.loads(clsplat("info", "--json", garden))
     assert entry["scene"] == str(garden)
@@ -82,7 +88,8 @@ def test_a_reconstructed_scene_shows_its_record(tmp_path: Path) -> None:
     for bad in ('{"photos": 12}', "[]", '{"photos": "x", "registered": 9, "error": 1e999}'):
         record.write_text(bad)
         assert "reconstruct.json: registered, photos and error must be numbers" in error_of("info", garden)
-    assert "photographs without poses: clsplat reconstruct" in error_of("info", garden / "images")
+    shutil.copytree(garden / "images", tmp_path / "photos")
+    assert "photographs without poses: clsplat reconstruct" in error_of("info", tmp_path / "photos")
 
 
 def test_a_lens_without_a_focal_length_is_named(tmp_path: Path) -> None:
@@ -92,7 +99,9 @@ def test_a_lens_without_a_focal_length_is_named(tmp_path: Path) -> None:
     for focal in (0.0, float("nan")):
         data[32:40] = np.float64(focal).tobytes()  # after the count, id, model, width and height
         file.write_bytes(data)
-        assert "has a focal length of" in error_of("info", garden)
+        messages = [error_of("info", garden), error_of("train", garden, "-m", garden / "m")]
+        assert messages[0] == messages[1]
+        assert re.search(r"'shot_0\.png': .*(focal lengths must be above 0|parameter that is not finite)", messages[0])
 
 
 def test_models_and_scenes_are_distinguished(tmp_path: Path, capture_folder: Path, model_folder: Path) -> None:
@@ -105,4 +114,11 @@ def test_models_and_scenes_are_distinguished(tmp_path: Path, capture_folder: Pat
     assert "neither a model (point_cloud/) nor a scene" in error_of("info", tmp_path)
     (tmp_path / "config.json").write_text("{}")
     assert "train a model first" in error_of("info", tmp_path)
-    assert "no such model folder or PLY file" in error_of("info", tmp_path / "none")
+    assert "no such model folder or file of splats" in error_of("info", tmp_path / "none")
+
+
+def test_one_photo_has_no_test_views(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", np.zeros((9, 9, 3)))
+    frames = [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30.0, "frames": frames}))
+    assert "test views      none: clsplat train --eval needs at least 2 photos\n" in clsplat("info", tmp_path)

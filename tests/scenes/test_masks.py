@@ -49,7 +49,8 @@ def test_masks_are_found_by_the_names_of_their_photos(folder: Path, form: str) -
 def test_masks_in_folders_of_photos(tmp_path: Path) -> None:
     for file in ("a.jpg.png", "left/b.png"):
         write_mask(tmp_path / file, left_half())
-    assert mask_files(tmp_path, ["a.jpg", "left/b.jpg", "right/b.jpg"]) == {
+    photos = {name: tmp_path / "photos" / name for name in ("a.jpg", "left/b.jpg", "right/b.jpg")}
+    assert mask_files(tmp_path, photos) == {
         "a.jpg": tmp_path / "a.jpg.png",
         "left/b.jpg": tmp_path / "left/b.png",
     }
@@ -75,11 +76,22 @@ def test_nearest_pixel() -> None:
     np.testing.assert_array_equal(resize_mask(mask, 2, 1), [[False, True]])
 
 
+@pytest.mark.parametrize(("old", "new"), [(9, 3), (4, 2), (3, 7), (5, 2), (100, 33)])
+def test_a_resized_mask_shows_what_lies_at_the_centre_of_each_pixel(old: int, new: int) -> None:
+    """Pixel i of the new mask has its centre at (i + 1/2) old / new, and old pixel j covers j to j + 1."""
+    for place in range(old):
+        mask = np.zeros((old, 2), bool)
+        mask[place] = True
+        expected = [place <= (2 * i + 1) * old / (2 * new) < place + 1 for i in range(new)]
+        np.testing.assert_array_equal(resize_mask(mask, 2, new)[:, 0], expected)
+        np.testing.assert_array_equal(resize_mask(mask.T, new, 2)[0], expected)
+
+
 def test_a_white_mask_is_dropped_and_a_black_mask_leaves_the_photo_out(folder: Path) -> None:
     write_mask(folder / "masks" / f"{NAMES[0]}.png", np.ones((HEIGHT, WIDTH), bool))
     write_mask(folder / "masks" / f"{NAMES[1]}.png", np.zeros((HEIGHT, WIDTH), bool))
     with pytest.warns(
-        UserWarning, match=rf"1 of {N_VIEWS} photos are left out: .*{NAMES[1]}: its mask hides every pixel"
+        UserWarning, match=rf"1 of {N_VIEWS} photos are left out .*{NAMES[1]}: its mask hides every pixel"
     ):
         scene = load_scene(folder)
     assert NAMES[1] not in scene.names
@@ -132,7 +144,7 @@ def test_mask_path_of_a_frame(tmp_path: Path) -> None:
     view = load_scene(tmp_path, eval=False).views[0]
     assert view.mask is not None
     np.testing.assert_array_equal(view.mask, left_half())
-    bad = {"nowhere.png": "nowhere.png: no such image file", 3: "mask_path 3 is not the name of a file"}
+    bad = {"nowhere.png": "mask_path 'nowhere.png' is not a file", 3: "mask_path 3 is not the name of a file"}
     for mask_path, message in bad.items():
         (tmp_path / "transforms.json").write_text(json.dumps(document | {"frames": [frame | {"mask_path": mask_path}]}))
         with pytest.raises(InputError, match=message):

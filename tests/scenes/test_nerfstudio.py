@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cli_runner import error_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scenes_data import scene_folder
@@ -83,6 +84,23 @@ def test_the_lens_of_a_frame_takes_precedence(folder: Path) -> None:
     assert views[3].camera.fx == FX
 
 
+@pytest.mark.parametrize("in_frames", [False, True])
+def test_angles_of_view_of_both_axes(folder: Path, in_frames: bool) -> None:
+    """Pixels may be other than square: then each axis has its own angle."""
+    angles = {"camera_angle_x": 1.0, "camera_angle_y": 0.5}
+    size = {"w": WIDTH, "h": HEIGHT}
+    if in_frames:
+        values = size | {"camera_angle_y": 3.0, "frames": [frame | angles for frame in frames()]}
+    else:
+        values = size | angles | {"frames": frames()}
+    camera = load_scene(write(folder, values)).views[0].camera
+    assert camera.fx == pytest.approx(WIDTH / 2 / np.tan(0.5), rel=1e-12)
+    assert camera.fy == pytest.approx(HEIGHT / 2 / np.tan(0.25), rel=1e-12)
+    mixed = size | {"fl_x": FX, "camera_angle_y": 0.5, "frames": frames()}
+    camera = load_scene(write(folder, mixed)).views[0].camera
+    assert (camera.fx, camera.fy) == (FX, pytest.approx(HEIGHT / 2 / np.tan(0.25), rel=1e-12))
+
+
 def test_lens_is_scaled_to_reduced_photos(folder: Path) -> None:
     for index, name in enumerate(NAMES):
         write_png(folder / "images_2" / name, photo_of(index, WIDTH // 2, HEIGHT // 2))
@@ -150,6 +168,23 @@ def test_lists_of_nerfstudio_split(folder: Path) -> None:
     assert load_scene(write(folder, LENS | lists | {"frames": frames()})).test_names == set(names[5:6])
 
 
+@pytest.mark.parametrize("key", ["train_filenames", "val_filenames", "test_filenames"])
+def test_lists_that_match_no_frame_are_named(folder: Path, key: str) -> None:
+    names = [f"images/{name}" for name in NAMES]
+    lists = {"train_filenames": names[:5], "test_filenames": names[5:], key: ["images/x.jpg", "images/y.jpg"]}
+    file = write(folder, LENS | lists | {"frames": frames()})
+    expected = f"{file}: {key} names no photo of a frame, for example 'images/x.jpg'; name photos such as '{names[0]}'"
+    assert expected in error_of("info", file)
+    assert expected in error_of("train", file, "-m", folder / "m")
+
+
+def test_listed_names_without_a_frame_are_left_out(folder: Path) -> None:
+    lists = {"train_filenames": [f"images/{NAMES[0]}", "images/x.jpg"], "test_filenames": [f"./images/{NAMES[1]}"]}
+    with pytest.warns(UserWarning, match=r"train_filenames names 1 of 2 photos that have no frame.*'images/x\.jpg'"):
+        scene = load_scene(write(folder, LENS | lists | {"frames": frames()}))
+    assert (len(scene.train), len(scene.test)) == (1, 1)
+
+
 def test_points_of_a_ply(folder: Path) -> None:
     xyz, rgb = cloud()
     header = "\n".join(
@@ -180,11 +215,9 @@ def test_points_of_the_model_behind_the_poses_are_transformed(folder: Path, tmp_
 def test_missing_photos_are_named_and_left_out(folder: Path) -> None:
     (folder / "images" / NAMES[3]).unlink()
     write(folder, LENS | {"frames": frames()})
-    with pytest.warns(
-        UserWarning, match=rf"1 of 9 frames name photos that do not exist, for example 'images/{NAMES[3]}'"
-    ):
+    with pytest.warns(UserWarning, match=rf"1 of 9 photos are left out \(12 %\): .*images/{NAMES[3]}: no such"):
         assert len(load_scene(folder).views) == 8
-    with pytest.raises(InputError, match="none of its 9 photos exists"):
+    with pytest.raises(InputError, match="none of its 9 photos can be used"):
         load_scene(write(folder, LENS | {"frames": frames("nowhere/")}))
 
 
@@ -215,7 +248,8 @@ def in_frame(**values: Any) -> Callable[[Values], Values]:
         (changed(ply_file_path="images"), "images: cannot be read"),
         (changed(test_filenames=[1]), "is not a list of photos"),
         (in_frame(transform_matrix=[[1, 2], [3, 4]]), "frame 1: transform_matrix must be 4 x 4"),
-        (in_frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "frame 1: transform_matrix has no rotation"),
+        (in_frame(transform_matrix=np.diag([2.0, 2, 1, 1]).tolist()), "frame 1: .* transform_matrix is not a rotation"),
+        (in_frame(transform_matrix=np.diag([1.0, 1, 1, 2]).tolist()), "frame 1: the last row .* is 0 0 0 2, not"),
         (in_frame(transform_matrix=None), "frame 1: transform_matrix must be"),
         (in_frame(file_path=f"./images/{NAMES[0]}"), "has a frame already"),
         (in_frame(cx=float("nan")), "frame 1: cx is 'nan'"),
@@ -252,7 +286,7 @@ def test_fox_has_the_cameras_of_its_colmap_model() -> None:
 
 @pytest.mark.data
 def test_instant_ngp_fox_skips_missing_photos() -> None:
-    with pytest.warns(UserWarning, match="17 of 67 frames"):
+    with pytest.warns(UserWarning, match="17 of 67 photos are left out"):
         scene = load_scene(scene_folder("fox") / "ngp", resolution=4)
     assert len(scene.views) == 50
     assert scene.views[0].camera.cx != pytest.approx(138.6395 / 4, rel=1e-4), "undistorted"

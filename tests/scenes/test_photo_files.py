@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from clsplat.errors import InputError
+from clsplat.files.digest import file_digest
 from clsplat.files.images import read_image, read_photo_header, write_photo
 from clsplat.scenes.reconstruct.photo_files import (
     PhotoFile,
@@ -84,9 +85,12 @@ def test_folders_without_photos(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no photos in this folder or below; looked for \.bmp"):
         find_photos(tmp_path)
     (tmp_path / "IMG_1.HEIC").write_bytes(b"heic")
-    with pytest.raises(InputError, match=r"1 file \.heic: convert them to JPEG"):
+    for name in ("b.cr2", "b.NEF"):
+        (tmp_path / name).write_bytes(b"raw")
+    text = "3 files .cr2, .heic, .nef: convert them to JPEG, for example with darktable-cli or heif-convert"
+    with pytest.raises(InputError, match=f"no photos in this folder or below; {text}"):
         find_photos(tmp_path)
-    assert unsupported_photos(tmp_path) == "1 file .heic"
+    assert unsupported_photos(tmp_path) == text
     assert not is_photographs(tmp_path)
 
 
@@ -99,21 +103,50 @@ def test_names_that_a_model_cannot_store(tmp_path: Path) -> None:
         find_photos(tmp_path)
 
 
-def test_fingerprint_follows_every_change(tmp_path: Path) -> None:
-    for name in ("a.png", "b.png"):
-        put(tmp_path / name)
-    marks = [fingerprint(tmp_path)]
-    assert fingerprint(tmp_path) == marks[0]
-    os.utime(tmp_path / "a.png", ns=(1, 1))
-    marks.append(fingerprint(tmp_path))
-    put(tmp_path / "masks" / "a.png")
-    marks.append(fingerprint(tmp_path))
-    (tmp_path / "a.png").rename(tmp_path / "c.png")
-    marks.append(fingerprint(tmp_path))
-    (tmp_path / "b.png").unlink()
-    (tmp_path / "b.png").symlink_to(tmp_path / "nowhere.png")
-    marks.append(fingerprint(tmp_path))
+def test_fingerprint_follows_every_change_of_contents(tmp_path: Path) -> None:
+    home = tmp_path / "first"
+    for name in ("a.png", "b.bmp"):
+        put(home / name)
+    marks = [fingerprint(home)]
+    os.utime(home / "a.png", ns=(1, 1))
+    home = home.rename(tmp_path / "second")
+    assert fingerprint(home) == marks[0], "times and places do not count"
+    size = (home / "b.bmp").stat().st_size
+    put(home / "b.bmp", 255 - PICTURE)
+    assert (home / "b.bmp").stat().st_size == size
+    marks.append(fingerprint(home))
+    put(home / "masks" / "a.png")
+    marks.append(fingerprint(home))
+    (home / "a.png").rename(home / "c.png")
+    marks.append(fingerprint(home))
+    (home / "b.bmp").unlink()
+    (home / "b.bmp").symlink_to(home / "nowhere.png")
+    marks.append(fingerprint(home))
     assert len(set(marks)) == 5
+
+
+def test_digest_reads_the_start_the_middle_and_the_end(tmp_path: Path) -> None:
+    file, data = tmp_path / "large", bytearray(1_000_000)
+    marks = set()
+    for place in (None, 0, 500_001, 999_999):
+        changed = bytearray(data)
+        if place is not None:
+            changed[place] = 1
+        file.write_bytes(changed)
+        marks.add(file_digest(file))
+    file.write_bytes(data + b"\0")
+    marks.add(file_digest(file))
+    marks.add(file_digest(file, file))
+    assert len(marks) == 6
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes")
+def test_a_pipe_is_never_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.png")
+    put(tmp_path / "b.png")
+    assert [photo.name for photo in find_photos(tmp_path)] == ["a.png", "b.png"]
+    assert len(fingerprint(tmp_path)) == 64
+    assert "a.png: is not a regular file" in str(staged(tmp_path, PhotoFile("a.png", tmp_path / "a.png")))
 
 
 # --- reading -------------------------------------------------------------------------------
@@ -211,6 +244,10 @@ def test_transparency_and_masks_hide_pixels_from_features(tmp_path: Path) -> Non
     assert isinstance(ready, StagedPhoto)
     handed = read_image(tmp_path / "work" / "masks" / f"{ready.staged}.png")[:, :, 0]
     np.testing.assert_array_equal(handed, np.repeat([[0] * 5 + [255] * 5 + [0] * 10], 12, axis=0))
+    black = put(tmp_path / "black.png", np.zeros((12, 20), np.uint8))
+    assert staged(tmp_path, PhotoFile("a.png", file, black)) == f"{file}: its mask {black} hides every pixel"
+    clear = put(tmp_path / "clear.png", np.dstack([PICTURE, np.zeros((12, 20, 1), np.uint8)]))
+    assert staged(tmp_path, PhotoFile("clear.png", clear)) == f"{clear}: every pixel is transparent"
     wrong = put(tmp_path / "w.png", PICTURE.swapaxes(0, 1))
     reason = staged(tmp_path, PhotoFile("a.png", file, wrong))
     assert isinstance(reason, str)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,8 +21,9 @@ from PIL import Image
 from clsplat.errors import InputError, OutputError
 from clsplat.scenes.colmap import find_model, read_model
 from clsplat.scenes.reconstruct import reconstruct as module
+from clsplat.scenes.reconstruct.model_scene import plan_scene
 from clsplat.scenes.reconstruct.options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, ReconstructOptions
-from clsplat.scenes.reconstruct.photo_files import PhotoFile
+from clsplat.scenes.reconstruct.photo_files import PhotoFile, find_photos
 from clsplat.scenes.reconstruct.reconstruct import is_made_from, reconstruct
 from clsplat.scenes.reconstruct.sfm_process import Step
 from clsplat.scenes.scene import Scene, load_scene
@@ -135,23 +137,78 @@ def test_a_scene_is_not_replaced_without_overwrite(scene: Path, walk: Path, tmp_
     assert is_made_from(tmp_path, walk) is None
 
 
+TINY = ("--eval", "--iterations", 10, "--cap-max", 300, "--sh-degree", 0)
+
+
 def test_training_on_photos_reuses_the_scene(scene: Path, walk: Path, tmp_path: Path) -> None:
-    """The scene lies beside the model, and is not used for other photos."""
-    (tmp_path / "walk-scene").symlink_to(scene)
-    options = ("--eval", "--iterations", 10, "--cap-max", 300, "--sh-degree", 0)
-    result = run("train", walk, "-m", tmp_path / "model", *options)
+    """The scene lies in the model's folder, moves with it, and is not used for other photos."""
+    photos = Path(shutil.copytree(walk, tmp_path / "walk"))
+    shutil.copytree(scene, tmp_path / "model" / "scene")
+    result = run("train", photos, "-m", tmp_path / "model", *TINY)
     assert result.exit_code == 0, result.output
-    assert f"no poses: {tmp_path / 'walk-scene'} was reconstructed from it before" in result.stderr
+    assert f"no poses: {tmp_path / 'model' / 'scene'} was reconstructed from it before" in result.stderr
     assert "test views (1)" in result.stdout
+    (tmp_path / "model").rename(tmp_path / "moved")
+    assert "resumed at iteration 10" in run("train", photos, "-m", tmp_path / "moved", "--resume").stderr
+    clsplat("eval", tmp_path / "moved", "--no-report")
+    Image.fromarray(255 - photo_walk.picture(0)).save(photos / "walk_00.png")
+    assert "was reconstructed from other photos" in error_of("train", photos, "-m", tmp_path / "moved", "--resume")
+    shutil.copytree(scene, tmp_path / "other" / "scene")
+    message = error_of("train", photos, "-m", tmp_path / "other", *TINY)
+    assert "other/scene: was reconstructed from other photos" in message
+    assert "use --overwrite" in message
+
+
+def test_folders_of_one_name_have_a_scene_each(scene: Path, walk: Path, tmp_path: Path) -> None:
+    """The second folder of photos is called as the first. Its model leaves the first model's scene alone."""
+    for name in ("a", "b"):
+        shutil.copytree(walk, tmp_path / name / "images")
+    (tmp_path / "b" / "images" / "walk_07.png").unlink()
+    for name in ("a", "b"):
+        planned = plan_scene(tmp_path / name / "images", tmp_path / "out" / name)
+        assert (planned.path, planned.exists) == (tmp_path / "out" / name / "scene", False)
+        shutil.copytree(scene, planned.path)
+    assert plan_scene(tmp_path / "a" / "images", tmp_path / "out" / "a").exists
+    with pytest.raises(OutputError, match=r"out/b/scene: was reconstructed from other photos than .*b/images now has"):
+        plan_scene(tmp_path / "b" / "images", tmp_path / "out" / "b")
+    replaced = plan_scene(tmp_path / "b" / "images", tmp_path / "out" / "b", overwrite=True)
+    assert (replaced.path, replaced.exists) == (tmp_path / "out" / "b" / "scene", False)
+
+
+def test_a_model_whose_scene_lies_beside_it(scene: Path, walk: Path, tmp_path: Path) -> None:
+    """Models of earlier versions record such a scene, and the scene records no contents of its photos."""
+    shutil.copytree(scene, tmp_path / "walk-scene")
+    record = json.loads((scene / "reconstruct.json").read_text())
+    digest = record.pop("photo_digest")
+    (tmp_path / "walk-scene" / "reconstruct.json").write_text(json.dumps(record | {"fingerprint": digest}))
+    clsplat("train", tmp_path / "walk-scene", "-m", tmp_path / "model", *TINY)
     assert "resumed at iteration 10" in run("train", walk, "-m", tmp_path / "model", "--resume").stderr
     clsplat("eval", tmp_path / "model", "--no-report")
-    (walk / "walk_00.png").touch()
-    assert "was reconstructed from other photos" in error_of("train", walk, "-m", tmp_path / "other", *options)
+    (tmp_path / "walk-scene" / "reconstruct.json").unlink()
+    message = error_of("train", walk, "-m", tmp_path / "model", "--resume")
+    assert f"was trained on {tmp_path / 'walk-scene'}, not on photographs" in message
+
+
+def test_a_scene_and_a_model_inside_the_photos(walk: Path, scene: Path, tmp_path: Path) -> None:
+    photos = Path(shutil.copytree(walk, tmp_path / "walk"))
+    shutil.copytree(scene, photos / "model" / "scene")
+    shutil.copytree(scene, photos / "scene")
+    clsplat("train", photos, "-m", photos / "model", *TINY)
+    clsplat("render", photos / "model", "-o", photos / "renders", "-q")
+    assert len(find_photos(photos)) == 9, "eight photos and the file that is none"
+    result = run("train", photos, "-m", photos / "model", *TINY, "--overwrite")
+    assert result.exit_code == 0, result.output
+    assert "was reconstructed from it before" in result.stderr
+    photos_read = [photo.name for photo in find_photos(photos)]
+    assert [name for name in photos_read if "/" in name] == []
+    (tmp_path / "work").mkdir()
+    with pytest.warns(UserWarning, match=r"left out: model, scene, 1 render in .*walk: scenes, models and renders"):
+        module._stage_all(find_photos(photos), photos, tmp_path / "work", lambda step: None)
 
 
 def test_too_few_photos(tmp_path: Path) -> None:
     photo_walk.write_walk(tmp_path / "two", 2)
-    assert "2 photos that can be read; at least 3" in error_of("reconstruct", tmp_path / "two", "-o", tmp_path / "s")
+    assert "2 photos that can be used; at least 3" in error_of("reconstruct", tmp_path / "two", "-o", tmp_path / "s")
     assert "no such folder" in error_of("reconstruct", tmp_path / "none", "-o", tmp_path / "s")
     assert [entry.name for entry in tmp_path.iterdir()] == ["two"]
 
@@ -161,9 +218,27 @@ def test_photos_that_do_not_fit_together(tmp_path: Path) -> None:
     (tmp_path / "noise").mkdir()
     for index in range(3):
         Image.fromarray(rng.integers(0, 256, (40, 60, 3)).astype(np.uint8)).save(tmp_path / "noise" / f"{index}.png")
-    with pytest.raises(InputError, match="no two photos fit together"):
+    with pytest.raises(InputError, match=r"no two photos fit together.*with texture$"):
         reconstruct(tmp_path / "noise", tmp_path / "scene")
     assert [entry.name for entry in tmp_path.iterdir()] == ["noise"]
+
+
+@pytest.mark.filterwarnings("ignore:left out")
+def test_masks_that_hide_too_much_are_named(tmp_path: Path) -> None:
+    photos = photo_walk.write_walk(tmp_path / "walk", 3)
+    (photos / "masks").mkdir()
+    hidden = np.zeros((photo_walk.HEIGHT, photo_walk.WIDTH), np.uint8)
+    for name in photo_walk.names(3):
+        Image.fromarray(hidden).save(photos / "masks" / name)
+    message = error_of("reconstruct", photos, "-o", tmp_path / "scene")
+    assert "0 photos that can be used; at least 3 are needed" in message
+    assert f"walk_00.png: its mask {photos / 'masks' / 'walk_00.png'} hides every pixel" in message
+    hidden[:9, :9] = 255
+    for name in photo_walk.names(3):
+        Image.fromarray(hidden).save(photos / "masks" / name)
+    message = error_of("reconstruct", photos, "-o", tmp_path / "scene")
+    assert "no two photos fit together" in message
+    assert f"look at the masks in {photos / 'masks'}: black hides" in message
 
 
 def test_a_crash_of_pycolmap_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,7 +284,7 @@ def test_leftovers_of_a_killed_run_are_removed_and_a_second_run_is_refused(tmp_p
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_ctrl_c_leaves_nothing(walk: Path, tmp_path: Path) -> None:
-    program = "from clsplat_cli.main import main; main()"
+    program = "from clsplat_cli.start import main; main()"
     child = subprocess.Popen(
         [sys.executable, "-c", program, "reconstruct", walk, "-o", tmp_path / "scene"],
         stderr=subprocess.PIPE,
@@ -234,6 +309,12 @@ def test_estimate_grows_with_photos_and_their_size(tmp_path: Path) -> None:
     seconds = [
         module.estimate_seconds([PhotoFile(file.name, file)] * count) for file in (small, large) for count in (20, 140)
     ]
+    damaged = tmp_path / "damaged.png"
+    damaged.write_bytes(b"no photo")
+    files = [PhotoFile(file.name, file) for file in (damaged, *[small] * 19)]
+    assert module.estimate_seconds(files) == seconds[0]
+    with pytest.raises(InputError, match=r"damaged\.png: cannot be read"):
+        module.estimate_seconds(files[:1])
     assert seconds[0] < min(seconds[1:3])
     assert seconds[3] > 10 * seconds[2], "all pairs: faster than the photos"
 
@@ -270,7 +351,7 @@ def test_options(tmp_path: Path) -> None:
         assert defaults[name] == value
     with pytest.raises(InputError, match="camera_model 'LENS': use one of SIMPLE_PINHOLE"):
         ReconstructOptions(camera_model="LENS")
-    with pytest.raises(InputError, match="max_size 3: must be at least 64"):
+    with pytest.raises(InputError, match="max_size 3: must be 64 to 65535"):
         ReconstructOptions(max_size=3)
 
 
@@ -309,4 +390,4 @@ def test_same_photos_same_model_and_a_video(walk: Path, tmp_path: Path) -> None:
         for index in range(photo_walk.N_PHOTOS):
             writer.write(photo_walk.picture(index))
     clsplat("train", tmp_path / "walk.mp4", "-m", tmp_path / "model", "--iterations", 5, "--cap-max", 300)
-    assert len(load_scene(tmp_path / "walk-scene").views) == 8
+    assert len(load_scene(tmp_path / "model" / "scene").views) == 8

@@ -13,9 +13,10 @@ from scipy.special import ndtr
 from clsplat.errors import InputError
 from clsplat.splats.approximate import line_fits, nearest_gaussians
 from clsplat.splats.convert import convert
-from clsplat.splats.dot_splat import RECORD, write_splat
+from clsplat.splats.dot_splat import RECORD
+from clsplat.splats.harmonics import SH_C0
 from clsplat.splats.shapes import SHAPES, SKEW_MAX, SLANT_MAX
-from clsplat.splats.splats import SH_C0, Splats
+from clsplat.splats.splats import Splats
 
 
 def skewed(share: float = 0.9, shape: str = "skew-normal", n: int = 12) -> Splats:
@@ -167,7 +168,7 @@ def test_other_normalisations_are_refused() -> None:
 
 def test_splat_file_holds_what_the_format_says(tmp_path: Path) -> None:
     splats, file = moment_matched(skewed()), tmp_path / "out.splat"
-    write_splat(file, splats)
+    splats.save(file)
     table = np.frombuffer(file.read_bytes(), RECORD)
     assert RECORD.itemsize == 32
     assert len(table) == 12
@@ -184,5 +185,5 @@ def test_splat_file_holds_what_the_format_says(tmp_path: Path) -> None:
 
 def test_splat_file_takes_gaussians_only(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="hold Gaussians, not skew-normal"):
-        write_splat(tmp_path / "out.splat", skewed())
+        skewed().save(tmp_path / "out.splat")
     assert not list(tmp_path.iterdir())

@@ -187,8 +187,8 @@ def test_values_out_of_bounds_are_named(file: Path, shape: str, field: Field) ->
     ("shape", "field"), [(shape.name, f) for shape in SHAPES.values() for f in shape.fields if f.nonzero], ids=str
 )
 def test_directions_of_no_length_are_named(file: Path, shape: str, field: Field) -> None:
-    columns = own_columns(shape) | {name: [0.5, 0.0] for name in field.ply}
-    with pytest.raises(InputError, match=r"vertex 1: norm is 0, must be above 0"):
+    columns = own_columns(shape) | {name: [0.0, 0.0] for name in field.ply}
+    with pytest.raises(InputError, match=r"2 of 2 splats are unusable .*vertex 0: norm is 0, must be above 0"):
         read_ply(save(file, columns))
 
 
@@ -223,12 +223,6 @@ ZERO_QUAT = plain(3) | {f"rot_{i}": [1.0, 1.0, 0.0] for i in range(4)}
         (without("skew_1"), "'skew_1' is missing"),
         (without("f_rest_4"), "has 8 properties f_rest"),
         (without("f_rest_4") | {"f_rest_9": [0.0, 0.0]}, "'f_rest_4' is missing"),
-        (plain() | {"gamma": [0.0, 0.0]}, "'gamma' is unknown for shape gaussian"),
-        (with_value("opacity", np.nan), "property opacity, vertex 1: value is nan"),
-        (with_value("x", np.inf), "property x, vertex 1: value is inf"),
-        (with_value("f_rest_5", -np.inf), "property f_rest_5, vertex 1: value is -inf"),
-        (with_value("f_dc_2", np.nan), "property f_dc_2, vertex 1"),
-        (ZERO_QUAT, r"property rot_0\.\.rot_3, vertex 2: norm is 0, must be above 0"),
         (with_value("skew_2", 1.5), r"skew_0\.\.skew_2, vertex 1: norm is 1.50333, must be at most 1.32"),
         ({"x": [0.0], "y": [0.0], "z": [0.0]}, "is a point cloud"),
     ],
@@ -239,8 +233,96 @@ def test_faulty_models_are_named(file: Path, columns: dict[str, list[float]], sa
     assert str(caught.value).startswith(str(file))
 
 
-def test_normals_may_hold_anything(file: Path) -> None:
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        (with_value("opacity", np.nan), "property opacity, vertex 1: value is nan"),
+        (with_value("x", np.inf), "property x, vertex 1: value is inf"),
+        (with_value("scale_2", np.inf), "property scale_2, vertex 1: value is inf"),
+        (with_value("f_rest_5", -np.inf), "property f_rest_5, vertex 1: value is -inf"),
+        (with_value("f_dc_2", np.nan), "property f_dc_2, vertex 1"),
+        (with_value("skew_0", np.nan), "property skew_0, vertex 1"),
+        (ZERO_QUAT, "property rot_0..rot_3, vertex 2: norm is 0, must be above 0"),
+    ],
+)
+def test_unusable_splats_are_left_out_and_counted(file: Path, columns: dict[str, list[float]], said: str) -> None:
+    lost = 2 if columns is ZERO_QUAT else 1
+    sound = {name: [values[i] if i != lost else 0.5 for i in range(3)] for name, values in columns.items()}
+    whole = read_ply(save(file, sound)).arrays
+    with pytest.warns(UserWarning, match=re.escape(f"{file}: left out 1 of 3 splats ({said}")):
+        read = read_ply(save(file, columns)).arrays
+    same(read, {name: np.delete(values, lost, axis=0) for name, values in whole.items()})
+
+
+def test_a_file_of_mostly_unusable_splats_is_refused(file: Path) -> None:
+    columns = plain(4) | {"y": [1.0, np.nan, np.inf, 2.0]}
+    with pytest.warns(UserWarning, match="left out 2 of 4 splats"):
+        assert len(read_ply(save(file, columns)).arrays["mean"]) == 2
+    columns["z"][3] = np.nan
+    with pytest.raises(InputError, match=r"3 of 4 splats are unusable \(property y, vertex 1: value is nan"):
+        read_ply(save(file, columns))
+
+
+def test_faults_of_kept_splats_have_their_number_in_the_file(file: Path) -> None:
+    columns = plain(4, skew=True) | {"x": [np.nan, 0.0, 0.0, 0.0], "skew_1": [0.0, 0.0, 9.0, 0.0]}
+    with (
+        pytest.warns(UserWarning, match="left out 1 of 4"),
+        pytest.raises(InputError, match=r"skew_0\.\.skew_2, vertex 2: norm is"),
+    ):
+        read_ply(save(file, columns))
+
+
+def test_infinite_opacities_and_scales_of_0_are_kept(file: Path, recwarn: pytest.WarningsRecorder) -> None:
+    """Converters of .splat files write an opacity of 255 as infinity; flat splats have scales of 0."""
+    columns = plain(3) | {"opacity": [np.inf, -np.inf, 1.0], "scale_1": [0.0, -np.inf, 1.0]}
+    read = read_ply(save(file, columns)).arrays
+    assert not recwarn.list
+    opacity = 1 / (1 + np.exp(-read["opacity_logit"].astype(np.float64)))
+    np.testing.assert_allclose(opacity, [1.0, 0.0, opacity[2]], atol=1e-6)
+    assert np.isfinite(read["log_scale"]).all()
+    assert 0 < np.exp(read["log_scale"][1, 1]) < 1e-25
+
+
+def test_other_columns_are_left_out_and_named(file: Path) -> None:
+    """Mip-Splatting adds filter_3D, mesh tools add colours in bytes."""
+    data = save(file, plain() | {"filter_3D": [0.1, 0.2], "red": [1.0, 2.0]}).read_bytes()
+    wanted = read_ply(save(file, plain())).arrays
+    file.write_bytes(data)
+    with pytest.warns(UserWarning, match=r"left out columns filter_3D, red, which gaussian splats do not have"):
+        same(read_ply(file).arrays, wanted)
+    head, body = data.split(b"end_header\n", 1)
+    width = len(body) // 2
+    rows = [body[i * width : (i + 1) * width - 4] + bytes([200 + i]) for i in range(2)]
+    file.write_bytes(head.replace(b"float red", b"uchar red") + b"end_header\n" + b"".join(rows))
+    with pytest.warns(UserWarning, match="columns filter_3D, red"):
+        same(read_ply(file).arrays, wanted)
+
+
+@pytest.mark.parametrize("fmt", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_faces_and_other_elements_are_left_out_and_named(file: Path, fmt: str) -> None:
+    """Elements before and after the vertices; those with lists only after them."""
+    wanted = read_ply(save(file, plain(), fmt)).arrays
+    head, body = file.read_bytes().split(b"end_header\n", 1)
+    order = ">" if "big" in fmt else "<"
+    text = fmt == "ascii"
+    first = b"7 8\n" if text else struct.pack(order + "Bf", 7, 8.0)
+    faces = b"3 0 1 0\n" if text else struct.pack(order + "Biii", 3, 0, 1, 0)
+    scan = b"element scan 1\nproperty uchar a\nproperty float b\nelement vertex"
+    face = b"element face 1\nproperty list uchar int vertex_indices\n"
+    file.write_bytes(head.replace(b"element vertex", scan) + face + b"end_header\n" + first + body + faces)
+    with pytest.warns(UserWarning, match="left out elements scan, face, which gaussian splats do not have"):
+        same(read_ply(file).arrays, wanted)
+    file.write_bytes(head.replace(b"element vertex", face + b"element vertex") + b"end_header\n" + faces + body)
+    with pytest.raises(InputError, match="element 'vertex' comes before 'vertex' or after lists"):
+        read_ply(file)
+    file.write_bytes(head + face + b"end_header\n" + body[: len(body) // 2])
+    with pytest.raises(InputError, match="is truncated"):
+        read_ply(file)
+
+
+def test_normals_may_hold_anything(file: Path, recwarn: pytest.WarningsRecorder) -> None:
     read_ply(save(file, plain() | {"nx": [np.nan, np.inf]}))
+    assert not recwarn.list
 
 
 @pytest.mark.parametrize(
@@ -249,8 +331,8 @@ def test_normals_may_hold_anything(file: Path) -> None:
         ("ply\n", "plx\n", "not a PLY file"),
         ("binary_little_endian", "binary_middle_endian", "'binary_middle_endian' is unknown"),
         ("format binary_little_endian 1.0\n", "", "no format line"),
-        ("element vertex 2", "element vertex 2\nelement face 0", "element 'face'"),
-        ("element vertex 2", "element chunk 2", "element 'chunk'"),
+        ("element vertex 2", "element vertex 2\nelement face 0", "'x' is missing"),
+        ("element vertex 2", "element chunk 2", "no element 'vertex'"),
         ("element vertex 2", "element vertex -2", "count '-2'"),
         ("element vertex 2", "element vertex 999999999999", "is truncated: 999999999999 vertices"),
         ("element vertex 2", "element vertex 1", "has extra data"),

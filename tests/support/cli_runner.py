@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
+
+import click
 from click.testing import CliRunner, Result
-from clsplat_cli.main import main
+from clsplat_cli.main import COMMANDS, main
 
 WIDTH, HEIGHT, N_VIEWS = 48, 36, 10
 TEST_NAMES = ["view_000.png", "view_008.png"]  # every 8th of ten
@@ -43,4 +46,29 @@ def error_of(*args: object, code: int = 1) -> str:
     assert errors == lines[-1:], result.output
     assert "Traceback" not in result.output
     assert result.stdout == ""
+    assert foreign_flags(errors[0], str(args[0])) == []
     return errors[0]
+
+
+FLAG = re.compile(r"(?<![\w/.-])-(?:-[a-z][a-z-]*|[a-z])(?![\w-])")
+
+
+def flags_of(command: str) -> set[str]:
+    """Return all options of a command."""
+    found = main.get_command(click.Context(main), command)
+    params = found.params if found else []
+    return {"--help", *(flag for param in params for flag in (*param.opts, *param.secondary_opts))}
+
+
+def foreign_flags(message: str, command: str) -> list[str]:
+    """Return the flags of a message that the command lacks. `clsplat train --eval` names an option of train.
+
+    What is quoted may come from the user. "(see: ...)" is click's.
+    """
+    text = re.sub(r"'[^']*'|`pip [^`]*`|\(see: .*?\)|clsplat devices", "", message)
+    foreign = []
+    for part in re.split(r"(?=clsplat [a-z-]+ )", text):
+        named = re.match(r"clsplat ([a-z-]+) ", part)
+        known = flags_of(named[1] if named and named[1] in COMMANDS else command)
+        foreign += [flag for flag in FLAG.findall(part) if flag not in known]
+    return foreign

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import packed_ply
+import sog_files
 from model_arrays import random_model
 from small_scene import FX, FY, NAMES, as_text, cloud, model_views, photo_of
 
@@ -17,15 +20,14 @@ from clsplat.cameras.cameras_json import named_cameras, read_cameras, write_came
 from clsplat.cameras.path import CameraPath, read_path, write_path
 from clsplat.errors import InputError
 from clsplat.files.images import image_size, read_image, write_grey16, write_png
+from clsplat.models.cfg_args import read_cfg_args
 from clsplat.scenes.colmap import find_model, read_model
 from clsplat.scenes.colmap_binary import write_binary_model
 from clsplat.scenes.point_cloud import read_point_cloud
 from clsplat.scenes.scene import load_scene
-from clsplat.splats.dot_splat import read_splat, write_splat
 from clsplat.splats.ply import read_ply
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
-from clsplat.splats.spz import read_spz, write_spz
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 
@@ -171,10 +173,10 @@ def make_checkpoint(folder: Path) -> None:
 def read_checkpoint(folder: Path) -> None:
     """Take the steps of resuming that need no device."""
     from clsplat.device.schedule import Schedule
+    from clsplat.training.extension import fitting_checkpoint
     from clsplat.training.folder import ModelFolder
-    from clsplat.training.run import _fitting_checkpoint
 
-    found = _fitting_checkpoint(ModelFolder(folder), TrainConfig(iterations=100))
+    found = fitting_checkpoint(ModelFolder(folder), TrainConfig(iterations=100))
     Schedule.parse(found.schedule)
     np.random.default_rng(0).bit_generator.state = found.rng
     assert found.signals.shape == (3, len(found.splats["mean"]))
@@ -196,6 +198,12 @@ def read_model_folder(folder: Path) -> None:
     loaded.read_cameras()
     assert loaded.test_names is None or all(isinstance(name, str) for name in loaded.test_names)
     assert all(np.isfinite(loaded.background))
+
+
+def make_cfg_args(folder: Path) -> None:
+    (folder / "cfg_args").write_text(
+        "Namespace(sh_degree=3, source_path='/data', images='images', resolution=2, white_background=True, eval=True)"
+    )
 
 
 def make_search(folder: Path) -> None:
@@ -315,12 +323,24 @@ READERS = {
     "ply-compact": Sample(make_compact, lambda f: finite(read_ply(f / "model.ply").arrays)),
     "point-cloud": Sample(make_ascii, lambda f: read_point_cloud(f / "points.ply")),
     "splat": Sample(
-        lambda f: write_splat(f / "a.splat", small_splats("gaussian")),
-        lambda f: finite(read_splat(f / "a.splat").arrays),
+        lambda f: small_splats("gaussian").save(f / "a.splat"),
+        lambda f: finite(Splats.load(f / "a.splat").arrays),
     ),
     "spz": Sample(
-        lambda f: write_spz(f / "a.spz", small_splats("gaussian", 2)), lambda f: finite(read_spz(f / "a.spz").arrays)
+        lambda f: small_splats("gaussian", 2).save(f / "a.spz"), lambda f: finite(Splats.load(f / "a.spz").arrays)
     ),
+    "ply-packed": Sample(
+        lambda f: packed_ply.write(f / "a.ply", packed_ply.some(6, 1)), lambda f: finite(read_ply(f / "a.ply").arrays)
+    ),
+    "sog": Sample(
+        lambda f: sog_files.write(f / "a.sog", *sog_files.some(6, 1)),
+        lambda f: finite(Splats.load(f / "a.sog").arrays),
+    ),
+    "sog-folder": Sample(
+        lambda f: sog_files.write(f / "meta.json", *sog_files.some(6, 1)),
+        lambda f: finite(Splats.load(f / "meta.json").arrays),
+    ),
+    "cfg-args": Sample(make_cfg_args, lambda f: read_cfg_args(f / "cfg_args")),
     "colmap-bin": Sample(make_scene, lambda f: read_model(find_model(f)), "sparse"),
     "colmap-txt": Sample(lambda f: make_scene(f, ".txt"), lambda f: read_model(find_model(f)), "sparse"),
     "scene": Sample(make_masked, read_scene),
@@ -337,3 +357,8 @@ READERS = {
     "search": Sample(make_search, read_search),
     "images": Sample(make_images, read_images),
 }
+if find_spec("zstandard"):
+    READERS["spz-4"] = Sample(
+        lambda f: small_splats("gaussian", 2).save(f / "a.spz", spz_version=4),
+        lambda f: finite(Splats.load(f / "a.spz").arrays),
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import socket
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -14,11 +15,16 @@ import zstandard
 from numpy.typing import NDArray
 from PIL import Image
 from websockets.sync.client import connect
-from websockets.typing import Subprotocol
+from websockets.typing import Origin, Subprotocol
 
 
 class Client:
     """One connection.
+
+    Parameters
+    ----------
+    origin, host : the headers of the page that connects; None sends no Origin and the usual Host.
+    path : of the address, with its query.
 
     Attributes
     ----------
@@ -26,12 +32,16 @@ class Client:
     pictures : JPEG bytes received so far.
     """
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, origin: str | None = None, host: str | None = None, path: str = "/") -> None:
         self.panel: dict[str, dict[str, Any]] = {}
         self.pictures: list[bytes] = []
         self.received: list[dict[str, Any]] = []
+        # The library takes the Host header from the address, and the connection from the socket.
         self._socket = connect(
-            f"ws://127.0.0.1:{port}",
+            f"ws://{host or f'127.0.0.1:{port}'}{path}",
+            sock=socket.create_connection(("127.0.0.1", port)),
+            origin=None if origin is None else Origin(origin),
+            proxy=None,
             subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
             max_size=None,
             compression=None,

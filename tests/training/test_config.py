@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from clsplat.errors import InputError
-from clsplat.training.config import GROUPS, OPTIONS, TrainConfig
+from clsplat.training.config import FREE_OPTIONS, GROUPS, OPTIONS, TrainConfig
 from clsplat.training.options.density import STRATEGIES, Adc, DensityConfig, Mcmc
 from clsplat.training.options.groups import OptimConfig
 from clsplat.training.options.option import Range, option_table
@@ -47,6 +47,89 @@ def test_a_strategy_has_defaults_of_its_own(strategy: str) -> None:
         TrainConfig(strategy=strategy, opacity_reg=-1)
 
 
+# Defaults with an effect on the model. Those of 3DGS and 3DGS-MCMC are published; benchmarks/SYSTEMS.md measures the
+# others. A change of any of them changes what a command without options trains.
+DEFAULTS = {
+    "shape": "skew-normal",
+    "iterations": 7000,
+    "cap_max": 100_000,
+    "sh_degree": 3,
+    "normalisation": "peak",
+    "antialiased": False,
+    "background": (0.0, 0.0, 0.0),
+    "random_background": False,
+    "seed": 0,
+    "strategy": "adc",
+    "init": "sfm",
+    "random_points": None,
+    "sh_interval": 0,
+    "coarse_to_fine": True,
+    "lambda_dssim": 0.2,
+    "bisect_reg": 0.0,
+    "position_lr_init": 1.6e-4,
+    "position_lr_final": 1.6e-6,
+    "opacity_lr": 0.05,
+    "scaling_lr": 5e-3,
+    "rotation_lr": 1e-3,
+    "feature_lr": 2.5e-3,
+    "skew_lr": None,
+    "normal_lr": 3e-3,
+    "beta_lr": 1e-3,
+    "nu_lr": 1e-2,
+    "skew_map": "auto",
+    "visible_adam": False,
+    "optimizer": "fused",
+    "position_optimizer": "adam",
+    "sghmc_friction": 120.0,
+    "sghmc_burn_in": 7 / 30,
+    "sghmc_burn_in_friction": 5e5,
+    "alternation": "off",
+    "alternation_warmup": 0.1,
+    "alternation_cycle": 100,
+    "alternation_split": 0.5,
+    "exposure": False,
+    "exposure_rate": 0.2,
+    "exposure_pull": 1e-2,
+}
+DEFAULTS_OF_STRATEGY = {
+    Adc: {
+        "densify_from": 0.05,
+        "densify_until": 0.5,
+        "densify_interval": 100,
+        "init_opacity": 0.2,
+        "init_scale": 0.7,
+        "opacity_reg": 0.0,
+        "scale_reg": 0.0,
+        "noise_lr": 0.0,
+        "grad_threshold": 2e-4,
+        "depth_threshold": 0.0,
+        "dense_size": 0.01,
+        "opacity_reset": 0,
+    },
+    Mcmc: {
+        "densify_from": 0.05,
+        "densify_until": 0.8,
+        "densify_interval": 100,
+        "init_opacity": 0.5,
+        "init_scale": 0.5,
+        "opacity_reg": 0.001,
+        "scale_reg": 0.001,
+        "noise_lr": 5e5,
+        "growth": 1.05,
+        "relocation": "length",
+        "relocation_limit": 1.0,
+    },
+}
+
+
+def test_defaults_with_an_effect_on_the_model() -> None:
+    of_strategies = {name for cls in DEFAULTS_OF_STRATEGY for name in option_table(cls)}
+    values = TrainConfig().to_json()
+    assert {name: values[name] for name in OPTIONS.keys() - of_strategies - set(FREE_OPTIONS)} == DEFAULTS
+    for cls, defaults in DEFAULTS_OF_STRATEGY.items():
+        assert dataclasses.asdict(cls()) == defaults
+
+
 def test_the_strategies_differ_in_defaults_of_shared_options() -> None:
     for name, definition in option_table(DensityConfig).items():
         differ = getattr(Adc(), name) != getattr(Mcmc(), name)
@@ -79,7 +162,7 @@ def test_options_of_the_other_strategy_have_no_effect() -> None:
         ({"lambda_dssim": 1.5}, "lambda_dssim 1.5: must be 0 to 1"),
         ({"position_lr_final": 0}, "position_lr_final 0: must be above 0"),
         ({"init_opacity": 1.0}, "init_opacity 1.0: must be above 0 and below 1"),
-        ({"init_scale": float("nan")}, "init_scale nan: must be above 0"),
+        ({"init_scale": float("nan")}, "init_scale nan: must be finite and above 0"),
         ({"skew_lr": -1.0}, "skew_lr -1.0: must be at least 0"),
         ({"seed": 2**64}, f"seed {2**64}: must be at least 0 and below {2**64}"),
         ({"background": (0, 0, 2)}, r"background \(0, 0, 2\): expected R,G,B, each 0 to 1"),
@@ -91,6 +174,20 @@ def test_a_value_out_of_range_is_named(options: dict[str, Any], message: str) ->
     with pytest.raises(InputError, match=message) as caught:
         TrainConfig(**options)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("background", [(-0.1, 0, 0), (0, 0, 1.1), (0, 0), (float("nan"), 0, 0)])
+def test_a_background_is_a_colour(background: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match="expected R,G,B, each 0 to 1"):
+        TrainConfig(background=background)  # type: ignore[arg-type]
+
+
+def test_rates_of_short_runs_are_raised() -> None:
+    """The published rates are for 30 000 iterations: max(1, 30 000 / iterations)^p, p = 3/4 for positions."""
+    assert TrainConfig(iterations=30_000).rate_factor("mean") == 1
+    assert TrainConfig(iterations=60_000).rate_factor("mean") == 1
+    assert TrainConfig(iterations=7500).rate_factor("mean") == pytest.approx(4**0.75)
+    assert TrainConfig(iterations=7500).rate_factor("quat") == pytest.approx(2)
 
 
 def test_ranges() -> None:
@@ -116,3 +213,16 @@ def test_the_example_in_the_documentation() -> None:
     module = importlib.import_module("clsplat.training.config")
     assert doctest.testmod(module).failed == 0
     assert doctest.testmod(module).attempted > 0
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("name", ["growth", "densify_from", "sghmc_friction", "relocation_limit"])
+def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> None:
+    """Also for an option without a range, and for one that only the other strategy has."""
+    with pytest.raises(InputError, match=rf"{name} {value}: must be finite"):
+        TrainConfig(**{name: value})
+
+
+def test_options_of_the_other_strategy_are_checked() -> None:
+    with pytest.raises(InputError, match="relocation_limit 5"):
+        TrainConfig(strategy="adc", relocation_limit=5.0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,10 @@ def rewritten(path: Path, **changes: Any) -> None:
         {"seconds": "long"},
         {"seconds": float("nan")},
         {"n_first": 0},
+        {"reached": {"sh_degree": 9, "downscale": 1}},
+        {"reached": {"sh_degree": 1, "downscale": 0}},
+        {"reached": {"sh_degree": 1}},
+        {"reached": [1, 2]},
         {"rng": {}},
         {"rng": {"bit_generator": "MT19937"}},
         {"version": "2\n2"},
@@ -68,6 +74,27 @@ def test_checkpoints_of_something_else(tmp_path: Path, changes: dict[str, Any]) 
     if "config" not in changes:
         with pytest.raises(InputError, match=r"checkpoint\.npz: "):
             Checkpoint.load(tmp_path / "checkpoint.npz")
+
+
+def test_checkpoints_in_odd_zip_files(tmp_path: Path) -> None:
+    """zipfile has an exception for each: an encrypted file, a later version, a damaged stream of LZMA, no archive."""
+    make_checkpoint(tmp_path)
+    path = tmp_path / "checkpoint.npz"
+    sound = path.read_bytes()
+    entry = sound.index(b"PK\x01\x02")  # the central directory: version at 6, flags at 8
+    for offset, value in ((8, 1), (6, 192)):
+        path.write_bytes(sound[: entry + offset] + bytes([value]) + sound[entry + offset + 1 :])
+        with pytest.raises(InputError, match=r"checkpoint\.npz: not a readable checkpoint"):
+            Checkpoint.load(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("meta.npy", bytes(5000))
+    data = path.read_bytes()
+    path.write_bytes(data[:50] + b"\xff" * 20 + data[70:])
+    with pytest.raises(InputError, match=r"checkpoint\.npz: not a readable checkpoint"):
+        Checkpoint.load(path)
+    path.write_bytes(pickle.dumps({"a": 1}))
+    with pytest.raises(InputError, match=r"not a readable checkpoint \(no archive of NumPy\)"):
+        Checkpoint.load(path)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +130,7 @@ def test_options_come_back() -> None:
         ("[" * 100_000, "is not JSON"),
         ('{"config": {"background": [0, 0, NaN]}}', "background"),
         ('{"config": {"background": [0, 0, 2]}}', "from 0 to 1"),
-        ('{"scene": {"test_names": [3]}}', "must be names"),
+        ('{"scene": {"test_names": [3]}}', "expected a list of names"),
     ],
 )
 def test_model_folders(tmp_path: Path, config: str, said: str) -> None:

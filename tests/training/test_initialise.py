@@ -228,3 +228,22 @@ def test_random_points_are_added_to_few() -> None:
     with pytest.raises(InputError, match="random_points 2: must be 0 to 1"):
         TrainConfig(random_points=2)
     assert all(preset(name)["random_points"] == 0 for name in PRESETS)
+
+
+def test_a_model_of_no_splats_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.ply"
+    saved(path, "skew-normal", np.full((12, 3), 0.2)).select(np.arange(0)).save(path)
+    with pytest.raises(InputError, match=r"model\.ply: has no splats"):
+        initial_splats(scene(0), init=str(path))
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.SPZ", "a.splat", "a"])
+def test_files_of_any_format_are_a_start(tmp_path: Path, name: str) -> None:
+    saved(tmp_path / "model.ply", "gaussian").save(tmp_path / name)
+    splats, message = initial_splats(scene(0), shape="gaussian", sh_degree=0, init=str(tmp_path / name))
+    assert message == f"12 splats from {tmp_path / name}"
+    np.testing.assert_array_equal(splats.mean, Splats.load(tmp_path / name).mean)
+    with pytest.raises(InputError, match="choose sfm, random, or the path of a file of splats"):
+        initial_splats(scene(0), init="scene")
+    with pytest.raises(InputError, match=r"gone.spz: cannot be read"):
+        initial_splats(scene(0), init=str(tmp_path / "gone.spz"))

@@ -28,6 +28,7 @@ def test_a_resumed_log_goes_on_where_the_checkpoint_is(tmp_path: Path) -> None:
         b'{"iteration": 150}',
         b'{"iteration": 20',
         b'{"iteration": 1e999}',
+        b"[" * 100_000,
     ]
     path.write_bytes(b"\n".join(lines))
     log = RunLog(path, 100)

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from device_schedules import schedule_on
 from numpy.typing import NDArray
 from reference.loss import reference_loss, reference_loss_gradient
 from reference.tolerances import ROUNDING, relative_error
@@ -13,7 +14,7 @@ from reference.tolerances import ROUNDING, relative_error
 from clsplat.device.device import Device
 from clsplat.device.memory import Pool, to_device, to_host
 from clsplat.device.program import Real
-from clsplat.device.schedule import SCHEDULES, Schedule
+from clsplat.device.schedule import Schedule, default_schedule
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.frame import DeviceImage, ImageLayout
 from clsplat.training.loss import ImageLoss, LossValue
@@ -22,11 +23,11 @@ from clsplat.training.loss import ImageLoss, LossValue
 SIZES = [(1, 1), (2, 3), (7, 40), (19, 27), (16, 16), (5, 97), (70, 37)]
 
 
-def loss_of(
-    device: Device, schedule: Schedule = SCHEDULES["cpu16"], real: Real = "float", weight: float = 0.2
-) -> ImageLoss:
+def loss_of(device: Device, schedule: Schedule | None = None, real: Real = "float", weight: float = 0.2) -> ImageLoss:
+    """Return a loss with the device's default schedule, or another one."""
     if real == "double" and not device.has_fp64:
         pytest.skip("no double precision")
+    schedule = schedule or default_schedule(device.info)
     return ImageLoss(Pool(device), KernelBuild("gaussian", 0, schedule, real=real), weight)
 
 
@@ -102,12 +103,13 @@ def test_segments_of_rows_change_no_gradient(device: Device, monkeypatch: pytest
 
 def test_strips_change_no_gradient(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """A strip is 640 px wide by default. Here strips of 1, 2 and 3 vectors divide an image of five vectors."""
+    schedule = schedule_on(device, "cpu16")
     color, truth = pair(21, 75)
-    whole = compared(loss_of(device), color, truth)
+    whole = compared(loss_of(device, schedule), color, truth)
     for strip in (1, 2, 3):
         for module in ("loss", "programs"):
             monkeypatch.setattr(f"clsplat.training.{module}.loss_strip", lambda _, strip=strip: strip)
-        value, gradient = compared(loss_of(device), color, truth)
+        value, gradient = compared(loss_of(device, schedule), color, truth)
         np.testing.assert_array_equal(gradient, whole[1])
         assert value.total == pytest.approx(whole[0].total, rel=1e-6)
 

@@ -92,6 +92,16 @@ def test_docstrings_name_paper_and_source(name: str) -> None:
     assert ("code" in text.splitlines()[0]) != ("Not published" in text)
 
 
+def test_splats_of_mcmc_start_small_and_half_opaque() -> None:
+    """3DGS-MCMC starts with a tenth of the distance to the neighbours and opacity 0.5; 3DGS with all of it and 0.1."""
+    found = {
+        name: (config.density.init_scale, config.density.init_opacity)
+        for name in ("3dgs", "3dgs-mcmc")
+        for config in [TrainConfig(**with_preset(name, {}))]
+    }
+    assert found == {"3dgs": (1.0, 0.1), "3dgs-mcmc": (0.1, 0.5)}
+
+
 def test_flags_replace_constants() -> None:
     values = with_preset("3dgs", {"opacity_lr": 0.025, "cap_max": 7})
     assert (values["opacity_lr"], values["cap_max"], values["grad_threshold"]) == (0.025, 7, 2e-4)

@@ -19,8 +19,9 @@ from clsplat_cli.main import _show_warning
 from clsplat_cli.progress import ViewCount
 
 import clsplat
+from clsplat.training.live_line import LiveLine
 from clsplat.training.log import Progress
-from clsplat.training.progress import LiveLine, TrainingDisplay, progress_line
+from clsplat.training.progress import TrainingDisplay, progress_line
 
 
 def count_views(total: int) -> None:
@@ -136,10 +137,11 @@ def test_counts_go_away_even_if_the_work_fails(terminal: Terminal, monkeypatch: 
 
 
 def test_a_log_file_gets_whole_lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    stream, seconds = io.StringIO(), iter(range(0, 1000, 4))
-    with TrainingDisplay(stream=stream, clock=lambda: next(seconds)) as display:
+    stream, now = io.StringIO(), [0.0]
+    with TrainingDisplay(stream=stream, clock=lambda: now[0]) as display:
         display(at(0, "13204 splats"))
         for iteration in range(100, 1001, 100):
+            now[0] += 4
             display(at(iteration))
     text = stream.getvalue()
     assert "\r" not in text
@@ -150,6 +152,7 @@ def test_a_log_file_gets_whole_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", log)
     count_views(3)
     assert log.getvalue() == "", "quick work needs no line"
+    seconds = iter(range(0, 1000, 4))
     monkeypatch.setattr(LiveLine.__init__, "__defaults__", (None, lambda: next(seconds)))
     count_views(12)
     assert all(line.startswith("rendering ") for line in log.getvalue().splitlines())

@@ -242,6 +242,14 @@ def test_a_limit_takes_the_weakest_first(limit: float) -> None:
     np.testing.assert_array_equal(np.flatnonzero(edit.source != np.arange(100)), np.arange(100 - count, 100))
 
 
+def test_a_splat_of_exactly_the_smallest_opacity_is_dead() -> None:
+    arrays = gaussians(np.array([0.0, -5.0]))
+    faintest = float(shapes.GAUSSIAN.strength(arrays)[1])
+    for least, moved in ((np.nextafter(faintest, 0), 0), (faintest, 1)):
+        edit = plan_relocation(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 2, min_opacity=float(least))
+        assert edit.relocated == moved
+
+
 def test_one_side_of_a_two_sided_splat_keeps_it_alive_and_the_other_stays_faint() -> None:
     shape = shapes.HALF_GAUSSIAN
     arrays = random_model(shape, 2, 0, dead=0)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -80,59 +78,6 @@ def test_one_seed_gives_one_model(scene: Scene, uninterrupted: Path, tmp_path: P
     assert ply(tmp_path / "other") != ply(uninterrupted)
 
 
-def raise_at_50(progress: Progress) -> None:
-    if progress.iteration == 50:
-        raise KeyboardInterrupt
-
-
-def press_ctrl_c_at_50(progress: Progress) -> None:
-    if progress.iteration == 50:
-        os.kill(os.getpid(), signal.SIGINT)
-
-
-@pytest.mark.parametrize(
-    ("optimizer", "changes", "interval"),
-    [
-        ("fused", {}, 30),
-        ("numpy", {}, 30),
-        ("fused", {"relocation_limit": 0.05}, 37),
-        ("fused", {"strategy": "adc", "densify_until": 0.8, "opacity_reset": 2}, 37),
-    ],
-    ids=["fused", "numpy", "relocation limit", "adc"],
-)
-def test_a_crashed_run_resumes_to_the_same_model(
-    scene: Scene, uninterrupted: Path, tmp_path: Path, optimizer: str, changes: dict[str, Any], interval: int
-) -> None:
-    """A crash at iteration 50 leaves an earlier checkpoint.
-
-    Relocation and growth occur both before and after it. At iteration 37, unfinished sums exist.
-    """
-    config = replace(CONFIG, optimizer=optimizer, checkpoint_interval=interval, **changes)
-    whole = uninterrupted
-    if optimizer != "fused" or changes:
-        whole = tmp_path / "whole"
-        train(scene, config, output=whole)
-    with pytest.raises(KeyboardInterrupt):
-        train(scene, config, raise_at_50, output=tmp_path / "m")
-    said: list[str] = []
-    resumed = train(scene, config, lambda progress: said.append(progress.message), output=tmp_path / "m", resume=True)
-    assert f"iteration {interval}" in said[0]
-    assert resumed.finished
-    assert ply(tmp_path / "m") == ply(whole)
-    logged = [json.loads(line)["iteration"] for line in (tmp_path / "m" / "log.jsonl").read_text().splitlines()]
-    assert logged == [50, 80]
-
-
-def test_ctrl_c_saves_and_resumes_to_the_same_model(scene: Scene, uninterrupted: Path, tmp_path: Path) -> None:
-    before = signal.getsignal(signal.SIGINT)
-    stopped = train(scene, CONFIG, press_ctrl_c_at_50, output=tmp_path / "m")
-    assert not stopped.finished
-    assert 50 <= stopped.iteration < CONFIG.iterations
-    assert signal.getsignal(signal.SIGINT) is before
-    assert train(scene, CONFIG, output=tmp_path / "m", resume=True).finished
-    assert ply(tmp_path / "m") == ply(uninterrupted)
-
-
 # --- training --------------------------------------------------------------------------------
 
 
@@ -173,10 +118,40 @@ def test_models_are_not_overwritten_and_resume_wants_the_same_config(scene: Scen
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clsplat.training.trainer.check_loss", lambda *_: None)  # it would find the fault first
     monkeypatch.setattr(ImageLoss, "value", lambda self, result: LossValue(float("nan"), 0, 0, 0))
     with pytest.raises(TrainingError, match=r"iteration 50: .* learning rates"):
         train(scene, CONFIG, output=tmp_path / "m")
     assert (tmp_path / "m" / "checkpoint.npz").is_file()
+
+
+def test_a_step_uses_the_sh_degree_of_its_iteration(scene: Scene, default_device: Device) -> None:
+    trainer = Trainer(scene, replace(CONFIG, sh_interval=3), device=default_device)
+    first, degrees = trainer.snapshot().sh[:, 1:], []
+    for _ in range(4):
+        degrees.append(trainer.step().sh_degree)
+        assert (trainer.snapshot().sh[:, 1:] != first).any() == (degrees[-1] == 1)
+    assert degrees == [0, 0, 1, 1]
+
+
+def test_statistics_start_again_after_a_densification(scene: Scene, default_device: Device) -> None:
+    trainer = Trainer(scene, replace(CONFIG, cap_max=300, densify_interval=4), device=default_device)
+    seen = []
+    for _ in range(9):
+        trainer.step()
+        seen.append(trainer.pipeline.statistics.read(trainer.splats.n).any())
+    assert seen == [True, True, True, False, True, True, True, False, True]
+
+
+def test_a_run_is_measured_over_its_background(scene: Scene, default_device: Device) -> None:
+    config = replace(CONFIG, background=(1.0, 0.25, 0.5), cap_max=100)
+    trainer = Trainer(scene, config, device=default_device)
+    measured = trainer.evaluate(scene.test).psnr
+    over, black = (
+        evaluate(trainer.renderer, trainer.snapshot(), scene.test, background).psnr
+        for background in (config.background, (0.0, 0.0, 0.0))
+    )
+    assert measured == over != black
 
 
 # --- fused kernels against NumPy -------------------------------------------------------------

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from clsplat.errors import InputError
-from clsplat.training.schedules import downscale_at, downscale_for, exponential_decay, resolution_schedule, sh_degree_at
+from clsplat.training.config import TrainConfig
+from clsplat.training.density.control import DensityControl
+from clsplat.training.schedules import (
+    RunSchedule,
+    downscale_at,
+    downscale_for,
+    exponential_decay,
+    growth_factor,
+    resolution_schedule,
+    sh_degree_at,
+)
 
 
 def test_decay_is_log_linear_and_constant_beyond() -> None:
@@ -31,6 +43,28 @@ def test_sh_degree_rises_every_interval() -> None:
     assert [sh_degree_at(i, 1000, 3) for i in (0, 999, 1000, 2999, 3000, 30_000)] == [0, 0, 1, 2, 3, 3]
     assert sh_degree_at(1, 0, 2) == 2
     assert sh_degree_at(5000, 1000, 0) == 0
+
+
+@pytest.mark.parametrize(("n_first", "cap"), [(100, 50_000), (1000, 3000), (2000, 2000)])
+def test_growth_reaches_the_cap_after_half_of_the_window(n_first: int, cap: int) -> None:
+    """A far cap needs more than the option `growth`. A near one is reached earlier, at that growth."""
+    config = TrainConfig(strategy="mcmc", iterations=2000, cap_max=cap, densify_interval=10, growth=1.05)
+    schedule = RunSchedule.create(config, n_first)
+    assert (schedule.densify_first, schedule.densify_last) == (100, 1600)
+    half = (1600 - 100) // 10 // 2
+    far = (cap / n_first) ** (1 / half)
+    assert schedule.growth == pytest.approx(max(far, 1.05))
+    assert n_first * schedule.growth**half >= cap * (1 - 1e-9)
+    if far > 1.05:
+        assert n_first * schedule.growth ** (half - 1) < cap
+    assert growth_factor(TrainConfig(strategy="adc", cap_max=cap), n_first, 1500) == 1.0
+
+
+def test_a_strategy_acts_at_both_ends_of_its_window() -> None:
+    config = TrainConfig(strategy="mcmc", iterations=100, densify_from=0.2, densify_until=0.8, densify_interval=20)
+    unused: Any = None
+    control = DensityControl(config, RunSchedule.create(config, 1), unused, unused, unused, unused, 1.0)
+    assert [iteration for iteration in range(101) if control.is_due(iteration)] == [20, 40, 60, 80]
 
 
 def test_default_resolution_schedule() -> None:

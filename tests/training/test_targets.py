@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import clsplat
 from clsplat.device.device import Device
 from clsplat.device.memory import to_host
-from clsplat.device.schedule import SCHEDULES
+from clsplat.device.schedule import default_schedule
 from clsplat.device.trace import recorded
 from clsplat.files.images import resize_area
 from clsplat.rendering.build import KernelBuild
@@ -36,7 +36,7 @@ def some_views() -> list[View]:
 
 
 def targets_of(device: Device, budget: int) -> Targets:
-    return Targets(device, KernelBuild("gaussian", 0, SCHEDULES["cpu16"]), some_views(), budget)
+    return Targets(device, KernelBuild("gaussian", 0, default_schedule(device.info)), some_views(), budget)
 
 
 def image_of(targets: Targets, target: Target) -> NDArray[np.uint8]:

@@ -3,53 +3,33 @@
 from __future__ import annotations
 
 import io
-import shutil
-import threading
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from serving import serving
 
 pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install clsplat[test-view])")
 
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
+from viewer_browser import CHROMIUM, chromium, wall
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
-from clsplat.splats.splats import SH_C0, Splats
 from clsplat.viewer.initial_view import SceneCameras, initial_view
+from clsplat.viewer.page import HELP
 from clsplat.viewer.server import Server
 from clsplat.viewer.settings import Settings
 from clsplat.viewer.source import ModelSource
 from clsplat.viewer.viewer import Viewer
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
 
-# WebGL without a graphics card; root may not use the sandbox.
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WIDTH, HEIGHT = 640, 480
 FRONT = Camera(WIDTH, HEIGHT, 500.0, 500.0, WIDTH / 2, HEIGHT / 2, np.eye(4))
-
-
-def wall() -> Splats:
-    """Return a wall of splats four units ahead: red on the left, green on the right, brighter downwards."""
-    y, x = np.mgrid[-1.5:1.5:25j, -2.0:2.0:33j]
-    n = x.size
-    colour = np.stack([x < 0, x >= 0, np.zeros_like(x)], axis=-1).reshape(n, 3) * (0.6 + 0.25 * y.reshape(n, 1))
-    return Splats(
-        "gaussian",
-        {
-            "mean": np.stack([x, y, np.full_like(x, 4.0)], axis=-1).reshape(n, 3).astype(np.float32),
-            "quat": np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-            "log_scale": np.full((n, 3), np.log(0.1), np.float32),
-            "opacity_logit": np.full(n, 6.0, np.float32),
-            "sh": ((colour - 0.5) / SH_C0)[:, None].astype(np.float32),
-        },
-    )
 
 
 @pytest.fixture(scope="module")
@@ -59,22 +39,16 @@ def server() -> Iterator[Server]:
     aside = FRONT.posed([[0.0, 0.0, 1.0, -4.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 4.0]])
     known = SceneCameras((NamedCamera("front", FRONT),), (NamedCamera("aside", aside),))
     running = Server(viewer, initial_view(wall().mean, [FRONT]), known, port=0)
-    worker = threading.Thread(target=viewer.run)
-    worker.start()
-    yield running
-    viewer.close()
-    running.close()
-    worker.join()
+    with serving(viewer, running):
+        yield running
 
 
 @pytest.fixture(scope="module")
 def page(server: Server) -> Iterator[Page]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    with chromium() as browser:
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
         page.goto(server.url)
         yield page
-        browser.close()
 
 
 def shot(page: Page) -> NDArray[np.uint8]:
@@ -127,3 +101,33 @@ def test_it_jumps_to_a_camera_and_changes_what_is_shown(server: Server, page: Pa
     show.click()
     page.get_by_role("option", name="Depth").click()
     wait_for(page, source.picture(FRONT, Settings(mode="depth", background=(0.0, 0.0, 1.0))))
+
+
+def test_a_slow_browser_shows_full_size_after_a_move(page: Page) -> None:
+    """viser lowers its resolution while a slow machine draws; a still page never draws enough to raise it again."""
+    session = page.context.new_cdp_session(page)
+    session.send("Emulation.setCPUThrottlingRate", {"rate": 3})
+    page.keyboard.down("ArrowRight")  # the camera turns in every frame
+    page.wait_for_timeout(4000)
+    page.keyboard.up("ArrowRight")
+    session.send("Emulation.setCPUThrottlingRate", {"rate": 1})
+    assert page.evaluate("document.querySelector('canvas[data-engine]').width") == WIDTH
+
+
+def test_keys_do_what_the_help_says(server: Server, page: Page) -> None:
+    """The keys are viser's. World axes here: x right, y down, z forward."""
+    lines = ("**W S** | forwards, backwards", "**A D** | left, right", "**E Q** | up, down")
+    assert all(line in HELP for line in lines)
+    (client,) = server.server.get_clients().values()
+    page.mouse.click(150, 400)
+    for key, axis, sign in (("w", 2, 1), ("s", 2, -1), ("a", 0, -1), ("d", 0, 1), ("e", 1, -1), ("q", 1, 1)):
+        client.camera.wxyz, client.camera.position = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        client.flush()
+        page.wait_for_timeout(200)
+        page.keyboard.down(key)
+        page.wait_for_timeout(200)
+        page.keyboard.up(key)
+        page.wait_for_timeout(150)
+        moved = client.camera.position
+        assert sign * moved[axis] > 0.05, (key, moved)
+        assert abs(moved[axis]) > 5 * np.abs(np.delete(moved, axis)).max(), (key, moved)

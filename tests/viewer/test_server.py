@@ -7,28 +7,35 @@ import json
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from reference.scenes import for_shape, random_camera, random_splats
+from serving import serving
 
 pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
 
 from viewer_client import Client
 from websockets.exceptions import ConnectionClosed
 
+from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
 from clsplat.cameras.path import path_of
 from clsplat.errors import OutputError
+from clsplat.files.images import write_png
+from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
 from clsplat.viewer.camera import Pose, camera_of
+from clsplat.viewer.crop import CropBox
 from clsplat.viewer.initial_view import SceneCameras, initial_view
-from clsplat.viewer.page import plain
+from clsplat.viewer.legend import legend
+from clsplat.viewer.page import Page, plain
 from clsplat.viewer.server import Server
 from clsplat.viewer.settings import Settings
 from clsplat.viewer.source import ModelSource
@@ -61,17 +68,15 @@ class Running:
             reload=self.reload,
             folder=folder,
         )
-        self.worker = threading.Thread(target=self.viewer.run)
-        self.worker.start()
+        self._open = ExitStack()
+        self._open.enter_context(serving(self.viewer, self.server))
 
     def reload(self) -> str:
         self.reloads += 1
         return f"read again *{self.reloads}*"
 
     def close(self) -> None:
-        self.viewer.close()
-        self.server.close()
-        self.worker.join()
+        self._open.close()
 
 
 @pytest.fixture(scope="module")
@@ -284,7 +289,13 @@ def test_reading_again_is_said_plainly(running: Running) -> None:
 
 
 def test_nothing_of_a_message_is_markup() -> None:
-    assert plain("a*b_c <i>\n[x](y)") == r"a\*b\_c \<i\> \[x\]\(y\)"
+    text, escaped = "a*b_c <i>\n[x](y)", r"a\*b\_c \<i\> \[x\]\(y\)"
+    assert plain(text) == escaped
+    page, server = Page.__new__(Page), Server.__new__(Server)
+    page._status, server._panel = SimpleNamespace(content=""), (SimpleNamespace(content=""), None)
+    page.set_status(text)
+    server.set_training_status(text)
+    assert page._status.content == server._panel[0].content == escaped
 
 
 @pytest.mark.slow
@@ -309,3 +320,131 @@ def test_the_benchmark_runs(tmp_path: Path, model_folder: Path) -> None:
     assert row["fps_moving"] > 1
     assert 0 < row["latency_ms"]["median"] <= row["latency_ms"]["p95"]
     assert {"device", "driver", "schedule", "commit", "splats"} <= set(row)
+
+
+def downloads(client: Client) -> dict[str, bytes]:
+    """Return the files that a client has received, by name."""
+    client.drain(0.3)
+    started = [m for m in client.received if m["type"] == "FileTransferStartDownload"]
+    parts = [m for m in client.received if m["type"] == "FileTransferPart"]
+    return {
+        start["filename"]: b"".join(
+            bytes(part["content"]) for part in parts if part["transfer_uuid"] == start["transfer_uuid"]
+        )
+        for start in started
+    }
+
+
+def test_a_picture_is_the_file_that_render_writes(running: Running, tmp_path: Path) -> None:
+    """It is larger than the window, and has the settings of the client."""
+    with Client(running.server.port) as client:
+        client.look()
+        client.still()
+        client.set("Background", [255, 0, 0])
+        client.set("Picture size", 300)
+        client.set("Download picture", True)
+        client.set("Download picture", True)
+        end = time.monotonic() + 10.0
+        while not downloads(client) and time.monotonic() < end:
+            pass
+        ((name, content), *_) = downloads(client).items()
+    assert name == "view_001.png"
+    camera = camera_of(Pose((1, 0, 0, 0), (0, 0, -3), 1.0, 96, 64), 300, enlarge=True)
+    assert camera is not None
+    assert (camera.width, camera.height) == (300, 200)
+    write_png(tmp_path / "view.png", Renderer().render(model(), camera, (1.0, 0.0, 0.0)).color, render=True)
+    assert content == (tmp_path / "view.png").read_bytes()
+
+
+def test_the_field_of_view_follows_the_slider_and_the_slider_follows_it(running: Running) -> None:
+    with Client(running.server.port) as client:
+        client.look(fov=1.0)
+        client.still()
+        client.drain(0.2)
+        slider = client.panel[client.uuid("Field of view")]
+        assert slider["value"] == 57.5
+        client.set("Field of view", 90.0)
+        client.drain(0.3)
+        changed = [m["fov"] for m in client.received if m["type"] == "SetCameraFovMessage" and not m.get("initial")]
+        assert changed == [pytest.approx(np.pi / 2)]
+        client.look(fov=np.pi / 2 + 1e-3)  # the browser's answer; the slider shows it already
+        client.still()
+        client.look(fov=0.5)
+        client.drain(0.3)
+        assert client.panel[client.uuid("Field of view")]["value"] == 28.5
+        assert len([m for m in client.received if m["type"] == "SetCameraFovMessage" and not m.get("initial")]) == 1
+
+
+def test_depth_has_a_legend(running: Running) -> None:
+    with Client(running.server.port) as client:
+        client.look()
+        client.still()
+        client.set("Show", "Depth")
+        client.still()
+        client.drain(0.3)
+        bars = [
+            props["content"] for props in client.panel.values() if "depth [world units]" in props.get("content", "")
+        ]
+        view = running.source.view(_front(), Settings(mode="depth", background=BACKGROUND))
+        assert bars == [legend("depth", view.near_far)]
+        client.set("Show", "Colour")
+        client.still()
+        client.drain(0.3)
+        assert not depth_bars(client)
+
+
+def depth_bars(client: Client) -> list[str]:
+    contents = [str(props.get("content", "")) for props in client.panel.values()]
+    return [content for content in contents if "depth [world units]" in content]
+
+
+def _front() -> Camera:
+    camera = camera_of(Pose((1, 0, 0, 0), (0, 0, -3), 1.0, 96, 64), 1000)
+    assert camera is not None
+    return camera
+
+
+def test_a_box_hides_what_is_outside_and_its_splats_are_saved(running: Running) -> None:
+    folder = running.server._folder
+    assert folder is not None
+    splats = model()
+    with Client(running.server.port) as client:
+        client.look()
+        client.still()
+        client.set("Save PLY", True)
+        client.until(plain("box: set Crop first"))
+        client.set("Crop", True)
+        client.until("of 40 splats are inside")
+        client.set("Size", [2.0, 3.0, 2.5])
+        client.drain(0.3)
+        controls = next(m for m in client.received if m["type"] == "TransformControlsMessage")
+        first = controls["name"]
+        pose = {
+            "type": "TransformControlsUpdateMessage",
+            "name": first,
+            "owner": controls["owner"],
+            "wxyz": [1.0, 0.0, 0.0, 0.0],
+            "position": [0.0, 0.0, 0.5],
+        }
+        client.send(pose)
+        box = CropBox.of((0, 0, 0.5), (1, 0, 0, 0), (2.0, 3.0, 2.5))
+        kept = splats.select(box.contains(splats.mean))
+        assert 0 < len(kept) < 40
+        client.until(f"{len(kept)} of 40 splats are inside")
+        assert shows(client, expected(Settings(background=BACKGROUND, crop=box)))
+        for number in (1, 2):
+            client.set("Save PLY", True)
+            client.until(plain(f"cropped_00{number}.ply"))
+        client.set("Download PLY", True)
+        client.until(plain("cropped.ply:"))
+        content = downloads(client)["cropped.ply"]
+        client.send(pose | {"name": f"{first}/corner", "position": [0.5, 0.25, 1.0]})
+        client.until(f"{CropBox.of((0, 0, 0.5), (1, 0, 0, 0), (1, 0.5, 2)).contains(splats.mean).sum()} of 40 splats")
+        client.set("Size", [-1.0, 1.0, 1.0])
+        client.set("Crop", False)
+        assert shows(client, expected(Settings(background=BACKGROUND)))
+    kept.save(folder / "expected.ply")
+    for name in ("cropped_001.ply", "cropped_002.ply"):
+        assert (folder / name).read_bytes() == (folder / "expected.ply").read_bytes() == content
+        (folder / name).unlink()
+    (folder / "expected.ply").unlink()

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
+import io
 import math
 import signal
 import threading
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from clsplat.errors import InputError
 from clsplat.rendering.colormaps import MODES
+from clsplat.rendering.frame import Frame
+from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
 from clsplat.training.config import TrainConfig
 from clsplat.training.log import Progress
+from clsplat.training.progress import TrainingDisplay
 from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
-from clsplat.viewer.camera import Pose
+from clsplat.viewer import training
+from clsplat.viewer.camera import Pose, camera_of
 from clsplat.viewer.settings import Settings
+from clsplat.viewer.source import ModelSource, ViewPicture
 from clsplat.viewer.training import SHARE, TrainingSource, TrainingView, run_line
 from clsplat.viewer.viewer import ViewerImage
 
 CONFIG = TrainConfig(iterations=40, cap_max=2400, sh_degree=1, densify_interval=10, strategy="mcmc")
 LAZY = TrainConfig(iterations=30, cap_max=2400, sh_degree=1, densify_interval=10, strategy="mcmc", visible_adam=True)
+LONG = TrainConfig(iterations=100_000, cap_max=2400, sh_degree=1, strategy="mcmc")
 
 
 def pose_of(scene: Scene) -> Pose:
@@ -60,15 +70,36 @@ def test_what_is_seen_is_the_run(scene: Scene) -> None:
     def visit(trainer: Trainer, stop: threading.Event) -> None:
         source.attach(trainer)
         if trainer.iteration == CONFIG.iterations:
-            seen["picture"] = source.picture(scene.train[0].camera, Settings())
+            seen["picture"] = source.view(scene.train[0].camera, Settings()).picture
 
     source = TrainingSource(CONFIG)
     with pytest.raises(InputError, match="not begun"):
-        source.picture(scene.train[0].camera, Settings())
+        source.view(scene.train[0].camera, Settings())
     model = train(scene, CONFIG, visit=visit)
     assert source.n_splats == len(model.splats)
     image = Renderer().render(model.splats, scene.train[0].camera).color
     assert np.array_equal(seen["picture"], np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8))
+
+
+def test_no_band_is_shown_before_it_is_trained(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run may start from a model whose bands are not in use yet."""
+    source, shown = TrainingSource(CONFIG), []
+    forward = Pipeline.forward
+
+    def spy(self: Pipeline, *args: Any) -> Frame:
+        shown.append(args[3])
+        return forward(self, *args)
+
+    trainer = Trainer(scene, replace(CONFIG, sh_degree=2, sh_interval=2))
+    source.attach(trainer)
+    monkeypatch.setattr(Pipeline, "forward", spy)
+    for trained in (0, 1, 1, 2):
+        trainer.step()
+        assert shown.pop() == trained
+        for chosen in (None, 0, 1, 2):
+            source.view(scene.train[0].camera, Settings(sh_degree=chosen))
+        assert shown == [trained, 0, min(trained, 1), trained]
+        shown.clear()
 
 
 def test_pictures_take_no_more_than_their_share() -> None:
@@ -82,10 +113,10 @@ def test_pictures_take_no_more_than_their_share() -> None:
 
         def attach(self, trainer: object) -> None: ...
 
-        def picture(self, camera: object, settings: object) -> np.ndarray:
+        def view(self, camera: object, settings: object) -> ViewPicture:
             now[0] += 0.03
             spent[0] += 0.03
-            return np.zeros((4, 4, 3), np.uint8)
+            return ViewPicture(np.zeros((4, 4, 3), np.uint8))
 
     class Device:
         class queue:
@@ -115,13 +146,13 @@ def test_a_paused_run_waits_and_still_shows(scene: Scene) -> None:
     def look_on() -> None:
         while not iterations:
             time.sleep(0.01)
-        assert view.toggle()
+        view.toggle()
         time.sleep(0.3)
         before = len(iterations)
         view.viewer.move(1, pose_of(scene))
         time.sleep(0.5)
         waited.append(len(iterations) == before)
-        assert not view.toggle()
+        view.toggle()
 
     waited: list[bool] = []
     looking = threading.Thread(target=look_on)
@@ -154,3 +185,118 @@ def test_a_line_tells_of_the_run() -> None:
     )
     assert "finished" in run_line(Progress(100, 100, 0.1, 20.0, 300, 2.0, 25.0))
     assert run_line(Progress(0, 100, math.nan, math.nan, 0, 0.0, 0.0, "so it begins")) == "so it begins"
+
+
+def paused_run(scene: Scene, monkeypatch: pytest.MonkeyPatch, watch: Callable[[TrainingView], None]) -> list[str]:
+    """Return what is said of a run that is paused at iteration 5. `watch` runs in a thread from then on."""
+    monkeypatch.setattr(training, "_GRACE", 0.3)
+    said: list[str] = []
+    view = TrainingView(CONFIG, on_pause=lambda paused, message: said.append(f"{paused} {message}"))
+    view.viewer.join(1, lambda shot: None)
+    watching = threading.Thread(target=watch, args=(view,))
+
+    def visit(trainer: Trainer, stop: threading.Event) -> None:
+        if trainer.iteration == 5:
+            view.toggle()
+            watching.start()
+        view.visit(trainer, stop)
+
+    assert train(scene, CONFIG, visit=visit).finished
+    watching.join()
+    return said
+
+
+def test_a_pause_is_said_and_ends_by_its_button(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def press_later(view: TrainingView) -> None:
+        time.sleep(0.8)  # longer than the grace: somebody watches
+        view.toggle()
+
+    said = paused_run(scene, monkeypatch, press_later)
+    assert said == [
+        "True iteration 5: paused by the viewer",
+        "False iteration 5: the viewer resumed the run",
+    ]
+
+
+def test_a_pause_ends_when_nobody_watches(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def load_again_and_leave(view: TrainingView) -> None:
+        left.append(time.monotonic())
+        view.viewer.leave(1)
+        time.sleep(0.15)
+        view.viewer.join(2, lambda shot: None)
+        time.sleep(0.5)
+        left.append(time.monotonic())
+        view.viewer.leave(2)
+
+    left: list[float] = []
+    said = paused_run(scene, monkeypatch, load_again_and_leave)
+    assert said[1] == "False iteration 5: the run goes on, because nobody watches it any more"
+    assert time.monotonic() - left[1] > 0.25
+
+
+def test_a_pause_is_shown_in_the_terminal_and_on_the_button(scene: Scene) -> None:
+    pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
+    from viewer_client import Client
+
+    from clsplat.viewer.options import ServerOptions
+    from clsplat.viewer.training_session import TrainingSession
+
+    def press() -> None:
+        with Client(int(session.urls[0].rpartition(":")[2])) as client:
+            client.look()
+            client.set("Pause", True)
+            client.uuid("Resume")
+            client.set("Resume", True)
+            client.uuid("Pause")
+
+    shown = io.StringIO()
+    with TrainingSession(scene, LONG, "run", ServerOptions(port=0)) as session:
+        pressing = threading.Thread(target=press)
+
+        def visit(trainer: Trainer, stop: threading.Event) -> None:
+            if trainer.iteration == 2:
+                pressing.start()
+            if trainer.iteration > 2 and not pressing.is_alive():
+                stop.set()
+            session.visit(trainer, stop)
+
+        train(scene, LONG, session.progress(TrainingDisplay(stream=shown)), visit=visit)
+        pressing.join()
+    lines = [line for line in shown.getvalue().splitlines() if "viewer" in line]
+    assert [line.partition(": ")[2] for line in lines] == ["paused by the viewer", "the viewer resumed the run"]
+
+
+def test_a_page_stays_after_the_run_and_shows_its_model(scene: Scene) -> None:
+    pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
+    from viewer_client import Client
+
+    from clsplat.viewer.options import ServerOptions
+    from clsplat.viewer.training_session import TrainingSession
+
+    shown: list[np.ndarray] = []
+    sliders: list[bool] = []
+
+    def look_on() -> None:
+        try:
+            with Client(int(session.urls[0].rpartition(":")[2])) as client:
+                client.look()
+                client.still()
+                client.until("the run has finished")
+                client.drain(0.5)  # the first camera may get another picture
+                client.look((0, 0, -4))
+                shown.append(client.still())
+                sliders.extend(props["visible"] for props in client.panel.values() if props.get("label") == "Splats")
+        finally:
+            session.stop()
+
+    with TrainingSession(scene, CONFIG, "run", ServerOptions(port=0)) as session:
+        model = train(scene, CONFIG, session.progress(lambda progress: None), visit=session.visit)
+        looking = threading.Thread(target=look_on)
+        looking.start()
+        session.stay(model)
+        looking.join()
+    camera = camera_of(Pose((1, 0, 0, 0), (0, 0, -4), 1.0, 96, 64), 1000)
+    assert camera is not None
+    expected = ModelSource(model.splats).picture(camera, Settings(background=CONFIG.background))
+    assert np.abs(shown[0].astype(int) - expected).mean() < 4.0
+    assert sliders == [True]

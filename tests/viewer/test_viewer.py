@@ -14,7 +14,7 @@ from reference.scenes import for_shape, random_camera, random_splats
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
 from clsplat.errors import DeviceError, InputError
-from clsplat.rendering.colormaps import MODES, Picture, to_bytes
+from clsplat.rendering.colormaps import MODES, to_bytes
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
 from clsplat.viewer.camera import MAX_FOV, AdaptiveResolution, Pose, camera_of, window_of
@@ -22,7 +22,7 @@ from clsplat.viewer.initial_view import SceneCameras, initial_view, vertical_fov
 from clsplat.viewer.recording import MAX_KEYS, Recording
 from clsplat.viewer.render_queue import RenderQueue
 from clsplat.viewer.settings import MAX_SIZE, MIN_SIZE, Settings
-from clsplat.viewer.source import ModelSource, ModelWatcher, coverage
+from clsplat.viewer.source import ModelSource, ModelWatcher, ViewPicture, coverage
 from clsplat.viewer.viewer import REST, Viewer, ViewerImage
 
 AHEAD = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 1.0, 96, 64)
@@ -46,18 +46,18 @@ class Clock:
 class Plain:
     """A source that takes some time and records its calls."""
 
-    modes, partial, n_splats, sh_degree = MODES, True, 7, 2
+    modes, partial, splats, n_splats, sh_degree = MODES, True, None, 7, 2
 
     def __init__(self, clock: Clock, seconds: float = 0.0, error: Exception | None = None) -> None:
         self.calls: list[tuple[Camera, Settings]] = []
         self.clock, self.seconds, self.error = clock, seconds, error
 
-    def picture(self, camera: Camera, settings: Settings) -> Picture:
+    def view(self, camera: Camera, settings: Settings) -> ViewPicture:
         self.calls.append((camera, settings))
         self.clock.now += self.seconds * camera.width * camera.height / (96 * 64)
         if self.error:
             raise self.error
-        return np.zeros((camera.height, camera.width, 3), np.uint8)
+        return ViewPicture(np.zeros((camera.height, camera.width, 3), np.uint8))
 
 
 # --- the queue ------------------------------------------------------------------------------
@@ -88,6 +88,9 @@ def test_a_delayed_request_waits_and_an_earlier_one_replaces_it() -> None:
     queue.request(1)
     assert queue.next_client(0.0) == 1
     assert queue.next_client(0.0) is None, "one request, not two"
+    queue.request(1)
+    queue.request(1, delay=5.0)
+    assert queue.next_client(0.0) == 1, "a later request does not delay an earlier one"
 
 
 def test_a_cancelled_request_is_not_served_and_close_wakes_the_server() -> None:
@@ -133,6 +136,8 @@ NONE: list[object] = [
     Pose((1, 0, 0, 0), (0, math.inf, 0), 1.0, 96, 64),
     Pose((1, 0, 0, 0), (0, 1e30, 0), 1.0, 96, 64),
     Pose((1, math.inf, 0, 0), (0, 0, 0), 1.0, 96, 64),
+    Pose((1e308, 1e308, 1e308, 1e308), (0, 0, 0), 1.0, 96, 64),
+    Pose((1e200, 0, 0, 0), (0, 0, 0), 1.0, 96, 64),
     Pose((1, 0, 0, 0), (0, 0, 0), math.nan, 96, 64),
     Pose((1, 0, 0, 0), (0, 0, 0), 0.0, 96, 64),
     Pose((1, 0, 0, 0), (0, 0, 0), 1.01 * MAX_FOV, 96, 64),
@@ -142,9 +147,18 @@ NONE: list[object] = [
 ]
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("pose", NONE, ids=range(len(NONE)))
 def test_absurd_cameras_are_none(pose: Pose) -> None:
     assert camera_of(pose, 1000) is None
+
+
+@pytest.mark.filterwarnings("error")
+def test_far_splats_have_a_first_view_without_warnings() -> None:
+    means = np.full((6, 3), 3e38, np.float32) * np.array([[-1], [1]] * 3, np.float32)
+    for some in (means, np.abs(means), means[:0]):
+        view = initial_view(some, [])
+        assert np.isfinite([view.position, view.look_at]).all()
 
 
 @pytest.mark.parametrize("size", [(0, 0), (-5, 10), (10**9, 10**9), (math.nan, 3), ("a", 3), (10**400, 1)])

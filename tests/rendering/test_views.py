@@ -1,0 +1,23 @@
+"""The range of depths of a path: quartiles over its frames, so that a frame inside a wall does not stretch it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clsplat.cameras.camera import Camera
+from clsplat.cameras.cameras_json import NamedCamera
+from clsplat.rendering import views
+
+
+def test_the_range_of_a_path_is_between_quartiles_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    nears, fars = np.array([1.0, 0.01, 1.2, 1.4, 1.6]), np.array([9.0, 8.0, 500.0, 6.0, 7.0])
+    ranges = iter(zip(nears, fars, strict=True))
+    monkeypatch.setattr(views, "depth_range", lambda image: next(ranges))
+    renderer: Any = SimpleNamespace(render=lambda splats, camera: None)
+    splats: Any = None
+    cameras = [NamedCamera(str(i), Camera(40, 30, 30.0, 30.0, 20.0, 15.0, np.eye(4))) for i in range(5)]
+    assert views.depths_seen(renderer, splats, cameras) == pytest.approx((1.0, 9.0))

@@ -1,0 +1,207 @@
+"""Norms of quaternions, names in text files, and poses and lenses that cannot be right."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runner import clsplat, error_of, run
+from small_scene import as_text, cloud, model_views, photo_of, write_garden
+
+from clsplat.errors import InputError
+from clsplat.files.images import write_png
+from clsplat.scenes.colmap import read_model
+from clsplat.scenes.colmap_binary import write_binary_model
+from clsplat.scenes.scene import load_scene
+
+
+@pytest.fixture
+def garden(tmp_path: Path) -> Path:
+    return write_garden(tmp_path)
+
+
+def text_model(garden: Path, rigs: bool = False) -> Path:
+    """Replace the binary model by text files and return images.txt."""
+    model = garden / "sparse" / "0"
+    as_text(model, garden / "text")
+    for file in model.iterdir():
+        file.unlink()
+    for file in (garden / "text").iterdir():
+        if rigs or file.stem not in ("rigs", "frames"):
+            file.rename(model / file.name)
+    return model / "images.txt"
+
+
+def scale_quaternions(file: Path, factor: float, first: int = 1, only: int | None = None) -> None:
+    """Multiply the quaternions in the lines of images.txt or frames.txt."""
+    lines, row = file.read_text().splitlines(), 0
+    step = 2 if file.stem == "images" else 1
+    body = [index for index, line in enumerate(lines) if not line.startswith("#")]
+    for row, index in enumerate(body[::step]):
+        if only is None or row == only:
+            words = lines[index].split(" ")
+            words[first : first + 4] = [repr(factor * float(word)) for word in words[first : first + 4]]
+            lines[index] = " ".join(words)
+    file.write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("rigs", [False, True])
+@pytest.mark.parametrize("factor", [1000.0, 1e-3, -1.0, 1e200])
+def test_quaternions_have_any_norm(garden: Path, factor: float, rigs: bool) -> None:
+    expected = load_scene(garden)
+    file = text_model(garden, rigs)
+    if rigs:
+        scale_quaternions(file.with_name("frames.txt"), factor, first=2)
+    else:
+        scale_quaternions(file, factor)
+    for view, other in zip(load_scene(garden).views, expected.views, strict=True):
+        np.testing.assert_allclose(view.camera.cam_from_world, other.camera.cam_from_world, atol=1e-12)
+
+
+def test_a_quaternion_of_norm_zero_is_named(garden: Path) -> None:
+    scale_quaternions(text_model(garden), 0.0, only=2)
+    for message in (error_of("info", garden), error_of("train", garden, "-m", garden / "m")):
+        assert "image 'shot_6.png' has a quaternion of norm 0; rebuild the model" in message
+
+
+@pytest.mark.parametrize(("place", "value"), [(0, 0.0), (0, np.nan), (0, np.inf), (5, np.nan), (6, np.inf)])
+def test_binary_poses_that_are_no_poses_are_named(garden: Path, place: int, value: float) -> None:
+    file = garden / "sparse" / "0" / "images.bin"
+    data = bytearray(file.read_bytes())
+    width = 4 if place == 0 else 1
+    data[12 + 8 * place : 12 + 8 * (place + width)] = struct.pack(f"<{width}d", *[value] * width)
+    file.write_bytes(data)
+    with pytest.raises(InputError, match=r"image 'shot_8\.png' has a (quaternion of norm 0|pose that is not finite)"):
+        load_scene(garden)
+    assert "shot_8.png" in error_of("info", garden)
+
+
+def test_names_with_spaces_are_read_from_text_models(garden: Path) -> None:
+    """Other programs write them; COLMAP itself ends a name at the first space."""
+    file = text_model(garden)
+    text, expected = file.read_text(), load_scene(garden)
+    for name in expected.names:
+        (garden / "images" / name).rename(garden / "images" / name.replace("shot_", "my  shot "))
+    file.write_text(text.replace("shot_", "my  shot "))
+    scene = load_scene(garden)
+    assert scene.names == [name.replace("shot_", "my  shot ") for name in expected.names]
+    for view, other in zip(scene.views, expected.views, strict=True):
+        np.testing.assert_array_equal(view.camera.cam_from_world, other.camera.cam_from_world)
+        np.testing.assert_array_equal(view.image, other.image)
+
+
+def test_text_models_with_spaces_are_not_written(garden: Path) -> None:
+    data = (garden / "sparse" / "0" / "images.bin").read_bytes()
+    (garden / "sparse" / "0" / "images.bin").write_bytes(data.replace(b"shot_3", b"shot 3"))
+    (garden / "images" / "shot_3.png").rename(garden / "images" / "shot 3.png")
+    target = garden / "out"
+    message = error_of("cameras", garden, target, "--format", "colmap-text")
+    assert "image 'shot 3.png': a name ends at the first space in COLMAP's text files; write a binary model" in message
+    assert not target.exists()
+    assert "9 cameras" in clsplat("cameras", garden, target, "--format", "colmap")
+    assert "shot 3.png" in [photo.name for photo in read_model(target).photos]
+
+
+# --- poses and lenses that cannot be right -------------------------------------------------
+
+
+def write_model(garden: Path, poses: list[np.ndarray], shift: float = 0.0, points: bool = True) -> None:
+    """Write the garden's model with other poses; `shift` moves its points."""
+    xyz, rgb = cloud()
+    views = [replace(view, cam_from_world=pose) for view, pose in zip(model_views(), poses, strict=True)]
+    if not points:
+        nothing = (np.empty((0, 2)), np.empty(0, np.int64))
+        views = [replace(view, pixels=nothing[0], point_index=nothing[1]) for view in views]
+        xyz, rgb = xyz[:0], rgb[:0]
+    write_binary_model(garden / "sparse" / "0", views, xyz + shift, rgb)
+
+
+def moved(scale: float = 1.0, shift: float = 0.0) -> list[np.ndarray]:
+    """Return the poses of cameras whose centres are scaled, then moved."""
+    poses = []
+    for view in model_views():
+        pose = view.cam_from_world.copy()
+        pose[:3, 3] = -pose[:3, :3] @ (-scale * pose[:3, :3].T @ pose[:3, 3] + shift)
+        poses.append(pose)
+    return poses
+
+
+@pytest.mark.parametrize("scale", [1e13, 1e30, 1e200])
+def test_poses_beyond_float32_are_named(garden: Path, scale: float) -> None:
+    write_model(garden, moved(scale))
+    for message in (error_of("info", garden), error_of("train", garden, "-m", garden / "m")):
+        assert re.search(r"the translation of 'shot_\d.png' is \d\.?\d*e\+\d+, more than 1e\+12; scale the", message)
+
+
+@pytest.mark.parametrize("points", [True, False])
+def test_a_scene_far_from_the_origin_is_named(garden: Path, points: bool) -> None:
+    write_model(garden, moved(shift=1e9), 1e9, points)
+    with pytest.raises(InputError, match=r"times the size of the scene .*, so float32 cannot hold it; move the scene"):
+        load_scene(garden)
+    write_model(garden, moved(shift=1e5), 1e5, points)
+    with pytest.warns(UserWarning, match=r"times the size of the scene .*; images lose sharpness in float32"):
+        load_scene(garden)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_model(garden, moved(scale=1e6), 0.0, False)
+        load_scene(garden)
+        write_model(garden, moved(shift=1e3), 1e3, points)
+        load_scene(garden)
+
+
+def test_cameras_far_from_their_points_are_named(garden: Path) -> None:
+    write_model(garden, moved(scale=1e11))
+    with pytest.raises(InputError, match="times the size of the scene"):
+        load_scene(garden)
+
+
+def test_equal_poses_of_different_photos_are_named(garden: Path) -> None:
+    write_model(garden, [np.eye(4)] * 9)
+    text = "8 of 9 photos have the pose of another photo but show something else, for example 'shot_1.png' and 'shot_0"
+    with pytest.warns(UserWarning, match=text):
+        load_scene(garden)
+    assert text in run("info", garden).stderr
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for index in range(9):
+            (garden / "images" / f"shot_{index}.png").write_bytes((garden / "images" / "shot_0.png").read_bytes())
+        load_scene(garden)
+
+
+@pytest.mark.parametrize(("k1", "size"), [(1e6, "8x6"), (-10.0, "80x60")])
+def test_lenses_beyond_undistortion_are_named(tmp_path: Path, k1: float, size: str) -> None:
+    for index, view in enumerate(model_views()):
+        write_png(tmp_path / view.name, photo_of(index))
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {"file_path": view.name, "transform_matrix": (np.linalg.inv(view.cam_from_world) @ flip).tolist(), "k1": k}
+        for view, k in zip(model_views(), [0.1, k1] + [0.0] * 7, strict=True)
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 33.0, "frames": frames}))
+    match = rf"the lens of 1 of 9 photos distorts too much .*'shot_1\.png': 40x30 px become {size} px\. .*{k1:g}"
+    with pytest.warns(UserWarning, match=match.replace("+", r"\+")):
+        load_scene(tmp_path)
+    assert f"40x30 px become {size} px" in run("info", tmp_path).stderr
+
+
+def test_points_far_away_are_read(garden: Path) -> None:
+    """Sparse models have such outliers. They are no reason to refuse a scene."""
+    xyz, rgb = cloud()
+    xyz[3] = 1e30
+    write_binary_model(garden / "sparse" / "0", model_views(), xyz, rgb)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_scene(garden).points.xyz.max() == 1e30
+    xyz[3] = 1e300
+    write_binary_model(garden / "sparse" / "0", model_views(), xyz, rgb)
+    with pytest.warns(UserWarning, match=r"1 of 12 points are further away than 1e\+30; they are left out"):
+        points = load_scene(garden).points
+    np.testing.assert_array_equal(points.xyz, np.delete(xyz, 3, axis=0))
+    np.testing.assert_array_equal(points.rgb, np.delete(rgb, 3, axis=0))
+    assert len(points.track_length) == 11

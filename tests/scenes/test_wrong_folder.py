@@ -1,0 +1,99 @@
+"""Folders one level too high or too low: every command names the scene."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runner import error_of
+from small_scene import NAMES, write_garden
+
+from clsplat.files.images import write_png
+from clsplat.scenes.wrong_folder import scene_above, scene_hint, scenes_below
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A folder with a COLMAP scene, a scene with transforms.json two levels down, and a folder of photos."""
+    garden = write_garden(tmp_path / "data")
+    frames = [{"file_path": f"shots/{NAMES[0]}", "transform_matrix": np.eye(4).tolist()}]
+    other = tmp_path / "data" / "more" / "other"
+    (other / "shots").mkdir(parents=True)
+    shutil.copy(garden / "images" / NAMES[0], other / "shots")
+    (other / "transforms.json").write_text(json.dumps({"fl_x": 30.0, "frames": frames}))
+    write_png(tmp_path / "data" / "loose" / "a.png", np.zeros((4, 4, 3)))
+    return tmp_path / "data"
+
+
+COMMANDS = {
+    "train": ("train", "{}", "-m", "OUT"),
+    "info": ("info", "{}"),
+    "compare": ("compare", "{}", "-o", "OUT"),
+    "reconstruct": ("reconstruct", "{}", "-o", "OUT"),
+}
+
+
+def refusal(command: str, path: Path, out: Path) -> str:
+    arguments = [path if part == "{}" else out if part == "OUT" else part for part in COMMANDS[command]]
+    message = error_of(*arguments)
+    assert not out.exists() or not any(out.rglob("*.ply"))
+    return message
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_folder_above_scenes(data: Path, tmp_path: Path, command: str) -> None:
+    message = refusal(command, data, tmp_path / "out")
+    assert "the subfolders garden, more/other are scenes: give one of them, such as " in message
+    shutil.rmtree(data / "more")
+    assert "the subfolder garden is a scene: give " in refusal(command, data, tmp_path / "out")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("part", ["sparse", "sparse/0"])
+def test_the_folder_of_a_colmap_model(data: Path, tmp_path: Path, command: str, part: str) -> None:
+    message = refusal(command, data / "garden" / part, tmp_path / "out")
+    assert message.endswith(f"{part}: is a part of the scene {data / 'garden'}: give that folder")
+
+
+@pytest.mark.parametrize("command", ["train", "info", "compare"])
+@pytest.mark.parametrize("part", ["garden/images", "more/other/shots"])
+def test_the_photos_of_a_scene(data: Path, tmp_path: Path, command: str, part: str) -> None:
+    """The command `reconstruct` may find new poses for them."""
+    message = refusal(command, data / part, tmp_path / "out")
+    assert str((data / part).parent) in message.partition(str(data / part))[2].partition(str(data / part))[0]
+    assert "give that folder" in message
+
+
+def test_folders_that_have_no_scene_to_name(data: Path) -> None:
+    assert scene_above(data / "loose") is None
+    assert scene_hint(data / "loose") is None
+    write_png(data / "garden" / "drafts" / "z.png", np.zeros((4, 4, 3)))
+    assert scene_above(data / "garden" / "drafts") is None, "the scene has no photo there"
+    assert scenes_below(data) == ["garden", "more/other"]
+    (data / "garden" / "sparse" / "0" / "images.bin").write_bytes(b"damaged")
+    assert scene_above(data / "garden" / "images") is None
+
+
+def test_relative_paths_stay_relative(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(data)
+    assert scene_above(Path("garden/images")) == Path("garden")
+    monkeypatch.chdir(data / "garden" / "images")
+    assert scene_above(Path()) == data / "garden"
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("a.jpg", "is one photo; give the folder of the photos"),
+        ("points.ply", "is a model or a point cloud, not a scene; give the scene's folder"),
+        ("notes.txt", "is not a scene; give a folder with photos, a transforms.json, or a video"),
+    ],
+)
+def test_files_that_are_not_scenes(tmp_path: Path, name: str, remedy: str) -> None:
+    (tmp_path / name).write_bytes(b"something")
+    for command in ("train", "compare"):
+        assert f"{name}: {remedy}" in refusal(command, tmp_path / name, tmp_path / "out")
+    assert f"{name}: is a file; give a folder" in refusal("reconstruct", tmp_path / name, tmp_path / "out")
