@@ -21,7 +21,7 @@ from clsplat.scenes.split import hold_out
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 TEST_HELPERS = [str(ROOT / "tests"), str(ROOT / "tests" / "support")]  # for sys.path: the reference and the helpers
-CLSPLAT = [sys.executable, "-c", "from clsplat_cli.main import main; main()"]  # the command line, for subprocesses
+CLSPLAT = [sys.executable, "-c", "from clsplat_cli.start import main; main()"]  # the command line, for subprocesses
 REDUCTION = {"fox": 2}  # `resolution` of load_scene; the other scenes are read as they are
 
 

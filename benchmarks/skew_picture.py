@@ -16,8 +16,9 @@ import numpy as np
 from clsplat.cameras.cameras_json import read_cameras
 from clsplat.files.images import write_png
 from clsplat.rendering.renderer import Renderer
+from clsplat.splats.harmonics import SH_C0
 from clsplat.splats.shapes import SKEW_LIMIT
-from clsplat.splats.splats import SH_C0, Splats
+from clsplat.splats.splats import Splats
 from clsplat.training.folder import ModelFolder
 
 

@@ -72,6 +72,7 @@ def measure(args: argparse.Namespace, folder: Path) -> None:
             "-o",
             str(folder / "images"),
             "--quiet",
+            "--overwrite",
             "--device",
             device.info.index,
         ]

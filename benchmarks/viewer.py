@@ -115,16 +115,16 @@ def serve(model: Path, device: str | None) -> None:
     places = np.array([camera.position for camera in path_of(model)])
     loaded = load_model(model)
     viewing = ViewingSession(loaded, options=ServerOptions(port=0), device=device)
-    make = viewing.source.picture
+    make = viewing.source.view
 
     def stamped(camera: Any, settings: Any) -> Any:
-        picture = make(camera, settings)
+        view = make(camera, settings)
         number = int(np.argmin(np.linalg.norm(places - camera.position, axis=1)))
         for bit in range(BITS):
-            picture[:BLOCK, BLOCK * bit : BLOCK * (bit + 1)] = 255 * (number >> bit & 1)
-        return picture
+            view.picture[:BLOCK, BLOCK * bit : BLOCK * (bit + 1)] = 255 * (number >> bit & 1)
+        return view
 
-    viewing.source.picture = stamped  # type: ignore[method-assign]
+    viewing.source.view = stamped  # type: ignore[method-assign]
     threading.Thread(target=viewing.run, daemon=True).start()
     opened = open_device(device)
     print(
