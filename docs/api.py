@@ -1,4 +1,7 @@
-"""Renders the docstrings of clsplat's public names: python docs/api.py FOLDER (pip install "clsplat[docs]")."""
+"""Renders the docstrings of clsplat's public names: python docs/api.py FOLDER [--overwrite].
+
+It needs pdoc: pip install "clsplat[docs]".
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,17 @@ import sys
 from pathlib import Path
 
 import clsplat
+from clsplat.errors import OutputError
+from clsplat.files.existing import refuse_existing
 
 _HEADING = re.compile(r"^([A-Z]\w+)\n-{3,}\n", re.M)
 # Several may stand on a line: "width, height : of the image [px]. focal : ..."
 _ITEM = re.compile(r"(?:^|(?<=[.;] ))([A-Za-z_*][\w.,* ]{0,60}?) : ")
 
 
-def render(folder: Path) -> Path:
+def render(folder: Path, overwrite: bool = False) -> Path:
     """Write the pages; returns the first."""
+    refuse_existing([folder / page for page in ("clsplat.html", "index.html", "search.js")], overwrite)
     try:
         import pdoc
         from pdoc import docstrings
@@ -40,6 +46,10 @@ def markdown_of(docstring: str) -> str:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit("usage: python docs/api.py FOLDER")
-    print(render(Path(sys.argv[1])))
+    folders = [word for word in sys.argv[1:] if word != "--overwrite"]
+    if len(folders) != 1:
+        sys.exit("usage: python docs/api.py FOLDER [--overwrite]")
+    try:
+        print(render(Path(folders[0]), "--overwrite" in sys.argv))
+    except OutputError as error:
+        sys.exit(f"error: {error}")

@@ -18,8 +18,8 @@ from xml.sax.saxutils import escape
 
 ROOT = Path(__file__).resolve().parents[1]
 DRAWING = ROOT / "docs" / "images" / "imports.svg"
-# Every package may import these two modules, so their arrows would hide the others.
-BASE = ("errors", "_version")
+# Every package may import these modules, so their arrows would hide the others.
+BASE = ("errors", "_version", "activity")
 
 BOX_WIDTH, BOX_HEIGHT, STEP = 324, 46, 74
 LEFT, TOP = 24, 24
