@@ -26,8 +26,9 @@ def add_splats(context: Any, path: Path, upright: bool = True, points: int = 100
     """
     import numpy as np
 
+    from clsplat.splats.harmonics import SH_C0
     from clsplat.splats.shapes import shape_named
-    from clsplat.splats.splats import SH_C0, Splats
+    from clsplat.splats.splats import Splats
 
     from .pictures import to_linear
 
