@@ -275,6 +275,9 @@ def test_a_state_continues_to_the_same_bits_and_goes_from_one_optimizer_to_the_o
             odd = {k: v for k, v in state.items() if k != key} if key in state else state | {key: state["steps"]}
             with pytest.raises(InputError, match=key):
                 other.load_state(odd)
+        for key in ("steps", "second.mean", "momentum"):
+            with pytest.raises(InputError, match=f"{key}.*shape"):
+                other.load_state(state | {key: state[key].ravel()[:1]})
 
 
 def test_every_field_has_a_rate(devices: list[Device]) -> None:

@@ -16,7 +16,7 @@ from ...splats.fields import Array, Group, Schema, sh_coefficients
 from ..density.edit import DensifyEdit
 from ..programs import PARTS, optim_program
 from .adam import BETA1, BETA2
-from .rules import Rules, StepCounts
+from .rules import Rules, StepCounts, check_state
 from .sghmc import STREAM, Sghmc
 from .skew_map import SkewMap
 
@@ -151,7 +151,7 @@ class FusedOptimizer:
         return state
 
     def load_state(self, state: dict[str, NDArray[Any]]) -> None:
-        self.rules.check_state(state, self.splats.schema)
+        check_state(state, self.state())
         self.steps = int(state["steps"][0])
         for role, buffers in (("first", self.first), ("second", self.second)):
             buffers.upload({name: state[f"{role}.{name}"] for name in self._base_names})

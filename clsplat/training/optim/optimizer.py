@@ -58,7 +58,7 @@ class Optimizer(Protocol):
         """Return the state for a checkpoint, without the splats. Both optimizers use the same keys."""
 
     def load_state(self, state: dict[str, NDArray[Any]]) -> None:
-        """Continue from `state`. Raise InputError if an entry is missing or unknown."""
+        """Continue from `state`. Raise InputError if an entry is missing, unknown, or of another shape."""
 
 
 def make_optimizer(

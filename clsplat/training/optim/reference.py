@@ -13,7 +13,7 @@ from ..density.edit import DensifyEdit
 from ..methods.sns import ParameterGroups
 from .adam import NumpyAdam
 from .noise import normal3
-from .rules import Rules, StepCounts
+from .rules import Rules, StepCounts, check_state
 from .sghmc import STREAM
 from .sghmc import step as sghmc_step
 
@@ -98,7 +98,7 @@ class ReferenceOptimizer:
         return state
 
     def load_state(self, state: dict[str, NDArray[Any]]) -> None:
-        self.rules.check_state(state, self.splats.schema)
+        check_state(state, self.state())
         self.base.step_count, self.skew.step_count = (int(count) for count in state["steps"])
         for adam in (self.base, self.skew) if self.rules.map is not None else (self.base,):
             adam.first = {name: state[f"first.{name}"].copy() for name in adam.first}

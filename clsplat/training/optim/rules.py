@@ -122,10 +122,19 @@ class Rules:
         pulled = config.density.opacity_reg or config.density.scale_reg or config.loss.bisect_reg
         return not (pulled or config.density.noise_lr or self.sghmc)
 
-    def check_state(self, state: Mapping[str, NDArray[Any]], schema: Schema) -> None:
-        """Raise InputError if an entry of an optimizer state is missing or unknown."""
-        expected = {"steps"} | {f"{role}.{name}" for role in ("first", "second") for name in schema.names}
-        expected |= ({"skew_s"} if self.map else set()) | ({"momentum"} if self.sghmc else set())
-        expected |= {"waiting.last", "waiting.drifts"} if self.config.optim.visible_adam else set()
-        if odd := sorted(expected ^ set(state)):
-            raise InputError(f"optimizer state: missing or unknown entry {odd[0]!r}: start without --resume")
+
+def check_state(state: Mapping[str, NDArray[Any]], expected: Mapping[str, NDArray[Any]]) -> None:
+    """Compare an optimizer state with one of the optimizer that is to continue from it.
+
+    Raises
+    ------
+    InputError : an entry is missing, unknown, or of another shape.
+    """
+    if odd := sorted(expected.keys() ^ state.keys()):
+        raise InputError(f"checkpoint: the optimizer's {odd[0]!r} is missing or unknown: start with --overwrite")
+    for name, array in expected.items():
+        if state[name].shape != array.shape:
+            raise InputError(
+                f"checkpoint: the optimizer's {name!r} has the shape {state[name].shape}, but {array.shape} is "
+                "expected: start with --overwrite"
+            )
