@@ -14,17 +14,19 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import queue
 import resource
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -70,10 +72,25 @@ def run_lines(numbers: range, seed: int, workers: int = 1, data: Path | None = N
         )
         for worker in range(workers)
     ]
+    texts: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+
+    def read(stream: IO[str]) -> None:
+        for text in stream:
+            texts.put(text)
+        texts.put(None)
+
+    # Each worker has a reader: a worker whose pipe is full would wait for the others to end.
     for process in processes:
         assert process.stdout is not None
-        for text in process.stdout:
+        threading.Thread(target=read, args=(process.stdout,), daemon=True).start()
+    running = len(processes)
+    while running:
+        text = texts.get()
+        if text is None:
+            running -= 1
+        else:
             yield Outcome(**json.loads(text))
+    for process in processes:
         if process.wait():
             raise RuntimeError(f"a worker ended with {process.returncode}")
 
