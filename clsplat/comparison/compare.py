@@ -114,5 +114,5 @@ def write_table(folder: Path, records: Sequence[Record]) -> None:
     if records:
         rows = summarise(records)
         with atomic_writer(folder / TABLE) as stream:
-            stream.write(markdown(records).encode())
+            stream.write(markdown(records).encode(errors="backslashreplace"))
         write_json(folder / RESULTS, {"rows": rows, "notes": notes(records, rows)})

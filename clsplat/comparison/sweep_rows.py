@@ -282,7 +282,7 @@ def write_rows(folder: Path, name: str, rows: Sequence[ChartRow]) -> list[Path]:
     paths = [folder / f"{name}.csv", folder / f"{name}.json"]
     for path, content in zip(paths, (text.getvalue(), json.dumps(list(rows), indent=1) + "\n"), strict=True):
         with atomic_writer(path) as stream:
-            stream.write(content.encode())
+            stream.write(content.encode(errors="backslashreplace"))
     return paths
 
 

@@ -58,7 +58,7 @@ def write_page(path: Path, title: str, sections: Sequence[Section], style: str =
         + "</body>\n</html>\n"
     )
     with atomic_writer(path) as stream:
-        stream.write(page.encode())
+        stream.write(page.encode(errors="backslashreplace"))  # a file name may be no UTF-8
     return path
 
 

@@ -89,9 +89,13 @@ def write_colmap(folder: Path, photos: Sequence[RegisteredImage], points: Points
 
     Raises
     ------
-    InputError : the name of a photo has a space, which COLMAP's text files cannot store.
+    InputError : the name of a photo has a space, which COLMAP's text files cannot store, or a
+        line end, or is not UTF-8.
     OutputError : a file cannot be written.
     """
+    unwritable = next((photo.name for photo in photos if not photo.name.isprintable()), None)
+    if unwritable is not None:
+        raise InputError(f"image {unwritable!a}: a COLMAP model cannot store this name; rename the photo")
     views, names = [], {}
     for photo in photos:
         lens = _plainest(photo.lens)

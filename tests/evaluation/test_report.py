@@ -211,6 +211,9 @@ def test_eval_writes_the_page(tmp_path: Path, model_folder: Path) -> None:
     assert str(other) in both, "two folders of one name are told apart"
     assert not (other / "report_train.html").exists()
     assert "not both" in error_of("eval", model, "--report", tmp_path / "x.html", "--no-report", code=2)
+    odd = Path(shutil.copytree(model, tmp_path / "not_utf8_\udcff"))
+    clsplat("eval", odd)
+    assert r"not_utf8_\udcff" in (odd / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_recorder_sees_renders_in_the_photos_exposure() -> None:

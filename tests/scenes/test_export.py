@@ -14,6 +14,7 @@ from small_scene import NAMES, write_garden
 
 from clsplat.cameras.cameras_json import read_cameras
 from clsplat.cameras.path import CameraPath, write_path
+from clsplat.errors import InputError
 from clsplat.scenes.colmap import read_model
 from clsplat.scenes.export import relative_files, write_colmap, write_transforms
 from clsplat.scenes.posed_images import PosedImages
@@ -150,6 +151,16 @@ def test_missing_cameras_and_unsupported_lenses_are_refused(garden: Path, tmp_pa
         write_transforms(tmp_path / "t.json", [RegisteredImage("a.png", np.eye(4), six)], ["a.png"], posed.points)
     assert not (tmp_path / "t.json").exists()
     assert relative_files([garden / "images" / "a.png"], garden / "out") == ["../images/a.png"]
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_names_that_a_colmap_model_cannot_store(garden: Path, tmp_path: Path, text: bool) -> None:
+    posed = with_lens(garden, "PINHOLE")
+    for name in ("view_\udcff.png", "two\nlines.png"):
+        photo = replace(posed.photos[0], name=name)
+        with pytest.raises(InputError, match="cannot store this name; rename the photo"):
+            write_colmap(tmp_path / "model", [photo], posed.points, text)
+        assert not (tmp_path / "model").exists()
 
 
 def test_cameras_of_a_transforms_file_are_those_of_its_scene(garden: Path, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ import sys
 import tempfile
 import traceback
 import warnings
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -285,8 +286,12 @@ def _json_of(data: bytes) -> Any:
 
 def _odd_npz(path: Path, rng: np.random.Generator) -> None:
     """Write an intact archive of damaged arrays, because the zip format's checksums detect all other damage."""
-    with np.load(path) as stored:
-        arrays = {name: stored[name] for name in stored.files}
+    try:
+        with np.load(path) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, zipfile.BadZipFile):  # an earlier step has damaged it
+        path.write_bytes(odd_bytes(path.read_bytes(), rng))
+        return
     name = sorted(arrays)[rng.integers(len(arrays))] if rng.random() < 0.5 else "meta"
     if name == "meta":
         arrays["meta"] = np.frombuffer(odd_json(json.loads(arrays["meta"].tobytes()), rng), np.uint8)
