@@ -156,6 +156,9 @@ def evaluate_models(
         )
     if not quiet:
         click.echo(_table(paths, measured))
+        for path, model in zip(paths, measured, strict=True):
+            if model.floaters is not None:
+                click.echo((f"{path}: " if len(paths) > 1 else "") + model.floaters.describe())
         click.echo(describe(options.protocol))
         pages = [model.report for model in measured] if report is None else [report]
         for page in pages:

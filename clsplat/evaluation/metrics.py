@@ -55,6 +55,10 @@ class MetricProtocol:
             a = color_corrected(a, b, mask)
         return {"PSNR": psnr(a, b, self.rounded, mask), "SSIM": ssim(a, b, self.padding, self.rounded, mask)}
 
+    def psnr(self, a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
+        """Return the PSNR of `measure` [dB] alone, which takes a fraction of the time; infinite for equal images."""
+        return psnr(color_corrected(a, b, mask) if self.corrected else a, b, self.rounded, mask)
+
     def describe(self) -> dict[str, str]:
         """Texts on how each metric is computed, by metric; and the protocol's name."""
         images = "rounded to 8 bits" if self.rounded else "real-valued, clipped to 0..1"

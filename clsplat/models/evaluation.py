@@ -12,6 +12,7 @@ from typing import Any
 
 from ..errors import InputError, OutputError
 from ..evaluation.evaluate import evaluate as evaluate_views
+from ..evaluation.floaters import measure_floaters
 from ..evaluation.metrics import DEFAULT_PROTOCOL, MetricProtocol
 from ..evaluation.perceptual import Flip, Lpips
 from ..files.existing import refuse_existing
@@ -204,6 +205,11 @@ class Evaluator:
             "device": str(self.renderer.device.info),
             "protocol": options.protocol.describe() | recorder.describe(),
         }
+        if scene.train:
+            test_psnr = measured.psnr if options.view_set == "test" else None
+            result["floaters"] = measure_floaters(
+                self.renderer, model.splats, scene.train, background, options.protocol, test_psnr
+            ).to_json()
         evaluation = ModelEvaluation(model, scene, result, per_view, recorder.images)
         if model.folder is None:
             return evaluation

@@ -71,6 +71,8 @@ def _facts(measured: ModelEvaluation) -> list[tuple[str, str]]:
         ("bytes", f"{result['bytes']} ({result['compact_bytes']} written compactly)"),
         ("background", ", ".join(f"{part:g}" for part in result["background"])),
     ]
+    if measured.floaters is not None:
+        facts.append(("floaters", measured.floaters.describe()))
     return facts + _options(model)
 
 

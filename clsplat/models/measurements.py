@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OutputError
+from ..evaluation.floaters import FloaterMeasures
 from ..evaluation.metrics import color_corrected
 from ..evaluation.perceptual import Flip, Lpips
 from ..evaluation.report.images import ComparedImage, compare_images
@@ -50,6 +51,12 @@ class ModelEvaluation:
     def ssim(self) -> float:
         """Mean SSIM."""
         return float(self.result["SSIM"])
+
+    @property
+    def floaters(self) -> FloaterMeasures | None:
+        """Measures of floaters on the training views; None without training views."""
+        stored = self.result.get("floaters")
+        return None if stored is None else FloaterMeasures(**{"psnr_gap": None, **stored})
 
 
 @dataclass

@@ -13,6 +13,7 @@ from ..device.device import Device, open_device
 from ..device.schedule import Schedule
 from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import Evaluation, evaluate
+from ..evaluation.floaters import measure_floaters
 from ..evaluation.metrics import check_sizes
 from ..rendering.frame import Frame
 from ..rendering.pipeline import Pipeline, isect_limit
@@ -224,15 +225,18 @@ class Trainer:
 
     def _measure_test_views(self, log: RunLog) -> None:
         it = self.iteration
-        self.evaluations[it] = self.evaluate(self.scene.test)
+        splats, background = self.snapshot(), self.config.background
+        self.evaluations[it] = measured = evaluate(self.renderer, splats, self.scene.test, background)
         self.evaluation_seconds[it] = self.seconds
+        floaters = measure_floaters(self.renderer, splats, self.scene.train, background, test_psnr=measured.psnr)
         log.write(
             {
                 "iteration": it,
                 "seconds": self.seconds,
-                "test_psnr": self.evaluations[it].psnr,
-                "test_ssim": self.evaluations[it].ssim,
+                "test_psnr": measured.psnr,
+                "test_ssim": measured.ssim,
                 "splats": self.splats.n,
+                **floaters.to_json(),
             }
         )
 

@@ -192,6 +192,7 @@ def test_flags_with_underscores_and_spaced_lists(scene: Path, tmp_path: Path) ->
     assert ply(tmp_path / "m", 3).is_file()
     logged = [json.loads(line) for line in (tmp_path / "m" / "log.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in logged if "test_psnr" in line] == [2]
+    assert all("psnr_gap" in line and "few_views_share" in line for line in logged if "test_psnr" in line)
 
 
 def _names(folder: Path, names: list[str]) -> Path:

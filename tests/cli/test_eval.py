@@ -27,6 +27,9 @@ def test_eval_writes_3dgs_files_with_the_protocol(copied_model: Path, scene: Pat
     out = clsplat("eval", copied_model, "--save-renders", tmp_path / "r")
     results = json.loads((copied_model / "results.json").read_text())
     entry = results[f"ours_{ITERATIONS}"]
+    assert set(entry["floaters"]) == {"train_psnr", "psnr_gap", "few_views_share", "near_camera_share"}
+    assert entry["floaters"]["psnr_gap"] == entry["floaters"]["train_psnr"] - entry["PSNR"]
+    assert "of the splats are seen by fewer than 3 training views" in (copied_model / "report.html").read_text()
     assert set(results) == {f"ours_{ITERATIONS}"}
     assert entry["protocol"]["name"] == "clsplat"
     assert entry["bytes"] == ply(copied_model).stat().st_size
@@ -130,7 +133,7 @@ def test_nothing_is_written_beside_a_file(splat_files: Path, scene: Path, tmp_pa
     assert "page" not in said
     page, pictures = tmp_path / "page.html", tmp_path / "r"
     said = clsplat("eval", *before[:3], "-s", scene, "--report", page, "--set", "all", "--save-renders", pictures)
-    assert said.count(".sp") == 2
+    assert said.count(".sp") == 4, "each file has a row of the table and a line on floaters"
     assert f"page: {page}" in said
     assert all(path.name in page.read_text() for path in before[:3])
     assert len(list(pictures.rglob("*.png"))) == 30
