@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .compression.search import Budgeted, train_budget
     from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
     from .models.cameras import export_cameras
+    from .models.clean import clean_model
     from .models.convert import conversion_cost, convert_model
     from .models.evaluation import EvaluationOptions, evaluate, evaluate_models
     from .models.info import inspect
@@ -67,6 +68,7 @@ _HOME = {
     "resume": "models.resume",
     "convert_model": "models.convert",
     "conversion_cost": "models.convert",
+    "clean_model": "models.clean",
     "prune_model": "models.prune",
     "inspect": "models.info",
     "export_cameras": "models.cameras",
@@ -96,6 +98,7 @@ __all__ = [
     "TrainingDisplay",
     "TrainingError",
     "ViewChoice",
+    "clean_model",
     "conversion_cost",
     "convert_model",
     "evaluate",

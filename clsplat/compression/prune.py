@@ -120,13 +120,13 @@ def prune(
                 measure_importance(validation.renderer, splats, views, validation.background, seed, parts=False), views
             ),
         )
-        threshold, splats, after = _highest_threshold(
+        threshold, splats, after = highest_threshold(
             scores,
             splats,
             now,
             before - SHARES["splats"] * tolerance,
             partial(without_splats, scores=scores),
-            validation,
+            validation.psnr,
         )
         thresholds, costs["splats"], now = replace(thresholds, splats=threshold), now - after, after
     if "fields" not in kinds and "bands" not in kinds:
@@ -134,13 +134,13 @@ def prune(
     importance = per_pixel(measure_importance(validation.renderer, splats, views, validation.background, seed), views)
     for name, change in importance.fields.items() if "fields" in kinds else ():
         scores = field_scores(splats, name, change)
-        threshold, splats, after = _highest_threshold(
+        threshold, splats, after = highest_threshold(
             scores,
             splats,
             now,
             before - SHARES["fields"] * tolerance,
             partial(without_field, name=name, scores=scores),
-            validation,
+            validation.psnr,
         )
         thresholds, costs[name], now = (
             replace(thresholds, fields=thresholds.fields | {name: threshold}),
@@ -150,13 +150,13 @@ def prune(
     if "bands" in kinds and splats.sh_degree:
         assert importance.colour is not None
         lower, lost = lower_bands(splats.sh, importance.colour)
-        threshold, splats, after = _highest_threshold(
+        threshold, splats, after = highest_threshold(
             band_slopes(lost),
             splats,
             now,
             before - SHARES["bands"] * tolerance,
             partial(without_bands, lower=lower, lost=lost),
-            validation,
+            validation.psnr,
         )
         thresholds, costs["bands"], now = replace(thresholds, bands=threshold), now - after, after
     return Pruned(splats, before, now, costs, thresholds)
@@ -287,15 +287,20 @@ def without_bands(splats: Splats, threshold: float, lower: Sequence[Array], lost
     return splats.with_arrays(arrays)
 
 
-def _highest_threshold(
+def highest_threshold(
     scores: DoubleArray,
     splats: Splats,
     now: float,
     floor: float,
     apply: Callable[[Splats, float], Splats],
-    validation: Validation,
+    psnr_of: Callable[[Splats], float],
 ) -> tuple[float, Splats, float]:
     """Find the highest threshold that keeps the PSNR at the floor or above, by bisection on the ranks of the scores.
+
+    Parameters
+    ----------
+    scores : infinite for what must stay. now : PSNR of `splats` [dB]. floor : smallest allowed PSNR [dB].
+    apply : returns the model without what is not above a threshold. psnr_of : returns the PSNR of a model [dB].
 
     Returns
     -------
@@ -310,7 +315,7 @@ def _highest_threshold(
         if middle <= low:
             break
         candidate = apply(splats, float(ranked[middle - 1]))
-        value = validation.psnr(candidate)
+        value = psnr_of(candidate)
         if value >= floor:
             low, best = middle, (float(ranked[middle - 1]), candidate, value)
         else:

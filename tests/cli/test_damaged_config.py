@@ -39,7 +39,7 @@ KINDS: dict[tuple[str, ...], type] = {
     ("scene", "photos"): dict,
 }
 QUICK = ("info", "convert", "train --resume", "train --config")
-ALL = (*QUICK, "cameras", "render", "eval", "prune", "view")
+ALL = (*QUICK, "cameras", "render", "eval", "prune", "clean", "view")
 
 
 @pytest.fixture
@@ -82,6 +82,7 @@ def arguments(command: str, model: Path, folder: Path) -> list[object]:
         "cameras": ["cameras", model, new.with_suffix(".json")],
         "render": ["render", model, "-o", new, "-q"],
         "eval": ["eval", model, "-q"],
+        "clean": ["clean", model, "-o", new, "-q"],
         "prune": ["prune", model, "-o", new.with_suffix(".ply"), "-q"],
         "view": ["view", model, "--port", 0, "-q"],
     }[command]

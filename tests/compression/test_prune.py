@@ -14,9 +14,9 @@ from conftest import MakeRenderer
 from clsplat.compression.prune import (
     Thresholds,
     Validation,
-    _highest_threshold,
     apply_thresholds,
     band_slopes,
+    highest_threshold,
     prune,
     strongest,
     within_bytes,
@@ -148,13 +148,8 @@ def test_bisection_removes_exactly_what_the_floor_allows(floor: float, left: int
     """Here the PSNR of a model is the number of its splats."""
     points = Splats.from_points(np.arange(30.0).reshape(10, 3), np.full((10, 3), 0.5), sh_degree=0)
     scores = np.random.default_rng(1).permutation(10) + 1.0
-
-    class CountsSplats:
-        psnr = staticmethod(len)
-
-    judge: Any = CountsSplats()
-    threshold, kept, value = _highest_threshold(
-        scores, points, 10.0, floor, lambda splats, at: without_splats(splats, at, scores), judge
+    threshold, kept, value = highest_threshold(
+        scores, points, 10.0, floor, lambda splats, at: without_splats(splats, at, scores), len
     )
     assert value == len(kept) == left
     assert threshold == (10 - left if left < 10 else 0)

@@ -48,7 +48,7 @@ NOT_RUN = (
 )
 # Commands that take minutes, or that resemble a command that is run.
 SLOW = re.compile(
-    r"clsplat (demo|compare|frontier|bench|reconstruct|prune)|--(budget|target-psnr|video|config|report)"
+    r"clsplat (demo|compare|frontier|bench|reconstruct|prune|clean)|--(budget|target-psnr|video|config|report)"
     r"|PHOTOS|-r 2|\.splat|gaussians\.ply|-direct"
 )
 REAL_PHOTOS = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data") / "sceaux_castle"

@@ -17,7 +17,7 @@ from clsplat.errors import FEWER_SPLATS, OTHER_DEVICE, SMALLER_IMAGES, ClsplatEr
 
 ROOT = Path(__file__).parents[2]
 TRAINING = ("train", "compare", "frontier")
-ALL_WITH_MODELS = ("render", "eval", "view", "prune")
+ALL_WITH_MODELS = ("render", "eval", "view", "prune", "clean")
 # Files whose messages name options in their text, and the commands that can raise them. All other files of clsplat/
 # name options as `Remedy`; each command shows its own.
 NAMED_IN = {

@@ -137,6 +137,9 @@ def test_convert_prune_and_cameras(model: Path, tmp_path: Path) -> None:
     cost = package.conversion_cost(converted)
     assert cost is not None
     assert f"{cost.mean:.2f} dB, worst {cost.worst:.2f} dB" in said
+    clsplat("clean", model, "-o", shell / "clean.ply", "-q")
+    cleaned = package.clean_model(model, notebook / "clean.ply").cleaned
+    assert len(cleaned.splats) == len(package.Splats.load(notebook / "clean.ply"))
     clsplat("prune", model, "-o", shell / "small.ply", "--tolerance", "0.5", "-q")
     pruned = package.prune_model(model, notebook / "small.ply", tolerance=0.5).pruned
     assert len(pruned.splats) == len(package.Splats.load(notebook / "small.ply"))

@@ -29,6 +29,7 @@ PACKAGES = (
     "evaluation",
     "training",
     "compression",
+    "cleaning",
     "models",
     "comparison",
     "profiling",

@@ -160,6 +160,7 @@ SANE = {
 }
 SANE_OUTPUTS = {
     "convert": ("out.ply", "out.spz", "out.splat"),
+    "clean": ("out.ply", "out", "out.spz"),
     "prune": ("out.ply", "out"),
     "cameras": ("out", "out.json"),
     "blender-addon": ("out.zip",),
@@ -269,12 +270,12 @@ def command_line(seed: int, number: int) -> Line:
     if name == "train" and rng.random() < 0.2:
         line.args = ["train", "--resume", "-m", "model", *line.args[line.args.index("train") + 1 :]]
         line.args = [arg for arg in line.args if arg not in SCENES]
-    if name in ("render", "eval", "prune") and rng.random() < 0.7 and "-s" not in line.args:
+    if name in ("render", "eval", "clean", "prune") and rng.random() < 0.7 and "-s" not in line.args:
         line.args += ["-s", str(rng.choice(["scene", "scene", "kitchen", "transforms", "fox"]))]
         if (
             "-r" not in line.args
             and "--resolution" not in line.args
-            and name in ("eval", "prune")
+            and name in ("eval", "clean", "prune")
             and line.args[-1] in REAL
         ):
             line.args += ["-r", "8"]

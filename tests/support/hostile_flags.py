@@ -46,6 +46,7 @@ BASES: dict[str, tuple[str, ...]] = {
     "render": ("{model}", "-o", "{out}", "--path", "orbit", "--frames", "2", "--size", "16x16"),
     "eval": ("{model}", "--save-renders", "{out}"),
     "info": ("{scene}",),
+    "clean": ("{model}", "-o", "{out}.ply"),
     "prune": ("{model}", "-o", "{out}.ply"),
     "compare": ("{scene}", "-o", "{out}", "--systems", "gaussian", "--cap-max", "9", "--iterations", "2"),
     "frontier": (

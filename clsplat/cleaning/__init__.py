@@ -1,0 +1,1 @@
+"""Removal of floaters, oversized splats and splats that no training view sees."""
