@@ -110,8 +110,8 @@ def is_isolated(splats: Splats) -> Mask:
     """Return (N,) whether the 8 nearest splats are unusually far, and beyond 3 standard deviations of the splat.
 
     This is the statistical removal of outliers (Rusu et al. 2008, "Towards 3D point cloud based object maps").
-    Densities of a scene span orders of magnitude. The logarithm of the mean distance is therefore compared with its median plus 4
-    robust standard deviations.
+    Densities of a scene span orders of magnitude, so the logarithm of the mean distance is compared. Its limit is the
+    median plus 4 robust standard deviations.
     """
     from scipy.spatial import cKDTree  # lazy: a slow import
 

@@ -131,9 +131,8 @@ def _check_output(output: Path, model: LoadedModel, overwrite: bool) -> None:
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output}: is not a folder: choose another name")
     if ModelFolder(output).is_used and not overwrite:
-        raise OutputError(
-            f"{output}: already holds a model: choose another folder", Remedy("replace it", "--overwrite")
-        )
+        replaces = Remedy("replace it", "--overwrite")
+        raise OutputError(f"{output}: already holds a model", Remedy("choose another folder"), replaces)
 
 
 def _write(splats: Splats, model: LoadedModel, output: Path) -> None:
@@ -141,7 +140,8 @@ def _write(splats: Splats, model: LoadedModel, output: Path) -> None:
     if output.suffix:
         splats.save(output)
         return
-    assert model.folder is not None and model.iteration is not None
+    assert model.folder is not None
+    assert model.iteration is not None
     folder = ModelFolder(output)
     folder.prepare()
     folder.clear()
