@@ -1,4 +1,4 @@
-"""Options that `clsplat compare` and `clsplat frontier` share: the grid of runs, and the sections of their help."""
+"""Options that `clsplat compare`, `frontier` and `benchmark` share: the grid of runs, and sections of their help."""
 
 from __future__ import annotations
 
@@ -22,20 +22,32 @@ def comparison_sections(*others: str) -> dict[str, tuple[str, ...]]:
 
 
 def grid_options(
-    *, output: str, systems: Sequence[str], about_systems: str, caps: Sequence[int], about_seeds: str = ""
+    *,
+    output: str,
+    systems: Sequence[str],
+    about_systems: str,
+    caps: Sequence[int] | str,
+    about_seeds: str = "",
+    default_output: bool = False,
+    also_systems: Sequence[str] = (),
 ) -> Callable[[F], F]:
     """Add `--output`, `--systems`, `--cap-max` and `--seeds`.
 
     Parameters
     ----------
     output, about_systems : help texts.
-    systems, caps : defaults.
+    systems, caps : defaults; a text says what the default caps are.
     about_seeds : more of the help text of `--seeds`.
+    default_output : whether the command has a folder of its own if `--output` is left out.
+    also_systems : other names of `--systems`.
     """
+    shown = caps if isinstance(caps, str) else ",".join(map(str, caps))
     options = [
-        click.option("-o", "--output", required=True, type=PATH, metavar="DIR", help=output),
+        click.option("-o", "--output", required=not default_output, type=PATH, metavar="DIR", help=output),
         click.option(
             "--systems",
+            *also_systems,
+            "systems",
             default=",".join(systems),
             show_default=True,
             metavar="NAME,NAME,...",
@@ -46,7 +58,7 @@ def grid_options(
             "caps",
             type=Numbers("caps"),
             multiple=True,
-            help=f"Caps on the splats: a run for each.  [default: {','.join(map(str, caps))}]",
+            help=f"Caps on the splats: a run for each.  [default: {shown}]",
         ),
         click.option(
             "--seeds",

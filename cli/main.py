@@ -34,6 +34,10 @@ COMMANDS = {
     "prune": ("clsplat_cli.prune:prune_model", "Remove the splats that a model's images do not need."),
     "compare": ("clsplat_cli.compare:compare_systems", "Train published systems side by side and print a table."),
     "frontier": ("clsplat_cli.frontier:draw_frontier", "Train systems at several caps and chart quality against cost."),
+    "benchmark": (
+        "clsplat_cli.benchmark:benchmark",
+        "Train a published set by its protocol, beside published figures.",
+    ),
     "bench": ("clsplat_cli.bench:bench", "Time the stages of training and rendering on this device."),
     "blender-addon": ("clsplat_cli.blender_addon:build_addon", "Build the Blender add-on as a zip."),
     "convert": (

@@ -54,13 +54,20 @@ class ViewCount:
         self._line.clear()
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table as text. The first column is aligned to the left, the others to the right."""
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str] = ()) -> str:
+    """Return a table as text. The first column and those named in `left` are aligned to the left, others to the right.
+
+    Spaces at the end of lines are left out.
+    """
     lines = [head, *rows]
     widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
+    left = (head[0], *left)
 
     def aligned(line: Sequence[str]) -> str:
-        others = (cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True))
-        return "  ".join((line[0].ljust(widths[0]), *others))
+        cells = (
+            cell.ljust(width) if title in left else cell.rjust(width)
+            for title, cell, width in zip(head, line, widths, strict=True)
+        )
+        return "  ".join(cells).rstrip()
 
     return "\n".join(map(aligned, lines))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ._version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from .benchmark.run import run_benchmark
     from .cameras.camera import Camera
     from .cameras.make_path import PathRequest
     from .compression.rules import BudgetOptions
@@ -74,6 +75,7 @@ _HOME = {
     "export_cameras": "models.cameras",
     "make_demo_scene": "scenes.demo.make",
     "reconstruct": "scenes.reconstruct.reconstruct",
+    "run_benchmark": "benchmark.run",
 }
 
 __all__ = [
@@ -112,6 +114,7 @@ __all__ = [
     "reconstruct",
     "render_views",
     "resume",
+    "run_benchmark",
     "train",
     "train_budget",
 ]

@@ -112,19 +112,25 @@ def measure_model(
     scene: Scene,
     config: TrainConfig,
     evaluation: Evaluation | None = None,
+    *,
+    repeat_renders: bool = True,
 ) -> Record:
     """Return what a record holds of a finished model, measured on the test views.
 
     Parameters
     ----------
     file : the saved model. evaluation : of the test views, if it is known already.
+    repeat_renders : whether the render time is that of `render_ms`, or that of one render of each view.
     """
     arrays = splats.arrays
     evaluation = evaluation or evaluate(renderer, splats, scene.test, config.background)
     return {
         "psnr": evaluation.psnr,
         "ssim": evaluation.ssim,
-        "render_ms": render_ms(renderer, splats, scene.test, config.background),
+        "render_ms": render_ms(renderer, splats, scene.test, config.background)
+        if repeat_renders
+        else evaluation.render_ms,
+        "renders_per_view": RENDERS if repeat_renders else 1,
         "splats": len(splats),
         "bytes": file.stat().st_size,
         "parameters": sum(array.size for array in arrays.values()),

@@ -21,23 +21,27 @@ _FROM_MEASURED = {
 }
 
 
-def summarise(records: Sequence[Record]) -> list[Record]:
+def summarise(records: Sequence[Record], measured: Sequence[str] = MEASURED) -> list[Record]:
     """Return a row for each scene, cap and system, ordered by scene and cap, then by the first run.
 
     Repeated runs do not count; see `repeats`. Systems of the same name with different options have these options added
     to "system".
 
+    Parameters
+    ----------
+    measured : keys of the values to summarise.
+
     Returns
     -------
     Rows with "scene", "cap", "iterations", "system", "config" (all options but the seed), "seeds" and "failed".
-    "failed" holds the messages by seed. "finite" and "cap_held" are over all runs of the row. Each of MEASURED is
+    "failed" holds the messages by seed. "finite" and "cap_held" are over all runs of the row. Each value measured is
     {"mean", "half_spread"}, half of maximum less minimum; it is None if every run failed or no run measured it.
     """
     groups: dict[str, list[Record]] = {}
     for record in records:
         if not record.get("repeat"):
             groups.setdefault(_group_key(record), []).append(record)
-    rows = [_row(group) for group in groups.values()]
+    rows = [_row(group, measured) for group in groups.values()]
     for row, options in zip(rows, [_differing(row, rows) for row in rows], strict=True):
         row["system"] += options
     places = {scene: place for place, scene in enumerate(dict.fromkeys(row["scene"] for row in rows))}
@@ -163,7 +167,7 @@ def _group_key(record: Record) -> str:
     return json.dumps([record["scene"], record["system"], config], sort_keys=True)
 
 
-def _row(group: Sequence[Record]) -> Record:
+def _row(group: Sequence[Record], measured: Sequence[str]) -> Record:
     """Return the row of runs that differ only in the seed."""
     first = group[0]
     row: Record = {
@@ -178,8 +182,8 @@ def _row(group: Sequence[Record]) -> Record:
         "cap_held": all(record["cap_held"] for record in group),
     }
     done = [record for record in group if not record["failed"]]
-    for key in MEASURED:
-        values = [record[key] for record in done if record[key] is not None]
+    for key in measured:
+        values = [record[key] for record in done if record.get(key) is not None]
         row[key] = (
             None if not values else {"mean": statistics.fmean(values), "half_spread": (max(values) - min(values)) / 2}
         )

@@ -14,6 +14,7 @@ from ..files.images import image_size
 from .colmap import Points, find_model, read_model
 from .photo_listing import list_images
 from .photo_names import place_photos
+from .reduced_photos import with_reduced_photos
 from .undistort import RegisteredImage
 
 _FEW_REGISTERED = 0.8  # share of registered photos below which a warning is issued
@@ -109,7 +110,7 @@ def read_colmap(root: Path, images: str | None) -> PosedImages:
     model = read_model(find_model(root))
     folder = _photo_folder(root, images or "images")
     placed = place_photos(folder, [photo.name for photo in model.photos])
-    files = dict(placed.values())
+    files = with_reduced_photos(folder, dict(placed.values()))
     sizes, left_out = read_sizes(files)
     _warn_of_unregistered(folder, len(model.photos))
     named = sorted((replace(photo, name=placed[photo.name][0]) for photo in model.photos), key=lambda photo: photo.name)

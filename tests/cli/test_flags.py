@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 # Steps through the values of a quick run, which has few values of each option.
-QUICK = {"train": 30, "compare": 59, "frontier": 59}
+QUICK = {"train": 30, "compare": 59, "frontier": 59, "benchmark": 59}
 SLOW_LINES = 30  # lines of a command that a slow test runs with all their work
 WITH_OPTIONS = [name for name in COMMANDS if params_of(name)]
 VALUES = st.one_of(

@@ -28,6 +28,7 @@ WITHOUT = {
     "view": "numbers the recorded paths",
     "compare": "goes on with its own folder",
     "frontier": "goes on with its own folder",
+    "benchmark": "goes on with its own folder",
 }
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from cli_runner import SHORT, clsplat, error_of, run
 from files.test_lock import HOLD
+from set_folders import as_colmap
 
 from clsplat.splats.splats import Splats
 from clsplat.training.checkpoint import Checkpoint
@@ -77,7 +78,8 @@ def small_scene(model: Path) -> Path:
 
 @pytest.mark.parametrize("kind", ["read-only", "a file"])
 def test_places_that_take_no_files(capture_folder: Path, model_folder: Path, tmp_path: Path, kind: str) -> None:
-    place = tmp_path / "place"
+    place, tanks = tmp_path / "place", tmp_path / "tanks"
+    as_colmap(capture_folder, tanks / "truck")
     commands = [
         ["train", capture_folder, "-m", place / "m", *SHORT],
         ["train", capture_folder, "-m", place / "m", "--budget", "auto", *SHORT],
@@ -88,6 +90,7 @@ def test_places_that_take_no_files(capture_folder: Path, model_folder: Path, tmp
         ["prune", model_folder, "-o", place / "p.ply"],
         ["compare", capture_folder, "-o", place / "c"],
         ["frontier", capture_folder, "-o", place / "f"],
+        ["benchmark", "tanks", tanks, "-o", place / "b"],
         ["blender-addon", "-o", place / "a.zip"],
     ]
     if kind == "a file":

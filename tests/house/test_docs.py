@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 from cli_runner import ITERATIONS, run
 from clsplat_cli.main import COMMANDS, main
+from set_folders import as_blender
 
 import clsplat
 from clsplat.files.images import image_size, write_png
@@ -48,7 +49,8 @@ NOT_RUN = (
 )
 # Commands that take minutes, or that resemble a command that is run.
 SLOW = re.compile(
-    r"clsplat (demo|compare|frontier|bench|reconstruct|prune|clean)|--(budget|target-psnr|video|config|report)"
+    r"clsplat (demo|compare|frontier|benchmark|bench|reconstruct|prune|clean)"
+    r"|--(budget|target-psnr|video|config|report)"
     r"|PHOTOS|-r 2|\.splat|gaussians\.ply|-direct"
 )
 REAL_PHOTOS = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data") / "sceaux_castle"
@@ -91,7 +93,7 @@ def shortened(command: str) -> list[str]:
     if "--resume" in words and "--iterations" in words:  # more than those of the model
         words[words.index("--iterations") + 1] = str(ITERATIONS + 1)
     name = words[0]
-    if name in ("train", "demo", "compare", "frontier") and "--resume" not in words:
+    if name in ("train", "demo", "compare", "frontier", "benchmark") and "--resume" not in words:
         options = {"--iterations", "--cap-max"} - set(words)
         words += [part for option in sorted(options) for part in (option, FEW[option])]
     if name == "demo":
@@ -110,6 +112,8 @@ def stand_ins(folder: Path, words: list[str], capture: Path, model: Path) -> Non
     for name in ("SCENE", "MODEL", "OTHER", "SMALL"):
         if any(name in word.split("/") for word in words) and name != target:
             shutil.copytree(capture if name == "SCENE" else model, folder / name)
+    if "SETS" in words:
+        as_blender(capture, folder / "SETS" / "lego")
     if "FILE.ply" in words:
         shutil.copy(max(model.glob("point_cloud/*/point_cloud.ply")), folder / "FILE.ply")
     if "PHOTOS" in words:

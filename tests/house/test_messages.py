@@ -16,7 +16,7 @@ import clsplat.errors
 from clsplat.errors import FEWER_SPLATS, OTHER_DEVICE, SMALLER_IMAGES, ClsplatError, InputError, Remedy
 
 ROOT = Path(__file__).parents[2]
-TRAINING = ("train", "compare", "frontier")
+TRAINING = ("train", "compare", "frontier", "benchmark")
 ALL_WITH_MODELS = ("render", "eval", "view", "prune", "clean")
 # Files whose messages name options in their text, and the commands that can raise them. All other files of clsplat/
 # name options as `Remedy`; each command shows its own.
@@ -47,7 +47,7 @@ NAMED_IN = {
 }
 # Files of the command line that several commands share. The others belong to the commands that they define.
 SHARED = {
-    "options.py": ("train", "compare", "frontier", "render", "eval", "view"),
+    "options.py": ("train", "compare", "frontier", "benchmark", "render", "eval", "view"),
     "path_options.py": ("render",),
     "models.py": ("render", "view"),
     "budget.py": ("train",),

@@ -36,6 +36,7 @@ SHARES = {
     "bench": 0.3,
     "compare": 0.3,
     "frontier": 0.3,
+    "benchmark": 0.3,
     "train": 2.0,
 }
 # Options that keep a run short. They may be given again with other values; the last value counts.
@@ -43,6 +44,7 @@ SHORT = {
     "train": ["--iterations", "6", "--cap-max", "300"],
     "compare": ["--iterations", "4", "--cap-max", "200", "--seeds", "0"],
     "frontier": ["--iterations", "4", "--cap-max", "150,200", "--seeds", "0"],
+    "benchmark": ["--iterations", "4", "--cap-max", "200", "--seeds", "0"],
     "demo": ["--iterations", "4", "--cap-max", "200", "--width", "32", "--views", "4"],
     "bench": ["--splats", "300", "--width", "64", "--height", "48", "--steps", "1"],
     "render": ["--size", "40x30"],
@@ -211,6 +213,7 @@ def write_inputs(root: Path, data: Path | None) -> None:
     data : folder of the real scenes `kitchen` and `fox`; None if it is not there.
     """
     write_capture(root / "scene", 32, 24, 8)
+    shutil.copytree(root / "scene", root / "set" / "truck")
     for name, make in (("transforms", make_transforms), ("blender", make_blender), ("photos", make_photographs)):
         (root / name).mkdir()
         make(root / name)
@@ -346,6 +349,8 @@ def _path(command: str, param: click.Parameter, rng: np.random.Generator, sane: 
     elif rng.random() < (0.95 if sane else 0.7):
         if str(param.name) in ("scene", "scenes", "photos", "source_path", "source"):
             pool = (*SCENES, "scene", "scene", "kitchen")
+        elif command == "benchmark":
+            pool = ("set", "set", "set/truck", "scene", ".")
         else:
             pool = (*MODELS, "model", "model", "model")
     else:

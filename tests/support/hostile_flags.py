@@ -53,6 +53,10 @@ BASES: dict[str, tuple[str, ...]] = {
         *("{scene}", "-o", "{out}", "--systems", "gaussian", "--cap-max", "9", "--iterations", "2", "--curve", "0"),
         *("--sh-degree", "0"),
     ),
+    "benchmark": (
+        *("tanks", "{place}/set", "-o", "{out}", "--systems", "gaussian", "--cap-max", "9", "--iterations", "2"),
+        *("--sh-degree", "0"),
+    ),
     "bench": ("--splats", "9", "--width", "16", "--height", "16", "--iterations", "1"),
     "blender-addon": ("-o", "{out}.zip"),
     "convert": ("{model}", "{out}.ply"),
@@ -79,6 +83,8 @@ class Places:
         (self.place / "empty.ply").write_bytes(b"")
         (self.place / "text.json").write_text('{"a": [1, 2]}')
         (self.place / "link").symlink_to(self.place / "nowhere")
+        (self.place / "set").mkdir()
+        (self.place / "set" / "truck").symlink_to(self.scene)
 
     def fill(self, args: tuple[str, ...], number: int) -> list[str]:
         """Return the arguments with the paths of case `number`."""
@@ -179,7 +185,9 @@ def bounded(patch: pytest.MonkeyPatch, plan_only: bool = False) -> Iterator[None
     for module in ("clsplat.device.device", "clsplat.scenes.photo_size"):
         patch.setattr(f"{module}.available_bytes", lambda: MEMORY)
     if plan_only:
-        for place in ("training.run.Trainer", "comparison.compare.warm_up", "models.prune._pruned"):
+        for place in ("training.run.Trainer", "models.prune._pruned"):
+            patch.setattr(f"clsplat.{place}", interrupt)
+        for place in ("comparison.compare.warm_up", "benchmark.measure.warm_up"):
             patch.setattr(f"clsplat.{place}", interrupt)
         for place in ("rendering.renderer.Renderer.render", "profiling.bench.bench_trainer"):
             patch.setattr(f"clsplat.{place}", interrupt)

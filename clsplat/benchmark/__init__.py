@@ -1,0 +1,1 @@
+"""Published benchmarks: their sets, protocols and figures, and their runs."""

@@ -1,0 +1,145 @@
+"""Runs of a published benchmark: each scene of a set by its protocol, with tables beside published figures."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..comparison.methods import Method, parse_methods
+from ..comparison.runs import Run, RunFile, refuse_foreign, run_key
+from ..comparison.table import Record
+from ..device.device import open_device
+from ..evaluation.perceptual import Lpips
+from ..files.lock import folder_lock
+from ..scenes.scene import Scene
+from ..training.config import TrainConfig
+from ..training.log import Progress
+from .measure import train_and_measure_in
+from .protocol import BenchmarkScene, find_scenes
+from .results import files_of_results, write_results
+from .sets import BenchmarkSet, benchmark_set
+
+MODELS = "models"
+
+
+def run_benchmark(
+    name: str,
+    folder: str | os.PathLike[str],
+    methods: Sequence[Method] | str = "default",
+    output: str | os.PathLike[str] | None = None,
+    *,
+    caps: Sequence[int] = (),
+    seeds: Sequence[int] = (0,),
+    common: Mapping[str, Any] | None = None,
+    images: str | None = None,
+    resolution: int | None = None,
+    lpips: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+    on_run: Callable[[Run, Record | None], None] | None = None,
+) -> list[Record]:
+    """Train and measure the scenes of a published set that a folder holds, by the protocol of the set.
+
+    Finished runs in `output` are read, and interrupted ones are resumed. The tables show all runs there.
+
+    Parameters
+    ----------
+    name : one of SETS.
+    folder : holds the scenes in folders with their names, or is one of them.
+    methods : methods, or their names as in `parse_methods`.
+    output : folder of runs.jsonl, NAME.md, NAME.csv, NAME.json and the models; by default "benchmark-NAME".
+    caps : caps on the splats, a run for each; by default the published number of each scene.
+    common : options of all methods, by the names of TrainConfig. By default iterations and background are those of the
+        protocol. The tables name every difference.
+    images, resolution : as for `find_scenes`.
+    lpips : whether to measure LPIPS too, which needs the extra of that name.
+    progress : as of `train`. on_run : called with (run, None) before each run and (run, record) after it.
+
+    Returns
+    -------
+    All runs of the set in `output`, in the order of their training. `results.report` makes the tables.
+
+    Raises
+    ------
+    InputError : an unknown set, no scene of it, missing photos, options that do not fit, or LPIPS is not installed.
+    OutputError : `output` cannot be written, holds files of others, or another benchmark writes there.
+    DeviceError : no device, or not enough memory.
+    KeyboardInterrupt : Ctrl-C. The tables of the finished runs are written, and the same call continues.
+    A run whose training fails raises nothing: its record has the message ("failed").
+    """
+    chosen = benchmark_set(name)
+    methods = parse_methods(methods) if isinstance(methods, str) else methods
+    options = {"iterations": chosen.iterations, "background": chosen.background, **(common or {})}
+    place = Path(f"benchmark-{name}" if output is None else output)
+    scenes = find_scenes(chosen, folder, images, resolution)
+    planned = [(scene, _runs(scene, methods, caps, seeds, options)) for scene in scenes]
+    metric = Lpips(unit_range=True) if lpips else None  # 3DGS's script passes images in 0..1
+    refuse_foreign(place, files_of_results(name))  # models may be there already: a run that stopped has no line yet
+    runs = RunFile(place)
+    with folder_lock(place):
+        try:
+            for scene, configs in planned:
+                loaded: Scene | None = None
+                for number, (label, config) in enumerate(configs, 1):
+                    done = runs.find(_identity(chosen, scene), label, config)
+                    if done is not None and (metric is None or done["failed"] or done.get("lpips") is not None):
+                        continue
+                    run = Run(scene.scene.name, label, config, number, len(configs))
+                    if on_run is not None:
+                        on_run(run, None)
+                    loaded = loaded or scene.load(config.background)
+                    record: Record = {
+                        "scene": _identity(chosen, scene),
+                        "system": label,
+                        "config": config.to_json(),
+                        "repeat": 0,
+                        "differences": [*scene.differences, *_differences(chosen, scene, config)],
+                    }
+                    model = place / MODELS / f"{scene.scene.name}-{run.stem}-{_key_digest(record)}"
+                    record |= train_and_measure_in(model, loaded, config, open_device(config.device), metric, progress)
+                    runs.add(record)
+                    if on_run is not None:
+                        on_run(run, record)
+        finally:
+            write_results(place, chosen, runs.records)
+    return [record for record in runs.records if record["scene"].get("set") == name]
+
+
+def _runs(
+    scene: BenchmarkScene,
+    methods: Sequence[Method],
+    caps: Sequence[int],
+    seeds: Sequence[int],
+    options: Mapping[str, Any],
+) -> list[tuple[str, TrainConfig]]:
+    """Return the label and the config of each run on a scene. Methods are innermost, as in `compare`."""
+    return [
+        (method.label, method.config(cap, seed, options))
+        for cap in caps or [scene.scene.splats]
+        for seed in seeds
+        for method in methods
+    ]
+
+
+def _identity(chosen: BenchmarkSet, scene: BenchmarkScene) -> dict[str, Any]:
+    """Return what identifies a scene in runs.jsonl, with the set and the photos that were used."""
+    return {**scene.identity, "set": chosen.name, "images": scene.images, "resolution": scene.resolution}
+
+
+def _differences(chosen: BenchmarkSet, scene: BenchmarkScene, config: TrainConfig) -> list[str]:
+    """Return how a run differs from the protocol of its set, in a few words each."""
+    found = []
+    if config.iterations != chosen.iterations:
+        found.append(f"not the published length ({chosen.iterations} iterations)")
+    if tuple(config.background) != chosen.background:
+        found.append("not the published background")
+    if chosen.counted and config.cap_max < scene.scene.splats:
+        found.append(f"at most {config.cap_max} splats, not {scene.scene.splats}")
+    return found
+
+
+def _key_digest(record: Mapping[str, Any]) -> str:
+    """Return eight digits that differ between runs with different options, so that no run replaces another."""
+    return hashlib.sha256(run_key(record).encode()).hexdigest()[:8]
