@@ -36,7 +36,7 @@ COMMANDS = {
     "frontier": ("clsplat_cli.frontier:draw_frontier", "Train systems at several caps and chart quality against cost."),
     "benchmark": (
         "clsplat_cli.benchmark:benchmark",
-        "Train a published set by its protocol, beside published figures.",
+        "Repeat a published benchmark by its protocol.",
     ),
     "bench": ("clsplat_cli.bench:bench", "Time the stages of training and rendering on this device."),
     "blender-addon": ("clsplat_cli.blender_addon:build_addon", "Build the Blender add-on as a zip."),
