@@ -27,13 +27,15 @@ def main() -> None:
     parser = common.parser(__doc__, common.RESULTS / "fuzz_commands.jsonl", device=False, smoke=False)
     parser.add_argument("--lines", type=int, default=5000)
     parser.add_argument("--first", type=int, default=0, help="number of the first line")
+    parser.add_argument("--step", type=int, default=1, help="run each STEP-th line only")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     args = parser.parse_args()
     if not args.table:
         start, outcomes = time.perf_counter(), []
         data = common.data_folder()
-        for outcome in run_lines(range(args.first, args.first + args.lines), args.seed, args.workers, data):
+        numbers = range(args.first, args.first + args.lines, args.step)
+        for outcome in run_lines(numbers, args.seed, args.workers, data):
             outcomes.append(outcome)
             if outcome.faults:
                 print(f"line {outcome.number} (seed {args.seed}): {outcome.args}: {outcome.faults}", flush=True)
@@ -47,6 +49,7 @@ def main() -> None:
             {
                 "seed": args.seed,
                 "first": args.first,
+                "step": args.step,
                 "lines": len(outcomes),
                 "succeeded": codes[0],
                 "refused": codes[1],

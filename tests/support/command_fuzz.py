@@ -66,7 +66,11 @@ def run_lines(numbers: range, seed: int, workers: int = 1, data: Path | None = N
     command = [sys.executable, __file__]
     processes = [
         subprocess.Popen(
-            [*command, *map(str, (numbers.start + worker, numbers.stop, workers, seed)), str(data or "")],
+            [
+                *command,
+                *map(str, (numbers.start + worker * numbers.step, numbers.stop, workers * numbers.step, seed)),
+                str(data or ""),
+            ],
             stdout=subprocess.PIPE,
             text=True,
         )

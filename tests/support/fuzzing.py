@@ -23,6 +23,7 @@ import tempfile
 import traceback
 import warnings
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -201,16 +202,24 @@ def damage(pristine: dict[Path, bytes], rng: np.random.Generator) -> list[Path]:
             _replace(path, rng)
             continue
         data = pristine[path]
-        structured = _json_of(data)
-        if structured is not None and rng.random() < 0.7:
-            path.write_bytes(odd_json(structured, rng))
-        elif path.suffix == ".npz" and rng.random() < 0.8:
-            _odd_npz(path, rng)
-        elif data.startswith(b"\x1f\x8b") and rng.random() < 0.8:  # inside gzip, so that its checksum stays correct
-            path.write_bytes(gzip.compress(odd_bytes(gzip.decompress(data), rng)))
-        else:
+        try:
+            _damage_inside(path, data, rng)
+        except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile):  # an earlier step has damaged it
             path.write_bytes(odd_bytes(data, rng))
     return chosen
+
+
+def _damage_inside(path: Path, data: bytes, rng: np.random.Generator) -> None:
+    """Write other values into the structure of an intact file. A file without a structure gets other bytes."""
+    structured = _json_of(data)
+    if structured is not None and rng.random() < 0.7:
+        path.write_bytes(odd_json(structured, rng))
+    elif path.suffix == ".npz" and rng.random() < 0.8:
+        _odd_npz(path, rng)
+    elif data.startswith(b"\x1f\x8b") and rng.random() < 0.8:  # inside gzip, so that its checksum stays correct
+        path.write_bytes(gzip.compress(odd_bytes(gzip.decompress(data), rng)))
+    else:
+        path.write_bytes(odd_bytes(data, rng))
 
 
 def odd_bytes(data: bytes, rng: np.random.Generator) -> bytes:
@@ -286,12 +295,8 @@ def _json_of(data: bytes) -> Any:
 
 def _odd_npz(path: Path, rng: np.random.Generator) -> None:
     """Write an intact archive of damaged arrays, because the zip format's checksums detect all other damage."""
-    try:
-        with np.load(path) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, zipfile.BadZipFile):  # an earlier step has damaged it
-        path.write_bytes(odd_bytes(path.read_bytes(), rng))
-        return
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
     name = sorted(arrays)[rng.integers(len(arrays))] if rng.random() < 0.5 else "meta"
     if name == "meta":
         arrays["meta"] = np.frombuffer(odd_json(json.loads(arrays["meta"].tobytes()), rng), np.uint8)
