@@ -26,6 +26,7 @@ from ..splats.splats import Splats
 from .rules import DESCRIPTIONS, Mask, candidates_of_views, candidates_without_views
 
 JUDGES = 40  # largest number of views that judge the steps of a bisection
+JUDGED_SHARE = 0.5  # of the tolerance, if some views are no judges: the mean of all may lose more than the judges'
 
 
 @dataclass(frozen=True)
@@ -114,13 +115,14 @@ def clean(
     def psnr(candidate: Splats) -> float:
         return mean_psnr(renderer, candidate, judges, background) if len(candidate) else 0.0
 
-    start = now = psnr(splats)
+    now = psnr(splats)
+    floor = now - tolerance * (1.0 if len(judges) == len(views) else JUDGED_SHARE)
     kept, results = np.ones(len(splats), np.bool_), []
     states: list[Mask] = []
     for rule in (name for name in DESCRIPTIONS if name in masks):
         states.append(kept)
         activity.report(f"rule {rule}: {int(np.sum(kept & masks[rule]))} candidates")
-        after, value = _apply(splats, kept, masks[rule], change, now, start - tolerance, psnr)
+        after, value = _apply(splats, kept, masks[rule], change, now, floor, psnr)
         results.append(RuleResult(rule, int(np.sum(kept & masks[rule])), int(kept.sum() - after.sum()), now - value))
         kept, now = after, value
     _check_left(int(kept.sum()))
