@@ -256,6 +256,10 @@ def _flag_of(definition: Option, section: str) -> Callable[[F], F]:
     """Return the decorator that adds the flag of a training option."""
     flag = "--" + definition.name.replace("_", "-")
     extra: dict[str, Any] = {"cls": SectionOption, "section": section, "help": definition.help}
+    if definition.by_scene:
+        extra["help"] += "  [default: by the scene]"
+    if definition.value_type is bool and definition.by_scene:
+        return click.option(f"{flag}/--no-{flag[2:]}", definition.name, default=None, **extra)
     if definition.value_type is bool:
         return click.option(
             f"{flag}/--no-{flag[2:]}", definition.name, default=definition.default, show_default=True, **extra
@@ -264,7 +268,7 @@ def _flag_of(definition: Option, section: str) -> Callable[[F], F]:
         return click.option(flag, definition.name, type=Numbers(), multiple=True, **extra)
     if definition.default is MISSING:
         extra["help"] += f"  [default: {_strategy_defaults(definition.name)}]"
-    elif definition.default is not None:
+    elif definition.default is not None and not definition.by_scene:
         # Click's own text would have all digits of a fraction.
         shown = f"{definition.default:g}" if definition.value_type is float else definition.default
         extra |= {"default": definition.default, "help": f"{extra['help']}  [default: {shown}]"}

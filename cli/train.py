@@ -16,6 +16,7 @@ from clsplat.files.stop_signals import exit_code
 from clsplat.models.resume import find_unfinished
 from clsplat.scenes.options import READING_OPTIONS
 from clsplat.training.config import TrainConfig
+from clsplat.training.decisions import decide
 from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
 from clsplat.training.stored_run import load_recorded_scene, read_options_file
@@ -186,11 +187,11 @@ def train(
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
     assert path is not None
     config = TrainConfig(**options)
-    warn_without_effect([config], flags)
     if is_photographs(path):
         path = scene_of_photos(path, model_path, overwrite, quiet, recorded)
     with activity_line(quiet):
         loaded = load_recorded_scene(path, reading, config.background)
+    warn_without_effect([decide(loaded, config).config], flags)
     check_photos(loaded, photos, model_path, allow=allow_changed_photos, all_views=True)
     if search is not None:
         if view:

@@ -12,6 +12,7 @@ from ..files.atomic import atomic_writer
 from ..files.json_file import write_json
 from ..files.lock import folder_lock
 from ..scenes.scene import Scene
+from ..training.decisions import decide
 from ..training.log import Progress
 from .measure import train_and_measure, warm_up
 from .methods import Method
@@ -81,7 +82,8 @@ def compare(
                 if not scene.test:
                     raise InputError(f"{scene.path}: no test views to measure on: load it with eval")
                 identity = scene_identity(scene)
-                for number, (label, config, again) in enumerate(configs, 1):
+                for number, (label, undecided, again) in enumerate(configs, 1):
+                    config = decide(scene, undecided).config
                     done = runs.find(identity, label, config, again)
                     if done is not None and (not curve or done.get("curve") is not None):
                         continue

@@ -16,8 +16,10 @@ from ..scenes.scene import Scene, View
 from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from ..training.config import TrainConfig
+from ..training.decisions import decide
 from ..training.log import Progress
 from ..training.optim.rules import field_rate, rate_option
+from ..training.options.density import Adc
 from ..training.trainer import Trainer
 from .importance import measure_importance
 from .prune import Validation, splat_scores, strongest
@@ -65,7 +67,9 @@ def prune_in_rounds(
         antialiased=splats.antialiased,
         iterations=10 * iterations,
         background=validation.background,
+        strategy=Adc.strategy,  # rounds add no splats, and adc has no penalties
     )
+    config = decide(scene, config).config
     good = splats
     while len(splats) > 1:
         fewer = without_quarter(splats, scene.train, validation.renderer, validation.background)

@@ -34,6 +34,7 @@ from ..scenes.split import hold_out
 from ..splats.splats import Splats
 from ..splats.stats import complexity
 from ..training.config import TrainConfig
+from ..training.decisions import as_decided, decide
 from ..training.folder import ModelFolder, scene_record
 from ..training.log import Progress
 from ..training.run import train
@@ -117,10 +118,13 @@ def train_budget(
     folder = ModelFolder(output)
     if resume:
         state.load()
+        config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
         state.check(config, options)
     elif (folder.is_used or state.path.exists()) and not overwrite:
         raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
     folder.prepare()
+    if not resume:
+        config = decide(scene, config).tell(progress)
     with folder_lock(folder.path):
         if not resume:
             folder.clear()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, field
 from typing import Any
 
 from ..errors import InputError
@@ -49,6 +49,12 @@ class TrainConfig:
     `to_json` and `from_json` use one flat dictionary. Its keys are also the flags of the command line. An option that
     only the other strategy has is accepted and has no effect (see `without_effect`).
 
+    `clsplat.train` decides some options by the scene, if the caller did not name them (`training/decisions.py`).
+
+    Attributes
+    ----------
+    given : values of the options that the caller named. It has no part in comparisons and files.
+
     Raises
     ------
     InputError : a value is out of range. TypeError : an unknown option.
@@ -82,7 +88,9 @@ class TrainConfig:
     )
     background: Color = option(BLACK, help="Colour behind the splats, each part 0 to 1.", metavar="R,G,B")  # noqa: RUF009
     random_background: bool = option(
-        False, help="Train with a random background colour in each iteration, also behind transparent photos."
+        False,
+        help="Train with a random background colour in each iteration, also behind transparent photos.",
+        by_scene=True,
     )
     seed: int = option(
         0,
@@ -102,6 +110,7 @@ class TrainConfig:
     phases: AlternationConfig
     appearance: AppearanceConfig
     output: OutputConfig
+    given: Mapping[str, Any] = field(init=False, repr=False, compare=False)
 
     def __init__(self, **options: Any) -> None:
         unknown = [name for name in options if name not in OPTIONS and name not in ("density", *GROUPS)]
@@ -118,6 +127,7 @@ class TrainConfig:
                 values[name] = dataclasses.replace(values[name], **changes)
         for name, value in values.items():
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "given", _given(options))
         check_options(self)
         check_map(self.optim.skew_map, shape_named(self.shape).skew_form)
         if len(self.background) != 3 or not all(0 <= part <= 1 for part in self.background):
@@ -144,7 +154,9 @@ class TrainConfig:
 
     def replace(self, **options: Any) -> TrainConfig:
         """Return a copy with other values of some options. The names are those of the constructor."""
-        return dataclasses.replace(self, **options)
+        changed = dataclasses.replace(self, **options)
+        object.__setattr__(changed, "given", {**self.given, **_given(options)})
+        return changed
 
     def without_effect(self, names: Iterable[str]) -> list[str]:
         """Return the options of `names` that have no effect, because only the other strategy has them."""
@@ -193,6 +205,17 @@ def read_options(values: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _given(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return by name the options that arguments of `TrainConfig` set. A group sets all of its options."""
+    values: dict[str, Any] = {}
+    for name in ("density", *GROUPS):
+        if options.get(name):
+            values |= dataclasses.asdict(options[name])
+    if options.get("density"):
+        values["strategy"] = options["density"].strategy
+    return values | {name: value for name, value in options.items() if name in OPTIONS}
+
+
 def _density_of(options: Mapping[str, Any]) -> Adc | Mcmc:
     """Return the group `density` that the arguments of `TrainConfig` describe.
 
@@ -222,6 +245,7 @@ def _run_options() -> dict[str, Option]:
         "Densification strategy. adc: clone, split and prune splats, as in 3DGS. mcmc: relocate dead splats, grow to "
         "the cap, and add noise to positions, as in 3DGS-MCMC.",
         choices=tuple(STRATEGIES),
+        by_scene=True,
     )
     return option_table(TrainConfig) | {"strategy": strategy}
 

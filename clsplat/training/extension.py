@@ -8,6 +8,7 @@ from ..errors import InputError
 from ..scenes.scene import View
 from .checkpoint import Checkpoint, Reached
 from .config import FREE_OPTIONS, TrainConfig
+from .decisions import as_decided
 from .folder import ModelFolder
 from .schedules import RunSchedule, sh_degree_at
 from .view_sampler import ViewSampler
@@ -18,11 +19,12 @@ def fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:
 
     Raises
     ------
-    InputError : the run had other options. Only FREE_OPTIONS may change, and the number of iterations may rise.
+    InputError : the run had other options. Only FREE_OPTIONS may change, and the number of iterations may rise. What
+        the run decided by itself stays.
     """
     checkpoint = Checkpoint.load(folder.checkpoint_path)
     stored = TrainConfig.from_json(checkpoint.config).to_json()
-    for key, value in config.to_json().items():
+    for key, value in as_decided(config, stored).to_json().items():
         if key in FREE_OPTIONS or stored[key] == value:
             continue
         remedy = "use the same options"

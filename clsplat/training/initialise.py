@@ -113,7 +113,7 @@ def _points(
             np.concatenate([rgb, rgb[nearest_of(xyz, placed)]]),
             (f"{message}, {n_random} at random where the cameras look"),
         )
-    count = min(cap, RANDOM_POINTS)
+    count = min(cap, RANDOM_POINTS) if not random_share else max(round(random_share * cap), 1)
     placed = random_points(scene, count, rng)
     rgb = rng.integers(0, 256, (count, 3), dtype=np.uint8)
     available = f"{n_points} points" if len(apart) == n_points else f"{n_points} points, {len(apart)} of them apart"

@@ -30,6 +30,7 @@ _RATES = {
     "lambda_dssim": 0.2,
     "bisect_reg": 0.0,
     "random_points": 0.0,
+    "random_background": False,
 }
 # 3DGS, code: densification every 100 iterations from 500 to 15 000 of 30 000, opacity reset every 3000 iterations.
 _CLONE_AND_SPLIT = {
@@ -191,6 +192,7 @@ def _skew_normal() -> Values:
         "densify_until": 25_000 / 30_000,
         "densify_interval": 100,
         "random_points": 0.0,
+        "random_background": False,
     } | _SGHMC
 
 

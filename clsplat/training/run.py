@@ -13,6 +13,7 @@ from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
 from ..splats.splats import Splats
 from .config import TrainConfig
+from .decisions import as_decided, decide
 from .extension import fitting_checkpoint
 from .folder import ModelFolder
 from .log import Progress
@@ -36,7 +37,7 @@ def train(
 
     Parameters
     ----------
-    config : options of the run; by default those of TrainConfig.
+    config : options of the run. Those that it does not name are decided by the scene (`training/decisions.py`).
     progress : called about every 50 iterations.
     output : model folder. Without it, no file is written and Ctrl-C raises KeyboardInterrupt.
     resume : continue from the folder's checkpoint. The config must be the same, except for options without an effect
@@ -61,9 +62,12 @@ def train(
     if folder is not None:
         if resume:
             checkpoint = fitting_checkpoint(folder, config)
+            config = as_decided(config, checkpoint.config)
         elif folder.is_used and not overwrite:
             raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
         folder.prepare()
+    if checkpoint is None:
+        config = decide(scene, config).tell(progress)
     with folder_lock(None if folder is None else folder.path):
         trainer = Trainer(scene, config, checkpoint, progress)
         if folder is not None:

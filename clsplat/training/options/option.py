@@ -67,6 +67,7 @@ class Option:
     range : the range of numbers. choices : allowed words, empty if there are none; a registry such as
         SHAPES may grow.
     metavar : placeholder for the value in `--help`. aliases : further flags.
+    by_scene : whether a run decides the value by the scene, if the caller does not name it.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Option:
     choices: Collection[str] = ()
     metavar: str | None = None
     aliases: tuple[str, ...] = ()
+    by_scene: bool = False
 
     @property
     def value_type(self) -> Any:
@@ -118,6 +120,7 @@ def option(
     choices: Collection[str] = (),
     metavar: str | None = None,
     aliases: Sequence[str] = (),
+    by_scene: bool = False,
 ) -> Any:
     """Return a dataclass field that is a training option; see `Option` and `Range` for the parameters."""
     allowed = Range(at_least, at_most, above, below)
@@ -127,6 +130,7 @@ def option(
         "choices": choices,
         "metavar": metavar,
         "aliases": tuple(aliases),
+        "by_scene": by_scene,
     }
     return dataclasses.field(default=default, metadata=metadata)
 

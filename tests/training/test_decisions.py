@@ -1,0 +1,108 @@
+"""Decisions of a run: what the scene shows, what the caller named, and that commands and library decide alike."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clsplat.scenes.scene import Points, Scene
+from clsplat.training.config import TrainConfig
+from clsplat.training.decisions import as_decided, decide, transparent_share
+from clsplat.training.folder import ModelFolder
+from clsplat.training.log import Progress
+from clsplat.training.presets import PRESETS, preset
+from clsplat.training.run import train
+
+
+def without_points(scene: Scene) -> Scene:
+    points = scene.points
+    return replace(scene, points=Points(points.xyz[:0], points.rgb[:0], points.track_length[:0]))
+
+
+def transparent(scene: Scene, share: float) -> Scene:
+    """Return the scene with photos whose upper rows are transparent."""
+
+    def alpha(height: int, width: int) -> np.ndarray:
+        values = np.full((height, width), 255, np.uint8)
+        values[: round(share * height)] = 0
+        return values
+
+    return replace(scene, views=[replace(view, alpha=alpha(*view.image.shape[:2])) for view in scene.views])
+
+
+def test_good_points_are_cloned_and_split(scene: Scene) -> None:
+    decision = decide(scene, TrainConfig(cap_max=len(scene.points)))
+    assert decision.config == TrainConfig(cap_max=len(scene.points), strategy="adc")
+    assert str(decision) == f"decided: strategy adc, because the scene has {len(scene.points)} points"
+
+
+@pytest.mark.parametrize("options", [{"init": "random"}, {"cap_max": 1_000_000}, {}])
+def test_random_starts_and_few_points_relocate(scene: Scene, options: dict[str, Any]) -> None:
+    start = scene if options else without_points(scene)
+    config = TrainConfig(opacity_lr=0.07, **options)
+    decided = decide(start, config).config
+    assert decided == TrainConfig(opacity_lr=0.07, strategy="mcmc", **options)
+    assert not decided.random_background
+
+
+def test_transparent_photos_get_random_backgrounds(scene: Scene) -> None:
+    seen = transparent(scene, 0.5)
+    assert transparent_share(seen.train) == pytest.approx(0.5, abs=0.1)
+    decision = decide(seen, TrainConfig())
+    assert decision.config.random_background
+    assert "% of the photos' pixels are transparent" in str(decision)
+    assert not decide(seen, TrainConfig(random_background=False)).config.random_background
+    assert not decide(transparent(scene, 0.0), TrainConfig()).config.random_background, "an alpha of 255 is opaque"
+
+
+def test_named_options_stay(scene: Scene) -> None:
+    """Options of a strategy that is not the default are kept until the strategy is known."""
+    start = transparent(without_points(scene), 0.5)
+    assert decide(start, TrainConfig(growth=1.2, init_scale=0.3)).config == TrainConfig(
+        growth=1.2, init_scale=0.3, strategy="mcmc", random_background=True
+    )
+    named = TrainConfig(strategy="adc", random_background=False)
+    assert decide(start, named).config == named
+    assert decide(start, named).reasons == ()
+    assert decide(start, TrainConfig(cap_max=7).replace(strategy="adc")).config.strategy == "adc"
+    complete = decide(start, TrainConfig()).config
+    again = decide(scene, complete)
+    assert again.config == complete, "nothing is decided twice"
+    assert again.reasons == ()
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_decide_nothing(scene: Scene, name: str) -> None:
+    config = TrainConfig(**preset(name))
+    decision = decide(transparent(without_points(scene), 0.5), config)
+    assert decision.config == config
+    assert decision.reasons == ()
+
+
+def test_a_run_stores_what_it_decided_and_says_it_once(scene: Scene, tmp_path: Path) -> None:
+    """A resumed run keeps the decisions, also if it is longer."""
+    start, messages = without_points(scene), []
+
+    def hear(progress: Progress) -> None:
+        messages.append(progress.message)
+
+    config = TrainConfig(iterations=2, cap_max=40, sh_degree=0)
+    train(start, config, hear, output=tmp_path)
+    stored = ModelFolder(tmp_path).read_config()["config"]
+    assert (stored["strategy"], stored["random_background"]) == ("mcmc", False)
+    assert sum(message.startswith("decided:") for message in messages) == 1
+    messages.clear()
+    # The points would decide otherwise.
+    train(scene, config.replace(iterations=4), hear, output=tmp_path, resume=True)
+    assert ModelFolder(tmp_path).read_config()["config"] == stored | {"iterations": 4}
+    assert not any(message.startswith("decided:") for message in messages)
+
+
+def test_decisions_of_a_stored_run_replace_undecided_options() -> None:
+    stored = TrainConfig(strategy="mcmc", random_background=True).to_json()
+    assert as_decided(TrainConfig(), stored) == TrainConfig(strategy="mcmc", random_background=True)
+    assert as_decided(TrainConfig(strategy="adc"), stored) == TrainConfig(strategy="adc", random_background=True)
