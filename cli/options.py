@@ -256,7 +256,7 @@ def _flag_of(definition: Option, section: str) -> Callable[[F], F]:
     """Return the decorator that adds the flag of a training option."""
     flag = "--" + definition.name.replace("_", "-")
     extra: dict[str, Any] = {"cls": SectionOption, "section": section, "help": definition.help}
-    if definition.by_scene:
+    if definition.by_scene and definition.default is not MISSING:
         extra["help"] += "  [default: by the scene]"
     if definition.value_type is bool and definition.by_scene:
         return click.option(f"{flag}/--no-{flag[2:]}", definition.name, default=None, **extra)
@@ -267,7 +267,8 @@ def _flag_of(definition: Option, section: str) -> Callable[[F], F]:
     if definition.value_type == tuple[int, ...]:
         return click.option(flag, definition.name, type=Numbers(), multiple=True, **extra)
     if definition.default is MISSING:
-        extra["help"] += f"  [default: {_strategy_defaults(definition.name)}]"
+        by_scene = ", or by the scene" if definition.by_scene else ""
+        extra["help"] += f"  [default: {_strategy_defaults(definition.name)}{by_scene}]"
     elif definition.default is not None and not definition.by_scene:
         # Click's own text would have all digits of a fraction.
         shown = f"{definition.default:g}" if definition.value_type is float else definition.default

@@ -53,7 +53,7 @@ class TrainConfig:
 
     Attributes
     ----------
-    given : values of the options that the caller named. It has no part in comparisons and files.
+    named_options : values of the options that the caller named. It has no part in comparisons and files.
 
     Raises
     ------
@@ -110,7 +110,7 @@ class TrainConfig:
     phases: AlternationConfig
     appearance: AppearanceConfig
     output: OutputConfig
-    given: Mapping[str, Any] = field(init=False, repr=False, compare=False)
+    named_options: Mapping[str, Any] = field(init=False, repr=False, compare=False)
 
     def __init__(self, **options: Any) -> None:
         unknown = [name for name in options if name not in OPTIONS and name not in ("density", *GROUPS)]
@@ -127,7 +127,7 @@ class TrainConfig:
                 values[name] = dataclasses.replace(values[name], **changes)
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "given", _given(options))
+        object.__setattr__(self, "named_options", _named_options(options))
         check_options(self)
         check_map(self.optim.skew_map, shape_named(self.shape).skew_form)
         if len(self.background) != 3 or not all(0 <= part <= 1 for part in self.background):
@@ -155,7 +155,7 @@ class TrainConfig:
     def replace(self, **options: Any) -> TrainConfig:
         """Return a copy with other values of some options. The names are those of the constructor."""
         changed = dataclasses.replace(self, **options)
-        object.__setattr__(changed, "given", {**self.given, **_given(options)})
+        object.__setattr__(changed, "named_options", {**self.named_options, **_named_options(options)})
         return changed
 
     def without_effect(self, names: Iterable[str]) -> list[str]:
@@ -205,7 +205,7 @@ def read_options(values: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _given(options: Mapping[str, Any]) -> dict[str, Any]:
+def _named_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return by name the options that arguments of `TrainConfig` set. A group sets all of its options."""
     values: dict[str, Any] = {}
     for name in ("density", *GROUPS):

@@ -2,8 +2,8 @@
 
 - Transparent photos are trained over random backgrounds. Over one colour, a splat of that colour costs nothing wherever
   it is, and other views see it before the object.
-- A run that starts at random places, or at few points of the scene, relocates splats (`mcmc`): splats where no photo
-  needs them fade and move. A run that starts at good points clones and splits them by gradient (`adc`).
+- A run that starts at random places, or at few points of the scene, has splats that no photo needs. Transparent photos
+  get the strategy that relocates them (`mcmc`). With `adc` a penalty on opacity lets them fade until they are pruned.
 
 docs/decisions.md has the measurements.
 """
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from .config import OPTIONS, TrainConfig
+from .initialise import MIN_POINTS
 from .log import Progress
 from .options.density import Adc, Mcmc
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 DECIDED = tuple(name for name, definition in OPTIONS.items() if definition.by_scene)
 FEW_POINTS = 0.05  # fewer points than this share of the cap are few
+PENALTY = Mcmc().opacity_reg  # weight of the mean opacity in a run that starts at random with adc
 TRANSPARENT_SHARE = 0.01  # smallest share of transparent pixels of photos that are trained over random backgrounds
 _STEP = 8  # pixels between two that are looked at
 _OPAQUE = 250  # smallest alpha of a pixel that counts as opaque: photos are resampled and rounded
@@ -53,48 +55,49 @@ class Decision:
 
 
 def decide(scene: Scene, config: TrainConfig) -> Decision:
-    """Return the options of a run on a scene. Options that the caller named (`TrainConfig.given`) stay as they are.
+    """Return the options of a run on a scene. Options that the caller named stay as they are.
 
     Parameters
     ----------
     scene : its training views and points are looked at, never its test views.
-    config : options of the run. All options of a preset or of a stored run count as named.
+    config : options of the run. All options of a stored run count as named (`TrainConfig.named_options`).
     """
     chosen: dict[str, Any] = {}
     reasons = []
-    if "strategy" not in config.given:
-        chosen["strategy"], reason = _strategy(scene, config)
-        reasons.append(reason)
-    if "random_background" not in config.given:
-        share = transparent_share(scene.train)
-        chosen["random_background"] = share >= TRANSPARENT_SHARE
-        if chosen["random_background"]:
-            reasons.append(f"random backgrounds, because {share:.0%} of the photos' pixels are transparent")
+    share = transparent_share(scene.train)
+    transparent = share >= TRANSPARENT_SHARE
+    why = random_start(scene, config)
+    if transparent and "random_background" not in config.named_options:
+        chosen["random_background"] = True
+        reasons.append(f"random backgrounds, because {share:.0%} of the photos' pixels are transparent")
+    if transparent and why and "strategy" not in config.named_options:
+        chosen["strategy"] = Mcmc.strategy
+        reasons.append(f"strategy {Mcmc.strategy}, because {why}")
+    elif why and config.strategy == Adc.strategy and "opacity_reg" not in config.named_options:
+        chosen["opacity_reg"] = PENALTY
+        reasons.append(f"a penalty on opacity of {PENALTY:g}, because {why}")
     return Decision(_with(config, chosen), tuple(reasons))
 
 
 def as_decided(config: TrainConfig, stored: Mapping[str, Any]) -> TrainConfig:
     """Return the options with the decisions of a stored run. stored : options of the run in the form of `to_json`."""
-    return _with(config, {name: stored[name] for name in DECIDED if name not in config.given})
+    return _with(config, {name: stored[name] for name in DECIDED if name not in config.named_options})
 
 
 def _with(config: TrainConfig, chosen: Mapping[str, Any]) -> TrainConfig:
     """Return the complete options. Those that the caller named replace the defaults of the chosen strategy."""
-    decided = TrainConfig(**({**config.given, **chosen})) if "strategy" in chosen else config.replace(**chosen)
+    decided = TrainConfig(**({**config.named_options, **chosen})) if "strategy" in chosen else config.replace(**chosen)
     return TrainConfig.from_json(decided.to_json())
 
 
-def _strategy(scene: Scene, config: TrainConfig) -> tuple[str, str]:
-    """Return the strategy and the reason."""
+def random_start(scene: Scene, config: TrainConfig) -> str:
+    """Return why most splats of a run start at random places; empty if they start at points or at a model."""
     n_points, init = len(scene.points.xyz), config.start.init
     if init == "random":
-        return Mcmc.strategy, f"strategy {Mcmc.strategy}, because the start is random"
-    if init != "sfm":
-        return Adc.strategy, f"strategy {Adc.strategy}, because the start is a model"
-    if n_points < FEW_POINTS * config.cap_max:
-        why = "the scene has no points" if not n_points else f"the scene has only {n_points} points"
-        return Mcmc.strategy, f"strategy {Mcmc.strategy}, because {why}"
-    return Adc.strategy, f"strategy {Adc.strategy}, because the scene has {n_points} points"
+        return "the start is random"
+    if init != "sfm" or n_points >= max(FEW_POINTS * config.cap_max, MIN_POINTS):
+        return ""
+    return f"the scene has only {n_points} points" if n_points else "the scene has no points"
 
 
 def transparent_share(views: list[View]) -> float:

@@ -54,7 +54,8 @@ def initial_splats(
     init : "sfm", "random", or the path of a file of splats. "sfm" without points becomes "random", with a message.
     seed : seed of random points and of the first skew.
     random_share : number of random points that are added to those of "sfm", as a fraction of the cap. None: a tenth if
-        the scene has fewer points than that, otherwise 0.
+        the scene has fewer points than that, otherwise 0. Without points of the scene it is the number of all points,
+        and None or 0 stands for the whole cap, at most RANDOM_POINTS.
     opacity, scale_factor : properties of splats from points. The scale is the factor times the mean distance to the
         three nearest points.
 

@@ -50,6 +50,18 @@ def test_a_wrong_file_of_options_is_named(scene: Path, tmp_path: Path, text: str
     assert not (tmp_path / "model").exists()
 
 
+def test_train_says_what_it_decided_by_the_scene(scene: Path, tmp_path: Path) -> None:
+    short = ("--iterations", "1", "--cap-max", "30")
+    said = run("train", scene, "-m", tmp_path / "a", "--init", "random", *short).stderr
+    assert said.count("decided: a penalty on opacity of 0.001, because the start is random") == 1
+    assert config_of(tmp_path / "a")["opacity_reg"] == 0.001
+    assert "decided:" not in run("train", "--resume", "-m", tmp_path / "a", "--iterations", "2").stderr
+    assert config_of(tmp_path / "a")["opacity_reg"] == 0.001
+    flags = ("--init", "random", "--opacity-reg", "0", "--random-background")
+    assert "decided:" not in run("train", scene, "-m", tmp_path / "b", *flags, *short).stderr
+    assert config_of(tmp_path / "b")["random_background"] is True
+
+
 def test_a_flag_of_the_other_strategy_warns(scene: Path, tmp_path: Path) -> None:
     short = ("--iterations", "2", "--cap-max", "30", "-q")
     result = run("train", scene, "-m", tmp_path / "a", "--growth", "1.2", "--grad-threshold", "0.1", *short)

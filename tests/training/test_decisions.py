@@ -11,7 +11,7 @@ import pytest
 
 from clsplat.scenes.scene import Points, Scene
 from clsplat.training.config import TrainConfig
-from clsplat.training.decisions import as_decided, decide, transparent_share
+from clsplat.training.decisions import PENALTY, Decision, as_decided, decide, transparent_share
 from clsplat.training.folder import ModelFolder
 from clsplat.training.log import Progress
 from clsplat.training.presets import PRESETS, preset
@@ -34,19 +34,24 @@ def transparent(scene: Scene, share: float) -> Scene:
     return replace(scene, views=[replace(view, alpha=alpha(*view.image.shape[:2])) for view in scene.views])
 
 
-def test_good_points_are_cloned_and_split(scene: Scene) -> None:
-    decision = decide(scene, TrainConfig(cap_max=len(scene.points)))
-    assert decision.config == TrainConfig(cap_max=len(scene.points), strategy="adc")
-    assert str(decision) == f"decided: strategy adc, because the scene has {len(scene.points)} points"
+def test_good_points_and_opaque_photos_need_no_decision(scene: Scene) -> None:
+    config = TrainConfig(cap_max=len(scene.points))
+    assert decide(scene, config) == Decision(config, ())
+    assert decide(scene, TrainConfig(init="model.ply")).reasons == ()
+    assert decide(transparent(scene, 0.5), config).config == config.replace(random_background=True)
 
 
 @pytest.mark.parametrize("options", [{"init": "random"}, {"cap_max": 1_000_000}, {}])
-def test_random_starts_and_few_points_relocate(scene: Scene, options: dict[str, Any]) -> None:
+def test_random_starts_and_few_points(scene: Scene, options: dict[str, Any]) -> None:
+    """Transparent photos get the strategy that relocates, other photos a penalty on opacity."""
     start = scene if options else without_points(scene)
     config = TrainConfig(opacity_lr=0.07, **options)
-    decided = decide(start, config).config
-    assert decided == TrainConfig(opacity_lr=0.07, strategy="mcmc", **options)
-    assert not decided.random_background
+    assert decide(start, config).config == config.replace(opacity_reg=PENALTY)
+    seen = transparent(start, 0.5)
+    expected = TrainConfig(opacity_lr=0.07, strategy="mcmc", random_background=True, **options)
+    assert decide(seen, config).config == expected
+    by_gradient = TrainConfig(strategy="adc", **options)
+    assert decide(seen, by_gradient).config == by_gradient.replace(random_background=True, opacity_reg=PENALTY)
 
 
 def test_transparent_photos_get_random_backgrounds(scene: Scene) -> None:
@@ -65,7 +70,7 @@ def test_named_options_stay(scene: Scene) -> None:
     assert decide(start, TrainConfig(growth=1.2, init_scale=0.3)).config == TrainConfig(
         growth=1.2, init_scale=0.3, strategy="mcmc", random_background=True
     )
-    named = TrainConfig(strategy="adc", random_background=False)
+    named = TrainConfig(strategy="adc", random_background=False, opacity_reg=0.0)
     assert decide(start, named).config == named
     assert decide(start, named).reasons == ()
     assert decide(start, TrainConfig(cap_max=7).replace(strategy="adc")).config.strategy == "adc"
@@ -93,7 +98,7 @@ def test_a_run_stores_what_it_decided_and_says_it_once(scene: Scene, tmp_path: P
     config = TrainConfig(iterations=2, cap_max=40, sh_degree=0)
     train(start, config, hear, output=tmp_path)
     stored = ModelFolder(tmp_path).read_config()["config"]
-    assert (stored["strategy"], stored["random_background"]) == ("mcmc", False)
+    assert (stored["strategy"], stored["random_background"], stored["opacity_reg"]) == ("adc", False, PENALTY)
     assert sum(message.startswith("decided:") for message in messages) == 1
     messages.clear()
     # The points would decide otherwise.
@@ -104,5 +109,8 @@ def test_a_run_stores_what_it_decided_and_says_it_once(scene: Scene, tmp_path: P
 
 def test_decisions_of_a_stored_run_replace_undecided_options() -> None:
     stored = TrainConfig(strategy="mcmc", random_background=True).to_json()
+    penalty = stored["opacity_reg"]
     assert as_decided(TrainConfig(), stored) == TrainConfig(strategy="mcmc", random_background=True)
-    assert as_decided(TrainConfig(strategy="adc"), stored) == TrainConfig(strategy="adc", random_background=True)
+    assert as_decided(TrainConfig(strategy="adc"), stored) == TrainConfig(
+        strategy="adc", random_background=True, opacity_reg=penalty
+    )

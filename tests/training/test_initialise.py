@@ -88,6 +88,13 @@ def test_scenes_without_points_start_at_random(init: str, n_points: int) -> None
     assert (f"the scene has {n_points} points" in message) == (init == "sfm")
 
 
+def test_a_random_start_may_leave_room_under_the_cap() -> None:
+    for n_points, init in ((50, "random"), (0, "sfm")):
+        for share, count in ((0.1, 30), (0.0, 300), (None, 300)):
+            splats, _ = initial_splats(scene(n_points), cap=300, init=init, random_share=share)
+            assert len(splats) == count
+
+
 def test_random_points_have_their_own_limit_and_need_no_extent() -> None:
     splats, _ = initial_splats(scene(0, extent=0.0), shape="gaussian", sh_degree=0, init="random")
     assert len(splats) == RANDOM_POINTS

@@ -28,7 +28,7 @@ class DensityConfig(OptionGroup):
         help="Scale of splats that are created from points, as a factor of the mean distance to three neighbours.",
         above=0,
     )
-    opacity_reg: float = option(help="Weight of the mean opacity in the loss.", at_least=0)
+    opacity_reg: float = option(help="Weight of the mean opacity in the loss.", at_least=0, by_scene=True)
     scale_reg: float = option(help="Weight of the mean scale in the loss.", at_least=0)
     noise_lr: float = option(
         help="Strength of the random motion of positions, as a factor of their learning rate.", at_least=0
