@@ -19,6 +19,7 @@ from ..errors import InputError
 from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
 from ..rendering.renderer import Renderer
+from ..scenes.read_view import keep_photos
 from ..scenes.scene import View
 from ..splats.color import BLACK, Color
 from ..splats.fields import Array, DoubleArray, sh_coefficients
@@ -66,10 +67,11 @@ class Pruned:
 
 
 class Validation:
-    """PSNR of models on the validation views."""
+    """PSNR of models on the validation views. It measures many models, so the photos are in memory."""
 
     def __init__(self, renderer: Renderer, views: Sequence[View], background: Color = BLACK) -> None:
         self.renderer, self.views, self.background = renderer, views, background
+        keep_photos(views)
 
     def psnr(self, splats: Splats) -> float:
         """Return the mean PSNR over the views [dB]."""

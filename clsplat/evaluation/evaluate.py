@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import statistics
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..errors import InputError
 from ..rendering.renderer import Rendered, Renderer
 from ..scenes.scene import View
 from ..splats.color import BLACK, Color
@@ -44,17 +46,31 @@ def evaluate(
     protocol: MetricProtocol = DEFAULT_PROTOCOL,
     on_view: Callable[[View, Rendered], None] | None = None,
 ) -> Evaluation:
-    """Render every view and compare it with its photo.
+    """Render every view and compare it with its photo. Photos that are not in memory are decoded one at a time.
 
     Parameters
     ----------
     views : at least one; pixels that a mask hides do not count.
-    on_view : called with each view and its render.
+    on_view : called with each view, its photo in memory, and its render.
+
+    Warns
+    -----
+    UserWarning : a photo cannot be decoded; its view is left out.
+
+    Raises
+    ------
+    InputError : no photo can be decoded.
     """
     per_view: dict[str, dict[str, float]] = {}
     times = []
     renderer.render(splats, views[0].camera, background)  # builds the kernels and uploads the splats
-    for view in views:
+    damaged: list[str] = []
+    for stored in views:
+        try:
+            view = stored.loaded()
+        except InputError as error:
+            damaged.append(str(error))
+            continue
         start = time.perf_counter()
         image = renderer.render(splats, view.camera, background)
         times.append(1e3 * (time.perf_counter() - start))
@@ -64,5 +80,9 @@ def evaluate(
         }
         if on_view is not None:
             on_view(view, image)
+    if not per_view:
+        raise InputError(f"none of the {len(views)} photos can be used ({damaged[0]})")
+    if damaged:
+        warnings.warn(f"{len(damaged)} of {len(views)} photos are not measured: {damaged[0]}", stacklevel=2)
     means = {key: statistics.fmean(v[key] for v in per_view.values()) for key in ("PSNR", "SSIM")}
     return Evaluation(means["PSNR"], means["SSIM"], statistics.median(times), per_view)

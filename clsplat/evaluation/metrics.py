@@ -167,19 +167,27 @@ def ssim(
         raise InputError(f"SSIM: an image of {size} is below its 11x11 window; use zero padding (3dgs)")
     if mask is not None:
         x = np.where(mask.reshape(*mask.shape, *[1] * (x.ndim - 2)), x, y)
-    mean_x, mean_y = _blur(x), _blur(y)
-    var_x = _blur(x * x) - mean_x * mean_x
-    var_y = _blur(y * y) - mean_y * mean_y
-    cov = _blur(x * y) - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
-    structure = (2 * cov + SSIM_C2) / (var_x + var_y + SSIM_C2)
-    similarity = luminance * structure
+    similarity = np.empty_like(x)
+    channels = [(..., channel) for channel in range(x.shape[2])] if x.ndim == 3 else [...]
+    for channel in channels:  # one at a time, because the maps of all channels take much memory
+        similarity[channel] = _similarity(x[channel], y[channel])
     if padding == "valid":
         inside = slice(SSIM_RADIUS, -SSIM_RADIUS)
         similarity, mask = similarity[inside, inside], None if mask is None else mask[inside, inside]
     # A mask can hide everything inside the border; no difference is then visible.
     counted = similarity if mask is None else similarity[mask]
     return float(np.mean(counted)) if counted.size else 1.0
+
+
+def _similarity(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the map of the structural similarity of one channel, (H, W)."""
+    mean_x, mean_y = _blur(x), _blur(y)
+    var_x = _blur(x * x) - mean_x * mean_x
+    var_y = _blur(y * y) - mean_y * mean_y
+    cov = _blur(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
+    structure = (2 * cov + SSIM_C2) / (var_x + var_y + SSIM_C2)
+    return np.asarray(luminance * structure)
 
 
 def _blur(image: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -33,6 +33,8 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "AVIF", "
 MAX_PIXELS = 400_000_000  # larger than the photo of any camera; a file that claims more is damaged or an attack
 _HEIC = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1")  # brands of ISO/IEC 23008-12
 _PHOTO_QUALITY = 97  # of a JPEG made from another JPEG: the second compression adds little error to the first
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk: its length, its name and its checksum
 _ALPHA_MODES = ("RGBA", "RGBa", "LA", "La", "PA")
 _SIXTEEN_BIT_MODES = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 
@@ -56,7 +58,9 @@ class PhotoHeader:
     exif: bytes
 
 
-def read_image(path: str | os.PathLike[str], upright: bool = False) -> ImageU8:
+def read_image(
+    path: str | os.PathLike[str], upright: bool = False, opaque_size: tuple[int, int] | None = None
+) -> ImageU8:
     """Return the pixels of an image file.
 
     Grey, palette and CMYK images become RGB; 16-bit grey is rounded to 8 bits, 16-bit colour keeps its high byte.
@@ -64,6 +68,8 @@ def read_image(path: str | os.PathLike[str], upright: bool = False) -> ImageU8:
     Parameters
     ----------
     upright : whether to turn the image by its EXIF orientation.
+    opaque_size : (width, height) to resize an image without transparency to, with the result of `resize_area` but
+        without an array of the full size [px]. An image with transparency keeps its size.
 
     Returns
     -------
@@ -78,10 +84,15 @@ def read_image(path: str | os.PathLike[str], upright: bool = False) -> ImageU8:
             image = ImageOps.exif_transpose(stored) if upright else stored
             if image.mode in _SIXTEEN_BIT_MODES:
                 grey = (np.clip(np.asarray(image), 0, 65535).astype(np.uint32) + 128) // 257
-                return np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)
+                pixels = np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)
+                return pixels if opaque_size is None else resize_area(pixels, *opaque_size)
             if image.mode != "F":
                 has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
-                return np.array(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.uint8)
+                mode = "RGBA" if has_alpha else "RGB"
+                pillow = image if image.mode == mode else image.convert(mode)
+                if opaque_size is not None and not has_alpha:
+                    pillow = _resized(pillow, *opaque_size)
+                return np.array(pillow, dtype=np.uint8)
         except Exception as error:  # decoders of damaged files raise nearly anything
             raise _unreadable(path, error) from error
     raise InputError(f"{path}: float pixels are not supported; convert it to 8-bit PNG or JPEG")
@@ -141,6 +152,18 @@ def read_photo_header(path: str | os.PathLike[str]) -> PhotoHeader:
         plain = orientation == 1 and image.format in ("JPEG", "PNG") and image.mode in ("RGB", "L") and not deep
         plain = plain and "transparency" not in image.info
         return PhotoHeader(width, height, plain, tuple(str(value) for value in camera if value), exif_bytes)
+
+
+def is_whole(path: str | os.PathLike[str]) -> bool:
+    """Return whether a JPEG or PNG ends as it should. Other files count as not whole: decode them to be sure."""
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(2)
+            stream.seek(-len(_PNG_END), os.SEEK_END)
+            end = stream.read()
+    except OSError:
+        return False
+    return end == _PNG_END if start == b"\x89P" else start == _JPEG_START and end.endswith(_JPEG_END)
 
 
 def is_render(path: Path) -> bool:
@@ -247,10 +270,17 @@ def resize_area(image: ImageU8, width: int, height: int) -> ImageU8:
     old_height, old_width = image.shape[:2]
     if (width, height) == (old_width, old_height):
         return image.copy()
-    pillow = Image.fromarray(image)
+    return np.array(_resized(Image.fromarray(image), width, height), dtype=np.uint8)
+
+
+def _resized(image: Image.Image, width: int, height: int) -> Image.Image:
+    """Return an image at another size, for `resize_area`."""
+    old_width, old_height = image.size
+    if (width, height) == (old_width, old_height):
+        return image
     if old_width % width == 0 and old_height % height == 0:
-        return np.array(pillow.reduce((old_width // width, old_height // height)), dtype=np.uint8)
-    return np.array(pillow.resize((width, height), Image.Resampling.BICUBIC), dtype=np.uint8)
+        return image.reduce((old_width // width, old_height // height))
+    return image.resize((width, height), Image.Resampling.BICUBIC)
 
 
 def _mark() -> PngImagePlugin.PngInfo:

@@ -86,7 +86,7 @@ class LoadedModel:
     def load_scene(
         self, choice: SceneChoice | None = None, *, check: bool = True, background: Color | None = None
     ) -> Scene:
-        """Return the scene that the model was trained on, with the same test views.
+        """Return the scene that the model was trained on, with the same test views. Photos are decoded at each use.
 
         Parameters
         ----------
@@ -123,6 +123,7 @@ class LoadedModel:
             background=self.background if background is None else background,
             masks=choice.masks or record.get("masks"),
             alpha=choice.alpha or record.get("alpha", ALPHA_USES[0]),
+            read_photos=False,
         )
         as_recorded = all(getattr(choice, name) in (None, record.get(name)) for name in ("images", "masks"))
         if check and as_recorded:

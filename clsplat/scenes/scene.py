@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import itertools
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,60 +13,28 @@ from typing import Any
 
 import numpy as np
 
-from .. import activity
 from ..cameras.camera import Camera
 from ..errors import InputError
 from ..files.digest import file_digest
-from ..files.images import ImageU8, read_image, resize_area
-from ..files.masks import MASK_FOLDER, NO_MASKS, Mask, mask_files, read_mask, resize_mask
+from ..files.images import ImageU8
+from ..files.masks import MASK_FOLDER, NO_MASKS, mask_files
 from ..files.real_path import real_path
 from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
 from .colmap import Points
 from .nerfstudio import read_transforms
 from .options import ALPHA_USES
-from .photo_size import check_memory, target_size
+from .photo_size import check_memory
 from .pose_checks import check_lenses, check_poses, without_far_points
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
+from .read_view import PhotoReader, read_views
 from .transforms_files import find_transforms
-from .undistort import RegisteredImage
+from .view import View
 from .wrong_folder import describe_file, scene_hint
 
 _EXTENT_MARGIN = 1.1  # extent over the largest distance of a camera from the cameras' mean, as in 3DGS
 
 __all__ = ["Points", "Scene", "View", "load_scene"]
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """An image with its camera.
-
-    Parameters
-    ----------
-    name : name of the image file in the scene's model.
-    camera : pinhole camera with the image's size.
-    image : (H, W, 3) uint8; photos with transparency are composited over the scene's background.
-    mask : (H, W) bool, True for pixels that count; None if all pixels count.
-    alpha : (H, W) uint8, opacity of a photo with transparency; None for other photos.
-    """
-
-    name: str
-    camera: Camera
-    image: ImageU8
-    mask: Mask | None = None
-    alpha: ImageU8 | None = None
-
-    def resized(self, width: int, height: int) -> View:
-        """Return the view at another size [px]."""
-        if (width, height) == (self.camera.width, self.camera.height):
-            return self
-        return View(
-            self.name,
-            self.camera.resized(width, height),
-            resize_area(self.image, width, height),
-            None if self.mask is None else resize_mask(self.mask, width, height),
-            None if self.alpha is None else resize_area(self.alpha, width, height),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +73,7 @@ class Scene:
 
     @property
     def images(self) -> list[ImageU8]:
-        """Images of all views, each (H, W, 3) uint8."""
+        """Images of all views, each (H, W, 3) uint8; photos that are not in memory are decoded."""
         return [view.image for view in self.views]
 
     @property
@@ -145,6 +112,7 @@ def load_scene(
     background: Color = BLACK,
     masks: str | None = None,
     alpha: str = ALPHA_USES[0],
+    read_photos: bool = True,
 ) -> Scene:
     """Read a scene: a folder with photos and a COLMAP model in `sparse`, or with transforms.json.
 
@@ -165,6 +133,8 @@ def load_scene(
         exists, and the masks named in transforms.json.
     alpha : use of a photo's transparency. "background" composites the photo over the background; "mask" masks out
         pixels that are less than half opaque.
+    read_photos : whether to decode the training photos now and keep them. Photos of test views, or all of them, are
+        decoded at each use instead (`View.loaded`).
 
     Warns
     -----
@@ -185,17 +155,24 @@ def load_scene(
     check_lenses(root, posed)
     test_names = select_test_names(posed, test_every, test_list) if eval else frozenset()
     mask_of = find_masks(root, posed, masks)
-    check_memory(root, posed.sizes.values(), resolution)
-
-    numbers = itertools.count(1)
-
-    def view(photo: RegisteredImage) -> View | str:
-        activity.report(f"reading photo {next(numbers)} of {len(posed.photos)}")
-        return _view(photo, posed.files[photo.name], resolution, background, mask_of.get(photo.name), alpha == "mask")
-
-    with ThreadPoolExecutor() as pool:  # decoding and resizing release the interpreter lock
-        results = list(pool.map(view, posed.photos))
-        names = [result.name for result in results if isinstance(result, View)]
+    decoded = [read_photos and photo.name not in test_names for photo in posed.photos]
+    sizes = [posed.sizes[photo.name] for photo, now in zip(posed.photos, decoded, strict=True) if now]
+    check_memory(root, sizes, resolution)
+    readers = [
+        PhotoReader(
+            photo,
+            posed.files[photo.name],
+            posed.sizes[photo.name],
+            resolution,
+            background,
+            mask_of.get(photo.name),
+            alpha == "mask",
+        )
+        for photo in posed.photos
+    ]
+    results = read_views(readers, decoded)
+    names = [result.name for result in results if isinstance(result, View)]
+    with ThreadPoolExecutor() as pool:
         digests = list(pool.map(lambda name: file_digest(*_files_of(name, posed, mask_of)), names))
     views = [view for view in results if isinstance(view, View)]
     unusable = {photo.name: view for photo, view in zip(posed.photos, results, strict=True) if isinstance(view, str)}
@@ -313,45 +290,3 @@ def _read_names(path: Path) -> list[str]:
             f"{path}: cannot be read as a list of names ({reason}); give a text file with one image name per line"
         ) from None
     return [line.strip() for line in lines if line.strip()]
-
-
-def _view(
-    photo: RegisteredImage,
-    file: Path,
-    resolution: int,
-    background: Color,
-    mask_file: Path | None,
-    alpha_hides: bool,
-) -> View | str:
-    """Return the view, or the reason why the photo cannot be used."""
-    try:
-        stored = read_image(file)
-    except InputError as error:
-        return str(error)
-    height, width = stored.shape[:2]
-    masks = [] if mask_file is None else [read_mask(mask_file)]
-    alpha = stored[:, :, 3] if stored.shape[2] == 4 else None
-    if alpha is not None and alpha_hides:
-        masks.append(alpha >= 128)
-        alpha, stored = None, stored[:, :, :3]
-    image, camera = photo.fit(_opaque(stored, background))
-    fitted = [photo.fit_mask(each, width, height) for each in masks]
-    mask = np.logical_and.reduce(fitted) if fitted else None
-    alpha = None if alpha is None else photo.fit_alpha(alpha)
-    view = View(photo.name, camera, image, mask, alpha)
-    view = view.resized(*target_size(camera.width, camera.height, resolution))
-    if view.mask is None:
-        return view
-    if not view.mask.any():
-        return f"{file}: its mask hides every pixel"
-    return replace(view, mask=None) if view.mask.all() else view
-
-
-def _opaque(image: ImageU8, background: Color) -> ImageU8:
-    """Return an image, (H, W, 3) or (H, W, 4) with straight alpha, composited over the background."""
-    if image.shape[2] == 3:
-        return image
-    alpha = image[:, :, 3:].astype(np.float32) / 255.0
-    under = 255.0 * np.clip(np.asarray(background, np.float32), 0.0, 1.0)
-    blended = alpha * image[:, :, :3].astype(np.float32) + (1.0 - alpha) * under
-    return np.rint(blended).astype(np.uint8)

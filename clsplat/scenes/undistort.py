@@ -74,7 +74,9 @@ class RegisteredImage:
 
     def fit_alpha(self, alpha: _images.ImageU8) -> _images.ImageU8:
         """Return the photo's opacity, (H, W) as stored, moved as `fit` moves its pixels; raises as `fit`."""
-        return self.fit(np.repeat(alpha[:, :, None], 3, axis=2))[0][:, :, 0]
+        if is_pinhole(self.lens):
+            return alpha
+        return self.fit(np.repeat(alpha[:, :, None], 3, axis=2))[0][:, :, 0].copy()
 
     def fit_mask(self, mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
         """Return a mask of the photo as a mask of the image that `fit` returns.

@@ -15,6 +15,7 @@ from ..cameras.camera import Camera
 from ..device.device import Device
 from ..device.memory import Pool, UploadQueue
 from ..device.opencl import Buffer, Event
+from ..files.host_memory import give_back_free_memory
 from ..files.images import ImageU8
 from ..rendering.build import KernelBuild
 from ..rendering.frame import ImageLayout
@@ -57,7 +58,8 @@ class Targets:
     """Target images of the training views, at the image size of the current stage.
 
     An image is uploaded at its first request, while the device works on the previous iteration. It stays until the size
-    changes. Images that do not fit the budget are uploaded each time.
+    changes. Images that do not fit the budget are uploaded each time. The memory of a CPU is that of the host: once a
+    photo of the full size is there, its view gives up its pixels.
 
     Parameters
     ----------
@@ -98,7 +100,7 @@ class Targets:
             return self._kept[index]
         view = self._reduced.get(index)
         if view is None:
-            view = self.views[index] if downscale == 1 else reduced(self.views[index], downscale)
+            view = self.views[index].loaded() if downscale == 1 else reduced(self.views[index], downscale)
         layout = ImageLayout(view.camera.width, view.camera.height)
         nbytes = self.channels * layout.plane
         stays = self._kept_bytes + nbytes <= self.budget
@@ -109,6 +111,9 @@ class Targets:
         if stays:
             self._kept[index] = target
             self._kept_bytes += nbytes
+            if downscale == 1 and self.device.info.type == "CPU":
+                self.views[index].release()
+                give_back_free_memory()
         elif downscale > 1:
             self._reduced[index] = view
         return target

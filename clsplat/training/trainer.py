@@ -20,6 +20,7 @@ from ..rendering.pipeline import Pipeline, isect_limit
 from ..rendering.renderer import Renderer
 from ..rendering.splat_buffers import CompactGradients, SplatBuffers
 from ..rendering.tuning import schedule_for
+from ..scenes.read_view import keep_photos
 from ..scenes.scene import Scene, View
 from ..splats.fields import Array
 from ..splats.optical_depth import finite_rows
@@ -78,6 +79,7 @@ class Trainer:
             raise InputError(f"{scene.path}: no training views: all are test views")
         check_sizes(((view.name, view.camera.width, view.camera.height) for view in scene.test), scene.path)
         check_rates(config)
+        keep_photos(scene.train)
         self.scene, self.config, self.progress = scene, config, progress
         self.device = device or open_device(config.device)
         # A resumed run keeps the stored schedule: another one sums in a different order and changes the result.

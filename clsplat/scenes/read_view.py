@@ -1,0 +1,192 @@
+"""Decoding of photos to views: composited, undistorted, masked and reduced, several photos at a time."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from .. import activity
+from ..cameras.camera import Camera
+from ..errors import InputError
+from ..files.host_memory import give_back_free_memory
+from ..files.images import ImageU8, is_whole, read_image, resize_area
+from ..files.masks import read_mask, resize_mask
+from ..splats.color import Color
+from .photo_size import target_size
+from .undistort import RegisteredImage, is_pinhole
+from .view import StoredView, View
+
+_OPAQUE = 128  # smallest alpha of a pixel that counts, if transparency is a mask
+_ROWS = 64  # rows that are composited at a time, which keeps the real numbers small
+# Bytes of a pixel at its stored size while a photo is decoded: Pillow's image and an array of it. Undistortion holds
+# the photo and its result, each as an array and as a bitmap of pycolmap.
+_DECODED_BYTES, _UNDISTORTED_BYTES = 8, 16
+_ALL_DECODED_BYTES = 512 << 20  # of all photos that are decoded at the same time
+
+
+@dataclass(frozen=True)
+class PhotoReader:
+    """Reads the view of one photo; parameters as those of `load_scene`.
+
+    Parameters
+    ----------
+    photo : the photo's name, pose and lens.
+    file : its file. size : its (width, height) as stored [px].
+    mask_file : file of its mask, if it has one.
+    alpha_hides : whether transparency is a mask.
+    """
+
+    photo: RegisteredImage
+    file: Path
+    size: tuple[int, int]
+    resolution: int
+    background: Color
+    mask_file: Path | None
+    alpha_hides: bool
+
+    @property
+    def decoding_bytes(self) -> int:
+        """Bytes of memory that decoding needs at most, beside the result."""
+        width, height = self.size
+        return width * height * (_DECODED_BYTES if is_pinhole(self.photo.lens) else _UNDISTORTED_BYTES)
+
+    @property
+    def is_hidden_perhaps(self) -> bool:
+        """Whether a mask may hide every pixel."""
+        return self.mask_file is not None or self.alpha_hides
+
+    def camera(self) -> Camera:
+        """Return the camera of the view without decoding the photo; raises as `RegisteredImage.fit`."""
+        camera = self.photo.fitted_camera(*self.size)
+        return camera.resized(*target_size(camera.width, camera.height, self.resolution))
+
+    def read(self) -> View | str:
+        """Return the view, or the reason why the photo cannot be used.
+
+        Raises
+        ------
+        InputError : a mask is damaged, or sizes do not fit.
+        """
+        camera = self.camera()
+        size = camera.width, camera.height
+        try:
+            stored = read_image(self.file, opaque_size=size if is_pinhole(self.photo.lens) else None)
+        except InputError as error:
+            return str(error)
+        width, height = self.size
+        masks = [] if self.mask_file is None else [read_mask(self.mask_file)]
+        alpha = None
+        if stored.shape[2] == 4:
+            alpha = stored[:, :, 3].copy()  # a slice would keep the whole photo in memory
+            if self.alpha_hides:
+                masks.append(alpha >= _OPAQUE)
+                alpha, stored = None, stored[:, :, :3]
+            else:
+                stored = _composited(stored, self.background)
+        image = self._fitted(np.ascontiguousarray(stored), size)
+        del stored
+        fitted = [self.photo.fit_mask(each, width, height) for each in masks]
+        mask = resize_mask(np.logical_and.reduce(fitted), *size) if fitted else None
+        view = View(
+            self.photo.name,
+            camera,
+            image,
+            mask,
+            None if alpha is None else resize_area(self.photo.fit_alpha(alpha), *size),
+        )
+        if mask is None:
+            return view
+        if not mask.any():
+            return f"{self.file}: its mask hides every pixel"
+        return replace(view, mask=None) if mask.all() else view
+
+    def _fitted(self, stored: ImageU8, size: tuple[int, int]) -> ImageU8:
+        """Return opaque pixels, as stored or reduced already, at the size of the view and without distortion."""
+        if is_pinhole(self.photo.lens):
+            return stored if stored.shape[1::-1] == size else resize_area(stored, *size)
+        image, camera = self.photo.fit(stored)
+        return image if (camera.width, camera.height) == size else resize_area(image, *size)
+
+    def view(self) -> View:
+        """Return the view; raise InputError if the photo cannot be used."""
+        found = self.read()
+        if isinstance(found, str):
+            raise InputError(found)
+        return found
+
+
+def read_views(readers: Sequence[PhotoReader], now: Sequence[bool]) -> list[View | str]:
+    """Return the view of each photo, or the reason why it cannot be used.
+
+    Parameters
+    ----------
+    now : whether to decode each photo now and keep it. Other photos become a `StoredView`. They are decoded once to
+        check them only if their files do not end as they should, or if their masks may hide everything.
+    """
+    numbers, n = itertools.count(1), sum(now)
+
+    def one(reader: PhotoReader, keep: bool) -> View | str:
+        if keep:
+            activity.report(f"reading photo {next(numbers)} of {n}")
+        view = None
+        if keep or reader.is_hidden_perhaps or not is_whole(reader.file):
+            found = reader.read()
+            if isinstance(found, str):
+                return found
+            view = found if keep else None
+        return StoredView(reader.photo.name, reader.camera(), reader.view, reader.decoding_bytes, view)
+
+    workers = decoding_threads([reader.decoding_bytes for reader in readers])
+    with ThreadPoolExecutor(workers) as pool:  # decoding and resizing release the interpreter lock
+        views = list(pool.map(one, readers, now))
+    give_back_free_memory()
+    return views
+
+
+def keep_photos(views: Iterable[View]) -> None:
+    """Decode the photos of views that are not in memory, and keep them.
+
+    Raises
+    ------
+    InputError : a photo cannot be used.
+    """
+    stored = [view for view in views if isinstance(view, StoredView) and not view.is_kept]
+    if not stored:
+        return
+    numbers = itertools.count(1)
+
+    def one(view: StoredView) -> None:
+        activity.report(f"reading photo {next(numbers)} of {len(stored)}")
+        view.keep()
+
+    with ThreadPoolExecutor(decoding_threads([view.decoding_bytes for view in stored])) as pool:
+        list(pool.map(one, stored))
+    give_back_free_memory()
+
+
+def decoding_threads(decoding_bytes: Sequence[int]) -> int:
+    """Return the number of photos to decode at the same time: one a processor, as far as memory allows.
+
+    Parameters
+    ----------
+    decoding_bytes : memory that each of the photos needs while it is decoded.
+    """
+    return max(1, min(os.cpu_count() or 1, _ALL_DECODED_BYTES // max(max(decoding_bytes, default=1), 1)))
+
+
+def _composited(image: ImageU8, background: Color) -> ImageU8:
+    """Return an image (H, W, 4) with straight alpha over the background, (H, W, 3)."""
+    composited = np.empty((*image.shape[:2], 3), np.uint8)
+    under = 255.0 * np.clip(np.asarray(background, np.float32), 0.0, 1.0)
+    for start in range(0, len(image), _ROWS):
+        rows = image[start : start + _ROWS]
+        alpha = rows[:, :, 3:].astype(np.float32) / 255.0
+        blended = alpha * rows[:, :, :3].astype(np.float32) + (1.0 - alpha) * under
+        composited[start : start + _ROWS] = np.rint(blended)
+    return composited

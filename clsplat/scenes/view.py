@@ -1,0 +1,111 @@
+"""Views: images with their cameras, in memory or decoded from their files when they are used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ..cameras.camera import Camera
+from ..files.images import ImageU8, resize_area
+from ..files.masks import Mask, resize_mask
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An image with its camera.
+
+    Parameters
+    ----------
+    name : name of the image file in the scene's model.
+    camera : pinhole camera with the image's size.
+    image : (H, W, 3) uint8; photos with transparency are composited over the scene's background.
+    mask : (H, W) bool, True for pixels that count; None if all pixels count.
+    alpha : (H, W) uint8, opacity of a photo with transparency; None for other photos.
+    """
+
+    name: str
+    camera: Camera
+    image: ImageU8
+    mask: Mask | None = None
+    alpha: ImageU8 | None = None
+
+    def loaded(self) -> View:
+        """Return the view with its pixels in memory."""
+        return self
+
+    def release(self) -> None:
+        """Give up the pixels in memory if they can be decoded again: no effect on a view without a file."""
+
+    def resized(self, width: int, height: int) -> View:
+        """Return the view at another size [px]."""
+        view = self.loaded()
+        if (width, height) == (view.camera.width, view.camera.height):
+            return view
+        return View(
+            view.name,
+            view.camera.resized(width, height),
+            resize_area(view.image, width, height),
+            None if view.mask is None else resize_mask(view.mask, width, height),
+            None if view.alpha is None else resize_area(view.alpha, width, height),
+        )
+
+
+class StoredView(View):
+    """A view of a photo that can be decoded again, so that its pixels need not stay in memory.
+
+    While the pixels are not kept, each use of `image`, `mask` or `alpha` decodes the photo. Whoever needs two of them,
+    or one of them twice, takes `loaded()`.
+
+    Parameters
+    ----------
+    name, camera : as for `View`.
+    read : decodes the photo. It raises InputError if the photo cannot be used.
+    decoding_bytes : memory that this needs beside the result.
+    kept : the view with its pixels in memory; None if they are not kept.
+    """
+
+    decoding_bytes: int
+    _read: Callable[[], View]
+    _kept: View | None
+
+    def __init__(
+        self, name: str, camera: Camera, read: Callable[[], View], decoding_bytes: int = 0, kept: View | None = None
+    ) -> None:
+        values = {"name": name, "camera": camera, "decoding_bytes": decoding_bytes, "_read": read, "_kept": kept}
+        for key, value in values.items():
+            object.__setattr__(self, key, value)  # the base class is frozen
+
+    def __repr__(self) -> str:
+        return f"StoredView({self.name!r}, {self.camera!r})"
+
+    @property
+    def image(self) -> ImageU8:
+        """Pixels of the photo, (H, W, 3) uint8."""
+        return self.loaded().image
+
+    @property
+    def mask(self) -> Mask | None:
+        """Pixels that count, as for `View`."""
+        return self.loaded().mask
+
+    @property
+    def alpha(self) -> ImageU8 | None:
+        """Opacity of the photo, as for `View`."""
+        return self.loaded().alpha
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the pixels are in memory."""
+        return self._kept is not None
+
+    def loaded(self) -> View:
+        """Return the view with its pixels in memory. Raise InputError if the photo cannot be used."""
+        return self._kept or self._read()
+
+    def keep(self) -> None:
+        """Decode the photo, and keep the pixels until `release`. Raise InputError if the photo cannot be used."""
+        object.__setattr__(self, "_kept", self.loaded())
+
+    def release(self) -> None:
+        """Give up the pixels in memory. The next use decodes the photo again."""
+        object.__setattr__(self, "_kept", None)
