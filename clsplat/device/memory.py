@@ -146,6 +146,13 @@ def to_host(device: Device, buffer: Buffer, array: NDArray[Any], offset: int = 0
     return array
 
 
+def send_to_host(device: Device, buffer: Buffer, array: NDArray[Any]) -> Event:
+    """Start to fill an array from a buffer, without waiting. The array is valid after the event's `wait`."""
+    event: Event = _pyopencl().enqueue_copy(device.queue, array, buffer, is_blocking=False)
+    device.observe("download", (array.nbytes,), event)
+    return event
+
+
 def _enqueue_upload(device: Device, queue: Any, buffer: Buffer, array: NDArray[Any], after: Event | None) -> Event:
     wait_for = None if after is None else [after]
     source = np.ascontiguousarray(array)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from ..cameras.camera import Camera
 from ..files.images import ImageU8, resize_area
@@ -67,6 +68,10 @@ class StoredView(View):
     decoding_bytes: int
     _read: Callable[[], View]
     _kept: View | None
+
+    def __new__(cls, *_: Any, **fields: Any) -> Any:
+        """Return a `View` for the fields of one, because `dataclasses.replace` calls the class with them."""
+        return View(**fields) if "image" in fields else super().__new__(cls)
 
     def __init__(
         self, name: str, camera: Camera, read: Callable[[], View], decoding_bytes: int = 0, kept: View | None = None

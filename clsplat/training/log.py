@@ -20,7 +20,7 @@ class Progress:
     Attributes
     ----------
     iteration, iterations : number of iterations done, and their total number.
-    loss, psnr : loss and PSNR [dB] of the last training image.
+    loss, psnr : running means of the loss and of the PSNR [dB] over the last training views (`RunningLoss`).
     seconds : training time, without evaluations.
     per_second : iterations per second.
     message : text to show instead of these values.

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device.memory import Pool, to_host
-from ..device.opencl import Buffer, KernelArgument
+from ..device.memory import Pool, send_to_host, to_host
+from ..device.opencl import Buffer, Event, KernelArgument
 from ..device.program import GROUP_ITEMS, lane_group
 from ..device.schedule import TILE
 from ..rendering.build import KernelBuild
@@ -60,6 +60,24 @@ class LossResult:
     count: int
     unmasked: float
     number: int
+
+
+@dataclass(frozen=True)
+class PendingValue:
+    """Values of the loss that are on the way to the host. `wait` returns them."""
+
+    result: LossResult
+    weight: float
+    parts: NDArray[np.floating]
+    event: Event
+
+    def wait(self) -> LossValue:
+        """Return the values after waiting for the device."""
+        self.event.wait()
+        result = self.result
+        l1, ssim, mse = (self.parts.astype(np.float64).sum(axis=1) / result.count).tolist()
+        total = (1 - self.weight) * l1 + self.weight * (1 - ssim)
+        return LossValue(total, l1 / result.unmasked, 1 - (1 - ssim) / result.unmasked, mse / result.unmasked)
 
 
 class ImageLoss:
@@ -131,12 +149,14 @@ class ImageLoss:
         ------
         RuntimeError : a later evaluation has overwritten the result.
         """
+        return self.value_later(result).wait()
+
+    def value_later(self, result: LossResult) -> PendingValue:
+        """Return the values of the latest evaluation without waiting for the device; raises as `value`."""
         if result.number != self._evaluations:
             raise RuntimeError(f"loss result {result.number} was overwritten by evaluation {self._evaluations}")
-        parts = to_host(self.device, result.partial, np.empty((3, result.n_parts), self.kernels.dtype))
-        l1, ssim, mse = (parts.astype(np.float64).sum(axis=1) / result.count).tolist()
-        total = (1 - self.weight) * l1 + self.weight * (1 - ssim)
-        return LossValue(total, l1 / result.unmasked, 1 - (1 - ssim) / result.unmasked, mse / result.unmasked)
+        parts = np.empty((3, result.n_parts), self.kernels.dtype)
+        return PendingValue(result, self.weight, parts, send_to_host(self.device, result.partial, parts))
 
     def _rows(self, strips: int, height: int) -> int:
         """Return the number of rows of a work-item: the largest that still leaves work for every compute unit."""

@@ -43,6 +43,7 @@ from .optim.optimizer import make_optimizer
 from .programs import kernel_build
 from .rate_limits import check_rates
 from .run_clock import RunClock
+from .running_mean import RunningLoss
 from .schedules import RunSchedule, sh_degree_at
 from .targets import Targets, target_budget, target_channels
 from .view_sampler import ViewSampler
@@ -108,6 +109,7 @@ class Trainer:
             config, self.schedule, self.splats, self.optimizer, self.pipeline.statistics, self.rng, scene.extent
         )
         self.clock = RunClock(config, self.schedule, self.views, self.pipeline, self.splats, self.iteration)
+        self.running = RunningLoss(len(scene.train))
         self.noise = ExplorationNoise(config, self.kernels, self.splats, scene.extent)
         self.renderer = Renderer(self.device)
         self.evaluations: dict[int, Evaluation] = {}
@@ -184,6 +186,7 @@ class Trainer:
                 it = self.iteration
                 if self.progress is not None:
                     self.clock.end(it)
+                    self.running.observe(self.loss, self.loss_result)
                 ends = it == config.iterations
                 measured = it in config.output.test_iterations and bool(self.scene.test)
                 if measured:
@@ -192,12 +195,12 @@ class Trainer:
                     value = self.loss.value(self.loss_result)
                     self.seconds += time.perf_counter() - start
                     self._log(value, log)
-                    self._show(value, since, started)
+                    self._show(since, started)
                     shown = time.perf_counter()
                 else:
                     self.seconds += time.perf_counter() - start
                     if self.progress is not None and time.perf_counter() - shown >= DISPLAY_INTERVAL:
-                        self._show(self.loss.value(self.loss_result), since, started)
+                        self._show(since, started)
                         shown = time.perf_counter()
                 if measured:
                     self._measure_test_views(log)
@@ -333,15 +336,16 @@ class Trainer:
             }
         )
 
-    def _show(self, value: LossValue, since: int, started: float) -> None:
+    def _show(self, since: int, started: float) -> None:
         if self.progress is not None:
+            loss, psnr = self.running.means()
             speed = (self.iteration - since) / (time.perf_counter() - started)
             self.progress(
                 Progress(
                     self.iteration,
                     self.config.iterations,
-                    value.total,
-                    value.psnr,
+                    loss,
+                    psnr,
                     self.splats.n,
                     self.seconds,
                     speed,
