@@ -10,8 +10,8 @@ WINDOW = 100  # views of a running mean, if a scene has as many
 class RunningLoss:
     """Exponential means of the loss and the PSNR over the last training views.
 
-    The weight of a value falls by the factor 1 - 2 / (N + 1) with each later one, so that the values are on average as
-    old as in the mean of the last N. The weights are divided by their sum, which corrects the first means (Kingma and
+    Each later value multiplies the weight of a value by 1 - 2 / (N + 1). The values are then on average as old as in
+    the mean of the last N. The weights are divided by their sum, which corrects the first means (Kingma and
     Ba 2015, Adam, section 3).
 
     Parameters

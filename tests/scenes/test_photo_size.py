@@ -9,18 +9,18 @@ from cli_runner import error_of
 from small_scene import HEIGHT, N_VIEWS, WIDTH, write_garden
 
 from clsplat.errors import InputError
-from clsplat.scenes import photo_size, scene
+from clsplat.scenes import photo_size, read_view
 from clsplat.scenes.photo_size import check_memory
 
 
-@pytest.mark.parametrize("command", ["train", "compare"])
+@pytest.mark.parametrize(("command", "kept"), [("train", N_VIEWS), ("compare", N_VIEWS - 2)])
 def test_too_large_photos_are_refused_before_they_are_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, kept: int
 ) -> None:
     garden = write_garden(tmp_path)
-    monkeypatch.setattr(scene, "read_image", lambda *arguments: pytest.fail("a photo was decoded"))
+    monkeypatch.setattr(read_view, "read_image", lambda *_, **options: pytest.fail("a photo was decoded"))
     message = error_of(command, garden, "-o", tmp_path / "out", "-r", 100_000)
-    assert f"garden: {N_VIEWS} photos of 100000x75000 px need at least " in message
+    assert f"garden: {kept} photos of 100000x75000 px need at least " in message
     assert message.endswith("MB are free: use smaller images (-r 2, 4, 8)")
 
 

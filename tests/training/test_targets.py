@@ -16,6 +16,7 @@ from clsplat.device.trace import recorded
 from clsplat.files.images import resize_area
 from clsplat.rendering.build import KernelBuild
 from clsplat.scenes.scene import View, load_scene
+from clsplat.scenes.view import StoredView
 from clsplat.training.config import TrainConfig
 from clsplat.training.targets import Target, Targets, target_budget, target_bytes
 from clsplat.training.trainer import Trainer
@@ -95,6 +96,29 @@ def test_what_is_promised_is_enough(device: Device, budget: int) -> None:
         image_of(targets, targets.get(i, 1))
     assert targets.nbytes <= target_bytes(targets.views, budget)
     assert target_budget(device) == device.info.global_mem_bytes // 4
+
+
+def test_photos_are_in_memory_once(devices: list[Device], capture_folder: Path) -> None:
+    """The memory of a CPU is that of the host: views give up their pixels to the device, and decode them again."""
+    scene, config = load_scene(capture_folder), TrainConfig(iterations=30, cap_max=300, sh_degree=1)
+    models = []
+    for _ in range(2):
+        trainer = Trainer(scene, config, device=devices[0])
+        views = [view for view in scene.train if isinstance(view, StoredView)]
+        assert len(views) == len(scene.train) <= 15
+        assert all(view.is_kept for view in views)
+        models.append(trainer.run().splats)
+        assert any(view.is_kept for view in views) == (devices[0].info.type != "CPU")
+    for name, array in models[0].arrays.items():
+        np.testing.assert_array_equal(array, models[1].arrays[name])
+
+
+def test_photos_that_do_not_fit_stay_with_their_views(devices: list[Device], capture_folder: Path) -> None:
+    scene = load_scene(capture_folder)
+    trainer = Trainer(scene, TrainConfig(iterations=30, cap_max=300, sh_degree=1), device=devices[0])
+    trainer.targets.budget = 0
+    trainer.run()
+    assert all(isinstance(view, StoredView) and view.is_kept for view in scene.train)
 
 
 def test_training_does_not_depend_on_what_stays(devices: list[Device], capture_folder: Path) -> None:
