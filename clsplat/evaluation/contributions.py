@@ -50,7 +50,7 @@ def contributions(
     """
     grey = splats.with_arrays(splats.to_numpy() | {"sh": np.zeros((len(splats), 1, 3), splats.sh.dtype)})
     for view in views:
-        view = view if longest is None else _at_most(view, longest)
+        view = view.loaded() if longest is None else _at_most(view, longest)
         renderer.render(grey, view.camera)
         weights = np.zeros((view.camera.height, view.camera.width, 3))
         weights[..., _ALL] = 1.0 if view.mask is None else view.mask

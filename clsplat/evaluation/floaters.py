@@ -128,5 +128,5 @@ def mean_psnr(
             ),
             MAX_PSNR,
         )
-        for view in views
+        for view in (stored.loaded() for stored in views)
     )
