@@ -126,7 +126,7 @@ def test_reading_and_compiling_are_reported(capture_folder: Path, monkeypatch: p
         scene = load_scene(capture_folder)
         build(device, ("measure/smoke.cl",))
         build(device, ("measure/smoke.cl",))
-    assert f"reading photo {len(scene.views)} of {len(scene.views)}" in said
+    assert f"reading photo {len(scene.train)} of {len(scene.train)}" in said  # test photos are decoded when used
     assert said.count("compiling kernels: smoke") == 1
     activity.report("nobody listens")
     assert "nobody listens" not in said
