@@ -20,6 +20,7 @@ _MAX_POSITION = 1e12  # training in float32 breaks between this and 1e15
 # from the first number on. At the second, steps of float32 are a twentieth of the scene.
 _FAR, _TOO_FAR = 1e4, 1e6
 _DIGITS = 9  # poses that agree to these decimals count as equal
+_LEAST_FOCAL = 1e-3  # of the side of an image: an angle of view of 179.9 degrees
 _SHRUNK, _GROWN = 0.21, 1.99  # COLMAP's undistortion scales a side by 0.2 to 2; such sides are at the limits
 
 
@@ -109,7 +110,7 @@ def check_lenses(root: Path, posed: PosedImages) -> None:
 
     Raises
     ------
-    InputError : as `RegisteredImage.fit`.
+    InputError : a focal length is below a thousandth of its side, or as `RegisteredImage.fit`.
     """
     scales: dict[tuple[object, ...], tuple[float, float]] = {}
     strange = []
@@ -118,6 +119,11 @@ def check_lenses(root: Path, posed: PosedImages) -> None:
         key = (lens.model, lens.width, lens.height, *lens.params, width, height)
         if key not in scales:  # undistortion takes milliseconds
             camera = photo.fitted_camera(width, height)
+            if camera.fx < _LEAST_FOCAL * camera.width or camera.fy < _LEAST_FOCAL * camera.height:
+                raise InputError(
+                    f"{root}: the focal lengths of {photo.name!r} are {camera.fx:g} and {camera.fy:g} px, too short "
+                    f"for an image of {camera.width}x{camera.height} px; correct its lens"
+                )
             scales[key] = camera.width / width, camera.height / height
         if min(scales[key]) <= _SHRUNK or min(scales[key]) >= _GROWN:
             strange.append((photo, width, height, scales[key]))

@@ -253,6 +253,8 @@ def in_frame(**values: Any) -> Callable[[Values], Values]:
         (in_frame(transform_matrix=None), "frame 1: transform_matrix must be"),
         (in_frame(file_path=f"./images/{NAMES[0]}"), "has a frame already"),
         (in_frame(cx=float("nan")), "frame 1: cx is 'nan'"),
+        (changed(fl_y=1e-300), "focal lengths of .* too short for an image of 40x30 px"),
+        (in_frame(fl_x=1e-5), f"focal lengths of '.*{NAMES[1]}' .* too short for an image"),
     ],
 )
 def test_errors_name_frame_and_key(folder: Path, change: Callable[[Values], Values], message: str) -> None:
