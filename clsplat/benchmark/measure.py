@@ -21,6 +21,7 @@ from ..rendering.renderer import Rendered, Renderer
 from ..scenes.scene import Scene, View
 from ..training.checkpoint import Checkpoint
 from ..training.config import TrainConfig
+from ..training.decisions import decide
 from ..training.folder import ModelFolder
 from ..training.log import Progress
 from ..training.run import train
@@ -46,6 +47,7 @@ def train_and_measure_in(
     KeyboardInterrupt : the run was stopped; its checkpoint is saved.
     Other exceptions are those of `train`. A run whose training fails raises nothing: its record has the message.
     """
+    config = decide(scene, config).config  # the record has the options of the run
     model_folder = ModelFolder(folder)
     resume = model_folder.checkpoint_path.is_file()
     if not resume:
