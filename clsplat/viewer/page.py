@@ -28,6 +28,7 @@ from .viewer import Viewer, ViewerImage
 
 QUALITY, MOVING_QUALITY = 95, 80  # JPEG quality of still and of moving frames
 _STATUS_INTERVAL = 0.5  # seconds between changes of the status line while moving
+_READING_TIME = 3.0  # seconds for which frames do not replace a message
 _TRAIN, _TEST = (110, 170, 255), (255, 160, 60)
 _NO_CAMERA = "–"
 _FOVS, _FOV_STEP = (5.0, 150.0), 0.5  # degrees
@@ -78,6 +79,7 @@ class Page:
         self._pictures = 0  # sent to this browser
         self._rates: list[float] = []
         self._status_time = 0.0
+        self._read_until = 0.0
         self._frusta: list[viser.CameraFrustumHandle] = []
         self._status = client.gui.add_markdown("")
         self._add_settings()
@@ -111,13 +113,15 @@ class Page:
             self._show_legend(frame)
             height, width = frame.picture.shape[:2]
             rate = "" if frame.still else f", {len(self._rates)} a second"
-            self.set_status(
-                frame.message
-                or f"{self.viewer.source.n_splats} splats, {width} × {height} px, {1e3 * frame.seconds:.0f} ms{rate}"
-            )
+            size = f"{self.viewer.source.n_splats} splats, {width} × {height} px"
+            if frame.message:
+                self.set_status(frame.message)
+            elif now >= self._read_until:
+                self._status.content = plain(f"{size}, {1e3 * frame.seconds:.0f} ms{rate}")
 
     def set_status(self, text: str) -> None:
-        """Set the status line at the top of the panel."""
+        """Set the status line at the top of the panel. Frames leave it for some seconds, so that it can be read."""
+        self._read_until = time.monotonic() + _READING_TIME
         self._status.content = plain(text)
 
     def model_changed(self) -> None:

@@ -31,6 +31,7 @@ from clsplat.errors import OutputError
 from clsplat.files.images import write_png
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
+from clsplat.viewer import page
 from clsplat.viewer.camera import Pose, camera_of
 from clsplat.viewer.crop import CropBox
 from clsplat.viewer.initial_view import SceneCameras, initial_view
@@ -280,12 +281,17 @@ def test_a_path_is_recorded_and_saved(running: Running, tmp_path: Path) -> None:
     assert [file.name for file in folder.iterdir()] == ["camera_path_001.json"]
 
 
-def test_reading_again_is_said_plainly(running: Running) -> None:
+def test_reading_again_is_said_plainly(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page, "_READING_TIME", 60.0)
     with Client(running.server.port) as client:
         client.look()
         client.still()
         client.set("Read the file again", True)
         client.until(plain("read again *1*"))
+        client.look((0, 0, -4))
+        client.still()
+        client.drain(0.5)
+        assert plain("read again *1*") in client.texts(), "frames leave a message for some seconds"
 
 
 def test_nothing_of_a_message_is_markup() -> None:
