@@ -21,7 +21,9 @@ WIDTH, HEIGHT, VIEWS = 64, 48, 26
 def capture(views: int = VIEWS) -> Scene:
     """Return a procedural capture with about 2400 points; every 8th view is a test view."""
     with tempfile.TemporaryDirectory() as folder:
-        return load_scene(write_capture(Path(folder) / "capture", WIDTH, HEIGHT, views))
+        scene = load_scene(write_capture(Path(folder) / "capture", WIDTH, HEIGHT, views))
+        # The photos are deleted with the folder, so they are decoded before.
+        return rebuilt(scene, [view.loaded() for view in scene.views], scene.points.xyz)
 
 
 def in_units(scene: Scene, scale: float) -> Scene:

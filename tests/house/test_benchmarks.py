@@ -275,11 +275,11 @@ def test_defaults(tmp_path: Path, capture_folder: Path) -> None:
     out = tmp_path / "defaults.jsonl"
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
     command = [sys.executable, str(BENCHMARKS / "defaults.py"), "--out", str(out), "--work", str(tmp_path / "work")]
-    options = ["--cases", f"{scene.name}:-1:60:4", "--systems", "default,default:strategy=mcmc"]
+    options = ["--cases", f"{scene.name}:-1:60:4", "--systems", "default:init=random,default:strategy=mcmc"]
     for _ in range(2):
         done = subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
     rows = [json.loads(line) for line in out.read_text().splitlines()]
-    assert [row["system"] for row in rows] == ["default", "default:strategy=mcmc"], "each once"
+    assert [row["system"] for row in rows] == ["default:init=random", "default:strategy=mcmc"], "each once"
     assert [len(row["decided"]) for row in rows] == [1, 0], "a named strategy is not decided"
     for row in rows:
         assert {"device", "driver", "schedule", "commit", "train_psnr", "seconds"} <= set(row)

@@ -24,8 +24,8 @@ def test_a_share_of_the_lines() -> None:
 
 @pytest.mark.slow
 def test_more_lines() -> None:
-    kitchen = scene_folder("kitchen")
-    outcomes = list(run_lines(range(LINES, LINES + 150), seed=0, workers=2, kitchen=kitchen))
+    data = scene_folder("kitchen").parent
+    outcomes = list(run_lines(range(LINES, LINES + 150), seed=0, workers=2, data=data))
     assert [(outcome.number, outcome.args, outcome.faults) for outcome in outcomes if outcome.faults] == []
 
 

@@ -133,6 +133,7 @@ def test_crashes_and_hangs_are_noticed(laboratory: Laboratory) -> None:
     assert "ended with -11" in outcome(laboratory, new="1000 * x")[1]
     laboratory.copy.pytest.timeout = 2.0
     assert outcome(laboratory, old="x / 2", new="x + 1")[1].endswith("no end within 2 s")
+    laboratory.copy.pytest.timeout = 60.0
     with pytest.raises(ValueError, match="selects no test"):
         outcome(laboratory, tests=("tests/small/test_small.py -k nothing",))
 
