@@ -24,11 +24,11 @@ from .initial_view import UP, SceneCameras, vertical_fov
 from .legend import legend
 from .path_panel import PathPanel
 from .settings import DEFAULT_SIZE, MAX_SIZE, MIN_SIZE
+from .status_line import StatusLine
 from .viewer import Viewer, ViewerImage
 
 QUALITY, MOVING_QUALITY = 95, 80  # JPEG quality of still and of moving frames
 _STATUS_INTERVAL = 0.5  # seconds between changes of the status line while moving
-_READING_TIME = 3.0  # seconds for which frames do not replace a message
 _TRAIN, _TEST = (110, 170, 255), (255, 160, 60)
 _NO_CAMERA = "–"
 _FOVS, _FOV_STEP = (5.0, 150.0), 0.5  # degrees
@@ -79,9 +79,9 @@ class Page:
         self._pictures = 0  # sent to this browser
         self._rates: list[float] = []
         self._status_time = 0.0
-        self._read_until = 0.0
         self._frusta: list[viser.CameraFrustumHandle] = []
-        self._status = client.gui.add_markdown("")
+        line = client.gui.add_markdown("")
+        self._status = StatusLine(lambda text: setattr(line, "content", text))
         self._add_settings()
         if known.by_label:
             self._add_cameras()
@@ -99,6 +99,7 @@ class Page:
         """Remove the client after the browser has gone."""
         self.viewer.leave(self.client.client_id)
         self._path.stop()
+        self._status.close()
 
     def send(self, frame: ViewerImage) -> None:
         """Show a frame; the serving thread calls this."""
@@ -115,17 +116,17 @@ class Page:
             rate = "" if frame.still else f", {len(self._rates)} a second"
             size = f"{self.viewer.source.n_splats} splats, {width} × {height} px"
             if frame.message:
-                self.set_status(frame.message)
-            elif now >= self._read_until:
-                self._status.content = plain(f"{size}, {1e3 * frame.seconds:.0f} ms{rate}")
+                self._status.say(frame.message)
+            else:
+                self._status.describe(f"{size}, {1e3 * frame.seconds:.0f} ms{rate}")
 
     def set_status(self, text: str) -> None:
-        """Set the status line at the top of the panel. Frames leave it for some seconds, so that it can be read."""
-        self._read_until = time.monotonic() + _READING_TIME
-        self._status.content = plain(text)
+        """Show a message in the status line at the top of the panel."""
+        self._status.say(text)
 
     def model_changed(self) -> None:
-        """Adapt the slider of splats to the new model."""
+        """Adapt the slider of splats to the new model. A message about the previous model need not stay."""
+        self._status.expire()
         n = self.viewer.source.n_splats
         everything = self._cap.value >= self._cap.max
         self._cap.max, self._cap.step, self._cap.visible = max(n, 1), _step(n), self.viewer.source.partial
@@ -296,11 +297,6 @@ class Page:
             action()
         except ClsplatError as error:
             self.set_status(str(error))
-
-
-def plain(text: str) -> str:
-    """Escape a text, so that the panel shows it without markup."""
-    return "".join("\\" + char if char in r"\`*_{}[]()<>#+-!|~$&" else char for char in text.replace("\n", " "))
 
 
 def _pose(camera: viser.CameraHandle) -> Pose:

@@ -15,7 +15,8 @@ import viser
 from .access import access_for
 from .initial_view import InitialView, SceneCameras, Vector
 from .listen import open_server
-from .page import Page, plain
+from .page import Page
+from .status_line import plain
 from .viewer import Viewer
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080

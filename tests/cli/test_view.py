@@ -147,7 +147,7 @@ def viewing(tmp_path: Path, model_folder: Path) -> Iterator[tuple[Command, Path]
 def test_view_shows_a_file_that_changes_and_ends_with_ctrl_c(viewing: tuple[Command, Path]) -> None:
     from viewer_client import Client
 
-    from clsplat.viewer.page import plain
+    from clsplat.viewer.status_line import plain
 
     command, ply = viewing
     whole, some = ply.read_bytes(), load_model(ply).splats.select(range(50))

@@ -31,15 +31,16 @@ from clsplat.errors import OutputError
 from clsplat.files.images import write_png
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
-from clsplat.viewer import page
+from clsplat.viewer import status_line
 from clsplat.viewer.camera import Pose, camera_of
 from clsplat.viewer.crop import CropBox
 from clsplat.viewer.initial_view import SceneCameras, initial_view
 from clsplat.viewer.legend import legend
-from clsplat.viewer.page import Page, plain
+from clsplat.viewer.page import Page
 from clsplat.viewer.server import Server
 from clsplat.viewer.settings import Settings
 from clsplat.viewer.source import ModelSource
+from clsplat.viewer.status_line import StatusLine, plain
 from clsplat.viewer.viewer import Viewer
 
 # The server silences these warnings of viser, but pytest has its own filters.
@@ -282,7 +283,7 @@ def test_a_path_is_recorded_and_saved(running: Running, tmp_path: Path) -> None:
 
 
 def test_reading_again_is_said_plainly(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page, "_READING_TIME", 60.0)
+    monkeypatch.setattr(status_line, "READING_TIME", 60.0)
     with Client(running.server.port) as client:
         client.look()
         client.still()
@@ -297,11 +298,12 @@ def test_reading_again_is_said_plainly(running: Running, monkeypatch: pytest.Mon
 def test_nothing_of_a_message_is_markup() -> None:
     text, escaped = "a*b_c <i>\n[x](y)", r"a\*b\_c \<i\> \[x\]\(y\)"
     assert plain(text) == escaped
+    shown: list[str] = []
     page, server = Page.__new__(Page), Server.__new__(Server)
-    page._status, server._panel = SimpleNamespace(content=""), (SimpleNamespace(content=""), None)
+    page._status, server._panel = StatusLine(shown.append), (SimpleNamespace(content=""), None)
     page.set_status(text)
     server.set_training_status(text)
-    assert page._status.content == server._panel[0].content == escaped
+    assert shown == [server._panel[0].content] == [escaped]
 
 
 @pytest.mark.slow
