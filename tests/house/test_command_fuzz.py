@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import command_fuzz
 import pytest
 from clsplat_cli.main import COMMANDS
 from command_fuzz import Outcome, changed_files, judge, run_lines, states_of
@@ -59,3 +60,10 @@ def test_a_changed_input_is_a_fault(tmp_path: Path) -> None:
     before = states_of(tmp_path)
     photo.write_bytes(b"other")
     assert changed_files(before, states_of(tmp_path)) == ["scene/a.png"]
+
+
+def test_a_failure_of_the_harness_is_a_fault(tmp_path: Path) -> None:
+    """The template does not exist."""
+    outcome = command_fuzz._run_or_report(3, 0, tmp_path / "nothing", tmp_path)
+    assert outcome.number == 3
+    assert "the harness failed" in outcome.faults[0] and "FileNotFoundError" in outcome.faults[0]

@@ -23,6 +23,7 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -107,7 +108,15 @@ def work(first: int, stop: int, step: int, seed: int, data: str) -> None:
         template.mkdir()
         _in_child(lambda: write_inputs(template, Path(data) if data else None))
         for number in range(first, stop, step):
-            print(json.dumps(asdict(run_line(number, seed, template, Path(parent)))), flush=True)
+            print(json.dumps(asdict(_run_or_report(number, seed, template, Path(parent)))), flush=True)
+
+
+def _run_or_report(number: int, seed: int, template: Path, parent: Path) -> Outcome:
+    """Run a line. A failure of this file is a fault of the line: a campaign of an hour must not end without a row."""
+    try:
+        return run_line(number, seed, template, parent)
+    except Exception:
+        return Outcome(number, "", [], 0, 0.0, 0, False, [f"the harness failed: {traceback.format_exc()[-_KEPT:]}"])
 
 
 def run_line(number: int, seed: int, template: Path, parent: Path) -> Outcome:
@@ -235,8 +244,6 @@ def _become(line: Line, root: Path, output: int) -> None:
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
     except BaseException:
-        import traceback
-
         traceback.print_exc()
         code = 99
     with contextlib.suppress(BaseException):
