@@ -66,4 +66,5 @@ def test_a_failure_of_the_harness_is_a_fault(tmp_path: Path) -> None:
     """The template does not exist."""
     outcome = command_fuzz._run_or_report(3, 0, tmp_path / "nothing", tmp_path)
     assert outcome.number == 3
-    assert "the harness failed" in outcome.faults[0] and "FileNotFoundError" in outcome.faults[0]
+    assert "the harness failed" in outcome.faults[0]
+    assert "FileNotFoundError" in outcome.faults[0]
