@@ -16,6 +16,7 @@ from ..evaluation.floaters import is_near
 from ..rendering.build import ALPHA_MIN
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
+from ..splats.fields import scale_of
 from ..splats.shapes import shape_named
 from ..splats.splats import Splats
 
@@ -124,7 +125,7 @@ def is_isolated(splats: Splats) -> Mask:
     log = np.log(np.maximum(distance, np.finfo(np.float64).tiny))
     middle = float(np.median(log))
     limit = middle + _DEVIATIONS * _NORMAL_MAD * float(np.median(np.abs(log - middle)))
-    isolated: Mask = (log > limit) & (distance > _REACH * np.exp(splats.log_scale.astype(np.float64).max(axis=1)))
+    isolated: Mask = (log > limit) & (distance > _REACH * scale_of(splats.log_scale).max(axis=1))
     return isolated
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .checks import LIMIT_SLACK
-from .fields import Array, DoubleArray
+from .fields import Array, DoubleArray, scale_of
 from .optical_depth import optical_depth, raw_of_optical_depth
 from .quaternions import rotations
 from .shapes import SKEW_MAX, SLANT_MAX, Shape, shape_named
@@ -103,7 +103,7 @@ def _bounded(vectors: DoubleArray, limit: float) -> DoubleArray:
 
 def to_world(model: ArraysByField, vectors: DoubleArray) -> DoubleArray:
     """Return the vectors R S v (N, 3): from the unit frame of each splat to the world."""
-    return np.einsum("nij,nj->ni", rotations(model["quat"]), np.exp(model["log_scale"]) * vectors)
+    return np.einsum("nij,nj->ni", rotations(model["quat"]), scale_of(model["log_scale"]) * vectors)
 
 
 def restretched(model: ArraysByField, along: DoubleArray, factor: DoubleArray) -> tuple[ArraysByField, DoubleArray]:

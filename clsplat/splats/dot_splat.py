@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
+from .fields import scale_of
 from .harmonics import SH_C0
 from .shapes import GAUSSIAN
 from .stored import StoredSplats, check_gaussian, gaussians
@@ -67,7 +68,7 @@ def records(splats: StoredSplats) -> NDArray[np.void]:
     """Return (N,) values of RECORD, the most important splats first."""
     wide = {name: values.astype(np.float64) for name, values in splats.arrays.items()}
     opacity: NDArray[np.float64] = GAUSSIAN.opacity(wide["opacity_logit"]).astype(np.float64)
-    scale = np.exp(np.clip(wide["log_scale"], -80.0, 80.0))
+    scale = scale_of(wide["log_scale"])
     unit = np.asarray(wide["quat"] / np.linalg.norm(wide["quat"], axis=1, keepdims=True), np.float64)
     table = np.empty(len(opacity), RECORD)
     table["position"], table["scale"] = wide["mean"], scale

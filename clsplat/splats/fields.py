@@ -17,6 +17,7 @@ Array = NDArray[np.floating]
 DoubleArray = NDArray[np.float64]
 
 MAX_SH_DEGREE = 3
+MAX_LOG_SCALE = 80.0
 
 
 class Group(Enum):
@@ -148,3 +149,8 @@ def public_shape(field: Field, n: int) -> tuple[int, ...]:
     if field.group is Group.SH:
         return (n, field.width // 3, 3)
     return (n,) if field.width == 1 else (n, field.width)
+
+
+def scale_of(log_scale: Array) -> DoubleArray:
+    """Return standard deviations. Logarithms beyond ±80 are cut, because single precision has no larger numbers."""
+    return np.exp(np.clip(log_scale.astype(np.float64), -MAX_LOG_SCALE, MAX_LOG_SCALE))

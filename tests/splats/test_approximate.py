@@ -187,3 +187,17 @@ def test_splat_file_takes_gaussians_only(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="hold Gaussians, not skew-normal"):
         skewed().save(tmp_path / "out.splat")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("shape", ["skew-normal", "skew-normal-direct"])
+def test_sizes_that_no_number_can_hold_spoil_nothing(tmp_path: Path, shape: str) -> None:
+    """A damaged file may have any logarithm of a scale."""
+    splats = skewed(shape=shape)
+    arrays = splats.to_numpy()
+    arrays["log_scale"][1], arrays["log_scale"][2, 0] = 1e30, -1e30
+    damaged = nearest_gaussians(Splats(shape, arrays))
+    damaged.save(tmp_path / "made.splat")
+    others = np.delete(np.arange(len(splats)), [1, 2])
+    for name, values in nearest_gaussians(splats).select(others).to_numpy().items():
+        np.testing.assert_array_equal(damaged.select(others).to_numpy()[name], values, err_msg=name)
