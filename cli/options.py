@@ -21,7 +21,7 @@ from .command import SectionedCommand, SectionOption
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-SETS = ("test", "train", "all")
+SETS = ("test", "train", "validation", "all")
 
 
 class AnyPath(click.Path):

@@ -38,7 +38,7 @@ class EvaluationOptions:
 
     Parameters
     ----------
-    view_set : views to measure: "test", "train" or "all".
+    view_set : views to measure: "test", "train", "validation" or "all".
     protocol : how PSNR and SSIM are computed. If `protocol.corrected`, LPIPS, FLIP and the report's images use
         colour-corrected renders too.
     lpips, flip : whether to measure these too. Each requires the extra of its name.
@@ -162,11 +162,21 @@ class Evaluator:
         options = self.options
         background = model.background if options.background is None else options.background
         scene = model.load_scene(options.scene, background=background)
-        views = {"test": scene.test, "train": scene.train, "all": scene.views}[options.view_set]
+        views = {
+            "test": scene.test,
+            "train": scene.train,
+            "validation": scene.validation,
+            "all": scene.views,
+        }[options.view_set]
         if not views and options.view_set == "test" and scene.test_names:
             raise InputError(
                 f"{model.path}: none of its {len(scene.test_names)} test photos can be used: "
                 "copy them to the scene, or measure training views with --set train"
+            )
+        if not views and options.view_set == "validation":
+            raise InputError(
+                f"{model.path}: has no validation views: measure others with --set, or train with "
+                "clsplat train --validate"
             )
         if not views:
             raise InputError(

@@ -77,6 +77,11 @@ class LoadedModel:
         names = self.scene_record.get("test_names")
         return None if names is None else frozenset(names)
 
+    @property
+    def validation_names(self) -> frozenset[str]:
+        """Names of the views that the run held out to choose between its models."""
+        return frozenset(self.scene_record.get("validation_names", ()))
+
     def read_cameras(self) -> list[NamedCamera]:
         """Return the cameras in the folder's cameras.json; an empty list if there is no such file."""
         if self.folder is None or not self.folder.cameras_path.is_file():
@@ -86,7 +91,7 @@ class LoadedModel:
     def load_scene(
         self, choice: SceneChoice | None = None, *, check: bool = True, background: Color | None = None
     ) -> Scene:
-        """Return the scene that the model was trained on, with the same test views. Photos are decoded at each use.
+        """Return the scene that the model was trained on, with the same views held out. Photos are decoded at each use.
 
         Parameters
         ----------
@@ -135,7 +140,7 @@ class LoadedModel:
                 f"{path}: lacks view {missing[0]!r}, a test view of {self.path}: "
                 "give the scene it was trained on with -s"
             )
-        return replace(scene, test_names=test_names)
+        return replace(scene, test_names=test_names, validation_names=self.validation_names)
 
 
 def load_model(path: str | os.PathLike[str], iteration: int | None = None) -> LoadedModel:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from ..cameras.cameras_json import NamedCamera, named_cameras, read_cameras, write_cameras
 from ..cameras.interpolate import resized_by_height
@@ -19,7 +20,7 @@ from ..rendering.views import RenderOutput, ViewProgress, files_of, render_to_fi
 from ..splats.color import Color
 from .model import LoadedModel, SceneChoice, in_both_forms, model_at
 
-VIEW_SETS = ("test", "train", "all")
+VIEW_SETS = ("test", "train", "validation", "all")
 
 
 @dataclass(frozen=True)
@@ -122,37 +123,51 @@ def choose_views(model: LoadedModel, choice: ViewChoice) -> tuple[list[NamedCame
     ------
     InputError : there are no such views, or the scene or a file cannot be read.
     """
-    test_names, source, view_set = model.test_names, model.path, choice.view_set
+    held_out, source, view_set = _HeldOut(model.test_names, model.validation_names), model.path, choice.view_set
     if choice.cameras is not None:
         views, source, view_set = read_cameras(choice.cameras), Path(choice.cameras), view_set or "all"
     elif choice.scene:
         scene = model.load_scene(choice.scene, check=False)
         views = named_cameras(scene.names, scene.cameras)
-        test_names, source = scene.test_names, scene.path
+        held_out, source = _HeldOut(scene.test_names, scene.validation_names), scene.path
     else:
         views = model.read_cameras()
     if choice.path is not None:
         request = choice.path if choice.size is None else replace(choice.path, size=choice.size)
         path = make_path(request, model.splats, views, source)
         return name_frames(path, request.kind), path
-    views = _select(views, test_names, view_set, source)
+    views = _select(views, held_out, view_set, source)
     if choice.size is not None:
         views = [NamedCamera(view.name, resized_by_height(view.camera, *choice.size)) for view in views]
     return views, None
 
 
-def _select(
-    views: Sequence[NamedCamera], test_names: frozenset[str] | None, view_set: str | None, source: Path
-) -> list[NamedCamera]:
-    """Return the test, train or all views; by default the test views, or all if there are no test views."""
+class _HeldOut(NamedTuple):
+    """Names of the views that a run did not train on. test : None if they are not known."""
+
+    test: frozenset[str] | None
+    validation: frozenset[str]
+
+
+def _select(views: Sequence[NamedCamera], held_out: _HeldOut, view_set: str | None, source: Path) -> list[NamedCamera]:
+    """Return the views of a set; by default the test views, or all if there are no test views."""
     if not views:
         raise InputError(
             f"{source}: no cameras to render: give --cameras cameras.json, a scene with -s, or --path orbit"
         )
-    names = in_both_forms(test_names or frozenset())
-    test = [view for view in views if view.name in names]
+    test_names, validation_names = in_both_forms(held_out.test or frozenset()), in_both_forms(held_out.validation)
+    test = [view for view in views if view.name in test_names]
     if view_set in (None, "all"):
         return test if test and view_set is None else list(views)
+    if view_set == "validation":
+        validation = [view for view in views if view.name in validation_names]
+        if not validation:
+            raise InputError(
+                f"{source}: no validation views are known: choose others with --set, or train with "
+                "clsplat train --validate"
+            )
+        return validation
     if not test:
         raise InputError(f"{source}: no test views are known: use --set all, or train with clsplat train --eval")
-    return test if view_set == "test" else [view for view in views if view.name not in names]
+    others = test_names | validation_names
+    return test if view_set == "test" else [view for view in views if view.name not in others]

@@ -53,6 +53,7 @@ class Scene:
     left_out : reason why a photo with a pose is not among the views, by name.
     photo_digests : digest of each photo's file and its mask's file (`file_digest`) by name; empty without files.
     photo_files : files of the photos and their masks.
+    validation_names : names of the views held out to choose between models; they are no training views.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Scene:
     left_out: Mapping[str, str] = field(default_factory=dict)
     photo_digests: Mapping[str, str] = field(default_factory=dict)
     photo_files: Sequence[Path] = ()
+    validation_names: frozenset[str] = frozenset()
 
     @property
     def cameras(self) -> list[Camera]:
@@ -84,12 +86,18 @@ class Scene:
     @cached_property
     def train(self) -> list[View]:
         """Training views."""
-        return [view for view in self.views if view.name not in self.test_names]
+        held_out = self.test_names | self.validation_names
+        return [view for view in self.views if view.name not in held_out]
 
     @cached_property
     def test(self) -> list[View]:
         """Test views, held out for evaluation."""
         return [view for view in self.views if view.name in self.test_names]
+
+    @cached_property
+    def validation(self) -> list[View]:
+        """Validation views, held out to choose between models."""
+        return [view for view in self.views if view.name in self.validation_names]
 
     @cached_property
     def extent(self) -> float:

@@ -22,6 +22,22 @@ def hold_out(scene: Scene) -> Scene:
     InputError : the scene has fewer than three training views.
     """
     views = scene.train
+    return replace(scene, views=views, test_names=_every_few(scene), validation_names=frozenset())
+
+
+def with_validation(scene: Scene) -> Scene:
+    """Return the scene with the views as validation views that `hold_out` chooses. Its test views stay.
+
+    Raises
+    ------
+    InputError : the scene has fewer than three training views.
+    """
+    return replace(scene, validation_names=_every_few(scene))
+
+
+def _every_few(scene: Scene) -> frozenset[str]:
+    """Return the names of the training views that are held out."""
+    views = scene.train
     if len(views) < MIN_TRAIN_VIEWS:
         raise InputError(
             f"{scene.path}: has {len(views)} training views; at least {MIN_TRAIN_VIEWS} are needed to hold one out",
@@ -29,5 +45,4 @@ def hold_out(scene: Scene) -> Scene:
             Remedy("choose the number of splats yourself", "--cap-max"),
         )
     stride = max(2, min(STRIDE, len(views) // MIN_TRAIN_VIEWS))
-    held_out = views[stride // 2 :: stride]
-    return replace(scene, views=views, test_names=frozenset(view.name for view in held_out))
+    return frozenset(view.name for view in views[stride // 2 :: stride])

@@ -23,6 +23,7 @@ from .options.groups import (
     ScheduleConfig,
     SghmcConfig,
     StartConfig,
+    ValidationConfig,
 )
 from .options.option import Option, OptionGroup, check_options, option, option_table
 
@@ -109,6 +110,7 @@ class TrainConfig:
     sghmc: SghmcConfig
     phases: AlternationConfig
     appearance: AppearanceConfig
+    validation: ValidationConfig
     output: OutputConfig
     named_options: Mapping[str, Any] = field(init=False, repr=False, compare=False)
 
@@ -259,6 +261,7 @@ GROUPS: dict[str, type[OptionGroup]] = {
     "sghmc": SghmcConfig,
     "phases": AlternationConfig,
     "appearance": AppearanceConfig,
+    "validation": ValidationConfig,
     "output": OutputConfig,
 }
 RUN_OPTIONS = _run_options()

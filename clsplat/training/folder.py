@@ -28,6 +28,7 @@ def scene_record(scene: Scene, folder: Path) -> dict[str, Any]:
     return {
         "path": path.relative_to(home).as_posix() if path.is_relative_to(home) else str(path),
         "test_names": sorted(scene.test_names),
+        **({"validation_names": sorted(scene.validation_names)} if scene.validation_names else {}),
         **scene.reading,
         **({"photos": dict(scene.photo_digests)} if scene.photo_digests else {}),
     }
@@ -115,10 +116,7 @@ class ModelFolder:
         ):
             path.unlink(missing_ok=True)
         for iteration in self.iterations():
-            ply = self.ply_path(iteration)
-            ply.unlink()
-            if not any(ply.parent.iterdir()):
-                ply.parent.rmdir()
+            self.remove_ply(iteration)
 
     def write_run(self, config: dict[str, Any], scene: Scene) -> None:
         """Write the run's options and the record of its scene to config.json."""
@@ -139,6 +137,13 @@ class ModelFolder:
     def write_exposures(self, by_photo: dict[str, list[list[float]]]) -> None:
         """Write 3DGS's exposure.json."""
         write_json(self.exposures_path, by_photo)
+
+    def remove_ply(self, iteration: int) -> None:
+        """Remove the point cloud of an iteration, if there is one, and its folder if it is empty then."""
+        ply = self.ply_path(iteration)
+        ply.unlink(missing_ok=True)
+        if ply.parent.is_dir() and not any(ply.parent.iterdir()):
+            ply.parent.rmdir()
 
     def save(self, splats: Splats, iteration: int) -> Path:
         """Write the point cloud of an iteration and return its file."""

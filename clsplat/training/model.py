@@ -23,6 +23,7 @@ class Model:
     evaluations : metrics of the test views by iteration, for the config's `test_iterations`.
     evaluation_seconds : training time before each evaluation.
     path : the model folder, or None.
+    best_iteration : iteration that was best on the validation views; 0 without the option `validate`.
     """
 
     splats: Splats
@@ -34,6 +35,7 @@ class Model:
     evaluations: dict[int, Evaluation] = field(default_factory=dict)
     evaluation_seconds: dict[int, float] = field(default_factory=dict)
     path: Path | None = None
+    best_iteration: int = 0
 
     @property
     def finished(self) -> bool:

@@ -73,8 +73,8 @@ def train(
         if folder is not None:
             if checkpoint is None:
                 folder.clear()
-            folder.write_run(config.to_json(), scene)
-            views = [*scene.test, *scene.train]
+            folder.write_run(config.to_json(), trainer.scene)
+            views = [*scene.test, *trainer.scene.validation, *trainer.scene.train]
             folder.write_cameras(named_cameras([view.name for view in views], [view.camera for view in views]))
         return trainer.run(folder, visit)
 

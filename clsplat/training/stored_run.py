@@ -88,6 +88,10 @@ def _is_text(value: object) -> bool:
     return True
 
 
+def _is_list_of_names(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(name, str) for name in value)
+
+
 def _is_count(value: object) -> bool:
     return type(value) is int and 1 <= value <= _LARGEST
 
@@ -109,10 +113,8 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "test_every": (f"a whole number from 1 to {_LARGEST}", _is_count),
     "eval": ("true or false", lambda value: isinstance(value, bool)),
     "photos": ("the digest of each photo by name", lambda value: isinstance(value, dict)),
-    "test_names": (
-        "a list of names",
-        lambda value: isinstance(value, list) and all(isinstance(name, str) for name in value),
-    ),
+    "test_names": ("a list of names", _is_list_of_names),
+    "validation_names": ("a list of names", _is_list_of_names),
 }
 
 

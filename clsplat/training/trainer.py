@@ -22,6 +22,7 @@ from ..rendering.splat_buffers import CompactGradients, SplatBuffers
 from ..rendering.tuning import schedule_for
 from ..scenes.read_view import keep_photos
 from ..scenes.scene import Scene, View
+from ..scenes.split import with_validation
 from ..splats.fields import Array
 from ..splats.optical_depth import finite_rows
 from ..splats.splats import Splats
@@ -46,6 +47,7 @@ from .run_clock import RunClock
 from .running_mean import RunningLoss
 from .schedules import RunSchedule, sh_degree_at
 from .targets import Targets, target_budget, target_channels
+from .validation import RunValidation
 from .view_sampler import ViewSampler
 
 Visit = Callable[["Trainer", threading.Event], None]
@@ -59,6 +61,7 @@ class Trainer:
 
     Parameters
     ----------
+    scene : with the option `validate`, some of its training views become validation views.
     checkpoint : state to continue from.
     progress : called with messages and with the progress of the run.
 
@@ -76,9 +79,14 @@ class Trainer:
         progress: Callable[[Progress], None] | None = None,
         device: Device | None = None,
     ) -> None:
+        if config.validation.validate and not scene.validation_names:
+            scene = with_validation(scene)
         if not scene.train:
             raise InputError(f"{scene.path}: no training views: all are test views")
-        check_sizes(((view.name, view.camera.width, view.camera.height) for view in scene.test), scene.path)
+        check_sizes(
+            ((view.name, view.camera.width, view.camera.height) for view in (*scene.test, *scene.validation)),
+            scene.path,
+        )
         check_rates(config)
         keep_photos(scene.train)
         self.scene, self.config, self.progress = scene, config, progress
@@ -112,6 +120,9 @@ class Trainer:
         self.running = RunningLoss(len(scene.train))
         self.noise = ExplorationNoise(config, self.kernels, self.splats, scene.extent)
         self.renderer = Renderer(self.device)
+        self.validation = RunValidation(
+            self.renderer, scene.validation, config.background, config.iterations, config.output.save_iterations
+        )
         self.evaluations: dict[int, Evaluation] = {}
         self.evaluation_seconds: dict[int, float] = {}
 
@@ -173,6 +184,8 @@ class Trainer:
         config = self.config
         log = RunLog(None if folder is None else folder.log_path, self.iteration)
         times = CheckpointTimes(config.output)
+        if folder is not None and self.iteration:
+            self.validation.resume(folder, self.iteration)
         started, since = time.perf_counter(), self.iteration
         shown = started
         with stoppable(folder is not None) as stop:
@@ -189,7 +202,8 @@ class Trainer:
                     self.running.observe(self.loss, self.loss_result)
                 ends = it == config.iterations
                 measured = it in config.output.test_iterations and bool(self.scene.test)
-                if measured:
+                validated = self.validation.is_due(it)
+                if measured or validated:
                     self.device.queue.finish()  # pending commands count as training time
                 if it % LOG_INTERVAL == 0 or ends:
                     value = self.loss.value(self.loss_result)
@@ -204,6 +218,8 @@ class Trainer:
                         shown = time.perf_counter()
                 if measured:
                     self._measure_test_views(log)
+                if validated:
+                    self.validation.measure(self.snapshot(), it, self.seconds, log, folder)
                 if folder is not None and (it in config.output.save_iterations or ends):
                     self._save_model(folder)
                 if folder is not None and (ends or times.is_due(it)):
@@ -216,6 +232,8 @@ class Trainer:
             # The file is written inside the block, where a second SIGTERM or SIGHUP does not interrupt it.
             if folder is not None and self.iteration < config.iterations:
                 self._save_checkpoint(folder, log)
+        if self.scene.validation and self.iteration == config.iterations:
+            self._send(self.validation.summary(folder))
         return Model(
             self.snapshot(),
             config,
@@ -226,6 +244,7 @@ class Trainer:
             self.evaluations,
             self.evaluation_seconds,
             None if folder is None else folder.path,
+            self.validation.best.iteration,
         )
 
     def _measure_test_views(self, log: RunLog) -> None:

@@ -195,11 +195,13 @@ def test_mask_follows_the_photo(model: str, params: list[float], reduced: int) -
     assert 0.2 < fitted.mean() < 0.6
 
 
-def test_mask_is_false_outside_the_photo() -> None:
+@pytest.mark.parametrize("right", [1, -1])
+@pytest.mark.parametrize("down", [1, -1])
+def test_mask_is_false_outside_the_photo(right: int, down: int) -> None:
     import pycolmap
 
-    # This lens leaves a thin strip of the fitted image blank.
-    params = [300, 310, 190, 155, -0.2, 0.05, 0.002, -0.003]
+    # This lens and its mirror images leave a thin strip of the fitted image blank, each on another side.
+    params = [300, 310, 200 - 10 * right, 150 + 5 * down, -0.2, 0.05, 0.002 * down, -0.003 * right]
     photo = RegisteredImage("sliver", np.eye(4), pycolmap.Camera(model="OPENCV", width=400, height=300, params=params))
     white, _ = photo.fit(np.full((300, 400, 3), 255, np.uint8))
     fitted = photo.fit_mask(np.ones((300, 400), bool), 400, 300)

@@ -90,6 +90,7 @@ DEFAULTS = {
     "exposure": False,
     "exposure_rate": 0.2,
     "exposure_pull": 1e-2,
+    "validate": False,
 }
 DEFAULTS_OF_STRATEGY = {
     Adc: {

@@ -48,6 +48,19 @@ class ScheduleConfig(OptionGroup):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ValidationConfig(OptionGroup):
+    """Views that are neither trained nor tested."""
+
+    title: ClassVar[str] = "Validation"
+
+    validate: bool = option(
+        False,
+        help="Hold out every 7th training photo, measure these photos along the run, and keep the model that was best "
+        "on them besides the last one. It is never chosen on test photos.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class LossConfig(OptionGroup):
     """The loss, except for regularisers whose defaults depend on the strategy (`DensityConfig`)."""
 
