@@ -78,11 +78,14 @@ class Validation:
         return statistics.fmean(self.per_view(splats))
 
     def per_view(self, splats: Splats) -> list[float]:
-        """Return the PSNR of each view [dB]; 0 for a model without splats."""
+        """Return the PSNR of the pixels that count, of each view [dB]; 0 for a model without splats."""
         if not len(splats):
             return [0.0] * len(self.views)
         return [
-            min(psnr(self.renderer.render(splats, view.camera, self.background).color, view.image), MAX_PSNR)
+            min(
+                psnr(self.renderer.render(splats, view.camera, self.background).color, view.image, mask=view.mask),
+                MAX_PSNR,
+            )
             for view in self.views
         ]
 

@@ -18,6 +18,7 @@ from ..scenes.scene import View
 from ..splats.fields import DoubleArray
 from ..splats.harmonics import SH_C0
 from ..splats.splats import Splats
+from .decoded import decoded
 
 _ALL, _CLEAR = 0, 1  # channels
 
@@ -47,10 +48,18 @@ def contributions(
     ----------
     views : the training views. Pixels that a mask hides do not count.
     longest : larger images are reduced to this longest side [px]; None keeps the size.
+
+    Warns
+    -----
+    UserWarning : a photo cannot be decoded; its view is left out.
+
+    Raises
+    ------
+    InputError : no photo can be decoded.
     """
     grey = splats.with_arrays(splats.to_numpy() | {"sh": np.zeros((len(splats), 1, 3), splats.sh.dtype)})
-    for view in views:
-        view = view.loaded() if longest is None else _at_most(view, longest)
+    for whole in decoded(views, "looked at"):
+        view = whole if longest is None else _at_most(whole, longest)
         renderer.render(grey, view.camera)
         weights = np.zeros((view.camera.height, view.camera.width, 3))
         weights[..., _ALL] = 1.0 if view.mask is None else view.mask

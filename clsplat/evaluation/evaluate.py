@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 import statistics
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..errors import InputError
 from ..rendering.renderer import Rendered, Renderer
 from ..scenes.scene import View
 from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
+from .decoded import decoded
 from .metrics import DEFAULT_PROTOCOL, MetricProtocol
 
 MAX_PSNR = 100.0  # replaces the infinite PSNR of equal images, which JSON cannot hold
@@ -64,13 +63,7 @@ def evaluate(
     per_view: dict[str, dict[str, float]] = {}
     times = []
     renderer.render(splats, views[0].camera, background)  # builds the kernels and uploads the splats
-    damaged: list[str] = []
-    for stored in views:
-        try:
-            view = stored.loaded()
-        except InputError as error:
-            damaged.append(str(error))
-            continue
+    for view in decoded(views, "measured"):
         start = time.perf_counter()
         image = renderer.render(splats, view.camera, background)
         times.append(1e3 * (time.perf_counter() - start))
@@ -80,9 +73,5 @@ def evaluate(
         }
         if on_view is not None:
             on_view(view, image)
-    if not per_view:
-        raise InputError(f"none of the {len(views)} photos can be used ({damaged[0]})")
-    if damaged:
-        warnings.warn(f"{len(damaged)} of {len(views)} photos are not measured: {damaged[0]}", stacklevel=2)
     means = {key: statistics.fmean(v[key] for v in per_view.values()) for key in ("PSNR", "SSIM")}
     return Evaluation(means["PSNR"], means["SSIM"], statistics.median(times), per_view)

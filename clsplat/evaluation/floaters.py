@@ -19,6 +19,7 @@ from ..splats.color import BLACK, Color
 from ..splats.fields import DoubleArray
 from ..splats.splats import Splats
 from .contributions import Contribution, contributions
+from .decoded import decoded
 from .evaluate import MAX_PSNR
 from .metrics import DEFAULT_PROTOCOL, MetricProtocol
 
@@ -128,5 +129,5 @@ def mean_psnr(
             ),
             MAX_PSNR,
         )
-        for view in (stored.loaded() for stored in views)
+        for view in decoded(views, "measured")
     )

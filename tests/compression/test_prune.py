@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +162,18 @@ def test_the_judge_has_the_background_of_the_model(splats: Splats, scene: Scene,
     for background in ((0.0, 0.0, 0.0), (1.0, 0.5, 0.25)):
         want = [psnr(renderer.render(few, view.camera, background).color, view.image) for view in scene.test]
         assert Validation(renderer, scene.test, background).per_view(few) == want
+
+
+def test_the_judge_looks_at_the_pixels_that_count(splats: Splats, scene: Scene, renderer: Renderer) -> None:
+    """A photo that is wrong behind its mask has the same PSNR."""
+    view = scene.test[0]
+    mask = np.zeros(view.image.shape[:2], bool)
+    mask[:, ::2] = True
+    wrong = np.where(mask[:, :, None], view.image, 255 - view.image)
+    few = splats.select(np.arange(100))
+    (value,) = Validation(renderer, [replace(view, image=wrong, mask=mask)]).per_view(few)
+    assert value == psnr(renderer.render(few, view.camera).color, view.image, mask=mask)
+    assert value != pytest.approx(Validation(renderer, [view]).per_view(few)[0], abs=1e-3)
 
 
 def test_a_model_is_pruned_over_its_background(

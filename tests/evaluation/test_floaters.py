@@ -10,10 +10,12 @@ import pytest
 from conftest import MakeRenderer
 
 from clsplat.device.device import Device
+from clsplat.errors import InputError
 from clsplat.evaluation.contributions import contributions
 from clsplat.evaluation.floaters import evenly, mean_psnr, measure_floaters, median_depth
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.view import StoredView, View
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 from clsplat.training.folder import ModelFolder
@@ -78,6 +80,22 @@ def test_masks_and_transparency_weigh_the_pixels(renderer: Renderer, scene: Scen
     (found,) = contributions(renderer, one, [masked])
     assert found.weight[0] == pytest.approx(alpha[left].sum(), rel=1e-3)
     assert found.clear[0] == pytest.approx((alpha * (1 - photo_alpha / 255))[left].sum(), rel=1e-3)
+
+
+def test_photos_that_cannot_be_decoded_are_left_out(renderer: Renderer, splats: Splats, scene: Scene) -> None:
+    def fail() -> View:
+        raise InputError("a.png: cannot be read")
+
+    first, *others = scene.train
+    damaged = StoredView(first.name, first.camera, fail, 1)
+    with (
+        pytest.warns(UserWarning, match=r"1 of 8 photos are not measured: a\.png"),
+        pytest.warns(UserWarning, match=r"1 of 8 photos are not looked at: a\.png"),
+    ):
+        measured = measure_floaters(renderer, splats, [damaged, *others])
+    assert measured == measure_floaters(renderer, splats, others)
+    with pytest.warns(UserWarning, match="1 of 2 photos are not looked at: a.png"):
+        assert len(list(contributions(renderer, splats, [damaged, others[0]]))) == 1
 
 
 def test_a_floater_before_a_camera_is_near(renderer: Renderer, splats: Splats, scene: Scene) -> None:
