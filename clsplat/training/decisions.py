@@ -2,9 +2,8 @@
 
 - Transparent photos are trained over random backgrounds. Over one colour, a splat of that colour costs nothing wherever
   it is, and other views see it before the object.
-- A run that starts at random places, or at few points of the scene, has splats that no photo needs. A penalty on
-  opacity lets them fade until they are pruned. `adc` then needs time to fill the cap again. Transparent photos in a run
-  that is short for its cap get the strategy that relocates the splats instead (`mcmc`).
+- A run that starts at random places, or at few points of the scene, has splats that no photo needs. Transparent photos
+  get the strategy that relocates them (`mcmc`). With `adc` a penalty on opacity lets them fade until they are pruned.
 
 docs/decisions.md has the measurements.
 """
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
 DECIDED = tuple(name for name, definition in OPTIONS.items() if definition.by_scene)
 FEW_POINTS = 0.05  # fewer points than this share of the cap are few
-SHORT = 25  # splats of the cap per iteration, above which `adc` does not fill the cap after a random start
 PENALTY = Mcmc().opacity_reg  # weight of the mean opacity in a run that starts at random with adc
 TRANSPARENT_SHARE = 0.01  # smallest share of transparent pixels of photos that are trained over random backgrounds
 _STEP = 8  # pixels between two that are looked at
@@ -72,10 +70,9 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if transparent and "random_background" not in config.named_options:
         chosen["random_background"] = True
         reasons.append(f"random backgrounds, because {share:.0%} of the photos' pixels are transparent")
-    short = config.cap_max > SHORT * config.iterations
-    if transparent and why and short and "strategy" not in config.named_options:
+    if transparent and why and "strategy" not in config.named_options:
         chosen["strategy"] = Mcmc.strategy
-        reasons.append(f"strategy {Mcmc.strategy}, because {why} and the run is short for {config.cap_max} splats")
+        reasons.append(f"strategy {Mcmc.strategy}, because {why}")
     elif why and config.strategy == Adc.strategy and "opacity_reg" not in config.named_options:
         chosen["opacity_reg"] = PENALTY
         reasons.append(f"a penalty on opacity of {PENALTY:g}, because {why}")

@@ -11,7 +11,7 @@ import pytest
 
 from clsplat.scenes.scene import Points, Scene
 from clsplat.training.config import TrainConfig
-from clsplat.training.decisions import PENALTY, SHORT, Decision, as_decided, decide, transparent_share
+from clsplat.training.decisions import PENALTY, Decision, as_decided, decide, transparent_share
 from clsplat.training.folder import ModelFolder
 from clsplat.training.log import Progress
 from clsplat.training.presets import PRESETS, preset
@@ -43,19 +43,13 @@ def test_good_points_and_opaque_photos_need_no_decision(scene: Scene) -> None:
 
 @pytest.mark.parametrize("options", [{"init": "random"}, {"cap_max": 1_000_000}, {}])
 def test_random_starts_and_few_points(scene: Scene, options: dict[str, Any]) -> None:
-    """They get a penalty on opacity. Transparent photos in a short run get the strategy that relocates."""
+    """Transparent photos get the strategy that relocates, other photos a penalty on opacity."""
     start = scene if options else without_points(scene)
     config = TrainConfig(opacity_lr=0.07, **options)
-    short = config.replace(iterations=config.cap_max // SHORT - 1)
-    long = config.replace(iterations=config.cap_max // SHORT)
-    for run in (short, long):
-        assert decide(start, run).config == run.replace(opacity_reg=PENALTY)
+    assert decide(start, config).config == config.replace(opacity_reg=PENALTY)
     seen = transparent(start, 0.5)
-    expected = TrainConfig(
-        opacity_lr=0.07, strategy="mcmc", random_background=True, iterations=short.iterations, **options
-    )
-    assert decide(seen, short).config == expected
-    assert decide(seen, long).config == long.replace(random_background=True, opacity_reg=PENALTY)
+    expected = TrainConfig(opacity_lr=0.07, strategy="mcmc", random_background=True, **options)
+    assert decide(seen, config).config == expected
     by_gradient = TrainConfig(strategy="adc", **options)
     assert decide(seen, by_gradient).config == by_gradient.replace(random_background=True, opacity_reg=PENALTY)
 
@@ -73,8 +67,8 @@ def test_transparent_photos_get_random_backgrounds(scene: Scene) -> None:
 def test_named_options_stay(scene: Scene) -> None:
     """Options of a strategy that is not the default are kept until the strategy is known."""
     start = transparent(without_points(scene), 0.5)
-    assert decide(start, TrainConfig(growth=1.2, init_scale=0.3, iterations=100)).config == TrainConfig(
-        growth=1.2, init_scale=0.3, strategy="mcmc", random_background=True, iterations=100
+    assert decide(start, TrainConfig(growth=1.2, init_scale=0.3)).config == TrainConfig(
+        growth=1.2, init_scale=0.3, strategy="mcmc", random_background=True
     )
     named = TrainConfig(strategy="adc", random_background=False, opacity_reg=0.0)
     assert decide(start, named).config == named
