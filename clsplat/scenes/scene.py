@@ -283,8 +283,9 @@ def select_test_names(posed: PosedImages, test_every: int, test_list: str | os.P
                 f"names look like {names[0]!r}"
             )
     if len(set(chosen)) == len(names):
+        folder = next((file.parent for file in posed.files.values()), "the scene")
         raise InputError(
-            f"no training view is left: all {len(names)} views are test views; choose fewer, or turn eval off"
+            f"{folder}: no training view is left: all {len(names)} views are test views; choose fewer, or turn eval off"
         )
     return frozenset(chosen)
 
