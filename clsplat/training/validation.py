@@ -9,7 +9,7 @@ import json
 import math
 from dataclasses import dataclass
 
-from ..evaluation.evaluate import Evaluation, evaluate
+from ..evaluation.evaluate import evaluate
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
 from ..splats.color import Color
@@ -21,8 +21,8 @@ MEASUREMENTS = 20  # in a run, at equal distances
 
 
 @dataclass(frozen=True)
-class Best:
-    """The best measurement so far. iteration : 0 before the first one. psnr : of the validation views [dB]."""
+class Measurement:
+    """A measurement. iteration : 0 before the first one. psnr : of the validation views [dB]."""
 
     iteration: int = 0
     psnr: float = -math.inf
@@ -43,8 +43,7 @@ class RunValidation:
     ) -> None:
         self.renderer, self.views, self.background = renderer, views, background
         self.iterations, self.kept = iterations, {*kept, iterations}
-        self.best = Best()
-        self.last: Best = self.best
+        self.best = self.last = Measurement()
 
     def is_due(self, iteration: int) -> bool:
         """Return whether the views are measured after an iteration (from 1). The last one is always measured."""
@@ -62,9 +61,7 @@ class RunValidation:
                 self.best = measured
         self.kept.add(self.best.iteration)
 
-    def measure(
-        self, splats: Splats, iteration: int, seconds: float, log: RunLog, folder: ModelFolder | None
-    ) -> Evaluation:
+    def measure(self, splats: Splats, iteration: int, seconds: float, log: RunLog, folder: ModelFolder | None) -> None:
         """Measure the splats of an iteration. The best point cloud so far replaces the one before.
 
         Parameters
@@ -73,7 +70,7 @@ class RunValidation:
         folder : receives the point clouds; None keeps no file.
         """
         measured = evaluate(self.renderer, splats, self.views, self.background)
-        self.last = Best(iteration, measured.psnr)
+        self.last = Measurement(iteration, measured.psnr)
         if measured.psnr > self.best.psnr:
             before, self.best = self.best, self.last
             if folder is not None:
@@ -89,7 +86,6 @@ class RunValidation:
                 "splats": len(splats),
             }
         )
-        return measured
 
     def summary(self, folder: ModelFolder | None) -> str:
         """Return a sentence for the end of the run."""
@@ -100,14 +96,14 @@ class RunValidation:
         return best if folder is None else f"{best}, and is kept in point_cloud/iteration_{self.best.iteration}"
 
 
-def _logged(folder: ModelFolder, until: int) -> list[Best]:
+def _logged(folder: ModelFolder, until: int) -> list[Measurement]:
     """Return the measurements in log.jsonl up to an iteration."""
     found = []
     for line in folder.log_path.read_bytes().splitlines() if folder.log_path.is_file() else ():
         try:
             values = json.loads(line)
             if values["iteration"] <= until:
-                found.append(Best(int(values["iteration"]), float(values["validation_psnr"])))
+                found.append(Measurement(int(values["iteration"]), float(values["validation_psnr"])))
         except (ValueError, KeyError, TypeError, RecursionError):
             continue  # another kind of line, or one that a crash cut off
     return found

@@ -37,26 +37,26 @@ def test_frames_are_described_at_once_if_there_is_no_message() -> None:
 
 
 def test_the_last_frame_is_described_once_a_message_has_been_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(status_line, "READING_TIME", 0.2)
+    monkeypatch.setattr(status_line, "READING_TIME", 2.0)
     line, start = StatusLine(shown := Shown()), time.monotonic()
     line.say("a message")
     line.describe("one")
     line.describe("two")
     assert shown.wait(2) == ["a message", "two"]
-    assert time.monotonic() - start >= 0.2
+    assert time.monotonic() - start >= 2.0
 
 
 def test_each_message_stays_for_its_own_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(status_line, "READING_TIME", 0.3)
+    monkeypatch.setattr(status_line, "READING_TIME", 3.0)
     line = StatusLine(shown := Shown())
     line.say("first")
     line.describe("one")
-    time.sleep(0.15)
+    time.sleep(0.5)
     line.say("second")
     start = time.monotonic()
     line.describe("two")
     assert shown.wait(3) == ["first", "second", "two"]
-    assert time.monotonic() - start >= 0.28
+    assert time.monotonic() - start >= 2.98
 
 
 def test_a_message_ends_with_its_model(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,10 +71,10 @@ def test_a_message_ends_with_its_model(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_nothing_is_shown_after_the_page_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(status_line, "READING_TIME", 0.1)
+    monkeypatch.setattr(status_line, "READING_TIME", 1.0)
     line = StatusLine(shown := Shown())
     line.say("a message")
     line.describe("one")
     line.close()
-    time.sleep(0.3)
+    time.sleep(1.5)
     assert shown.texts == ["a message"]
