@@ -7,7 +7,7 @@ import lzma
 import math
 import zipfile
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ from ..errors import InputError
 from ..files.atomic import atomic_writer
 from ..splats.fields import MAX_SH_DEGREE, Array
 
-VERSION = 3
-READABLE = (2, VERSION)  # version 2 has no `reached`
+VERSION = 4
+READABLE = (2, 3, VERSION)  # version 2 has no `reached`, and both have no `average`
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ class Checkpoint:
     n_first : number of splats at the start of the run, which the growth depends on.
     signals : (3, N) densification statistics (SplatStatistics).
     reached : limits of the schedules, if the run was made longer.
+    average : state of the `ParameterAverage` by key, empty before the last part of the run.
     """
 
     iteration: int
@@ -67,6 +68,7 @@ class Checkpoint:
     n_first: int
     signals: Array
     reached: Reached | None = None
+    average: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
         """Write the checkpoint to a file. If that fails, raise OutputError and keep the old file."""
@@ -83,6 +85,7 @@ class Checkpoint:
         }
         arrays = {f"splats.{k}": v for k, v in self.splats.items()}
         arrays |= {f"optimizer.{k}": v for k, v in self.optimizer.items()}
+        arrays |= {f"average.{k}": v for k, v in self.average.items()}
         arrays["signals"] = self.signals
         arrays["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
         with atomic_writer(path) as stream:
@@ -119,6 +122,7 @@ class Checkpoint:
                 meta["n_first"],
                 arrays["signals"],
                 Reached(**meta["reached"]) if meta.get("reached") else None,
+                part("average."),
             )
             checkpoint._check()
         except _DAMAGE as error:
@@ -144,11 +148,17 @@ class Checkpoint:
             raise ValueError("its queue is not a list of views")
         np.random.default_rng().bit_generator.state = self.rng
         n = len(self.splats["mean"])
-        for group in (self.splats, self.optimizer, {"signals": self.signals}):
+        for group in (self.splats, self.optimizer, self.average, {"signals": self.signals}):
             if not all(values.dtype.kind in "fiu" and values.ndim for values in group.values()):
                 raise ValueError("it holds something that is not an array of numbers")
         if any(len(values) != n for values in self.splats.values()) or self.signals.shape != (3, n):
             raise ValueError("its arrays are not of the same splats")
+        if self.average:
+            shapes = {name: values.shape for name, values in self.average.items() if name != "count"}
+            if shapes != {name: values.shape for name, values in self.splats.items()}:
+                raise ValueError("its average is not of the same splats")
+            if self.average["count"].shape != (1,) or self.average["count"][0] < 1:
+                raise ValueError("its average has no count")
 
 
 _KINDS = {

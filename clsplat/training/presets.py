@@ -29,6 +29,7 @@ _RATES = {
     "rotation_lr": 1e-3,
     "lambda_dssim": 0.2,
     "bisect_reg": 0.0,
+    "average_last": 0.0,
     "random_points": 0.0,
     "random_background": False,
 }
@@ -171,9 +172,9 @@ def _skew_normal() -> Values:
     - SGHMC has the constants of SSS, in the stable form.
     - The strategy is the relocation of SSS without its square. The paper's training times and baselines suggest that
       SNS builds on the code of SSS.
-    - All other rates are clsplat's defaults, which are those of 3DGS.
+    - All other rates are those of 3DGS.
     """
-    return {
+    return _RATES | {
         "shape": "skew-normal-direct",
         "normalisation": "none",
         "skew_map": "polar",
@@ -186,13 +187,9 @@ def _skew_normal() -> Values:
         "alternation": "cyclic",
         "opacity_reg": 0.0,
         "scale_reg": 0.0,
-        "bisect_reg": 0.0,
-        "lambda_dssim": 0.2,
         "densify_from": 500 / 30_000,
         "densify_until": 25_000 / 30_000,
         "densify_interval": 100,
-        "random_points": 0.0,
-        "random_background": False,
     } | _SGHMC
 
 

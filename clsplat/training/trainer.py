@@ -26,6 +26,7 @@ from ..scenes.split import with_validation
 from ..splats.fields import Array
 from ..splats.optical_depth import finite_rows
 from ..splats.splats import Splats
+from .average import ParameterAverage
 from .checkpoint import Checkpoint
 from .checkpoint_times import CheckpointTimes
 from .config import TrainConfig
@@ -113,6 +114,9 @@ class Trainer:
             self.reached.downscale if self.reached else None,
         )
         self.schedule = RunSchedule.create(config, self.n_first)
+        self.average = ParameterAverage(config, self.schedule.densify_last)
+        if checkpoint is not None and checkpoint.config["iterations"] == config.iterations:
+            self.average.load_state(checkpoint.average)
         self.density = DensityControl(
             config, self.schedule, self.splats, self.optimizer, self.pipeline.statistics, self.rng, scene.extent
         )
@@ -299,11 +303,17 @@ class Trainer:
         if self.density.is_due(it):
             self.density.densify(it)
         self.noise.add(it, mean_lr)
+        if self.average.is_due(it):
+            self.average.add(self.optimizer.read())
         return frame
 
     def snapshot(self) -> Splats:
-        """Return the present splats on the host, except splats that are not finite."""
-        arrays = self.optimizer.read()
+        """Return the present splats on the host, except splats that are not finite.
+
+        After the last iteration they are the mean over the last part of the run (option `average_last`).
+        """
+        averaged = self.average.result() if self.iteration >= self.config.iterations else None
+        arrays = averaged or self.optimizer.read()
         sound = finite_rows(arrays)
         if len(sound) and not sound.any():
             raise TrainingError(f"iteration {self.iteration}: no splat is finite any more: lower the learning rates")
@@ -331,6 +341,7 @@ class Trainer:
             self.n_first,
             self.pipeline.statistics.read(self.splats.n),
             self.reached,
+            self.average.state(),
         )
 
     def evaluate(self, views: list[View]) -> Evaluation:

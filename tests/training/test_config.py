@@ -77,6 +77,7 @@ DEFAULTS = {
     "beta_lr": 1e-3,
     "nu_lr": 1e-2,
     "skew_map": "auto",
+    "average_last": 0.05,
     "visible_adam": False,
     "optimizer": "fused",
     "position_optimizer": "adam",

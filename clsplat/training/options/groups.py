@@ -104,6 +104,13 @@ class OptimConfig(OptionGroup):
         "form.",
         choices=("auto", *SKEW_MAPS),
     )
+    average_last: float = option(
+        0.05,
+        help="Part of the run, at its end, whose parameters are averaged for the model: 0.05 is the last twentieth. "
+        "0: the parameters of the last iteration.",
+        at_least=0,
+        at_most=1,
+    )
     visible_adam: bool = option(
         False,
         help="Update only splats that the image shows; the others catch up later. Regularisers, noise and SGHMC "

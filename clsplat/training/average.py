@@ -1,0 +1,63 @@
+"""The mean of the parameters over the last part of a run (Izmailov et al. 2018, stochastic weight averaging).
+
+Each step follows one photo, so the parameters never come to rest. Their mean is nearer to the optimum of all photos
+than the last step is. The mean begins after the last densification, because only then the splats stay the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..splats.fields import Array
+from .config import TrainConfig
+
+SAMPLES = 20  # number of iterations whose parameters are averaged, at equal distances
+
+
+class ParameterAverage:
+    """Running mean of the public arrays of the splats.
+
+    Parameters
+    ----------
+    config : options of the run; `average_last` is the fraction of the run that counts.
+    densify_last : last iteration at which the strategy may densify.
+
+    Attributes
+    ----------
+    count : number of samples so far.
+    """
+
+    def __init__(self, config: TrainConfig, densify_last: int) -> None:
+        self._last = config.iterations
+        window = min(round(config.optim.average_last * self._last), self._last - densify_last)
+        self._begin = self._last - window
+        self._every = max(window // SAMPLES, 1)
+        self._mean: dict[str, Array] = {}
+        self.count = 0
+
+    def is_due(self, iteration: int) -> bool:
+        """Return whether the parameters after an iteration (from 1) are a sample. Those of the last iteration are."""
+        return self._begin < iteration <= self._last and (self._last - iteration) % self._every == 0
+
+    def add(self, arrays: Mapping[str, Array]) -> None:
+        """Add a sample. It has the splats of the samples before."""
+        self.count += 1
+        for name, values in arrays.items():
+            mean = self._mean.get(name)
+            self._mean[name] = values.copy() if mean is None else mean + (values - mean) / np.float32(self.count)
+
+    def result(self) -> dict[str, Array] | None:
+        """Return the mean after the last iteration; None if no sample was due."""
+        return dict(self._mean) or None
+
+    def state(self) -> dict[str, Any]:
+        """Return the arrays of a checkpoint, by key; empty without a sample."""
+        return {**self._mean, "count": np.array([self.count])} if self.count else {}
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from the arrays of a checkpoint."""
+        self._mean = {name: values for name, values in state.items() if name != "count"}
+        self.count = int(state["count"][0]) if state else 0
