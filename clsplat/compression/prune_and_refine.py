@@ -18,7 +18,7 @@ from ..splats.splats import Splats
 from ..training.config import TrainConfig
 from ..training.decisions import decide
 from ..training.log import Progress
-from ..training.optim.rules import field_rate, rate_option
+from ..training.optim.rules import SH_REST_POWER, rate_option, run_rate, run_rest_rate
 from ..training.options.density import Adc
 from ..training.trainer import Trainer
 from .importance import measure_importance
@@ -127,13 +127,11 @@ def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Pat
     short = config.replace(iterations=iterations)
     # Rates of short runs are larger: the short run gets options that lead to the rates of the long one.
     rates = {
-        rate_option(field): rate
-        * field_rate(config, field)
-        * config.rate_factor(field.name)
-        / short.rate_factor(field.name)
+        rate_option(field): rate * run_rate(config, field) / short.rate_factor(field.name)
         for field in splats.schema
         if field.name != "mean" and hasattr(config.optim, rate_option(field))
     }
+    rates["feature_rest_lr"] = rate * run_rest_rate(config) / short.length_factor(SH_REST_POWER)
     last = config.optim.position_lr_final * config.rate_factor("mean") / short.rate_factor("mean")
     return short.replace(
         shape=splats.shape,
@@ -153,5 +151,6 @@ def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Pat
         test_iterations=(),
         position_lr_init=min(_WARM * last, config.optim.position_lr_init),
         position_lr_final=last,
+        lr_factor=1.0,
         **rates,
     )

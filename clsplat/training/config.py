@@ -150,8 +150,12 @@ class TrainConfig:
 
         3DGS's rates were published for 30 000 iterations; shorter runs need larger steps. p is the field's
         `lr_power`: 3/4 for positions, 1/2 for rotation and the parameters of shapes, 1/4 for scale, 0 for the others.
+        View-dependent colours have 1/4 (`optim.rules.SH_REST_POWER`).
         """
-        power = next((known.lr_power for known in known_fields() if known.name == field), 0.0)
+        return self.length_factor(next((known.lr_power for known in known_fields() if known.name == field), 0.0))
+
+    def length_factor(self, power: float) -> float:
+        """Return max(1, 30 000 / iterations)^power."""
         return float(max(1.0, PUBLISHED_ITERATIONS / self.iterations) ** power)
 
     def replace(self, **options: Any) -> TrainConfig:

@@ -4,6 +4,7 @@
   it is, and other views see it before the object.
 - A run that starts at random places, or at few points of the scene, has splats that no photo needs. Transparent photos
   get the strategy that relocates them (`mcmc`). With `adc` a penalty on opacity lets them fade until they are pruned.
+- Splats that start at random places have a longer way, so their learning rates are twice as high.
 
 docs/decisions.md has the measurements.
 """
@@ -19,6 +20,8 @@ from .config import OPTIONS, TrainConfig
 from .initialise import MIN_POINTS
 from .log import Progress
 from .options.density import Adc, Mcmc
+from .options.groups import OptimConfig
+from .options.option import option_table
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene, View
@@ -26,6 +29,9 @@ if TYPE_CHECKING:
 DECIDED = tuple(name for name, definition in OPTIONS.items() if definition.by_scene)
 FEW_POINTS = 0.05  # fewer points than this share of the cap are few
 PENALTY = Mcmc().opacity_reg  # weight of the mean opacity in a run that starts at random with adc
+RANDOM_START_RATES = 2.0  # factor on the learning rates of a run that starts at random
+FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
+_RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
 TRANSPARENT_SHARE = 0.01  # smallest share of transparent pixels of photos that are trained over random backgrounds
 _STEP = 8  # pixels between two that are looked at
 _OPAQUE = 250  # smallest alpha of a pixel that counts as opaque: photos are resampled and rounded
@@ -76,6 +82,9 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     elif why and config.strategy == Adc.strategy and "opacity_reg" not in config.named_options:
         chosen["opacity_reg"] = PENALTY
         reasons.append(f"a penalty on opacity of {PENALTY:g}, because {why}")
+    if why and config.iterations >= FEWEST_ITERATIONS and not {"lr_factor", *_RATES} & config.named_options.keys():
+        chosen["lr_factor"] = RANDOM_START_RATES
+        reasons.append(f"learning rates times {RANDOM_START_RATES:g}, because {why}")
     return Decision(_with(config, chosen), tuple(reasons))
 
 

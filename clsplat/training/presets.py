@@ -24,6 +24,8 @@ _RATES = {
     "position_lr_init": 1.6e-4,
     "position_lr_final": 1.6e-6,
     "feature_lr": 2.5e-3,
+    "feature_rest_lr": None,
+    "lr_factor": 1.0,
     "opacity_lr": 0.05,
     "scaling_lr": 5e-3,
     "rotation_lr": 1e-3,
@@ -174,23 +176,27 @@ def _skew_normal() -> Values:
       SNS builds on the code of SSS.
     - All other rates are those of 3DGS.
     """
-    return _RATES | {
-        "shape": "skew-normal-direct",
-        "normalisation": "none",
-        "skew_map": "polar",
-        "skew_lr": 1.25e-2,
-        "strategy": "mcmc",
-        "relocation": "length",
-        "relocation_limit": 0.05,
-        "growth": 1.05,
-        "position_optimizer": "sghmc",
-        "alternation": "cyclic",
-        "opacity_reg": 0.0,
-        "scale_reg": 0.0,
-        "densify_from": 500 / 30_000,
-        "densify_until": 25_000 / 30_000,
-        "densify_interval": 100,
-    } | _SGHMC
+    return (
+        _RATES
+        | {
+            "shape": "skew-normal-direct",
+            "normalisation": "none",
+            "skew_map": "polar",
+            "skew_lr": 1.25e-2,
+            "strategy": "mcmc",
+            "relocation": "length",
+            "relocation_limit": 0.05,
+            "growth": 1.05,
+            "position_optimizer": "sghmc",
+            "alternation": "cyclic",
+            "opacity_reg": 0.0,
+            "scale_reg": 0.0,
+            "densify_from": 500 / 30_000,
+            "densify_until": 25_000 / 30_000,
+            "densify_interval": 100,
+        }
+        | _SGHMC
+    )
 
 
 def _bisected_skew() -> Values:

@@ -19,7 +19,9 @@ LIMITS = {
     "rotation_lr": ("quat", 0.1),  # change of a quaternion, about half the angle [rad]
     "opacity_lr": ("opacity_logit", 0.4),  # change of a logit
     "feature_lr": ("sh", 0.08),  # change of a colour coefficient
+    "feature_rest_lr": ("sh", 0.08),
 }
+_WITHOUT_FACTOR = ("position_lr_final", "feature_lr")  # `lr_factor` does not apply to these
 
 
 def check_rates(config: TrainConfig) -> None:
@@ -27,16 +29,29 @@ def check_rates(config: TrainConfig) -> None:
 
     Raises
     ------
-    InputError : names the first rate that is too high, and the highest usable one.
+    InputError : names the first rate that is too high, and the highest usable one. It names `lr_factor` if the rate
+        itself is not too high.
     """
     for name, (field, limit) in LIMITS.items():
-        rate, default = float(getattr(config.optim, name)), float(OPTIONS[name].default)
-        factor = config.rate_factor(field)
-        highest = max(limit / factor, default)
+        rate, default = getattr(config.optim, name), OPTIONS[name].default or 0.0
+        if rate is None:
+            continue
+        length = config.rate_factor(field)
+        highest = max(limit / length, default)
         if rate > highest:
-            digit = 10.0 ** (math.floor(math.log10(highest)) - 1)
-            usable = digit * math.floor(highest / digit)  # rounded down, so that this check accepts it
-            raise InputError(
-                f"{name} {rate:g}: each of {config.iterations} iterations would take steps of "
-                f"{rate * factor:.2g}, and training falls apart above {limit:g}: use at most {usable:.2g}"
+            raise _too_high(config, name, rate, rate * length, limit, highest)
+        factor = 1.0 if name in _WITHOUT_FACTOR else config.optim.lr_factor
+        if factor > 1 and factor * rate * length > limit:
+            raise _too_high(
+                config, "lr_factor", factor, factor * rate * length, limit, max(limit / (rate * length), 1.0)
             )
+
+
+def _too_high(config: TrainConfig, name: str, value: float, step: float, limit: float, highest: float) -> InputError:
+    """Return the error of an option whose value leads to steps above the limit. highest : highest usable value."""
+    digit = 10.0 ** (math.floor(math.log10(highest)) - 1)
+    usable = digit * math.floor(highest / digit)  # rounded down, so that the check accepts it
+    return InputError(
+        f"{name} {value:g}: each of {config.iterations} iterations would take steps of {step:.2g}, and training falls "
+        f"apart above {limit:g}: use at most {usable:.2g}"
+    )

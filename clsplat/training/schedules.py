@@ -45,7 +45,9 @@ class RunSchedule:
         first = max(int(config.density.densify_from * steps), 1)
         last = int(config.density.densify_until * steps)
         return cls(
-            exponential_decay(config.optim.position_lr_init, config.optim.position_lr_final, steps),
+            exponential_decay(
+                config.optim.lr_factor * config.optim.position_lr_init, config.optim.position_lr_final, steps
+            ),
             config.schedule.sh_interval or max(1, min(1000, steps // 10)),
             first,
             last,

@@ -122,7 +122,7 @@ def test_options_that_make_no_sense(values: dict[str, float]) -> None:
 
 
 def test_fine_tuning_goes_on_at_the_runs_last_rates() -> None:
-    config = TrainConfig(iterations=2000)
+    config = TrainConfig(iterations=2000, lr_factor=2.0)
     splats = Splats.from_points(np.eye(3), np.full((3, 3), 0.5), sh_degree=1)
     short = fine_tuning(config, splats, 200, Path("start.ply"), rate=0.5)
     assert (short.iterations, short.cap_max, short.sh_degree, short.start.init) == (200, 3, 1, "start.ply")
@@ -130,13 +130,16 @@ def test_fine_tuning_goes_on_at_the_runs_last_rates() -> None:
         config.optim.position_lr_final * config.rate_factor("mean")
     )
     assert short.optim.scaling_lr * short.rate_factor("log_scale") == pytest.approx(
-        0.5 * config.optim.scaling_lr * config.rate_factor("log_scale")
+        config.optim.scaling_lr * config.rate_factor("log_scale")
     )
     assert short.optim.skew_lr is not None
     assert short.optim.skew_lr * short.rate_factor("skew") == pytest.approx(
-        0.5 * splats.schema["skew"].lr * config.rate_factor("skew")
+        splats.schema["skew"].lr * config.rate_factor("skew")
     )
-    assert short.optim.opacity_lr == 0.5 * config.optim.opacity_lr
+    assert short.optim.opacity_lr == config.optim.opacity_lr
+    assert short.optim.feature_lr == 0.5 * config.optim.feature_lr
+    assert short.optim.feature_rest_lr == pytest.approx(config.optim.feature_lr / 20 * 10**-0.25)
+    assert short.optim.lr_factor == 1, "the rates have the factor of the run"
     assert short.density.densify_until == short.density.noise_lr == 0
 
 

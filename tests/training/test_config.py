@@ -72,6 +72,8 @@ DEFAULTS = {
     "scaling_lr": 5e-3,
     "rotation_lr": 1e-3,
     "feature_lr": 2.5e-3,
+    "feature_rest_lr": None,
+    "lr_factor": 1.0,
     "skew_lr": None,
     "normal_lr": 3e-3,
     "beta_lr": 1e-3,

@@ -11,7 +11,15 @@ import pytest
 
 from clsplat.scenes.scene import Points, Scene
 from clsplat.training.config import TrainConfig
-from clsplat.training.decisions import PENALTY, Decision, as_decided, decide, transparent_share
+from clsplat.training.decisions import (
+    FEWEST_ITERATIONS,
+    PENALTY,
+    RANDOM_START_RATES,
+    Decision,
+    as_decided,
+    decide,
+    transparent_share,
+)
 from clsplat.training.folder import ModelFolder
 from clsplat.training.log import Progress
 from clsplat.training.presets import PRESETS, preset
@@ -51,7 +59,9 @@ def test_random_starts_and_few_points(scene: Scene, options: dict[str, Any]) -> 
     expected = TrainConfig(opacity_lr=0.07, strategy="mcmc", random_background=True, **options)
     assert decide(seen, config).config == expected
     by_gradient = TrainConfig(strategy="adc", **options)
-    assert decide(seen, by_gradient).config == by_gradient.replace(random_background=True, opacity_reg=PENALTY)
+    assert decide(seen, by_gradient).config == by_gradient.replace(
+        random_background=True, opacity_reg=PENALTY, lr_factor=RANDOM_START_RATES
+    )
 
 
 def test_transparent_photos_get_random_backgrounds(scene: Scene) -> None:
@@ -68,9 +78,9 @@ def test_named_options_stay(scene: Scene) -> None:
     """Options of a strategy that is not the default are kept until the strategy is known."""
     start = transparent(without_points(scene), 0.5)
     assert decide(start, TrainConfig(growth=1.2, init_scale=0.3)).config == TrainConfig(
-        growth=1.2, init_scale=0.3, strategy="mcmc", random_background=True
+        growth=1.2, init_scale=0.3, strategy="mcmc", random_background=True, lr_factor=2.0
     )
-    named = TrainConfig(strategy="adc", random_background=False, opacity_reg=0.0)
+    named = TrainConfig(strategy="adc", random_background=False, opacity_reg=0.0, lr_factor=1.0)
     assert decide(start, named).config == named
     assert decide(start, named).reasons == ()
     assert decide(start, TrainConfig(cap_max=7).replace(strategy="adc")).config.strategy == "adc"
@@ -78,6 +88,16 @@ def test_named_options_stay(scene: Scene) -> None:
     again = decide(scene, complete)
     assert again.config == complete, "nothing is decided twice"
     assert again.reasons == ()
+
+
+@pytest.mark.parametrize("named", [{"scaling_lr": 0.01}, {"position_lr_final": 1e-6}, {"lr_factor": 1.0}], ids=str)
+def test_random_starts_have_higher_rates_unless_a_rate_is_named(scene: Scene, named: dict[str, float]) -> None:
+    start = without_points(scene)
+    assert decide(start, TrainConfig()).config.optim.lr_factor == RANDOM_START_RATES
+    assert decide(scene, TrainConfig(init="random")).config.optim.lr_factor == RANDOM_START_RATES
+    assert decide(scene, TrainConfig(cap_max=len(scene.points))).config.optim.lr_factor == 1
+    assert decide(start, TrainConfig(iterations=FEWEST_ITERATIONS - 1)).config.optim.lr_factor == 1
+    assert decide(start, TrainConfig(**named)).config.optim == TrainConfig(**named).optim
 
 
 @pytest.mark.parametrize("name", PRESETS)

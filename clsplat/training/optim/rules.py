@@ -24,6 +24,7 @@ from .skew_map import SkewMap
 StepCounts = tuple[int, int]  # steps of the base parameters and of the skew
 
 SH_REST_FACTOR = 1.0 / 20.0  # 3DGS: bands above the constant learn 20 times slower
+SH_REST_POWER = 1.0 / 4.0  # of the length factor of their rate (`TrainConfig.rate_factor`)
 
 
 # Options that hold the rates of the core fields, of colour and of the second opacity.
@@ -50,6 +51,19 @@ def field_rate(config: TrainConfig, field: Field) -> float:
     return field.lr if value is None else value
 
 
+def run_rate(config: TrainConfig, field: Field) -> float:
+    """Return Adam's rate of a field in a run, its learning rate times all factors. "sh" is the constant band here."""
+    factor = 1.0 if field.name == "sh" else config.optim.lr_factor
+    return field_rate(config, field) * config.rate_factor(field.name) * factor
+
+
+def run_rest_rate(config: TrainConfig) -> float:
+    """Return Adam's rate of the SH bands above the constant one in a run."""
+    rate = config.optim.feature_rest_lr
+    rate = SH_REST_FACTOR * config.optim.feature_lr if rate is None else rate
+    return rate * config.length_factor(SH_REST_POWER) * config.optim.lr_factor
+
+
 @dataclass(frozen=True)
 class Rules:
     """Values of the config that the optimizers use. extent : extent of the scene [world units]."""
@@ -64,13 +78,12 @@ class Rules:
     @cached_property
     def rates(self) -> dict[str, float]:
         """Adam's rate of each field except the mean. The rate of the mean is an argument of each step."""
-        fields = [field for field in self.shape.schema(0) if field.name != "mean"]
-        return {field.name: field_rate(self.config, field) * self.config.rate_factor(field.name) for field in fields}
+        return {field.name: run_rate(self.config, field) for field in self.shape.schema(0) if field.name != "mean"}
 
     def sh_rates(self, rows: int, dtype: np.dtype[np.floating]) -> Array:
         """Return the rate of each row of the colour. The first three rows are the constant band."""
         rates = np.full(rows, self.rates["sh"], dtype)
-        rates[3:] *= SH_REST_FACTOR
+        rates[3:] = run_rest_rate(self.config)
         return rates
 
     def penalty(self, n: int) -> Penalty:

@@ -88,7 +88,20 @@ class OptimConfig(OptionGroup):
     scaling_lr: float = option(5e-3, help="Learning rate of scales, as logarithms.", at_least=0)
     rotation_lr: float = option(1e-3, help="Learning rate of rotations, as quaternions.", at_least=0)
     feature_lr: float = option(
-        2.5e-3, help="Learning rate of colours. View-dependent coefficients use a twentieth of it.", at_least=0
+        2.5e-3, help="Learning rate of colours, for the part that is the same in all directions.", at_least=0
+    )
+    feature_rest_lr: float | None = option(
+        None,
+        help="Learning rate of the part of colours that depends on the direction. By default a twentieth of "
+        "feature_lr.",
+        at_least=0,
+    )
+    lr_factor: float = option(
+        1.0,
+        help="Factor on all learning rates except those of positions at the end of the run and of the part of colours "
+        "that is the same in all directions.",
+        above=0,
+        by_scene=True,
     )
     skew_lr: float | None = option(
         None,
