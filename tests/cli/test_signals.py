@@ -125,7 +125,7 @@ def test_a_closed_terminal_loses_nothing(capture_folder: Path, tmp_path: Path) -
     os.close(terminal)
     _, status = os.waitpid(process, 0)
     assert os.waitstatus_to_exitcode(status) == 128 + signal.SIGHUP
-    assert 50 <= saved_iteration(tmp_path / "m") < 100_000
+    assert 1 <= saved_iteration(tmp_path / "m") < 100_000
 
 
 def test_a_signal_outside_training_names_itself(monkeypatch: pytest.MonkeyPatch) -> None:

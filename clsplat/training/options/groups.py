@@ -92,8 +92,8 @@ class OptimConfig(OptionGroup):
     )
     feature_rest_lr: float | None = option(
         None,
-        help="Learning rate of the part of colours that depends on the direction. By default a twentieth of "
-        "feature_lr.",
+        help="Learning rate of the part of colours that depends on the direction. By default a twentieth of the other "
+        "part's.",
         at_least=0,
     )
     lr_factor: float = option(
