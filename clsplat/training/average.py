@@ -49,9 +49,9 @@ class ParameterAverage:
             mean = self._mean.get(name)
             self._mean[name] = values.copy() if mean is None else mean + (values - mean) / np.float32(self.count)
 
-    def result(self) -> dict[str, Array] | None:
-        """Return the mean after the last iteration; None if no sample was due."""
-        return dict(self._mean) or None
+    def result(self) -> dict[str, Array]:
+        """Return the mean of the samples."""
+        return dict(self._mean)
 
     def state(self) -> dict[str, Any]:
         """Return the arrays of a checkpoint, by key; empty without a sample."""

@@ -307,13 +307,17 @@ class Trainer:
             self.average.add(self.optimizer.read())
         return frame
 
+    @property
+    def has_mean(self) -> bool:
+        """Whether the run has ended, and its model is the mean over its last part."""
+        return self.iteration >= self.config.iterations and self.average.count > 0
+
     def snapshot(self) -> Splats:
         """Return the present splats on the host, except splats that are not finite.
 
         After the last iteration they are the mean over the last part of the run (option `average_last`).
         """
-        averaged = self.average.result() if self.iteration >= self.config.iterations else None
-        arrays = averaged or self.optimizer.read()
+        arrays = self.average.result() if self.has_mean else self.optimizer.read()
         sound = finite_rows(arrays)
         if len(sound) and not sound.any():
             raise TrainingError(f"iteration {self.iteration}: no splat is finite any more: lower the learning rates")

@@ -13,6 +13,7 @@ from ..rendering.colormaps import MODES, model_for, picture, picture_of
 from ..rendering.overdraw import splats_per_pixel
 from ..rendering.pipeline import Pipeline
 from ..rendering.renderer import read_frame
+from ..rendering.splat_buffers import SplatBuffers
 from ..training.config import TrainConfig
 from ..training.log import Progress
 from ..training.trainer import Trainer
@@ -39,11 +40,12 @@ class TrainingSource:
         self._config = config
         self._trainer: Trainer | None = None
         self._pipeline: Pipeline | None = None
+        self._mean: SplatBuffers | None = None
 
     def attach(self, trainer: Trainer) -> None:
         """Attach to a run and build the kernels. The buffers are separate, so that the run keeps its bits."""
         if trainer is not self._trainer:
-            self._trainer = trainer
+            self._trainer, self._mean = trainer, None
             self._pipeline = Pipeline(trainer.device, trainer.kernels.for_rendering(), trainer.pipeline.max_isects)
 
     @property
@@ -65,12 +67,20 @@ class TrainingSource:
         degree = trainer.sh_degree
         if settings.sh_degree is not None:
             degree = min(degree, settings.sh_degree)
-        frame = pipeline.forward(trainer.splats, camera, settings.background, degree)
+        frame = pipeline.forward(self._splats(trainer), camera, settings.background, degree)
         image = read_frame(frame)
         if settings.mode == "depth":
             return depth_view(image, settings)
         counts = splats_per_pixel(pipeline, frame) if settings.mode == "splats" else None
         return ViewPicture(picture_of(image, settings.mode, settings.background, counts=counts))
+
+    def _splats(self, trainer: Trainer) -> SplatBuffers:
+        """Return the splats to show: those of the run, or at its end those of the model, which may be a mean."""
+        if not trainer.has_mean:
+            return trainer.splats
+        if self._mean is None:
+            self._mean = SplatBuffers.of(trainer.device, trainer.snapshot(), trainer.splats.dtype)
+        return self._mean
 
 
 class TrainingView:

@@ -52,10 +52,10 @@ def dirty(sound: Splats, scene: Scene) -> Splats:
 def test_floaters_go_and_the_photos_lose_nothing(
     dirty: Splats, sound: Splats, scene: Scene, renderer: Renderer
 ) -> None:
-    cleaned = clean(dirty, scene.train, scene.extent, renderer, tolerance=0.02)
+    cleaned = clean(dirty, scene.train, scene.extent, renderer, tolerance=0.1)
     assert cleaned.before is not None
     assert cleaned.after is not None
-    assert cleaned.after.psnr >= cleaned.before.psnr - 0.02
+    assert cleaned.after.psnr >= cleaned.before.psnr - 0.1
     assert set(cleaned.before.per_view) == {view.name for view in scene.train}
     removed = {rule.rule: rule.removed for rule in cleaned.rules}
     assert removed["unseen"] >= 12
