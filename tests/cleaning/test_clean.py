@@ -31,8 +31,9 @@ def scene(model_folder: Path) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def sound(model_folder: Path) -> Splats:
-    return load_model(model_folder).splats
+def sound(model_folder: Path, scene: Scene, renderer: Renderer) -> Splats:
+    """Return the model without floaters of its own, so that the tolerance is left for those that are put in."""
+    return clean(load_model(model_folder).splats, scene.train, scene.extent, renderer, tolerance=0.02).splats
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +53,10 @@ def dirty(sound: Splats, scene: Scene) -> Splats:
 def test_floaters_go_and_the_photos_lose_nothing(
     dirty: Splats, sound: Splats, scene: Scene, renderer: Renderer
 ) -> None:
-    cleaned = clean(dirty, scene.train, scene.extent, renderer, tolerance=0.1)
+    cleaned = clean(dirty, scene.train, scene.extent, renderer, tolerance=0.02)
     assert cleaned.before is not None
     assert cleaned.after is not None
-    assert cleaned.after.psnr >= cleaned.before.psnr - 0.1
+    assert cleaned.after.psnr >= cleaned.before.psnr - 0.02
     assert set(cleaned.before.per_view) == {view.name for view in scene.train}
     removed = {rule.rule: rule.removed for rule in cleaned.rules}
     assert removed["unseen"] >= 12
