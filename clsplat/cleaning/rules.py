@@ -22,7 +22,7 @@ from ..splats.splats import Splats
 
 Mask = NDArray[np.bool_]
 
-# What a rule removes, in the order in which the rules are applied.
+# What a rule removes.
 DESCRIPTIONS = {
     "faint": "opacity below 1/255: no image shows them",
     "unseen": "no training view shows them",
@@ -32,6 +32,7 @@ DESCRIPTIONS = {
     "isolated": "far from all others",
     "outside": "on transparent parts of photos",
 }
+FREE = ("faint", "unseen")  # rules whose candidates no training view shows
 
 _NEIGHBOURS = 8
 _DEVIATIONS = 4.0  # robust standard deviations of the logarithm of the distance

@@ -11,6 +11,7 @@ from conftest import MakeRenderer
 
 import clsplat.cleaning.clean as cleaning
 from clsplat.cleaning.clean import clean, clean_without_views
+from clsplat.compression.importance import measure_importance
 from clsplat.device.device import Device
 from clsplat.errors import InputError, OutputError
 from clsplat.models.clean import clean_model
@@ -82,6 +83,21 @@ def test_the_tolerance_stops_a_rule(
         assert cleaned.after.psnr >= cleaned.before.psnr - tolerance
         counts.append(len(cleaned.splats))
     assert counts[0] > counts[1] > counts[2] > 0
+
+
+def test_a_dear_rule_leaves_the_tolerance_to_a_cheap_one(
+    sound: Splats, scene: Scene, renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first rule names nearly every splat, the second one splat that is worth little."""
+    change = measure_importance(renderer, sound, scene.train, (0, 0, 0), parts=False).removal
+    cheap = np.arange(len(sound)) == np.argsort(change)[len(sound) // 2]
+    monkeypatch.setattr(cleaning, "candidates_of_views", lambda *_: {"near cameras": ~cheap})
+    monkeypatch.setattr(cleaning, "candidates_without_views", lambda *_: {"oversized": cheap})
+    cleaned = clean(sound, scene.train, scene.extent, renderer, tolerance=0.1)
+    first, second = cleaned.rules
+    assert (first.rule, first.removed) == ("oversized", 1)
+    assert (second.rule, second.candidates) == ("near cameras", len(sound) - 1)
+    assert 0 < second.removed < len(sound) - 1
 
 
 def test_views_that_did_not_judge_take_a_rule_back(
