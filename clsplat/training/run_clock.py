@@ -18,6 +18,7 @@ from .targets import reduced_camera
 from .view_sampler import ViewSampler
 
 WORTH_A_MESSAGE = 10.0  # seconds; a shorter run needs no forecast before it begins
+PROBING_SHARE = 0.03  # of the time of the iterations that forward passes of the forecast may take
 _PROBE_VIEWS = 3
 
 
@@ -57,17 +58,23 @@ class RunClock:
         )
         self.forecast = Forecast(run, splats.n, iteration)
         self.clock: Callable[[], float] = time.perf_counter
-        self._begun = 0.0
+        self._begun = self._iterating = self._probing = self._last_probe = 0.0
 
     def begin(self, iteration: int) -> None:
-        """Start the time of an iteration (from 1). Now and then this first measures forward passes."""
-        if self.forecast.is_probe_due(iteration):
+        """Start the time of an iteration (from 1). Now and then this first measures forward passes.
+
+        Short runs and those of large photos measure fewer passes: the forecast may not slow a run down.
+        """
+        affordable = self._probing + self._last_probe <= PROBING_SHARE * self._iterating
+        if affordable and self.forecast.is_probe_due(iteration):
             self.measure_passes(iteration)
         self._begun = self.clock()
 
     def end(self, iteration: int) -> None:
         """Stop the time of an iteration."""
-        self.forecast.observe(iteration, self.splats.n, self.clock() - self._begun)
+        seconds = self.clock() - self._begun
+        self._iterating += seconds
+        self.forecast.observe(iteration, self.splats.n, seconds)
 
     def first_estimate(self, done: int) -> str | None:
         """Return how long the rest of a run takes, measured by forward passes alone; None for a short run."""
@@ -80,8 +87,11 @@ class RunClock:
 
     def measure_passes(self, iteration: int) -> None:
         """Measure forward passes at the present image size and at the later ones. They do not change the run."""
+        start = self.clock()
         downscales = self.forecast.downscales(iteration)
         self.forecast.probe({downscale: self._seconds_of_pass(downscale, iteration) for downscale in downscales})
+        self._last_probe = self.clock() - start
+        self._probing += self._last_probe
 
     def _seconds_of_pass(self, downscale: int, iteration: int) -> float:
         views: Sequence[View] = self.views.views

@@ -18,7 +18,9 @@ from clsplat.training.forecast import Forecast, RunShape
 from clsplat.training.live_line import Heartbeat, LiveLine, activity_line, rough_duration
 from clsplat.training.log import Progress
 from clsplat.training.run import train
+from clsplat.training.run_clock import PROBING_SHARE
 from clsplat.training.schedules import RunSchedule, resolution_schedule, sh_degree_at
+from clsplat.training.trainer import Trainer
 
 N_FIRST, PIXELS = 10_000, 400_000
 
@@ -110,6 +112,31 @@ def test_progress_does_not_change_the_model(scene: Scene) -> None:
     alone = train(scene, config).splats.to_numpy()
     assert all(np.array_equal(seen[name], alone[name]) for name in alone)
     assert any(report.forecast is not None for report in said)
+
+
+def test_measured_passes_take_a_small_share_of_a_run(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Large photos have slow forward passes, and a short run has few iterations to pay for them."""
+    clock = Trainer(scene, TrainConfig(iterations=400, cap_max=400), progress=lambda _: None).clock
+    now, passes = [0.0], [0]
+
+    def measured(downscale: int, iteration: int) -> float:
+        passes[0] += 1
+        now[0] += 1.0
+        return 1.0
+
+    monkeypatch.setattr(clock, "_seconds_of_pass", measured)
+    monkeypatch.setattr(clock.forecast, "is_probe_due", lambda iteration: iteration % 5 == 1)
+    clock.clock = lambda: now[0]
+    assert clock.first_estimate(0) is not None
+    first = passes[0]
+    later = []
+    for it in range(1, 300):
+        clock.begin(it)
+        now[0] += 2.0
+        clock.end(it)
+        later += [passes[0] / (2.0 * it)] if passes[0] > first else []
+    assert later, "a longer run measures again"
+    assert max(later) <= PROBING_SHARE
 
 
 def test_something_is_shown_between_two_lines_of_the_log(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
