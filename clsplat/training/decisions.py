@@ -4,6 +4,8 @@
   it is, and other views see it before the object.
 - A run that starts at random places, or at few points of the scene, has splats that no photo needs. Transparent photos
   get the strategy that relocates them (`mcmc`). With `adc` a penalty on opacity lets them fade until they are pruned.
+- Beside the points of a scene, some splats start at random places too: a plain wall has no points, and would else get
+  no splats. They also need the penalty.
 - Splats that start at random places have a longer way, so their learning rates are twice as high.
 
 docs/decisions.md has the measurements.
@@ -28,7 +30,9 @@ if TYPE_CHECKING:
 
 DECIDED = tuple(name for name, definition in OPTIONS.items() if definition.by_scene)
 FEW_POINTS = 0.05  # fewer points than this share of the cap are few
-PENALTY = Mcmc().opacity_reg  # weight of the mean opacity in a run that starts at random with adc
+PENALTY = Mcmc().opacity_reg  # weight of the mean opacity in a run with splats that start at random and adc
+RANDOM_SHARE = 0.05  # share of the cap that starts at random places beside the scene's points
+RANDOM_SHARE_OF_FEW = 0.1  # the same, if the scene has fewer points than this share
 RANDOM_START_RATES = 2.0  # factor on the learning rates of a run that starts at random
 FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
 _RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
@@ -73,15 +77,19 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     share = transparent_share(scene.train)
     transparent = share >= TRANSPARENT_SHARE
     why = random_start(scene, config)
+    share_random = config.start.random_points
+    if "random_points" not in config.named_options and (beside := share_beside(scene, config, transparent)):
+        chosen["random_points"] = share_random = beside
+        reasons.append(f"random points beside the scene's, {beside:.0%} of the cap, for what has no points")
     if transparent and "random_background" not in config.named_options:
         chosen["random_background"] = True
         reasons.append(f"random backgrounds, because {share:.0%} of the photos' pixels are transparent")
     if transparent and why and "strategy" not in config.named_options:
         chosen["strategy"] = Mcmc.strategy
         reasons.append(f"strategy {Mcmc.strategy}, because {why}")
-    elif why and config.strategy == Adc.strategy and "opacity_reg" not in config.named_options:
+    elif config.strategy == Adc.strategy and "opacity_reg" not in config.named_options and (why or share_random):
         chosen["opacity_reg"] = PENALTY
-        reasons.append(f"a penalty on opacity of {PENALTY:g}, because {why}")
+        reasons.append(f"a penalty on opacity of {PENALTY:g}, because {why or 'some points are random'}")
     if why and config.iterations >= FEWEST_ITERATIONS and not {"lr_factor", *_RATES} & config.named_options.keys():
         chosen["lr_factor"] = RANDOM_START_RATES
         reasons.append(f"learning rates times {RANDOM_START_RATES:g}, because {why}")
@@ -107,6 +115,19 @@ def random_start(scene: Scene, config: TrainConfig) -> str:
     if init != "sfm" or n_points >= max(FEW_POINTS * config.cap_max, MIN_POINTS):
         return ""
     return f"the scene has only {n_points} points" if n_points else "the scene has no points"
+
+
+def share_beside(scene: Scene, config: TrainConfig, transparent: bool) -> float:
+    """Return the share of the cap that starts at random places beside the points of a scene.
+
+    Where photos are transparent, nothing is missing that good points do not show.
+    """
+    n_points = len(scene.points.xyz)
+    if config.start.init != "sfm" or n_points < MIN_POINTS:
+        return 0.0
+    if n_points < RANDOM_SHARE_OF_FEW * config.cap_max:
+        return RANDOM_SHARE_OF_FEW
+    return 0.0 if transparent else RANDOM_SHARE
 
 
 def transparent_share(views: list[View]) -> float:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ..scenes.scene import Scene
 
 RANDOM_POINTS = 100_000  # 3DGS
-MIN_POINT_SHARE = 0.1  # scenes with fewer points than this share of the cap get additional random points
 MIN_POINTS = 4  # the first scale needs a point and its three neighbours
 _MAX_NEAR_SHARE = 0.1  # largest share of the visible points that may be nearer than the near plane
 _SAMPLED_POINTS = 2000  # points that are tested against the near plane
@@ -53,9 +52,8 @@ def initial_splats(
     cap : largest number of splats. The points with the longest tracks are kept, or the most opaque splats of a model.
     init : "sfm", "random", or the path of a file of splats. "sfm" without points becomes "random", with a message.
     seed : seed of random points and of the first skew.
-    random_share : number of random points that are added to those of "sfm", as a fraction of the cap. None: a tenth if
-        the scene has fewer points than that, otherwise 0. Without points of the scene it is the number of all points,
-        and None or 0 stands for the whole cap, at most RANDOM_POINTS.
+    random_share : number of random points that are added to those of "sfm", as a fraction of the cap. Without points
+        of the scene it is the number of all points, and 0 stands for the whole cap, at most RANDOM_POINTS. None is 0.
     opacity, scale_factor : properties of splats from points. The scale is the factor times the mean distance to the
         three nearest points.
 
@@ -97,9 +95,7 @@ def _points(
     apart = distinct(points.xyz)
     if init == "sfm" and len(apart) >= MIN_POINTS:
         xyz, rgb, tracks = points.xyz[apart], points.rgb[apart], points.track_length[apart]
-        if random_share is None:
-            random_share = MIN_POINT_SHARE if len(apart) < MIN_POINT_SHARE * cap else 0.0
-        n_random = min(round(random_share * cap), cap - 1)
+        n_random = min(round((random_share or 0.0) * cap), cap - 1)
         if len(apart) <= cap - n_random:
             message = f"{len(apart)} splats from the scene's points"
         else:

@@ -14,6 +14,8 @@ from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import (
     FEWEST_ITERATIONS,
     PENALTY,
+    RANDOM_SHARE,
+    RANDOM_SHARE_OF_FEW,
     RANDOM_START_RATES,
     Decision,
     as_decided,
@@ -43,24 +45,40 @@ def transparent(scene: Scene, share: float) -> Scene:
 
 
 def test_good_points_and_opaque_photos_need_no_decision(scene: Scene) -> None:
-    config = TrainConfig(cap_max=len(scene.points))
+    config = TrainConfig(cap_max=len(scene.points), random_points=0.0)
     assert decide(scene, config) == Decision(config, ())
     assert decide(scene, TrainConfig(init="model.ply")).reasons == ()
     assert decide(transparent(scene, 0.5), config).config == config.replace(random_background=True)
+
+
+def test_some_points_are_random_beside_good_ones(scene: Scene) -> None:
+    """A twentieth of the cap, or a tenth if the scene has fewer points. A penalty on opacity removes needless ones."""
+    for cap, share in ((len(scene.points), RANDOM_SHARE), (int(len(scene.points) / RANDOM_SHARE_OF_FEW) + 9, 0.1)):
+        config = TrainConfig(cap_max=cap)
+        decision = decide(scene, config)
+        assert decision.config == config.replace(random_points=share, opacity_reg=PENALTY)
+        assert f"random points beside the scene's, {share:.0%} of the cap" in str(decision)
+    config = TrainConfig(cap_max=len(scene.points))
+    assert decide(scene, config.replace(opacity_reg=0.0)).config.density.opacity_reg == 0
+    named = config.replace(random_points=0.02)
+    assert decide(scene, named).config == named.replace(opacity_reg=PENALTY)
+    by_relocation = config.replace(strategy="mcmc")
+    assert decide(scene, by_relocation).config == by_relocation.replace(random_points=RANDOM_SHARE)
 
 
 @pytest.mark.parametrize("options", [{"init": "random"}, {"cap_max": 1_000_000}, {}])
 def test_random_starts_and_few_points(scene: Scene, options: dict[str, Any]) -> None:
     """Transparent photos get the strategy that relocates, other photos a penalty on opacity."""
     start = scene if options else without_points(scene)
+    beside = {"random_points": RANDOM_SHARE_OF_FEW} if "cap_max" in options else {}
     config = TrainConfig(opacity_lr=0.07, **options)
-    assert decide(start, config).config == config.replace(opacity_reg=PENALTY)
+    assert decide(start, config).config == config.replace(opacity_reg=PENALTY, **beside)
     seen = transparent(start, 0.5)
-    expected = TrainConfig(opacity_lr=0.07, strategy="mcmc", random_background=True, **options)
+    expected = TrainConfig(opacity_lr=0.07, strategy="mcmc", random_background=True, **options, **beside)
     assert decide(seen, config).config == expected
     by_gradient = TrainConfig(strategy="adc", **options)
     assert decide(seen, by_gradient).config == by_gradient.replace(
-        random_background=True, opacity_reg=PENALTY, lr_factor=RANDOM_START_RATES
+        random_background=True, opacity_reg=PENALTY, lr_factor=RANDOM_START_RATES, **beside
     )
 
 

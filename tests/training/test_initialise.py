@@ -210,15 +210,11 @@ def test_a_scene_before_the_near_plane_is_refused() -> None:
         initial_splats(source)
 
 
-def test_random_points_are_added_to_few() -> None:
-    """Random points fill a fraction of the cap.
-
-    The default is a tenth, if the scene has fewer points. Their colours are those of their neighbours.
-    """
+def test_random_points_are_added_to_those_of_the_scene() -> None:
+    """Random points fill a fraction of the cap, and their colours are those of their neighbours."""
     source = scene(60)
     for share, cap, ours, placed in (
-        (None, 500, 60, 0),
-        (None, 601, 60, 60),
+        (None, 601, 60, 0),
         (0.5, 100, 50, 50),
         (0.0, 10_000, 60, 0),
         (1.0, 40, 1, 39),

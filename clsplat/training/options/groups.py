@@ -26,10 +26,11 @@ class StartConfig(OptionGroup):
     )
     random_points: float | None = option(
         None,
-        help="Number of random points that are added to the scene's points, as a fraction of the cap. By default 0.1 "
-        "if the scene has fewer points than that, otherwise 0. With init random, 0 stands for the whole cap.",
+        help="Number of random points that are added to the scene's points, as a fraction of the cap. With init random, "
+        "0 stands for the whole cap.",
         at_least=0,
         at_most=1,
+        by_scene=True,
     )
 
 
