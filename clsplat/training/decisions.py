@@ -77,10 +77,10 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     share = transparent_share(scene.train)
     transparent = share >= TRANSPARENT_SHARE
     why = random_start(scene, config)
-    share_random = config.start.random_points
+    share_random = config.start.random_points if config.start.init == "sfm" else 0.0
     if "random_points" not in config.named_options and (beside := share_beside(scene, config, transparent)):
         chosen["random_points"] = share_random = beside
-        reasons.append(f"random points beside the scene's, {beside:.0%} of the cap, for what has no points")
+        reasons.append(f"random points beside the scene's ({beside:.0%} of the cap), because some parts may have none")
     if transparent and "random_background" not in config.named_options:
         chosen["random_background"] = True
         reasons.append(f"random backgrounds, because {share:.0%} of the photos' pixels are transparent")

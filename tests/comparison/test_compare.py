@@ -22,6 +22,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
+from clsplat.training.decisions import decide
 from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
 
@@ -42,7 +43,7 @@ def compared(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_is_the_training_it_names(scene: Scene, compared: Path) -> None:
-    config = TrainConfig(shape="gaussian", cap_max=CAP, seed=1, **SHORT)
+    config = decide(scene, TrainConfig(shape="gaussian", cap_max=CAP, seed=1, **SHORT)).config
     model = train(scene, config)
     measured = evaluate(Renderer(), model.splats, scene.test)
     (record,) = [r for r in done(compared) if TrainConfig.from_json(r["config"]) == config]

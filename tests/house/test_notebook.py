@@ -16,6 +16,7 @@ from cli_runner import SHORT, clsplat
 import clsplat as package
 from clsplat.evaluation.metrics import protocol_named
 from clsplat.scenes.demo.scene import write_capture
+from clsplat.training.log import Progress
 
 ITERATIONS, CAP = 30, 60
 VARIABLE = ("render_ms",)  # keys of results.json whose times differ between runs
@@ -87,11 +88,11 @@ def test_train_and_evaluate_with_other_photos(scene: Path, tmp_path: Path) -> No
 
 def test_resume(scene: Path, tmp_path: Path) -> None:
     notebook, shell = tmp_path / "notebook", tmp_path / "shell"
-    calls = []
+    begun = []
 
-    def interrupt(progress: object) -> None:
-        calls.append(progress)
-        if len(calls) == 2:
+    def interrupt(progress: Progress) -> None:
+        if progress.iteration and not begun:
+            begun.append(progress)
             os.kill(os.getpid(), signal.SIGINT)
 
     config = small_config(iterations=120)

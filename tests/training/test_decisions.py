@@ -57,11 +57,12 @@ def test_some_points_are_random_beside_good_ones(scene: Scene) -> None:
         config = TrainConfig(cap_max=cap)
         decision = decide(scene, config)
         assert decision.config == config.replace(random_points=share, opacity_reg=PENALTY)
-        assert f"random points beside the scene's, {share:.0%} of the cap" in str(decision)
+        assert f"random points beside the scene's ({share:.0%} of the cap)" in str(decision)
     config = TrainConfig(cap_max=len(scene.points))
     assert decide(scene, config.replace(opacity_reg=0.0)).config.density.opacity_reg == 0
     named = config.replace(random_points=0.02)
     assert decide(scene, named).config == named.replace(opacity_reg=PENALTY)
+    assert decide(scene, TrainConfig(init="model.ply", random_points=0.1)).reasons == ()
     by_relocation = config.replace(strategy="mcmc")
     assert decide(scene, by_relocation).config == by_relocation.replace(random_points=RANDOM_SHARE)
 

@@ -35,7 +35,7 @@ CONFIG = TrainConfig(iterations=60, cap_max=4000, sh_degree=1, densify_interval=
 # Splats of low opacity die soon, so that relocation acts in a short run.
 MCMC = {"strategy": "mcmc", "densify_until": 1.0, "init_opacity": 0.02, "opacity_reg": 0.1}
 # Only some splats are above the threshold: which of them depends on the sums of gradients.
-ADC = {"strategy": "adc", "densify_until": 0.8, "opacity_reset": 2, "grad_threshold": 3e-3}
+ADC = {"random_points": 0.0, "strategy": "adc", "densify_until": 0.8, "opacity_reset": 2, "grad_threshold": 3e-3}
 CRASH = 25  # the checkpoint before it is at 17, between two densifications
 
 

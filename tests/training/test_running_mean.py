@@ -49,12 +49,13 @@ def test_a_scene_of_different_views_has_a_steady_mean() -> None:
 
 
 def test_the_display_shows_means_and_the_log_single_views(scene: Scene, tmp_path: Path) -> None:
+    from clsplat.training.decisions import decide
     from clsplat.training.trainer import Trainer
 
     shown: list[Progress] = []
     config = clsplat.TrainConfig(iterations=100, cap_max=300, sh_degree=1)
     clsplat.train(scene, config, shown.append, output=tmp_path / "model")
-    trainer, losses, psnrs = Trainer(scene, config), [], []
+    trainer, losses, psnrs = Trainer(scene, decide(scene, config).config), [], []
     for _ in range(100):
         trainer.step()
         value = trainer.loss.value(trainer.loss_result)
