@@ -26,6 +26,7 @@ from clsplat.comparison.runs import RUNS
 from clsplat.comparison.table import Record, markdown
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.config import TrainConfig
+from clsplat.training.decisions import as_decided
 
 OUT = common.RESULTS / "systems"
 
@@ -280,11 +281,14 @@ def short(label: str) -> str:
 
 
 def runs_by_seed(records: list[Record], method: Method, cap: int, iterations: int) -> dict[int, Record]:
-    """Return the runs of a method by seed; runs that had other options are left out."""
+    """Return the runs of a method by seed; runs that had other options are left out.
+
+    What a run decided by its scene is no other option. The last run of a seed counts.
+    """
 
     def same(record: Record) -> bool:
         options = TrainConfig.from_json(record["config"]).replace(device=None)
-        return options == method.config(cap, options.seed, {"iterations": iterations})
+        return options == as_decided(method.config(cap, options.seed, {"iterations": iterations}), options.to_json())
 
     return {
         record["config"]["seed"]: record
