@@ -283,7 +283,7 @@ def short(label: str) -> str:
 def runs_by_seed(records: list[Record], method: Method, cap: int, iterations: int) -> dict[int, Record]:
     """Return the runs of a method by seed; runs that had other options are left out.
 
-    What a run decided by its scene is no other option. The last run of a seed counts.
+    Options that a run decided by its scene may differ. The last run of a seed counts.
     """
 
     def same(record: Record) -> bool:

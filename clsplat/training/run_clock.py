@@ -18,7 +18,7 @@ from .targets import reduced_camera
 from .view_sampler import ViewSampler
 
 WORTH_A_MESSAGE = 10.0  # seconds; a shorter run needs no forecast before it begins
-PROBING_SHARE = 0.03  # of the time of the iterations that forward passes of the forecast may take
+PROBING_SHARE = 0.08  # of the time of the iterations that forward passes of the forecast may take
 _PROBE_VIEWS = 3
 
 
