@@ -44,6 +44,7 @@ _CLONE_AND_SPLIT = {
     "grad_threshold": 2e-4,
     "depth_threshold": 0.0,
     "dense_size": 0.01,
+    "turnover": 0.0,
     "opacity_reset": 10,
     "init_opacity": 0.1,
     "init_scale": 1.0,

@@ -108,6 +108,7 @@ DEFAULTS_OF_STRATEGY = {
         "grad_threshold": 2e-4,
         "depth_threshold": 0.0,
         "dense_size": 0.01,
+        "turnover": 0.05,
         "opacity_reset": 0,
     },
     Mcmc: {

@@ -18,6 +18,9 @@ axis. The paper does not define the two halves. Here they preserve these propert
              the unit normal of the plane, or eta / sqrt(1 + |eta|^2) for a soft plane. A soft plane without skew
              changes neither opacity.
 
+Beyond 3DGS, the cap does not end densification. If it has no room for the splats with a high gradient, the faintest of
+the others are pruned for them. 3DGS has no cap.
+
 In the direct form of skew, "mean" is the centroid, location + sqrt(2/pi) R S delta.
 """
 
@@ -58,6 +61,7 @@ def plan_adc(
     depth_threshold: float = 0.0,
     dense_size: float = 0.01,
     prune_large: bool = False,
+    turnover: float = 0.0,
 ) -> DensifyEdit:
     """Return the edit that clones, splits and prunes.
 
@@ -76,6 +80,7 @@ def plan_adc(
     depth_threshold : threshold of the mean depth gradient times the extent; 0: not used.
     dense_size : splats larger than this fraction of the extent are split, the others are cloned.
     prune_large : whether splats larger than WORLD_SIZE are pruned.
+    turnover : largest number of faint splats that are pruned to make room under the cap, as a fraction of the cap.
 
     Raises
     ------
@@ -86,7 +91,8 @@ def plan_adc(
         raise TrainingError("no splat has finite parameters any more: lower the learning rates")
     with np.errstate(over="ignore"):
         size = np.exp(arrays["log_scale"].astype(np.float64).max(axis=1))
-    bright = sound & (shape.strength(arrays) >= MIN_OPACITY)
+    strength = shape.strength(arrays)
+    bright = sound & (strength >= MIN_OPACITY)
     by_axis = depth_threshold > 0
     limit = WORLD_SIZE * extent if prune_large else math.inf
     keep = bright & (size <= limit)
@@ -97,6 +103,11 @@ def plan_adc(
     score = _score(stats, grad_threshold, depth_threshold, extent)
     splits = (score > 1.0) & splittable & (by_axis | (size > dense_size * extent))
     clones = (score > 1.0) & keep & bright & ~splits
+    if turnover and len(keep) <= cap:
+        others = keep & ~splits & ~clones
+        wanted = np.count_nonzero(splits | clones) + np.count_nonzero(splits & ~keep)
+        missing = int(np.count_nonzero(keep) + wanted - cap)
+        keep = keep & ~_faintest(strength, others, min(missing, int(turnover * cap)))
     split, clone = _best(score, splits, clones, keep, cap)
     stay = np.flatnonzero(keep & ~np.isin(np.arange(len(keep)), split))
     parents = np.concatenate([split, split])
@@ -149,6 +160,14 @@ def _best(
     cost = np.cumsum(np.where(keep[rows], 1, 2))  # a split saves a splat that would be pruned for its size
     rows = np.sort(rows[cost <= cap - np.count_nonzero(keep)])
     return rows[splits[rows]], rows[clones[rows]]
+
+
+def _faintest(strength: Array, among: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+    """Return which splats have the `count` smallest strengths among some, (N,). The first of equal ones count."""
+    rows = np.flatnonzero(among)
+    chosen = np.zeros(len(among), np.bool_)
+    chosen[rows[np.argsort(strength[rows], kind="stable")[: max(count, 0)]]] = True
+    return chosen
 
 
 def _drawn_halves(parents: Mapping[str, Array], shape: Shape, rng: np.random.Generator) -> dict[str, Array]:

@@ -77,6 +77,7 @@ def next_edit(
         grad_threshold=density.grad_threshold,
         depth_threshold=density.depth_threshold,
         dense_size=density.dense_size,
+        turnover=density.turnover,
         prune_large=0 < every < info.iteration,
     )
     return with_reset(grown, arrays, shape) if resets(density, config.iterations, info) else grown

@@ -61,6 +61,13 @@ class Adc(DensityConfig):
     dense_size: float = option(
         0.01, help="Splats larger than this fraction of the scene extent are split, others are cloned.", at_least=0
     )
+    turnover: float = option(
+        0.05,
+        help="Largest part of the cap that a densification step may replace once the cap is reached: the faintest "
+        "splats make room for new ones where the gradient is high. 0: densification ends at the cap.",
+        at_least=0,
+        at_most=1,
+    )
     opacity_reset: int = option(
         0,
         help="Number of opacity resets in a run of full length (3DGS: 10), at least 1000 iterations apart. 0: none.",
