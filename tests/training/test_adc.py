@@ -59,14 +59,22 @@ def plain(n: int, scale: float, opacity: float = 0.5) -> Arrays:
     spare=st.integers(-20, 150),
     by_axis=st.booleans(),
     large=st.booleans(),
+    turnover=st.sampled_from([0.0, 0.05, 0.5]),
     shape=st.sampled_from(ALL_SHAPES),
 )
-def test_laws_of_a_plan(n: int, seed: int, dead: float, spare: int, by_axis: bool, large: bool, shape: Shape) -> None:
+def test_laws_of_a_plan(
+    n: int, seed: int, dead: float, spare: int, by_axis: bool, large: bool, turnover: float, shape: Shape
+) -> None:
     arrays = random_model(shape, n, seed, dead)
     rng = np.random.default_rng(seed)
     stats = stats_of(*(rng.exponential(scale, n) for scale in (THRESHOLD, 0.1)))
     cap = max(1, n + spare)
-    options = {"depth_threshold": 0.1 if by_axis else 0.0, "dense_size": 0.02, "prune_large": large}
+    options = {
+        "depth_threshold": 0.1 if by_axis else 0.0,
+        "dense_size": 0.02,
+        "prune_large": large,
+        "turnover": turnover,
+    }
     edit = edited(arrays, shape, stats, cap, seed, **options)
     again = edited(arrays, shape, stats, cap, seed, **options)
     moved = edit.apply(arrays)
@@ -169,6 +177,35 @@ def test_the_cap_holds_exactly_and_the_largest_gradients_come_first(scale: float
     # Pruning frees rows for densification in the same action.
     arrays["opacity_logit"][3] = -9
     assert len(edited(arrays, shapes.GAUSSIAN, stats_of(gradient), cap=6).source) == 6
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.1])  # clones, and splits
+def test_at_the_cap_the_faintest_make_room_for_the_largest_gradients(scale: float) -> None:
+    gradient = np.array([3, 9, 0, 0, 7, 0]) * THRESHOLD
+    arrays = plain(6, scale)
+    arrays["opacity_logit"][:] = (1, 2, 0, -1, 3, 2)
+    plan = lambda turnover, cap=6, of=gradient: edited(  # noqa: E731
+        arrays, shapes.GAUSSIAN, stats_of(of), cap=cap, turnover=turnover
+    )
+    assert plan(0.0).source.tolist() == list(range(6))
+    assert np.bincount(plan(0.17).source).tolist() == [1, 2, 1, 0, 1, 1]  # one of six
+    assert np.bincount(plan(0.34).source).tolist() == [1, 2, 0, 0, 2, 1]
+    assert np.bincount(plan(0.5).source, minlength=6).tolist() == [0, 2, 0, 0, 2, 1]  # row 0 asks, but is faint itself
+    # Nothing is pruned that no gradient asks for, or that the cap has room for. A larger model than the cap stays.
+    assert plan(0.5, of=0 * gradient).source.tolist() == list(range(6))
+    assert np.bincount(plan(0.5, of=np.array([0, 9, 0, 0, 0, 0]) * THRESHOLD).source).tolist() == [1, 2, 1, 0, 1, 1]
+    assert np.bincount(plan(0.5, cap=8).source).tolist() == [2, 2, 1, 0, 2, 1]
+    assert np.bincount(plan(0.5, cap=9).source).tolist() == [2, 2, 1, 1, 2, 1]
+    assert plan(0.5, cap=5).source.tolist() == list(range(6))
+
+
+def test_a_turnover_counts_the_two_halves_of_a_splat_that_is_pruned_for_its_size() -> None:
+    arrays = plain(4, 1e-3)
+    arrays["opacity_logit"][:] = (2, 1, 0, -1)
+    arrays["log_scale"][0, 1] = math.log(1.1 * WORLD_SIZE * EXTENT)
+    loud = stats_of(np.array([9, 9, 0, 0]) * THRESHOLD)
+    edit = edited(arrays, shapes.GAUSSIAN, loud, cap=4, turnover=0.5, prune_large=True)
+    assert np.bincount(edit.source, minlength=4).tolist() == [2, 2, 0, 0]
 
 
 def test_what_is_not_finite_goes_and_the_model_is_never_empty() -> None:

@@ -102,7 +102,8 @@ def test_adc_hands_on_its_options() -> None:
     assert len(action(adc(grad_threshold=0.2), arrays=arrays, stats=stats)[1].source) == N
     deep = adc(grad_threshold=0.2, depth_threshold=0.5)
     assert len(action(deep, arrays=arrays, stats=stats)[1].source) == N + 1
-    assert len(action(adc(cap_max=N), arrays=arrays, stats=stats)[1].source) == N
+    assert not action(adc(cap_max=N, turnover=0.0), arrays=arrays, stats=stats)[1].added
+    assert action(adc(cap_max=N, turnover=0.01), arrays=arrays, stats=stats)[1].added
     size = float(np.exp(arrays["log_scale"][5].max()))
     assert "log_scale" in action(adc(dense_size=size / 2), arrays=arrays, stats=stats)[1].values
     cloned = action(adc(dense_size=size * 2), arrays=arrays, stats=stats)[1]

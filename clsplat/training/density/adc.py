@@ -18,8 +18,8 @@ axis. The paper does not define the two halves. Here they preserve these propert
              the unit normal of the plane, or eta / sqrt(1 + |eta|^2) for a soft plane. A soft plane without skew
              changes neither opacity.
 
-Beyond 3DGS, the cap does not end densification. If it has no room for the splats with a high gradient, the faintest of
-the others are pruned for them. 3DGS has no cap.
+Beyond 3DGS, the cap does not end densification. If it has no room for the splats with a high gradient, the faintest
+splats are pruned for them. 3DGS has no cap.
 
 In the direct form of skew, "mean" is the centroid, location + sqrt(2/pi) R S delta.
 """
@@ -80,7 +80,8 @@ def plan_adc(
     depth_threshold : threshold of the mean depth gradient times the extent; 0: not used.
     dense_size : splats larger than this fraction of the extent are split, the others are cloned.
     prune_large : whether splats larger than WORLD_SIZE are pruned.
-    turnover : largest number of faint splats that are pruned to make room under the cap, as a fraction of the cap.
+    turnover : largest number of splats that are pruned to make room under the cap, the faintest first, as a fraction
+        of the cap, 0 to 0.5. It has no effect on more splats than the cap.
 
     Raises
     ------
@@ -104,10 +105,10 @@ def plan_adc(
     splits = (score > 1.0) & splittable & (by_axis | (size > dense_size * extent))
     clones = (score > 1.0) & keep & bright & ~splits
     if turnover and len(keep) <= cap:
-        others = keep & ~splits & ~clones
         wanted = np.count_nonzero(splits | clones) + np.count_nonzero(splits & ~keep)
         missing = int(np.count_nonzero(keep) + wanted - cap)
-        keep = keep & ~_faintest(strength, others, min(missing, int(turnover * cap)))
+        faint = _faintest(strength, keep, min(missing, int(turnover * cap)))
+        keep, splits, clones = keep & ~faint, splits & ~faint, clones & ~faint
     split, clone = _best(score, splits, clones, keep, cap)
     stay = np.flatnonzero(keep & ~np.isin(np.arange(len(keep)), split))
     parents = np.concatenate([split, split])

@@ -66,7 +66,7 @@ class Adc(DensityConfig):
         help="Largest part of the cap that a densification step may replace once the cap is reached: the faintest "
         "splats make room for new ones where the gradient is high. 0: densification ends at the cap.",
         at_least=0,
-        at_most=1,
+        at_most=0.5,
     )
     opacity_reset: int = option(
         0,
