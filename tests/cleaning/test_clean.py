@@ -34,7 +34,7 @@ def scene(model_folder: Path) -> Scene:
 @pytest.fixture(scope="module")
 def sound(model_folder: Path, scene: Scene, renderer: Renderer) -> Splats:
     """Return the model without floaters of its own, so that the tolerance is left for those that are put in."""
-    return clean(load_model(model_folder).splats, scene.train, scene.extent, renderer, tolerance=0.02).splats
+    return clean(load_model(model_folder).splats, scene.train, scene.extent, renderer, tolerance=0.2).splats
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +51,12 @@ def dirty(sound: Splats, scene: Scene) -> Splats:
     return sound.with_arrays(more)
 
 
+def rows_of(splats: Splats) -> list[bytes]:
+    """Return the parameters of each splat."""
+    arrays = splats.to_numpy()
+    return [b"".join(values[row].tobytes() for values in arrays.values()) for row in range(len(splats))]
+
+
 def test_floaters_go_and_the_photos_lose_nothing(
     dirty: Splats, sound: Splats, scene: Scene, renderer: Renderer
 ) -> None:
@@ -65,8 +71,8 @@ def test_floaters_go_and_the_photos_lose_nothing(
     assert removed["oversized"] + removed["near cameras"] >= 2
     assert "outside" not in removed, "these photos have no transparency"
     assert len(cleaned.splats) == len(dirty) - sum(removed.values())
-    kept = np.isin(sound.mean, cleaned.splats.mean).all(axis=1)
-    np.testing.assert_array_equal(cleaned.splats.sh, sound.sh[kept])  # with their bits and in their order
+    before = iter(rows_of(sound))
+    assert all(row in before for row in rows_of(cleaned.splats)), "the rest has its bits and its order"
 
 
 def test_the_tolerance_stops_a_rule(

@@ -173,7 +173,7 @@ def test_the_judge_looks_at_the_pixels_that_count(splats: Splats, scene: Scene, 
     few = splats.select(np.arange(100))
     (value,) = Validation(renderer, [replace(view, image=wrong, mask=mask)]).per_view(few)
     assert value == psnr(renderer.render(few, view.camera).color, view.image, mask=mask)
-    assert value != pytest.approx(Validation(renderer, [view]).per_view(few)[0], abs=1e-3)
+    assert value != pytest.approx(Validation(renderer, [replace(view, image=wrong)]).per_view(few)[0], abs=1e-3)
 
 
 def test_a_model_is_pruned_over_its_background(

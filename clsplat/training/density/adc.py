@@ -105,8 +105,8 @@ def plan_adc(
     splits = (score > 1.0) & splittable & (by_axis | (size > dense_size * extent))
     clones = (score > 1.0) & keep & bright & ~splits
     if turnover and len(keep) <= cap:
-        wanted = np.count_nonzero(splits | clones) + np.count_nonzero(splits & ~keep)
-        missing = int(np.count_nonzero(keep) + wanted - cap)
+        growth = np.count_nonzero(splits | clones) + np.count_nonzero(splits & ~keep)
+        missing = int(np.count_nonzero(keep) + growth - cap)
         faint = _faintest(strength, keep, min(missing, int(turnover * cap)))
         keep, splits, clones = keep & ~faint, splits & ~faint, clones & ~faint
     split, clone = _best(score, splits, clones, keep, cap)
