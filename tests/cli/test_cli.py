@@ -19,6 +19,7 @@ from cli_runner import (
     WIDTH,
     clsplat,
     error_of,
+    last_iteration,
     run,
 )
 
@@ -240,7 +241,7 @@ def test_interrupt_then_resume(scene: Path, tmp_path: Path) -> None:
     process = subprocess.Popen([*PROGRAM, *map(str, args)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     for line in process.stderr:
-        if "/100000" in line:
+        if last_iteration(line, 100_000) >= 50:
             break
     process.send_signal(2)
     rest = process.communicate(timeout=300)[1]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import SHORT, run
+from cli_runner import SHORT, last_iteration, run
 from signal_moments import count_moments, fault_of, run_until
 
 import clsplat.scenes.scene as scene_module
@@ -69,7 +68,7 @@ def arguments(command: str, scene: Path, folder: Path) -> list[object]:
 
 @pytest.fixture
 def start_training(capture_folder: Path, tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
-    """Start a long run as a process and wait for its first line of progress."""
+    """Start a long run as a process and wait for its 50th iteration."""
 
     def start(**extra: object) -> subprocess.Popen[str]:
         args = ["train", capture_folder, "-m", tmp_path / "m", *LONG]
@@ -82,7 +81,7 @@ def start_training(capture_folder: Path, tmp_path: Path) -> Callable[..., subpro
         )
         assert process.stderr is not None
         for line in process.stderr:
-            if "/100000" in line:
+            if last_iteration(line, 100_000) >= 50:
                 return process
         raise AssertionError("the run has not begun")
 
@@ -121,7 +120,7 @@ def test_a_closed_terminal_loses_nothing(capture_folder: Path, tmp_path: Path) -
     if process == 0:
         os.execv(sys.executable, [*PROGRAM, *map(str, args)])
     shown = b""
-    while not any(int(done) >= 50 for done in re.findall(rb"(\d+)/100000", shown)):  # some come before the 50th
+    while last_iteration(shown.decode(errors="replace"), 100_000) < 50:
         shown += os.read(terminal, 4096)
     os.close(terminal)
     _, status = os.waitpid(process, 0)

@@ -53,6 +53,14 @@ def error_of(*args: object, code: int = 1) -> str:
 FLAG = re.compile(r"(?<![\w/.-])-(?:-[a-z][a-z-]*|[a-z])(?![\w-])")
 
 
+def last_iteration(shown: str, iterations: int) -> int:
+    """Return the highest iteration that lines of progress show, such as "120/100000"; 0 if they show none.
+
+    The first line comes after a time, so its iteration depends on the speed of the machine.
+    """
+    return max((int(done) for done in re.findall(rf"(\d+)/{iterations}\b", shown)), default=0)
+
+
 def flags_of(command: str) -> set[str]:
     """Return all options of a command."""
     found = main.get_command(click.Context(main), command)
