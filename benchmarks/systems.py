@@ -46,6 +46,7 @@ BASE = {
     "densify_interval": 100,
     "grad_threshold": 2e-4,
     "opacity_reset": 10,
+    "turnover": 0.0,
 }
 
 

@@ -136,7 +136,7 @@ class SplatStatistics:
     """
 
     ROWS = 3
-    TIMES_SEEN = 2  # row
+    SCREEN_GRADIENT, TIMES_SEEN = 0, 2  # rows
 
     def __init__(self, pool: Pool, dtype: np.dtype[np.floating]) -> None:
         self.device, self.dtype = pool.device, dtype

@@ -123,6 +123,7 @@ DEFAULTS_OF_STRATEGY = {
         "growth": 1.05,
         "relocation": "length",
         "relocation_limit": 1.0,
+        "turnover": 0.05,
     },
 }
 

@@ -233,6 +233,29 @@ def test_draws_are_in_proportion_to_the_strength() -> None:
     np.testing.assert_allclose(share, np.abs(live), atol=5 * 0.5 / math.sqrt(n_dead))
 
 
+def test_with_a_turnover_the_faintest_move_to_high_gradients_once_nothing_grows() -> None:
+    arrays = gaussians(np.arange(20.0) - 4)  # none is dead
+    gradient = np.zeros(20)
+    gradient[[2, 9, 15]] = (5.0, 1.0, np.inf)
+
+    def plan(cap: int, turnover: float, of: np.ndarray | None = gradient) -> DensifyEdit:
+        rng = np.random.default_rng(0)
+        return plan_relocation(arrays, shapes.GAUSSIAN, rng, cap, growth=1.05, turnover=turnover, gradient=of)
+
+    edit = plan(20, 0.25)
+    assert (edit.relocated, edit.added) == (5, 0)
+    assert edit.source.tolist() == [9] * 5 + list(range(5, 20))  # row 2 is faint itself; a gradient must be finite
+    assert plan(20, 0.04).relocated == 0  # less than one splat
+    assert plan(20, 0.25, None).source[:5].min() >= 5  # by strength
+    assert plan(20, 0.25, np.zeros(20)).source[:5].min() >= 5
+    growing = plan(21, 0.25)
+    assert (growing.relocated, growing.added) == (0, 1)
+    assert equal(growing, plan(21, 0.0, None))
+    dead = gaussians(np.array([-9.0, -9.0, 1.0, 2.0]))
+    edit = plan_relocation(dead, shapes.GAUSSIAN, np.random.default_rng(0), 4, turnover=0.5)
+    assert edit.relocated == 2, "the dead ones are the faintest"
+
+
 @pytest.mark.parametrize("limit", [0.0, 0.05, 0.3, 1.0])
 def test_a_limit_takes_the_weakest_first(limit: float) -> None:
     logit = np.concatenate([np.zeros(50), np.linspace(-6, -12, 50)])

@@ -48,6 +48,17 @@ def test_mcmc_relocates_and_grows_by_the_options() -> None:
     assert "log_scale" not in flat.values
 
 
+def test_mcmc_moves_splats_at_the_cap_to_high_mean_gradients() -> None:
+    arrays = random_model(shapes.GAUSSIAN, N, 1, dead=0)
+    row = int(shapes.GAUSSIAN.strength(arrays).argmax())
+    stats = np.zeros((3, N))
+    stats[:, row] = (1.0, 0.0, 4.0)
+    _, edit = action(mcmc(shape="gaussian", cap_max=N), arrays=arrays, stats=stats)
+    assert edit.relocated == 5
+    assert np.flatnonzero(np.bincount(edit.source) == 6).tolist() == [row]
+    assert not action(mcmc(shape="gaussian", cap_max=N, turnover=0.0), arrays=arrays, stats=stats)[1].relocated
+
+
 def test_length_squared_is_twice_the_log_factor() -> None:
     shifts = []
     for rule in ("length", "length-squared"):

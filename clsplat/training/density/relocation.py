@@ -10,6 +10,9 @@ Both integrals are numerical, so they exist for every profile. For the Gaussian 
 factor applies to lengths (ubc-vision/3dgs-mcmc#37). Student splatting squares it, which is the rule "length-squared".
 If a splat has two opacities, each has its o', and the line crosses the plane between them. For negative opacities
 (the scooping of Student splatting) the formula applies to |o|, and the sign stays.
+
+Beyond 3DGS-MCMC, splats still move once the number of splats no longer grows. With a turnover the faintest splats count
+as dead then, and all copies are drawn in proportion to the mean screen gradient, as `adc` chooses its splats.
 """
 
 from __future__ import annotations
@@ -55,6 +58,8 @@ def plan_relocation(
     min_opacity: float = MIN_OPACITY,
     rule: str = "length",
     limit: float = 1.0,
+    turnover: float = 0.0,
+    gradient: Array | None = None,
 ) -> DensifyEdit:
     """Return the edit that moves dead splats onto live ones and grows towards the cap.
 
@@ -74,6 +79,9 @@ def plan_relocation(
         (the scale does not change; Deformable Beta Splatting).
     limit : largest number of dead splats that are relocated, the weakest first, as a fraction of all splats. Non-finite
         splats are always relocated.
+    turnover : number of the faintest splats that count as dead if the number of splats does not grow, as a fraction of
+        all splats, 0 to 0.5.
+    gradient : (N,) mean screen gradient, which draws the copies if there is a turnover.
 
     Raises
     ------
@@ -93,14 +101,18 @@ def plan_relocation(
     names = opacity_names(arrays)
     strength = np.where(sound, shape.strength(arrays), 0.0)
     alive = strength > min_opacity
-    donors, dead = np.flatnonzero(alive), np.flatnonzero(sound & ~alive)
     n_new = max(n, min(cap, math.ceil(growth * n - 1e-6)))  # 1.05 * 100 is a little above 105 in binary
+    replacing = turnover > 0 and n_new == n
+    if replacing:
+        alive[np.argsort(strength, kind="stable")[: int(turnover * n)]] = False
+    donors, dead = np.flatnonzero(alive), np.flatnonzero(sound & ~alive)
     if not len(donors):
         donors, dead, n_new = np.flatnonzero(sound), dead[:0], n
     weakest = np.argsort(strength[dead], kind="stable")[: int(limit * n)]
     moving = np.sort(np.concatenate([np.flatnonzero(~sound), dead[weakest]]))
 
-    weights = strength[donors] if strength[donors].any() else np.ones(len(donors))
+    asked = strength if gradient is None or not replacing else np.where(np.isfinite(gradient), gradient, 0.0)
+    weights = asked[donors] if asked[donors].any() else np.ones(len(donors))
     drawn = donors[_draw(weights, len(moving) + n_new - n, rng)]
     source = np.arange(n_new, dtype=np.int64)
     source[moving] = drawn[: len(moving)]

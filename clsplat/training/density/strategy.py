@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...rendering.splat_buffers import SplatStatistics
 from ...splats.fields import Array
 from ...splats.shapes import shape_named
 from ..config import TrainConfig
@@ -65,6 +66,8 @@ def next_edit(
             growth=info.growth,
             limit=density.relocation_limit,
             rule=density.relocation if scaled else "opacity-only",
+            turnover=density.turnover,
+            gradient=stats[SplatStatistics.SCREEN_GRADIENT] / np.maximum(stats[SplatStatistics.TIMES_SEEN], 1.0),
         )
     every = reset_interval(density, config.iterations)
     grown = plan_adc(

@@ -33,6 +33,13 @@ class DensityConfig(OptionGroup):
     noise_lr: float = option(
         help="Strength of the random motion of positions, as a factor of their learning rate.", at_least=0
     )
+    turnover: float = option(
+        0.05,
+        help="Part of the cap that a densification step may replace once the cap is reached: the faintest splats make "
+        "room for new ones where the gradient is high. 0: none.",
+        at_least=0,
+        at_most=0.5,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,13 +67,6 @@ class Adc(DensityConfig):
     )
     dense_size: float = option(
         0.01, help="Splats larger than this fraction of the scene extent are split, others are cloned.", at_least=0
-    )
-    turnover: float = option(
-        0.05,
-        help="Largest part of the cap that a densification step may replace once the cap is reached: the faintest "
-        "splats make room for new ones where the gradient is high. 0: densification ends at the cap.",
-        at_least=0,
-        at_most=0.5,
     )
     opacity_reset: int = option(
         0,
