@@ -11,8 +11,8 @@ factor applies to lengths (ubc-vision/3dgs-mcmc#37). Student splatting squares i
 If a splat has two opacities, each has its o', and the line crosses the plane between them. For negative opacities
 (the scooping of Student splatting) the formula applies to |o|, and the sign stays.
 
-Beyond 3DGS-MCMC, splats still move once the number of splats no longer grows. With a turnover the faintest splats count
-as dead then, and all copies are drawn in proportion to the mean screen gradient, as `adc` chooses its splats.
+Beyond 3DGS-MCMC, splats still move once their number no longer grows. With a turnover the faintest ones count as dead
+then. Copies are drawn in proportion to the mean screen gradient, by which `adc` chooses too.
 """
 
 from __future__ import annotations
@@ -111,8 +111,8 @@ def plan_relocation(
     weakest = np.argsort(strength[dead], kind="stable")[: int(limit * n)]
     moving = np.sort(np.concatenate([np.flatnonzero(~sound), dead[weakest]]))
 
-    asked = strength if gradient is None or not replacing else np.where(np.isfinite(gradient), gradient, 0.0)
-    weights = asked[donors] if asked[donors].any() else np.ones(len(donors))
+    demand = strength if gradient is None or not replacing else np.where(np.isfinite(gradient), gradient, 0.0)
+    weights = demand[donors] if demand[donors].any() else np.ones(len(donors))
     drawn = donors[_draw(weights, len(moving) + n_new - n, rng)]
     source = np.arange(n_new, dtype=np.int64)
     source[moving] = drawn[: len(moving)]
