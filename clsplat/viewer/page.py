@@ -80,20 +80,22 @@ class Page:
         self._rates: list[float] = []
         self._status_time = 0.0
         self._frusta: list[viser.CameraFrustumHandle] = []
-        line = client.gui.add_markdown("")
-        self._status = StatusLine(lambda text: setattr(line, "content", text))
-        self._add_settings()
-        if known.by_label:
-            self._add_cameras()
-        self._path = PathPanel(client, self._here, self._jump, self._try, self.set_status, folder)
-        self._crop = CropPanel(
-            client, lambda: viewer.source.splats, up, self._choose_box, self._try, self.set_status, folder
-        )
-        with client.gui.add_folder("Help", expand_by_default=False):
-            client.gui.add_markdown(HELP)
-        viewer.join(client.client_id, self.send)
-        self._moved(client.camera)
+        # The browser gets the panel as a whole, after `join`: what it sends before that would be lost.
+        with client.atomic():
+            line = client.gui.add_markdown("")
+            self._status = StatusLine(lambda text: setattr(line, "content", text))
+            self._add_settings()
+            if known.by_label:
+                self._add_cameras()
+            self._path = PathPanel(client, self._here, self._jump, self._try, self.set_status, folder)
+            self._crop = CropPanel(
+                client, lambda: viewer.source.splats, up, self._choose_box, self._try, self.set_status, folder
+            )
+            with client.gui.add_folder("Help", expand_by_default=False):
+                client.gui.add_markdown(HELP)
+            viewer.join(client.client_id, self.send)
         client.camera.on_update(self._on_camera)
+        self._moved(client.camera)
 
     def close(self) -> None:
         """Remove the client after the browser has gone."""

@@ -93,13 +93,11 @@ class Viewer:
 
     def move(self, client_id: int, pose: Pose) -> None:
         """Move the camera of a client."""
-        self._change(client_id, pose=pose)
+        self._change(client_id, lambda _: {"pose": pose})
 
     def choose(self, client_id: int, name: str, value: Any) -> None:
         """Change a setting of a client; unusable values change nothing."""
-        client = self._clients.get(client_id)
-        if client is not None:
-            self._change(client_id, settings=client.settings.changed(name, value, self.source.modes))
+        self._change(client_id, lambda client: {"settings": client.settings.changed(name, value, self.source.modes)})
 
     def order_picture(self, client_id: int, size: int, receive: Callable[[ViewerImage], None]) -> None:
         """Render a client's view once with a longest side of `size` px. The serving thread calls `receive` with it."""
@@ -165,12 +163,13 @@ class Viewer:
         """Stop serving."""
         self.queue.close()
 
-    def _change(self, client_id: int, **values: Any) -> None:
+    def _change(self, client_id: int, values: Callable[[ViewerClient], dict[str, Any]]) -> None:
+        """Change attributes of a client. Two changes that arrive together are both made."""
         with self._lock:
             client = self._clients.get(client_id)
             if client is None:
                 return
-            for name, value in values.items():
+            for name, value in values(client).items():
                 setattr(client, name, value)
             client.moved = self._clock()
         self.queue.request(client_id)

@@ -125,7 +125,10 @@ def test_keys_do_what_the_help_says(server: Server, page: Page) -> None:
         client.flush()
         page.wait_for_timeout(200)
         page.keyboard.down(key)
-        page.wait_for_timeout(200)
+        for _ in range(100):
+            page.wait_for_timeout(100)
+            if np.abs(client.camera.position).max() > 0.05:
+                break
         page.keyboard.up(key)
         page.wait_for_timeout(150)
         moved = client.camera.position

@@ -31,9 +31,10 @@ from clsplat.errors import OutputError
 from clsplat.files.images import write_png
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
-from clsplat.viewer import status_line
+from clsplat.viewer import page, status_line
 from clsplat.viewer.camera import Pose, camera_of
 from clsplat.viewer.crop import CropBox
+from clsplat.viewer.crop_panel import CropPanel
 from clsplat.viewer.initial_view import SceneCameras, initial_view
 from clsplat.viewer.legend import legend
 from clsplat.viewer.page import Page
@@ -148,6 +149,21 @@ def test_two_browsers_see_what_each_has_chosen(running: Running) -> None:
         assert shows(two, expected(Settings(background=(1.0, 0.0, 0.0), cap=5, sh_degree=0)))
         one.set("Resolution", 64)
         one.still((43, 64))
+
+
+def test_a_setting_chosen_at_once_is_taken(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A browser may use the panel as soon as it shows it."""
+
+    class Slow(CropPanel):
+        def __init__(self, *values: Any) -> None:
+            time.sleep(0.3)  # a busy machine
+            super().__init__(*values)
+
+    monkeypatch.setattr(page, "CropPanel", Slow)
+    with Client(running.server.port) as client:
+        client.look()
+        client.set("Background", [255, 0, 0])
+        assert shows(client, expected(Settings(background=(1.0, 0.0, 0.0))))
 
 
 def test_lines_that_break_in_mid_frame_harm_nobody(running: Running) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -274,6 +275,29 @@ def test_each_client_has_its_own_settings() -> None:
         ("depth", BACKGROUND),
         ("colour", BACKGROUND),
     ]
+
+
+def test_settings_that_arrive_together_are_all_taken() -> None:
+    """Messages of one browser come in several threads."""
+    both = threading.Barrier(2)
+
+    class Slow(Plain):
+        @property
+        def modes(self) -> tuple[str, ...]:  # type: ignore[override]
+            """Wait for the other thread, if it may come here too."""
+            with contextlib.suppress(threading.BrokenBarrierError):
+                both.wait(0.5)
+            return MODES
+
+    viewer = Viewer(Slow(Clock()))
+    viewer.join(1, lambda shot: None)
+    changes = [("cap", 5), ("sh_degree", 0)]
+    threads = [threading.Thread(target=viewer.choose, args=(1, *change)) for change in changes]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert viewer.settings_of(1) == Settings(cap=5, sh_degree=0)
 
 
 @pytest.mark.parametrize("error", [DeviceError("out of memory"), ValueError("a bug\nof a driver"), MemoryError()])
