@@ -172,7 +172,7 @@ def _skew_normal() -> Values:
     - The rate of the skew is 1.25e-2, which is 5 times the rate of the centred form, after trials in 2D. The bound is
       10.
     - Warm-up, cycle and split of the alternation are clsplat's defaults.
-    - First opacity and scale are clsplat's defaults with "mcmc".
+    - The first opacity is 0.5, the first scale half the distance to the neighbours.
     - SGHMC has the constants of SSS, in the stable form.
     - The strategy is the relocation of SSS without its square. The paper's training times and baselines suggest that
       SNS builds on the code of SSS.
@@ -190,6 +190,8 @@ def _skew_normal() -> Values:
             "relocation_limit": 0.05,
             "growth": 1.05,
             "turnover": 0.0,
+            "init_opacity": 0.5,
+            "init_scale": 0.5,
             "position_optimizer": "sghmc",
             "alternation": "cyclic",
             "opacity_reg": 0.0,

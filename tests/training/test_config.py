@@ -115,7 +115,7 @@ DEFAULTS_OF_STRATEGY = {
         "densify_from": 0.05,
         "densify_until": 0.8,
         "densify_interval": 100,
-        "init_opacity": 0.5,
+        "init_opacity": 0.2,
         "init_scale": 0.5,
         "opacity_reg": 0.001,
         "scale_reg": 0.001,

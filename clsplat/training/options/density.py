@@ -23,7 +23,7 @@ class DensityConfig(OptionGroup):
     densify_from: float = option(0.05, help="Start of densification, as a fraction of the run.")
     densify_until: float = option(help="End of densification, as a fraction of the run.")
     densify_interval: int = option(100, help="Iterations between two densification steps.", at_least=1)
-    init_opacity: float = option(help="Opacity of splats that are created from points.", above=0, below=1)
+    init_opacity: float = option(0.2, help="Opacity of splats that are created from points.", above=0, below=1)
     init_scale: float = option(
         help="Scale of splats that are created from points, as a factor of the mean distance to three neighbours.",
         above=0,
@@ -50,7 +50,6 @@ class Adc(DensityConfig):
     strategy: ClassVar[str] = "adc"
 
     densify_until: float = 0.5
-    init_opacity: float = 0.2
     init_scale: float = 0.7
     opacity_reg: float = 0.0
     scale_reg: float = 0.0
@@ -83,7 +82,6 @@ class Mcmc(DensityConfig):
     strategy: ClassVar[str] = "mcmc"
 
     densify_until: float = 0.8
-    init_opacity: float = 0.5
     init_scale: float = 0.5
     opacity_reg: float = 0.001
     scale_reg: float = 0.001
