@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 from clsplat.cameras.camera import Camera
+from clsplat.splats.splats import Splats
+from clsplat.training.initialise import RANDOM_POINTS
+from clsplat.training.options.density import Mcmc
 from clsplat.training.random_points import random_points, seen
 
 
@@ -79,3 +82,23 @@ def test_one_camera_and_cameras_in_one_place_do() -> None:
     turned = looking(np.tile([0.0, 0.0, 1.0], (8, 1)), np.array([3.0, 0.0, 1.0]))
     xyz = random_points(scene(turned, 0.0), 100, np.random.default_rng(0))
     assert np.isfinite(xyz).all()
+
+
+def test_light_reaches_the_middle_of_the_largest_random_start() -> None:
+    """Inside an opaque fog no splat has a gradient. Training failed with a transmittance of 1e-8."""
+    density = Mcmc()
+    cameras = looking(ring(40), np.zeros(3))
+    xyz = random_points(scene(cameras), RANDOM_POINTS, np.random.default_rng(0))
+    splats = Splats.from_points(
+        xyz, np.zeros(xyz.shape, np.uint8), opacity=density.init_opacity, scale_factor=density.init_scale
+    )
+    scale = np.exp(splats.to_numpy()["log_scale"]).mean(axis=1)
+    depths = []
+    for camera in cameras[::4]:
+        from_camera = xyz - camera.position
+        along = from_camera @ camera.rotation[2]
+        distance = np.linalg.norm(from_camera - along[:, None] * camera.rotation[2], axis=1)
+        before = (along > 0) & (along < np.linalg.norm(camera.position))
+        alpha = density.init_opacity * np.exp(-0.5 * (distance / scale) ** 2)
+        depths.append(-np.log1p(-alpha[before]).sum())
+    assert np.exp(-np.mean(depths)) > 1e-4
