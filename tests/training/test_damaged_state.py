@@ -121,7 +121,7 @@ def test_options_of_another_kind_are_named(values: Any, said: str) -> None:
 def test_options_come_back() -> None:
     for config in (TrainConfig(), TrainConfig(strategy="mcmc", save_iterations=(3, 4), device="cpu", skew_lr=0.1)):
         assert TrainConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
-    assert TrainConfig.from_json({"init_opacity": None, "skew_lr": None}) == TrainConfig()
+    assert TrainConfig.from_json({"init_scale": None, "skew_lr": None}) == TrainConfig()
 
 
 @pytest.mark.parametrize(
