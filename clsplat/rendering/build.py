@@ -36,13 +36,8 @@ _BELOW_SHAPE = (
     "render/blend.clh",
     "shape/contract.clh",
 )
-_ABOVE_SHAPE = (
-    "render/antialias.clh",
-    "render/project.cl",
-    "render/batch.clh",
-    "render/blocks.clh",
-    "render/rasterize.cl",
-)
+_PROJECTION = ("render/antialias.clh", "render/project.cl")
+_PIXELS = ("render/batch.clh", "render/blocks.clh", "render/rasterize.cl")
 
 
 @dataclass(frozen=True)
@@ -94,9 +89,17 @@ class KernelBuild:
     def lanes(self) -> int:
         return self.schedule.lanes
 
-    def raster_program(self, device: Device) -> Program:
-        """Projection, rasterisation, and their gradients."""
-        return self._shape_program(device, *_ABOVE_SHAPE)
+    def projection_program(self, device: Device) -> Program:
+        """Projection and its gradient. Options of the pixels do not change it, so their builds share one program."""
+        schedule = Schedule(1, TILE * TILE // self.lanes, self.lanes)
+        shared = replace(
+            self, schedule=schedule, with_depth=False, with_v_alpha=False, alpha_max=ALPHA_MAX, t_min=T_MIN
+        )
+        return shared._shape_program(device, *_PROJECTION)
+
+    def pixel_program(self, device: Device) -> Program:
+        """Rasterisation and its gradient. All SH degrees share one program, because colours are projected before."""
+        return replace(self, sh_degree=0)._shape_program(device, *_PIXELS)
 
     def count_program(self, device: Device) -> Program:
         """Count of the useful pairs of a frame (rendering/overdraw.py)."""

@@ -48,7 +48,7 @@ class Pipeline:
     def __init__(self, device: Device, kernels: KernelBuild, max_isects: int | None = None) -> None:
         self.device, self.kernels = device, kernels
         self.max_isects = isect_limit(device, kernels) if max_isects is None else max_isects
-        self.program = kernels.raster_program(device)
+        self.projection, self.pixels = kernels.projection_program(device), kernels.pixel_program(device)
         self.group = lane_group(device)
         self.pool = pool = Pool(device)
         self.statistics = SplatStatistics(pool, kernels.dtype)
@@ -136,7 +136,7 @@ class Pipeline:
             if len(frame.bands) > 1:
                 # The block sets of this band are lost by now. Rasterize it again, without changing the images.
                 self._rasterize(frame, band, self._scratch_images)
-            self.program.rasterize_vjp(
+            self.pixels.rasterize_vjp(
                 (band.end * group,),
                 (group,),
                 tile_ranges=lists.ranges,
@@ -155,7 +155,7 @@ class Pipeline:
                 stride=layout.stride,
                 plane=layout.plane,
             )
-            self.program.gather_isect_grads.over(
+            self.pixels.gather_isect_grads.over(
                 -(-n // self.kernels.lanes),
                 self.group,
                 splat_isects=lists.splat_isects,
@@ -165,7 +165,7 @@ class Pipeline:
                 n_splats=n,
                 go_on=int(band.first > 0),
             )
-        self.program.project_splats_vjp.over(
+        self.projection.project_splats_vjp.over(
             -(-n // self.kernels.lanes),
             self.group,
             geom=splats.geom,
@@ -200,7 +200,7 @@ class Pipeline:
         if not n:
             return projected
         self._camera_event = send_to_device(self.device, projected.camera, block)
-        self.program.project_splats.over(
+        self.projection.project_splats.over(
             -(-n // self.kernels.lanes),
             self.group,
             geom=splats.geom,
@@ -237,7 +237,7 @@ class Pipeline:
     def _rasterize(self, frame: Frame, band: Band, images: RenderedImages, background: Color = BLACK) -> None:
         """Draw the tiles of a band, and those before it."""
         layout, group, (r, g, b) = frame.layout, self.kernels.schedule.group, background
-        self.program.rasterize(
+        self.pixels.rasterize(
             (band.end * group,),
             (group,),
             tile_ranges=self._lists.ranges,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -58,7 +59,8 @@ def compiler(devices: list[Device]) -> Device:
 def build_all(device: Device, kernels: KernelBuild) -> None:
     if kernels.real == "double" and not device.has_fp64:
         return
-    kernels.raster_program(device)
+    kernels.projection_program(device)
+    kernels.pixel_program(device)
     loss_program(device, kernels)
     exposure_program(device, kernels)
     optim_program(device, kernels)
@@ -83,6 +85,22 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
     # Shapes that a test has registered lie in other folders, with absolute paths.
     used = {name for names, *_ in compiler.programs for name in names if not Path(name).is_absolute()}
     assert used == {name for name in there if name.endswith((".cl", ".clh"))}
+
+
+def test_builds_share_the_programs_that_they_do_not_change(compiler: Device) -> None:
+    """Training and rendering share the projection, all SH degrees the pixels. Other options change both programs."""
+    training = KernelBuild("gaussian", 3, SCHEDULES["cpu16"])
+    flat, drawn = KernelBuild("gaussian", 0, SCHEDULES["cpu16"]), training.for_rendering()
+    assert training.projection_program(compiler) is drawn.projection_program(compiler)
+    assert training.pixel_program(compiler) is not drawn.pixel_program(compiler)
+    assert training.pixel_program(compiler) is flat.pixel_program(compiler)
+    assert training.projection_program(compiler) is not flat.projection_program(compiler)
+    for option in ({"antialiased": True}, {"alpha_min": 0.0}, {"normalisation": "pdf"}):
+        other = replace(training, **option)
+        assert training.projection_program(compiler) is not other.projection_program(compiler), option
+        assert training.pixel_program(compiler) is not other.pixel_program(compiler), option
+    wide = replace(training, schedule=SCHEDULES["gpu256"])
+    assert training.pixel_program(compiler) is not wide.pixel_program(compiler)
 
 
 @pytest.mark.slow
