@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import FEWER_SPLATS, OTHER_DEVICE, SMALLER_IMAGES, DeviceError
 from ..files.host_memory import available_bytes
 from .caches import ensure_caches
+from .context import shared_context
 from .opencl import Buffer, Event, first_line, is_out_of_memory
 from .pip_runtime import register_pip_runtime
 
@@ -77,13 +78,14 @@ Observer = Callable[[str, tuple[int, ...], Event], None]
 
 
 class Device:
-    """An opened device: a context and one in-order queue with profiling.
+    """An opened device: the context that the process has on it, and an in-order queue of its own with profiling.
 
     Attributes
     ----------
     info : properties of the device.
+    shared : the context with its built programs; other `Device` objects of this device use it too.
     context, queue : pyopencl objects.
-    programs : programs built for this device, cached by `program.build`.
+    programs : programs that this object has launched kernels of, cached by `program.build`.
     observer : called with every command that is enqueued, or None (see trace.py).
     """
 
@@ -93,7 +95,8 @@ class Device:
         self.info = info
         self.cl_device = cl_device
         try:
-            self.context = cl.Context([cl_device])
+            self.shared = shared_context(cl_device)
+            self.context = self.shared.cl_context
             self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         except cl.Error as error:
             raise DeviceError(f"device {info} cannot be opened: {first_line(error)}") from None

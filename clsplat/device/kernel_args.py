@@ -35,9 +35,10 @@ class Parameter:
     dtype: np.dtype[Any] | None = None
 
 
-def parse_signatures(
-    text: str, real: Real, defines: Mapping[str, int | float | str] | None = None
-) -> dict[str, tuple[Parameter, ...]]:
+Signatures = dict[str, tuple[Parameter, ...]]
+
+
+def parse_signatures(text: str, real: Real, defines: Mapping[str, int | float | str] | None = None) -> Signatures:
     """Return the parameters of every kernel in OpenCL C text, by kernel name.
 
     Parameters

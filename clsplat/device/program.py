@@ -24,7 +24,7 @@ import numpy as np
 from .. import activity
 from ..errors import OTHER_DEVICE, DeviceError, Remedy
 from .device import BROKEN_POCL, LESS_MEMORY, Device
-from .kernel_args import Parameter, parse_signatures
+from .kernel_args import Parameter, Signatures, parse_signatures
 from .kernel_args import Real as Real  # of this module's interface
 from .memory import to_device, to_host
 from .opencl import Event, KernelArgument, elapsed_ms, first_line, is_out_of_memory
@@ -57,7 +57,7 @@ def build(
     defines: Mapping[str, Define] | None = None,
     real: Real = "float",
 ) -> Program:
-    """Return the program of source files; it is built once for each device, files, defines and `real`.
+    """Return the program of source files; a process builds it once for each device, text, defines and `real`.
 
     Parameters
     ----------
@@ -70,29 +70,37 @@ def build(
     DeviceError : the device has no doubles, or the build failed (device, first error line, defines).
     """
     defines = dict(defines or {})
-    key = (files, tuple(sorted(defines.items())), real, os.environ.get(OPTIONS_VARIABLE, ""))
-    if key not in device.programs:
-        activity.report(f"compiling kernels: {Path(files[-1]).stem}")
-        device.programs[key] = build_text(device, source(*files), defines, real)
-    return device.programs[key]
+    options = (tuple(sorted(defines.items())), real, os.environ.get(OPTIONS_VARIABLE, ""))
+    if (files, *options) not in device.programs:
+        built, text = device.shared.built, source(*files)
+        if (text, *options) not in built:
+            activity.report(f"compiling kernels: {Path(files[-1]).stem}")
+            built[text, *options] = _built(device, text, defines, real)
+        device.programs[files, *options] = Program(device, *built[text, *options])
+    return device.programs[files, *options]
 
 
 def build_text(device: Device, text: str, defines: Mapping[str, Define] | None = None, real: Real = "float") -> Program:
-    """Return the program of OpenCL C text, without caching it in `device`; otherwise like `build`."""
+    """Return the program of OpenCL C text. It is built at every call; otherwise like `build`."""
+    return Program(device, *_built(device, text, dict(defines or {}), real))
+
+
+def _built(device: Device, text: str, defines: Mapping[str, Define], real: Real) -> tuple[pyopencl.Program, Signatures]:
+    """The built program and its signatures; DeviceError as in `build`."""
     import pyopencl as cl
 
     if real == "double" and not device.has_fp64:
         raise DeviceError(f"device {device.info} has no double precision", Remedy("use float32"), OTHER_DEVICE)
     lines = [f"#define REAL_DOUBLE {int(real == 'double')}", f"#define HAS_PREFETCH {int(device.info.has_prefetch)}"]
-    lines += [f"#define {name} {_literal(name, value, real)}" for name, value in (defines or {}).items()]
+    lines += [f"#define {name} {_literal(name, value, real)}" for name, value in defines.items()]
     options = [*OPTIONS, *os.environ.get(OPTIONS_VARIABLE, "").split()]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)  # some compilers warn at every success
             built = _compiled(device, "\n".join([*lines, text]), options)
     except cl.Error as error:
-        raise _build_error(device, error, defines or {}, real) from None
-    return Program(device, built, parse_signatures(text, real, defines))
+        raise _build_error(device, error, defines, real) from None
+    return built, parse_signatures(text, real, defines)
 
 
 def lane_group(device: Device) -> int:
@@ -106,7 +114,7 @@ def lane_group(device: Device) -> int:
 class Program:
     """A built program. `program["name"]` and `program.name` return a Kernel, the same one each time."""
 
-    def __init__(self, device: Device, built: pyopencl.Program, signatures: dict[str, tuple[Parameter, ...]]) -> None:
+    def __init__(self, device: Device, built: pyopencl.Program, signatures: Signatures) -> None:
         self.device = device
         self.signatures = signatures
         self._built = built

@@ -41,7 +41,7 @@ LAST = ("benchmark", "profiling", "viewer")
 
 # Libraries that only these modules import.
 OWNERS = {
-    "pyopencl": {"device.device", "device.memory", "device.opencl", "device.program"},
+    "pyopencl": {"device.context", "device.device", "device.memory", "device.opencl", "device.program"},
     "pycolmap": {"scenes.undistort"},
     "PIL": {"files.images"},
     "matplotlib": {"evaluation.chart_style"},
