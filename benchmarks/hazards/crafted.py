@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.cameras.camera import Camera
-from clsplat.rendering.camera_block import NEAR
 from clsplat.splats.fields import public_shape
+from clsplat.splats.near_plane import NEAR_PLANE as NEAR
 from clsplat.splats.shapes import Shape
 
 Arrays = dict[str, NDArray[np.float64]]

@@ -65,6 +65,7 @@ def prune_in_rounds(
         shape=splats.shape,
         normalisation=splats.normalisation,
         antialiased=splats.antialiased,
+        near_plane=splats.near_plane,
         iterations=10 * iterations,
         background=validation.background,
         strategy=Adc.strategy,  # rounds add no splats, and adc has no penalties
@@ -137,6 +138,7 @@ def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Pat
         shape=splats.shape,
         normalisation=splats.normalisation,
         antialiased=splats.antialiased,
+        near_plane=splats.near_plane,
         sh_degree=splats.sh_degree,
         cap_max=len(splats),
         init=str(start),

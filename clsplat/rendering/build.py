@@ -11,6 +11,7 @@ from ..device.device import Device
 from ..device.program import Define, Program, Real, build
 from ..device.schedule import TILE, Schedule
 from ..splats.fields import Group, Schema
+from ..splats.near_plane import NEAR_PLANE
 from ..splats.shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, Shape, shape_named
 from .camera_block import CAMERA_MEMBERS
 
@@ -60,6 +61,7 @@ class KernelBuild:
     alpha_max: float = ALPHA_MAX
     t_min: float = T_MIN
     antialiased: bool = False
+    near_plane: float = NEAR_PLANE  # no constant of the kernels: a member of the camera
 
     @cached_property
     def schema(self) -> Schema:

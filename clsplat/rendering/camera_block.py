@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 
-NEAR = 0.01  # world units
-
 _TANGENT_MARGIN = 0.3  # of the tangent of half the field of view, as in gsplat
 
 CAMERA_MEMBERS = (
@@ -21,8 +19,11 @@ CAMERA_MEMBERS = (
 )
 
 
-def camera_block(camera: Camera) -> NDArray[np.float64]:
-    """Values of CAMERA_MEMBERS, in this order; the bounds of the tangents are those of gsplat."""
+def camera_block(camera: Camera, near_plane: float) -> NDArray[np.float64]:
+    """Values of CAMERA_MEMBERS, in this order; the bounds of the tangents are those of gsplat.
+
+    near_plane : depth below which splats are not drawn [world units].
+    """
     tan_x, tan_y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
     values = dict(zip(CAMERA_MEMBERS, (*camera.rotation.ravel(), *camera.translation), strict=False))
     values |= {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
@@ -33,5 +34,5 @@ def camera_block(camera: Camera) -> NDArray[np.float64]:
         "tan_y_max": (camera.height - camera.cy) / camera.fy + _TANGENT_MARGIN * tan_y,
     }
     values |= dict(zip(("px", "py", "pz"), camera.position, strict=True))
-    values["near"] = NEAR
+    values["near"] = near_plane
     return np.array([values[member] for member in CAMERA_MEMBERS])

@@ -188,7 +188,7 @@ class Pipeline:
     def _project(self, splats: SplatBuffers, camera: Camera, layout: ImageLayout, degree: int) -> ProjectedSplats:
         """Project the splats into the image."""
         n, capacity = splats.n, splats.capacity
-        block = camera_block(camera).astype(self.kernels.dtype)
+        block = camera_block(camera, self.kernels.near_plane).astype(self.kernels.dtype)
         projected = ProjectedSplats(
             n,
             capacity,

@@ -163,6 +163,7 @@ class Renderer:
             alpha_max=alpha_max,
             t_min=t_min,
             antialiased=splats.antialiased,
+            near_plane=splats.near_plane,
         ).for_rendering()
         if kernels not in self._pipelines:
             self._pipelines[kernels] = Pipeline(self.device, kernels)

@@ -67,7 +67,15 @@ def write_splats(
     elif suffix == SPZ_ENDING:
         write_spz(path, splats, spz_version)
     else:
-        write_ply(path, splats.shape, splats.normalisation, splats.arrays, compact, splats.antialiased)
+        write_ply(
+            path,
+            splats.shape,
+            splats.normalisation,
+            splats.arrays,
+            compact,
+            splats.antialiased,
+            splats.near_plane,
+        )
 
 
 def check_ending(path: Path) -> str:

@@ -44,9 +44,8 @@ def convert(splats: Splats, shape: str) -> Splats:
     else:
         model, normalisation = _gaussian(model, splats.normalisation, source, target), "peak"
     dtype = splats.mean.dtype
-    return Splats(
-        shape, {name: values.astype(dtype) for name, values in model.items()}, normalisation, splats.antialiased
-    )
+    arrays = {name: values.astype(dtype) for name, values in model.items()}
+    return Splats(shape, arrays, normalisation, splats.antialiased, splats.near_plane)
 
 
 def _refuse(bad: NDArray[np.bool_], target: Shape, why: str, remedy: str) -> None:

@@ -16,6 +16,7 @@ from .any_file import read_splats, write_splats
 from .checks import check_arrays, sh_degree_for
 from .fields import MAX_SH_DEGREE, Array, Schema, public_shape, sh_coefficients
 from .harmonics import SH_C0
+from .near_plane import NEAR_PLANE, usable_near_plane
 from .shapes import DEFAULT_SHAPE, check_normalisation, shape_named
 from .spz import VERSIONS as SPZ_VERSIONS
 from .stored import StoredSplats
@@ -38,22 +39,29 @@ class Splats:
         The arrays are copied. They become float32 unless all of them are float64.
     normalisation : "peak", "pdf" or "none".
     antialiased : whether the opacity of a small splat falls as the low-pass filter widens it, as in training.
+    near_plane : depth below which a splat is not drawn, by its centre [world units].
 
     Raises
     ------
     InputError : a name is unknown, an array has a wrong shape, or a value is unusable.
     """
 
-    __slots__ = ("_antialiased", "_arrays", "_normalisation", "_schema", "_shape")
+    __slots__ = ("_antialiased", "_arrays", "_near_plane", "_normalisation", "_schema", "_shape")
 
     _antialiased: bool
     _arrays: dict[str, Array]
+    _near_plane: float
     _normalisation: str
     _schema: Schema
     _shape: str
 
     def __init__(
-        self, shape: str, arrays: Mapping[str, ArrayLike], normalisation: str = "peak", antialiased: bool = False
+        self,
+        shape: str,
+        arrays: Mapping[str, ArrayLike],
+        normalisation: str = "peak",
+        antialiased: bool = False,
+        near_plane: float = NEAR_PLANE,
     ) -> None:
         descriptor = shape_named(shape)
         double = all(getattr(values, "dtype", None) == np.float64 for values in arrays.values())
@@ -74,6 +82,7 @@ class Splats:
         self._shape = descriptor.name
         self._normalisation = check_normalisation(normalisation)
         self._antialiased = bool(antialiased)
+        self._near_plane = usable_near_plane(near_plane)
         self._schema = schema
         self._arrays = {field.name: fields[field.name] for field in schema}
 
@@ -88,7 +97,7 @@ class Splats:
         InputError : the file is missing or damaged, or has another format.
         """
         found = read_splats(path)
-        return cls(found.shape, found.arrays, found.normalisation, found.antialiased)
+        return cls(found.shape, found.arrays, found.normalisation, found.antialiased, found.near_plane)
 
     def save(self, path: str | os.PathLike[str], compact: bool = False, *, spz_version: int = SPZ_VERSIONS[0]) -> None:
         """Write a .splat or .spz file, or else a PLY file in float32, atomically.
@@ -104,7 +113,7 @@ class Splats:
         InputError : the file holds Gaussians only, and these splats have another shape.
         OutputError : the file cannot be written.
         """
-        stored = StoredSplats(self._shape, self._normalisation, self._antialiased, self._arrays)
+        stored = StoredSplats(self._shape, self._normalisation, self._antialiased, self._arrays, self._near_plane)
         write_splats(path, stored, compact, spz_version)
 
     @classmethod
@@ -180,6 +189,11 @@ class Splats:
         return self._antialiased
 
     @property
+    def near_plane(self) -> float:
+        """Depth below which a splat is not drawn, by its centre [world units]."""
+        return self._near_plane
+
+    @property
     def schema(self) -> Schema:
         """Fields of these splats."""
         return self._schema
@@ -237,7 +251,13 @@ class Splats:
 
     def with_arrays(self, arrays: Mapping[str, ArrayLike]) -> Splats:
         """Return splats of the same kind with other arrays of any length. Raises InputError as `Splats` does."""
-        return Splats(self._shape, arrays, self._normalisation, self._antialiased)
+        return Splats(self._shape, arrays, self._normalisation, self._antialiased, self._near_plane)
+
+    def with_near_plane(self, depth: float) -> Splats:
+        """Return the same splats with another near plane [world units]. Raises InputError if it is not above 0."""
+        if depth == self._near_plane:
+            return self
+        return Splats(self._shape, self._arrays, self._normalisation, self._antialiased, depth)
 
     def select(self, indices: ArrayLike) -> Splats:
         """Return the splats at `indices`: whole numbers in any order with repeats, or an (N,) boolean mask.
@@ -278,7 +298,7 @@ class Splats:
                     "remove them or choose another shape"
                 )
             arrays["opacity_logit"] = target.raw_opacity(np.clip(opacity, *_OPACITIES)).astype(raw.dtype)
-        return Splats(name, arrays, self._normalisation, self._antialiased)
+        return Splats(name, arrays, self._normalisation, self._antialiased, self._near_plane)
 
 
 def _real(name: str, values: ArrayLike, dtype: np.dtype[Any]) -> Array:

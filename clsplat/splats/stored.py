@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .checks import Fault, first_fault, unusable
 from .fields import Array, Field, Schema
+from .near_plane import NEAR_PLANE
 from .shapes import GAUSSIAN, shape_named
 
 OPAQUE_LOGIT = 15.0  # stands for an opacity of 1; its negative stands for 0
@@ -31,7 +32,7 @@ class StoredSplats:
     Parameters
     ----------
     shape, normalisation : names of the kernel and its normalisation.
-    antialiased : see `Splats`.
+    antialiased, near_plane : see `Splats`.
     arrays : public arrays by field name, all of one real type.
     """
 
@@ -39,6 +40,7 @@ class StoredSplats:
     normalisation: str
     antialiased: bool
     arrays: Mapping[str, Array]
+    near_plane: float = NEAR_PLANE
 
 
 def gaussians(path: object, arrays: Mapping[str, NDArray[np.floating]], antialiased: bool = False) -> StoredSplats:

@@ -65,7 +65,7 @@ def transformed(splats: Splats, matrix: ArrayLike) -> Splats:
     }
     arrays = splats.to_numpy()
     arrays |= {name: values.astype(arrays[name].dtype) for name, values in changed.items()}
-    return splats.with_arrays(arrays)
+    return splats.with_arrays(arrays).with_near_plane(scale * splats.near_plane)
 
 
 def turned_harmonics(sh: Array, rotation: DoubleArray) -> Array:
@@ -88,6 +88,8 @@ def turned_harmonics(sh: Array, rotation: DoubleArray) -> Array:
 
 def joined(parts: Sequence[Splats]) -> Splats:
     """Join splats to one model, of a shape to which all of them can be converted.
+
+    Its near plane is the smallest of theirs.
 
     Raises
     ------
@@ -120,4 +122,5 @@ def _stacked(parts: Sequence[Splats]) -> Splats:
     arrays["sh"] = np.concatenate(
         [np.pad(part.sh, ((0, 0), (0, coefficients - part.sh.shape[1]), (0, 0))) for part in parts]
     )
-    return next((part for part in parts if len(part)), parts[0]).with_arrays(arrays)
+    first = next((part for part in parts if len(part)), parts[0])
+    return first.with_arrays(arrays).with_near_plane(min(part.near_plane for part in parts))

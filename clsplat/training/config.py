@@ -87,6 +87,14 @@ class TrainConfig:
         help="Lower the opacity of small splats by the factor by which the screen filter enlarges them "
         "(Mip-Splatting). The model then looks similar at other image sizes.",
     )
+    near_plane: float | None = option(
+        None,
+        help="Depth below which a splat is not drawn, by its centre [world units]: 0.2 as in 3DGS, or less in scenes "
+        "that are small or near to their cameras.",
+        above=0,
+        metavar="DEPTH",
+        by_scene=True,
+    )
     background: Color = option(BLACK, help="Colour behind the splats, each part 0 to 1.", metavar="R,G,B")  # noqa: RUF009
     random_background: bool = option(
         False,

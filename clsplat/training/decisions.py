@@ -7,6 +7,8 @@
 - Beside the points of a scene, some splats start at random places too: a plain wall has no points, and would else get
   no splats. They also need the penalty.
 - Splats that start at random places have a longer way, so their learning rates are twice as high.
+- Splats very close to a camera are not drawn (`near_plane.py`): one of them can hide a whole scene from views between
+  those of the photos.
 
 docs/decisions.md has the measurements.
 """
@@ -21,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 from .config import OPTIONS, TrainConfig
 from .initialise import MIN_POINTS
 from .log import Progress
+from .near_plane import FARTHEST, choose_near_plane
 from .options.density import Adc, Mcmc
 from .options.groups import OptimConfig
 from .options.option import option_table
@@ -93,6 +96,10 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if why and config.iterations >= FEWEST_ITERATIONS and not {"lr_factor", *_RATES} & config.named_options.keys():
         chosen["lr_factor"] = RANDOM_START_RATES
         reasons.append(f"learning rates times {RANDOM_START_RATES:g}, because {why}")
+    if "near_plane" not in config.named_options:
+        chosen["near_plane"] = near = choose_near_plane(scene)
+        if near < FARTHEST:
+            reasons.append(f"a near plane of {near:g} units, because the scene is small or near to cameras")
     return Decision(_with(config, chosen), tuple(reasons))
 
 

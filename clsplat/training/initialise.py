@@ -10,21 +10,20 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.stop_signals import held
-from ..rendering.camera_block import NEAR
 from ..splats.any_file import READ_ENDINGS
 from ..splats.fields import Array, sh_coefficients
 from ..splats.morton import morton_order
+from ..splats.near_plane import NEAR_PLANE
 from ..splats.shapes import DEFAULT_SHAPE, shape_named
 from ..splats.splats import Splats
-from .random_points import random_points, seen
+from .near_plane import check_near_plane
+from .random_points import random_points
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
 
 RANDOM_POINTS = 100_000  # 3DGS
 MIN_POINTS = 4  # the first scale needs a point and its three neighbours
-_MAX_NEAR_SHARE = 0.1  # largest share of the visible points that may be nearer than the near plane
-_SAMPLED_POINTS = 2000  # points that are tested against the near plane
 
 
 def initial_splats(
@@ -37,6 +36,7 @@ def initial_splats(
     *,
     normalisation: str = "peak",
     antialiased: bool = False,
+    near_plane: float = NEAR_PLANE,
     random_share: float | None = 0.0,
     opacity: float,
     scale_factor: float,
@@ -48,7 +48,7 @@ def initial_splats(
     Parameters
     ----------
     scene : scene with points and training cameras.
-    shape, sh_degree, normalisation, antialiased : properties of the result.
+    shape, sh_degree, normalisation, antialiased, near_plane : properties of the result.
     cap : largest number of splats. The points with the longest tracks are kept, or the most opaque splats of a model.
     init : "sfm", "random", or the path of a file of splats. "sfm" without points becomes "random", with a message.
     seed : seed of random points and of the first skew.
@@ -60,11 +60,11 @@ def initial_splats(
     Raises
     ------
     InputError : the cap is below 1; `init` is unknown; the model is unreadable, or has another normalisation or
-        antialiasing; or the scene is so small that it is nearer than the near plane.
+        antialiasing; or much of the scene is nearer than the near plane.
     """
     if cap < 1:
         raise InputError(f"cap {cap}: at least 1 splat is needed")
-    check_size(scene)
+    check_near_plane(scene, near_plane)
     rng = np.random.default_rng(seed)
     if init in ("sfm", "random"):
         xyz, rgb, message = _points(scene, init, cap, rng, random_share)
@@ -83,7 +83,7 @@ def initial_splats(
         splats, message = _from_model(init, shape, cap, sh_degree, normalisation, antialiased)
     else:
         raise InputError(f"init {init!r}: choose sfm, random, or the path of a file of splats")
-    return _started(splats, rng), message
+    return _started(splats, rng).with_near_plane(near_plane), message
 
 
 def _points(
@@ -135,20 +135,6 @@ def distinct(xyz: Array) -> NDArray[np.int64]:
     same = np.zeros(len(xyz), np.bool_)
     same[order[1:]] = (xyz[order[1:]] == xyz[order[:-1]]).all(axis=1)  # lexsort is stable: the first comes first
     return np.flatnonzero(~same)
-
-
-def check_size(scene: Scene) -> None:
-    """Raise InputError if too much of the scene is nearer than the near plane, where nothing is rendered."""
-    xyz = scene.points.xyz[:: -(-len(scene.points.xyz) // _SAMPLED_POINTS) or 1]
-    depths = [depth[inside] for depth, inside in (seen(view.camera, xyz) for view in scene.train)]
-    depth = np.concatenate(depths) if depths else np.zeros(0)
-    if not len(depth) or np.mean(depth < NEAR) <= _MAX_NEAR_SHARE:
-        return
-    factor = 10.0 ** np.ceil(np.log10(10 * NEAR / np.median(depth)))
-    raise InputError(
-        f"{scene.path}: {np.mean(depth < NEAR):.0%} of what its cameras see is nearer than the near plane "
-        f"({NEAR:g} units): make the reconstruction about {factor:g} times as large"
-    )
 
 
 def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene: Scene) -> NDArray[np.int64]:

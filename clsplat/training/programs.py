@@ -9,6 +9,7 @@ from ..device.program import Define, Program, build
 from ..device.schedule import Schedule
 from ..rendering.build import CULLED_KEY, MARGIN_X, MARGIN_Y, KernelBuild, layout_defines
 from ..splats.fields import Group
+from ..splats.near_plane import NEAR_PLANE
 from ..splats.shapes import shape_named
 from .config import TrainConfig
 from .optim import adam
@@ -28,6 +29,7 @@ def kernel_build(config: TrainConfig, schedule: Schedule) -> KernelBuild:
         config.normalisation,
         skew_map=config.skew_map or SKEW_MAPS[0],
         antialiased=config.antialiased,
+        near_plane=config.near_plane or NEAR_PLANE,
     )
 
 

@@ -62,7 +62,7 @@ def train(
     if folder is not None:
         if resume:
             checkpoint = fitting_checkpoint(folder, config)
-            config = as_decided(config, checkpoint.config)
+            config = as_decided(config, TrainConfig.from_json(checkpoint.config).to_json())
         elif folder.is_used and not overwrite:
             raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
         folder.prepare()

@@ -142,6 +142,7 @@ class Trainer:
             config.seed,
             normalisation=config.normalisation,
             antialiased=config.antialiased,
+            near_plane=self.kernels.near_plane,
             random_share=config.start.random_points,
             opacity=config.density.init_opacity,
             scale_factor=config.density.init_scale,
@@ -327,6 +328,7 @@ class Trainer:
                 {name: array[sound] for name, array in arrays.items()},
                 self.config.normalisation,
                 self.config.antialiased,
+                self.kernels.near_plane,
             )
         except InputError as error:
             raise TrainingError(f"iteration {self.iteration}: {error}: lower the learning rates") from None

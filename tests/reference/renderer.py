@@ -23,7 +23,7 @@ from reference.radial import RADIAL
 from reference.shape import Array, Geometry, Kernel
 from reference.skewed import SKEWED
 
-NEAR_PLANE = 0.01  # splats with a camera z below this are skipped
+NEAR_PLANE = 0.01  # splats with a camera z below this are skipped, unless a model names another depth
 REFERENCES = SKEWED | RADIAL
 FIELDS = {name: ("mean", "quat", "log_scale", "opacity_logit", *own.fields, "sh") for name, own in REFERENCES.items()}
 STEP = 1e-20  # the complex step; its square must vanish compared with 1
@@ -158,11 +158,13 @@ def prepared(arrays: Mapping[str, ArrayLike], shape: str) -> dict[str, Array]:
     return {name: np.asarray(arrays[name], dtype=np.float64) for name in FIELDS[shape]}
 
 
-def visible_order(values: Mapping[str, Array], camera: Camera, shape: str) -> NDArray[np.intp]:
+def visible_order(
+    values: Mapping[str, Array], camera: Camera, shape: str, near_plane: float = NEAR_PLANE
+) -> NDArray[np.intp]:
     """Return the indices of splats at or beyond the near plane, nearest first. Equal depths keep their order."""
     z = projected_point(values, shape) @ camera.rotation[2] + camera.translation[2]
     order = np.argsort(z, kind="stable")
-    return order[z[order] >= NEAR_PLANE]
+    return order[z[order] >= near_plane]
 
 
 def render_reference(
@@ -176,6 +178,7 @@ def render_reference(
     t_min: float = 1e-4,
     sh_degree: int | None = None,
     antialiased: bool = False,
+    near_plane: float = NEAR_PLANE,
 ) -> Rendered:
     """Render raw splats.
 
@@ -183,7 +186,7 @@ def render_reference(
     fields of the shape.
     """
     values = prepared(arrays, shape)
-    order = visible_order(values, camera, shape)
+    order = visible_order(values, camera, shape, near_plane)
     size = (camera.height, camera.width)
     if len(order) == 0:
         color = np.broadcast_to(np.asarray(background, dtype=np.float64), (*size, 3)).copy()
@@ -208,6 +211,7 @@ def reference_gradients(
     sh_degree: int | None = None,
     fields: Sequence[str] | None = None,
     antialiased: bool = False,
+    near_plane: float = NEAR_PLANE,
 ) -> dict[str, Array]:
     """Return the gradient of sum(v_color * color) + sum(v_alpha * alpha) with respect to the raw values.
 
@@ -218,7 +222,7 @@ def reference_gradients(
     values = prepared(arrays, shape)
     names = FIELDS[shape] if fields is None else tuple(fields)
     gradients = {name: np.zeros_like(values[name]) for name in names}
-    order = visible_order(values, camera, shape)
+    order = visible_order(values, camera, shape, near_plane)
     if len(order) == 0:
         return gradients
     options = (camera, shape, normalisation, sh_degree, antialiased)

@@ -19,11 +19,11 @@ from clsplat.device.device import Device
 from clsplat.device.schedule import SCHEDULES, TILE, Schedule, default_schedule
 from clsplat.errors import InputError
 from clsplat.rendering.build import BATCH, KernelBuild
-from clsplat.rendering.camera_block import NEAR
 from clsplat.rendering.frame import DeviceImage
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.renderer import Renderer
 from clsplat.rendering.splat_buffers import ParameterBuffers, SplatBuffers
+from clsplat.splats.near_plane import NEAR_PLANE
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 
@@ -231,14 +231,16 @@ def test_nothing_to_see(make_renderer: MakeRenderer, scheduled: tuple[Device, Sc
 
 
 @EVERY
-def test_near_plane(make_renderer: MakeRenderer, device: Device, shape: str) -> None:
-    """A splat at the near plane is drawn. A splat at the next smaller z is not."""
+@pytest.mark.parametrize("near", [NEAR_PLANE, 0.3])
+def test_near_plane(make_renderer: MakeRenderer, device: Device, shape: str, near: float) -> None:
+    """A splat at the near plane of its model is drawn. A splat at the next smaller z is not."""
     camera = Camera(9, 7, 8.0, 8.0, 4.3, 3.6, np.eye(4))
-    for z, seen in ((NEAR, True), (np.nextafter(NEAR, 0.0), False), (-1.0, False)):
+    for z, seen in ((near, True), (np.nextafter(near, 0.0), False), (-1.0, False)):
         arrays = random_splats(3, 1, 3)
-        arrays["mean"], arrays["log_scale"] = np.array([[0.0, 0.0, z]]), np.full((1, 3), -6.0)
+        arrays["mean"], arrays["log_scale"] = np.array([[0.0, 0.0, z]]), np.full((1, 3), np.log(z) if z > 0 else -6.0)
+        arrays["log_scale"] -= 1.4
         arrays["skew"][:] = 0.0  # all shapes then project (x, y, z)
-        case = Case(arrays, camera, shape, dtype=np.float64)
+        case = Case(arrays, camera, shape, dtype=np.float64, near_plane=near)
         assert case.image.alpha.any() == seen
         case.check(make_renderer(device, "float64"), ROUNDING, ROUNDING)
 

@@ -15,8 +15,10 @@ from scenes_data import scene_folder
 
 from clsplat.errors import InputError
 from clsplat.splats.fields import Field
+from clsplat.splats.near_plane import NEAR_PLANE
 from clsplat.splats.ply import read_ply, write_ply
 from clsplat.splats.shapes import SHAPES
+from clsplat.splats.splats import Splats
 
 IN_FOLDER = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 ORDER_DEGREE_1 = (
@@ -65,6 +67,17 @@ def same(a: Arrays, b: Arrays) -> None:
     for name in a:
         assert a[name].dtype == b[name].dtype, name
         np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+@pytest.mark.parametrize("compact", [False, True])
+def test_the_near_plane_is_stored_unless_it_is_the_usual_one(file: Path, compact: bool) -> None:
+    splats = Splats.load(save(file, plain()))
+    splats.save(file, compact)
+    assert b"near_plane" not in file.read_bytes()
+    assert Splats.load(file).near_plane == NEAR_PLANE == 0.01
+    for near in (0.2, 0.1 + 0.2, 1e-9):
+        splats.with_near_plane(near).save(file, compact)
+        assert Splats.load(file).near_plane == near
 
 
 @IN_FOLDER
@@ -344,6 +357,8 @@ def test_normals_may_hold_anything(file: Path, recwarn: pytest.WarningsRecorder)
         ("end_header\n", "", "header"),
         ("element vertex 2", "comment clsplat shape=cube\nelement vertex 2", "unknown shape 'cube'"),
         ("element", "comment clsplat shape=gaussian normalisation=x\nelement", "normalisation 'x'"),
+        ("element", "comment clsplat near_plane=0\nelement", "'clsplat near_plane=0': give a depth above 0"),
+        ("element", "comment clsplat near_plane=far\nelement", "'clsplat near_plane=far': give a depth above 0"),
     ],
 )
 def test_faulty_headers_are_named(file: Path, old: str, new: str, said: str) -> None:

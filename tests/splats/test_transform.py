@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device
 from clsplat.errors import InputError
+from clsplat.splats.approximate import nearest_gaussians
+from clsplat.splats.convert import convert
 from clsplat.splats.harmonics import sh_basis
 from clsplat.splats.splats import Splats
 from clsplat.splats.transform import joined, similarity, transformed, turned_harmonics
@@ -91,6 +93,19 @@ def test_joined_models_have_all_splats_and_all_bands() -> None:
     np.testing.assert_array_equal(both.sh[:5, 4:], 0)
     np.testing.assert_array_equal(both.mean[5:], second.mean)
     assert joined([first]).shape == "gaussian"
+
+
+def test_the_near_plane_grows_with_the_model_and_a_joined_model_has_the_smallest() -> None:
+    splats = random_splats("gaussian", 5, 1).with_near_plane(0.2)
+    larger = transformed(splats, np.diag([3.0, 3.0, 3.0, 1.0]))
+    assert larger.near_plane == pytest.approx(0.6)
+    assert joined([larger, splats]).near_plane == 0.2
+    for same in (splats.as_shape("skew-normal"), splats.select([0]), convert(splats, "skew-normal-direct")):
+        assert same.near_plane == 0.2
+    assert nearest_gaussians(random_splats("skew-normal", 5, 1).with_near_plane(0.2)).near_plane == 0.2
+    for wrong in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match=r"near plane .*: give a depth above 0"):
+            splats.with_near_plane(wrong)
 
 
 def test_shapes_without_equals_are_refused() -> None:

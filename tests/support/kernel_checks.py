@@ -23,6 +23,7 @@ from reference.tolerances import relative_error
 from clsplat.cameras.camera import Camera
 from clsplat.rendering import renderer as render
 from clsplat.rendering.build import ALPHA_MAX, ALPHA_MIN, T_MIN
+from clsplat.splats.near_plane import NEAR_PLANE
 from clsplat.splats.shapes import NORMALISATIONS, SHAPES
 from clsplat.splats.splats import Splats
 
@@ -60,6 +61,7 @@ class Case:
     seed: int = 0
     thresholds: dict[str, float] = field(default_factory=dict)
     antialiased: bool = False
+    near_plane: float = NEAR_PLANE
 
     @cached_property
     def values(self) -> Arrays:
@@ -67,7 +69,7 @@ class Case:
 
     @cached_property
     def splats(self) -> Splats:
-        return Splats(self.shape, self.values, self.normalisation, self.antialiased)
+        return Splats(self.shape, self.values, self.normalisation, self.antialiased, self.near_plane)
 
     @cached_property
     def image(self) -> Rendered:
@@ -78,6 +80,7 @@ class Case:
             self.normalisation,
             BACKGROUND,
             antialiased=self.antialiased,
+            near_plane=self.near_plane,
             **self.thresholds,
         )
 
@@ -92,6 +95,7 @@ class Case:
             BACKGROUND,
             fields=self.fields,
             antialiased=self.antialiased,
+            near_plane=self.near_plane,
             **self.thresholds,
         )
 
@@ -100,7 +104,7 @@ class Case:
         """Return (height, width)."""
         shape = (self.camera.height, self.camera.width)
         values = prepared(self.values, self.shape)
-        order = visible_order(values, self.camera, self.shape)
+        order = visible_order(values, self.camera, self.shape, self.near_plane)
         if self.thresholds or not len(order):
             return np.ones(shape, bool)
         ordered = {name: value[order] for name, value in values.items()}

@@ -56,6 +56,7 @@ DEFAULTS = {
     "sh_degree": 3,
     "normalisation": "peak",
     "antialiased": False,
+    "near_plane": None,
     "background": (0.0, 0.0, 0.0),
     "random_background": False,
     "seed": 0,

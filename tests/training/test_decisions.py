@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from clsplat.errors import InputError
+from clsplat.models.model import load_model
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Points, Scene
+from clsplat.splats.near_plane import NEAR_PLANE
+from clsplat.splats.splats import Splats
+from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import (
     FEWEST_ITERATIONS,
@@ -24,13 +30,37 @@ from clsplat.training.decisions import (
 )
 from clsplat.training.folder import ModelFolder
 from clsplat.training.log import Progress
+from clsplat.training.near_plane import FARTHEST, check_near_plane
 from clsplat.training.presets import PRESETS, preset
+from clsplat.training.random_points import seen
 from clsplat.training.run import train
 
 
 def without_points(scene: Scene) -> Scene:
     points = scene.points
     return replace(scene, points=Points(points.xyz[:0], points.rgb[:0], points.track_length[:0]))
+
+
+def options_of(**named: Any) -> TrainConfig:
+    """Return options with a near plane, which else depends on the scene."""
+    return TrainConfig(near_plane=0.1, **named)
+
+
+def some_splats(scene: Scene, file: Path) -> Path:
+    """A file of splats at the scene's points."""
+    Splats.from_points(scene.points.xyz, scene.points.rgb).save(file)
+    return file
+
+
+def of_size(scene: Scene, factor: float) -> Scene:
+    """Return the scene with all lengths times a factor."""
+    views = []
+    for view in scene.views:
+        pose = view.camera.cam_from_world.copy()
+        pose[:3, 3] *= factor
+        views.append(replace(view, camera=view.camera.posed(pose)))
+    points = scene.points
+    return replace(scene, views=views, points=Points(factor * points.xyz, points.rgb, points.track_length))
 
 
 def transparent(scene: Scene, share: float) -> Scene:
@@ -45,24 +75,24 @@ def transparent(scene: Scene, share: float) -> Scene:
 
 
 def test_good_points_and_opaque_photos_need_no_decision(scene: Scene) -> None:
-    config = TrainConfig(cap_max=len(scene.points), random_points=0.0)
+    config = options_of(cap_max=len(scene.points), random_points=0.0)
     assert decide(scene, config) == Decision(config, ())
-    assert decide(scene, TrainConfig(init="model.ply")).reasons == ()
+    assert decide(scene, options_of(init="model.ply")).reasons == ()
     assert decide(transparent(scene, 0.5), config).config == config.replace(random_background=True)
 
 
 def test_some_points_are_random_beside_good_ones(scene: Scene) -> None:
     """A twentieth of the cap, or a tenth if the scene has fewer points. A penalty on opacity removes needless ones."""
     for cap, share in ((len(scene.points), RANDOM_SHARE), (int(len(scene.points) / RANDOM_SHARE_OF_FEW) + 9, 0.1)):
-        config = TrainConfig(cap_max=cap)
+        config = options_of(cap_max=cap)
         decision = decide(scene, config)
         assert decision.config == config.replace(random_points=share, opacity_reg=PENALTY)
         assert f"random points beside the scene's ({share:.0%} of the cap)" in str(decision)
-    config = TrainConfig(cap_max=len(scene.points))
+    config = options_of(cap_max=len(scene.points))
     assert decide(scene, config.replace(opacity_reg=0.0)).config.density.opacity_reg == 0
     named = config.replace(random_points=0.02)
     assert decide(scene, named).config == named.replace(opacity_reg=PENALTY)
-    assert decide(scene, TrainConfig(init="model.ply", random_points=0.1)).reasons == ()
+    assert decide(scene, options_of(init="model.ply", random_points=0.1)).reasons == ()
     by_relocation = config.replace(strategy="mcmc")
     assert decide(scene, by_relocation).config == by_relocation.replace(random_points=RANDOM_SHARE)
 
@@ -72,12 +102,12 @@ def test_random_starts_and_few_points(scene: Scene, options: dict[str, Any]) -> 
     """Transparent photos get the strategy that relocates, other photos a penalty on opacity."""
     start = scene if options else without_points(scene)
     beside = {"random_points": RANDOM_SHARE_OF_FEW} if "cap_max" in options else {}
-    config = TrainConfig(opacity_lr=0.07, **options)
+    config = options_of(opacity_lr=0.07, **options)
     assert decide(start, config).config == config.replace(opacity_reg=PENALTY, **beside)
     seen = transparent(start, 0.5)
-    expected = TrainConfig(opacity_lr=0.07, strategy="mcmc", random_background=True, **options, **beside)
+    expected = options_of(opacity_lr=0.07, strategy="mcmc", random_background=True, **options, **beside)
     assert decide(seen, config).config == expected
-    by_gradient = TrainConfig(strategy="adc", **options)
+    by_gradient = options_of(strategy="adc", **options)
     assert decide(seen, by_gradient).config == by_gradient.replace(
         random_background=True, opacity_reg=PENALTY, lr_factor=RANDOM_START_RATES, **beside
     )
@@ -96,17 +126,39 @@ def test_transparent_photos_get_random_backgrounds(scene: Scene) -> None:
 def test_named_options_stay(scene: Scene) -> None:
     """Options of a strategy that is not the default are kept until the strategy is known."""
     start = transparent(without_points(scene), 0.5)
-    assert decide(start, TrainConfig(growth=1.2, init_scale=0.3)).config == TrainConfig(
+    assert decide(start, options_of(growth=1.2, init_scale=0.3)).config == options_of(
         growth=1.2, init_scale=0.3, strategy="mcmc", random_background=True, lr_factor=2.0
     )
-    named = TrainConfig(strategy="adc", random_background=False, opacity_reg=0.0, lr_factor=1.0)
+    named = options_of(strategy="adc", random_background=False, opacity_reg=0.0, lr_factor=1.0)
     assert decide(start, named).config == named
     assert decide(start, named).reasons == ()
-    assert decide(start, TrainConfig(cap_max=7).replace(strategy="adc")).config.strategy == "adc"
-    complete = decide(start, TrainConfig()).config
+    assert decide(start, options_of(cap_max=7).replace(strategy="adc")).config.strategy == "adc"
+    complete = decide(start, options_of()).config
     again = decide(scene, complete)
     assert again.config == complete, "nothing is decided twice"
     assert again.reasons == ()
+
+
+def test_the_near_plane_is_that_of_3dgs_unless_the_scene_is_small_or_near(scene: Scene) -> None:
+    """0.2 units, a twentieth of the extent, or half of the depth up to which a hundredth of the points lie."""
+    depths = [seen(view.camera, scene.points.xyz) for view in scene.train]
+    nearest = np.quantile(np.concatenate([depth[inside] for depth, inside in depths]), 0.01)
+    assert FARTHEST == 0.2
+    for size in (100.0, 1.0, 0.01, 1e-6):
+        sized = of_size(scene, size)
+        decision = decide(sized, TrainConfig())
+        near = min(0.2, 0.05 * sized.extent, 0.5 * size * nearest)
+        assert decision.config.near_plane == pytest.approx(near, rel=0.05)
+        assert (f"a near plane of {decision.config.near_plane:g} units" in str(decision)) == (near < 0.2)
+        check_near_plane(sized, decision.config.near_plane)
+    away = replace(scene, points=Points(scene.points.xyz + 1e6, scene.points.rgb, scene.points.track_length))
+    assert decide(away, TrainConfig()).config.near_plane == pytest.approx(min(0.2, 0.05 * scene.extent), rel=0.05)
+    middle, points = scene.train[0].camera, scene.points
+    place = middle.position + 0.1 * middle.rotation[2]
+    close = replace(scene, points=Points(np.tile(place, (len(points.xyz), 1)), points.rgb, points.track_length))
+    assert decide(close, TrainConfig()).config.near_plane == pytest.approx(min(0.05, 0.05 * scene.extent), rel=0.05)
+    assert decide(scene, TrainConfig(near_plane=0.7)).config.near_plane == 0.7
+    assert decide(scene, TrainConfig(near_plane=None)).config.near_plane is None, "a run of an earlier version"
 
 
 @pytest.mark.parametrize("named", [{"scaling_lr": 0.01}, {"position_lr_final": 1e-6}, {"lr_factor": 1.0}], ids=str)
@@ -120,8 +172,9 @@ def test_random_starts_have_higher_rates_unless_a_rate_is_named(scene: Scene, na
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_decide_nothing(scene: Scene, name: str) -> None:
-    config = TrainConfig(**preset(name))
+def test_presets_decide_the_near_plane_only(scene: Scene, name: str) -> None:
+    assert decide(scene, TrainConfig(**preset(name))).config.near_plane is not None
+    config = options_of(**preset(name))
     decision = decide(transparent(without_points(scene), 0.5), config)
     assert decision.config == config
     assert decision.reasons == ()
@@ -144,6 +197,35 @@ def test_a_run_stores_what_it_decided_and_says_it_once(scene: Scene, tmp_path: P
     train(scene, config.replace(iterations=4), hear, output=tmp_path, resume=True)
     assert ModelFolder(tmp_path).read_config()["config"] == stored | {"iterations": 4}
     assert not any(message.startswith("decided:") for message in messages)
+
+
+def test_a_model_has_the_near_plane_of_its_run(scene: Scene, tmp_path: Path) -> None:
+    """Training does not see what is nearer, and the images of the model do not show it."""
+    config = TrainConfig(iterations=2, cap_max=40, sh_degree=0)
+    train(scene, config, output=tmp_path / "decided")
+    assert load_model(tmp_path / "decided").splats.near_plane == decide(scene, config).config.near_plane
+    depths = [seen(view.camera, scene.points.xyz) for view in scene.train]
+    near = 1.001 * float(np.quantile(np.concatenate([depth[inside] for depth, inside in depths]), 0.05))
+    splats = train(scene, config.replace(near_plane=near, init=str(some_splats(scene, tmp_path / "s.ply")))).splats
+    assert splats.near_plane == near
+    camera, renderer = scene.train[0].camera, Renderer()
+    flat = splats.as_shape("gaussian")
+    shown = flat.mean @ camera.rotation[2] + camera.translation[2] >= near
+    assert 0 < shown.sum() < len(flat)
+    image, kept = renderer.render(flat, camera).color, flat.select(shown).with_near_plane(NEAR_PLANE)
+    np.testing.assert_array_equal(image, renderer.render(kept, camera).color)
+    with pytest.raises(InputError, match="nearer than the near plane"):
+        train(scene, config.replace(near_plane=2 * near), output=tmp_path / "refused")
+
+
+def test_a_run_of_an_earlier_version_keeps_its_near_plane(scene: Scene, tmp_path: Path) -> None:
+    config = TrainConfig(iterations=2, cap_max=40, sh_degree=0)
+    train(scene, config.replace(near_plane=None), output=tmp_path)
+    checkpoint = Checkpoint.load(ModelFolder(tmp_path).checkpoint_path)
+    del checkpoint.config["near_plane"]
+    checkpoint.save(ModelFolder(tmp_path).checkpoint_path)
+    train(scene, config.replace(iterations=3), output=tmp_path, resume=True)
+    assert load_model(tmp_path).splats.near_plane == NEAR_PLANE
 
 
 def test_decisions_of_a_stored_run_replace_undecided_options() -> None:

@@ -206,8 +206,13 @@ def test_a_scene_before_the_near_plane_is_refused() -> None:
         pose[0, 3] = -x
         view.camera = view.camera.posed(pose)
     source.path = "yard"
-    with pytest.raises(InputError, match=r"^yard: 100% of what its cameras see is nearer .* about 100 times as large"):
+    with pytest.raises(
+        InputError, match=r"^yard: 100% of what its cameras see .* \(0.01 units\): use a smaller"
+    ) as got:
         initial_splats(source)
+    assert "(--near-plane)" in got.value.for_command(["--near-plane"])
+    splats, _ = initial_splats(source, near_plane=1e-3)
+    assert splats.near_plane == 1e-3
 
 
 def test_random_points_are_added_to_those_of_the_scene() -> None:
