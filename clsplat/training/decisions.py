@@ -96,7 +96,7 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if why and config.iterations >= FEWEST_ITERATIONS and not {"lr_factor", *_RATES} & config.named_options.keys():
         chosen["lr_factor"] = RANDOM_START_RATES
         reasons.append(f"learning rates times {RANDOM_START_RATES:g}, because {why}")
-    if "near_plane" not in config.named_options:
+    if config.near_plane is None:
         chosen["near_plane"] = near = choose_near_plane(scene)
         if near < FARTHEST:
             reasons.append(f"a near plane of {near:g} units, because the scene is small or near to cameras")
@@ -105,7 +105,9 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
 
 def as_decided(config: TrainConfig, stored: Mapping[str, Any]) -> TrainConfig:
     """Return the options with the decisions of a stored run. stored : options of the run in the form of `to_json`."""
-    return _with(config, {name: stored[name] for name in DECIDED if name not in config.named_options})
+    undecided = [name for name in DECIDED if name not in config.named_options]
+    undecided += ["near_plane"] if config.near_plane is None else []
+    return _with(config, {name: stored[name] for name in undecided})
 
 
 def _with(config: TrainConfig, chosen: Mapping[str, Any]) -> TrainConfig:

@@ -44,8 +44,9 @@ def dirty(sound: Splats, scene: Scene) -> Splats:
     more = {name: np.concatenate([values, values[:14]]) for name, values in arrays.items()}
     more["mean"][-14:-2] = 1e4
     camera = scene.train[0].camera
-    more["mean"][-2] = camera.position + 0.02 * camera.rotation[2]
-    more["log_scale"][-2] = np.log(2e-4)
+    depth = 1.05 * sound.near_plane
+    more["mean"][-2] = camera.position + depth * camera.rotation[2]
+    more["log_scale"][-2] = np.log(0.01 * depth)
     more["opacity_logit"][-2:] = [4.0, -5.0]
     more["log_scale"][-1] = np.log(2 * scene.extent)
     return sound.with_arrays(more)

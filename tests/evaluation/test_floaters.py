@@ -100,7 +100,8 @@ def test_photos_that_cannot_be_decoded_are_left_out(renderer: Renderer, splats: 
 
 def test_a_floater_before_a_camera_is_near(renderer: Renderer, splats: Splats, scene: Scene) -> None:
     before = measure_floaters(renderer, splats, scene.train)
-    after = measure_floaters(renderer, joined(splats, blob(scene, 0, 0.05, 0.004)), scene.train)
+    depth = 1.05 * splats.near_plane
+    after = measure_floaters(renderer, joined(splats, blob(scene, 0, depth, 0.08 * depth)), scene.train)
     assert after.near_camera_share > before.near_camera_share + 0.001
     assert after.train_psnr < before.train_psnr
 
