@@ -24,6 +24,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
+from clsplat.training.decisions import decide
 from clsplat.training.exposure import ExposureLoss, exposures_json
 from clsplat.training.loss import ImageLoss
 from clsplat.training.run import train
@@ -262,7 +263,7 @@ def test_random_backgrounds_show_through_nothing_opaque(scene: Scene) -> None:
 
 
 def test_a_resumed_run_has_the_same_exposures(scene: Scene, tmp_path: Path) -> None:
-    config = replace(CONFIG, iterations=40, exposure=True, random_background=True)
+    config = decide(scene, replace(CONFIG, iterations=40, exposure=True, random_background=True)).config
     whole = train(scene, config, output=tmp_path / "whole")
     trainer = Trainer(scene, config)
     for _ in range(23):
