@@ -36,7 +36,7 @@ def on_place(place: int, *values: object, slow: bool = False) -> object:
 
 # All schedules that suit it are tested on the first device, two of them on the others. Each combination builds kernels
 # for seconds, so the default run has one schedule of each kind: wide vectors, single lanes, and groups.
-FAST_SCHEDULES = ("cpu16", "scalar", "gpu256")
+FAST_SCHEDULES = ("cpu16", "scalar", "gpu64")
 DEVICE_SCHEDULES = [
     (place, name)
     for place, info in enumerate(USABLE)

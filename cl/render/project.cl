@@ -251,13 +251,14 @@ kernel void project_splats_vjp(
     } else {
         vreal basis[SH_COUNT];
         sh_basis(direction, sh_degree, basis);
-        for (int k = 0; k < used; ++k)
-            for (int c = 0; c < 3; ++c)
-                lanes_store(basis[k] * v_rgb[c], grad_sh + first + (ulong)(3 * k + c) * capacity);
+        UNROLL for (int k = 0; k < SH_COUNT; ++k) for (int c = 0; c < 3 && k < used; ++c)
+            lanes_store(basis[k] * v_rgb[c], grad_sh + first + (ulong)(3 * k + c) * capacity);
     }
-    for (int k = 0; k < used; ++k) {
+    // Unrolled, so that GPUs keep the array in registers.
+    UNROLL for (int k = 0; k < SH_COUNT; ++k) {
         v_basis[k] = zero;
-        for (int c = 0; c < 3; ++c) v_basis[k] += v_rgb[c] * lanes_load(sh + first + (ulong)(3 * k + c) * capacity);
+        for (int c = 0; c < 3 && k < used; ++c)
+            v_basis[k] += v_rgb[c] * lanes_load(sh + first + (ulong)(3 * k + c) * capacity);
     }
     vec3 v_direction = sh_basis_vjp(direction, sh_degree, v_basis);
     v_direction = add3(v_direction, scale3(direction, -dot3(direction, v_direction)));

@@ -13,8 +13,9 @@
 //   a work-item keeps one pixel in registers.
 // - Isects come in batches of BATCH (batch.clh). The loop ends when no pixel of the tile is live.
 // - An isect visits only the blocks that the splat can reach (blocks.clh).
-// - A pass computes alpha in all these blocks, and a second one blends. A CPU holds fewer operations in flight than the
-//   chain from pixel to transmittance of one block has; two short chains keep it busier than a long one.
+// - On CPUs a pass computes alpha in all these blocks, and a second one blends. A CPU holds fewer operations in flight than
+//   the chain from pixel to transmittance of one block has; two short chains keep it busier than a long one. On GPUs other
+//   groups fill the gaps, and one pass needs fewer registers.
 //
 // Images are planar with a margin: plane c has pixel (x, y) at c * plane + (y + MARGIN_Y) * stride + x + MARGIN_X. Pixels of
 // a tile beyond width or height are written as 0.
@@ -27,6 +28,28 @@
 #define shape_alpha_plain_vjp(dx, dy, alpha, v_alpha, v)
 #define shape_sums_plain(sums)
 #endif
+
+static inline vreal pixel_alpha(vreal dx, vreal dy, const real *rec, bool plain, shape_pixel *pixel) {
+    if (plain) return shape_alpha_plain(dx, dy, rec + HEAD);
+    return shape_alpha(dx, dy, rec + HEAD, pixel);
+}
+
+// Writes alpha in each block of a set.
+static inline void alpha_pass(
+    block_set blocks,
+    const vreal *px,
+    const vreal *py,
+    const real *rec,
+    bool plain,
+    vreal *alphas,
+    shape_pixel *pixels
+) {
+    if (plain) {
+        for_blocks(v, blocks) alphas[v] = shape_alpha_plain(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD);
+    } else {
+        for_blocks(v, blocks) alphas[v] = shape_alpha(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD, &pixels[v]);
+    }
+}
 
 // Overwrites color [3 planes], transmittance [plane] with the final T, and depth [plane] with the sum of weight * z.
 // Overwrites isect_blocks [n_isects], by unsorted isect id, with the set of blocks in which the isect was blended.
@@ -97,21 +120,13 @@ kernel void rasterize(
 #else
             block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
+            const bool plain = shape_is_plain(rec + HEAD);
             vreal alphas[VECS];
-            if (shape_is_plain(rec + HEAD))
-                for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
-                    const int v = next_block(set);
-                    alphas[v] = shape_alpha_plain(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD);
-                }
-            else
-                for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
-                    const int v = next_block(set);
-                    shape_pixel pixel;
-                    alphas[v] = shape_alpha(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD, &pixel);
-                }
-            for (; !no_blocks_left(blocks); blocks = without_next(blocks)) {
-                const int v = next_block(blocks);
-                vreal alpha = alphas[v];
+            shape_pixel pixels[VECS];
+            if (ALONE) alpha_pass(blocks, px, py, rec, plain, alphas, pixels);
+            for_blocks(v, blocks) {
+                const vreal dx = px[v] - rec[HEAD_X], dy = py[v] - rec[HEAD_Y];
+                vreal alpha = ALONE ? alphas[v] : pixel_alpha(dx, dy, rec, plain, &pixels[v]);
                 vmask hit;
                 const vreal weight = blend(&alpha, &T[v], &hit);
                 red[v] = lanes_mad(weight, (vreal)rec[HEAD_RED], red[v]);
@@ -210,23 +225,13 @@ kernel void rasterize_vjp(
 #else
             block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
+            const bool plain = shape_is_plain(rec + HEAD);
             vreal alphas[VECS];
             shape_pixel pixels[VECS];
-            const bool plain = shape_is_plain(rec + HEAD);
-            if (plain)
-                for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
-                    const int v = next_block(set);
-                    alphas[v] = shape_alpha_plain(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD);
-                }
-            else
-                for (block_set set = blocks; !no_blocks_left(set); set = without_next(set)) {
-                    const int v = next_block(set);
-                    alphas[v] = shape_alpha(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD, &pixels[v]);
-                }
-            for (; !no_blocks_left(blocks); blocks = without_next(blocks)) {
-                const int v = next_block(blocks);
+            if (ALONE) alpha_pass(blocks, px, py, rec, plain, alphas, pixels);
+            for_blocks(v, blocks) {
                 const vreal dx = px[v] - rec[HEAD_X], dy = py[v] - rec[HEAD_Y];
-                const vreal raw_alpha = alphas[v];
+                const vreal raw_alpha = ALONE ? alphas[v] : pixel_alpha(dx, dy, rec, plain, &pixels[v]);
                 vreal alpha = raw_alpha;
                 const vreal T_before = T[v];
                 vmask hit;

@@ -91,16 +91,21 @@ def _built(device: Device, text: str, defines: Mapping[str, Define], real: Real)
 
     if real == "double" and not device.has_fp64:
         raise DeviceError(f"device {device.info} has no double precision", Remedy("use float32"), OTHER_DEVICE)
-    lines = [f"#define REAL_DOUBLE {int(real == 'double')}", f"#define HAS_PREFETCH {int(device.info.has_prefetch)}"]
-    lines += [f"#define {name} {_literal(name, value, real)}" for name, value in defines.items()]
     options = [*OPTIONS, *os.environ.get(OPTIONS_VARIABLE, "").split()]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)  # some compilers warn at every success
-            built = _compiled(device, "\n".join([*lines, text]), options)
+            built = _compiled(device, with_defines(text, defines, real, device.info.has_prefetch), options)
     except cl.Error as error:
         raise _build_error(device, error, defines, real) from None
     return built, parse_signatures(text, real, defines)
+
+
+def with_defines(text: str, defines: Mapping[str, Define], real: Real, has_prefetch: bool) -> str:
+    """Return the text that a compiler reads: `#define` lines, then OpenCL C."""
+    lines = [f"#define REAL_DOUBLE {int(real == 'double')}", f"#define HAS_PREFETCH {int(has_prefetch)}"]
+    lines += [f"#define {name} {_literal(name, value, real)}" for name, value in defines.items()]
+    return "\n".join([*lines, text])
 
 
 def lane_group(device: Device) -> int:

@@ -62,6 +62,7 @@ SCHEDULES = {
     "scalar": Schedule(1, 256, 1),
     "gpu256": Schedule(256, 1, 1),
     "gpu64": Schedule(64, 4, 1),
+    "gpu32": Schedule(32, 8, 1),
 }
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..device.device import Device
 from ..device.memory import Pool
 from ..device.opencl import Buffer
-from ..device.program import GROUP_ITEMS, build
+from ..device.program import GROUP_ITEMS, Program, build
 
 DIGIT_BITS = 4  # sorted by one pass
 _MAX_GROUP = 256
@@ -16,6 +17,11 @@ _SORT_RUN, _SCAN_RUN = 16, 64  # values of a work-item
 def radix_passes(key_bits: int) -> int:
     """Return the number of passes over all pairs in a sort by `key_bits` bits."""
     return -(-key_bits // DIGIT_BITS)
+
+
+def sort_program(device: Device, group: int) -> Program:
+    """Return the program of sorts and scans, for work-groups of `group` items."""
+    return build(device, ("render/sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": DIGIT_BITS})
 
 
 class SortPairs:
@@ -32,7 +38,7 @@ class Sorter:
     def __init__(self, pool: Pool) -> None:
         device = pool.device
         self.group = min(_MAX_GROUP, device.info.max_group)
-        self.program = build(device, ("render/sort.cl",), {"SORT_GROUP": self.group, "RADIX_BITS": DIGIT_BITS})
+        self.program = sort_program(device, self.group)
         self._scan_sums = pool.buffer(np.uint64)
         self._counts, self._starts, self._total = (pool.buffer(t) for t in (np.uint32, np.uint32, np.uint64))
 

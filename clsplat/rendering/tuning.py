@@ -33,7 +33,7 @@ from .pipeline import Pipeline
 from .splat_buffers import ParameterBuffers, SplatBuffers
 
 SCHEDULE_VARIABLE = "CLSPLAT_SCHEDULE"
-_WIDE_CANDIDATES, _OTHER_CANDIDATES = ("cpu16", "cpu8", "gpu256"), ("gpu256", "gpu64")
+_WIDE_CANDIDATES, _OTHER_CANDIDATES = ("cpu16", "cpu8", "gpu256"), ("gpu256", "gpu64", "gpu32")
 _TIMED = ("rasterize", "rasterize_vjp")
 _SPLATS, _REPEATS = 3000, 5
 _MIN_TILES, _TILES_PER_UNIT = 256, 16  # of the image; fewer tiles would measure latency, not throughput

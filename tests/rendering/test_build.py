@@ -17,7 +17,7 @@ from clsplat.device.schedule import SCHEDULES
 from clsplat.profiling.roofline import CHAINS, roofline_program
 from clsplat.rendering.binning import ORDER_DEFINES
 from clsplat.rendering.build import KernelBuild
-from clsplat.rendering.radix_sort import DIGIT_BITS
+from clsplat.rendering.radix_sort import sort_program
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.training.optim.skew_map import SKEW_MAPS
 from clsplat.training.programs import exposure_program, lazy_program, loss_program, optim_program
@@ -74,7 +74,7 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
     KernelBuild(DEFAULT_SHAPE, 3, SCHEDULES["cpu16"]).count_program(compiler)
     roofline_program(compiler, CHAINS[0])
     build(compiler, ("measure/smoke.cl",))
-    build(compiler, ("render/sort.cl",), {"SORT_GROUP": 64, "RADIX_BITS": DIGIT_BITS})
+    sort_program(compiler, 64)
     build(compiler, ("render/order.cl", "render/bin.cl"), ORDER_DEFINES)
     there = {
         f"{folder.name}/{file.name}"
@@ -111,6 +111,6 @@ def test_every_kernel_builds_on_every_device(device: Device) -> None:
 
 @pytest.mark.parametrize("group", [64, 256])
 def test_sort_and_binning_build(device: Device, group: int) -> None:
-    build(device, ("render/sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": DIGIT_BITS})
+    sort_program(device, group)
     build(device, ("render/order.cl", "render/bin.cl"), ORDER_DEFINES)
     build(device, ("render/bin.cl",))

@@ -312,21 +312,22 @@ def test_splats_too_wide_for_float32_are_not_seen(make_renderer: MakeRenderer, d
     assert alphas == pytest.approx([0.5, 0.0], abs=1e-2)
 
 
-def test_a_finished_corner_does_not_end_its_tile(
+def test_a_finished_column_does_not_end_its_tile(
     make_renderer: MakeRenderer, scheduled: tuple[Device, Schedule]
 ) -> None:
-    """A batch of near splats finishes the first pixel of the tile. The batches behind it show in the other pixels."""
-    corner, behind = 70, 40  # a batch has 64
-    arrays = random_splats(1, corner + behind, 3)
+    """A batch of near splats finishes all pixels of the first work-item. The batches behind it show in the others."""
+    column, behind = 70, 40  # a batch has 64
+    arrays = random_splats(1, column + behind, 3)
     rng = np.random.default_rng(1)
-    arrays["mean"][:corner] = rng.uniform(-0.01, 0.01, (corner, 3)) - np.array([0.97, 0.97, 0])
-    arrays["mean"][corner:] = rng.uniform(-0.5, 0.5, (behind, 3)) + np.array([0.3, 0, 2])
-    arrays["log_scale"][:] = np.where(np.arange(corner + behind) < corner, -4.5, -1.5)[:, None]
-    arrays["opacity_logit"][:corner], arrays["opacity_logit"][corner:] = 2.0, -2.5
+    arrays["mean"][:column] = rng.uniform(-0.01, 0.01, (column, 3)) - np.array([0.97, 0, 0])
+    arrays["mean"][column:] = rng.uniform(-0.5, 0.5, (behind, 3)) + np.array([0.3, 0, 2])
+    arrays["quat"][:column] = 1, 0, 0, 0
+    arrays["log_scale"][:column], arrays["log_scale"][column:] = (-4.5, 1, -4.5), -1.5
+    arrays["opacity_logit"][:column], arrays["opacity_logit"][column:] = 2.0, -2.5
     pose = np.eye(4)
     pose[2, 3] = 4.0
     case = Case(arrays, Camera(16, 16, 32.0, 32.0, 8.0, 8.0, pose), "gaussian", fields=("mean", "sh"))
-    assert case.image.alpha[0, 0] > 0.99 > case.image.alpha[8:].max() > 0.3
+    assert case.image.alpha[:, 0].min() > 0.99 > case.image.alpha[:, 8:].max() > 0.3
     case.check(make_renderer(scheduled[0], schedule=scheduled[1]), IMAGE_FLOAT32, GRADIENT_FLOAT32)
 
 

@@ -33,8 +33,8 @@ def test_wide_lanes_are_measured_only_where_they_compile_in_time(
         {"platform": "rusticl", "type": "GPU"},
         {"platform": "A", "type": "GPU"},
     ):
-        assert candidates(device, monkeypatch, **mesa, max_group=1024) == ["256x1x1", "64x4x1"]
-    assert candidates(device, monkeypatch, platform="A", type="GPU", max_group=128) == ["64x4x1"]
+        assert candidates(device, monkeypatch, **mesa, max_group=1024) == ["256x1x1", "64x4x1", "32x8x1"]
+    assert candidates(device, monkeypatch, platform="A", type="GPU", max_group=128) == ["64x4x1", "32x8x1"]
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.splats.splats import Splats
 
 SCHEDULES = {
-    "races": ("1x16x16", "1x32x8", "1x256x1", "64x4x1", "256x1x1"),
+    "races": ("1x16x16", "1x32x8", "1x256x1", "32x8x1", "64x4x1", "256x1x1"),
     "uninitialized": ("1x16x16", "1x256x1", "64x4x1"),
 }
 

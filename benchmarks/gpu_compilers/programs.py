@@ -1,0 +1,73 @@
+"""The OpenCL programs of clsplat as a GPU's compiler reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any, cast
+from unittest import mock
+
+import clsplat.device.program
+from clsplat.device.device import Device
+from clsplat.device.program import OPTIONS as OPTIONS  # of this module's interface
+from clsplat.device.program import build
+from clsplat.device.schedule import SCHEDULES
+from clsplat.rendering.build import KernelBuild
+from clsplat.rendering.radix_sort import sort_program
+from clsplat.training.programs import loss_program, optim_program
+
+SHAPES = ("gaussian", "skew-normal")
+GPU_SCHEDULES = tuple(name for name, schedule in SCHEDULES.items() if schedule.group > 1)
+SORT_GROUP, ITEM_GROUP = 256, 64
+_SH_DEGREE = 3
+_PIXEL_KERNELS = ("rasterize", "rasterize_vjp")
+
+
+def programs() -> dict[str, str]:
+    """Return the text of each program of a training step on a GPU, by name."""
+    texts: dict[str, str] = {}
+    gpu = SCHEDULES[GPU_SCHEDULES[0]]
+    with _recorded() as (device, built):
+        for shape in SHAPES:
+            kernels = KernelBuild(shape, _SH_DEGREE, gpu)
+            kernels.projection_program(device)
+            texts[f"project {shape}"] = built.pop()
+            optim_program(device, kernels)
+            texts[f"optimize {shape}"] = built.pop()
+            for name in GPU_SCHEDULES:
+                KernelBuild(shape, _SH_DEGREE, SCHEDULES[name]).pixel_program(device)
+                texts[f"pixels {shape} {name}"] = built.pop()
+        loss_program(device, KernelBuild(SHAPES[0], _SH_DEGREE, gpu))
+        texts["loss"] = built.pop()
+        sort_program(device, SORT_GROUP)
+        texts["sort"] = built.pop()
+        build(device, ("render/bin.cl",))
+        texts["bin"] = built.pop()
+    return texts
+
+
+def group_size(program: str, kernel: str) -> int:
+    """Return the number of work-items of a kernel's groups."""
+    if kernel in _PIXEL_KERNELS:
+        return SCHEDULES[program.split()[-1]].group
+    return SORT_GROUP if kernel.startswith("radix") or kernel == "scan_spine" else ITEM_GROUP
+
+
+@contextmanager
+def _recorded() -> Iterator[tuple[Device, list[str]]]:
+    """A stand-in for a GPU whose builds are appended to the list as text."""
+    texts: list[str] = []
+
+    def keep(_device: Device, text: str, _options: list[str]) -> object:
+        texts.append(text)
+        return object()
+
+    device: Any = SimpleNamespace(
+        info=SimpleNamespace(has_prefetch=False, type="GPU"),
+        shared=SimpleNamespace(built={}),
+        programs={},
+        has_fp64=False,
+    )
+    with mock.patch.object(clsplat.device.program, "_compiled", keep):
+        yield cast(Device, device), texts
