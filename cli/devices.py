@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 @click.command()
 @click.pass_context
 def devices(ctx: click.Context) -> None:
-    """List the OpenCL devices, test each with a small kernel, and suggest fixes for known faults.
+    """List the OpenCL devices, test each on a small scene, and suggest fixes for known faults.
 
-    The first call finds the fastest schedule of each device, which takes some seconds.
+    The self-test compares an image, its gradients, the loss and steps of the optimizer with known numbers. The first
+    call also finds the fastest schedule of each device, which takes some seconds.
 
     The default device of the other commands is marked. --device takes an index such as 0:1, "cpu", "gpu", or a part
     of a platform's or device's name. The exit code is 1 if no device works.
@@ -87,27 +88,30 @@ def hints(platforms: set[str], has_gpu: bool, root: Path = Path("/")) -> list[st
 
 
 def _try(info: DeviceInfo) -> dict[str, str]:
-    """Return the schedule and the result of the smoke test; DeviceError if the device does not work.
-
-    The loss of training is tested, too.
-    """
+    """Return the schedule and the results of the tests; DeviceError if the device does not work or computes wrong."""
     from clsplat.device.device import open_device
     from clsplat.device.program import smoke_test
     from clsplat.device.schedule import SCHEDULES
+    from clsplat.rendering.self_test import check_rendering
     from clsplat.rendering.tuning import schedule_for
     from clsplat.training.config import TrainConfig
     from clsplat.training.loss_check import check_loss
     from clsplat.training.programs import kernel_build
+    from clsplat.training.step_check import check_step
 
     device = open_device(info.index)
     build_ms, run_ms = smoke_test(device)
     schedule = schedule_for(device)
+    check_rendering(device, schedule)
     config = TrainConfig()
-    check_loss(device, kernel_build(config, schedule), config.loss.lambda_dssim)
+    kernels = kernel_build(config, schedule)
+    check_loss(device, kernels, config.loss.lambda_dssim)
+    check_step(device, kernels, config.sghmc.position_optimizer)
     name = next((name for name, known in SCHEDULES.items() if known == schedule), "set by hand")
     return {
         "schedule": f"{name} ({schedule})",
         "smoke test": f"ok (built in {build_ms:.0f} ms, ran in {run_ms:.3f} ms)",
+        "self-test": "image, gradients, loss and steps are right",
     }
 
 

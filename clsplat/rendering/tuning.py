@@ -1,18 +1,20 @@
-"""The fastest schedule of a device: measured once on a small scene, then cached.
+"""The fastest schedule of a device that computes right: measured and tested once on small scenes, then cached.
 
-`CLSPLAT_SCHEDULE` overrides it with a name of `SCHEDULES` or GROUPxVECSxLANES. The cache is one JSON file in the user's
-cache folder. Its keys are device, driver and the text of the kernels.
+`CLSPLAT_SCHEDULE` overrides it with a name of `SCHEDULES` or GROUPxVECSxLANES, which is tested all the same. The cache
+is one JSON file in the user's cache folder. Its keys are device, driver and the text of the kernels.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib.resources
 import json
 import math
 import os
 import statistics
 import time
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -21,15 +23,15 @@ from .. import activity
 from .._version import __version__
 from ..cameras.camera import Camera
 from ..device.device import Device, DeviceInfo
-from ..device.program import source
 from ..device.program_cache import cache_folder
 from ..device.schedule import SCHEDULES, TILE, Schedule, default_schedule
 from ..device.trace import recorded
-from ..errors import ClsplatError, OutputError
+from ..errors import ClsplatError, DeviceError, OutputError
 from ..files.atomic import atomic_writer
 from ..splats.splats import Splats
 from .build import KernelBuild
 from .pipeline import Pipeline
+from .self_test import NUMBERS, check_rendering
 from .splat_buffers import ParameterBuffers, SplatBuffers
 
 SCHEDULE_VARIABLE = "CLSPLAT_SCHEDULE"
@@ -47,20 +49,50 @@ def schedule_for(device: Device) -> Schedule:
 
     Raises
     ------
-    DeviceError : the variable does not hold a schedule.
+    DeviceError : the variable does not hold a schedule, or the device fails its self-test with every schedule.
     """
     forced = os.environ.get(SCHEDULE_VARIABLE)
     if forced:
-        return Schedule.parse(forced)
+        schedule = Schedule.parse(forced)
+        require_right(device, schedule)
+        return schedule
     key = _key(device)
     if key not in _chosen:
         cached = _read_cache().get(key)
         if cached is None:
             times = measure(device)
-            cached = min(times, key=times.__getitem__) if times else str(default_schedule(device.info))
+            cached = _first_right(device, sorted(times, key=times.__getitem__) or [str(default_schedule(device.info))])
             _write_cache(key, cached)
         _chosen[key] = Schedule.parse(cached)
     return _chosen[key]
+
+
+def require_right(device: Device, schedule: Schedule) -> None:
+    """Run the self-test of a device with a schedule, unless it has passed before.
+
+    Raises
+    ------
+    DeviceError : it fails.
+    """
+    key = f"{_key(device)}|{schedule}"
+    if key not in _chosen and key not in _read_cache():
+        activity.report("testing whether this device computes right, once")
+        check_rendering(device, schedule)
+        _write_cache(key, str(schedule))
+    _chosen[key] = schedule
+
+
+def _first_right(device: Device, schedules: list[str]) -> str:
+    """Return the first schedule with which the device passes its self-test; DeviceError of the first one if none is."""
+    fault: ClsplatError | None = None
+    for name in schedules:
+        try:
+            require_right(device, Schedule.parse(name))
+        except ClsplatError as error:
+            fault = fault or error
+        else:
+            return name
+    raise fault or DeviceError(f"device {device.info}: no schedule to test")
 
 
 def measure(device: Device) -> dict[str, float]:
@@ -122,9 +154,16 @@ def _scene() -> Splats:
 
 def _key(device: Device) -> str:
     info = device.info
-    text = source("render/rasterize.cl", "math/lanes.clh", "math/approx.clh", "render/group.clh", "render/blend.clh")
-    digest = hashlib.sha256(text.encode()).hexdigest()[:12]
-    return "|".join((info.platform, info.platform_version, info.name, info.driver, __version__, digest))
+    return "|".join((info.platform, info.platform_version, info.name, info.driver, __version__, _digest()))
+
+
+@cache
+def _digest() -> str:
+    """A digest of everything that the self-test depends on: all kernels, and the stored numbers."""
+    folders = (folder for folder in importlib.resources.files("clsplat_cl").iterdir() if folder.is_dir())
+    kernels = (file for folder in folders for file in folder.iterdir() if file.name.endswith((".cl", ".clh")))
+    texts = {file.name: file.read_bytes() for file in kernels} | {NUMBERS.name: NUMBERS.read_bytes()}
+    return hashlib.sha256(b"\0".join(texts[name] for name in sorted(texts))).hexdigest()[:12]
 
 
 def _cache_path() -> Path:

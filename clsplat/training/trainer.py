@@ -19,7 +19,7 @@ from ..rendering.frame import Frame
 from ..rendering.pipeline import Pipeline, isect_limit
 from ..rendering.renderer import Renderer
 from ..rendering.splat_buffers import CompactGradients, SplatBuffers
-from ..rendering.tuning import schedule_for
+from ..rendering.tuning import require_right, schedule_for
 from ..scenes.read_view import keep_photos
 from ..scenes.scene import Scene, View
 from ..scenes.split import with_validation
@@ -47,6 +47,7 @@ from .rate_limits import check_rates
 from .run_clock import RunClock
 from .running_mean import RunningLoss
 from .schedules import RunSchedule, sh_degree_at
+from .step_check import check_step
 from .targets import Targets, target_budget, target_channels
 from .validation import RunValidation
 from .view_sampler import ViewSampler
@@ -94,6 +95,7 @@ class Trainer:
         self.device = device or open_device(config.device)
         # A resumed run keeps the stored schedule: another one sums in a different order and changes the result.
         schedule = Schedule.parse(checkpoint.schedule) if checkpoint else schedule_for(self.device)
+        require_right(self.device, schedule)
         self.kernels = kernel_build(config, schedule)
         self.memory = run_memory(self.device, self.kernels, config, scene.train)
         self.rng = np.random.default_rng(config.seed)
@@ -167,6 +169,7 @@ class Trainer:
         self.optimizer = make_optimizer(self.device, kernels, self.splats, config, self.scene.extent)
         self.loss = ImageLoss(self.pipeline.pool, kernels, config.loss.lambda_dssim)
         check_loss(self.device, kernels, config.loss.lambda_dssim)
+        check_step(self.device, kernels, config.sghmc.position_optimizer)
         channels = target_channels(self.scene.train, config.random_background)
         self.targets = Targets(self.device, kernels, self.scene.train, target_budget(self.device), channels)
         self.exposure = ExposureLoss(self.loss, self.targets, config, self.scene.background)

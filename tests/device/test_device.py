@@ -244,6 +244,7 @@ def test_command_lists_and_tries_every_device():
     for info in list_devices():
         assert f"{info.index}  {info.name}" in result.output
     assert "ok (built in" in result.output
+    assert "image, gradients, loss and steps are right" in result.output
     assert str(schedule_for(open_device())) in result.output
     assert result.output.count("(default)") == 1
 

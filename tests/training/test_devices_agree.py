@@ -32,7 +32,9 @@ def trained(scene: Scene, device: Device, **options: object) -> tuple[list[float
 def test_devices_train_alike(
     devices: list[Device], scene: Scene, options: dict[str, object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Rounding differs, and Adam enlarges it. A gradient without SSIM, or of other opacities, is far outside."""
+    """Rounding differs, and Adam enlarges it: much in a few iterations, hardly in the median. A gradient without SSIM,
+    or of other opacities, is far outside.
+    """
     if len(devices) < 2:
         pytest.skip("one device only; RUSTICL_ENABLE=llvmpipe shows Mesa's (apt install mesa-opencl-icd)")
     monkeypatch.setenv(SCHEDULE_VARIABLE, "gpu256")  # of all devices; Mesa compiles wide lanes for minutes
@@ -40,6 +42,8 @@ def test_devices_train_alike(
     assert first[1][-1] < 0.9 * first[1][0], "training lowers the loss"
     for device in devices[1:]:
         other = trained(scene, device, **options)
-        np.testing.assert_allclose(other[0], first[0], atol=2e-3, err_msg=f"SSIM on {device.info}")
+        apart = np.abs(np.subtract(other[0], first[0]))
+        assert np.median(apart) < 5e-4, f"SSIM on {device.info}"
+        assert apart.max() < 6e-3, f"SSIM on {device.info}"
         np.testing.assert_allclose(other[1], first[1], rtol=5e-3, err_msg=f"loss on {device.info}")
         assert np.abs(other[2] - first[2]).mean() < 2e-3, f"a test view on {device.info}"
