@@ -57,7 +57,8 @@ def main() -> None:
         sys.exit(str(error))
     stored = read(args.out)
     if args.write:
-        stored |= found
+        compiled_for = {key.split(" | ")[0] for key in found}
+        stored = {key: usage for key, usage in stored.items() if key.split(" | ")[0] not in compiled_for} | found
         args.out.write_text(json.dumps({key: asdict(stored[key]) for key in sorted(stored)}, indent=1) + "\n")
         write_page(stored)
         return

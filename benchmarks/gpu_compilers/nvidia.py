@@ -59,7 +59,7 @@ def _compile(name: str, text: str, target: str, folder: Path) -> Mapping[str, Us
         raise CompilerError(_missing() or "")
     linked = _linked(text, folder, libdevice)
     optimised, assembly, binary = (folder / f"{target}.{kind}" for kind in ("bc", "ptx", "cubin"))
-    kept = ",".join(re.findall(r"kernel void (\w+)\(", text))
+    kept = ",".join(re.findall(r"kernel\s+void\s+(\w+)\(", text))
     passes = ("-passes=internalize,default<O3>", f"-internalize-public-api-list={kept}")
     commands.run([commands.OPT, f"-mcpu={target}", *passes, linked, "-o", optimised])
     commands.run([commands.LLC, f"-mcpu={target}", *_LLC, optimised, "-o", assembly])

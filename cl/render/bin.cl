@@ -32,15 +32,14 @@ kernel void count_isects(
     counts[rank] = count;
 }
 
-// Overwrites splat_isects [n], by splat, with the first isect and the end; and for each isect [n_isects] isect_tile, the sort
-// key, isect_id, its number and the payload of the sort, and isect_splat. offsets [n]: exclusive scan of counts.
+// Overwrites splat_isects [n], by splat, with the first isect and the end; and for each isect [n_isects] isect_tile, the key
+// of the sort, and isect_splat. offsets [n]: exclusive scan of counts.
 kernel void emit_isects(
     global const uint *restrict order,
     global const int4 *restrict tile_rect,
     global const uint *restrict offsets,
     global uint2 *restrict splat_isects,
     global uint *restrict isect_tile,
-    global uint *restrict isect_id,
     global uint *restrict isect_splat,
     uint n_splats,
     int first_tile,
@@ -58,7 +57,6 @@ kernel void emit_isects(
         const int row = y * tiles_x, end_x = min(rect.z, end_tile - row);
         for (int x = max(rect.x, first_tile - row); x < end_x; ++x, ++at) {
             isect_tile[at] = (uint)(row + x);
-            isect_id[at] = at;
             isect_splat[at] = i;
         }
     }

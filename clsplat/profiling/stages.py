@@ -14,7 +14,7 @@ from ..splats.shapes import shape_named
 
 STAGES = {
     "project": ("project_splats",),
-    "depth sort": ("depth_span", "depth_histogram", "depth_scatter", "depth_buckets", "fill_iota"),
+    "depth sort": ("depth_span", "depth_histogram", "depth_scatter", "depth_buckets"),
     "binning": ("count_tiles", "total_tiles", "count_isects", "emit_isects"),
     "tile sort": ("list_isects", "find_tile_ranges"),
     "rasterize": ("rasterize",),
@@ -46,8 +46,8 @@ HOST = "host"  # wall time in which the device is idle
 STAGE_OF = {kernel: stage for stage, kernels in STAGES.items() for kernel in kernels}
 
 # Kernels that several stages share. They belong to the stage that the last launch of _BEGINS has begun.
-SHARED = ("radix_histogram", "radix_scatter", "scan_sums", "scan_spine", "scan_apply")
-_BEGINS = {"fill_iota": "depth sort", "count_isects": "binning", "emit_isects": "tile sort"}
+SHARED = ("radix_histogram", "radix_scan", "radix_scatter", "scan_sums", "scan_spine", "scan_apply")
+_BEGINS = {"project_splats": "depth sort", "count_isects": "binning", "emit_isects": "tile sort"}
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,11 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
         }
     else:
         listing = {
-            # Indices written; in each pass keys are read twice, values once, and both are written.
-            "depth sort": Work(n * (4 + 20 * depth_passes)),
-            # Order and boxes read twice, counts and their scan; three words of each isect written.
-            "binning": Work(68 * n + 12 * isects),
-            "tile sort": Work((4 + 20 * tile_passes) * isects + 8 * tiles),
+            # In each pass keys are read twice, values once except in the first pass, and both are written.
+            "depth sort": Work(n * (20 * depth_passes - 4)),
+            # Order and boxes read twice, counts and their scan; two words of each isect written.
+            "binning": Work(68 * n + 8 * isects),
+            "tile sort": Work(20 * tile_passes * isects + 8 * tiles),
         }
     return listing | {
         "project": Work(n * (real * (geometry + colour) + record + 20)),

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device.device import Device
-from ..device.memory import Pool, copy
+from ..device.memory import Pool
 from ..device.opencl import Buffer
 from ..device.program import Define, build
 from ..errors import FEWER_SPLATS, OTHER_DEVICE, DeviceError
 from .build import CULLED_KEY
 from .frame import Band, ProjectedSplats, TileLists
-from .radix_sort import Sorter, SortPairs
+from .radix_sort import Sorter, SortMemory
 
 MAX_ISECTS = 2**31 - 1  # of a band: ids have 32 bits
 BUCKET_BITS = 11  # bits of a depth key that choose its bucket
@@ -224,10 +224,9 @@ class GroupBinner:
     """The binner for devices with many work-items (cl/render/sort.cl, and the first half of cl/render/bin.cl)."""
 
     def __init__(self, pool: Pool) -> None:
-        self.device = pool.device
         self.sorter = Sorter(pool)
         self.program = build(pool.device, ("render/bin.cl",))
-        self._by_depth, self._by_tile = SortPairs(pool), SortPairs(pool)
+        self._by_depth, self._by_tile = SortMemory(pool), SortMemory(pool)
         self._counts, self._offsets, self._n_isects = (pool.buffer(t) for t in (np.uint32, np.uint32, np.uint64))
         self._ranges, self._splat_isects = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 2)
         self._isect_splat = pool.buffer(np.uint32)
@@ -237,12 +236,9 @@ class GroupBinner:
         self._counted: tuple[int, int] | None = None  # tiles whose counts are in the buffers
 
     def order(self, splats: ProjectedSplats) -> None:
-        self._splats, pairs = splats, self._by_depth
-        for memory in (pairs.keys, pairs.values, pairs.spare_keys, pairs.spare_values):
-            memory.reserve(splats.capacity)
-        copy(self.device, splats.depth_key, pairs.keys.reserve(splats.n), 4 * splats.n)
-        self.sorter.iota(pairs.values.reserve(splats.n), splats.n)
-        self._order = self.sorter.sort(pairs, splats.n, 32)[1]
+        self._splats = splats
+        self._by_depth.reserve(splats.capacity)
+        self._order = self.sorter.sort(splats.depth_key, splats.n, 32, self._by_depth)[1]
 
     def begin(self, tiles_x: int, tiles_y: int) -> None:
         self._image, self._counted = _Image(tiles_x, tiles_x * tiles_y), None
@@ -256,6 +252,7 @@ class GroupBinner:
         if self._counted != (band.first, band.end):
             self._count(band.first, band.end)
         ids = self._by_tile.values.reserve(n_isects)
+        tiles = self._by_tile.keys.reserve(n_isects)
         splat_isects, isect_splat = self._splat_isects.reserve(splats.capacity), self._isect_splat.reserve(n_isects)
         self.program.emit_isects.over(
             splats.n,
@@ -263,8 +260,7 @@ class GroupBinner:
             tile_rect=splats.tile_rect,
             offsets=self._offsets.buffer,
             splat_isects=splat_isects,
-            isect_tile=self._by_tile.keys.reserve(n_isects),
-            isect_id=ids,
+            isect_tile=tiles,
             isect_splat=isect_splat,
             n_splats=splats.n,
             first_tile=band.first,
@@ -274,7 +270,7 @@ class GroupBinner:
         ranges = self._ranges.zeros(image.n_tiles)
         if n_isects:
             bits = max((image.n_tiles - 1).bit_length(), 1)
-            tiles, ids = self.sorter.sort(self._by_tile, n_isects, bits)
+            tiles, ids = self.sorter.sort(tiles, n_isects, bits, self._by_tile)
             self.program.find_tile_ranges.over(n_isects, sorted_tile=tiles, tile_ranges=ranges, n_isects=n_isects)
         return TileLists(ranges, ids, isect_splat, splat_isects)
 

@@ -268,5 +268,5 @@ def isect_limit(device: Device, kernels: KernelBuild) -> int:
 
 
 def isect_bytes(kernels: KernelBuild) -> int:
-    """Return the device memory of an isect: its gradient record, tile, id, a spare of both, splat and block set."""
+    """Return the device memory of an isect: its gradient record, two copies of tile and id, splat and block set."""
     return kernels.v_record * kernels.dtype.itemsize + 4 * 6

@@ -9,8 +9,8 @@ from ..device.memory import Pool
 from ..device.opencl import Buffer
 from ..device.program import GROUP_ITEMS, Program, build
 
-DIGIT_BITS = 4  # sorted by one pass
-_MAX_GROUP = 256
+DIGIT_BITS = 5  # sorted by one pass
+_MAX_GROUP, _GROUP_STEP = 256, 1 << DIGIT_BITS  # a group has a whole number of work-items for each digit
 _SORT_RUN, _SCAN_RUN = 16, 64  # values of a work-item
 
 
@@ -24,12 +24,17 @@ def sort_program(device: Device, group: int) -> Program:
     return build(device, ("render/sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": DIGIT_BITS})
 
 
-class SortPairs:
-    """Memory for pairs of uint32. Each array has a spare, because a pass reads one and writes the other."""
+class SortMemory:
+    """Memory for two copies of pairs of uint32, because a pass reads one and writes the other."""
 
     def __init__(self, pool: Pool) -> None:
         self.keys, self.values = pool.buffer(np.uint32), pool.buffer(np.uint32)
         self.spare_keys, self.spare_values = pool.buffer(np.uint32), pool.buffer(np.uint32)
+
+    def reserve(self, n: int) -> None:
+        """Make room for n pairs."""
+        for memory in (self.keys, self.values, self.spare_keys, self.spare_values):
+            memory.reserve(n)
 
 
 class Sorter:
@@ -37,10 +42,10 @@ class Sorter:
 
     def __init__(self, pool: Pool) -> None:
         device = pool.device
-        self.group = min(_MAX_GROUP, device.info.max_group)
+        self.group = min(_MAX_GROUP, device.info.max_group) // _GROUP_STEP * _GROUP_STEP
         self.program = sort_program(device, self.group)
         self._scan_sums = pool.buffer(np.uint64)
-        self._counts, self._starts, self._total = (pool.buffer(t) for t in (np.uint32, np.uint32, np.uint64))
+        self._counts, self._totals = pool.buffer(np.uint32), pool.buffer(np.uint32)
 
     def scan(self, values: Buffer, scanned: Buffer, n: int, total: Buffer) -> None:
         """Write the exclusive scan of n values, modulo 2^32, into another buffer, and their sum (uint64) to `total`."""
@@ -51,37 +56,38 @@ class Sorter:
         self.program.scan_spine((self.group,), (self.group,), sums=sums, total=total, n=n_runs)
         self.program.scan_apply.over(n_runs, values=values, sums=sums, scanned=scanned, n=n, run=_SCAN_RUN)
 
-    def sort(self, pairs: SortPairs, n: int, key_bits: int) -> tuple[Buffer, Buffer]:
-        """Sort the first n pairs by the low `key_bits` bits of their keys.
+    def sort(self, keys: Buffer, n: int, key_bits: int, memory: SortMemory) -> tuple[Buffer, Buffer]:
+        """Sort the first n keys by their low `key_bits` bits, at least one.
+
+        Parameters
+        ----------
+        keys : not changed, unless they are `memory.keys`.
 
         Returns
         -------
-        keys, values : the sorted arrays. The other two buffers of `pairs` are overwritten.
+        keys, order : the sorted keys, and the place that each had; both in `memory`.
         """
-        source = pairs.keys.reserve(n), pairs.values.reserve(n)
-        target = pairs.spare_keys.reserve(n), pairs.spare_values.reserve(n)
         n_blocks = max(-(-n // (_SORT_RUN * self.group)), 1)
-        n_counts = n_blocks << DIGIT_BITS
-        counts, starts, total = self._counts.reserve(n_counts), self._starts.reserve(n_counts), self._total.reserve(1)
+        counts, totals = self._counts.reserve(n_blocks << DIGIT_BITS), self._totals.reserve(1 << DIGIT_BITS)
         size, local = (n_blocks * self.group,), (self.group,)
+        values = memory.values.reserve(n)  # the first pass reads none
+        target = memory.spare_keys.reserve(n), memory.spare_values.reserve(n)
+        spare = memory.keys.reserve(n), values
         for shift in range(0, key_bits, DIGIT_BITS):
-            self.program.radix_histogram(size, local, keys=source[0], counts=counts, n=n, run=_SORT_RUN, shift=shift)
-            self.scan(counts, starts, n_counts, total)
+            part = {"n": n, "run": _SORT_RUN, "shift": shift}
+            self.program.radix_histogram(size, local, keys=keys, counts=counts, **part)
+            self.program.radix_scan((self.group << DIGIT_BITS,), local, counts=counts, totals=totals, n_blocks=n_blocks)
             self.program.radix_scatter(
                 size,
                 local,
-                keys=source[0],
-                values=source[1],
-                starts=starts,
+                keys=keys,
+                values=values,
+                counts=counts,
+                totals=totals,
                 keys_out=target[0],
                 values_out=target[1],
-                n=n,
-                run=_SORT_RUN,
-                shift=shift,
+                numbered=int(shift == 0),
+                **part,
             )
-            source, target = target, source
-        return source
-
-    def iota(self, values: Buffer, n: int) -> None:
-        """Set values[i] = i."""
-        self.program.fill_iota.over(n, values=values, n=n)
+            (keys, values), target, spare = target, spare, target
+        return keys, values

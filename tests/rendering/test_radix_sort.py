@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.device.device import Device
 from clsplat.device.memory import Pool, to_device, to_host
-from clsplat.rendering.radix_sort import Sorter, SortPairs
+from clsplat.rendering.radix_sort import Sorter, SortMemory
 
 SIZES = [
     0,
@@ -51,15 +51,17 @@ class SortMachine:
 
     def __init__(self, device: Device) -> None:
         pool = Pool(device)
-        self.device, self.sorter, self.pairs = device, Sorter(pool), SortPairs(pool)
+        self.device, self.sorter, self.memory = device, Sorter(pool), SortMemory(pool)
+        self.keys = pool.buffer(UINT32)
         self.values, self.scanned, self.total = (pool.buffer(dtype) for dtype in (UINT32, UINT32, UINT64))
 
-    def sort(self, keys: Array, key_bits: int) -> tuple[Array, Array]:
-        """Return the sorted keys and the original index of each."""
+    def sort(self, keys: Array, key_bits: int, in_place: bool) -> tuple[Array, Array]:
+        """Return the sorted keys and the original index of each. Other buffers keep the keys."""
         device, n = self.device, len(keys)
-        to_device(device, self.pairs.keys.reserve(n), keys)
-        self.sorter.iota(self.pairs.values.reserve(n), n)
-        sorted_keys, order = self.sorter.sort(self.pairs, n, key_bits)
+        given = self.memory.keys if in_place else self.keys
+        to_device(device, given.reserve(n), keys)
+        sorted_keys, order = self.sorter.sort(given.buffer, n, key_bits, self.memory)
+        assert in_place or np.array_equal(given.read(n), keys)
         return to_host(device, sorted_keys, np.empty(n, UINT32)), to_host(device, order, np.empty(n, UINT32))
 
     def scan(self, values: Array) -> tuple[Array, int]:
@@ -76,9 +78,10 @@ def sorter(device: Device) -> SortMachine:
 
 
 def check_sort(sorter: SortMachine, keys: Array, key_bits: int = ALL_BITS) -> None:
-    sorted_keys, order = sorter.sort(keys, key_bits)
-    assert np.array_equal(order, np.argsort(keys, kind="stable")), f"n={len(keys)}"
-    assert np.array_equal(sorted_keys, np.sort(keys)), f"n={len(keys)}"
+    for in_place in (False, True):
+        sorted_keys, order = sorter.sort(keys, key_bits, in_place)
+        assert np.array_equal(order, np.argsort(keys, kind="stable")), f"n={len(keys)}"
+        assert np.array_equal(sorted_keys, np.sort(keys)), f"n={len(keys)}"
 
 
 def check_scan(sorter: SortMachine, values: Array) -> None:
@@ -103,6 +106,10 @@ def test_any_number_of_bits(sorter: SortMachine, key_bits: int) -> None:
     """Test odd and even numbers of passes, and a shorter last digit. Higher bits of the keys are zero."""
     keys = np.random.default_rng(key_bits).integers(0, 2**key_bits, 5000, UINT32)
     check_sort(sorter, keys, key_bits)
+
+
+def test_more_blocks_than_a_group_has_items(sorter: SortMachine) -> None:
+    check_sort(sorter, np.random.default_rng(0).integers(0, 2**5, 1_100_000, UINT32), 5)
 
 
 def test_sorted_reversed_and_equal_keys(sorter: SortMachine) -> None:

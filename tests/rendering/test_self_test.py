@@ -46,7 +46,7 @@ FAULTS = {
 OF_A_KIND = [  # faults of the binners
     ("CPU", "++bottom[rect.z];", ""),
     ("CPU", "depth_order[start + k] =", "depth_order[n - 1 - start - k] ="),
-    ("GPU", "const uint to = hist[((key >> shift)", "const uint to = hist[((key >> (shift / 2))"),
+    ("GPU", "numbered ? (uint)k", "numbered ? (uint)(n - 1 - k)"),
     ("GPU", "tile_ranges[2 * tile + 1] = at + 1", "tile_ranges[2 * tile + 1] = at"),
 ]
 

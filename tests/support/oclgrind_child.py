@@ -186,11 +186,10 @@ def sort_and_scan(device: Device, mode: str) -> None:
     rng = np.random.default_rng(0)
     for n in (300, 4100):
         pool = memory.Pool(device)
-        sorter, pairs = radix_sort.Sorter(pool), radix_sort.SortPairs(pool)
+        sorter, pairs = radix_sort.Sorter(pool), radix_sort.SortMemory(pool)
         keys = rng.integers(0, 50, n, np.uint32)
         memory.to_device(device, pairs.keys.reserve(n), keys)
-        sorter.iota(pairs.values.reserve(n), n)
-        _, order = sorter.sort(pairs, n, 6)
+        _, order = sorter.sort(pairs.keys.buffer, n, 6, pairs)
         got = memory.to_host(device, order, np.empty(n, np.uint32))
         assert np.array_equal(got, np.argsort(keys, kind="stable"))
     n = 4100
