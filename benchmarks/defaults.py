@@ -3,6 +3,7 @@
     python benchmarks/defaults.py --cases lego:-1:30000:1500 fox:2:20000:1000 --systems default,3dgs --seeds 0 1 2
     python benchmarks/defaults.py --cases lego_full:-1:100000:2000 --views test     # once, after the choice
     python benchmarks/defaults.py --table
+    python benchmarks/defaults.py --page       # write the table "Scenes at full size" of SYSTEMS.md
 
 A case is scene:resolution:cap:iterations, with the resolution of `load_scene`. Systems are those of `clsplat compare`,
 such as default:strategy=mcmc. Transparent scenes have a white background, as published figures have. Runs are measured
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common import RESULTS, Runs, data_folder, environment, groups, parser, table
+from common import RESULTS, ROOT, Runs, data_folder, environment, groups, parser, table
 
 from clsplat.comparison.methods import Method, parse_methods
 from clsplat.evaluation.evaluate import evaluate
@@ -32,6 +33,9 @@ from clsplat.training.run import train
 
 KEY = ("scene", "resolution", "cap", "iterations", "system", "seed", "views")
 TRAINING_VIEWS = 20  # training views that are measured, to see how far training and other views are apart
+FULL_SIZE = ("lego_full", "fox", "kitchen_large", "south_building_large")  # scenes, in the order of the page
+PAGE = ROOT / "benchmarks" / "SYSTEMS.md"
+BEGIN, END = "<!-- table of defaults.py -->", "<!-- end of the table -->"
 TRANSPARENT = ("lego", "lego_full")
 
 
@@ -140,6 +144,42 @@ def page(rows: list[dict[str, Any]]) -> str:
     return "\n".join(parts)
 
 
+def full_size(rows: list[dict[str, Any]]) -> str:
+    """Return a Markdown table of the runs at full size on test views. Variants of a system are left out."""
+    plain = [r for r in rows if r["views"] == "test" and r["resolution"] == -1 and r["scene"] in FULL_SIZE]
+    plain = [r for r in plain if not set(r["system"]) & {" ", ":"}]
+    cases = groups(plain, "scene", "cap", "iterations").items()
+    lines = []
+    for (scene, cap, iterations), case in sorted(cases, key=lambda item: (FULL_SIZE.index(item[0][0]), *item[0][1:])):
+        means = {name: statistics.fmean(r["psnr"] for r in same) for (name,), same in groups(case, "system").items()}
+        for system in sorted(means, key=means.__getitem__, reverse=True):
+            same = [r for r in case if r["system"] == system]
+            psnr = [r["psnr"] for r in same]
+            shown = f"{means[system]:.2f}"
+            shown = f"**{shown}**" if system == max(means, key=means.__getitem__) else shown
+            lines.append(
+                (
+                    f"`{scene}`",
+                    f"{cap:,}".replace(",", " "),
+                    f"{iterations:,}".replace(",", " "),
+                    system,
+                    shown + (f" ± {statistics.stdev(psnr):.2f}" if len(psnr) > 1 else ""),
+                    f"{statistics.fmean(r['ssim'] for r in same):.4f}",
+                    f"{statistics.fmean(r['train_psnr'] for r in same):.2f}",
+                    f"{statistics.fmean(r['seconds'] for r in same) / 60:.0f}",
+                )
+            )
+    head = ("scene", "splats", "iterations", "system", "PSNR", "SSIM", "PSNR of training views", "minutes")
+    return table(head, lines, right=(*head[1:3], *head[4:]))
+
+
+def write_page(rows: list[dict[str, Any]]) -> None:
+    """Write the table between the two marks of SYSTEMS.md."""
+    text = PAGE.read_text(encoding="utf-8")
+    begin, end = text.index(BEGIN) + len(BEGIN), text.index(END)
+    PAGE.write_text(f"{text[:begin]}\n\n{full_size(rows)}\n\n{text[end:]}", encoding="utf-8")
+
+
 def main() -> None:
     flags = parser(__doc__, RESULTS / "defaults.jsonl", smoke=False)
     flags.add_argument("--cases", nargs="+", default=["lego:-1:30000:1500", "fox:2:20000:1000"])
@@ -147,8 +187,12 @@ def main() -> None:
     flags.add_argument("--seeds", nargs="+", type=int, default=[0])
     flags.add_argument("--views", choices=("validation", "test"), default="validation")
     flags.add_argument("--work", type=Path, help="folder of the models, for runs that may be interrupted")
+    flags.add_argument("--page", action="store_true", help="write the table of SYSTEMS.md, and run nothing")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
+    if args.page:
+        write_page(runs.rows)
+        return
     if not args.table:
         for seed in args.seeds:
             for case in map(Case.parse, args.cases):

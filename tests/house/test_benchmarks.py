@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import defaults
 import pytest
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
@@ -267,6 +268,11 @@ def test_arithmetic(tmp_path: Path, capture_folder: Path) -> None:
         assert row["raster_ms"] > 0
         assert f"| {row['variant']} | {row['image_error']:.1e} |" in done.stdout
     assert rows[0]["relative_ms"] == 1
+
+
+def test_the_page_has_the_stored_runs_at_full_size() -> None:
+    rows = defaults.Runs(BENCHMARKS / "results" / "defaults.jsonl", defaults.KEY).rows
+    assert defaults.full_size(rows) in defaults.PAGE.read_text(encoding="utf-8"), "run defaults.py --page"
 
 
 @pytest.mark.slow
