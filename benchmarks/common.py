@@ -150,6 +150,13 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]], right: Collecti
     return markdown_table(head, [[str(cell) for cell in row] for row in rows], right)
 
 
+def write_between(path: Path, begin: str, end: str, text: str) -> None:
+    """Replace what stands between two marks of a page."""
+    page = path.read_text(encoding="utf-8")
+    start = page.index(begin) + len(begin)
+    path.write_text(f"{page[:start]}\n\n{text}\n\n{page[page.index(end) :]}", encoding="utf-8")
+
+
 def print_run(run: Run, record: Record | None) -> None:
     """Print one line after each run of a comparison; a callback for `compare`."""
     if record is not None:

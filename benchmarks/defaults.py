@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common import RESULTS, ROOT, Runs, data_folder, environment, groups, parser, table
+from common import RESULTS, ROOT, Runs, data_folder, environment, groups, parser, table, write_between
 
 from clsplat.comparison.methods import Method, parse_methods
 from clsplat.evaluation.evaluate import evaluate
@@ -173,13 +173,6 @@ def full_size(rows: list[dict[str, Any]]) -> str:
     return table(head, lines, right=(*head[1:3], *head[4:]))
 
 
-def write_page(rows: list[dict[str, Any]]) -> None:
-    """Write the table between the two marks of SYSTEMS.md."""
-    text = PAGE.read_text(encoding="utf-8")
-    begin, end = text.index(BEGIN) + len(BEGIN), text.index(END)
-    PAGE.write_text(f"{text[:begin]}\n\n{full_size(rows)}\n\n{text[end:]}", encoding="utf-8")
-
-
 def main() -> None:
     flags = parser(__doc__, RESULTS / "defaults.jsonl", smoke=False)
     flags.add_argument("--cases", nargs="+", default=["lego:-1:30000:1500", "fox:2:20000:1000"])
@@ -191,7 +184,7 @@ def main() -> None:
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
     if args.page:
-        write_page(runs.rows)
+        write_between(PAGE, BEGIN, END, full_size(runs.rows))
         return
     if not args.table:
         for seed in args.seeds:

@@ -60,21 +60,20 @@ def main() -> None:
         compiled_for = {key.split(" | ")[0] for key in found}
         stored = {key: usage for key, usage in stored.items() if key.split(" | ")[0] not in compiled_for} | found
         args.out.write_text(json.dumps({key: asdict(stored[key]) for key in sorted(stored)}, indent=1) + "\n")
-        write_page(stored)
+        common.write_between(PAGE, _BEGIN, _END, "\n\n".join(tables(stored)))
         return
     worse = list(faults(found, stored))
     print("\n".join(worse) or f"{len(found)} kernels need no more than the stored results")
     sys.exit(1 if worse else 0)
 
 
-def compiled(compiler: Compiler, target: str, only: str = "") -> Usages:
-    """Return the usage of each kernel of the programs whose name has a part `only`."""
+def compiled(compiler: Compiler, target: str) -> Usages:
+    """Return the usage of each kernel of all programs."""
     found: Usages = {}
     for name, text in programs().items():
-        if only in name:
-            with tempfile.TemporaryDirectory() as folder:
-                usages = compiler.compile(name, text, target, Path(folder))
-            found |= {f"{target} | {name} | {kernel}": usage for kernel, usage in usages.items()}
+        with tempfile.TemporaryDirectory() as folder:
+            usages = compiler.compile(name, text, target, Path(folder))
+        found |= {f"{target} | {name} | {kernel}": usage for kernel, usage in usages.items()}
     return found
 
 
@@ -103,13 +102,6 @@ def faults(found: Usages, stored: Usages) -> Iterator[str]:
             yield f"{key}: occupancy {usage.occupancy:.0%}, {before.occupancy:.0%} before"
         if usage.width < before.width:
             yield f"{key}: {usage.width} work-items run together, {before.width} before"
-
-
-def write_page(stored: Usages) -> None:
-    """Write the tables between the two marks of GPU.md."""
-    text = PAGE.read_text(encoding="utf-8")
-    begin, end = text.index(_BEGIN) + len(_BEGIN), text.index(_END)
-    PAGE.write_text(text[:begin] + "\n\n" + "\n\n".join(tables(stored)) + "\n\n" + text[end:], encoding="utf-8")
 
 
 def tables(stored: Usages) -> Iterator[str]:

@@ -93,9 +93,11 @@ class Trainer:
         keep_photos(scene.train)
         self.scene, self.config, self.progress = scene, config, progress
         self.device = device or open_device(config.device)
-        # A resumed run keeps the stored schedule: another one sums in a different order and changes the result.
-        schedule = Schedule.parse(checkpoint.schedule) if checkpoint else schedule_for(self.device)
-        require_right(self.device, schedule)
+        if checkpoint is None:
+            schedule = schedule_for(self.device)
+        else:  # a resumed run keeps its schedule: another one sums in a different order and changes the result
+            schedule = Schedule.parse(checkpoint.schedule)
+            require_right(self.device, schedule)
         self.kernels = kernel_build(config, schedule)
         self.memory = run_memory(self.device, self.kernels, config, scene.train)
         self.rng = np.random.default_rng(config.seed)
