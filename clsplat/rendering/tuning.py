@@ -44,17 +44,22 @@ _CLOCK_FLOOR = 1e-3  # ms; no device is as fast, but Mesa 22.3 reports 1 ns for 
 _chosen: dict[str, Schedule] = {}
 
 
-def schedule_for(device: Device) -> Schedule:
+def schedule_for(device: Device, stored: str | None = None) -> Schedule:
     """Return the device's best schedule from the environment or from the cache, or measure it, which takes seconds.
+
+    Parameters
+    ----------
+    stored : the schedule of a checkpoint, which a resumed run keeps: another one sums in a different order and changes
+        the result.
 
     Raises
     ------
-    DeviceError : the variable does not hold a schedule, or the device fails its self-test with every schedule.
+    DeviceError : the text is not a schedule, or the device fails its self-test with this one or with every schedule.
     """
-    forced = os.environ.get(SCHEDULE_VARIABLE)
+    forced = stored or os.environ.get(SCHEDULE_VARIABLE)
     if forced:
         schedule = Schedule.parse(forced)
-        require_right(device, schedule)
+        _require_right(device, schedule)
         return schedule
     key = _key(device)
     if key not in _chosen:
@@ -67,7 +72,7 @@ def schedule_for(device: Device) -> Schedule:
     return _chosen[key]
 
 
-def require_right(device: Device, schedule: Schedule) -> None:
+def _require_right(device: Device, schedule: Schedule) -> None:
     """Run the self-test of a device with a schedule, unless it has passed before.
 
     Raises
@@ -87,7 +92,7 @@ def _first_right(device: Device, schedules: list[str]) -> str:
     fault: ClsplatError | None = None
     for name in schedules:
         try:
-            require_right(device, Schedule.parse(name))
+            _require_right(device, Schedule.parse(name))
         except ClsplatError as error:
             fault = fault or error
         else:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ..device.device import Device, open_device
-from ..device.schedule import Schedule
 from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.floaters import measure_floaters
@@ -19,7 +18,7 @@ from ..rendering.frame import Frame
 from ..rendering.pipeline import Pipeline, isect_limit
 from ..rendering.renderer import Renderer
 from ..rendering.splat_buffers import CompactGradients, SplatBuffers
-from ..rendering.tuning import require_right, schedule_for
+from ..rendering.tuning import schedule_for
 from ..scenes.read_view import keep_photos
 from ..scenes.scene import Scene, View
 from ..scenes.split import with_validation
@@ -93,11 +92,7 @@ class Trainer:
         keep_photos(scene.train)
         self.scene, self.config, self.progress = scene, config, progress
         self.device = device or open_device(config.device)
-        if checkpoint is None:
-            schedule = schedule_for(self.device)
-        else:  # a resumed run keeps its schedule: another one sums in a different order and changes the result
-            schedule = Schedule.parse(checkpoint.schedule)
-            require_right(self.device, schedule)
+        schedule = schedule_for(self.device, checkpoint.schedule if checkpoint else None)
         self.kernels = kernel_build(config, schedule)
         self.memory = run_memory(self.device, self.kernels, config, scene.train)
         self.rng = np.random.default_rng(config.seed)
