@@ -76,7 +76,7 @@ kernel void wake_all(
 }
 
 // The three settle kernels do the skipped steps of the selected vectors: of the colour, of the geometry except the
-// skew, and of the skew. Global sizes are those of step_color, step_geometry (with first_part = 0) and step_skew.
+// skew, and of the skew. Global sizes: (capacity / LANES, coefficients of all bands), (capacity / LANES, parts), capacity / LANES.
 kernel void settle_color(
     global real *restrict sh,
     global real *restrict sh_m,
@@ -139,62 +139,5 @@ kernel void settle_skew(
     if (age.y > 0)
         for (int row = 0; row < SKEW_WIDTH; ++row) adam_catch_up(skip, lr, 0, 0, skew_s + i, adam, row * capacity);
     if (age.y > 0 || SKEW_ROTATES) write_skew(geom + i, skew_s + i, capacity);
-}
-#endif
-
-// The step kernels of optim.cl for the selected vectors only.
-kernel void step_visible_color(
-    global real *restrict sh,
-    global const real *restrict grad_sh,
-    global real *restrict sh_m,
-    global real *restrict sh_v,
-    global const int2 *restrict ages,
-    ulong capacity,
-    int sh_degree,
-    real lr,
-    real rest_lr,
-    real correct1,
-    real correct2
-) {
-    if (ages[get_global_id(0)].x < 0) return;
-    color_step(sh, grad_sh, sh_m, sh_v, capacity, sh_degree, lr, rest_lr, correct1, correct2);
-}
-kernel void step_visible_geometry(
-    global real *restrict geom,
-    global const real *restrict grad_geom,
-    global real *restrict geom_m,
-    global real *restrict geom_v,
-    constant real *restrict rates,
-    global const int2 *restrict ages,
-    ulong capacity,
-    uint first_part,
-    real mean_lr,
-    real correct1,
-    real correct2,
-    real opacity_scale,
-    real scale_scale,
-    real bisect_scale
-) {
-    if (ages[get_global_id(0)].x < 0) return;
-    geometry_step(
-        geom, grad_geom, geom_m, geom_v, rates, capacity, first_part, mean_lr, correct1, correct2, opacity_scale,
-        scale_scale, bisect_scale
-    );
-}
-#ifdef ROW_SKEW
-kernel void step_visible_skew(
-    global real *restrict geom,
-    global const real *restrict grad_geom,
-    global real *restrict skew_s,
-    global real *restrict skew_m,
-    global real *restrict skew_v,
-    global const int2 *restrict ages,
-    ulong capacity,
-    real lr,
-    real correct1,
-    real correct2
-) {
-    if (ages[get_global_id(0)].x < 0) return;
-    skew_step(geom, grad_geom, skew_s, skew_m, skew_v, capacity, lr, correct1, correct2);
 }
 #endif

@@ -2,7 +2,7 @@
 // The NumPy form is clsplat/training/optim/reference.py; a test compares both after each step.
 // All buffers are [rows, capacity] with one column for each splat. A work-item steps LANES splats.
 
-// Steps coefficient k of the colour. grad_sh [6, capacity] holds the gradient of the colour and the view direction
+// Steps coefficient k of the colour with rate lr. grad_sh [6, capacity] holds the gradient of the colour and the view direction
 // (cl/render/project.cl). The gradient of the coefficient is the gradient of the colour times the basis function.
 static inline void step_coefficient(
     uint k,
@@ -17,40 +17,6 @@ static inline void step_coefficient(
     sh_basis(vec3_load(grad_sh + 3 * capacity, capacity), degree, basis);
     for (int c = 0; c < 3; ++c)
         adam_step(basis[k] * lanes_load(grad_sh + c * capacity), lr, sh, adam, (3 * k + c) * capacity);
-}
-
-// Steps the colour. lr is the rate of the constant band, rest_lr the rate of the other bands.
-// Global size: (capacity / LANES, coefficients of sh_degree).
-static inline void color_step(
-    global real *sh,
-    global const real *grad_sh,
-    global real *sh_m,
-    global real *sh_v,
-    const ulong capacity,
-    int sh_degree,
-    real lr,
-    real rest_lr,
-    real correct1,
-    real correct2
-) {
-    const ulong i = get_global_id(0) * LANES;
-    const uint k = get_global_id(1);
-    const adam_moments adam = {sh_m + i, sh_v + i, correct1, correct2};
-    step_coefficient(k, sh_degree, k == 0 ? lr : rest_lr, sh + i, grad_sh + i, adam, capacity);
-}
-kernel void step_color(
-    global real *restrict sh,
-    global const real *restrict grad_sh,
-    global real *restrict sh_m,
-    global real *restrict sh_v,
-    ulong capacity,
-    int sh_degree,
-    real lr,
-    real rest_lr,
-    real correct1,
-    real correct2
-) {
-    color_step(sh, grad_sh, sh_m, sh_v, capacity, sh_degree, lr, rest_lr, correct1, correct2);
 }
 
 // A geometry step has four parts. Each part reads and writes different rows, so that few memory streams are open at the
@@ -101,30 +67,21 @@ static inline void regularise(
     }
 }
 
-// Steps the geometry except the skew. rates [3, GEOM_ROWS] holds the rate of each row and two bounds. The bounds are
-// those of fields that are optimised in log space, and 0 for the others. The rate of the means is mean_lr.
-// Global size: (capacity / LANES, number of parts from first_part on). first_part is 1 if SGHMC moves the means.
-static inline void geometry_step(
+// Steps one part of the geometry. rates [3, GEOM_ROWS] holds the rate of each row and two bounds. The bounds are those of
+// fields that are optimised in log space, and 0 for the others. The rate of the means is mean_lr.
+static inline void step_part(
+    uint part,
     global real *geom,
     global const real *grad_geom,
-    global real *geom_m,
-    global real *geom_v,
+    adam_moments adam,
     constant real *rates,
     const ulong capacity,
-    uint first_part,
     real mean_lr,
-    real correct1,
-    real correct2,
     real opacity_scale,
     real scale_scale,
     real bisect_scale
 ) {
-    const ulong i = get_global_id(0) * LANES;
-    const uint part = first_part + get_global_id(1);
-    geom += i;
-    grad_geom += i;
     const uint2 rows = part_rows(part);
-    const adam_moments adam = {geom_m + i, geom_v + i, correct1, correct2};
     vreal g[PART_ROWS];
     for (uint row = rows.x; row < rows.y; ++row) g[row - rows.x] = lanes_load(grad_geom + row * capacity);
     if (opacity_scale > 0 || scale_scale > 0 || bisect_scale > 0)
@@ -135,26 +92,6 @@ static inline void geometry_step(
         if (high > 0) adam_step_bounded(g[row - rows.x], lr, low, high, geom, adam, row * capacity);
         else adam_step(g[row - rows.x], lr, geom, adam, row * capacity);
     }
-}
-kernel void step_geometry(
-    global real *restrict geom,
-    global const real *restrict grad_geom,
-    global real *restrict geom_m,
-    global real *restrict geom_v,
-    constant real *restrict rates,
-    ulong capacity,
-    uint first_part,
-    real mean_lr,
-    real correct1,
-    real correct2,
-    real opacity_scale,
-    real scale_scale,
-    real bisect_scale
-) {
-    geometry_step(
-        geom, grad_geom, geom_m, geom_v, rates, capacity, first_part, mean_lr, correct1, correct2, opacity_scale,
-        scale_scale, bisect_scale
-    );
 }
 
 #ifdef ROW_SKEW
@@ -167,43 +104,24 @@ static inline void write_skew(global real *geom, global const real *skew_s, cons
     vec3_store(skew, geom + ROW_SKEW * capacity, capacity);
 }
 
-// Steps the trainable skew skew_s [SKEW_WIDTH, capacity] and writes the kernel's skew. Runs after step_geometry.
-// Global size: capacity / LANES.
-static inline void skew_step(
+// Steps the trainable skew skew_s [SKEW_WIDTH, capacity] and writes the kernel's skew.
+static inline void step_skew(
     global real *geom,
     global const real *grad_geom,
     global real *skew_s,
-    global real *skew_m,
-    global real *skew_v,
+    adam_moments adam,
     const ulong capacity,
-    real lr,
-    real correct1,
-    real correct2
+    real lr
 ) {
-    const ulong i = get_global_id(0) * LANES;
-    const adam_moments adam = {skew_m + i, skew_v + i, correct1, correct2};
     vreal v_s[SKEW_WIDTH];
-    skew_of_vjp(skew_s + i, vec3_load(grad_geom + ROW_SKEW * capacity + i, capacity), v_s, capacity);
-    for (int row = 0; row < SKEW_WIDTH; ++row) adam_step(v_s[row], lr, skew_s + i, adam, row * capacity);
-    write_skew(geom + i, skew_s + i, capacity);
-}
-kernel void step_skew(
-    global real *restrict geom,
-    global const real *restrict grad_geom,
-    global real *restrict skew_s,
-    global real *restrict skew_m,
-    global real *restrict skew_v,
-    ulong capacity,
-    real lr,
-    real correct1,
-    real correct2
-) {
-    skew_step(geom, grad_geom, skew_s, skew_m, skew_v, capacity, lr, correct1, correct2);
+    skew_of_vjp(skew_s, vec3_load(grad_geom + ROW_SKEW * capacity, capacity), v_s, capacity);
+    for (int row = 0; row < SKEW_WIDTH; ++row) adam_step(v_s[row], lr, skew_s, adam, row * capacity);
+    write_skew(geom, skew_s, capacity);
 }
 
 #if SKEW_ROTATES
 // For maps that depend on the rotation. Turns the gradient of the skew into the world's frame, in place. Adds the
-// gradient through the rotation to the gradient of the quaternion. Runs before step_geometry.
+// gradient through the rotation to the gradient of the quaternion. Runs before step_splats.
 kernel void turn_skew_gradient(
     global const real *restrict geom,
     global real *restrict grad_geom,
@@ -229,3 +147,67 @@ kernel void map_skew(global real *restrict geom, global const real *restrict ske
 }
 #endif
 #endif
+
+// Steps all parameters. The second index of a work-item chooses among the first `coefficients` of the colour, then `parts` of
+// the geometry from first_part on, then the skew. With a map that depends on the rotation, the skew has a launch of its own
+// after the geometry. lr is the rate of the constant band of the colour, rest_lr the rate of the other bands.
+// With LAZY only vectors of splats whose age is not negative step (lazy.cl); the geometry and the skew of all others step as
+// well, unless geometry_waits.
+// Global size: (capacity / LANES, coefficients + parts, and one more for the skew).
+kernel void step_splats(
+    global real *restrict sh,
+    global const real *restrict grad_sh,
+    global real *restrict sh_m,
+    global real *restrict sh_v,
+    global real *restrict geom,
+    global const real *restrict grad_geom,
+    global real *restrict geom_m,
+    global real *restrict geom_v,
+#ifdef ROW_SKEW
+    global real *restrict skew_s,
+    global real *restrict skew_m,
+    global real *restrict skew_v,
+    real skew_lr,
+    real skew_correct1,
+    real skew_correct2,
+#endif
+#if LAZY
+    global const int2 *restrict ages,
+    uint geometry_waits,
+#endif
+    constant real *restrict rates,
+    ulong capacity,
+    uint coefficients,
+    uint first_part,
+    uint parts,
+    int sh_degree,
+    real lr,
+    real rest_lr,
+    real mean_lr,
+    real correct1,
+    real correct2,
+    real opacity_scale,
+    real scale_scale,
+    real bisect_scale
+) {
+    const ulong i = get_global_id(0) * LANES;
+    const uint k = get_global_id(1);
+#if LAZY
+    if ((k < coefficients || geometry_waits) && ages[get_global_id(0)].x < 0) return;
+#endif
+    if (k < coefficients) {
+        const adam_moments adam = {sh_m + i, sh_v + i, correct1, correct2};
+        step_coefficient(k, sh_degree, k == 0 ? lr : rest_lr, sh + i, grad_sh + i, adam, capacity);
+    } else if (k < coefficients + parts) {
+        const adam_moments adam = {geom_m + i, geom_v + i, correct1, correct2};
+        step_part(
+            first_part + k - coefficients, geom + i, grad_geom + i, adam, rates, capacity, mean_lr, opacity_scale,
+            scale_scale, bisect_scale
+        );
+    } else {
+#ifdef ROW_SKEW
+        const adam_moments adam = {skew_m + i, skew_v + i, skew_correct1, skew_correct2};
+        step_skew(geom + i, grad_geom + i, skew_s + i, adam, capacity, skew_lr);
+#endif
+    }
+}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from ..device.trace import TRANSFERS, Launch
 from ..rendering.build import KernelBuild
+from ..rendering.group_binner import DEPTH_BITS
 from ..rendering.radix_sort import radix_passes
 from ..splats.fields import Group, sh_coefficients
 from ..splats.flops import ADAM, BLEND, BLEND_VJP, LOSS
@@ -15,7 +16,7 @@ from ..splats.shapes import shape_named
 STAGES = {
     "project": ("project_splats",),
     "depth sort": ("depth_span", "depth_histogram", "depth_scatter", "depth_buckets"),
-    "binning": ("count_tiles", "total_tiles", "count_isects", "emit_isects"),
+    "binning": ("count_tiles", "total_tiles", "count_isects", "scan_isects", "emit_isects"),
     "tile sort": ("list_isects", "find_tile_ranges"),
     "rasterize": ("rasterize",),
     "loss": ("unpack_image", "photo_of_render", "image_loss", "image_loss_vjp", "photo_of_render_vjp", "step_exposure"),
@@ -23,9 +24,7 @@ STAGES = {
     "gather": ("gather_isect_grads",),
     "project_vjp": ("project_splats_vjp",),
     "step": (
-        "step_color",
-        "step_geometry",
-        "step_skew",
+        "step_splats",
         "turn_skew_gradient",
         "map_skew",
         "sghmc_step",
@@ -35,9 +34,6 @@ STAGES = {
         "settle_color",
         "settle_geometry",
         "settle_skew",
-        "step_visible_color",
-        "step_visible_geometry",
-        "step_visible_skew",
     ),
     "strategy": ("gather_columns", "zero_columns"),
     "transfers": TRANSFERS,
@@ -46,7 +42,7 @@ HOST = "host"  # wall time in which the device is idle
 STAGE_OF = {kernel: stage for stage, kernels in STAGES.items() for kernel in kernels}
 
 # Kernels that several stages share. They belong to the stage that the last launch of _BEGINS has begun.
-SHARED = ("radix_histogram", "radix_scan", "radix_scatter", "scan_sums", "scan_spine", "scan_apply")
+SHARED = ("radix_histogram", "radix_scan", "radix_scatter")
 _BEGINS = {"project_splats": "depth sort", "count_isects": "binning", "emit_isects": "tile sort"}
 
 
@@ -95,7 +91,7 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
     geometry, colour = kernels.schema.rows(Group.GEOM), 3 * sh_coefficients(sizes.sh_degree)
     record, v_record = real * kernels.record, real * kernels.v_record
     tiles = -(-pixels // 256)
-    depth_passes, tile_passes = (radix_passes(bits) for bits in (32, max((tiles - 1).bit_length(), 1)))
+    depth_passes, tile_passes = (radix_passes(bits) for bits in (DEPTH_BITS, max((tiles - 1).bit_length(), 1)))
     forward, backward = shape.flops
     if is_cpu:
         listing = {
@@ -108,8 +104,8 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
         listing = {
             # In each pass keys are read twice, values once except in the first pass, and both are written.
             "depth sort": Work(n * (20 * depth_passes - 4)),
-            # Order and boxes read twice, counts and their scan; two words of each isect written.
-            "binning": Work(68 * n + 8 * isects),
+            # Order and boxes read twice, the range of each splat; two words of each isect written.
+            "binning": Work(48 * n + 8 * isects),
             "tile sort": Work(20 * tile_passes * isects + 8 * tiles),
         }
     return listing | {

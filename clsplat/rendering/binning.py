@@ -1,7 +1,7 @@
 """From projected splats to the isects of each tile, front to back, for one band of tiles at a time.
 
-Two binners give the same numbers. The one for CPUs cuts the work into a few chunks and counts by tile. The other one
-takes a work-item for each splat, and sorts.
+Two binners give the same numbers. `ChunkBinner` is for CPUs: it cuts the work into a few chunks and counts by tile.
+`GroupBinner` (group_binner.py) has many work-items, and sorts.
 """
 
 from __future__ import annotations
@@ -13,17 +13,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device.device import Device
 from ..device.memory import Pool
-from ..device.opencl import Buffer
 from ..device.program import Define, build
 from ..errors import FEWER_SPLATS, OTHER_DEVICE, DeviceError
 from .build import CULLED_KEY
 from .frame import Band, ProjectedSplats, TileLists
-from .radix_sort import Sorter, SortMemory
 
 MAX_ISECTS = 2**31 - 1  # of a band: ids have 32 bits
 BUCKET_BITS = 11  # bits of a depth key that choose its bucket
+CHUNK_FILES = ("render/order.cl", "render/band.clh", "render/bin.cl")
 ORDER_DEFINES: dict[str, Define] = {"BUCKET_BITS": BUCKET_BITS, "CULLED_KEY": f"{CULLED_KEY:#x}u"}
 _MIN_CHUNK = 2048  # splats of a chunk, so that there are few counters for each splat
 _CHUNKS_PER_UNIT = 4  # at most; near splats have more tiles, so equal chunks take unequal time
@@ -47,11 +45,6 @@ class Binner(Protocol):
 
     def list_isects(self, band: Band) -> TileLists:
         """List the isects of a band. The next call overwrites the lists."""
-
-
-def make_binner(device: Device, pool: Pool) -> Binner:
-    """Return the binner for this kind of device."""
-    return ChunkBinner(pool) if device.info.type == "CPU" else GroupBinner(pool)
 
 
 def cut_bands(count: Callable[[int, int], int], tiles_x: int, tiles_y: int, limit: int) -> tuple[Band, ...]:
@@ -85,20 +78,20 @@ def cut_bands(count: Callable[[int, int], int], tiles_x: int, tiles_y: int, limi
 
 @dataclass(frozen=True)
 class _Image:
-    """Sizes of the image that a binner works on; `chunks` of splats with `cells` counters each."""
+    """Sizes of the image that the binner works on; `chunks` of splats with `cells` counters each."""
 
     tiles_x: int
     n_tiles: int
-    chunks: int = 0
-    cells: int = 0
+    chunks: int
+    cells: int
 
 
 class ChunkBinner:
-    """The binner for CPUs (cl/render/order.cl, and the second half of cl/render/bin.cl)."""
+    """The binner for CPUs (cl/render/order.cl, cl/render/bin.cl)."""
 
     def __init__(self, pool: Pool) -> None:
         self.units = max(pool.device.info.compute_units, 1)
-        self.program = build(pool.device, ("render/order.cl", "render/bin.cl"), ORDER_DEFINES)
+        self.program = build(pool.device, CHUNK_FILES, ORDER_DEFINES)
         # Order by depth.
         self._span, self._bucket_counts = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 1 << BUCKET_BITS)
         self._bucket_starts, self._n_visible = pool.buffer(np.uint32), pool.buffer(np.uint32)
@@ -218,74 +211,3 @@ class ChunkBinner:
             tiles_x=image.tiles_x,
         )
         return lists
-
-
-class GroupBinner:
-    """The binner for devices with many work-items (cl/render/sort.cl, and the first half of cl/render/bin.cl)."""
-
-    def __init__(self, pool: Pool) -> None:
-        self.sorter = Sorter(pool)
-        self.program = build(pool.device, ("render/bin.cl",))
-        self._by_depth, self._by_tile = SortMemory(pool), SortMemory(pool)
-        self._counts, self._offsets, self._n_isects = (pool.buffer(t) for t in (np.uint32, np.uint32, np.uint64))
-        self._ranges, self._splat_isects = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 2)
-        self._isect_splat = pool.buffer(np.uint32)
-        self._splats: ProjectedSplats
-        self._image: _Image
-        self._order: Buffer
-        self._counted: tuple[int, int] | None = None  # tiles whose counts are in the buffers
-
-    def order(self, splats: ProjectedSplats) -> None:
-        self._splats = splats
-        self._by_depth.reserve(splats.capacity)
-        self._order = self.sorter.sort(splats.depth_key, splats.n, 32, self._by_depth)[1]
-
-    def begin(self, tiles_x: int, tiles_y: int) -> None:
-        self._image, self._counted = _Image(tiles_x, tiles_x * tiles_y), None
-
-    def count(self, first: int, end: int) -> int:
-        self._count(first, end)
-        return int(self._n_isects.read(1)[0])
-
-    def list_isects(self, band: Band) -> TileLists:
-        splats, image, n_isects = self._splats, self._image, band.n_isects
-        if self._counted != (band.first, band.end):
-            self._count(band.first, band.end)
-        ids = self._by_tile.values.reserve(n_isects)
-        tiles = self._by_tile.keys.reserve(n_isects)
-        splat_isects, isect_splat = self._splat_isects.reserve(splats.capacity), self._isect_splat.reserve(n_isects)
-        self.program.emit_isects.over(
-            splats.n,
-            order=self._order,
-            tile_rect=splats.tile_rect,
-            offsets=self._offsets.buffer,
-            splat_isects=splat_isects,
-            isect_tile=tiles,
-            isect_splat=isect_splat,
-            n_splats=splats.n,
-            first_tile=band.first,
-            end_tile=band.end,
-            tiles_x=image.tiles_x,
-        )
-        ranges = self._ranges.zeros(image.n_tiles)
-        if n_isects:
-            bits = max((image.n_tiles - 1).bit_length(), 1)
-            tiles, ids = self.sorter.sort(tiles, n_isects, bits, self._by_tile)
-            self.program.find_tile_ranges.over(n_isects, sorted_tile=tiles, tile_ranges=ranges, n_isects=n_isects)
-        return TileLists(ranges, ids, isect_splat, splat_isects)
-
-    def _count(self, first: int, end: int) -> None:
-        splats = self._splats
-        counts, offsets = self._counts.reserve(splats.capacity), self._offsets.reserve(splats.capacity)
-        self.program.count_isects.over(
-            splats.n,
-            order=self._order,
-            tile_rect=splats.tile_rect,
-            counts=counts,
-            n_splats=splats.n,
-            first_tile=first,
-            end_tile=end,
-            tiles_x=self._image.tiles_x,
-        )
-        self.sorter.scan(counts, offsets, splats.n, self._n_isects.reserve(1))
-        self._counted = (first, end)

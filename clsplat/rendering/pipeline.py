@@ -20,10 +20,11 @@ from ..device.memory import Pool, send_to_device
 from ..device.opencl import Buffer, Event
 from ..device.program import lane_group
 from ..splats.color import BLACK, Color
-from .binning import MAX_ISECTS, cut_bands, make_binner
+from .binning import MAX_ISECTS, Binner, ChunkBinner, cut_bands
 from .build import KernelBuild
 from .camera_block import camera_block
 from .frame import Band, Frame, ImageLayout, ProjectedSplats, RenderedImages, TileLists
+from .group_binner import GroupBinner
 from .splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers, SplatStatistics
 
 
@@ -52,7 +53,8 @@ class Pipeline:
         self.group = lane_group(device)
         self.pool = pool = Pool(device)
         self.statistics = SplatStatistics(pool, kernels.dtype)
-        self.binner = make_binner(device, pool)
+        on_cpu = device.info.type == "CPU"
+        self.binner: Binner = ChunkBinner(pool) if on_cpu else GroupBinner(pool, kernels.near_plane)
         real = kernels.dtype
         self._camera, self._records = pool.buffer(real), pool.buffer(real, kernels.record)
         self._depth_key, self._tile_rect = pool.buffer(np.uint32), pool.buffer(np.int32, 4)

@@ -1,4 +1,4 @@
-"""Stable radix sort of pairs and exclusive scan, for devices with many work-items (CPUs use cl/render/order.cl)."""
+"""Stable radix sort of pairs, for devices with many work-items (CPUs use cl/render/order.cl)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from ..device.device import Device
 from ..device.memory import Pool
 from ..device.opencl import Buffer
-from ..device.program import GROUP_ITEMS, Program, build
+from ..device.program import Program, build
 
-DIGIT_BITS = 5  # sorted by one pass
-_MAX_GROUP, _GROUP_STEP = 256, 1 << DIGIT_BITS  # a group has a whole number of work-items for each digit
-_SORT_RUN, _SCAN_RUN = 16, 64  # values of a work-item
+DIGIT_BITS = 6  # sorted by one pass
+_MAX_GROUP, _GROUP_STEP = 128, 1 << DIGIT_BITS  # a group has a whole number of work-items for each digit
+_RUN = 16  # pairs of a work-item
 
 
 def radix_passes(key_bits: int) -> int:
@@ -19,9 +19,14 @@ def radix_passes(key_bits: int) -> int:
     return -(-key_bits // DIGIT_BITS)
 
 
+def scan_group(device: Device) -> int:
+    """Return the number of work-items that sort or scan together."""
+    return min(_MAX_GROUP, device.info.max_group) // _GROUP_STEP * _GROUP_STEP
+
+
 def sort_program(device: Device, group: int) -> Program:
-    """Return the program of sorts and scans, for work-groups of `group` items."""
-    return build(device, ("render/sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": DIGIT_BITS})
+    """Return the program of sorts, for work-groups of `group` items."""
+    return build(device, ("render/scan.clh", "render/sort.cl"), {"SCAN_GROUP": group, "RADIX_BITS": DIGIT_BITS})
 
 
 class SortMemory:
@@ -38,43 +43,35 @@ class SortMemory:
 
 
 class Sorter:
-    """Sorts and scans uint32 buffers."""
+    """Sorts uint32 buffers."""
 
     def __init__(self, pool: Pool) -> None:
-        device = pool.device
-        self.group = min(_MAX_GROUP, device.info.max_group) // _GROUP_STEP * _GROUP_STEP
-        self.program = sort_program(device, self.group)
-        self._scan_sums = pool.buffer(np.uint64)
+        self.group = scan_group(pool.device)
+        self.program = sort_program(pool.device, self.group)
         self._counts, self._totals = pool.buffer(np.uint32), pool.buffer(np.uint32)
 
-    def scan(self, values: Buffer, scanned: Buffer, n: int, total: Buffer) -> None:
-        """Write the exclusive scan of n values, modulo 2^32, into another buffer, and their sum (uint64) to `total`."""
-        # Whole groups: the items beyond n sum nothing.
-        n_runs = -(-max(n, 1) // (_SCAN_RUN * GROUP_ITEMS)) * GROUP_ITEMS
-        sums = self._scan_sums.reserve(n_runs)
-        self.program.scan_sums.over(n_runs, values=values, sums=sums, n=n, run=_SCAN_RUN)
-        self.program.scan_spine((self.group,), (self.group,), sums=sums, total=total, n=n_runs)
-        self.program.scan_apply.over(n_runs, values=values, sums=sums, scanned=scanned, n=n, run=_SCAN_RUN)
-
-    def sort(self, keys: Buffer, n: int, key_bits: int, memory: SortMemory) -> tuple[Buffer, Buffer]:
-        """Sort the first n keys by their low `key_bits` bits, at least one.
+    def sort(self, keys: Buffer, n: int, key_bits: int, memory: SortMemory, smallest: int = 0) -> tuple[Buffer, Buffer]:
+        """Sort the first n keys.
 
         Parameters
         ----------
         keys : not changed, unless they are `memory.keys`.
+        key_bits : bits of the difference of a key and the smallest one, at least one. Keys with larger differences
+            come last, in their order.
+        smallest : lower bound of the keys.
 
         Returns
         -------
         keys, order : the sorted keys, and the place that each had; both in `memory`.
         """
-        n_blocks = max(-(-n // (_SORT_RUN * self.group)), 1)
+        n_blocks = max(-(-n // (_RUN * self.group)), 1)
         counts, totals = self._counts.reserve(n_blocks << DIGIT_BITS), self._totals.reserve(1 << DIGIT_BITS)
         size, local = (n_blocks * self.group,), (self.group,)
         values = memory.values.reserve(n)  # the first pass reads none
         target = memory.spare_keys.reserve(n), memory.spare_values.reserve(n)
         spare = memory.keys.reserve(n), values
         for shift in range(0, key_bits, DIGIT_BITS):
-            part = {"n": n, "run": _SORT_RUN, "shift": shift}
+            part = {"n": n, "run": _RUN, "base": smallest, "top": (1 << key_bits) - 1, "shift": shift}
             self.program.radix_histogram(size, local, keys=keys, counts=counts, **part)
             self.program.radix_scan((self.group << DIGIT_BITS,), local, counts=counts, totals=totals, n_blocks=n_blocks)
             self.program.radix_scatter(

@@ -83,12 +83,13 @@ _OPTIM_FILES = (
 
 def optim_program(device: Device, kernels: KernelBuild) -> Program:
     """Return the program of the optimizer: steps of colour, geometry and skew, SGHMC, noise, and moves of columns."""
-    return build(device, _OPTIM_FILES, _optim_defines(kernels), kernels.real)
+    return build(device, _OPTIM_FILES, _optim_defines(kernels) | {"LAZY": 0}, kernels.real)
 
 
 def lazy_program(device: Device, kernels: KernelBuild) -> Program:
     """Return the program of the optimizer with the kernels for visible splats (optim/lazy.py)."""
     defines = _optim_defines(kernels) | {
+        "LAZY": 1,
         "ADAM_WAITS": adam.WAITS,
         "CULLED_KEY": f"{CULLED_KEY:#x}u",
         "DRIFT": adam.DECAY_ROWS + adam.DRIFT,

@@ -18,9 +18,10 @@ from clsplat.device.device import Device, open_device
 from clsplat.device.memory import Pool, to_device, to_host
 from clsplat.device.schedule import SCHEDULES, Schedule, default_schedule
 from clsplat.errors import DeviceError
-from clsplat.rendering.binning import MAX_ISECTS, Band, ChunkBinner, GroupBinner, cut_bands
+from clsplat.rendering.binning import MAX_ISECTS, Band, ChunkBinner, cut_bands
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.frame import DeviceImage, Frame, ProjectedSplats
+from clsplat.rendering.group_binner import GroupBinner
 from clsplat.rendering.overdraw import count_pairs
 from clsplat.rendering.pipeline import Pipeline, isect_limit
 from clsplat.rendering.splat_buffers import ParameterBuffers, SplatBuffers
@@ -37,6 +38,7 @@ CULLED = 0xFFFFFFFF
 # Bands do not change the order of sums. But Intel's compiler adds the records of a splat in groups, and bands divide
 # these groups differently. The tolerance is relative to the largest entry of a field. The largest error is 4e-6 (skew).
 REGROUPED = 2e-5
+NEAR = 0.01  # the nearest depth of the tests of binners
 POCL = "Portable Computing Language"
 
 Arrays = dict[str, NDArray[Any]]
@@ -145,14 +147,21 @@ def test_cutting_halves_rows_first() -> None:
 @pytest.mark.parametrize("n", [1, 300, 2049, 40_000])
 @pytest.mark.parametrize("kind", ["CPU", "GPU"])
 def test_binning_is_that_of_numpy(device: Device, kind: str, n: int) -> None:
-    """Test random and equal depths, culled splats, and rectangles up to the whole image, for all tiles and bands."""
+    """Test near, far and equal depths, culled splats, and rectangles up to the whole image, for all tiles and bands."""
     device = as_kind(device, kind)
     (tiles_x, tiles_y), rng = (9, 6), np.random.default_rng(n)
-    binner = (ChunkBinner if kind == "CPU" else GroupBinner)(Pool(device))
+    binner = make_binner(device, kind)
     size = np.array([tiles_x, tiles_y])
     low = rng.integers(0, size, (n, 2))
     rect = np.concatenate([low, np.minimum(low + rng.integers(1, 8, (n, 2)) ** 2 // 9 + 1, size)], 1).astype(np.int32)
-    for depth in (10.0 ** rng.uniform(-2, 8, n), np.full(n, 3.0), rng.integers(1, 5, n), np.full(n, np.inf)):
+    for depth in (
+        10.0 ** rng.uniform(-2, 8, n),
+        10.0 ** rng.uniform(-2, 36, n),
+        np.full(n, NEAR),
+        np.full(n, 3.0),
+        rng.integers(1, 5, n),
+        np.full(n, np.inf),
+    ):
         keys = depth.astype(np.float32).view(np.uint32).copy()
         keys[rng.random(n) < 0.2] = CULLED
         keys[np.isinf(depth)] = CULLED
@@ -161,6 +170,11 @@ def test_binning_is_that_of_numpy(device: Device, kind: str, n: int) -> None:
         for first, end in ((0, 54), (13, 31), (20, 21)):
             binner.begin(tiles_x, tiles_y)
             check_band(device, binner, keys, rect, first, end, size)
+
+
+def make_binner(device: Device, kind: str) -> ChunkBinner | GroupBinner:
+    """Return the binner of a kind of device; depths start at NEAR."""
+    return ChunkBinner(Pool(device)) if kind == "CPU" else GroupBinner(Pool(device), NEAR)
 
 
 def projected(device: Device, keys: NDArray[np.uint32], rect: NDArray[np.int32]) -> ProjectedSplats:
@@ -175,7 +189,7 @@ def projected(device: Device, keys: NDArray[np.uint32], rect: NDArray[np.int32])
 def test_any_number_of_tiles_is_sorted(device: Device, kind: str) -> None:
     """Tile indices of one bit more need another pass of the sort: 16 and 17 tiles, 256 and 257 tiles."""
     device, rng, n = as_kind(device, kind), np.random.default_rng(1), 40
-    binner = (ChunkBinner if kind == "CPU" else GroupBinner)(Pool(device))
+    binner = make_binner(device, kind)
     for tiles_x, tiles_y in ((1, 1), (4, 4), (17, 1), (5, 5), (16, 16), (257, 1), (20, 25)):
         size = np.array([tiles_x, tiles_y])
         low = rng.integers(0, size, (n, 2))
@@ -227,9 +241,9 @@ def check_band(
 def test_counts_beyond_32_bits(device: Device) -> None:
     """70 000 splats over 65 536 tiles: the count of more than 2^32 isects does not overflow."""
     n, side = 70_000, 256
-    for kind, binner_of in (("CPU", ChunkBinner), ("GPU", GroupBinner)):
+    for kind in ("CPU", "GPU"):
         other = as_kind(device, kind)
-        binner = binner_of(Pool(other))
+        binner = make_binner(other, kind)
         rect = np.tile(np.array([0, 0, side, side], np.int32), (n, 1))
         binner.order(projected(other, np.ones(n, np.uint32), rect))
         binner.begin(side, side)

@@ -15,8 +15,9 @@ from clsplat.device.device import Device
 from clsplat.device.program import build
 from clsplat.device.schedule import SCHEDULES
 from clsplat.profiling.roofline import CHAINS, roofline_program
-from clsplat.rendering.binning import ORDER_DEFINES
+from clsplat.rendering.binning import CHUNK_FILES, ORDER_DEFINES
 from clsplat.rendering.build import KernelBuild
+from clsplat.rendering.group_binner import group_binning_program
 from clsplat.rendering.radix_sort import sort_program
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.training.optim.skew_map import SKEW_MAPS
@@ -75,7 +76,8 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
     roofline_program(compiler, CHAINS[0])
     build(compiler, ("measure/smoke.cl",))
     sort_program(compiler, 64)
-    build(compiler, ("render/order.cl", "render/bin.cl"), ORDER_DEFINES)
+    group_binning_program(compiler, 64)
+    build(compiler, CHUNK_FILES, ORDER_DEFINES)
     there = {
         f"{folder.name}/{file.name}"
         for folder in files("clsplat_cl").iterdir()
@@ -109,8 +111,8 @@ def test_every_kernel_builds_on_every_device(device: Device) -> None:
         build_all(device, kernels)
 
 
-@pytest.mark.parametrize("group", [64, 256])
+@pytest.mark.parametrize("group", [64, 128])
 def test_sort_and_binning_build(device: Device, group: int) -> None:
     sort_program(device, group)
-    build(device, ("render/order.cl", "render/bin.cl"), ORDER_DEFINES)
-    build(device, ("render/bin.cl",))
+    group_binning_program(device, group)
+    build(device, CHUNK_FILES, ORDER_DEFINES)

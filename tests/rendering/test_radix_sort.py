@@ -1,4 +1,4 @@
-"""Sorting and scanning on the device equal NumPy's."""
+"""Sorting on the device equals NumPy's."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SIZES = [
     100_003,
 ]  # sizes around every boundary of runs, groups, blocks and chunks
 ALL_BITS = 32
-UINT32, UINT64 = np.uint32, np.uint64
+UINT32 = np.uint32
 
 MACHINES: dict[Device, SortMachine] = {}  # kept between examples
 
@@ -53,23 +53,15 @@ class SortMachine:
         pool = Pool(device)
         self.device, self.sorter, self.memory = device, Sorter(pool), SortMemory(pool)
         self.keys = pool.buffer(UINT32)
-        self.values, self.scanned, self.total = (pool.buffer(dtype) for dtype in (UINT32, UINT32, UINT64))
 
-    def sort(self, keys: Array, key_bits: int, in_place: bool) -> tuple[Array, Array]:
+    def sort(self, keys: Array, key_bits: int, in_place: bool, smallest: int = 0) -> tuple[Array, Array]:
         """Return the sorted keys and the original index of each. Other buffers keep the keys."""
         device, n = self.device, len(keys)
         given = self.memory.keys if in_place else self.keys
         to_device(device, given.reserve(n), keys)
-        sorted_keys, order = self.sorter.sort(given.buffer, n, key_bits, self.memory)
+        sorted_keys, order = self.sorter.sort(given.buffer, n, key_bits, self.memory, smallest)
         assert in_place or np.array_equal(given.read(n), keys)
         return to_host(device, sorted_keys, np.empty(n, UINT32)), to_host(device, order, np.empty(n, UINT32))
-
-    def scan(self, values: Array) -> tuple[Array, int]:
-        """Return the exclusive scan and the total."""
-        n = len(values)
-        to_device(self.device, self.values.reserve(n), values)
-        self.sorter.scan(self.values.buffer, self.scanned.reserve(n), n, self.total.reserve(1))
-        return self.scanned.read(n), int(self.total.read(1)[0])
 
 
 @pytest.fixture(scope="module")
@@ -82,13 +74,6 @@ def check_sort(sorter: SortMachine, keys: Array, key_bits: int = ALL_BITS) -> No
         sorted_keys, order = sorter.sort(keys, key_bits, in_place)
         assert np.array_equal(order, np.argsort(keys, kind="stable")), f"n={len(keys)}"
         assert np.array_equal(sorted_keys, np.sort(keys)), f"n={len(keys)}"
-
-
-def check_scan(sorter: SortMachine, values: Array) -> None:
-    scanned, total = sorter.scan(values)
-    want = np.concatenate([np.zeros(1, UINT64), np.cumsum(values, dtype=UINT64)])
-    assert np.array_equal(scanned, want[:-1].astype(UINT32)), f"n={len(values)}"  # modulo 2^32
-    assert total == want[-1]
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -109,7 +94,8 @@ def test_any_number_of_bits(sorter: SortMachine, key_bits: int) -> None:
 
 
 def test_more_blocks_than_a_group_has_items(sorter: SortMachine) -> None:
-    check_sort(sorter, np.random.default_rng(0).integers(0, 2**5, 1_100_000, UINT32), 5)
+    n_blocks, n_pairs = sorter.sorter.group + 3, 2048
+    check_sort(sorter, np.random.default_rng(0).integers(0, 2**5, n_blocks * n_pairs, UINT32), 5)
 
 
 def test_sorted_reversed_and_equal_keys(sorter: SortMachine) -> None:
@@ -119,11 +105,19 @@ def test_sorted_reversed_and_equal_keys(sorter: SortMachine) -> None:
         check_sort(sorter, keys)
 
 
-@pytest.mark.parametrize("n", SIZES)
-def test_scan_is_numpy_s_cumulative_sum(sorter: SortMachine, n: int) -> None:
-    rng = np.random.default_rng(n)
-    check_scan(sorter, rng.integers(0, 9, n, UINT32))
-    check_scan(sorter, rng.integers(0, 2**32, n, UINT32))  # the sum wraps around
+@pytest.mark.parametrize("key_bits", [4, 30])
+def test_keys_above_a_smallest_one(sorter: SortMachine, key_bits: int) -> None:
+    """Keys from the smallest one on are sorted. Keys whose difference has more bits come last, in their order."""
+    smallest, rng = 0x3C23D70A, np.random.default_rng(key_bits)  # the bits of 0.01
+    top = (1 << key_bits) - 1
+    keys = (smallest + rng.integers(0, top + 1, 5000)).astype(UINT32)
+    keys[:2] = smallest, smallest + top
+    far = rng.random(5000) < 0.2
+    keys[far] = rng.choice(np.array([smallest + top + 1, 0xFFFFFFFF, smallest - 1, 0], UINT32), far.sum())
+    order = sorter.sort(keys, key_bits, False, smallest)[1]
+    low = (keys >= smallest) & (keys < smallest + top)
+    assert np.array_equal(order[: low.sum()], np.flatnonzero(low)[np.argsort(keys[low], kind="stable")])
+    assert np.array_equal(order[low.sum() :], np.flatnonzero(~low))
 
 
 @pytest.mark.skipif(not USABLE, reason="no OpenCL device")
@@ -134,4 +128,3 @@ def test_any_keys(devices: list[Device], data: st.DataObject) -> None:
     keys = np.array(data.draw(st.lists(st.integers(0, 2**32 - 1), max_size=700)), UINT32)
     sorter = MACHINES.setdefault(devices[0], SortMachine(devices[0]))
     check_sort(sorter, keys)
-    check_scan(sorter, keys)

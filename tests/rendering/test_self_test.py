@@ -47,7 +47,7 @@ OF_A_KIND = [  # faults of the binners
     ("CPU", "++bottom[rect.z];", ""),
     ("CPU", "depth_order[start + k] =", "depth_order[n - 1 - start - k] ="),
     ("GPU", "numbered ? (uint)k", "numbered ? (uint)(n - 1 - k)"),
-    ("GPU", "tile_ranges[2 * tile + 1] = at + 1", "tile_ranges[2 * tile + 1] = at"),
+    ("GPU", "n_isects, tile + 1)", "n_isects, tile)"),
 ]
 
 

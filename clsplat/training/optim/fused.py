@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...device.device import Device
 from ...device.memory import fill_zero, to_device, to_host
-from ...device.program import GROUP_ITEMS, Kernel, Program, lane_group
+from ...device.program import GROUP_ITEMS, Program, lane_group
 from ...rendering.build import KernelBuild
 from ...rendering.splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers
 from ...splats.fields import Array, Group, Schema, sh_coefficients
@@ -89,11 +89,18 @@ class FusedOptimizer:
             self.steps += 1
             if sghmc is not None and self.momentum is not None:  # before the geometry: SGHMC uses the old covariance
                 self._sghmc(sghmc, self.momentum, grads, mean_lr, iteration)
-            self._step_base(grads, mean_lr, sh_degree)
+        with_skew = skew is not None and groups.skew
         if skew is not None and groups.skew:
             skew.steps += 1
-            self._step_skew(skew, grads)
-        elif skew is not None and skew.map.rotates:
+        arguments = self._arguments(grads, mean_lr, sh_degree)
+        follows = skew is not None and skew.map.rotates  # the skew needs the new rotation: it steps after the geometry
+        if groups.base:
+            first = int(sghmc is not None)  # SGHMC moves the means
+            base = {"coefficients": sh_coefficients(sh_degree), "first_part": first, "parts": len(PARTS) - first}
+            self._step(base, with_skew and not follows, arguments)
+        if with_skew and (follows or not groups.base):
+            self._step({"coefficients": 0, "first_part": 0, "parts": 0}, True, arguments)
+        elif follows and not with_skew and skew is not None:
             self._launch("map_skew", skew_s=skew.s.buffer)
 
     def settle(self) -> None:
@@ -173,63 +180,42 @@ class FusedOptimizer:
         """Work-items of a kernel over all splats."""
         return -(-self.splats.n // (self.kernels.lanes * GROUP_ITEMS)) * GROUP_ITEMS
 
-    def _step_base(self, grads: CompactGradients, mean_lr: float, sh_degree: int) -> None:
-        """Step the colour and the geometry, except the skew."""
-        corrections, penalty = bias_corrections(self.steps), self.rules.penalty(self.splats.n)
-        self._kernel("color")(
-            (self._columns, sh_coefficients(sh_degree)),
+    def _step(self, parts: dict[str, int], with_skew: bool, arguments: dict[str, Any]) -> None:
+        """Step coefficients of the colour, parts of the geometry, and the skew."""
+        self.program.step_splats(
+            (self._columns, parts["coefficients"] + parts["parts"] + int(with_skew)),
             (GROUP_ITEMS, 1),
-            sh=self.splats.sh,
-            grad_sh=grads.sh,
-            sh_m=self.first.sh,
-            sh_v=self.second.sh,
-            capacity=self.splats.capacity,
-            sh_degree=sh_degree,
+            **parts,
+            **arguments,
+        )
+
+    def _arguments(self, grads: CompactGradients, mean_lr: float, sh_degree: int) -> dict[str, Any]:
+        """Return the arguments of the kernel `step_splats`, except what it steps."""
+        penalty, skew = self.rules.penalty(self.splats.n), self.skew
+        arguments = {
+            "sh": self.splats.sh,
+            "grad_sh": grads.sh,
+            "sh_m": self.first.sh,
+            "sh_v": self.second.sh,
+            "geom": self.splats.geom,
+            "grad_geom": grads.geom,
+            "geom_m": self.first.geom,
+            "geom_v": self.second.geom,
+            "rates": self.rates,
+            "capacity": self.splats.capacity,
+            "sh_degree": sh_degree,
+            "mean_lr": mean_lr,
+            "opacity_scale": penalty.opacity,
+            "scale_scale": penalty.scale,
+            "bisect_scale": penalty.bisect,
             **self.color_rates,
-            **corrections,
-            **self._selection("color"),
-        )
-        first_part = int(self.rules.sghmc is not None)  # 1 skips the means, which SGHMC has moved already
-        self._kernel("geometry")(
-            (self._columns, len(PARTS) - first_part),
-            (GROUP_ITEMS, 1),
-            geom=self.splats.geom,
-            grad_geom=grads.geom,
-            geom_m=self.first.geom,
-            geom_v=self.second.geom,
-            rates=self.rates,
-            capacity=self.splats.capacity,
-            first_part=first_part,
-            mean_lr=mean_lr,
-            opacity_scale=penalty.opacity,
-            scale_scale=penalty.scale,
-            bisect_scale=penalty.bisect,
-            **corrections,
-            **self._selection("geometry"),
-        )
-
-    def _step_skew(self, skew: TrainableSkew, grads: CompactGradients) -> None:
-        self._kernel("skew")(
-            (self._columns,),
-            (GROUP_ITEMS,),
-            geom=self.splats.geom,
-            grad_geom=grads.geom,
-            skew_s=skew.s.buffer,
-            skew_m=skew.first.buffer,
-            skew_v=skew.second.buffer,
-            capacity=self.splats.capacity,
-            lr=self.rules.rates["skew"],
-            **bias_corrections(skew.steps),
-            **self._selection("skew"),
-        )
-
-    def _kernel(self, name: str) -> Kernel:
-        """Return the kernel that steps "color", "geometry" or "skew"."""
-        return self.program[f"step_{name}"]
-
-    def _selection(self, name: str) -> dict[str, Any]:
-        """Return the arguments that select the splats of `_kernel(name)`: none, because it steps all splats."""
-        return {}
+            **bias_corrections(self.steps),
+        }
+        if skew is not None:
+            buffers = {"skew_s": skew.s.buffer, "skew_m": skew.first.buffer, "skew_v": skew.second.buffer}
+            corrections = {f"skew_{name}": value for name, value in bias_corrections(skew.steps).items()}
+            arguments |= {**buffers, "skew_lr": self.rules.rates["skew"], **corrections}
+        return arguments
 
     def _launch(self, name: str, **arguments: Any) -> None:
         """Run a kernel over the geometry of all splats."""

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from ...device.device import Device
 from ...device.memory import copy as copy_buffer
 from ...device.memory import send_to_device, to_device, to_host
-from ...device.program import GROUP_ITEMS, Kernel
+from ...device.program import GROUP_ITEMS
 from ...rendering.build import KernelBuild
 from ...rendering.splat_buffers import CompactGradients, SplatBuffers
 from ...splats.fields import Array, Group, sh_coefficients
@@ -217,11 +217,6 @@ class VisibleOptimizer(FusedOptimizer):
                 **common,
             )
 
-    def _is_lazy(self, name: str) -> bool:
-        return name == "color" or self.rules.geometry_waits
-
-    def _kernel(self, name: str) -> Kernel:
-        return self.program[f"step_visible_{name}" if self._is_lazy(name) else f"step_{name}"]
-
-    def _selection(self, name: str) -> dict[str, Any]:
-        return {"ages": self.ages} if self._is_lazy(name) else {}
+    def _arguments(self, grads: CompactGradients, mean_lr: float, sh_degree: int) -> dict[str, Any]:
+        waits = {"ages": self.ages, "geometry_waits": int(self.rules.geometry_waits)}
+        return super()._arguments(grads, mean_lr, sh_degree) | waits

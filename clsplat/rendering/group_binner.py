@@ -1,0 +1,113 @@
+"""The binner for devices with many work-items: a work-item for a few splats, and two sorts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..device.device import Device
+from ..device.memory import Pool
+from ..device.opencl import Buffer
+from ..device.program import Program, build
+from .frame import Band, ProjectedSplats, TileLists
+from .radix_sort import Sorter, SortMemory
+
+DEPTH_BITS = 30  # of a depth key above that of the near plane: all depths up to 2^128 times the nearest one
+_RUN = 4  # splats of a work-item that counts or lists isects
+
+
+def group_binning_program(device: Device, group: int) -> Program:
+    """Return the program that lists isects by splat, for work-groups of `group` items."""
+    files = ("render/scan.clh", "render/band.clh", "render/group_bin.cl")
+    return build(device, files, {"SCAN_GROUP": group, "RUN": _RUN})
+
+
+class GroupBinner:
+    """The `Binner` for devices with many work-items (cl/render/sort.cl, cl/render/group_bin.cl).
+
+    Parameters
+    ----------
+    near_plane : smallest depth of a splat that is seen, in units of the scene.
+    """
+
+    def __init__(self, pool: Pool, near_plane: float) -> None:
+        self.sorter = Sorter(pool)
+        self.group, self.smallest_key = self.sorter.group, int(np.float32(near_plane).view(np.uint32))
+        self.program = group_binning_program(pool.device, self.group)
+        self._by_depth, self._by_tile = SortMemory(pool), SortMemory(pool)
+        self._blocks, self._n_isects = pool.buffer(np.uint32), pool.buffer(np.uint64)
+        self._ranges, self._splat_isects = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 2)
+        self._isect_splat = pool.buffer(np.uint32)
+        self._splats: ProjectedSplats
+        self._order: Buffer
+        self._tiles_x, self._n_tiles = 0, 0
+        self._counted: tuple[int, int] | None = None  # tiles whose counts are in the buffer
+
+    def order(self, splats: ProjectedSplats) -> None:
+        self._splats = splats
+        self._by_depth.reserve(splats.capacity)
+        self._order = self.sorter.sort(splats.depth_key, splats.n, DEPTH_BITS, self._by_depth, self.smallest_key)[1]
+
+    def begin(self, tiles_x: int, tiles_y: int) -> None:
+        self._tiles_x, self._n_tiles, self._counted = tiles_x, tiles_x * tiles_y, None
+
+    def count(self, first: int, end: int) -> int:
+        self._count(first, end)
+        return int(self._n_isects.read(1)[0])
+
+    def list_isects(self, band: Band) -> TileLists:
+        splats, n_isects = self._splats, band.n_isects
+        if self._counted != (band.first, band.end):
+            self._count(band.first, band.end)
+        ids = self._by_tile.values.reserve(n_isects)
+        tiles = self._by_tile.keys.reserve(n_isects)
+        splat_isects, isect_splat = self._splat_isects.reserve(splats.capacity), self._isect_splat.reserve(n_isects)
+        self.program.emit_isects(
+            (self._n_blocks * self.group,),
+            (self.group,),
+            order=self._order,
+            tile_rect=splats.tile_rect,
+            block_starts=self._blocks.buffer,
+            splat_isects=splat_isects,
+            isect_tile=tiles,
+            isect_splat=isect_splat,
+            n_splats=splats.n,
+            first_tile=band.first,
+            end_tile=band.end,
+            tiles_x=self._tiles_x,
+        )
+        if n_isects:
+            bits = max((self._n_tiles - 1).bit_length(), 1)
+            tiles, ids = self.sorter.sort(tiles, n_isects, bits, self._by_tile)
+        ranges = self._ranges.reserve(self._n_tiles)
+        self.program.find_tile_ranges.over(
+            self._n_tiles, sorted_tile=tiles, tile_ranges=ranges, n_isects=n_isects, n_tiles=self._n_tiles
+        )
+        return TileLists(ranges, ids, isect_splat, splat_isects)
+
+    @property
+    def _n_blocks(self) -> int:
+        """Blocks of depth ranks; a work-group has one."""
+        return -(-self._splats.n // (self.group * _RUN))
+
+    def _count(self, first: int, end: int) -> None:
+        """Write the first isect of each block, and the number of isects."""
+        splats, blocks = self._splats, self._blocks.reserve(self._n_blocks)
+        self.program.count_isects(
+            (self._n_blocks * self.group,),
+            (self.group,),
+            order=self._order,
+            tile_rect=splats.tile_rect,
+            block_counts=blocks,
+            n_splats=splats.n,
+            first_tile=first,
+            end_tile=end,
+            tiles_x=self._tiles_x,
+        )
+        self.program.scan_isects(
+            (self.group,),
+            (self.group,),
+            block_counts=blocks,
+            total=self._n_isects.reserve(1),
+            n_blocks=self._n_blocks,
+        )
+        self._counted = (first, end)
