@@ -11,17 +11,18 @@ from unittest import mock
 import clsplat.device.program
 from clsplat.device.device import Device
 from clsplat.device.program import OPTIONS as OPTIONS  # of this module's interface
-from clsplat.device.program import build
 from clsplat.device.schedule import SCHEDULES
 from clsplat.rendering.build import KernelBuild
+from clsplat.rendering.group_binner import group_binning_program
 from clsplat.rendering.radix_sort import sort_program
 from clsplat.training.programs import loss_program, optim_program
 
 SHAPES = ("gaussian", "skew-normal")
 GPU_SCHEDULES = tuple(name for name, schedule in SCHEDULES.items() if schedule.group > 1)
-SORT_GROUP, ITEM_GROUP = 256, 64
+SCAN_GROUP, ITEM_GROUP = 128, 64
 _SH_DEGREE = 3
 _PIXEL_KERNELS = ("rasterize", "rasterize_vjp")
+_SCAN_KERNELS = ("radix_histogram", "radix_scan", "radix_scatter", "count_isects", "scan_isects", "emit_isects")
 
 
 def programs() -> dict[str, str]:
@@ -40,9 +41,9 @@ def programs() -> dict[str, str]:
                 texts[f"pixels {shape} {name}"] = built.pop()
         loss_program(device, KernelBuild(SHAPES[0], _SH_DEGREE, gpu))
         texts["loss"] = built.pop()
-        sort_program(device, SORT_GROUP)
+        sort_program(device, SCAN_GROUP)
         texts["sort"] = built.pop()
-        build(device, ("render/bin.cl",))
+        group_binning_program(device, SCAN_GROUP)
         texts["bin"] = built.pop()
     return texts
 
@@ -51,7 +52,7 @@ def group_size(program: str, kernel: str) -> int:
     """Return the number of work-items of a kernel's groups."""
     if kernel in _PIXEL_KERNELS:
         return SCHEDULES[program.split()[-1]].group
-    return SORT_GROUP if kernel.startswith("radix") or kernel == "scan_spine" else ITEM_GROUP
+    return SCAN_GROUP if kernel in _SCAN_KERNELS else ITEM_GROUP
 
 
 @contextmanager

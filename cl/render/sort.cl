@@ -2,7 +2,7 @@
 //
 // Each pass counts digits, scans the counts and scatters (Zagha and Blelloch 1991). SCAN_GROUP work-items share a block of
 // the input. Each has a contiguous run of it, so pairs with the same digit keep their order. RADIX = 1 << RADIX_BITS.
-// A block has fewer than 65 536 pairs, so its counters have 16 bits: the digits can be wider.
+// A run has fewer than 256 pairs and a block fewer than 65 536, so counters have 8 and 16 bits: digits can be wider.
 // Pairs are sorted by min(key - base, top): keys that lie close together have fewer digits, and other keys come last.
 
 #define RADIX (1 << RADIX_BITS)
@@ -13,25 +13,28 @@ static inline uint digit_of(uint key, uint base, uint top, uint shift) {
     return (min(key - base, top) >> shift) & (RADIX - 1);
 }
 
-// Overwrites hist[digit * SCAN_GROUP + item] with the histograms of this group's runs.
-static inline void
-count_digits(global const uint *keys, uint n, uint run, uint base, uint top, uint shift, local ushort *hist) {
-    const uint lid = get_local_id(0);
-    for (uint d = 0; d < RADIX; ++d) hist[d * SCAN_GROUP + lid] = 0;
-    const ulong start = (ulong)get_global_id(0) * run;
-    for (ulong k = start; k < start + run && k < n; ++k) ++hist[digit_of(keys[k], base, top, shift) * SCAN_GROUP + lid];
-    barrier(CLK_LOCAL_MEM_FENCE);
-}
+// Overwrites hist[digit * SCAN_GROUP + item] with the histograms of this group's runs. A macro, because counters of a run have
+// 8 bits, and places in a block 16.
+#define COUNT_DIGITS(hist) \
+    { \
+        const uint lid_ = get_local_id(0); \
+        for (uint d = 0; d < RADIX; ++d) hist[d * SCAN_GROUP + lid_] = 0; \
+        const ulong start_ = (ulong)get_global_id(0) * run; \
+        for (ulong k = start_; k < start_ + run && k < n; ++k) \
+            ++hist[digit_of(keys[k], base, top, shift) * SCAN_GROUP + lid_]; \
+        barrier(CLK_LOCAL_MEM_FENCE); \
+    }
 
 // Writes to parts [SCAN_GROUP] the sum of the counters that each work-item has a share of: helper h of digit d is d * HELPERS
 // + h.
-static inline void share_sums(local const ushort *hist, local uint *parts) {
-    const uint lid = get_local_id(0);
-    uint sum = 0;
-    for (uint k = 0; k < SHARE; ++k) sum += hist[lid * SHARE + k];
-    parts[lid] = sum;
-    barrier(CLK_LOCAL_MEM_FENCE);
-}
+#define SHARE_SUMS(hist, parts) \
+    { \
+        const uint lid_ = get_local_id(0); \
+        uint sum_ = 0; \
+        for (uint k = 0; k < SHARE; ++k) sum_ += hist[lid_ * SHARE + k]; \
+        parts[lid_] = sum_; \
+        barrier(CLK_LOCAL_MEM_FENCE); \
+    }
 
 // Overwrites counts [RADIX, n_blocks], digit-major.
 SCAN_ATTRIBUTE
@@ -44,10 +47,10 @@ kernel void radix_histogram(
     uint top,
     uint shift
 ) {
-    local ushort hist[RADIX * SCAN_GROUP];
+    local uchar hist[RADIX * SCAN_GROUP];  // a run has fewer than 256 pairs
     local uint parts[SCAN_GROUP];
-    count_digits(keys, n, run, base, top, shift, hist);
-    share_sums(hist, parts);
+    COUNT_DIGITS(hist)
+    SHARE_SUMS(hist, parts)
     const uint d = get_local_id(0);
     if (d >= RADIX) return;
     uint sum = 0;
@@ -90,8 +93,8 @@ kernel void radix_scatter(
         for (uint d = 0; d < lid; ++d) at += totals[d];
         starts[lid] = at;
     }
-    count_digits(keys, n, run, base, top, shift, hist);
-    share_sums(hist, parts);
+    COUNT_DIGITS(hist)
+    SHARE_SUMS(hist, parts)
     // Each counter becomes the number of pairs with its digit in the runs before its own.
     uint before = 0;
     for (uint h = lid / HELPERS * HELPERS; h < lid; ++h) before += parts[h];

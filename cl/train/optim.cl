@@ -13,10 +13,12 @@ static inline void step_coefficient(
     adam_moments adam,
     const ulong capacity
 ) {
-    vreal basis[SH_COUNT];
+    vreal basis[SH_COUNT], factor = (vreal)0;
     sh_basis(vec3_load(grad_sh + 3 * capacity, capacity), degree, basis);
+    // An index that is known when the kernel is compiled keeps the basis in registers.
+    UNROLL for (uint j = 0; j < SH_COUNT; ++j) if (j == k) factor = basis[j];
     for (int c = 0; c < 3; ++c)
-        adam_step(basis[k] * lanes_load(grad_sh + c * capacity), lr, sh, adam, (3 * k + c) * capacity);
+        adam_step(factor * lanes_load(grad_sh + c * capacity), lr, sh, adam, (3 * k + c) * capacity);
 }
 
 // A geometry step has four parts. Each part reads and writes different rows, so that few memory streams are open at the
@@ -148,11 +150,10 @@ kernel void map_skew(global real *restrict geom, global const real *restrict ske
 #endif
 #endif
 
-// Steps all parameters. The second index of a work-item chooses among the first `coefficients` of the colour, then `parts` of
-// the geometry from first_part on, then the skew. With a map that depends on the rotation, the skew has a launch of its own
-// after the geometry. lr is the rate of the constant band of the colour, rest_lr the rate of the other bands.
-// With LAZY only vectors of splats whose age is not negative step (lazy.cl); the geometry and the skew of all others step as
-// well, unless geometry_waits.
+// Steps all parameters. The second index of a work-item says what it steps. The first `coefficients` are those of the colour.
+// Then come `parts` of the geometry, from first_part on, and then the skew. With a map that depends on the rotation, the skew
+// has a launch of its own after the geometry. lr is the rate of the colour's constant band, rest_lr the rate of the others.
+// With LAZY, vectors of splats with a negative age do not step (lazy.cl). Their geometry and skew do, unless geometry_waits.
 // Global size: (capacity / LANES, coefficients + parts, and one more for the skew).
 kernel void step_splats(
     global real *restrict sh,

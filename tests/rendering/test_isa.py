@@ -55,7 +55,7 @@ def test_the_page_has_the_stored_results() -> None:
 )
 def test_a_kernel_that_needs_more_is_named(change: dict[str, float], message: str) -> None:
     before = Usage(registers=40, local_bytes=0, stack_bytes=0, spills=0, width=32, occupancy=1.0)
-    key = "sm_90 | sort | scan_sums"
+    key = "sm_90 | sort | radix_scan"
     assert list(isa.faults({key: before}, {key: before})) == []
     assert list(isa.faults({key: replace(before, **change)}, {key: before})) == [f"{key}: {message}"]
     assert list(isa.faults({key: before}, {})) == [f"{key}: not in the stored results; run with --write"]

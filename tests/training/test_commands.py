@@ -1,0 +1,34 @@
+"""The number of commands of a training step on a GPU: a small scene waits for the host, which enqueues them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from small_scene import write_garden
+
+from clsplat.device.device import Device, open_device
+from clsplat.device.trace import recorded
+from clsplat.rendering.radix_sort import radix_passes
+from clsplat.scenes.scene import load_scene
+from clsplat.training.config import TrainConfig
+from clsplat.training.trainer import Trainer
+
+LIMIT = 40
+TILE_BITS_1080P = (-(-1920 // 16) * -(-1080 // 16) - 1).bit_length()
+
+
+@pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])
+def test_a_step_has_few_commands(device: Device, shape: str, tmp_path: Path) -> None:
+    """Count the commands of a step on a small image, and the further passes of the tile sort of a large one."""
+    gpu = open_device(device.info.index)
+    gpu.info = replace(gpu.info, type="GPU")
+    scene = load_scene(write_garden(tmp_path))
+    trainer = Trainer(scene, TrainConfig(iterations=30, cap_max=200, shape=shape, densify_interval=50), device=gpu)
+    trainer.step()  # the first step clears statistics
+    with recorded(gpu) as commands:
+        frame = trainer.step()
+    names = [command.name for command in commands]
+    small = radix_passes(max((frame.layout.n_tiles - 1).bit_length(), 1))
+    assert len(names) + 3 * (radix_passes(TILE_BITS_1080P) - small) <= LIMIT, names
