@@ -82,7 +82,11 @@ def read(path: Path = OUT) -> Usages:
     if not path.exists():
         return {}
     stored = json.loads(path.read_text(encoding="utf-8"))
-    return {key: Usage(**{**values, "loops": tuple(values["loops"])}) for key, values in stored.items()}
+    loops = ("loops", "around")
+    return {
+        key: Usage(**{**values, **{name: tuple(values.get(name, ())) for name in loops}})
+        for key, values in stored.items()
+    }
 
 
 def faults(found: Usages, stored: Usages) -> Iterator[str]:

@@ -16,11 +16,14 @@ from .progress import table
 
 if TYPE_CHECKING:
     from clsplat.profiling.bench import Report, StageTime
+    from clsplat.profiling.roofline import Roofline
     from clsplat.scenes.scene import Scene
     from clsplat.splats.splats import Splats
+    from clsplat.training.trainer import Trainer
 
 SPLATS, WIDTH, HEIGHT = 30_000, 640, 480
 HEAD = ("stage", "ms", "share", "MB", "of copy limit", "Mflop", "of FMA limit")
+PREDICTED_HEAD = ("stage", "measured ms", "predicted ms", "with measured limits", "bound by")
 _DOMINANT = 0.1  # smallest share of an iteration for which a stage gets a sentence
 _NEAR = 0.5  # smallest fraction of a limit that counts as the limit of a stage
 
@@ -105,6 +108,8 @@ def bench(
     The limits are measured on the same device: bytes per second of a copy, and operations per second of fused
     multiply-adds. The bytes and operations of a stage are the minimum that it needs. Pairs of splat and pixel count
     only if they change the image. Other programs on the machine make all numbers worse.
+
+    On a GPU, a model of its time is printed beside the measured times: from stated rates, and from the measured limits.
     """
     from clsplat.device.device import open_device
     from clsplat.profiling.bench import bench_trainer, measure_render, measure_training, write_reports
@@ -132,7 +137,7 @@ def bench(
     reports = []
     for measure in (measure_training, measure_render):
         reports.append(measure(trainer, limits, iterations))
-        click.echo("\n" + "\n".join(describe(reports[-1], scene.name)))
+        click.echo("\n" + "\n".join([*describe(reports[-1], scene.name), *predictions(reports[-1], trainer, limits)]))
     if json_path is not None:
         write_reports(json_path, trainer, limits, scene.name, reports)
 
@@ -149,6 +154,31 @@ def describe(report: Report, scene: str) -> list[str]:
     ]
     dominant = sorted((stage for stage in report.stages if stage.share >= _DOMINANT), key=lambda stage: -stage.share)
     return [*lines, *(sentence(stage) for stage in dominant)]
+
+
+def predictions(report: Report, trainer: Trainer, limits: Roofline) -> list[str]:
+    """Return the lines that compare the model of a GPU with the measured times; no line if the device is not a GPU."""
+    from clsplat.profiling.gpu_model import predict, total_ms
+    from clsplat.profiling.gpus import corrected, gpu_of
+
+    gpu = gpu_of(trainer.device)
+    if gpu is None:
+        return []
+    measured = {stage.stage: stage.ms for stage in report.stages}
+    stated, fitted = (
+        predict(trainer.kernels, report.sizes, rates, trainer.kernels.schedule, stages=measured)
+        for rates in (gpu, corrected(gpu, limits))
+    )
+    rows = [
+        (first.stage, *(f"{ms:.3f}" for ms in (measured[first.stage], first.ms, second.ms)), second.bound)
+        for first, second in zip(stated, fitted, strict=True)
+    ]
+    sums = (sum(measured[stage.stage] for stage in stated), total_ms(stated), total_ms(fitted))
+    rows.append(("sum", *(f"{ms:.3f}" for ms in sums), ""))
+    return [
+        f"model of {gpu.name}: {gpu.units} units, {gpu.clock:.2f} GHz, {gpu.bandwidth:.0f} GB/s",
+        table(PREDICTED_HEAD, rows, ("bound by",)),
+    ]
 
 
 def cells(stage: StageTime) -> tuple[str, ...]:

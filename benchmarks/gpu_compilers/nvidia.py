@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -93,6 +93,7 @@ def _usage(program: str, kernel: str, part: str, target: str, listing: str) -> U
     (registers,) = _numbers(r"Used (\d+) registers", part)
     local = re.search(r"(\d+) bytes smem", part)
     local_bytes = int(local[1]) if local else 0
+    inner, around = loops_of(listing, kernel)
     return Usage(
         registers=registers,
         local_bytes=local_bytes,
@@ -100,7 +101,8 @@ def _usage(program: str, kernel: str, part: str, target: str, listing: str) -> U
         spills=stores + loads,
         width=_WARP,
         occupancy=round(_occupancy(target, registers, local_bytes, group_size(program, kernel)), 3),
-        loops=inner_loops(listing, kernel),
+        loops=inner,
+        around=around,
     )
 
 
@@ -121,10 +123,11 @@ def _occupancy(target: str, registers: int, local_bytes: int, group: int) -> flo
     return min(by_registers, by_memory, groups, warps // group_warps) * group_warps / warps
 
 
-def inner_loops(listing: str, kernel: str) -> tuple[int, ...]:
-    """Return the instructions of each innermost loop of a kernel in nvdisasm's listing, in order of their places.
+def loops_of(listing: str, kernel: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the instructions of a kernel's innermost loops, and of the loops directly around them.
 
-    A loop is what lies between a branch backwards and its target.
+    A loop is what lies between a branch backwards and its target. Both are in the order of their places in nvdisasm's
+    listing.
     """
     body = listing.split(f".text.{kernel}:", 1)[1].split("//----", 1)[0]
     labels: dict[str, int] = {}
@@ -139,12 +142,18 @@ def inner_loops(listing: str, kernel: str) -> tuple[int, ...]:
                 branches.append((place, branch[1]))
             place += 1
     loops = {(labels[name], end) for end, name in branches if name in labels and labels[name] < end}
-    inner = [
-        (first, end)
-        for first, end in loops
-        if not any((a, b) != (first, end) and first <= a and b <= end for a, b in loops)
-    ]
-    return tuple(end - first + 1 for first, end in sorted(inner))
+    within = {loop: {other for other in loops - {loop} if _encloses(loop, other)} for loop in loops}
+    inner = {loop for loop in loops if not within[loop]}
+    around = {loop for loop in loops - inner if within[loop] <= inner}
+    return _lengths(inner), _lengths(around)
+
+
+def _encloses(loop: tuple[int, int], other: tuple[int, int]) -> bool:
+    return loop[0] <= other[0] and other[1] <= loop[1]
+
+
+def _lengths(loops: Iterable[tuple[int, int]]) -> tuple[int, ...]:
+    return tuple(end - first + 1 for first, end in sorted(loops))
 
 
 NVIDIA = Compiler("NVIDIA", tuple(_LIMITS), _missing, _compile)

@@ -20,6 +20,7 @@ class Usage:
     width : work-items that run together.
     occupancy : share of the places for resident work-items that the kernel can fill, 0 to 1; None: not known.
     loops : instructions of each innermost loop, in order of their places; () if the compiler does not tell.
+    around : instructions of the loops directly around innermost ones, in order of their places; () likewise.
     """
 
     registers: int
@@ -29,6 +30,7 @@ class Usage:
     width: int
     occupancy: float | None = None
     loops: tuple[int, ...] = ()
+    around: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,8 @@ from ..rendering.build import KernelBuild
 from ..rendering.frame import DeviceImage, ImageLayout
 from .programs import loss_program, loss_strip
 
-_MIN_ROWS = 32  # minimum rows of a work-item, which also blurs ten rows outside of them
-_ITEMS_PER_UNIT = {"CPU": 6, "GPU": 2048}  # enough work-items that no compute unit waits long for the last one
+MIN_ROWS = 32  # minimum rows of a work-item, which also blurs ten rows outside of them
+ITEMS_PER_UNIT = {"CPU": 6, "GPU": 2048}  # enough work-items that no compute unit waits long for the last one
 
 
 @dataclass(frozen=True)
@@ -161,5 +161,5 @@ class ImageLoss:
     def _rows(self, strips: int, height: int) -> int:
         """Return the number of rows of a work-item: the largest that still leaves work for every compute unit."""
         info = self.device.info
-        items = info.compute_units * _ITEMS_PER_UNIT["CPU" if info.type == "CPU" else "GPU"]
-        return max(-(-height // -(-items // (3 * strips))), _MIN_ROWS)
+        items = info.compute_units * ITEMS_PER_UNIT["CPU" if info.type == "CPU" else "GPU"]
+        return max(-(-height // -(-items // (3 * strips))), MIN_ROWS)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from ..device.device import Device
+from ..device.device import Device, DeviceInfo
 from ..errors import FEWER_SPLATS, OTHER_DEVICE, SMALLER_IMAGES, DeviceError, Remedy
 from ..rendering.build import KernelBuild
 from ..rendering.frame import ImageLayout
 from ..rendering.pipeline import isect_bytes
-from ..rendering.splat_buffers import COMPACT_ROWS, capacity_for
+from ..rendering.splat_buffers import CAPACITY_STEP, COMPACT_ROWS, capacity_for
 from ..scenes.scene import View
 from ..splats.fields import Group
 from .config import TrainConfig
@@ -30,8 +30,9 @@ _MIN_ISECTS = 1 << 20  # isects that must fit; images with more are rendered in 
 # tile counts (4).
 _SCREEN_WORDS = 21
 _WAITING_WORDS = 4  # additional words of a splat with `visible_adam`, if a vector has one splat
+_MOST_SPLATS = 1 << 30  # upper end of the search for the number that fits
 
-_REMEDIES = (FEWER_SPLATS, SMALLER_IMAGES, Remedy("use fewer spherical harmonics", "--sh-degree"), OTHER_DEVICE)
+_REMEDIES = (SMALLER_IMAGES, Remedy("use fewer spherical harmonics", "--sh-degree"), OTHER_DEVICE)
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,8 @@ class Estimate:
     ----------
     isect : bytes of one isect.
     largest_buffer : bytes of the largest buffer that does not hold isects.
+    available : bytes of the device; 0 if it is not known.
+    most_splats : largest number of splats with which the run fits the device; 0 if it is not known.
     """
 
     splats: int
@@ -49,16 +52,24 @@ class Estimate:
     images: int
     isect: int
     largest_buffer: int
+    available: int = 0
+    most_splats: int = 0
 
     @property
     def total(self) -> int:
         return self.splats + self.isects + self.images
 
     def __str__(self) -> str:
+        of = f" of {self.available / 1e6:.0f} MB" if self.available else ""
         return (
-            f"{self.total / 1e6:.0f} MB of device memory (splats {self.splats / 1e6:.0f}, "
-            f"splat-tile pairs {self.isects / 1e6:.0f}, images {self.images / 1e6:.0f})"
+            f"{self.total / 1e6:.0f} MB{of} of device memory (splats {self.splats / 1e6:.0f}, "
+            f"splat-tile pairs {self.isects / 1e6:.0f}, images {self.images / 1e6:.0f}){self.room}"
         )
+
+    @property
+    def room(self) -> str:
+        """The number of splats that fit, as the end of a sentence."""
+        return f"; up to {self.most_splats} splats fit" if self.most_splats else ""
 
 
 def peak_bytes() -> int:
@@ -71,9 +82,17 @@ def peak_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024  # bytes on macOS, KiB on Linux
 
 
-def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, target_bytes: int) -> Estimate:
-    """Return the memory of a run with the maximum number of splats and the largest image."""
-    real, n = kernels.dtype.itemsize, capacity_for(config.cap_max)
+def estimate(
+    config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, target_bytes: int, splats: int | None = None
+) -> Estimate:
+    """Return the memory of a run with the largest image.
+
+    Parameters
+    ----------
+    target_bytes : bytes of the photos on the device, and of what belongs to them.
+    splats : largest number of splats; None for that of the options.
+    """
+    real, n = kernels.dtype.itemsize, capacity_for(config.cap_max if splats is None else splats)
     rows = {group: kernels.schema.rows(group) for group in Group}
     screen = (kernels.record + kernels.v_record) * real + 4 * (
         _SCREEN_WORDS + _WAITING_WORDS * config.optim.visible_adam
@@ -82,14 +101,14 @@ def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, tar
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
     extra = 6 * SkewMap(config.skew_map).width if config.skew_map else 0  # s and two moments, with spare copies
     extra += 0 if config.sghmc.position_optimizer == "adam" else 6  # momentum
-    buffers = [rows[Group.SH] * n * real, 9 * layout.plane * real]
+    widest = max(*rows.values(), kernels.record, kernels.v_record)  # of the buffers with a column for each splat
     splat = _ROLES * rows[Group.GEOM] + (_ROLES - 1) * rows[Group.SH] + COMPACT_ROWS + extra
     return Estimate(
         n * (splat * real + screen),
         n_isects * isect,
         _IMAGE_PLANES * layout.plane * real + target_bytes,
         isect,
-        max(buffers),
+        max(widest * n * real, 9 * layout.plane * real),
     )
 
 
@@ -99,26 +118,52 @@ def run_memory(device: Device, kernels: KernelBuild, config: TrainConfig, views:
     layout = ImageLayout(largest.width, largest.height)
     channels = target_channels(views, config.random_background)
     images = target_bytes(views, target_budget(device), channels)
-    needed = estimate(
-        config, kernels, layout, images + exposure_bytes(layout, kernels.dtype.itemsize, config, channels)
+    images += exposure_bytes(layout, kernels.dtype.itemsize, config, channels)
+    needed = estimate(config, kernels, layout, images)
+    needed = replace(
+        needed,
+        available=device.info.global_mem_bytes,
+        most_splats=most_splats(config, kernels, layout, images, device.info),
     )
     check(needed, device)
     return needed
 
 
-def room_for_isects(needed: Estimate, device: Device) -> int:
+def most_splats(
+    config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, target_bytes: int, info: DeviceInfo
+) -> int:
+    """Return the largest number of splats with which a run fits a device, a multiple of 1024; 0 if none fits."""
+
+    def fits(steps: int) -> bool:
+        return fault(estimate(config, kernels, layout, target_bytes, steps * CAPACITY_STEP), info) is None
+
+    low, high = 0, _MOST_SPLATS // CAPACITY_STEP  # low fits or is 0, high does not fit
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low * CAPACITY_STEP
+
+
+def room_for_isects(needed: Estimate, info: DeviceInfo) -> int:
     """Return the number of isects that fit besides splats and images. Buffers may be larger by half as they grow."""
-    return max(device.info.global_mem_bytes - needed.splats - needed.images, 0) * 2 // (3 * needed.isect)
+    return max(info.global_mem_bytes - needed.splats - needed.images, 0) * 2 // (3 * needed.isect)
+
+
+def fault(needed: Estimate, info: DeviceInfo) -> str | None:
+    """Return why splats, images and _MIN_ISECTS isects do not fit a device; None if they fit."""
+    if needed.total > info.global_mem_bytes and room_for_isects(needed, info) < _MIN_ISECTS:
+        text = replace(needed, available=0)
+        return f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, the run needs about {text}"
+    if needed.largest_buffer > info.max_alloc_bytes:
+        return (
+            f"{info} allows {info.max_alloc_bytes / 1e6:.0f} MB in one buffer, "
+            f"the run needs about {needed.largest_buffer / 1e6:.0f} MB{needed.room}"
+        )
+    return None
 
 
 def check(needed: Estimate, device: Device) -> None:
-    """Raise DeviceError if splats, images and _MIN_ISECTS isects do not fit into the device's memory."""
-    info = device.info
-    if needed.total > info.global_mem_bytes and room_for_isects(needed, device) < _MIN_ISECTS:
-        raise DeviceError(f"{info} has {info.global_mem_bytes / 1e6:.0f} MB, the run needs about {needed}", *_REMEDIES)
-    if needed.largest_buffer > info.max_alloc_bytes:
-        raise DeviceError(
-            f"{info} allows {info.max_alloc_bytes / 1e6:.0f} MB in one buffer, "
-            f"the run needs about {needed.largest_buffer / 1e6:.0f} MB",
-            *_REMEDIES,
-        )
+    """Raise DeviceError if the run does not fit the device. The error names the number of splats that fits."""
+    found = fault(needed, device.info)
+    if found is not None:
+        raise DeviceError(found, *([FEWER_SPLATS] if needed.most_splats else []), *_REMEDIES)

@@ -158,7 +158,7 @@ class Trainer:
         """Create the pipeline, the splats, the optimizer and the losses."""
         config, kernels, dtype = self.config, self.kernels, self.kernels.dtype
         capacity = max(config.cap_max, len(first["mean"]))
-        max_isects = min(isect_limit(self.device, kernels), room_for_isects(self.memory, self.device))
+        max_isects = min(isect_limit(self.device, kernels), room_for_isects(self.memory, self.device.info))
         self.pipeline = Pipeline(self.device, kernels, max_isects)
         self.splats = SplatBuffers(self.device, kernels.schema, capacity, dtype)
         self.splats.set(first)

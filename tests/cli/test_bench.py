@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from cli_runner import HEIGHT, N_VIEWS, WIDTH, clsplat, error_of
 from clsplat_cli.bench import sentence
 
+from clsplat.device.device import Device, open_device
 from clsplat.profiling.bench import Report, StageTime
 from clsplat.profiling.roofline import Roofline
 from clsplat.profiling.stages import HOST, STAGES
@@ -46,6 +48,7 @@ def test_made_up_scene(tmp_path: Path) -> None:
         assert any(line.startswith(f"{stage}  ") for line in training.splitlines()), stage
     assert "200 gaussian splats" in training
     assert "rasterize_vjp" not in render
+    assert "predicted" not in said, "the device is no GPU"
     assert " takes " in render, "a sentence on what takes the time"
     stored = json.loads(file.read_text())
     assert {"device", "driver", "schedule", "scene", "copy_bytes_per_s", "fma_flops_per_s"} <= set(stored)
@@ -54,6 +57,29 @@ def test_made_up_scene(tmp_path: Path) -> None:
         ("training step", 48, 32),
         ("render", 48, 32),
     ]
+
+
+def test_a_gpu_is_compared_with_its_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A processor pretends to be a GPU. The measured limits are lower, so the second prediction is longer."""
+
+    def pretended(name: str | None) -> Device:
+        device = open_device(name)
+        device.info = replace(device.info, type="GPU", name="NVIDIA GeForce RTX 4090")
+        return device
+
+    monkeypatch.setattr("clsplat.device.device.open_device", pretended)
+    monkeypatch.setenv("CLSPLAT_SCHEDULE", "gpu64")
+    said = clsplat("bench", "--splats", 200, "--width", 48, "--height", 32, "--iterations", 1, "--shape", "gaussian")
+    training, render = said.split("render: ")
+    for text in (training, render):
+        assert "model of RTX 4090: 128 units, 2.52 GHz, 1008 GB/s" in text
+    model = training.split("model of ")[1]
+    lines = {words[0]: words for line in model.splitlines() if (words := line.split())}
+    for stage in ("rasterize_vjp", "step", "sum"):
+        _, measured, stated, fitted, *_ = lines[stage]
+        assert float(measured) > 0
+        assert 0 < float(stated) <= float(fitted)
+    assert "rasterize_vjp" not in render
 
 
 def test_scene_from_its_points_and_from_a_model(capture_folder: Path, model_folder: Path) -> None:

@@ -65,6 +65,19 @@ def test_stages(tmp_path: Path) -> None:
     assert all("| 0.50 | 1.00 |" in line for line in lines), printed
 
 
+def test_gpu_model(tmp_path: Path) -> None:
+    out = tmp_path / "workloads.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "gpu_model.py"), "--smoke", "--out", str(out)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["shape"] for row in rows] == ["gaussian", "skew-normal"]
+    for row in rows:
+        assert 0 < row["visible"] <= row["sizes"]["splats"] == 500
+        assert 0 < row["shares"]["rows2"] <= row["shares"]["rows4"] <= row["shares"]["looked"] <= 1
+    assert "| rasterize_vjp |" in said
+    assert "skew-normal at most 1.2 times" in said
+
+
 @pytest.mark.slow
 def test_systems(tmp_path: Path, capture_folder: Path) -> None:
     scene = capture_folder

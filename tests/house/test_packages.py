@@ -60,6 +60,7 @@ OWNERS = {
 SHAPE_NAMES_IN = {
     "splats/convert.py": "which shape's splats are Gaussians of other scales",
     "training/presets.py": "a published system has its kernel",
+    "profiling/gpu_counts.py": "whose loops a GPU's compiler has counted; the others follow their operations",
     "rendering/tuning.py": "the cheapest kernel is the one that schedules are measured on",
 }
 

@@ -267,7 +267,7 @@ def test_isects_alone_refuse_no_run(devices: list[Device]) -> None:
     device, needed = as_kind(devices[0], "CPU"), Estimate(500 * 10**6, 10**9, 200 * 10**6, 60, 10**6)
     device.info = replace(device.info, max_alloc_bytes=1 << 30, global_mem_bytes=10**9)
     check(needed, device)
-    assert room_for_isects(needed, device) == 300 * 10**6 * 2 // 180
+    assert room_for_isects(needed, device.info) == 300 * 10**6 * 2 // 180
     device.info = replace(device.info, global_mem_bytes=760 * 10**6)
     with pytest.raises(DeviceError, match="the run needs about"):
         check(needed, device)

@@ -83,7 +83,7 @@ def test_a_program_that_does_not_compile_is_one_error(compiler: Compiler, tmp_pa
         compiler.compile("sort", "kernel void broken(global int *a) { a[0] = b; }", compiler.targets[0], tmp_path)
 
 
-def test_inner_loops_are_counted() -> None:
+def test_loops_are_counted() -> None:
     listing = """
 .text.other:
         /*0000*/ EXIT ;
@@ -101,5 +101,5 @@ def test_inner_loops_are_counted() -> None:
         /*0060*/ BRA `(.L_x_9) ;
 //---- end
 """
-    assert nvidia.inner_loops(listing, "walk") == (2,)
-    assert nvidia.inner_loops(listing, "other") == ()
+    assert nvidia.loops_of(listing, "walk") == ((2,), (4,))
+    assert nvidia.loops_of(listing, "other") == ((), ())

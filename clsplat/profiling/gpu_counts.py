@@ -1,0 +1,190 @@
+"""What each stage asks of a GPU: bytes, instructions, accesses to local memory and commands.
+
+Bytes are those of `stages.work_of`. Instructions are those of the loops over isects and rows, as NVIDIA's compiler has
+them for sm_90 (benchmarks/results/isa.json). The instructions of other kernels are not counted, because their bytes
+take longer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..device.schedule import SCHEDULES, Schedule
+from ..rendering.build import KernelBuild
+from ..rendering.group_binner import DEPTH_BITS
+from ..rendering.radix_sort import radix_passes
+from ..splats.flops import BLEND, BLEND_VJP
+from ..splats.shapes import shape_named
+from ..training.loss import ITEMS_PER_UNIT, MIN_ROWS
+from .stages import Sizes, work_of
+
+WARP = 32  # work-items that run together
+GPU_SCHEDULES = {name: schedule for name, schedule in SCHEDULES.items() if schedule.group > 1}
+SUM_JOBS = 2 * 73  # instructions of the jobs of a group's sums as the compiler unrolls them: stored, but rarely run
+_JOB = 20  # instructions of one such job
+_RECORD_READS = 11  # reads of a record by a warp; longer records are read 16 bytes at once
+_ROWS, _ROWS_VJP = 295, 193  # instructions of image_loss and image_loss_vjp for a pixel of a row and channel
+_WINDOW_ROWS = 10  # rows that a work-item of the loss reads besides its own
+_PER_FLOP = 1.1  # instructions of a pixel for each operation; for shapes that the compilers were not asked about
+
+
+@dataclass(frozen=True)
+class PixelLoop:
+    """Instructions of a work-item for one isect.
+
+    Attributes
+    ----------
+    single : with one block of pixels, which is not tested.
+    isect : with several blocks, besides the blocks.
+    block : a block that the splat's rows reach.
+    """
+
+    single: float
+    isect: float
+    block: float
+
+    def of(self, vecs: int, reached: float) -> float:
+        """Return the instructions with `vecs` blocks, if this share of them is reached."""
+        return self.single if vecs == 1 else self.isect + self.block * vecs * reached
+
+
+FORWARD = {"gaussian": PixelLoop(39, 21, 32), "skew-normal": PixelLoop(96, 12, 70.5)}
+BACKWARD = {"gaussian": PixelLoop(189, 127, 57.5), "skew-normal": PixelLoop(266, 102, 119)}
+
+
+@dataclass(frozen=True)
+class Shares:
+    """How much of the listed work is done.
+
+    The defaults are those of a made-up scene of a million splats at 1080p (benchmarks/results/gpu_workloads.jsonl).
+
+    Attributes
+    ----------
+    looked : isects that a tile looks at before all of its pixels are finished, of all.
+    rows2, rows4 : blocks of 2 and of 4 rows of a tile that the rows of a splat reach, of all.
+    """
+
+    looked: float = 1.0
+    rows2: float = 0.53
+    rows4: float = 0.6
+
+    def reached(self, schedule: Schedule) -> float:
+        """Return the share of a work-item's blocks that it computes."""
+        rows = WARP // 16 if schedule.group == WARP else schedule.group // 16
+        return {2: self.rows2, 4: self.rows4}.get(rows, 1.0)
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Work of a stage.
+
+    Attributes
+    ----------
+    bytes : of device memory. instructions : of work-items. local_bytes : of local memory.
+    commands : kernels and transfers.
+    waits : times that the host waits for the device and the device then waits for the host.
+    """
+
+    bytes: float = 0
+    instructions: float = 0
+    local_bytes: float = 0
+    commands: int = 0
+    waits: int = 0
+
+
+def counts_of(
+    kernels: KernelBuild, sizes: Sizes, schedule: Schedule, units: int, shares: Shares | None = None
+) -> dict[str, Counts]:
+    """Return the counts of each stage of a training step.
+
+    Parameters
+    ----------
+    schedule : a schedule of `GPU_SCHEDULES`, or another one of groups.
+    units : multiprocessors; the loss cuts its strips by them.
+    shares : None for the defaults.
+    """
+    shares = shares or Shares()
+    work = work_of(kernels, sizes, is_cpu=False)
+    forward, backward = loops_of(kernels.shape)
+    looked, group = shares.looked * sizes.isects, schedule.group
+    warps, reached = group / WARP, shares.reached(schedule)
+    jobs, sum_reads = sum_work(kernels.v_record, group)
+    last_sum = 2 * parts_of(group)  # instructions of the sum over the parts: the first warp alone runs them
+    gradient = backward.of(schedule.vecs, reached) - last_sum * (1 - 1 / warps) + _JOB * jobs / warps
+    reads = warps * _RECORD_READS
+    instructions = {
+        "rasterize": looked * group * forward.of(schedule.vecs, reached),
+        "rasterize_vjp": looked * group * gradient,
+        "loss": 3 * sizes.pixels * _halo(sizes.pixels, units) * (_ROWS + _ROWS_VJP),
+    }
+    local = {
+        "rasterize": looked * reads * 4 * WARP,
+        "rasterize_vjp": looked * (reads + sum_reads) * 4 * WARP,
+    }
+    waits = {"transfers": 1}
+    return {
+        stage: Counts(
+            work[stage].bytes if stage in work else 0,
+            instructions.get(stage, 0),
+            local.get(stage, 0),
+            commands,
+            waits.get(stage, 0),
+        )
+        for stage, commands in commands_of(kernels, sizes.pixels).items()
+    }
+
+
+def commands_of(kernels: KernelBuild, pixels: int) -> dict[str, int]:
+    """Return the commands of each stage of a training step with the default optimizer on a GPU."""
+    tiles = -(-pixels // 256)
+    depth_passes, tile_passes = (radix_passes(bits) for bits in (DEPTH_BITS, max((tiles - 1).bit_length(), 1)))
+    return {
+        "project": 1,
+        "depth sort": 3 * depth_passes,
+        "binning": 3,
+        "tile sort": 3 * tile_passes + 1,
+        "rasterize": 1,
+        "loss": 3,
+        "rasterize_vjp": 1,
+        "gather": 1,
+        "project_vjp": 1,
+        "step": 1,
+        "transfers": 3,  # the photo, the camera and the number of isects
+    }
+
+
+def loops_of(shape: str) -> tuple[PixelLoop, PixelLoop]:
+    """Return the loops of `rasterize` and `rasterize_vjp`. A block of an uncounted shape follows its operations."""
+    if shape in FORWARD:
+        return FORWARD[shape], BACKWARD[shape]
+    forward, backward = shape_named(shape).flops
+    return (
+        _with_block(FORWARD["gaussian"], _PER_FLOP * (forward + BLEND)),
+        _with_block(BACKWARD["gaussian"], _PER_FLOP * (forward + backward + BLEND_VJP)),
+    )
+
+
+def _with_block(loop: PixelLoop, block: float) -> PixelLoop:
+    """Return a loop whose blocks have another number of instructions."""
+    return PixelLoop(loop.single + block - loop.block, loop.isect, block)
+
+
+def parts_of(group: int) -> int:
+    """Return the parts of a group's sums (GROUP_PARTS of cl/render/group.clh)."""
+    return 32 if group >= 256 else group // 8
+
+
+def sum_work(n: int, group: int) -> tuple[int, int]:
+    """Return the rounds of jobs, and the accesses of warps to local memory, of `n` sums over a group.
+
+    The accesses are the stored values, the values and parts of the jobs, and the parts of the last sum.
+    """
+    parts = parts_of(group)
+    jobs = -(-n * parts // WARP)
+    return jobs, n * group // WARP + jobs * (group // parts + 1) + parts
+
+
+def _halo(pixels: int, units: int) -> float:
+    """Rows that the loss reads, of those that it writes."""
+    rows = max(3 * pixels / (units * ITEMS_PER_UNIT["GPU"]), MIN_ROWS)
+    return (rows + _WINDOW_ROWS) / rows
