@@ -85,11 +85,11 @@ def timed_step(trainer: Any) -> dict[str, float]:
     """Return the milliseconds of a training step: both raster stages on the device, and the whole step."""
     from clsplat.device.trace import recorded
 
-    trainer.device.queue.finish()
+    trainer.device.finish()
     with recorded(trainer.device) as launches:
         start = time.perf_counter()
         trainer.step()
-        trainer.device.queue.finish()
+        trainer.device.finish()
         wall = 1e3 * (time.perf_counter() - start)
     return {stage: sum(launch.ms for launch in launches if launch.name == stage) for stage in RASTER} | {"step": wall}
 

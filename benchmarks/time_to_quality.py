@@ -75,7 +75,7 @@ def train(runs: common.Runs, name: str, options: str, seed: int, args: argparse.
         start, cpu_start = time.perf_counter(), time.process_time()
         for _ in range(min(args.every, config.iterations - trainer.iteration)):
             trainer.step()
-        device.queue.finish()
+        device.finish()
         seconds, cpu = seconds + time.perf_counter() - start, cpu + time.process_time() - cpu_start
         psnr = trainer.evaluate(scene.test).psnr
         along.append([trainer.iteration, round(seconds, 3), round(cpu, 3), trainer.splats.n, round(psnr, 3)])

@@ -312,7 +312,7 @@ def watch_training(scene: str, args: argparse.Namespace) -> None:
         else:
             view._left = view._clock()  # unwatched time earns no time for pictures
         if trainer.iteration % STRETCH == 0:
-            trainer.device.queue.finish()
+            trainer.device.finish()
             seconds[now[0]].append(time.perf_counter() - now[1])
             now[0] = KINDS[trainer.iteration // STRETCH % len(KINDS)]
             watcher.stdin.write(now[0] + "\n")

@@ -106,9 +106,9 @@ def measure(trainer: Any, iterations: int) -> dict[str, Any]:
     from clsplat.device.trace import recorded
     from clsplat.profiling.stages import by_stage
 
-    lanes, queue, seconds = trainer.kernels.lanes, trainer.device.queue, 0.0
+    lanes, seconds = trainer.kernels.lanes, 0.0
     trainer.step()  # builds the kernels
-    queue.finish()
+    trainer.device.finish()
     stages: dict[str, list[float]] = {"step": [], "device": []}
     splats_seen, seen = [], []
     for iteration in range(2, iterations + 1):
@@ -118,7 +118,7 @@ def measure(trainer: Any, iterations: int) -> dict[str, Any]:
         else:
             with recorded(trainer.device) as launches:
                 frame = trainer.step()
-            queue.finish()
+            trainer.device.finish()
             ms = {"step": 0.0, "strategy": 0.0, "device": 0.0}
             for stage, launch in by_stage(launches):
                 ms[stage] = ms.get(stage, 0.0) + launch.ms
@@ -126,7 +126,7 @@ def measure(trainer: Any, iterations: int) -> dict[str, Any]:
             for name, times in stages.items():
                 times.append(ms[name])
         if iteration == iterations:
-            queue.finish()
+            trainer.device.finish()
         seconds += time.perf_counter() - start
         if iteration % MEASURED_EVERY == 0:
             n = frame.n_splats

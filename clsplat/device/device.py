@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -78,13 +79,15 @@ Observer = Callable[[str, tuple[int, ...], Event], None]
 
 
 class Device:
-    """An opened device: the context that the process has on it, and an in-order queue of its own with profiling.
+    """An opened device: the context that the process has on it, and an in-order queue of its own.
 
     Attributes
     ----------
     info : properties of the device.
     shared : the context with its built programs; other `Device` objects of this device use it too.
-    context, queue : pyopencl objects.
+    context : of pyopencl.
+    queue : of pyopencl, another one within `profiled`: read this attribute for each command. Its commands have no times
+        otherwise, because taking them can keep short kernels of a GPU apart.
     programs : programs that this object has launched kernels of, cached by `program.build`.
     observer : called with every command that is enqueued, or None (see trace.py).
     """
@@ -97,7 +100,7 @@ class Device:
         try:
             self.shared = shared_context(cl_device)
             self.context = self.shared.cl_context
-            self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+            self.queue = cl.CommandQueue(self.context)
         except cl.Error as error:
             raise DeviceError(f"device {info} cannot be opened: {first_line(error)}") from None
         self.programs: dict[Any, Any] = {}
@@ -106,6 +109,28 @@ class Device:
     @property
     def has_fp64(self) -> bool:
         return self.info.has_fp64
+
+    def finish(self) -> None:
+        """Wait until all commands of the queue have finished."""
+        self.queue.finish()
+
+    @contextmanager
+    def profiled(self) -> Iterator[None]:
+        """Enqueue the commands of a `with` block in a queue whose events have times. Blocks may be nested."""
+        import pyopencl as cl
+
+        profiling = cl.command_queue_properties.PROFILING_ENABLE
+        outer = self.queue
+        if outer.properties & profiling:
+            yield
+            return
+        self.finish()  # two queues have no order
+        self.queue = cl.CommandQueue(self.context, properties=profiling)
+        try:
+            yield
+        finally:
+            self.finish()
+            self.queue = outer
 
     def observe(self, name: str, size: tuple[int, ...], event: Event) -> None:
         """Report a command to the observer: a kernel with its global size, or a transfer with its bytes."""

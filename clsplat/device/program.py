@@ -154,7 +154,6 @@ class Kernel:
         self.name = name
         self.parameters = parameters
         self._device = device
-        self._queue = device.queue
         self._kernel = cl.Kernel(built, name)
         if self._kernel.num_args != len(parameters):
             raise DeviceError(f"kernel {name}: {self._kernel.num_args} parameters built, {len(parameters)} in its text")
@@ -187,13 +186,13 @@ class Kernel:
         for i in self._local:
             values[i] = self._local_memory(values[i])
         if 0 in global_size:
-            return self._marker(self._queue)
+            return self._marker(self._device.queue)
         try:
             self._kernel.set_args(*values)
         except Exception as error:  # of pyopencl and struct; some are bare RuntimeErrors
             raise TypeError(f"kernel {self.name}: {first_line(error)}, parameters {self._names}") from error
         try:
-            event = self._enqueue(self._queue, self._kernel, global_size, local_size)
+            event = self._enqueue(self._device.queue, self._kernel, global_size, local_size)
         except self._cl_error as error:
             failed = f"kernel {self.name} on {self._device.info}: {first_line(error)}"
             if is_out_of_memory(error):
@@ -235,9 +234,10 @@ def smoke_test(device: Device) -> tuple[float, float]:
     source_buffer, result = device.alloc(x.nbytes), device.alloc(x.nbytes)
     try:
         to_device(device, source_buffer, x)
-        event = kernel((1024,), None, x=source_buffer, y=result, n=x.size)
-        computed = to_host(device, result, np.empty_like(x))
+        with device.profiled():
+            event = kernel((1024,), None, x=source_buffer, y=result, n=x.size)
         run_ms = elapsed_ms(event)
+        computed = to_host(device, result, np.empty_like(x))
     except cl.Error as error:
         raise DeviceError(f"device {device.info} cannot run kernels: {first_line(error)}: update its driver") from None
     expected = np.array([math.exp(-v * v) + math.erfc(v) for v in x.tolist()])

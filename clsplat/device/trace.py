@@ -37,8 +37,9 @@ def recorded(device: Device) -> Iterator[list[Launch]]:
         if outer is not None:
             outer(name, size, event)
 
-    device.observer = note
-    try:
-        yield launches
-    finally:
-        device.observer = outer
+    with device.profiled():
+        device.observer = note
+        try:
+            yield launches
+        finally:
+            device.observer = outer

@@ -128,7 +128,7 @@ def measure_training(trainer: Trainer, limits: Roofline, iterations: int) -> Rep
     measured = _measure("training step", trainer, trainer.step, limits, iterations)
     start = time.perf_counter()
     trainer.density.densify(trainer.iteration)
-    trainer.device.queue.finish()
+    trainer.device.finish()
     action_ms = 1e3 * (time.perf_counter() - start) / trainer.config.density.densify_interval
     wall_ms = measured.wall_ms + action_ms
     stages = [dataclasses.replace(stage, share=stage.ms / wall_ms) for stage in measured.stages]
@@ -202,12 +202,12 @@ def _measure(task: str, trainer: Trainer, run: Callable[[], Frame], limits: Roof
 
 
 def _timed(pipeline: Pipeline, run: Callable[[], Frame]) -> _Iteration:
-    queue = pipeline.device.queue
-    queue.finish()
-    with recorded(pipeline.device) as launches:
+    device = pipeline.device
+    device.finish()
+    with recorded(device) as launches:
         start = time.perf_counter()
         frame = run()
-        queue.finish()
+        device.finish()
         wall_ms = 1e3 * (time.perf_counter() - start)
     stage_ms: dict[str, float] = {}
     for stage, launch in by_stage(launches):

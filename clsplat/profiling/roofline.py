@@ -58,8 +58,9 @@ def measure_roofline(device: Device, repeats: int = _REPEATS, nbytes: int | None
     if nbytes is None:
         cache = int(getattr(device.cl_device, "global_mem_cache_size", 0))
         nbytes = min(max(_CACHES * cache, _MIN_BYTES), _MAX_BYTES, device.info.max_alloc_bytes)
-    fma = max(_fma(device, chains, repeats) for chains in CHAINS)
-    return Roofline(_copy(device, nbytes, repeats), fma)
+    with device.profiled():
+        fma = max(_fma(device, chains, repeats) for chains in CHAINS)
+        return Roofline(_copy(device, nbytes, repeats), fma)
 
 
 def _copy(device: Device, nbytes: int, repeats: int) -> float:

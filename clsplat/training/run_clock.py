@@ -97,12 +97,12 @@ class RunClock:
         views: Sequence[View] = self.views.views
         views = views[:: max(len(views) // _PROBE_VIEWS, 1)][:_PROBE_VIEWS]
         degree = sh_degree_at(iteration, self.schedule.sh_interval, self.config.sh_degree)
-        queue, seconds = self.splats.device.queue, []
+        device, seconds = self.splats.device, []
         for view in [views[0], *views]:  # the first pass allocates memory and does not count
             camera = reduced_camera(view.camera, downscale)
-            queue.finish()
+            device.finish()
             start = self.clock()
             self.pipeline.forward(self.splats, camera, self.config.background, degree)
-            queue.finish()
+            device.finish()
             seconds.append(self.clock() - start)
         return statistics.median(seconds[1:])

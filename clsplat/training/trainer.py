@@ -209,7 +209,7 @@ class Trainer:
                 measured = it in config.output.test_iterations and bool(self.scene.test)
                 validated = self.validation.is_due(it)
                 if measured or validated:
-                    self.device.queue.finish()  # pending commands count as training time
+                    self.device.finish()  # pending commands count as training time
                 if it % LOG_INTERVAL == 0 or ends:
                     value = self.loss.value(self.loss_result)
                     self.seconds += time.perf_counter() - start

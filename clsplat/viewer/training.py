@@ -125,7 +125,7 @@ class TrainingView:
                 self._refreshed = now
                 self.viewer.refresh()
             if self.viewer.queue.has_due:
-                trainer.device.queue.finish()  # pending work of the iteration counts as training time
+                trainer.device.finish()  # pending work of the iteration counts as training time
                 start = self._clock()
                 self.viewer.serve()
                 spent = self._clock() - start

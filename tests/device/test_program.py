@@ -69,7 +69,8 @@ def run_affine(device: Device, real: str, n: int) -> tuple[np.ndarray, np.ndarra
     cl.enqueue_copy(device.queue, xs, x)
     built = build_text(device, AFFINE, {"OFFSET": 1 / 255}, real)
     size = (-(-n // 64) * 64,)
-    event = built.affine(size, (64,), x=xs, y=ys, n=n, a=2, scratch=64 * dtype.itemsize, shift=3 << 32)
+    with device.profiled():
+        event = built.affine(size, (64,), x=xs, y=ys, n=n, a=2, scratch=64 * dtype.itemsize, shift=3 << 32)
     y = np.empty_like(x)
     cl.enqueue_copy(device.queue, y, ys)
     event.wait()

@@ -223,7 +223,7 @@ def main() -> None:
         "sort": sort_and_scan,
         "faults": faults,
     }[what](device, mode)
-    device.queue.finish()
+    device.finish()
     print("finished")
 
 

@@ -64,7 +64,7 @@ def check_allocations(device: Device, tmp_path: Path, monkeypatch: pytest.Monkey
     trainer = Trainer(scene, config, device=device)
     for _ in range(config.iterations):
         trainer.step()
-    trainer.device.queue.finish()
+    trainer.device.finish()
     assert trainer.memory.total / 2 < sum(sizes) <= trainer.memory.total
 
 
