@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -59,16 +58,6 @@ class Estimate:
             f"{self.total / 1e6:.0f} MB of device memory (splats {self.splats / 1e6:.0f}, "
             f"splat-tile pairs {self.isects / 1e6:.0f}, images {self.images / 1e6:.0f})"
         )
-
-
-def peak_bytes() -> int:
-    """Return the peak host memory of this process; 0 if the system does not report it (Windows)."""
-    try:
-        import resource
-    except ImportError:
-        return 0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # bytes on macOS, KiB on Linux
 
 
 def estimate(config: TrainConfig, kernels: KernelBuild, layout: ImageLayout, target_bytes: int) -> Estimate:
