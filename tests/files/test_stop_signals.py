@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -121,3 +122,30 @@ def test_other_threads_leave_the_handlers_alone() -> None:
     thread.start()
     thread.join()
     assert done == [True]
+
+
+WITHOUT = """
+import os, signal, sys, time
+for name in ("SIGHUP", "SIGKILL", "SIGTERM", "pthread_kill"):
+    delattr(signal, name)
+from clsplat.files import stop_signals
+assert stop_signals.STOP_SIGNALS == (signal.SIGINT,)
+stop_signals.install()
+with stop_signals.kept_from_libraries():
+    pass
+try:
+    with stop_signals.held():
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(0.05)
+        assert stop_signals.is_waiting()
+    time.sleep(5)
+except KeyboardInterrupt:
+    print(stop_signals.reason(), stop_signals.exit_code())
+"""
+
+
+def test_a_system_with_few_signals_is_interrupted_by_ctrl_c() -> None:
+    """Windows has no SIGHUP, no SIGKILL and no pthread_kill; a system might even lack SIGTERM."""
+    done = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, timeout=60)
+    assert done.stderr == ""
+    assert done.stdout == "interrupted 130\n"
