@@ -20,7 +20,7 @@ from ..device.program import Define, build
 from ..errors import FEWER_SPLATS, OTHER_DEVICE, DeviceError
 from .build import CULLED_KEY
 from .frame import Band, ProjectedSplats, TileLists
-from .radix_sort import Sorter, SortMemory
+from .radix_sort import Sorter, SortMemory, sort_group
 
 MAX_ISECTS = 2**31 - 1  # of a band: ids have 32 bits
 BUCKET_BITS = 11  # bits of a depth key that choose its bucket
@@ -50,8 +50,8 @@ class Binner(Protocol):
 
 
 def make_binner(device: Device, pool: Pool) -> Binner:
-    """Return the binner for this kind of device."""
-    return ChunkBinner(pool) if device.info.type == "CPU" else GroupBinner(pool)
+    """Return the binner for this kind of device. The one for CPUs works with groups of one."""
+    return ChunkBinner(pool) if device.info.type == "CPU" or not sort_group(device) else GroupBinner(pool)
 
 
 def cut_bands(count: Callable[[int, int], int], tiles_x: int, tiles_y: int, limit: int) -> tuple[Band, ...]:

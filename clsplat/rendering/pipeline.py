@@ -19,6 +19,7 @@ from ..device.device import Device
 from ..device.memory import Pool, send_to_device
 from ..device.opencl import Buffer, Event
 from ..device.program import lane_group
+from ..device.schedule import require_groups
 from ..splats.color import BLACK, Color
 from .binning import MAX_ISECTS, cut_bands, make_binner
 from .build import KernelBuild
@@ -48,7 +49,10 @@ class Pipeline:
     def __init__(self, device: Device, kernels: KernelBuild, max_isects: int | None = None) -> None:
         self.device, self.kernels = device, kernels
         self.max_isects = isect_limit(device, kernels) if max_isects is None else max_isects
+        require_groups(kernels.schedule, device.info, device.info.max_group)
         self.projection, self.pixels = kernels.projection_program(device), kernels.pixel_program(device)
+        for name in ("rasterize", "rasterize_vjp"):
+            require_groups(kernels.schedule, device.info, self.pixels[name].max_group)
         self.group = lane_group(device)
         self.pool = pool = Pool(device)
         self.statistics = SplatStatistics(pool, kernels.dtype)

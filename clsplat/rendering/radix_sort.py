@@ -12,6 +12,7 @@ from ..device.program import GROUP_ITEMS, Program, build
 DIGIT_BITS = 5  # sorted by one pass
 _MAX_GROUP, _GROUP_STEP = 256, 1 << DIGIT_BITS  # a group has a whole number of work-items for each digit
 _SORT_RUN, _SCAN_RUN = 16, 64  # values of a work-item
+_IN_GROUPS = ("radix_histogram", "radix_scan", "radix_scatter", "scan_spine")  # kernels whose work-items work together
 
 
 def radix_passes(key_bits: int) -> int:
@@ -22,6 +23,19 @@ def radix_passes(key_bits: int) -> int:
 def sort_program(device: Device, group: int) -> Program:
     """Return the program of sorts and scans, for work-groups of `group` items."""
     return build(device, ("render/sort.cl",), {"SORT_GROUP": group, "RADIX_BITS": DIGIT_BITS})
+
+
+def sort_group(device: Device) -> int:
+    """Return the size of the work-groups that sort on a device; 0 if its groups are too small."""
+    group = _whole_steps(min(_MAX_GROUP, device.info.max_group))
+    if not group:
+        return 0
+    program = sort_program(device, group)
+    return _whole_steps(min(group, *(program[name].max_group for name in _IN_GROUPS)))
+
+
+def _whole_steps(group: int) -> int:
+    return group // _GROUP_STEP * _GROUP_STEP
 
 
 class SortMemory:
@@ -38,12 +52,11 @@ class SortMemory:
 
 
 class Sorter:
-    """Sorts and scans uint32 buffers."""
+    """Sorts and scans uint32 buffers, on a device whose `sort_group` is not 0."""
 
     def __init__(self, pool: Pool) -> None:
-        device = pool.device
-        self.group = min(_MAX_GROUP, device.info.max_group) // _GROUP_STEP * _GROUP_STEP
-        self.program = sort_program(device, self.group)
+        self.group = sort_group(pool.device)
+        self.program = sort_program(pool.device, self.group)
         self._scan_sums = pool.buffer(np.uint64)
         self._counts, self._totals = pool.buffer(np.uint32), pool.buffer(np.uint32)
 

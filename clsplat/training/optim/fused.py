@@ -176,9 +176,10 @@ class FusedOptimizer:
     def _step_base(self, grads: CompactGradients, mean_lr: float, sh_degree: int) -> None:
         """Step the colour and the geometry, except the skew."""
         corrections, penalty = bias_corrections(self.steps), self.rules.penalty(self.splats.n)
-        self._kernel("color")(
-            (self._columns, sh_coefficients(sh_degree)),
-            (GROUP_ITEMS, 1),
+        self._kernel("color").over(
+            self._columns,
+            GROUP_ITEMS,
+            sh_coefficients(sh_degree),
             sh=self.splats.sh,
             grad_sh=grads.sh,
             sh_m=self.first.sh,
@@ -190,9 +191,10 @@ class FusedOptimizer:
             **self._selection("color"),
         )
         first_part = int(self.rules.sghmc is not None)  # 1 skips the means, which SGHMC has moved already
-        self._kernel("geometry")(
-            (self._columns, len(PARTS) - first_part),
-            (GROUP_ITEMS, 1),
+        self._kernel("geometry").over(
+            self._columns,
+            GROUP_ITEMS,
+            len(PARTS) - first_part,
             geom=self.splats.geom,
             grad_geom=grads.geom,
             geom_m=self.first.geom,
@@ -209,9 +211,8 @@ class FusedOptimizer:
         )
 
     def _step_skew(self, skew: TrainableSkew, grads: CompactGradients) -> None:
-        self._kernel("skew")(
-            (self._columns,),
-            (GROUP_ITEMS,),
+        self._kernel("skew").over(
+            self._columns,
             geom=self.splats.geom,
             grad_geom=grads.geom,
             skew_s=skew.s.buffer,
@@ -233,9 +234,7 @@ class FusedOptimizer:
 
     def _launch(self, name: str, **arguments: Any) -> None:
         """Run a kernel over the geometry of all splats."""
-        self.program[name](
-            (self._columns,), (GROUP_ITEMS,), geom=self.splats.geom, capacity=self.splats.capacity, **arguments
-        )
+        self.program[name].over(self._columns, geom=self.splats.geom, capacity=self.splats.capacity, **arguments)
 
     def _sghmc(
         self, sghmc: Sghmc, momentum: StateRows, grads: CompactGradients, mean_lr: float, iteration: int
@@ -299,9 +298,10 @@ class FusedOptimizer:
 
     def _gather(self, values: Any, source: Any, spare: Any, n: int, rows: int) -> tuple[Any, Any]:
         """Return the gathered buffer, and the other one, which is now the spare."""
-        self.program.gather_columns(
-            (-(-n // GROUP_ITEMS) * GROUP_ITEMS, rows),
-            (GROUP_ITEMS, 1),
+        self.program.gather_columns.over(
+            n,
+            GROUP_ITEMS,
+            rows,
             values=values,
             source=source,
             moved=spare,
@@ -314,9 +314,10 @@ class FusedOptimizer:
         rows.buffer, rows.spare = self._gather(rows.buffer, source, rows.spare, n, rows.width)
 
     def _zero(self, values: Any, fresh: Any, n: int, rows: int) -> None:
-        self.program.zero_columns(
-            (-(-n // GROUP_ITEMS) * GROUP_ITEMS, rows),
-            (GROUP_ITEMS, 1),
+        self.program.zero_columns.over(
+            n,
+            GROUP_ITEMS,
+            rows,
             values=values,
             fresh=fresh,
             capacity=self.splats.capacity,
