@@ -128,14 +128,15 @@ WITHOUT = """
 import os, signal, sys, time
 for name in ("SIGHUP", "SIGKILL", "SIGTERM", "pthread_kill"):
     delattr(signal, name)
+signal.SIGBREAK = signal.SIGUSR1
 from clsplat.files import stop_signals
-assert stop_signals.STOP_SIGNALS == (signal.SIGINT,)
+assert stop_signals.STOP_SIGNALS == (signal.SIGINT, signal.SIGBREAK)
 stop_signals.install()
 with stop_signals.kept_from_libraries():
     pass
 try:
     with stop_signals.held():
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(getattr(signal, sys.argv[1]))
         time.sleep(0.05)
         assert stop_signals.is_waiting()
     time.sleep(5)
@@ -144,8 +145,12 @@ except KeyboardInterrupt:
 """
 
 
-def test_a_system_with_few_signals_is_interrupted_by_ctrl_c() -> None:
-    """Windows has no SIGHUP, no SIGKILL and no pthread_kill; a system might even lack SIGTERM."""
-    done = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, timeout=60)
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("SIGINT", "interrupted 130"), ("SIGBREAK", f"stopped by SIGUSR1 {128 + getattr(signal, 'SIGUSR1', 0)}")],
+)
+def test_a_system_with_few_signals_is_interrupted_from_the_keyboard(name: str, said: str) -> None:
+    """Windows has no SIGHUP, no SIGKILL and no pthread_kill. SIGUSR1 stands for its Ctrl-Break."""
+    done = subprocess.run([sys.executable, "-c", WITHOUT, name], capture_output=True, text=True, timeout=60)
     assert done.stderr == ""
-    assert done.stdout == "interrupted 130\n"
+    assert done.stdout == f"{said}\n"
