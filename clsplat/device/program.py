@@ -111,8 +111,8 @@ def with_defines(text: str, defines: Mapping[str, Define], real: Real, has_prefe
 def lane_group(device: Device) -> int:
     """Return the group size for kernels whose work-items are vectors of splats.
 
-    A CPU gets groups of one: its lanes do the work, and PoCL adds up the private arrays of all items of a group. A kernel
-    with a smaller limit gets smaller groups (`Kernel.over`).
+    A CPU gets groups of one: its lanes do the work, and PoCL adds up the private arrays of all items of a group.
+    `Kernel.over` makes groups smaller where a kernel has a smaller limit.
     """
     return 1 if device.info.type == "CPU" else GROUP_ITEMS
 
