@@ -19,7 +19,6 @@ precision, other tiles. They were slower or less accurate, so this version has o
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 from collections import defaultdict
 from dataclasses import dataclass, field
@@ -127,7 +126,7 @@ def run(scene: Scene, shape: str, device: Device, args: argparse.Namespace) -> N
                 "gradient_error": None,
                 "psnr_change": change,
                 "psnr": psnr[name],
-                "load": os.getloadavg()[0],
+                "load": common.load_average(),
             },
         )
 
@@ -181,7 +180,7 @@ def measure(
                 "raster_vjp_ms": ms["rasterize_vjp"],
                 "ms": sum(ms.values()),
                 "relative_ms": sum(ms.values()) / sum(medians["default"].values()),
-                "load": os.getloadavg()[0],
+                "load": common.load_average(),
             }
         )
     return rows

@@ -28,11 +28,11 @@ from clsplat.compression.rules import BudgetOptions
 from clsplat.compression.search import train_budget
 from clsplat.compression.state import FILE
 from clsplat.device.device import open_device
+from clsplat.files.host_memory import peak_bytes
 from clsplat.rendering.renderer import Renderer
 from clsplat.rendering.tuning import schedule_for
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.config import TrainConfig
-from clsplat.training.memory_estimate import peak_bytes
 
 OUT = common.RESULTS / "budget"
 HEAD = (

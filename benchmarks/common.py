@@ -70,7 +70,7 @@ def commit() -> str:
     """Return the short hash of the measured code, with "+" if the kernels or the library differ from it."""
 
     def git(*args: str) -> str:
-        return subprocess.run(["git", *args], cwd=ROOT, capture_output=True, text=True).stdout.strip()
+        return subprocess.run(["git", *args], cwd=ROOT, capture_output=True, text=True, encoding="utf-8").stdout.strip()
 
     return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "cl", "clsplat") else "")
 
@@ -89,16 +89,21 @@ def environment(device: Device, schedule: object) -> dict[str, Any]:
     }
 
 
+def load_average(minutes: int = 1) -> float:
+    """Return the mean number of waiting processes over the last 1, 5 or 15 minutes; NaN on Windows."""
+    return os.getloadavg()[(1, 5, 15).index(minutes)] if hasattr(os, "getloadavg") else float("nan")
+
+
 def append(path: Path, row: Mapping[str, Any]) -> None:
     """Add one JSON line to a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as stream:
+    with path.open("a", encoding="utf-8") as stream:
         stream.write(json.dumps(row) + "\n")
 
 
 def read(path: Path) -> list[dict[str, Any]]:
     """Return all JSON lines of a file; no line if the file is missing."""
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
 class Runs:

@@ -30,13 +30,13 @@ def main() -> None:
         start = time.perf_counter()
         subprocess.run(command, env=environment, check=True)
         seconds = time.perf_counter() - start
-        results = json.loads((root / "out" / "model" / "results.json").read_text())
-        schedules = json.loads((root / "cache" / "clsplat" / "schedules.json").read_text())
+        results = json.loads((root / "out" / "model" / "results.json").read_text(encoding="utf-8"))
+        schedules = json.loads((root / "cache" / "clsplat" / "schedules.json").read_text(encoding="utf-8"))
     measured = next(iter(results.values()))
     device = open_device(args.device)
     row = {
         "seconds": seconds,
-        "load": os.getloadavg()[0],
+        "load": common.load_average(),
         **{key: measured[key] for key in ("PSNR", "SSIM", "render_ms", "splats", "bytes")},
     }
     common.append(args.out, row | common.environment(device, next(iter(schedules.values()))))

@@ -83,7 +83,7 @@ def main() -> None:
     if args.child:
         print(json.dumps(digests(args.cases, args.device, Path(args.child))))
         return
-    stored = json.loads(args.file.read_text()) if args.file.exists() else {}
+    stored = json.loads(args.file.read_text(encoding="utf-8")) if args.file.exists() else {}
     differences = 0
     with tempfile.TemporaryDirectory() as folder:
         write_scene(Path(folder))
@@ -99,7 +99,7 @@ def main() -> None:
             else:
                 differences += compare(key, computed["digests"], stored[key])
     if args.write:
-        args.file.write_text(json.dumps(stored, indent=1, sort_keys=True) + "\n")
+        args.file.write_text(json.dumps(stored, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     sys.exit(1 if differences else 0)
 
 
@@ -108,7 +108,7 @@ def in_child(schedule: str, cases: list[str], device: str | None, folder: str) -
     command = [sys.executable, __file__, "--child", folder, "--cases", *cases]
     command += ["--device", device] if device else []
     environment = os.environ | {"CLSPLAT_SCHEDULE": schedule}
-    result = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    result = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True, encoding="utf-8")
     computed: dict[str, Any] = json.loads(result.stdout.splitlines()[-1])
     return computed
 
@@ -179,7 +179,7 @@ def write_scene(folder: Path) -> None:
         Image.fromarray(image).save(folder / name)
         frames.append({"file_path": name, "transform_matrix": world_from_camera.tolist()})
     lens = {"w": WIDTH, "h": HEIGHT, "fl_x": focal, "fl_y": focal, "cx": WIDTH / 2, "cy": HEIGHT / 2}
-    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}), encoding="utf-8")
 
 
 if __name__ == "__main__":

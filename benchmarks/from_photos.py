@@ -136,7 +136,7 @@ def _same_photos(posed: Scene, made: Path, work: Path) -> Path:
     held_out = {order[Path(name).name] for name in posed.test_names}
     chosen = [name for name in views if (int(name[6:11]) if name.startswith("frame_") else order[name]) in held_out]
     file = work / f"{made.name}-test.txt"
-    file.write_text("\n".join(chosen))
+    file.write_text("\n".join(chosen), encoding="utf-8")
     return file
 
 

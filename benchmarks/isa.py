@@ -59,7 +59,9 @@ def main() -> None:
     if args.write:
         compiled_for = {key.split(" | ")[0] for key in found}
         stored = {key: usage for key, usage in stored.items() if key.split(" | ")[0] not in compiled_for} | found
-        args.out.write_text(json.dumps({key: asdict(stored[key]) for key in sorted(stored)}, indent=1) + "\n")
+        args.out.write_text(
+            json.dumps({key: asdict(stored[key]) for key in sorted(stored)}, indent=1) + "\n", encoding="utf-8"
+        )
         common.write_between(PAGE, _BEGIN, _END, "\n\n".join(tables(stored)))
         return
     worse = list(faults(found, stored))

@@ -52,6 +52,7 @@ OPTIONS = [
 ]
 MOMENTS = ("any time", "after a checkpoint", "while writing")
 TIMEOUT = 120  # seconds of a process
+KILLED = -int(getattr(signal, "SIGKILL", -1))  # exit code of a killed process; 1 on Windows
 CACHES = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "CUDA_CACHE_PATH")
 
 
@@ -136,23 +137,27 @@ class Killer:
         checkpoint = model / "checkpoint.npz"
         before = stamp(checkpoint)
         errors = self.folder / "errors"
-        with errors.open("w") as stream, subprocess.Popen(self.command(model), env=environment, stderr=stream) as child:
+        with (
+            errors.open("w", encoding="utf-8") as stream,
+            subprocess.Popen(self.command(model), env=environment, stderr=stream) as child,
+        ):
             killed = bool(moment) and self.wait(child, moment, checkpoint, before)
             if killed:
-                child.send_signal(signal.SIGKILL)
+                child.kill()
             try:
                 code = child.wait(TIMEOUT)
             except subprocess.TimeoutExpired:
                 child.kill()
                 self.faults.append(f"run {self.runs}: hung after {self.kills.total()} kills")
-        if code == -signal.SIGKILL:
+        if code == KILLED:
             self.kills[moment] += 1
             if checkpoint.is_file():
                 self.at.append(Checkpoint.load(checkpoint).iteration)
             return False
         if code:
             self.faults.append(
-                f"run {self.runs}: ended with {code} after {self.kills.total()} kills: {errors.read_text()[-300:]}"
+                f"run {self.runs}: ended with {code} after {self.kills.total()} kills: "
+                f"{errors.read_text(encoding='utf-8', errors='replace')[-300:]}"
             )
         return True
 
@@ -213,7 +218,7 @@ def stamp(path: Path) -> int:
 
 def timeless(log: Path) -> list[dict[str, Any]]:
     """Return the lines of a log without their times."""
-    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
 
 

@@ -119,9 +119,9 @@ def main() -> None:
                         "commit": commit(),
                         "psnr": measure(scene, config, args.first, device),
                     }
-                    with out.open("a") as stream:
+                    with out.open("a", encoding="utf-8") as stream:
                         stream.write(json.dumps(row) + "\n")
-    print(table([json.loads(line) for line in out.read_text().splitlines()]))
+    print(table([json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]))
 
 
 if __name__ == "__main__":

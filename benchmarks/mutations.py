@@ -114,7 +114,7 @@ def read_results(path: Path) -> dict[str, Result]:
     """Return the stored results by the name of the mutation."""
     if not path.is_file():
         return {}
-    return {entry["id"]: Result(**entry) for entry in json.loads(path.read_text())["results"]}
+    return {entry["id"]: Result(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["results"]}
 
 
 def write_results(path: Path, results: list[Result]) -> None:
@@ -122,7 +122,9 @@ def write_results(path: Path, results: list[Result]) -> None:
     caught, real = share_caught(results)
     head = {"commit": common.commit(), "caught": caught, "real": real}
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(head | {"results": [asdict(result) for result in results]}, indent=1) + "\n")
+    path.write_text(
+        json.dumps(head | {"results": [asdict(result) for result in results]}, indent=1) + "\n", encoding="utf-8"
+    )
 
 
 def report(mutations: list[Mutation], stored: dict[str, Result]) -> str:

@@ -48,7 +48,7 @@ def run(name: str, shape: str, args: argparse.Namespace) -> dict[str, Any]:
     from clsplat.scenes.random_scene import synthetic_scene
     from clsplat.scenes.scene import load_scene
 
-    device, load = open_device(args.device), os.getloadavg()[0]
+    device, load = open_device(args.device), common.load_average()
     schedules = [str(Schedule.parse(schedule)) for schedule in args.schedules]
     if name == "synthetic":
         scene, start = synthetic_scene(args.splats, 64, 48, shape)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -76,14 +75,14 @@ def run(
 ) -> None:
     """Measure one case and append its line, unless it is finished. limits : options of `measure_roofline`."""
     from clsplat.device.device import open_device
+    from clsplat.files.host_memory import peak_bytes
     from clsplat.profiling.bench import bench_trainer, measure_render, measure_training
     from clsplat.profiling.roofline import measure_roofline
     from clsplat.rendering.tuning import schedule_for
     from clsplat.scenes.random_scene import synthetic_scene
     from clsplat.scenes.scene import load_scene
-    from clsplat.training.memory_estimate import peak_bytes
 
-    device, load = open_device(device_name), os.getloadavg()[0]
+    device, load = open_device(device_name), common.load_average()
     environment = common.environment(device, schedule_for(device))
     if case["scene"] != SYNTHETIC:
         scene = load_scene(common.data_folder() / case["scene"], eval=False)

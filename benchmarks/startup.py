@@ -55,7 +55,7 @@ def measure(args: argparse.Namespace, folder: Path) -> None:
 
     device = open_device(args.device)
     schedule = schedule_for(device)
-    row = common.environment(device, schedule) | {"runs": args.runs, "load": os.getloadavg()[0]}
+    row = common.environment(device, schedule) | {"runs": args.runs, "load": common.load_average()}
     command = common.CLSPLAT
     append(args.out, row | {"task": "--help", "caches": ""}, [seconds([*command, "--help"]) for _ in range(args.runs)])
     for shape in args.shapes:

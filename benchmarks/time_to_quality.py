@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import os
 import time
 from typing import Any
 
@@ -52,7 +51,7 @@ def train(runs: common.Runs, name: str, options: str, seed: int, args: argparse.
     from clsplat.rendering.tuning import schedule_for
     from clsplat.training.trainer import Trainer
 
-    device, load = open_device(args.device), os.getloadavg()[0]
+    device, load = open_device(args.device), common.load_average()
     case = {
         "scene": name,
         "views": "validation" if args.validate else "test",

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import os
 import statistics
 import subprocess
 import sys
@@ -97,7 +96,7 @@ def run(runs: common.Runs, key: dict[str, Any], options: list[str], models: Path
         "per_view": last.per_view,
         "seconds": model.seconds,
         "cpu_seconds": cpu,
-        "load": os.getloadavg()[1],
+        "load": common.load_average(5),
         "splats": len(model.splats),
         "peak_mb": model.peak_bytes / 1e6,
         "render_ms": last.render_ms,

@@ -215,6 +215,7 @@ def walk(scene: str, model: Path, window: str, args: argparse.Namespace) -> None
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
+        encoding="utf-8",
     )
     assert server.stdin is not None
     assert server.stdout is not None
@@ -299,6 +300,7 @@ def watch_training(scene: str, args: argparse.Namespace) -> None:
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
+        encoding="utf-8",
     )
     assert watcher.stdin is not None
     assert watcher.stdout is not None

@@ -16,7 +16,6 @@ the image saw, as means over the measured iterations. A finished run of this com
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 import tempfile
 import time
@@ -77,7 +76,7 @@ def train(runs: common.Runs, case: dict[str, Any], args: argparse.Namespace) -> 
     from clsplat.rendering.tuning import schedule_for
     from clsplat.training.trainer import Trainer
 
-    device, load = open_device(args.device), os.getloadavg()[0]
+    device, load = open_device(args.device), common.load_average()
     resolution, iterations = case.pop("resolution"), case["iterations"]
     case |= common.environment(device, schedule_for(device))
     if case in runs:

@@ -51,8 +51,8 @@ def _run(command: Callable[[], object]) -> int:
 
 def _end_at_signals() -> None:
     """Let signals end the process without a word: for the time before the work begins, and after it."""
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)  # Windows has no SIGHUP
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP, and only Windows has SIGBREAK
         if number is not None and signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _end)
 

@@ -53,7 +53,7 @@ def modules() -> dict[str, Path]:
 def imports_of(name: str, path: Path) -> set[str]:
     """Return the modules of the library that a module imports, at its top or inside a function."""
     known, found = modules(), set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.level:
             base = name.split(".")[: -node.level]
             target = ".".join([*base, *(node.module or "").split(".")]).strip(".")
@@ -72,7 +72,7 @@ def package_of(name: str) -> str:
 
 def package_line() -> list[str]:
     """Return the packages of ARCHITECTURE.md's package line, from left to right."""
-    text = (ROOT / "ARCHITECTURE.md").read_text()
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
     line = re.search(r"^    (\w+(?:\s+< \w+)+(?:, \w+)*)$", text, re.M)
     if line is None:
         raise ValueError("ARCHITECTURE.md has no line 'package < package < ...'")
@@ -148,7 +148,9 @@ def _draw_arrow(arrow: Arrow, order: list[str], heights: dict[str, float]) -> tu
 def _draw_box(package: str, centre: float, colour: str) -> str:
     """Draw a package with its name, the number of its modules and the first line of its docstring."""
     members = [name for name in modules() if package_of(name) == package and not name.endswith("__init__")]
-    purpose = ast.get_docstring(ast.parse((ROOT / "clsplat" / package / "__init__.py").read_text())) or ""
+    purpose = (
+        ast.get_docstring(ast.parse((ROOT / "clsplat" / package / "__init__.py").read_text(encoding="utf-8"))) or ""
+    )
     y = centre - BOX_HEIGHT / 2
     return (
         f'<rect x="{LEFT}" y="{y}" width="{BOX_WIDTH}" height="{BOX_HEIGHT}" rx="7" fill="#ffffff" stroke="{colour}" '
@@ -161,5 +163,5 @@ def _draw_box(package: str, centre: float, colour: str) -> str:
 
 if __name__ == "__main__":
     DRAWING.parent.mkdir(exist_ok=True)
-    DRAWING.write_text(draw())
+    DRAWING.write_text(draw(), encoding="utf-8")
     print(DRAWING.relative_to(ROOT))

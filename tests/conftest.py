@@ -5,6 +5,7 @@ The default device is the first; the others are for the slow tests, as building 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -18,6 +19,18 @@ from clsplat.device.schedule import SCHEDULES, Schedule, default_schedule
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.demo.scene import write_capture
 from clsplat.scenes.scene import Scene, load_scene
+
+# Tests that need POSIX: pseudo-terminals, limits of a process, forks, alarms.
+collect_ignore = [
+    "cli/test_flags.py",
+    "house/test_command_fuzz.py",
+    "house/test_fuzz.py",
+    "scenes/test_stored_views.py",
+    "training/test_progress.py",
+    "training/test_resume.py",
+]
+if sys.platform != "win32":
+    collect_ignore.clear()
 
 MakeRenderer = Callable[..., Renderer]
 

@@ -26,7 +26,7 @@ def _missing() -> str | None:
 
 def _compile(_name: str, text: str, target: str, folder: Path) -> Mapping[str, Usage]:
     source, assembly = folder / "program.cl", folder / f"{target}.s"
-    source.write_text(text)
+    source.write_text(text, encoding="utf-8")
     report = commands.run(
         [
             commands.CLANG,
@@ -72,7 +72,8 @@ def _libraries(target: str, folder: Path) -> Path:
         text.write_text(
             'target triple = "amdgcn-amd-amdhsa"\n'
             "@__oclc_ISA_version = linkonce_odr protected local_unnamed_addr addrspace(4) "
-            f"constant i32 {_ISA[target]}\n"
+            f"constant i32 {_ISA[target]}\n",
+            encoding="utf-8",
         )
         commands.run([commands.CLANG, "-x", "ir", "-emit-llvm", "-c", text, "-o", constant])
     return place

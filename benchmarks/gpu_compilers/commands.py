@@ -28,7 +28,12 @@ def run(command: Sequence[str | Path], *, cwd: Path | None = None) -> str:
     CompilerError : it failed.
     """
     result = subprocess.run(
-        [str(part) for part in command], cwd=cwd, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        [str(part) for part in command],
+        cwd=cwd,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        encoding="utf-8",
     )
     if result.returncode:
         lines = [line for line in result.stdout.splitlines() if line.strip()]

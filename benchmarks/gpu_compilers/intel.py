@@ -53,7 +53,7 @@ def _missing() -> str | None:
 
 def _compile(_name: str, text: str, target: str, folder: Path) -> Mapping[str, Usage]:
     source, out = folder / "program.cl", folder / target
-    source.write_text(text)
+    source.write_text(text, encoding="utf-8")
     libraries = _place() / "usr" / "lib" / "x86_64-linux-gnu"
     paths = f"{libraries}:{libraries.parent / 'llvm-14' / 'lib'}"
     with mock.patch.dict(os.environ, LD_LIBRARY_PATH=paths):

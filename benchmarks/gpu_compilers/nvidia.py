@@ -74,7 +74,7 @@ def _linked(text: str, folder: Path, libdevice: Path) -> Path:
     source, code, builtins, both, linked = (
         folder / name for name in ("program.cl", "program.bc", "builtins.bc", "both.bc", "linked.bc")
     )
-    source.write_text(text)
+    source.write_text(text, encoding="utf-8")
     commands.run([*_CLANG, _BUILTINS, "-o", builtins])
     commands.run([*_CLANG, source, "-o", code])
     commands.run([commands.LINK, code, builtins, "-o", both])

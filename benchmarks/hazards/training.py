@@ -295,7 +295,7 @@ def diverged_at(log: Path) -> int | None:
     """Return the iteration after which the loss stays above that of the first report; None if there is none."""
     if not log.exists():
         return None
-    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     losses = [(row["iteration"], row["loss"]) for row in rows if "loss" in row]
     bad = None
     for iteration, loss in reversed(losses[1:]):

@@ -177,10 +177,10 @@ kernel void step_exposure(
         shares[item][j] = sum;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item < SUMS) {
+    for (int j = item; j < SUMS; j += EXPOSURE_GROUP) {
         real sum = 0;
-        for (int other = 0; other < EXPOSURE_GROUP; ++other) sum += shares[other][item];
-        sums[item] = sum;
+        for (int other = 0; other < EXPOSURE_GROUP; ++other) sum += shares[other][j];
+        sums[j] = sum;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item == 0) {

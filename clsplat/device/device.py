@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from .pip_runtime import register_pip_runtime
 if TYPE_CHECKING:
     import pyopencl
 
+_VERSION = (1, 2)  # of OpenCL
 _MIB = 1 << 20
 _EAGER_BYTES = 16 * _MIB  # buffers of this size and more are claimed at once, so that a lack of memory shows here
 
@@ -38,7 +40,12 @@ LESS_MEMORY = (FEWER_SPLATS, SMALLER_IMAGES, OTHER_DEVICE)
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Properties that an OpenCL device reports; `index` is "platform:device"."""
+    """Properties that an OpenCL device reports; `index` is "platform:device".
+
+    Attributes
+    ----------
+    max_group : largest work-group of the device. A kernel may have a smaller limit (`Kernel.max_group`).
+    """
 
     index: str
     platform: str
@@ -59,6 +66,9 @@ class DeviceInfo:
         """A reason why this device is known not to work, with the remedy; None if there is no such reason."""
         if self.platform == "Portable Computing Language" and "3.0-rc2" in self.platform_version:
             return BROKEN_POCL
+        version = re.match(r"OpenCL (\d+)\.(\d+)", self.version)
+        if version and tuple(map(int, version.groups())) < _VERSION:
+            return f"it has {version[0]}, and the kernels need OpenCL 1.2: update its driver or use another device"
         return None
 
     @property
@@ -248,7 +258,7 @@ def _describe(index: str, platform: pyopencl.Platform, device: pyopencl.Device) 
         global_mem_bytes=device.global_mem_size,
         max_alloc_bytes=device.max_mem_alloc_size,
         local_mem_bytes=device.local_mem_size,
-        max_group=device.max_work_group_size,
+        max_group=min(device.max_work_group_size, device.max_work_item_sizes[0]),
         has_fp64="cl_khr_fp64" in device.extensions.split(),
         compute_units=device.max_compute_units,
     )

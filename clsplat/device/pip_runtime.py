@@ -38,13 +38,15 @@ def register_pip_runtime() -> bool:
         # If an earlier call or a parent process has set it, this process still has to load the libraries.
         return (Path(chosen) / _ICD).is_file() and _preload(library.parent)
     system = sorted(SYSTEM_VENDORS.glob("*.icd"))
-    if any(RUNTIME in icd.read_text(errors="replace") for icd in system) or not _preload(library.parent):
+    if any(RUNTIME in icd.read_text(encoding="utf-8", errors="replace") for icd in system) or not _preload(
+        library.parent
+    ):
         return False
     folder = Path(tempfile.mkdtemp(prefix="clsplat-icd-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for icd in system:
         shutil.copyfile(icd, folder / icd.name)
-    (folder / _ICD).write_text(f"{library.resolve()}\n")
+    (folder / _ICD).write_text(f"{library.resolve()}\n", encoding="utf-8")
     os.environ[VENDORS_VARIABLE] = str(folder)
     return True
 

@@ -112,6 +112,7 @@ def lane_group(device: Device) -> int:
     """Return the group size for kernels whose work-items are vectors of splats.
 
     A CPU gets groups of one: its lanes do the work, and PoCL adds up the private arrays of all items of a group.
+    `Kernel.over` makes groups smaller where a kernel has a smaller limit.
     """
     return 1 if device.info.type == "CPU" else GROUP_ITEMS
 
@@ -146,6 +147,11 @@ class Kernel:
 
     Values are buffers for `global` pointers, numbers for scalars and sizes in bytes for `local` pointers.
     Kernels are not thread-safe, because OpenCL's kernel objects are not.
+
+    Attributes
+    ----------
+    max_group : largest work-group. Apple's CPU devices have groups of one in kernels with barriers.
+    item_group : group size if the work-items share nothing, at most GROUP_ITEMS.
     """
 
     def __init__(self, device: Device, built: pyopencl.Program, name: str, parameters: tuple[Parameter, ...]) -> None:
@@ -160,6 +166,8 @@ class Kernel:
         self._names = tuple(p.name for p in parameters)
         self._local = tuple(i for i, p in enumerate(parameters) if p.kind == "local")
         self._kernel.set_scalar_arg_dtypes([p.dtype for p in parameters])
+        self.max_group = _max_group(self._kernel, device)
+        self.item_group = min(GROUP_ITEMS, 1 << (self.max_group.bit_length() - 1))
         self._local_memory: Callable[[Any], Any] = cl.LocalMemory
         self._enqueue: Callable[..., Any] = cl.enqueue_nd_range_kernel
         self._marker: Callable[..., Any] = cl.enqueue_marker
@@ -201,17 +209,35 @@ class Kernel:
         self._device.observe(self.name, global_size, event)
         return event
 
-    def over(self, n: int, group: int = GROUP_ITEMS, /, **args: KernelArgument) -> Event:
+    def over(self, n: int, group: int = GROUP_ITEMS, /, *more: int, **args: KernelArgument) -> Event:
         """Enqueue at least `n` work-items in whole groups; the kernel must ignore the items from n on.
 
-        The group size is fixed, because PoCL compiles a kernel again for each size that it chooses itself.
+        The work-items share nothing, so that groups may be smaller than `group`, where a device has only small ones.
+        The size is fixed, because PoCL compiles a kernel again for each size that it chooses itself.
+
+        Parameters
+        ----------
+        more : numbers of work-items in the other dimensions, in which groups have one.
         """
-        return self(((n + group - 1) // group * group,), (group,), **args)
+        group = min(group, self.item_group)
+        return self(((n + group - 1) // group * group, *more), (group, *(1 for _ in more)), **args)
 
     def _mismatch(self, names: set[str]) -> str:
         missing = [name for name in self._names if name not in names]
         unknown = sorted(names - set(self._names))
         return f"kernel {self.name}: missing arguments {missing}, unknown arguments {unknown}"
+
+
+def _max_group(kernel: pyopencl.Kernel, device: Device) -> int:
+    """Return the largest work-group of a kernel: what its driver says, but no more than the device has."""
+    import pyopencl as cl
+
+    allowed = max(device.info.max_group, 1)
+    try:
+        limit = kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device.cl_device)
+    except cl.Error:
+        limit = 0
+    return min(limit, allowed) if limit else allowed
 
 
 def smoke_test(device: Device) -> tuple[float, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..errors import DeviceError
+from ..errors import OTHER_DEVICE, DeviceError, Remedy
 from .device import DeviceInfo
 
 TILE = 16  # side of a tile [px]
@@ -67,7 +67,18 @@ SCHEDULES = {
 
 
 def default_schedule(info: DeviceInfo) -> Schedule:
-    """Return the schedule of an unmeasured device: wide lanes where they are fast, else one pixel per work-item."""
+    """Return the schedule of an unmeasured device: wide lanes where they are fast, else the largest group."""
     if info.has_wide_lanes:
         return SCHEDULES["cpu16"]
-    return SCHEDULES["gpu256"] if info.max_group >= SCHEDULES["gpu256"].group else SCHEDULES["gpu64"]
+    fitting = (name for name in ("gpu256", "gpu64", "gpu32") if SCHEDULES[name].group <= info.max_group)
+    return SCHEDULES[next(fitting, "scalar")]
+
+
+def require_groups(schedule: Schedule, info: DeviceInfo, max_group: int) -> None:
+    """Raise DeviceError if a schedule has larger work-groups than a device, or its kernels, can have."""
+    if schedule.group > max_group:
+        raise DeviceError(
+            f"schedule {schedule}: {info} has work-groups of {max_group} at most",
+            Remedy("choose a schedule with smaller groups, such as scalar"),
+            OTHER_DEVICE,
+        )

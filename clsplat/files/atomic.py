@@ -5,15 +5,22 @@ from __future__ import annotations
 import errno
 import os
 import re
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import OutputError
+from . import windows
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _TEMPORARY = re.compile(r"\..+\.(\d+)\.tmp(\..*)?")
+# Seconds to wait before further attempts to replace a file. Windows refuses while anybody has it open, and search
+# indexes and virus scanners open every new file for a moment.
+WINDOWS_WAITS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
+_WAITS: tuple[float, ...] = WINDOWS_WAITS if sys.platform == "win32" else ()
 
 
 @contextmanager
@@ -48,13 +55,30 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield temporary
-            os.replace(temporary, target)
+            move(temporary, target)
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or str(error)
         remedy = "free some space, or choose another place" if error.errno in _DISK_FULL else "choose another place"
         raise OutputError(f"{target}: cannot be written ({reason}); {remedy}") from error
+
+
+def move(source: Path, target: Path) -> None:
+    """Rename a file, which may replace another one, or a folder.
+
+    Raises
+    ------
+    OSError : the system refuses, on Windows also after a second.
+    """
+    for seconds in _WAITS:
+        try:
+            os.replace(source, target)
+        except PermissionError:
+            time.sleep(seconds)
+        else:
+            return
+    os.replace(source, target)
 
 
 def remove_leftovers(folder: Path) -> None:
@@ -66,8 +90,8 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _is_running(process: int) -> bool:
-    if os.name == "nt":
-        return True  # os.kill would end the process
+    if sys.platform == "win32":
+        return windows.is_running(process)
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):

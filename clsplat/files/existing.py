@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..errors import OutputError
+from .file_names import name_key
 from .real_path import real_path
 
 
@@ -21,9 +22,9 @@ def refuse_existing(paths: Iterable[str | Path], overwrite: bool = False, inputs
     overwrite : whether files may be replaced. Folders and devices such as /dev/null never are.
     inputs : files that are read, such as the photos of the scene. They are never replaced either.
     """
-    kept, written = set(map(real_path, inputs)), set()
+    kept, written = {name_key(real_path(path)) for path in inputs}, set()
     for path in map(Path, paths):
-        place = real_path(path)
+        place = name_key(real_path(path))
         if place in kept:
             raise OutputError(f"{path}: is a photo of the scene: choose another place")
         if place in written:

@@ -1,13 +1,20 @@
-"""Memory of the machine: how much is free, and how to give some back."""
+"""Memory of the machine and of this process: how much is free, how much was used, and how to give some back."""
 
 from __future__ import annotations
 
 import ctypes
 import sys
 
+from . import windows
+
+_UNLIMITED = 1 << 62
+
 
 def available_bytes() -> int:
-    """Return the free memory of the machine on Linux; on other systems a number that never limits."""
+    """Return the free memory of the machine on Linux and Windows; on other systems a number that never limits."""
+    if sys.platform == "win32":
+        free = windows.available_bytes()
+        return _UNLIMITED if free is None else free
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             for line in file:
@@ -15,7 +22,19 @@ def available_bytes() -> int:
                     return int(line.split()[1]) * 1024
     except OSError:
         pass
-    return 1 << 62
+    return _UNLIMITED
+
+
+def peak_bytes() -> int:
+    """Return the peak memory of this process; 0 if the system does not report it."""
+    if sys.platform == "win32":
+        return windows.peak_bytes()
+    try:
+        import resource
+    except ImportError:
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # bytes on macOS, KiB on Linux
 
 
 def give_back_free_memory() -> None:

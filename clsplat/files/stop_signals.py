@@ -1,4 +1,4 @@
-"""Signals that ask the process to end: Ctrl-C, SIGTERM of service managers, SIGHUP of a closed terminal."""
+"""Signals that ask the process to end: Ctrl-C, SIGTERM of service managers, SIGHUP of a closed terminal, Ctrl-Break."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-# Windows has no SIGHUP.
-STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+# Windows has no SIGHUP, and only Windows has SIGBREAK.
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+STOP_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 _RETRY = 0.01  # seconds until a signal that came during an import is handled
 _OFFSET = 128  # shells report the end by signal n as exit code 128 + n
 

@@ -147,7 +147,7 @@ def _write(splats: Splats, model: LoadedModel, output: Path) -> None:
     folder.clear()
     stored = model.folder.read_config()
     if "path" in model.scene_record:  # the record may be relative to the old folder
-        stored["scene"] = {**stored["scene"], "path": str(real_path(model.scene_record["path"]))}
+        stored["scene"] = {**stored["scene"], "path": real_path(model.scene_record["path"]).as_posix()}
     folder.write_config(stored)
     if cameras := model.read_cameras():
         folder.write_cameras(cameras)

@@ -80,7 +80,7 @@ def _fma(device: Device, chains: int, repeats: int) -> float:
     sums = device.alloc(4 * items)
 
     def launch(rounds: int) -> Callable[[], Event]:
-        return lambda: kernel((items,), (group,), sums=sums, a=0.5, b=1.0, rounds=rounds)
+        return lambda: kernel.over(items, group, sums=sums, a=0.5, b=1.0, rounds=rounds)
 
     rounds = 64
     while (ms := _median_ms(launch(rounds), 1)) < _LONG_MS:

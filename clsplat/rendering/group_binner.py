@@ -8,11 +8,20 @@ from ..device.device import Device
 from ..device.memory import Pool
 from ..device.opencl import Buffer
 from ..device.program import Program, build
+from .binning import Binner, ChunkBinner
 from .frame import Band, ProjectedSplats, TileLists
-from .radix_sort import Sorter, SortMemory
+from .radix_sort import Sorter, SortMemory, sort_group
 
 DEPTH_BITS = 30  # of a depth key above that of the near plane: all depths up to 2^128 times the nearest one
 _RUN = 4  # splats of a work-item that counts or lists isects
+
+
+def make_binner(pool: Pool, near_plane: float) -> Binner:
+    """Return the binner for a kind of device. The one for CPUs works with groups of one, too."""
+    device = pool.device
+    if device.info.type == "CPU" or not sort_group(device):
+        return ChunkBinner(pool)
+    return GroupBinner(pool, near_plane)
 
 
 def group_binning_program(device: Device, group: int) -> Program:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
+from ..files.file_names import RESERVED, name_key
 from ..files.image_names import bare_name
 from ..files.images import write_grey16, write_png
 from ..files.video import VideoWriter
@@ -41,11 +42,12 @@ def output_stems(names: Sequence[str], extras: Sequence[str] = (), keep_suffix: 
     for name in names:
         stem = _safe(name) if keep_suffix else bare_name(_safe(name))
         for file in (stem, *(f"{stem}_{extra}" for extra in extras)):
-            if file in view_of:
+            key = name_key(file)
+            if key in view_of:
                 raise InputError(
-                    f"views {view_of[file]!r} and {name!r} would both be written to {file}: rename one of them"
+                    f"views {view_of[key]!r} and {name!r} would both be written to {file}: rename one of them"
                 )
-            view_of[file] = name
+            view_of[key] = name
         stems.append(stem)
     return stems
 
@@ -56,6 +58,8 @@ def _safe(name: str) -> str:
     absolute = name.startswith(("/", "\\")) or (bool(parts) and ":" in parts[0])
     if not parts or absolute or ".." in parts or "\0" in name:
         raise InputError(f"view {name!r}: its image would lie outside the output folder: rename it")
+    if refused := RESERVED.intersection(name):
+        raise InputError(f"view {name!r}: this system has no files with {min(refused)} in their name: rename it")
     return str(PurePosixPath(*parts))
 
 

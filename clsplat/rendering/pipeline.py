@@ -19,12 +19,13 @@ from ..device.device import Device
 from ..device.memory import Pool, send_to_device
 from ..device.opencl import Buffer, Event
 from ..device.program import lane_group
+from ..device.schedule import require_groups
 from ..splats.color import BLACK, Color
-from .binning import MAX_ISECTS, Binner, ChunkBinner, cut_bands
+from .binning import MAX_ISECTS, cut_bands
 from .build import KernelBuild
 from .camera_block import camera_block
 from .frame import Band, Frame, ImageLayout, ProjectedSplats, RenderedImages, TileLists
-from .group_binner import GroupBinner
+from .group_binner import make_binner
 from .splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers, SplatStatistics
 
 
@@ -49,12 +50,14 @@ class Pipeline:
     def __init__(self, device: Device, kernels: KernelBuild, max_isects: int | None = None) -> None:
         self.device, self.kernels = device, kernels
         self.max_isects = isect_limit(device, kernels) if max_isects is None else max_isects
+        require_groups(kernels.schedule, device.info, device.info.max_group)
         self.projection, self.pixels = kernels.projection_program(device), kernels.pixel_program(device)
+        for name in ("rasterize", "rasterize_vjp"):
+            require_groups(kernels.schedule, device.info, self.pixels[name].max_group)
         self.group = lane_group(device)
         self.pool = pool = Pool(device)
         self.statistics = SplatStatistics(pool, kernels.dtype)
-        on_cpu = device.info.type == "CPU"
-        self.binner: Binner = ChunkBinner(pool) if on_cpu else GroupBinner(pool, kernels.near_plane)
+        self.binner = make_binner(pool, kernels.near_plane)
         real = kernels.dtype
         self._camera, self._records = pool.buffer(real), pool.buffer(real, kernels.record)
         self._depth_key, self._tile_rect = pool.buffer(np.uint32), pool.buffer(np.int32, 4)

@@ -12,6 +12,7 @@ from ..device.program import Program, build
 DIGIT_BITS = 6  # sorted by one pass
 _MAX_GROUP, _GROUP_STEP = 128, 1 << DIGIT_BITS  # a group has a whole number of work-items for each digit
 _RUN = 16  # pairs of a work-item
+_IN_GROUPS = ("radix_histogram", "radix_scan", "radix_scatter")  # kernels whose work-items work together
 
 
 def radix_passes(key_bits: int) -> int:
@@ -19,14 +20,22 @@ def radix_passes(key_bits: int) -> int:
     return -(-key_bits // DIGIT_BITS)
 
 
-def scan_group(device: Device) -> int:
-    """Return the number of work-items that sort or scan together."""
-    return min(_MAX_GROUP, device.info.max_group) // _GROUP_STEP * _GROUP_STEP
-
-
 def sort_program(device: Device, group: int) -> Program:
     """Return the program of sorts, for work-groups of `group` items."""
     return build(device, ("render/scan.clh", "render/sort.cl"), {"SCAN_GROUP": group, "RADIX_BITS": DIGIT_BITS})
+
+
+def sort_group(device: Device) -> int:
+    """Return the size of the work-groups that sort and scan on a device; 0 if its groups are too small."""
+    group = _whole_steps(min(_MAX_GROUP, device.info.max_group))
+    if not group:
+        return 0
+    program = sort_program(device, group)
+    return _whole_steps(min(group, *(program[name].max_group for name in _IN_GROUPS)))
+
+
+def _whole_steps(group: int) -> int:
+    return group // _GROUP_STEP * _GROUP_STEP
 
 
 class SortMemory:
@@ -43,10 +52,10 @@ class SortMemory:
 
 
 class Sorter:
-    """Sorts uint32 buffers."""
+    """Sorts uint32 buffers, on a device whose `sort_group` is not 0."""
 
     def __init__(self, pool: Pool) -> None:
-        self.group = scan_group(pool.device)
+        self.group = sort_group(pool.device)
         self.program = sort_program(pool.device, self.group)
         self._counts, self._totals = pool.buffer(np.uint32), pool.buffer(np.uint32)
 

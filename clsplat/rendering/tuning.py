@@ -36,6 +36,7 @@ from .splat_buffers import ParameterBuffers, SplatBuffers
 
 SCHEDULE_VARIABLE = "CLSPLAT_SCHEDULE"
 _WIDE_CANDIDATES, _OTHER_CANDIDATES = ("cpu16", "cpu8", "gpu256"), ("gpu256", "gpu64", "gpu32")
+_LAST_CANDIDATE = "scalar"  # slow, but it needs neither groups nor vectors; measured if nothing else runs
 _TIMED = ("rasterize", "rasterize_vjp")
 _SPLATS, _REPEATS = 3000, 5
 _MIN_TILES, _TILES_PER_UNIT = 256, 16  # of the image; fewer tiles would measure latency, not throughput
@@ -106,12 +107,13 @@ def measure(device: Device) -> dict[str, float]:
     A device without a usable clock gets the time of the whole frame on the host's clock.
     """
     times: dict[str, float] = {}
-    for name in _WIDE_CANDIDATES if device.info.has_wide_lanes else _OTHER_CANDIDATES:
-        activity.report(f"finding the fastest kernels of this device, once: {name}")
+    for name in (*(_WIDE_CANDIDATES if device.info.has_wide_lanes else _OTHER_CANDIDATES), _LAST_CANDIDATE):
         schedule = SCHEDULES[name]
-        if schedule.group <= device.info.max_group:
-            with suppress(ClsplatError):
-                times[str(schedule)] = _measure_one(device, schedule)
+        if schedule.group > device.info.max_group or (name == _LAST_CANDIDATE and times):
+            continue
+        activity.report(f"finding the fastest kernels of this device, once: {name}")
+        with suppress(ClsplatError):
+            times[str(schedule)] = _measure_one(device, schedule)
     return times
 
 

@@ -44,7 +44,9 @@ class ExposureLoss:
         self.in_use = needs_exposure(config, targets.channels)
         if not self.in_use:
             return
-        self.program = exposure_program(self.device, self.kernels)
+        self.program, self._step_group = exposure_program(self.device, self.kernels), EXPOSURE_GROUP
+        if self.program.step_exposure.max_group < EXPOSURE_GROUP:
+            self.program, self._step_group = exposure_program(self.device, self.kernels, 1), 1
         self._rows = np.tile(_IDENTITY.ravel(), (len(targets.views), 1)).astype(self.kernels.dtype)
         self._exposures = self.device.alloc(self._rows.nbytes)
         to_device(self.device, self._exposures, self._rows)
@@ -63,7 +65,6 @@ class ExposureLoss:
             laid_over = self._laid_over.reserve(layout)
         items = -(-layout.width // (self.kernels.lanes * EXPOSURE_VECS))
         group = min(lane_group(self.device), items)
-        size = -(-items // group) * group, layout.height
         shift = [255.0 * (new - old) for new, old in zip(background, self.background, strict=True)]
         common: dict[str, KernelArgument] = {
             "color": rendered,
@@ -76,9 +77,10 @@ class ExposureLoss:
             "stride": layout.stride,
             "plane": layout.plane,
         }
-        self.program.photo_of_render(
-            size,
-            (group, 1),
+        self.program.photo_of_render.over(
+            items,
+            group,
+            layout.height,
             photo=photo,
             target=laid_over,
             shift_r=shift[0],
@@ -89,13 +91,13 @@ class ExposureLoss:
         result = self.loss.evaluate(layout, photo, laid_over, target.unmasked)
         parts = items * layout.height
         partial = self._partial.reserve(parts)
-        self.program.photo_of_render_vjp(
-            size, (group, 1), v=result.v_color, target=laid_over, partial=partial, **common
+        self.program.photo_of_render_vjp.over(
+            items, group, layout.height, v=result.v_color, target=laid_over, partial=partial, **common
         )
         if self.learns:
             self.program.step_exposure(
-                (EXPOSURE_GROUP,),
-                (EXPOSURE_GROUP,),
+                (self._step_group,),
+                (self._step_group,),
                 exposures=self._exposures,
                 partial=partial,
                 parts=parts,

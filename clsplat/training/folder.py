@@ -26,7 +26,7 @@ def scene_record(scene: Scene, folder: Path) -> dict[str, Any]:
     """
     path, home = real_path(scene.path), real_path(folder)
     return {
-        "path": path.relative_to(home).as_posix() if path.is_relative_to(home) else str(path),
+        "path": path.relative_to(home).as_posix() if path.is_relative_to(home) else path.as_posix(),
         "test_names": sorted(scene.test_names),
         **({"validation_names": sorted(scene.validation_names)} if scene.validation_names else {}),
         **scene.reading,

@@ -132,7 +132,10 @@ class LiveLine:
     def _write(self, text: str) -> None:
         # The terminal may be closed. A run must not end without a checkpoint because nobody sees its progress.
         with suppress(OSError):
-            self.stream.write(text)
+            try:
+                self.stream.write(text)
+            except UnicodeEncodeError:  # Windows has consoles of a few letters, and names of photos have any
+                self.stream.write(text.encode("ascii", "backslashreplace").decode("ascii"))
             self.stream.flush()
 
 

@@ -64,7 +64,7 @@ class RunLog:
                     continue  # a crash interrupted the writing of this line
         with atomic_writer(path) as stream:  # keeps the old file if the program crashes here
             stream.writelines(kept)
-        self._stream = self._guard(lambda: path.open("a"))
+        self._stream = self._guard(lambda: path.open("a", encoding="utf-8", newline="\n"))
 
     def write(self, values: dict[str, Any]) -> None:
         if self.path is not None:

@@ -114,7 +114,7 @@ class ImageLoss:
         n_parts = 3 * segments * strips
         partial = self._partial.reserve(n_parts)
         group, count = self._group, 3 * layout.width * layout.height
-        size, v_color = (-(-strips // group) * group, segments, 3), self._v_color.reserve(layout)
+        v_color = self._v_color.reserve(layout)
         common: dict[str, KernelArgument] = {
             "rendered": rendered,
             "truth": target,
@@ -125,10 +125,12 @@ class ImageLoss:
             "plane": layout.plane,
             "segment": segment,
         }
-        self.program.image_loss(size, (group, 1, 1), partial=partial, **common)
-        self.program.image_loss_vjp(
-            size,
-            (group, 1, 1),
+        self.program.image_loss.over(strips, group, segments, 3, partial=partial, **common)
+        self.program.image_loss_vjp.over(
+            strips,
+            group,
+            segments,
+            3,
             v_color=v_color,
             l1_scale=(1 - self.weight) / count,
             ssim_scale=self.weight / count,

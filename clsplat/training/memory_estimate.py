@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -70,16 +69,6 @@ class Estimate:
     def room(self) -> str:
         """The number of splats that fit, as the end of a sentence."""
         return f"; up to {self.most_splats} splats fit" if self.most_splats else ""
-
-
-def peak_bytes() -> int:
-    """Return the peak host memory of this process; 0 if the system does not report it (Windows)."""
-    try:
-        import resource
-    except ImportError:
-        return 0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # bytes on macOS, KiB on Linux
 
 
 def estimate(

@@ -51,14 +51,19 @@ def loss_program(device: Device, kernels: KernelBuild) -> Program:
     return build(device, ("math/lanes.clh", "train/loss.cl"), defines, kernels.real)
 
 
-def exposure_program(device: Device, kernels: KernelBuild) -> Program:
-    """Return the program of exposure, masks and transparency. It depends on lanes and precision only."""
+def exposure_program(device: Device, kernels: KernelBuild, group: int = EXPOSURE_GROUP) -> Program:
+    """Return the program of exposure, masks and transparency. It depends on lanes and precision only.
+
+    Parameters
+    ----------
+    group : work-items of the kernel step_exposure. With another number it sums in another order.
+    """
     defines: dict[str, Define] = {
         "LANES": kernels.lanes,
         "MARGIN_X": MARGIN_X,
         "MARGIN_Y": MARGIN_Y,
         "PHOTO_VECS": EXPOSURE_VECS,
-        "EXPOSURE_GROUP": EXPOSURE_GROUP,
+        "EXPOSURE_GROUP": group,
         "SUMS": EXPOSURE_SUMS,
     }
     return build(device, ("math/lanes.clh", "train/exposure.cl"), defines, kernels.real)

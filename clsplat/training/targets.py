@@ -124,9 +124,10 @@ class Targets:
         upload = self._uploads.pop(target.index, None)
         if upload is not None:
             self._queue.wait_on_device(upload.event)
-            self._unpacked[upload.slot] = self.program.unpack_image(
-                (layout.stride, layout.rows),
-                (16, 1),
+            self._unpacked[upload.slot] = self.program.unpack_image.over(
+                layout.stride,
+                16,
+                layout.rows,
                 bytes=upload.packed,
                 truth=target.buffer,
                 channels=self.channels,

@@ -14,6 +14,7 @@ from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.floaters import measure_floaters
 from ..evaluation.metrics import check_sizes
+from ..files.host_memory import peak_bytes
 from ..rendering.frame import Frame
 from ..rendering.pipeline import Pipeline, isect_limit
 from ..rendering.renderer import Renderer
@@ -38,7 +39,7 @@ from .interrupt import stoppable
 from .log import Progress, RunLog
 from .loss import ImageLoss, LossValue
 from .loss_check import check_loss
-from .memory_estimate import peak_bytes, room_for_isects, run_memory
+from .memory_estimate import room_for_isects, run_memory
 from .model import Model
 from .optim.optimizer import make_optimizer
 from .programs import kernel_build

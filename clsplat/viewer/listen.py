@@ -48,7 +48,9 @@ def open_server(host: str, port: int, access: Access) -> viser.ViserServer:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.socket(family) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            # On Windows SO_REUSEADDR takes a port from the program that listens on it.
+            option: int = getattr(socket, "SO_EXCLUSIVEADDRUSE", socket.SO_REUSEADDR)
+            probe.setsockopt(socket.SOL_SOCKET, option, 1)
             probe.bind((host, port))
     except (OSError, OverflowError) as error:
         raise _refusal(host, port, getattr(error, "strerror", None) or str(error)) from None

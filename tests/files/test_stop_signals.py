@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -121,3 +122,35 @@ def test_other_threads_leave_the_handlers_alone() -> None:
     thread.start()
     thread.join()
     assert done == [True]
+
+
+WITHOUT = """
+import os, signal, sys, time
+for name in ("SIGHUP", "SIGKILL", "SIGTERM", "pthread_kill"):
+    delattr(signal, name)
+signal.SIGBREAK = signal.SIGUSR1
+from clsplat.files import stop_signals
+assert stop_signals.STOP_SIGNALS == (signal.SIGINT, signal.SIGBREAK)
+stop_signals.install()
+with stop_signals.kept_from_libraries():
+    pass
+try:
+    with stop_signals.held():
+        signal.raise_signal(getattr(signal, sys.argv[1]))
+        time.sleep(0.05)
+        assert stop_signals.is_waiting()
+    time.sleep(5)
+except KeyboardInterrupt:
+    print(stop_signals.reason(), stop_signals.exit_code())
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("SIGINT", "interrupted 130"), ("SIGBREAK", f"stopped by SIGUSR1 {128 + getattr(signal, 'SIGUSR1', 0)}")],
+)
+def test_a_system_with_few_signals_is_interrupted_from_the_keyboard(name: str, said: str) -> None:
+    """Windows has no SIGHUP, no SIGKILL and no pthread_kill. SIGUSR1 stands for its Ctrl-Break."""
+    done = subprocess.run([sys.executable, "-c", WITHOUT, name], capture_output=True, text=True, timeout=60)
+    assert done.stderr == ""
+    assert done.stdout == f"{said}\n"

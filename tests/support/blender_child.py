@@ -248,7 +248,7 @@ def composited() -> Facts:
     made.cycles.use_denoising = False
     made.world = None
     facing = camera.matrix_world
-    depth = json.loads((FOLDER / "facts.json").read_text())["depth"]
+    depth = json.loads((FOLDER / "facts.json").read_text(encoding="utf-8"))["depth"]
     corners = [facing @ Vector((x, y, -depth)) for x, y in ((-9, -9), (0, -9), (0, 9), (-9, 9))]
     mesh = bpy.data.meshes.new("plane")
     mesh.from_pydata(corners, [], [(0, 1, 2, 3)])
@@ -337,7 +337,7 @@ def main(cases: Sequence[Callable[[], Facts]], file: str) -> None:
         except Exception:
             facts[case.__name__] = {"failed": traceback.format_exc()}
         facts[case.__name__]["took"] = time.perf_counter() - start
-    (FOLDER / file).write_text(json.dumps(facts))
+    (FOLDER / file).write_text(json.dumps(facts), encoding="utf-8")
 
 
 if __name__ == "__main__":

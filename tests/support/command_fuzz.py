@@ -74,6 +74,7 @@ def run_lines(numbers: range, seed: int, workers: int = 1, data: Path | None = N
             ],
             stdout=subprocess.PIPE,
             text=True,
+            encoding="utf-8",
         )
         for worker in range(workers)
     ]
@@ -232,8 +233,8 @@ def _become(line: Line, root: Path, output: int) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         os.environ.update(line.environment)
-        sys.stdout = os.fdopen(1, "w", errors="surrogateescape")
-        sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace")
+        sys.stdout = os.fdopen(1, "w", errors="surrogateescape", encoding="utf-8")
+        sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", encoding="utf-8")
         sys.argv = ["clsplat", *line.args]
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # a campaign under nohup or & ignores them
             signal.signal(number, signal.SIG_DFL)

@@ -232,14 +232,14 @@ def write_inputs(root: Path, data: Path | None) -> None:
     shutil.copy(root / "transforms" / "points.ply", files)
     shutil.copy(root / "model" / "cameras.json", files)
     shutil.copy(root / "model" / "config.json", files)
-    (files / "test.txt").write_text("view_000.png\n")
-    (files / "text.txt").write_text("not what you expect\n")
+    (files / "test.txt").write_text("view_000.png\n", encoding="utf-8")
+    (files / "text.txt").write_text("not what you expect\n", encoding="utf-8")
     (files / "empty").touch()
     write_png(files / "photo.png", np.zeros((9, 9, 3), np.uint8))
     precious.mkdir()
     for name in ("note.txt", "film.mp4", "page.html", "model.ply"):
-        (precious / name).write_text("the only copy\n")
-    (precious / "values.json").write_text(json.dumps({"precious": True}))
+        (precious / name).write_text("the only copy\n", encoding="utf-8")
+    (precious / "values.json").write_text(json.dumps({"precious": True}), encoding="utf-8")
     write_png(precious / "picture.png", np.zeros((9, 9, 3), np.uint8))
     (root / "link").symlink_to("missing/target")
     for name in REAL:
@@ -361,5 +361,7 @@ def _path(command: str, param: click.Parameter, rng: np.random.Generator, sane: 
 def point_into(root: Path, template: Path) -> None:
     """Make the stored model name the scene in this folder, not the one in the template."""
     for config in (root / "model" / "config.json", root / "files" / "config.json"):
-        text = config.read_text().replace(json.dumps(os.fspath(template))[1:-1], json.dumps(os.fspath(root))[1:-1])
-        config.write_text(text)
+        text = config.read_text(encoding="utf-8").replace(
+            json.dumps(os.fspath(template))[1:-1], json.dumps(os.fspath(root))[1:-1]
+        )
+        config.write_text(text, encoding="utf-8")

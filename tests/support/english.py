@@ -121,7 +121,7 @@ def identifiers(path: Path, source: str) -> Iterator[tuple[int, str]]:
 
 def findings(path: Path) -> Iterator[tuple[int, str]]:
     """Yield line numbers and complaints of one file."""
-    source = path.read_text()
+    source = path.read_text(encoding="utf-8")
     if path.suffix == ".py":
         parts = prose_of_python(source)
     elif path.suffix in (".cl", ".clh"):

@@ -68,7 +68,7 @@ def make_ascii(folder: Path) -> None:
     lines += [f"property float {name}" for name in ("x", "y", "z")]
     lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
     rows = ["0 0.5 1 10 20 30", "1 2 3 0 255 0", "-1 -2 -3 1 2 3"]
-    (folder / "points.ply").write_text("\n".join([*lines, "end_header", *rows, ""]))
+    (folder / "points.ply").write_text("\n".join([*lines, "end_header", *rows, ""]), encoding="utf-8")
 
 
 def make_scene(folder: Path, suffix: str = ".bin") -> None:
@@ -116,7 +116,7 @@ def make_transforms(folder: Path) -> None:
         "ply_file_path": "points.ply",
         "applied_transform": np.eye(4)[:3].tolist(),
     }
-    (folder / "transforms.json").write_text(json.dumps(values))
+    (folder / "transforms.json").write_text(json.dumps(values), encoding="utf-8")
     make_ascii(folder)
 
 
@@ -135,7 +135,7 @@ def read_listed(folder: Path) -> None:
 
 def make_listed(folder: Path) -> None:
     make_scene(folder)
-    (folder / "test.txt").write_text(f"{NAMES[0]}\n{NAMES[2]}\n")
+    (folder / "test.txt").write_text(f"{NAMES[0]}\n{NAMES[2]}\n", encoding="utf-8")
 
 
 def cameras() -> list[Camera]:
@@ -157,7 +157,9 @@ def read_config(folder: Path) -> None:
 
 
 def make_config(folder: Path) -> None:
-    (folder / "config.json").write_text(json.dumps({"config": TrainConfig(iterations=100).to_json(), "scene": {}}))
+    (folder / "config.json").write_text(
+        json.dumps({"config": TrainConfig(iterations=100).to_json(), "scene": {}}), encoding="utf-8"
+    )
 
 
 def make_checkpoint(folder: Path) -> None:
@@ -187,7 +189,9 @@ def make_model(folder: Path) -> None:
     small_splats("gaussian").save(folder / "point_cloud" / "iteration_50" / "point_cloud.ply")
     make_cameras(folder)
     scene = {"path": "/data", "test_names": [NAMES[0]], "images": "images", "resolution": 2}
-    (folder / "config.json").write_text(json.dumps({"config": TrainConfig(iterations=100).to_json(), "scene": scene}))
+    (folder / "config.json").write_text(
+        json.dumps({"config": TrainConfig(iterations=100).to_json(), "scene": scene}), encoding="utf-8"
+    )
 
 
 def read_model_folder(folder: Path) -> None:
@@ -202,7 +206,8 @@ def read_model_folder(folder: Path) -> None:
 
 def make_cfg_args(folder: Path) -> None:
     (folder / "cfg_args").write_text(
-        "Namespace(sh_degree=3, source_path='/data', images='images', resolution=2, white_background=True, eval=True)"
+        "Namespace(sh_degree=3, source_path='/data', images='images', resolution=2, white_background=True, eval=True)",
+        encoding="utf-8",
     )
 
 
@@ -216,7 +221,7 @@ def make_search(folder: Path) -> None:
         "options": asdict(BudgetOptions()),
         "scene": {"path": "/data", "resolution": 2},
     }
-    (folder / "budget.json").write_text(json.dumps(values))
+    (folder / "budget.json").write_text(json.dumps(values), encoding="utf-8")
 
 
 def read_search(folder: Path) -> None:
@@ -309,7 +314,9 @@ def make_blender(folder: Path) -> None:
             }
             for i in places
         ]
-        (folder / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+        (folder / f"transforms_{part}.json").write_text(
+            json.dumps({"camera_angle_x": 0.7, "frames": frames}), encoding="utf-8"
+        )
 
 
 def read_facts(folder: Path) -> None:

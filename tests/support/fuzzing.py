@@ -117,7 +117,9 @@ def campaign(readers: Sequence[str], count: int, seed: int = 0, table: str = "fu
     while remaining:
         command = [sys.executable, __file__, table, ",".join(remaining), str(first), str(count), str(seed)]
         reader = remaining[0]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8"
+        ) as process:
             assert process.stdout is not None
             assert process.stderr is not None
             for line in process.stdout:
@@ -152,7 +154,7 @@ def work(table: str, readers: str, first: int, count: int, seed: int) -> None:
             sample.make(folder)
             pristine = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
             sample.read(folder)  # loads the reader's modules before memory is limited
-            pages = int(Path("/proc/self/statm").read_text().split()[0])
+            pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0])
             _, limit = resource.getrlimit(resource.RLIMIT_AS)
             resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ROOM, limit))
             damaged = {path: data for path, data in pristine.items() if sample.damaged in str(path)}

@@ -81,7 +81,7 @@ class Places:
         for name in ("folder", "cwd"):
             (self.place / name).mkdir(parents=True, exist_ok=True)
         (self.place / "empty.ply").write_bytes(b"")
-        (self.place / "text.json").write_text('{"a": [1, 2]}')
+        (self.place / "text.json").write_text('{"a": [1, 2]}', encoding="utf-8")
         (self.place / "link").symlink_to(self.place / "nowhere")
         (self.place / "set").mkdir()
         (self.place / "set" / "truck").symlink_to(self.scene)

@@ -254,7 +254,7 @@ class WarmPytest:
             timer.start()
             code = int(self._answer(server))
             timer.cancel()
-        return None if late.is_set() else code, self.output.read_text(errors="replace")
+        return None if late.is_set() else code, self.output.read_text(errors="replace", encoding="utf-8")
 
     def close(self) -> None:
         """End the process."""
@@ -264,7 +264,9 @@ class WarmPytest:
     def _started(self) -> subprocess.Popen[str]:
         if self._server is None:
             command = [sys.executable, str(Path(__file__).with_name("warm_pytest.py")), *self.libraries]
-            self._server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+            self._server = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
+            )
             self._answer(self._server)
         return self._server
 
@@ -280,7 +282,11 @@ class WarmPytest:
             yield
             return
         waiting = subprocess.Popen(
-            [*self.prefix, "sh", "-c", "echo; read end"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [*self.prefix, "sh", "-c", "echo; read end"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
         )
         assert waiting.stdout is not None
         waiting.stdout.readline()

@@ -36,7 +36,9 @@ def as_blender(capture: Path, scene: Path, n_test: int = 3) -> Path:
             pose = opengl_pose(view.camera.cam_from_world).tolist()
             frames.append({"file_path": f"./{split}/r_{number}", "transform_matrix": pose})
         angle = 2 * np.arctan(0.5 * views[0].camera.width / views[0].camera.fx)
-        (scene / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+        (scene / f"transforms_{split}.json").write_text(
+            json.dumps({"camera_angle_x": angle, "frames": frames}), encoding="utf-8"
+        )
     return scene
 
 

@@ -41,7 +41,13 @@ def run_until(number: int, moment: int, args: Sequence[object]) -> subprocess.Co
     """Run `clsplat ARGS` and send the signal at a moment. Moment 0 sends none and prints the number of moments."""
     command = [sys.executable, "-c", PROGRAM, str(number), str(moment), *map(str, args)]
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL, preexec_fn=heed_ctrl_c
+        command,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        stdin=subprocess.DEVNULL,
+        preexec_fn=heed_ctrl_c,
+        encoding="utf-8",
     )
 
 

@@ -167,6 +167,32 @@ def test_a_dumb_terminal_gets_whole_lines(terminal: Terminal, monkeypatch: pytes
     assert terminal.seen() == [progress_line(at(500)), ""]
 
 
+class PlainConsole(io.TextIOWrapper):
+    """A console of Windows with the letters of code page 437, which shows escape sequences as letters."""
+
+    def __init__(self) -> None:
+        self.shown = io.BytesIO()
+        super().__init__(self.shown, encoding="cp437", newline="\n")
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_console_without_escape_sequences_shows_every_letter(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TERM", raising=False)
+    console = PlainConsole()
+    line = LiveLine(stream=console)
+    line.show("reading photo \u5199\u771f.jpg")
+    line.say("done \u2192 m\u00fcde")
+    with TrainingDisplay(stream=console) as display:
+        display(at(500))
+    text = console.shown.getvalue().decode("cp437")
+    assert text.startswith("\rreading photo \\u5199\\u771f.jpg\r")
+    assert "done \\u2192 m\\xfcde\n" in text
+    assert f"\r{progress_line(at(500), 79)}\n" in text
+    assert all(letter.isprintable() or letter in "\r\n" for letter in text)
+
+
 def test_a_notebook_gets_one_line_on_its_output(monkeypatch: pytest.MonkeyPatch) -> None:
     output = io.StringIO()
     shell = SimpleNamespace(kernel=object())

@@ -31,7 +31,8 @@ from clsplat.errors import OutputError
 from clsplat.files.images import write_png
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
-from clsplat.viewer import page, status_line
+from clsplat.viewer import listen, page, status_line
+from clsplat.viewer.access import Access
 from clsplat.viewer.camera import Pose, camera_of
 from clsplat.viewer.crop import CropBox
 from clsplat.viewer.crop_panel import CropPanel
@@ -472,3 +473,21 @@ def test_a_box_hides_what_is_outside_and_its_splats_are_saved(running: Running) 
         assert (folder / name).read_bytes() == (folder / "expected.ply").read_bytes() == content
         (folder / name).unlink()
     (folder / "expected.ply").unlink()
+
+
+def test_on_windows_the_port_of_another_program_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SO_REUSEADDR, which skips a wait on other systems, takes the port from the program that listens there."""
+    options: list[int] = []
+
+    class Probe(socket.socket):
+        def setsockopt(self, level: int, option: int, value: Any) -> None:
+            options.append(option)
+
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        monkeypatch.setattr(socket, "SO_EXCLUSIVEADDRUSE", -5, raising=False)
+        monkeypatch.setattr(socket, "socket", Probe)
+        with pytest.raises(OutputError, match=f"127.0.0.1:{port}: cannot listen on this address"):
+            listen.open_server("127.0.0.1", port, Access(frozenset({"127.0.0.1"})))
+    assert options == [-5]

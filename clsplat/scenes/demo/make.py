@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 from ...errors import OutputError
+from ...files.atomic import move
 from .scene import write_capture
 
 
@@ -35,7 +36,7 @@ def make_demo_scene(folder: str | os.PathLike[str], width: int = 200, n_views: i
         if unfinished.exists():  # left by an interrupted run
             shutil.rmtree(unfinished)
         write_capture(unfinished, width, width * 3 // 4, n_views)
-        os.replace(unfinished, folder)
+        move(unfinished, folder)
     except OSError as error:
         reason = error.strerror or error
         raise OutputError(f"{folder}: cannot be written ({reason}): choose another folder") from None

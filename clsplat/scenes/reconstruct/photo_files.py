@@ -13,6 +13,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...files.digest import file_digest
+from ...files.file_names import name_key
 from ...files.image_names import CONVERTERS, IMAGE_SUFFIXES, JPEG_SUFFIXES
 from ...files.images import (
     ImageU8,
@@ -139,7 +140,7 @@ def fingerprint(path: Path) -> str:
     files = [file for photo in find_photos(path) for file in (photo.file, photo.mask) if file is not None]
     digest = hashlib.sha256()
     for file in files:
-        digest.update(os.fsencode(os.path.relpath(file, path)) + f"\0{file_digest(file)}\0".encode())
+        digest.update(os.fsencode(Path(os.path.relpath(file, path)).as_posix()) + f"\0{file_digest(file)}\0".encode())
     return digest.hexdigest()
 
 
@@ -244,10 +245,11 @@ def _count_unsupported(home: Path) -> str:
 def _scene_names(names: Sequence[str]) -> list[str]:
     """Return the names in the scene: suffixes other than JPEG and PNG become .png, in a way that keeps names unique."""
     kept = {name for name in names if Path(name).suffix.lower() in (*JPEG_SUFFIXES, ".png")}
-    renamed: list[str] = []
+    taken, renamed = set(map(name_key, kept)), []
     for name in names:
         short = str(PurePosixPath(name).with_suffix(".png"))
-        renamed.append(name if name in kept else short if short not in (kept | set(renamed)) else f"{name}.png")
+        renamed.append(name if name in kept else short if name_key(short) not in taken else f"{name}.png")
+        taken.add(name_key(renamed[-1]))
     return renamed
 
 

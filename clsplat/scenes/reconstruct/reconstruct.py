@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ...errors import InputError, OutputError
+from ...files.atomic import move
 from ...files.images import PhotoHeader, read_photo_header
 from ...files.json_file import read_json, write_json
 from ...files.lock import folder_lock
@@ -116,7 +117,7 @@ def reconstruct(
         groups = [[photo.staged for photo in group] for group in group_by_camera(ready, options.camera_mode)]
         pairs = _pairs(len(ready), _sequential(options, source, len(ready)))
         names = [photo.staged for photo in ready]
-        (work / "pairs.txt").write_text("".join(f"{names[a]} {names[b]}\n" for a, b in pairs))
+        (work / "pairs.txt").write_bytes("".join(f"{names[a]} {names[b]}\n" for a, b in pairs).encode())
         masks = complete_masks(ready, work / "masks")
         job = {
             "masks": masks and str(masks),
@@ -244,8 +245,8 @@ def _move_into_place(finished: Path, scene: Path) -> None:
     """Move the finished scene to its folder in place of an old scene."""
     if scene.exists():
         old = finished.with_name("old")
-        scene.rename(old)
-    finished.rename(scene)
+        move(scene, old)
+    move(finished, scene)
 
 
 def _stage_all(photos: Sequence[PhotoFile], source: Path, work: Path, report: StepCallback) -> list[StagedPhoto]:

@@ -19,6 +19,7 @@ from ...errors import InputError, Remedy
 from ...files.masks import MASK_FOLDER
 from ...files.real_path import real_path
 
+_NEW_GROUP: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)  # what a session is elsewhere, on Windows
 _POLL = 0.3  # time between two queries of the database [s]
 # The number of rows of these tables shows the progress of a stage.
 _TABLES = {"features": "keypoints", "pairs": "two_view_geometries", "pairs again": "two_view_geometries"}
@@ -72,7 +73,8 @@ def run_sfm(work: Path, job: dict[str, Any], report: StepCallback, source: str) 
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=_environment(),
-            start_new_session=True,
+            start_new_session=True,  # Ctrl-C is for this process, which then ends the child
+            creationflags=_NEW_GROUP,
         )
     try:
         last = _watch(child, database, report)
@@ -149,7 +151,7 @@ def _count_rows(database: Path, table: str) -> int:
 def _reason(last: dict[str, Any], code: int, log: Path) -> str:
     if "error" in last:
         return str(last["error"])
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     ended = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
     return f"{ended}: {lines[-1][:160]}" if lines else ended
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ...files.atomic import move
 from ...files.video import require_encoder
 from .options import MIN_PHOTOS, N_FRAMES
 from .photo_files import PhotoFile
@@ -74,7 +75,7 @@ def extract_frames(
         written, file = folder / f"{order:06}.jpg", folder / f"frame_{index:05}.jpg"
         if not written.is_file():
             raise InputError(f"{video}: frame {index} cannot be decoded; the file is damaged: copy it again")
-        written.rename(file)
+        move(written, file)
         files.append(PhotoFile(file.name, file))
     return files
 

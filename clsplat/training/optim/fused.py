@@ -182,9 +182,10 @@ class FusedOptimizer:
 
     def _step(self, parts: dict[str, int], with_skew: bool, arguments: dict[str, Any]) -> None:
         """Step coefficients of the colour, parts of the geometry, and the skew."""
-        self.program.step_splats(
-            (self._columns, parts["coefficients"] + parts["parts"] + int(with_skew)),
-            (GROUP_ITEMS, 1),
+        self.program.step_splats.over(
+            self._columns,
+            GROUP_ITEMS,
+            parts["coefficients"] + parts["parts"] + int(with_skew),
             **parts,
             **arguments,
         )
@@ -219,9 +220,7 @@ class FusedOptimizer:
 
     def _launch(self, name: str, **arguments: Any) -> None:
         """Run a kernel over the geometry of all splats."""
-        self.program[name](
-            (self._columns,), (GROUP_ITEMS,), geom=self.splats.geom, capacity=self.splats.capacity, **arguments
-        )
+        self.program[name].over(self._columns, geom=self.splats.geom, capacity=self.splats.capacity, **arguments)
 
     def _sghmc(
         self, sghmc: Sghmc, momentum: StateRows, grads: CompactGradients, mean_lr: float, iteration: int
@@ -285,9 +284,10 @@ class FusedOptimizer:
 
     def _gather(self, values: Any, source: Any, spare: Any, n: int, rows: int) -> tuple[Any, Any]:
         """Return the gathered buffer, and the other one, which is now the spare."""
-        self.program.gather_columns(
-            (-(-n // GROUP_ITEMS) * GROUP_ITEMS, rows),
-            (GROUP_ITEMS, 1),
+        self.program.gather_columns.over(
+            n,
+            GROUP_ITEMS,
+            rows,
             values=values,
             source=source,
             moved=spare,
@@ -300,9 +300,10 @@ class FusedOptimizer:
         rows.buffer, rows.spare = self._gather(rows.buffer, source, rows.spare, n, rows.width)
 
     def _zero(self, values: Any, fresh: Any, n: int, rows: int) -> None:
-        self.program.zero_columns(
-            (-(-n // GROUP_ITEMS) * GROUP_ITEMS, rows),
-            (GROUP_ITEMS, 1),
+        self.program.zero_columns.over(
+            n,
+            GROUP_ITEMS,
+            rows,
             values=values,
             fresh=fresh,
             capacity=self.splats.capacity,

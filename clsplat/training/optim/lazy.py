@@ -165,9 +165,8 @@ class VisibleOptimizer(FusedOptimizer):
     def _select(self, kernel: str, **arguments: Any) -> None:
         """Select vectors with the kernel wake_visible or wake_all. The step counts are those before the next step."""
         self._sent = send_to_device(self.device, self.table, self._table())  # kept: releasing it waits for the transfer
-        self.program[kernel](
-            (-(-self._vectors // GROUP_ITEMS) * GROUP_ITEMS,),
-            (GROUP_ITEMS,),
+        self.program[kernel].over(
+            self._vectors,
             last=self._last,
             ages=self.ages,
             vectors=self._vectors,
@@ -185,9 +184,10 @@ class VisibleOptimizer(FusedOptimizer):
             "capacity": splats.capacity,
             "keeps_moments": int(keeps_moments),
         }
-        self.program.settle_color(
-            (self._columns, sh_coefficients(splats.schema.sh_degree)),
-            (GROUP_ITEMS, 1),
+        self.program.settle_color.over(
+            self._columns,
+            GROUP_ITEMS,
+            sh_coefficients(splats.schema.sh_degree),
             sh=splats.sh,
             sh_m=self.first.sh,
             sh_v=self.second.sh,
@@ -196,9 +196,10 @@ class VisibleOptimizer(FusedOptimizer):
         )
         if not self.rules.geometry_waits:
             return
-        self.program.settle_geometry(
-            (self._columns, len(PARTS)),
-            (GROUP_ITEMS, 1),
+        self.program.settle_geometry.over(
+            self._columns,
+            GROUP_ITEMS,
+            len(PARTS),
             geom=splats.geom,
             geom_m=self.first.geom,
             geom_v=self.second.geom,
@@ -206,9 +207,8 @@ class VisibleOptimizer(FusedOptimizer):
             **common,
         )
         if self.skew is not None:
-            self.program.settle_skew(
-                (self._columns,),
-                (GROUP_ITEMS,),
+            self.program.settle_skew.over(
+                self._columns,
                 geom=splats.geom,
                 skew_s=skew_s,
                 skew_m=self.skew.first.buffer,

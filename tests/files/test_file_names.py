@@ -1,0 +1,54 @@
+"""Names of files on systems that ignore case or reserve characters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from clsplat.errors import InputError, OutputError
+from clsplat.files import file_names
+from clsplat.files.existing import refuse_existing
+from clsplat.rendering import outputs
+from clsplat.scenes.reconstruct.photo_files import _scene_names
+
+
+@pytest.fixture(params=[False, True], ids=["case matters", "case is ignored"])
+def ignores_case(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    monkeypatch.setattr(file_names, "IGNORES_CASE", request.param)
+    return bool(request.param)
+
+
+def test_two_views_never_share_an_image(ignores_case: bool) -> None:
+    names = ["IMG_1.jpg", "img_1.png"]
+    if not ignores_case:
+        assert outputs.output_stems(names) == ["IMG_1", "img_1"]
+        return
+    with pytest.raises(InputError, match=r"views 'IMG_1.jpg' and 'img_1.png' would both be written to img_1"):
+        outputs.output_stems(names)
+
+
+def test_two_outputs_never_share_a_file(ignores_case: bool, tmp_path: Path) -> None:
+    paths = [tmp_path / "A.json", tmp_path / "a.json"]
+    if not ignores_case:
+        refuse_existing(paths)
+        return
+    with pytest.raises(OutputError, match="is named for two files"):
+        refuse_existing(paths)
+    with pytest.raises(OutputError, match="is a photo of the scene"):
+        refuse_existing(paths[:1], overwrite=True, inputs=paths[1:])
+
+
+def test_two_photos_never_share_a_name_in_a_scene(ignores_case: bool) -> None:
+    names = _scene_names(["A.tif", "a.png", "b.tif", "B.bmp"])
+    assert names == (
+        ["A.tif.png", "a.png", "b.png", "B.bmp.png"] if ignores_case else ["A.png", "a.png", "b.png", "B.png"]
+    )
+
+
+def test_reserved_characters_are_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A colon would write into a hidden part of the file `frame`."""
+    assert outputs.output_stems(["day/frame:1.png"]) == ["day/frame:1"]
+    monkeypatch.setattr(outputs, "RESERVED", frozenset('<>:"|?*'))
+    with pytest.raises(InputError, match=r"^view 'day/frame:1.png': this system has no files with : in their name"):
+        outputs.output_stems(["day/frame:1.png"])
