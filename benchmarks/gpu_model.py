@@ -84,7 +84,8 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write the tables into GPU.md")
     args = parser.parse_args()
     if args.measure or args.smoke:
-        args.out.write_text("".join(json.dumps(asdict(one)) + "\n" for one in measured(args.device, args.smoke)))
+        rows = "".join(json.dumps(asdict(one)) + "\n" for one in measured(args.device, args.smoke))
+        args.out.write_text(rows, encoding="utf-8")
     text = "\n\n".join(tables(read(args.out)))
     print(text)
     if args.write:

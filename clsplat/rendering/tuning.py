@@ -161,7 +161,7 @@ def _scene() -> Splats:
 
 def _key(device: Device) -> str:
     info = device.info
-    return "|".join((info.platform, info.platform_version, info.name, info.driver, __version__, _digest()))
+    return "|".join((info.platform, info.platform_version, info.name, info.type, info.driver, __version__, _digest()))
 
 
 @cache

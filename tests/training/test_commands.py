@@ -20,8 +20,9 @@ TILE_BITS_1080P = (-(-1920 // 16) * -(-1080 // 16) - 1).bit_length()
 
 
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])
-def test_a_step_has_few_commands(device: Device, shape: str, tmp_path: Path) -> None:
+def test_a_step_has_few_commands(device: Device, monkeypatch: pytest.MonkeyPatch, shape: str, tmp_path: Path) -> None:
     """Count the commands of a step on a small image, and the further passes of the tile sort of a large one."""
+    monkeypatch.setenv("CLSPLAT_SCHEDULE", "gpu64")
     gpu = open_device(device.info.index)
     gpu.info = replace(gpu.info, type="GPU")
     scene = load_scene(write_garden(tmp_path))
