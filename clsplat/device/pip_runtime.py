@@ -3,18 +3,20 @@
 The wheels `intel-opencl-rt` and `intel-cmplr-lib-rt` put their libraries into `<prefix>/lib`, where the dynamic linker
 does not search. Their `.icd` file holds a path of Intel's build machine. This module loads the libraries that the
 runtime needs. Then it writes an `.icd` file with the true path, next to copies of the system's, and shows the loader
-this folder.
+this folder. Nothing has to remove the folder, so a process that is killed leaves nothing behind.
 """
 
 from __future__ import annotations
 
-import atexit
 import ctypes
+import hashlib
 import os
 import shutil
 import sys
 import tempfile
 from pathlib import Path
+
+from .caches import user_cache
 
 VENDORS_VARIABLE = "OCL_ICD_VENDORS"
 SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
@@ -27,8 +29,9 @@ _PRELOAD = ("libintlc.so.5", "libirng.so", "libimf.so", "libsvml.so", "libtbb.so
 def register_pip_runtime() -> bool:
     """Register the pip-installed runtime with this process's OpenCL loader; return whether it is registered.
 
-    It must run before the loader's first use in the process; further calls cost nothing. It does nothing if the runtime
-    is not installed, if the system has registered one, or if the user has set OCL_ICD_VENDORS.
+    It must run after `ensure_caches` and before the loader's first use in the process; further calls cost nothing. It
+    does nothing if the runtime is not installed, if the system has registered one, or if the user has set
+    OCL_ICD_VENDORS.
     """
     library = Path(sys.prefix) / "lib" / RUNTIME
     if not library.is_file():
@@ -42,13 +45,25 @@ def register_pip_runtime() -> bool:
         library.parent
     ):
         return False
-    folder = Path(tempfile.mkdtemp(prefix="clsplat-icd-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    for icd in system:
-        shutil.copyfile(icd, folder / icd.name)
-    (folder / _ICD).write_text(f"{library.resolve()}\n", encoding="utf-8")
-    os.environ[VENDORS_VARIABLE] = str(folder)
+    texts = {icd.name: icd.read_bytes() for icd in system} | {_ICD: f"{library.resolve()}\n".encode()}
+    os.environ[VENDORS_VARIABLE] = str(_folder_of(texts))
     return True
+
+
+def _folder_of(texts: dict[str, bytes]) -> Path:
+    """Return a folder with these files. It is in the user's cache and stays there: other processes use it, too."""
+    digest = hashlib.sha256(repr(sorted(texts.items())).encode()).hexdigest()[:16]
+    folder = user_cache() / "clsplat" / f"opencl-vendors-{digest}"
+    if not folder.is_dir():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        written = Path(tempfile.mkdtemp(dir=folder.parent))
+        for name, text in texts.items():
+            (written / name).write_bytes(text)
+        try:
+            written.rename(folder)
+        except OSError:  # another process was first
+            shutil.rmtree(written, ignore_errors=True)
+    return folder
 
 
 def _preload(folder: Path) -> bool:

@@ -183,6 +183,7 @@ def prefix(tmp_path, monkeypatch):
     system.mkdir()
     (system / "pocl.icd").write_text("libpocl.so\n")
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(runtime, "SYSTEM_VENDORS", system)
     monkeypatch.setattr(runtime, "_preload", lambda folder: True)
     # Set first, so that monkeypatch removes what register_pip_runtime sets.
@@ -199,6 +200,18 @@ def test_the_pip_runtime_is_registered_with_those_of_the_system(prefix):
     assert list(texts.values()) == [str((prefix / "lib" / runtime.RUNTIME).resolve())]
     assert runtime.register_pip_runtime(), "a second call keeps it registered"
     assert os.environ[runtime.VENDORS_VARIABLE] == str(folder)
+
+
+def test_processes_share_the_folder_of_vendors(prefix, monkeypatch):
+    """A process that is killed leaves no folder behind: the next one uses the same. Other vendors have another."""
+    folders = []
+    for text in ("libpocl.so\n", "libpocl.so\n", "libpocl.so.2\n"):
+        (prefix / "vendors" / "pocl.icd").write_text(text)
+        assert runtime.register_pip_runtime()
+        folders.append(os.environ[runtime.VENDORS_VARIABLE])
+        monkeypatch.delenv(runtime.VENDORS_VARIABLE)
+    assert folders[0] == folders[1] != folders[2]
+    assert len(list((prefix / "cache" / "clsplat").iterdir())) == 2
 
 
 def test_user_choice_and_system_registration_are_left_alone(prefix, monkeypatch):
