@@ -13,15 +13,9 @@ static inline void step_coefficient(
     adam_moments adam,
     const ulong capacity
 ) {
-    vreal basis[SH_COUNT];
+    vreal basis[SH_COUNT], factor = (vreal)0;
     sh_basis(vec3_load(grad_sh + 3 * capacity, capacity), degree, basis);
-#if LANES == 1
-    // Indices that are known when the kernel is compiled keep the basis in a GPU's registers.
-    real factor = 0;
-    UNROLL for (uint j = 0; j < SH_COUNT; ++j) if (j == k) factor = basis[j];
-#else
-    const vreal factor = basis[k];
-#endif
+    lanes_pick(factor, basis, SH_COUNT, k);
     for (int c = 0; c < 3; ++c)
         adam_step(factor * lanes_load(grad_sh + c * capacity), lr, sh, adam, (3 * k + c) * capacity);
 }

@@ -119,9 +119,8 @@ def test_pictures_take_no_more_than_their_share() -> None:
             return ViewPicture(np.zeros((4, 4, 3), np.uint8))
 
     class Device:
-        class queue:
-            @staticmethod
-            def finish() -> None: ...
+        @staticmethod
+        def finish() -> None: ...
 
     class Run:
         device = Device
