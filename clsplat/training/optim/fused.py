@@ -96,10 +96,9 @@ class FusedOptimizer:
         follows = skew is not None and skew.map.rotates  # the skew needs the new rotation: it steps after the geometry
         if groups.base:
             first = int(sghmc is not None)  # SGHMC moves the means
-            base = {"coefficients": sh_coefficients(sh_degree), "first_part": first, "parts": len(PARTS) - first}
-            self._step(base, with_skew and not follows, arguments)
+            self._step(arguments, with_skew and not follows, sh_coefficients(sh_degree), first, len(PARTS) - first)
         if with_skew and (follows or not groups.base):
-            self._step({"coefficients": 0, "first_part": 0, "parts": 0}, True, arguments)
+            self._step(arguments, True)
         elif follows and not with_skew and skew is not None:
             self._launch("map_skew", skew_s=skew.s.buffer)
 
@@ -180,13 +179,17 @@ class FusedOptimizer:
         """Work-items of a kernel over all splats."""
         return -(-self.splats.n // (self.kernels.lanes * GROUP_ITEMS)) * GROUP_ITEMS
 
-    def _step(self, parts: dict[str, int], with_skew: bool, arguments: dict[str, Any]) -> None:
+    def _step(
+        self, arguments: dict[str, Any], with_skew: bool, coefficients: int = 0, first_part: int = 0, parts: int = 0
+    ) -> None:
         """Step coefficients of the colour, parts of the geometry, and the skew."""
         self.program.step_splats.over(
             self._columns,
             GROUP_ITEMS,
-            parts["coefficients"] + parts["parts"] + int(with_skew),
-            **parts,
+            coefficients + parts + int(with_skew),
+            coefficients=coefficients,
+            first_part=first_part,
+            parts=parts,
             **arguments,
         )
 
