@@ -1,15 +1,30 @@
-// columns.cl: kernels that move splats between columns of a buffer [rows, capacity].
+// columns.cl: kernels that move splats between columns of buffers [rows, capacity].
 
-// moved[row, i] = values[row, source[i]]. Global size: (at least n, rows).
+// moved[row, i] = values[first + row, source[i]]; a row of `moved` has `width` columns. Global size: (at least n, rows).
 kernel void gather_columns(
     global const real *restrict values,
     global const int *restrict source,
     global real *restrict moved,
     ulong capacity,
+    ulong width,
+    uint first,
     uint n
 ) {
-    const ulong i = get_global_id(0), row = get_global_id(1) * capacity;
-    if (i < n) moved[row + i] = values[row + source[i]];
+    const ulong i = get_global_id(0), row = get_global_id(1);
+    if (i < n) moved[row * width + i] = values[(first + row) * capacity + source[i]];
+}
+
+// values[first + row, target[i]] = moved[row, i] for n different targets; moved [rows, n]. Global size: (at least n, rows).
+kernel void scatter_columns(
+    global const real *restrict moved,
+    global const int *restrict target,
+    global real *restrict values,
+    ulong capacity,
+    uint first,
+    uint n
+) {
+    const ulong i = get_global_id(0), row = get_global_id(1);
+    if (i < n) values[(first + row) * capacity + target[i]] = moved[row * n + i];
 }
 
 // values[row, i] = 0 where fresh[i]. Global size: (at least n, rows).

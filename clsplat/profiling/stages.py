@@ -35,7 +35,7 @@ STAGES = {
         "settle_geometry",
         "settle_skew",
     ),
-    "strategy": ("gather_columns", "zero_columns"),
+    "strategy": ("summarise_splats", "gather_columns", "scatter_columns", "zero_columns"),
     "transfers": TRANSFERS,
 }
 HOST = "host"  # wall time in which the device is idle

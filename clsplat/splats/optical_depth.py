@@ -6,7 +6,7 @@ The optical depth of a stack of N equal splats is N times that of one. A signed 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,8 @@ MAX_COORDINATE = 1e15  # SGHMC can throw a splat farther; it never returns, and 
 _NAMES = ("opacity_logit", "opacity_minus_logit")
 
 
-def opacity_names(arrays: Mapping[str, Array]) -> tuple[str, ...]:
-    """Return the names of the opacity fields of a model: one, or one for each side of a plane (plus, minus)."""
+def opacity_names(arrays: Container[str]) -> tuple[str, ...]:
+    """Return the names of the opacity fields among the fields of a model: one, or one for each side of a plane."""
     return tuple(name for name in _NAMES if name in arrays)
 
 
@@ -41,7 +41,7 @@ def optical_depth(shape: Shape, raw: Array) -> DoubleArray:
     return np.maximum(depth, 0.0)
 
 
-def raw_of_optical_depth(shape: Shape, depth: DoubleArray, old: Array) -> DoubleArray:
+def raw_of_optical_depth(shape: Shape, depth: DoubleArray | np.float64, old: Array) -> DoubleArray:
     """Return the raw values of |o| = 1 - exp(-depth); signed opacities get the sign of the raw values `old`."""
     depth = np.maximum(depth, MIN_DEPTH)
     opacity = -np.expm1(-depth)

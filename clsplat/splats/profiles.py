@@ -78,3 +78,8 @@ def _peak_normalised(z: Array, slope: Array) -> Array:
         mode -= (slope * inverse_mills - mode) / (-1.0 - slope**2 * inverse_mills * (inverse_mills + u))
     log_kernel = -0.5 * z**2 + log_ndtr(slope * z) + 0.5 * mode**2 - log_ndtr(slope * mode)
     return np.exp(log_kernel)[:, None]
+
+
+EVEN = (gaussian, generalised_exponential, student_t)  # profiles with one opacity and the same values at z and -z
+SHORT = (gaussian, skew_normal, skew_normal_direct, half_gaussian, bisected_skew)  # below 1e-17 beyond REACH
+REACH = 9.0

@@ -10,6 +10,7 @@ from ..device.schedule import Schedule
 from ..rendering.build import CULLED_KEY, MARGIN_X, MARGIN_Y, KernelBuild, layout_defines
 from ..splats.fields import Group
 from ..splats.near_plane import NEAR_PLANE
+from ..splats.optical_depth import MAX_COORDINATE
 from ..splats.shapes import shape_named
 from .config import TrainConfig
 from .optim import adam
@@ -82,12 +83,11 @@ _OPTIM_FILES = (
     "train/adam.clh",
     "train/optim.cl",
     "train/positions.cl",
-    "train/columns.cl",
 )
 
 
 def optim_program(device: Device, kernels: KernelBuild) -> Program:
-    """Return the program of the optimizer: steps of colour, geometry and skew, SGHMC, noise, and moves of columns."""
+    """Return the program of the optimizer: steps of colour, geometry and skew, SGHMC and noise."""
     return build(device, _OPTIM_FILES, _optim_defines(kernels) | {"LAZY": 0}, kernels.real)
 
 
@@ -102,6 +102,14 @@ def lazy_program(device: Device, kernels: KernelBuild) -> Program:
         "DRIFT_SKEW": adam.DECAY_ROWS + adam.DRIFT_SKEW,
     }
     return build(device, (*_OPTIM_FILES, "train/lazy.cl"), defines, kernels.real)
+
+
+def columns_program(device: Device, kernels: KernelBuild) -> Program:
+    """Return the program of densification: a summary of every splat, and moves of splats between columns."""
+    schema = kernels.schema
+    defines = layout_defines(shape_named(kernels.shape), schema)
+    defines |= {"LANES": 1, "SH_ROWS": schema.rows(Group.SH), "MAX_COORDINATE": MAX_COORDINATE}
+    return build(device, ("math/lanes.clh", "train/columns.cl", "train/density.cl"), defines, kernels.real)
 
 
 def _optim_defines(kernels: KernelBuild) -> dict[str, Define]:

@@ -118,7 +118,14 @@ class Trainer:
         if checkpoint is not None and checkpoint.config["iterations"] == config.iterations:
             self.average.load_state(checkpoint.average)
         self.density = DensityControl(
-            config, self.schedule, self.splats, self.optimizer, self.pipeline.statistics, self.rng, scene.extent
+            config,
+            self.kernels,
+            self.schedule,
+            self.splats,
+            self.optimizer,
+            self.pipeline.statistics,
+            self.rng,
+            scene.extent,
         )
         self.clock = RunClock(config, self.schedule, self.views, self.pipeline, self.splats, self.iteration)
         self.running = RunningLoss(len(scene.train))

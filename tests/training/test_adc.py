@@ -17,6 +17,7 @@ from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import Shape
 from clsplat.training.density.adc import MIN_OPACITY, RESET_OPACITY, SPLIT_SHRINK, WORLD_SIZE, plan_adc, with_reset
 from clsplat.training.density.edit import DensifyEdit
+from clsplat.training.density.table import HostSplats
 
 EXTENT = 2.0
 THRESHOLD = 2e-4
@@ -33,7 +34,7 @@ def edited(
     arrays: Arrays, shape: Shape, stats: np.ndarray, cap: int = 10_000, seed: int = 0, **options: float | None
 ) -> DensifyEdit:
     return plan_adc(
-        arrays,
+        HostSplats(shape, arrays),
         shape,
         stats,
         np.random.default_rng(seed),
@@ -331,7 +332,7 @@ def test_a_reset_lowers_opacities_and_their_state_only(shape: Shape) -> None:
         arrays, shape, stats_of(np.linspace(0, 2, 200) * THRESHOLD, np.linspace(0, 1, 200)), depth_threshold=0.5
     )
     before = edit.apply(arrays)
-    reset = with_reset(edit, arrays, shape)
+    reset = with_reset(edit, HostSplats(shape, arrays), shape)
     after = reset.apply(arrays)
     names = opacity_names(arrays)
     for name, array in after.items():

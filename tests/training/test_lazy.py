@@ -32,6 +32,7 @@ from clsplat.splats.morton import morton_order
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
 from clsplat.training.density.edit import DensifyEdit
+from clsplat.training.density.table import SplatTable
 from clsplat.training.log import Progress
 from clsplat.training.optim.adam import NumpyAdam
 from clsplat.training.optim.lazy import DRIFT_MEAN, WAITS, Drifts
@@ -238,12 +239,12 @@ def test_training_steps_what_was_seen_and_settles_before_each_action(
     trainer = Trainer(*wide, device=devices[0])
     sparse, edited = 0, []
 
-    def unchanged(arrays: dict[str, np.ndarray]) -> DensifyEdit:
-        edited.append(all(np.array_equal(array, trainer.optimizer.read()[name]) for name, array in arrays.items()))
-        n = len(arrays["mean"])
+    def unchanged(splats: SplatTable) -> DensifyEdit:
+        read, n = trainer.optimizer.read(), trainer.splats.n
+        edited.append(all(np.array_equal(splats.field(name), array) for name, array in read.items()))
         return DensifyEdit(np.arange(n), {}, np.zeros(n, bool))
 
-    monkeypatch.setattr("clsplat.training.density.control.next_edit", lambda config, arrays, *rest: unchanged(arrays))
+    monkeypatch.setattr("clsplat.training.density.control.next_edit", lambda config, splats, *rest: unchanged(splats))
     for _ in range(40):
         before = trainer.splats.download(500)
         trainer.step()

@@ -18,7 +18,7 @@ from clsplat.splats.harmonics import sh_basis
 from clsplat.splats.shapes import SHAPES, shape_named
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
-from clsplat.training.density.edit import DensifyEdit
+from clsplat.training.density.edit import DensifyEdit, NewValues
 from clsplat.training.optim.optimizer import Optimizer, make_optimizer
 from clsplat.training.optim.regularisers import Penalty
 from clsplat.training.optim.skew_map import MAPS, SKEW_MAPS
@@ -134,7 +134,11 @@ def growing(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> DensifyE
     fresh = np.zeros(n + 40, bool)
     fresh[rng.integers(0, n, 30)] = True
     fresh[n : n + 20] = True  # the other new rows start without state too
-    values = {"opacity_logit": arrays["opacity_logit"][source] - 1, "log_scale": arrays["log_scale"][source] - 0.1}
+    some = np.arange(n // 10, n + 30)
+    values = {
+        "opacity_logit": NewValues(np.arange(n + 40), arrays["opacity_logit"][source] - 1),
+        "log_scale": NewValues(some, arrays["log_scale"][source[some]] - 0.1),
+    }
     return DensifyEdit(source, values, fresh)
 
 
@@ -146,10 +150,11 @@ def shrinking(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> Densif
     fresh[::7] = True
     moved = {name: array[source].copy() for name, array in arrays.items()}
     moved["quat"][3] = [0.5, 0.1, -0.2, 0.7]
-    values = {"mean": moved["mean"] + 0.1, "quat": moved["quat"]}
+    rows = np.arange(n - 100)
+    values = {"mean": NewValues(rows, moved["mean"] + 0.1), "quat": NewValues(rows[2:5], moved["quat"][2:5])}
     if "skew" in moved:
         moved["skew"][5:9] *= -0.5
-        values["skew"] = moved["skew"]
+        values["skew"] = NewValues(rows[4:20], moved["skew"][4:20])
     resets = ("opacity_logit", "mean", "sh", *(("skew",) if "skew" in moved else ()))
     return DensifyEdit(source, values, fresh, state_source=source, reset_fields=resets)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from clsplat.errors import InputError, TrainingError
 from clsplat.splats import shapes
 from clsplat.splats.optical_depth import opacity_names
 from clsplat.splats.shapes import BETA_BOUNDS, NU_BOUNDS, SKEW_MAX, SLANT_MAX, Shape
-from clsplat.training.density.relocation import MIN_OPACITY, N_MAX, RULES, DensifyEdit, plan_relocation, relocation
+from clsplat.training.density.edit import DensifyEdit
+from clsplat.training.density.relocation import MIN_OPACITY, N_MAX, RULES, plan_relocation, relocation
+from clsplat.training.density.table import HostSplats
 
 TWO_SIDED = [s for s in ALL_SHAPES if any(f.name == "opacity_minus_logit" for f in s.fields)]
 
@@ -153,11 +156,17 @@ def test_rows_do_not_mix(shape: Shape) -> None:
             assert raw[name][i] == alone[0][name][0]
 
 
+def planned(arrays: Arrays, shape: Shape, rng: np.random.Generator, cap: int, **options: Any) -> DensifyEdit:
+    return plan_relocation(HostSplats(shape, arrays), shape, rng, cap, **options)
+
+
 def equal(a: DensifyEdit, b: DensifyEdit) -> bool:
     return (
         np.array_equal(a.source, b.source)
         and np.array_equal(a.fresh, b.fresh)
-        and all(np.array_equal(a.values[name], b.values[name]) for name in a.values)
+        and set(a.values) == set(b.values)
+        and all(np.array_equal(a.values[name].rows, b.values[name].rows) for name in a.values)
+        and all(np.array_equal(a.values[name].values, b.values[name].values) for name in a.values)
     )
 
 
@@ -174,7 +183,7 @@ def equal(a: DensifyEdit, b: DensifyEdit) -> bool:
 def test_laws_of_a_plan(n: int, seed: int, dead: float, growth: float, spare: int, rule: str, shape: Shape) -> None:
     arrays = random_model(shape, n, seed, dead)
     cap = max(1, n + spare)
-    edit = plan_relocation(arrays, shape, np.random.default_rng(seed), cap, growth=growth, rule=rule)
+    edit = planned(arrays, shape, np.random.default_rng(seed), cap, growth=growth, rule=rule)
     alive = shape.strength(arrays) > MIN_OPACITY
     n_new = len(edit.source)
 
@@ -228,7 +237,7 @@ def test_draws_are_in_proportion_to_the_strength() -> None:
     live = np.array([0.1, -0.2, 0.7])
     arrays = gaussians(np.concatenate([np.arctanh(live), np.zeros(n_dead)]))
     arrays["nu"] = np.full(len(arrays["mean"]), 5.0)
-    edit = plan_relocation(arrays, shapes.STUDENT_T, np.random.default_rng(5), cap=1)
+    edit = planned(arrays, shapes.STUDENT_T, np.random.default_rng(5), cap=1)
     share = np.bincount(edit.source[3:], minlength=3) / n_dead
     np.testing.assert_allclose(share, np.abs(live), atol=5 * 0.5 / math.sqrt(n_dead))
 
@@ -240,7 +249,7 @@ def test_with_a_turnover_the_faintest_move_to_high_gradients_once_nothing_grows(
 
     def plan(cap: int, turnover: float, of: np.ndarray | None = gradient) -> DensifyEdit:
         rng = np.random.default_rng(0)
-        return plan_relocation(arrays, shapes.GAUSSIAN, rng, cap, growth=1.05, turnover=turnover, gradient=of)
+        return planned(arrays, shapes.GAUSSIAN, rng, cap, growth=1.05, turnover=turnover, gradient=of)
 
     edit = plan(20, 0.25)
     assert (edit.relocated, edit.added) == (5, 0)
@@ -252,14 +261,14 @@ def test_with_a_turnover_the_faintest_move_to_high_gradients_once_nothing_grows(
     assert (growing.relocated, growing.added) == (0, 1)
     assert equal(growing, plan(21, 0.0, None))
     dead = gaussians(np.array([-9.0, -9.0, 1.0, 2.0]))
-    edit = plan_relocation(dead, shapes.GAUSSIAN, np.random.default_rng(0), 4, turnover=0.5)
+    edit = planned(dead, shapes.GAUSSIAN, np.random.default_rng(0), 4, turnover=0.5)
     assert edit.relocated == 2, "the dead ones are the faintest"
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.05, 0.3, 1.0])
 def test_a_limit_takes_the_weakest_first(limit: float) -> None:
     logit = np.concatenate([np.zeros(50), np.linspace(-6, -12, 50)])
-    edit = plan_relocation(gaussians(logit), shapes.GAUSSIAN, np.random.default_rng(0), 100, limit=limit)
+    edit = planned(gaussians(logit), shapes.GAUSSIAN, np.random.default_rng(0), 100, limit=limit)
     count = min(int(limit * 100), 50)
     assert edit.relocated == count
     np.testing.assert_array_equal(np.flatnonzero(edit.source != np.arange(100)), np.arange(100 - count, 100))
@@ -269,7 +278,7 @@ def test_a_splat_of_exactly_the_smallest_opacity_is_dead() -> None:
     arrays = gaussians(np.array([0.0, -5.0]))
     faintest = float(shapes.GAUSSIAN.strength(arrays)[1])
     for least, moved in ((np.nextafter(faintest, 0), 0), (faintest, 1)):
-        edit = plan_relocation(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 2, min_opacity=float(least))
+        edit = planned(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 2, min_opacity=float(least))
         assert edit.relocated == moved
 
 
@@ -278,15 +287,15 @@ def test_one_side_of_a_two_sided_splat_keeps_it_alive_and_the_other_stays_faint(
     arrays = random_model(shape, 2, 0, dead=0)
     arrays["opacity_logit"][:] = (-20.0, -9.0)
     arrays["opacity_minus_logit"][:] = (1.0, -9.0)
-    edit = plan_relocation(arrays, shape, np.random.default_rng(0), 2)
+    edit = planned(arrays, shape, np.random.default_rng(0), 2)
     assert edit.source.tolist() == [0, 0]
-    opacity = shape.opacity(edit.values["opacity_logit"].astype(np.float64))
+    opacity = shape.opacity(edit.after("opacity_logit", arrays["opacity_logit"]).astype(np.float64))
     np.testing.assert_allclose(opacity, math.exp(-20) / 2, rtol=1e-3)
 
 
 def test_same_generator_same_plan_and_another_differs() -> None:
     arrays = random_model(shapes.SKEW_NORMAL, 500, 0)
-    edits = [plan_relocation(arrays, shapes.SKEW_NORMAL, np.random.default_rng(seed), 1000) for seed in (1, 1, 2)]
+    edits = [planned(arrays, shapes.SKEW_NORMAL, np.random.default_rng(seed), 1000) for seed in (1, 1, 2)]
     assert equal(edits[0], edits[1])
     assert not equal(edits[0], edits[2])
 
@@ -299,7 +308,7 @@ def test_rows_that_are_not_finite_are_relocated_and_start_afresh(bad: float, fie
     arrays = random_model(shape, 40, 0, dead=0)
     rows = [3, 17]
     arrays[field].reshape(40, -1)[rows, -1] = bad
-    edit = plan_relocation(arrays, shape, np.random.default_rng(0), 40, limit=limit)
+    edit = planned(arrays, shape, np.random.default_rng(0), 40, limit=limit)
     assert edit.relocated == 2
     assert not np.isin(edit.source, rows).any()
     assert edit.fresh[rows].all()
@@ -309,18 +318,18 @@ def test_rows_that_are_not_finite_are_relocated_and_start_afresh(bad: float, fie
 def test_what_is_not_finite_goes_even_where_nothing_is_alive() -> None:
     arrays = gaussians(np.full(20, -9.0))
     arrays["mean"][3] = np.nan
-    edit = plan_relocation(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 40, growth=2)
+    edit = planned(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 40, growth=2)
     assert (edit.relocated, edit.added) == (1, 0)
     assert np.isfinite(edit.apply(arrays)["mean"]).all()
     arrays["mean"][:] = np.nan
     with pytest.raises(TrainingError, match="no splat has finite parameters"):
-        plan_relocation(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 40)
+        planned(arrays, shapes.GAUSSIAN, np.random.default_rng(0), 40)
 
 
 def test_growth_does_not_overshoot_by_rounding_and_empty_models_pass() -> None:
     rng = np.random.default_rng(0)
-    assert plan_relocation(gaussians(np.zeros(100)), shapes.GAUSSIAN, rng, 1000, growth=1.05).added == 5
-    assert len(plan_relocation(gaussians(np.zeros(0)), shapes.GAUSSIAN, rng, 10).source) == 0
+    assert planned(gaussians(np.zeros(100)), shapes.GAUSSIAN, rng, 1000, growth=1.05).added == 5
+    assert len(planned(gaussians(np.zeros(0)), shapes.GAUSSIAN, rng, 10).source) == 0
 
 
 @pytest.mark.parametrize("shape", ALL_SHAPES, ids=lambda s: s.name)
@@ -329,7 +338,7 @@ def test_extreme_opacities(shape: Shape) -> None:
     extreme = np.array([80.0, -80.0, 1e30, -1e30, 0.0], np.float32)
     for name in opacity_names(arrays):
         arrays[name] = extreme
-    edit = plan_relocation(arrays, shape, np.random.default_rng(0), 20, growth=4)
+    edit = planned(arrays, shape, np.random.default_rng(0), 20, growth=4)
     assert all(np.isfinite(array).all() for array in edit.apply(arrays).values())
 
 
@@ -339,4 +348,4 @@ BAD_OPTIONS = [{"rule": "area"}, {"growth": 0.9}, {"growth": math.nan}, {"min_op
 @pytest.mark.parametrize("options", BAD_OPTIONS)
 def test_bad_options(options: dict[str, object]) -> None:
     with pytest.raises(InputError):
-        plan_relocation(gaussians(np.zeros(3)), shapes.GAUSSIAN, np.random.default_rng(0), 5, **options)  # type: ignore[arg-type]
+        planned(gaussians(np.zeros(3)), shapes.GAUSSIAN, np.random.default_rng(0), 5, **options)  # type: ignore[arg-type]

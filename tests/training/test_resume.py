@@ -58,8 +58,8 @@ def edits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
     found: list[tuple[int, int, int]] = []
     next_edit = control.next_edit
 
-    def spy(config: Any, arrays: Any, stats: Any, rng: Any, info: Any) -> Any:
-        edit = next_edit(config, arrays, stats, rng, info)
+    def spy(config: Any, splats: Any, stats: Any, rng: Any, info: Any) -> Any:
+        edit = next_edit(config, splats, stats, rng, info)
         found.append((info.iteration, edit.relocated, edit.added))
         return edit
 

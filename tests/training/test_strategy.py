@@ -14,6 +14,7 @@ from clsplat.training.density import strategy
 from clsplat.training.density.edit import DensifyEdit
 from clsplat.training.density.relocation import relocation
 from clsplat.training.density.strategy import StepInfo
+from clsplat.training.density.table import HostSplats
 
 N = 100
 
@@ -29,7 +30,7 @@ def action(
     arrays = random_model(shape, N, 1) if arrays is None else arrays
     stats = np.zeros((3, N)) if stats is None else stats
     info = StepInfo(iteration, int(config.density.densify_until * config.iterations), 1.5, 1.0)
-    return arrays, strategy.next_edit(config, arrays, stats, np.random.default_rng(seed), info)
+    return arrays, strategy.next_edit(config, HostSplats(shape, arrays), stats, np.random.default_rng(seed), info)
 
 
 def mcmc(**options: Any) -> TrainConfig:
@@ -63,7 +64,7 @@ def test_length_squared_is_twice_the_log_factor() -> None:
     shifts = []
     for rule in ("length", "length-squared"):
         arrays, edit = action(mcmc(shape="gaussian", cap_max=130, relocation=rule))
-        shifts.append(edit.values["log_scale"] - arrays["log_scale"][edit.source])
+        shifts.append(edit.after("log_scale", arrays["log_scale"]) - arrays["log_scale"][edit.source])
     assert shifts[0].min() < -0.01
     np.testing.assert_allclose(shifts[1], 2 * shifts[0], atol=1e-5)
     size = np.bincount(edit.source, minlength=N)

@@ -35,10 +35,11 @@ from numpy.typing import NDArray
 
 from ...errors import TrainingError
 from ...splats.fields import Array, DoubleArray
-from ...splats.optical_depth import finite_rows, opacity_names, optical_depth, raw_of_optical_depth
+from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical_depth
 from ...splats.quaternions import rotations
 from ...splats.shapes import Shape
-from .edit import DensifyEdit
+from .edit import DensifyEdit, NewValues
+from .table import SplatTable, smallest
 
 # 3DGS's constants.
 MIN_OPACITY = 0.005  # fainter splats are pruned
@@ -50,7 +51,7 @@ Indices = NDArray[np.int64]
 
 
 def plan_adc(
-    arrays: Mapping[str, Array],
+    splats: SplatTable,
     shape: Shape,
     stats: Array,
     rng: np.random.Generator,
@@ -71,7 +72,7 @@ def plan_adc(
 
     Parameters
     ----------
-    arrays : all public arrays of the model.
+    splats : the splats before the densification.
     stats : (3, N) densification statistics (SplatStatistics): sums of the screen and the depth gradient, and counts.
     rng : generator; three normals are drawn for each half.
     cap : largest number of splats after growth. A larger number of splats is kept.
@@ -87,59 +88,58 @@ def plan_adc(
     ------
     TrainingError : no splat is finite.
     """
-    sound = finite_rows(arrays)
+    summary = splats.summary()
+    sound = summary.finite
     if len(sound) and not sound.any():
         raise TrainingError("no splat has finite parameters any more: lower the learning rates")
-    with np.errstate(over="ignore"):
-        size = np.exp(arrays["log_scale"].astype(np.float64).max(axis=1))
-    strength = shape.strength(arrays)
-    bright = sound & (strength >= MIN_OPACITY)
+    log_size = summary.log_size.astype(np.float64)
+    bright = summary.raw_opacity >= shape.raw_opacity(np.array(MIN_OPACITY))  # this is False for a NaN
     by_axis = depth_threshold > 0
-    limit = WORLD_SIZE * extent if prune_large else math.inf
-    keep = bright & (size <= limit)
-    splittable = bright & (size / (1.0 if by_axis else SPLIT_SHRINK) <= limit)
+    limit = _log(WORLD_SIZE * extent) if prune_large else math.inf
+    keep = bright & (log_size <= limit)
+    splittable = bright & (log_size - (0.0 if by_axis else math.log(SPLIT_SHRINK)) <= limit)
     if not keep.any():
         keep = sound
 
     score = _score(stats, grad_threshold, depth_threshold, extent)
-    splits = (score > 1.0) & splittable & (by_axis | (size > dense_size * extent))
+    splits = (score > 1.0) & splittable & (by_axis | (log_size > _log(dense_size * extent)))
     clones = (score > 1.0) & keep & bright & ~splits
     if turnover and len(keep) <= cap:
         growth = np.count_nonzero(splits | clones) + np.count_nonzero(splits & ~keep)
         missing = int(np.count_nonzero(keep) + growth - cap)
-        faint = _faintest(strength, keep, min(missing, int(turnover * cap)))
-        keep, splits, clones = keep & ~faint, splits & ~faint, clones & ~faint
+        among = np.flatnonzero(keep)
+        faint = among[smallest(summary.raw_opacity[among], min(missing, int(turnover * cap)))]
+        for rows in (keep, splits, clones):
+            rows[faint] = False
     split, clone = _best(score, splits, clones, keep, cap)
-    stay = np.flatnonzero(keep & ~np.isin(np.arange(len(keep)), split))
-    parents = np.concatenate([split, split])
-    source = np.concatenate([stay, clone, parents])
+    stays = keep.copy()
+    stays[split] = False
+    stay = np.flatnonzero(stays)
+    source = np.concatenate([stay, clone, split, split])
 
-    halved = {name: array[parents] for name, array in arrays.items()}
-    changed = _halves_along_axis(halved, shape) if by_axis else _drawn_halves(halved, shape, rng)
-    values = {}
-    for name, halves in changed.items():
-        values[name] = arrays[name][source]
-        values[name][len(stay) + len(clone) :] = halves
+    parents = {name: np.concatenate([array, array]) for name, array in splats.take(split).items()}
+    changed = _halves_along_axis(parents, shape) if by_axis else _drawn_halves(parents, shape, rng)
+    halves = np.arange(len(stay) + len(clone), len(source))
+    values = {name: NewValues(halves, array) for name, array in changed.items()}
     fresh = np.arange(len(source)) >= len(stay)
     return DensifyEdit(
         source, values, fresh, state_source=source, added=len(clone) + 2 * len(split), removed=len(keep) - len(stay)
     )
 
 
-def with_reset(edit: DensifyEdit, arrays: Mapping[str, Array], shape: Shape) -> DensifyEdit:
+def with_reset(edit: DensifyEdit, splats: SplatTable, shape: Shape) -> DensifyEdit:
     """Return the edit with 3DGS's opacity reset.
 
     The reset limits |opacity| to RESET_OPACITY and sets the optimizer state of the opacity to zero.
     """
-    names = opacity_names(arrays)
-    after = {name: edit.values.get(name, arrays[name][edit.source]) for name in names}
-    low = {
-        name: raw_of_optical_depth(
-            shape, np.minimum(optical_depth(shape, after[name]), -math.log1p(-RESET_OPACITY)), after[name]
-        )
-        for name in names
-    }
-    return replace(edit, values=edit.values | low, reset_fields=edit.reset_fields + names)
+    names, rows = opacity_names(shape.schema(0)), np.arange(len(edit.source))
+    values = dict(edit.values)
+    for name in names:
+        raw = edit.after(name, splats.field(name))
+        low = raw_of_optical_depth(shape, np.float64(-math.log1p(-RESET_OPACITY)), raw)
+        above = np.abs(raw) > np.abs(low) if shape.signed else raw > low
+        values[name] = NewValues(rows, np.where(above, low, raw))
+    return replace(edit, values=values, reset_fields=edit.reset_fields + names)
 
 
 def _score(stats: Array, grad_threshold: float, depth_threshold: float, extent: float) -> DoubleArray:
@@ -152,23 +152,22 @@ def _score(stats: Array, grad_threshold: float, depth_threshold: float, extent: 
     return np.where(np.isfinite(score), score, 0.0)
 
 
+def _log(length: float) -> np.float64:
+    """Return the logarithm of a length; that of 0 is -inf."""
+    with np.errstate(divide="ignore"):
+        return np.float64(np.log(length))
+
+
 def _best(
     score: DoubleArray, splits: NDArray[np.bool_], clones: NDArray[np.bool_], keep: NDArray[np.bool_], cap: int
 ) -> tuple[Indices, Indices]:
     """Return the rows to split and the rows to clone that the cap has room for, in rising order."""
     rows = np.flatnonzero(splits | clones)
-    rows = rows[np.argsort(-score[rows], kind="stable")]
-    cost = np.cumsum(np.where(keep[rows], 1, 2))  # a split saves a splat that would be pruned for its size
-    rows = np.sort(rows[cost <= cap - np.count_nonzero(keep)])
+    cost, room = np.where(keep[rows], 1, 2), cap - np.count_nonzero(keep)  # a split saves a splat of a pruned size
+    if cost.sum() > room:
+        order = np.argsort(-score[rows], kind="stable")
+        rows = np.sort(rows[order[np.cumsum(cost[order]) <= room]])
     return rows[splits[rows]], rows[clones[rows]]
-
-
-def _faintest(strength: Array, among: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
-    """Return which splats have the `count` smallest strengths among some, (N,). The first of equal ones count."""
-    rows = np.flatnonzero(among)
-    chosen = np.zeros(len(among), np.bool_)
-    chosen[rows[np.argsort(strength[rows], kind="stable")[: max(count, 0)]]] = True
-    return chosen
 
 
 def _drawn_halves(parents: Mapping[str, Array], shape: Shape, rng: np.random.Generator) -> dict[str, Array]:

@@ -12,8 +12,9 @@ from ..config import TrainConfig
 from ..methods.sns import learning_groups
 from ..optim.noise import noise_amount, noise_reach
 from ..optim.optimizer import Optimizer
-from ..programs import optim_program
+from ..programs import columns_program, optim_program
 from ..schedules import RunSchedule
+from .on_device import DeviceSplats
 from .strategy import StepInfo, next_edit
 
 
@@ -30,6 +31,7 @@ class DensityControl:
     def __init__(
         self,
         config: TrainConfig,
+        kernels: KernelBuild,
         schedule: RunSchedule,
         splats: SplatBuffers,
         optimizer: Optimizer,
@@ -39,6 +41,7 @@ class DensityControl:
     ) -> None:
         self.config, self.schedule, self.splats, self.optimizer = config, schedule, splats, optimizer
         self.statistics, self.rng, self.extent = statistics, rng, extent
+        self.table = DeviceSplats(splats, columns_program(splats.device, kernels))
 
     def is_due(self, iteration: int) -> bool:
         """Whether the strategy densifies after this iteration."""
@@ -54,13 +57,13 @@ class DensityControl:
         """
         info = StepInfo(iteration, self.schedule.densify_last, self.schedule.growth, self.extent)
         self.optimizer.settle()
-        arrays, statistics = self.splats.download(self.splats.n), self.statistics.read(self.splats.n)
+        statistics = self.statistics.read(self.splats.n)
         if self.splats.n and not statistics[SplatStatistics.TIMES_SEEN].any():
             raise TrainingError(
                 f"iteration {iteration}: no image shows any splat (transparent, or outside of all images): "
                 "check the start (init) and the learning rates"
             )
-        edit = next_edit(self.config, arrays, statistics, self.rng, info)
+        edit = next_edit(self.config, self.table, statistics, self.rng, info)
         self.optimizer.apply(self.optimizer.arranged(edit))
         self.statistics.reset()
 

@@ -25,11 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, TrainingError
+from ...splats import profiles
 from ...splats.fields import Array, DoubleArray
-from ...splats.optical_depth import finite_rows, opacity_names, optical_depth, raw_of_optical_depth
+from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical_depth
 from ...splats.shapes import Shape
 from ..methods import sss
-from .edit import DensifyEdit
+from .edit import DensifyEdit, NewValues
+from .table import SplatTable, smallest
 
 # 3DGS-MCMC's constants.
 MIN_OPACITY = 0.005  # splats with at most this opacity are dead: they are relocated
@@ -49,7 +51,7 @@ _CHUNK = 2048  # number of splats that are integrated at once, to limit the memo
 
 
 def plan_relocation(
-    arrays: Mapping[str, Array],
+    splats: SplatTable,
     shape: Shape,
     rng: np.random.Generator,
     cap: int,
@@ -69,7 +71,7 @@ def plan_relocation(
 
     Parameters
     ----------
-    arrays : all public arrays of the model.
+    splats : the splats before the densification.
     rng : generator; one number is drawn for each copy.
     cap : largest number of splats after growth. A larger number of splats is kept.
     growth : new count over old count, at least 1.
@@ -94,22 +96,22 @@ def plan_relocation(
         raise InputError(
             f"growth {growth} must be at least 1, min_opacity {min_opacity} between 0 and 1, limit {limit} 0 to 1"
         )
-    n = len(arrays["mean"])
-    sound = finite_rows(arrays)
+    summary = splats.summary()
+    sound = summary.finite
+    n = len(sound)
     if n and not sound.any():
         raise TrainingError("no splat has finite parameters any more: lower the learning rates")
-    names = opacity_names(arrays)
-    strength = np.where(sound, shape.strength(arrays), 0.0)
+    strength = np.where(sound, shape.opacity(summary.raw_opacity.astype(np.float64)), 0.0)
     alive = strength > min_opacity
     n_new = max(n, min(cap, math.ceil(growth * n - 1e-6)))  # 1.05 * 100 is a little above 105 in binary
     replacing = turnover > 0 and n_new == n
     if replacing:
-        alive[np.argsort(strength, kind="stable")[: int(turnover * n)]] = False
+        alive[smallest(strength, int(turnover * n))] = False
     donors, dead = np.flatnonzero(alive), np.flatnonzero(sound & ~alive)
     if not len(donors):
         donors, dead, n_new = np.flatnonzero(sound), dead[:0], n
-    weakest = np.argsort(strength[dead], kind="stable")[: int(limit * n)]
-    moving = np.sort(np.concatenate([np.flatnonzero(~sound), dead[weakest]]))
+    weakest = dead[smallest(strength[dead], int(limit * n))]
+    moving = np.sort(np.concatenate([np.flatnonzero(~sound), weakest]))
 
     demand = strength if gradient is None or not replacing else np.where(np.isfinite(gradient), gradient, 0.0)
     weights = demand[donors] if demand[donors].any() else np.ones(len(donors))
@@ -120,18 +122,15 @@ def plan_relocation(
 
     copies = np.bincount(drawn, minlength=n)
     targets = np.flatnonzero(copies)
-    raw, factor = relocation(
-        shape, {name: array[targets] for name, array in arrays.items()}, copies[targets] + 1, min_opacity
-    )
-    values = {}
-    for name in names:
-        values[name] = arrays[name].copy()
-        values[name][targets] = raw[name]
-        values[name] = values[name][source]
+    stacked = splats.take(targets)
+    raw, factor = relocation(shape, stacked, copies[targets] + 1, min_opacity)
+    new: dict[str, Array] = {**raw}
     if RULES[rule]:
-        log_scale = arrays["log_scale"].copy()
-        log_scale[targets] += (RULES[rule] * np.log(factor))[:, None].astype(log_scale.dtype)
-        values["log_scale"] = log_scale[source]
+        log_scale = stacked["log_scale"]
+        new["log_scale"] = log_scale + (RULES[rule] * np.log(factor))[:, None].astype(log_scale.dtype)
+    rows = np.concatenate([targets, moving, np.arange(n, n_new)])  # the targets and their copies
+    of_target = np.concatenate([np.arange(len(targets)), np.searchsorted(targets, drawn)])
+    values = {name: NewValues(rows, array[of_target]) for name, array in new.items()}
 
     fresh = np.zeros(n_new, np.bool_)
     fresh[:n] = (copies > 0) | ~sound
@@ -177,7 +176,7 @@ def _length_factor(
     count: NDArray[np.integer],
 ) -> DoubleArray:
     """Return the integral of one splat divided by the integral of the stack; opacities are (N, S)."""
-    z, weight = _nodes()
+    z, weight = _nodes(shape.profile in profiles.EVEN, shape.profile in profiles.SHORT)
     profile = shape.profile(z, arrays)  # (N, S, K)
     one = np.einsum("nsk,ns,k->n", profile, opacity, weight)
     alpha = np.minimum(np.einsum("nsk,ns->nk", profile, new_opacity), 1.0)
@@ -187,14 +186,22 @@ def _length_factor(
     return np.where(count > 1, factor, 1.0)
 
 
-@lru_cache(maxsize=1)
-def _nodes() -> tuple[DoubleArray, DoubleArray]:
-    """Return the nodes and weights of integrals over a line, (2 _NODES,) each, symmetric about 0."""
+@lru_cache
+def _nodes(even: bool, short: bool) -> tuple[DoubleArray, DoubleArray]:
+    """Return the nodes and weights of integrals over a line, (K,) each.
+
+    even : the integrand is even, so that nodes above 0 are enough. short : it is 0 beyond `profiles.REACH`.
+    """
     u = (np.arange(_NODES) + 0.5) / _NODES
     reach = math.asinh(_FARTHEST / _KNEE)
     z = _KNEE * np.sinh(reach * u**3)
     weight = _KNEE * np.cosh(reach * u**3) * reach * 3.0 * u**2 / _NODES
-    nodes, weights = np.concatenate([-z[::-1], z]), np.concatenate([weight[::-1], weight])
+    if short:
+        z, weight = z[z <= profiles.REACH], weight[z <= profiles.REACH]
+    if even:
+        nodes, weights = z, 2.0 * weight
+    else:
+        nodes, weights = np.concatenate([-z[::-1], z]), np.concatenate([weight[::-1], weight])
     for array in (nodes, weights):
         array.setflags(write=False)
     return nodes, weights
@@ -205,7 +212,10 @@ def _draw(weights: DoubleArray, count: int, rng: np.random.Generator) -> NDArray
     if count == 0:
         return np.zeros(0, np.int64)
     cumulative = np.cumsum(weights)
-    drawn = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
+    places = rng.random(count) * cumulative[-1]
+    order = np.argsort(places)  # a search in rising order reads the memory in order
+    drawn = np.empty(count, np.int64)
+    drawn[order] = np.searchsorted(cumulative, places[order], side="right")
     last = np.flatnonzero(weights)[-1]  # random() * total may round up to the total
-    indices: NDArray[np.int64] = np.minimum(drawn, last).astype(np.int64)
+    indices: NDArray[np.int64] = np.minimum(drawn, last)
     return indices

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,7 @@ from ..options.density import Adc, Mcmc
 from .adc import plan_adc, with_reset
 from .edit import DensifyEdit
 from .relocation import plan_relocation
+from .table import SplatTable
 
 # Minimum number of iterations between opacity resets. The learning rate of opacities is the same in short runs, so
 # opacities always need this time to recover.
@@ -40,13 +40,13 @@ class StepInfo:
 
 
 def next_edit(
-    config: TrainConfig, arrays: Mapping[str, Array], stats: Array, rng: np.random.Generator, info: StepInfo
+    config: TrainConfig, splats: SplatTable, stats: Array, rng: np.random.Generator, info: StepInfo
 ) -> DensifyEdit:
     """Return the edit of one densification.
 
     Parameters
     ----------
-    arrays : all public arrays of the model.
+    splats : the splats before the densification.
     stats : (3, N) densification statistics since the last densification (SplatStatistics).
     rng : generator of the run, the only source of randomness.
 
@@ -59,7 +59,7 @@ def next_edit(
         # The length factor needs a profile with peak 1. Other normalisations change the peak with the view.
         scaled = config.normalisation == "peak" or not shape.normalised
         return plan_relocation(
-            arrays,
+            splats,
             shape,
             rng,
             config.cap_max,
@@ -71,7 +71,7 @@ def next_edit(
         )
     every = reset_interval(density, config.iterations)
     grown = plan_adc(
-        arrays,
+        splats,
         shape,
         stats,
         rng,
@@ -83,7 +83,7 @@ def next_edit(
         turnover=density.turnover,
         prune_large=0 < every < info.iteration,
     )
-    return with_reset(grown, arrays, shape) if resets(density, config.iterations, info) else grown
+    return with_reset(grown, splats, shape) if resets(density, config.iterations, info) else grown
 
 
 def reset_interval(density: Adc, iterations: int) -> int:

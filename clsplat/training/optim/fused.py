@@ -13,8 +13,9 @@ from ...device.program import GROUP_ITEMS, Program, lane_group
 from ...rendering.build import KernelBuild
 from ...rendering.splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers
 from ...splats.fields import Array, Group, Schema, sh_coefficients
+from ..columns import Columns
 from ..density.edit import DensifyEdit
-from ..programs import PARTS, optim_program
+from ..programs import PARTS, columns_program, optim_program
 from .adam import BETA1, BETA2
 from .rules import Rules, StepCounts, check_state
 from .sghmc import STREAM, Sghmc
@@ -63,6 +64,7 @@ class FusedOptimizer:
         self.device, self.kernels, self.splats, self.rules = device, kernels, splats, rules
         self.program: Program = optim_program(device, kernels)
         self._group = lane_group(device)
+        self.columns = Columns(device, columns_program(device, kernels), splats.capacity, splats.dtype)
         self.steps = 0
         schema, dtype = splats.schema, splats.dtype
         # Moments have the size of the splat buffers, so one spare buffer serves all. The rows of the skew are not used.
@@ -113,13 +115,14 @@ class FusedOptimizer:
 
     def apply(self, edit: DensifyEdit) -> None:
         splats, n_old, n_new = self.splats, self.splats.n, len(edit.source)
-        source = self._indices(edit.source)
+        source = self.columns.indices(edit.source)
         fresh = edit.fresh.copy()
         state_source = None
         if edit.state_source is None:
             fresh[n_old:] = True  # columns above the old count may hold an older state
         else:
-            state_source = self._indices(edit.state_source)
+            same = edit.state_source is edit.source
+            state_source = source if same else self.columns.indices(edit.state_source)
         fresh_buffer = self.device.alloc(n_new)
         to_device(self.device, fresh_buffer, fresh.astype(np.uint8))
         for group in Group:
@@ -132,11 +135,11 @@ class FusedOptimizer:
                     moments.buffers[group], self.spare[group] = self._gather(
                         moments.buffers[group], state_source, self.spare[group], n_new, rows
                     )
-                self._zero(moments.buffers[group], fresh_buffer, n_new, rows)
+                self.columns.zero(moments.buffers[group], fresh_buffer, n_new, rows)
         for state in self._other_state():
             if state_source is not None:
                 self._gather_rows(state, state_source, n_new)
-            self._zero(state.buffer, fresh_buffer, n_new, state.width)
+            self.columns.zero(state.buffer, fresh_buffer, n_new, state.width)
         splats.n = n_new
         self._set_values(edit, source)
         self._reset_fields(edit.reset_fields)
@@ -258,17 +261,37 @@ class FusedOptimizer:
 
     def _set_values(self, edit: DensifyEdit, source: Any) -> None:
         """Write the new values of the edit, and the trainable skew that belongs to them."""
+        followers = self._followers(edit, source)
+        schema = self.splats.schema
+        for name, new in edit.values.items():
+            field, target = schema[name], self.columns.indices(new.rows)
+            values = new.values.reshape(len(new.rows), field.width)
+            self.columns.put(self.splats.buffers[field.group], target, values, schema.offset(name))
+        if self.skew is not None and followers is not None:
+            rows, before = followers
+            s = self.columns.take(self.skew.s.buffer, rows, len(before["quat"]), 0, self.skew.s.width)
+            s = self.skew.map.follow(s, before, self._skew_and_quat(rows, len(s)))
+            self.columns.put(self.skew.s.buffer, rows, s, 0)
+
+    def _followers(self, edit: DensifyEdit, source: Any) -> tuple[Any, dict[str, Array]] | None:
+        """Move the trainable skew. Return the rows with a new skew or rotation, and both before they change."""
         if self.skew is None:
-            self.splats.upload(edit.values)
-            return
-        n, names = self.splats.n, ("skew", "quat")
-        self._gather_rows(self.skew.s, source, n)
-        if not any(name in edit.values for name in names):
-            self.splats.upload(edit.values)
-            return
-        before = self.splats.download(n, names)
-        self.splats.upload(edit.values)
-        self.skew.s.set(self.skew.map.follow(self.skew.s.get(n), before, self.splats.download(n, names)))
+            return None
+        self._gather_rows(self.skew.s, source, self.splats.n)
+        rows = [edit.values[name].rows for name in ("skew", "quat") if name in edit.values]
+        if not rows:
+            return None
+        changed = np.unique(np.concatenate(rows))
+        target = self.columns.indices(changed)
+        return target, self._skew_and_quat(target, len(changed))
+
+    def _skew_and_quat(self, rows: Any, n: int) -> dict[str, Array]:
+        """Return the skew and the quaternion of n splats."""
+        schema = self.splats.schema
+        return {
+            name: self.columns.take(self.splats.geom, rows, n, schema.offset(name), schema[name].width)
+            for name in ("skew", "quat")
+        }
 
     def _reset_fields(self, names: tuple[str, ...]) -> None:
         n, schema = self.splats.n, self.splats.schema
@@ -280,38 +303,13 @@ class FusedOptimizer:
         if self.momentum is not None and "mean" in names:
             self.momentum.set(np.zeros((0, 3)))
 
-    def _indices(self, source: NDArray[np.int64]) -> Any:
-        buffer = self.device.alloc(4 * len(source))
-        to_device(self.device, buffer, source.astype(np.int32))
-        return buffer
-
     def _gather(self, values: Any, source: Any, spare: Any, n: int, rows: int) -> tuple[Any, Any]:
         """Return the gathered buffer, and the other one, which is now the spare."""
-        self.program.gather_columns.over(
-            n,
-            GROUP_ITEMS,
-            rows,
-            values=values,
-            source=source,
-            moved=spare,
-            capacity=self.splats.capacity,
-            n=n,
-        )
+        self.columns.gather(values, source, spare, n, rows)
         return spare, values
 
     def _gather_rows(self, rows: StateRows, source: Any, n: int) -> None:
         rows.buffer, rows.spare = self._gather(rows.buffer, source, rows.spare, n, rows.width)
-
-    def _zero(self, values: Any, fresh: Any, n: int, rows: int) -> None:
-        self.program.zero_columns.over(
-            n,
-            GROUP_ITEMS,
-            rows,
-            values=values,
-            fresh=fresh,
-            capacity=self.splats.capacity,
-            n=n,
-        )
 
 
 def bias_corrections(steps: int) -> dict[str, float]:

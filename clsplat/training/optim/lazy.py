@@ -83,10 +83,8 @@ class Drifts:
 
 def in_morton_order(edit: DensifyEdit, splats: SplatBuffers) -> DensifyEdit:
     """Return the edit with its rows along a Morton curve, so that splats that are visible together share vectors."""
-    mean = edit.values.get("mean")
-    if mean is None:
-        mean = splats.download(splats.n, ("mean",))["mean"][edit.source]
-    return edit.permuted(morton_order(mean), splats.n)
+    mean = splats.download(splats.n, ("mean",))["mean"]
+    return edit.permuted(morton_order(edit.after("mean", mean)), splats.n)
 
 
 class VisibleOptimizer(FusedOptimizer):
