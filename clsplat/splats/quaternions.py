@@ -19,7 +19,11 @@ def rotations(quat: Array) -> Array:
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+    matrices: Array = np.empty((len(quat), 3, 3), quat.dtype)
+    for i, row in enumerate(rows):
+        for j, column in enumerate(row):
+            matrices[:, i, j] = column
+    return matrices
 
 
 def from_smallest_three(others: NDArray[np.float64], largest: NDArray[np.integer]) -> NDArray[np.float64]:

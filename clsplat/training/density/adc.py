@@ -143,13 +143,20 @@ def with_reset(edit: DensifyEdit, splats: SplatTable, shape: Shape) -> DensifyEd
 
 
 def _score(stats: Array, grad_threshold: float, depth_threshold: float, extent: float) -> DoubleArray:
-    """Return the larger of both mean gradients over their thresholds, (N,); 0 if it is not finite."""
-    seen = np.maximum(stats[2].astype(np.float64), 1.0)
-    tiny = np.finfo(np.float64).tiny
-    score: DoubleArray = stats[0] / seen / max(grad_threshold, tiny)
+    """Return the larger of both mean gradients over their thresholds, (N,); 0 if it is small or not finite."""
+    least = np.maximum(stats[2], 1.0)
+    loud = stats[0] > 0.5 * grad_threshold * least
     if depth_threshold > 0:
-        score = np.fmax(score, stats[1] * extent / seen / depth_threshold)
-    return np.where(np.isfinite(score), score, 0.0)
+        loud |= stats[1] * extent > 0.5 * depth_threshold * least
+    rows = np.flatnonzero(loud)  # only these can exceed a threshold: few, so they may be in double precision
+    screen, depth, seen = stats[:, rows]
+    seen = np.maximum(seen.astype(np.float64), 1.0)
+    ratio: DoubleArray = screen / seen / max(grad_threshold, np.finfo(np.float64).tiny)
+    if depth_threshold > 0:
+        ratio = np.fmax(ratio, depth * extent / seen / depth_threshold)
+    score = np.zeros(len(loud))
+    score[rows] = np.where(np.isfinite(ratio), ratio, 0.0)
+    return score
 
 
 def _log(length: float) -> np.float64:
@@ -201,10 +208,16 @@ def _halves_along_axis(parents: Mapping[str, Array], shape: Shape) -> dict[str, 
 def _placed(
     parents: Mapping[str, Array], shape: Shape, shift: DoubleArray, changed: dict[str, Array]
 ) -> dict[str, Array]:
-    """Return `changed` with the means. Centroids move by `shift`, in the parents' deviations along their axes."""
+    """Return `changed` with the means. Centroids move by `shift`, in the parents' deviations along their axes.
+
+    The rows of `parents` are all parents twice.
+    """
     old, new = (np.exp(of["log_scale"].astype(np.float64)) for of in (parents, changed))
     step = old * (shift + _centroid(parents, shape)) - new * _centroid({**parents, **changed}, shape)
-    step = np.einsum("nij,nj->ni", rotations(parents["quat"].astype(np.float64)), step)
+    turn = rotations(
+        parents["quat"][: len(step) // 2].astype(np.float64)
+    )  # both halves have the rotation of the parent
+    step = np.einsum("nij,hnj->hni", turn, step.reshape(2, -1, 3)).reshape(-1, 3)
     return changed | {"mean": parents["mean"] + step}
 
 
