@@ -160,7 +160,7 @@ class SplatStatistics:
         if not self._capacity:
             return np.zeros((self.ROWS, n), self.dtype)
         rows = np.empty((self.ROWS, self._capacity), self.dtype)
-        return np.ascontiguousarray(to_host(self.device, self._rows.buffer, rows)[:, :n])
+        return to_host(self.device, self._rows.buffer, rows)[:, :n]
 
     def write(self, statistics: Array, capacity: int) -> None:
         """Continue from statistics (3, n)."""

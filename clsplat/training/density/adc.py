@@ -121,7 +121,8 @@ def plan_adc(
     changed = _halves_along_axis(parents, shape) if by_axis else _drawn_halves(parents, shape, rng)
     halves = np.arange(len(stay) + len(clone), len(source))
     values = {name: NewValues(halves, array) for name, array in changed.items()}
-    fresh = np.arange(len(source)) >= len(stay)
+    fresh = np.zeros(len(source), np.bool_)
+    fresh[len(stay) :] = True
     return DensifyEdit(
         source, values, fresh, state_source=source, added=len(clone) + 2 * len(split), removed=len(keep) - len(stay)
     )
@@ -214,9 +215,7 @@ def _placed(
     """
     old, new = (np.exp(of["log_scale"].astype(np.float64)) for of in (parents, changed))
     step = old * (shift + _centroid(parents, shape)) - new * _centroid({**parents, **changed}, shape)
-    turn = rotations(
-        parents["quat"][: len(step) // 2].astype(np.float64)
-    )  # both halves have the rotation of the parent
+    turn = rotations(parents["quat"][: len(step) // 2].astype(np.float64))
     step = np.einsum("nij,hnj->hni", turn, step.reshape(2, -1, 3)).reshape(-1, 3)
     return changed | {"mean": parents["mean"] + step}
 

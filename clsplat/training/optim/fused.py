@@ -124,7 +124,7 @@ class FusedOptimizer:
             same = edit.state_source is edit.source
             state_source = source if same else self.columns.indices(edit.state_source)
         fresh_buffer = self.device.alloc(n_new)
-        to_device(self.device, fresh_buffer, fresh.astype(np.uint8))
+        to_device(self.device, fresh_buffer, fresh.view(np.uint8))
         for group in Group:
             rows = splats.schema.rows(group)
             splats.buffers[group], self.spare[group] = self._gather(
