@@ -16,6 +16,7 @@ from ..evaluation.perceptual import Lpips
 from ..files.lock import folder_lock
 from ..scenes.scene import Scene
 from ..training.config import TrainConfig
+from ..training.presets import PRESETS
 from ..training.log import Progress
 from .measure import train_and_measure_in
 from .protocol import BenchmarkScene, find_scenes
@@ -82,7 +83,8 @@ def run_benchmark(
         try:
             for scene, configs in planned:
                 loaded: Scene | None = None
-                for number, (label, config) in enumerate(configs, 1):
+                for number, (method, config) in enumerate(configs, 1):
+                    label = method.label
                     done = runs.find(_identity(chosen, scene), label, config)
                     if done is not None and (metric is None or done["failed"] or done.get("lpips") is not None):
                         continue
@@ -95,7 +97,7 @@ def run_benchmark(
                         "system": label,
                         "config": config.to_json(),
                         "repeat": 0,
-                        "differences": [*scene.differences, *_differences(chosen, scene, config)],
+                        "differences": [*scene.differences, *_differences(chosen, scene, method, config)],
                     }
                     model = place / MODELS / f"{scene.scene.name}-{run.stem}-{_key_digest(record)}"
                     record |= train_and_measure_in(model, loaded, config, open_device(config.device), metric, progress)
@@ -113,10 +115,13 @@ def _runs(
     caps: Sequence[int],
     seeds: Sequence[int],
     options: Mapping[str, Any],
-) -> list[tuple[str, TrainConfig]]:
-    """Return the label and the config of each run on a scene. Methods are innermost, as in `compare`."""
+) -> list[tuple[Method, TrainConfig]]:
+    """Return the method and the config of each run on a scene. Methods are innermost, as in `compare`.
+
+    Presets learn from images at full size in the whole run, as their publications do.
+    """
     return [
-        (method.label, method.config(cap, seed, options))
+        (method, method.config(cap, seed, {"coarse_to_fine": False, **options} if method.base in PRESETS else options))
         for cap in caps or [scene.scene.splats]
         for seed in seeds
         for method in methods
@@ -128,13 +133,15 @@ def _identity(chosen: BenchmarkSet, scene: BenchmarkScene) -> dict[str, Any]:
     return {**scene.identity, "set": chosen.name, "images": scene.images, "resolution": scene.resolution}
 
 
-def _differences(chosen: BenchmarkSet, scene: BenchmarkScene, config: TrainConfig) -> list[str]:
+def _differences(chosen: BenchmarkSet, scene: BenchmarkScene, method: Method, config: TrainConfig) -> list[str]:
     """Return how a run differs from the protocol of its set, in a few words each."""
     found = []
     if config.iterations != chosen.iterations:
         found.append(f"not the published length ({chosen.iterations} iterations)")
     if tuple(config.background) != chosen.background:
         found.append("not the published background")
+    if method.base in PRESETS and config.schedule.coarse_to_fine:
+        found.append("small images in the first half of the run")
     if chosen.counted and config.cap_max < scene.scene.splats:
         found.append(f"at most {config.cap_max} splats, not {scene.scene.splats}")
     return found

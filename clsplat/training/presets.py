@@ -1,7 +1,8 @@
 """Presets: the published systems as options of `TrainConfig`, each constant with its source.
 
 A preset sets the kernel, the optimizer, the strategy and the published constants. It does not set the cap, the number
-of iterations or the image schedule, which are equal for all systems of a comparison. Published learning rates and the
+of iterations or the image schedule, which are equal for all systems of a comparison. `clsplat benchmark` alone trains
+presets on images at full size from the first iteration, as published. Published learning rates and the
 defaults belong to runs of 30 000 iterations (`TrainConfig.rate_factor`). Times within a run are fractions of the
 published run length. "Code" means the constants of the authors' release. They replace those of the paper, because the
 published results come from the release.
@@ -84,6 +85,8 @@ def _gaussian_splatting() -> Values:
     The scene extent multiplies the position rate. Colour bands above the constant have a twentieth of the colour rate.
     Regularisers and noise are off. The first opacity is 0.1, the first scale the distance to three neighbours.
     A splat densifies if its mean gradient is above 2e-4: it is cloned below 0.01 of the extent, and split above.
+
+    Not included: the opacity reset at iteration 500 over a white background.
     """
     return {"shape": "gaussian"} | _ADAM | _RATES | _CLONE_AND_SPLIT
 

@@ -78,12 +78,28 @@ def test_the_protocol_is_the_default(capture_folder: Path, tmp_path: Path, monke
         raise KeyboardInterrupt
 
     monkeypatch.setattr("clsplat.benchmark.run.train_and_measure_in", stop)
-    for common in ({}, {"iterations": 7, "background": BLACK}):
+    wanted: list[tuple[str, dict[str, Any]]] = [
+        ("default", {}),
+        ("default", {"iterations": 7, "background": BLACK}),
+        ("3dgs", {}),
+        ("3dgs", {"coarse_to_fine": True}),
+        ("3dgs:coarse_to_fine=true", {}),
+    ]
+    for methods, common in wanted:
         with pytest.raises(KeyboardInterrupt):
-            run_benchmark("nerf-synthetic", scene, output=tmp_path / "out", common=common)
-    first, second = configs
+            run_benchmark("nerf-synthetic", scene, methods, tmp_path / "out", common=common)
+    first, second, *presets = configs
     assert (first.iterations, first.background, first.cap_max) == (30_000, WHITE, 325_000)
     assert (second.iterations, second.background, second.cap_max) == (7, BLACK, 325_000)
+    assert first.schedule.coarse_to_fine
+    assert [config.schedule.coarse_to_fine for config in presets] == [False, True, True], "presets learn at full size"
+
+
+def test_a_preset_that_learns_from_small_images_is_not_as_published(tanks: Path, tmp_path: Path) -> None:
+    small = "small images in the first half of the run"
+    methods = "3dgs,3dgs:coarse_to_fine=true,default"
+    records = run_benchmark("tanks", tanks / "truck", methods, tmp_path, caps=[CAP], common=SHORT)
+    assert [small in record["differences"] for record in records] == [False, True, False]
 
 
 def test_finished_runs_are_read(tanks: Path, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
