@@ -1,7 +1,7 @@
 """Host time of one densification, by strategy and shape; a JSON line a run.
 
     python benchmarks/densify.py [--device 0:0] [--splats 1000000] [--shapes gaussian skew-normal] [--repeats 5]
-    python benchmarks/densify.py --table             # print the finished runs, run nothing
+    python benchmarks/densify.py --table [--write]   # print the finished runs, run nothing; write the table into GPU.md
     python benchmarks/densify.py --smoke --out FILE
 
 The splats, their opacities and their gradients are random. About one in twenty is cloned or split, relocated or added.
@@ -37,6 +37,7 @@ KEY = ("action", "shape", "splats", "platform", "commit")
 EXTENT = 5.0
 LOUD = 0.05  # share of the splats with a gradient above the threshold
 ROOM = 1.1  # capacity over number of splats
+_BEGIN, _END = "<!-- table of densify.py -->", "<!-- end of the table of densify.py -->"
 
 # Options of the run, and the iteration of the action.
 ACTIONS: dict[str, tuple[dict[str, Any], int]] = {
@@ -55,13 +56,17 @@ def main() -> None:
     parser.add_argument("--shapes", nargs="+", default=["gaussian", "skew-normal"])
     parser.add_argument("--actions", nargs="+", default=list(ACTIONS), choices=list(ACTIONS))
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--write", action="store_true", help="write the table into GPU.md")
     args = parser.parse_args()
     if args.smoke:
         args.splats, args.repeats = [2000], 1
     runs = common.Runs(args.out, KEY)
     if not args.table:
         measure_all(runs, args)
-    print(table(runs.rows))
+    text = table(runs.rows)
+    print(text)
+    if args.write:
+        common.write_between(common.ROOT / "benchmarks" / "GPU.md", _BEGIN, _END, text)
 
 
 def measure_all(runs: common.Runs, args: argparse.Namespace) -> None:
@@ -144,11 +149,9 @@ def random_splats(shape: Shape, n: int, sh_degree: int) -> tuple[dict[str, np.nd
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the results as a Markdown table."""
     columns = {"action": "action", "shape": "shape", "splats": "splats"}
-    columns |= {"host_ms": "host ms", "device_ms": "device ms", "wall_ms": "wall ms"}
-    columns |= {"read_mb": "read MB", "written_mb": "written MB", "device": "device", "commit": "commit"}
-    return common.table(
-        list(columns.values()), ([row[name] for name in columns] for row in rows), set(list(columns.values())[2:8])
-    )
+    columns |= {"host_ms": "host ms", "read_mb": "read MB", "written_mb": "written MB", "commit": "commit"}
+    cells = ([f"{row[name]:.1f}" if isinstance(row[name], float) else row[name] for name in columns] for row in rows)
+    return common.table(list(columns.values()), cells, set(list(columns.values())[2:-1]))
 
 
 if __name__ == "__main__":

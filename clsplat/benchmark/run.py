@@ -16,8 +16,8 @@ from ..evaluation.perceptual import Lpips
 from ..files.lock import folder_lock
 from ..scenes.scene import Scene
 from ..training.config import TrainConfig
-from ..training.presets import PRESETS
 from ..training.log import Progress
+from ..training.presets import PRESETS
 from .measure import train_and_measure_in
 from .protocol import BenchmarkScene, find_scenes
 from .results import files_of_results, write_results

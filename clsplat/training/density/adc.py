@@ -145,10 +145,10 @@ def with_reset(edit: DensifyEdit, splats: SplatTable, shape: Shape) -> DensifyEd
 
 def _score(stats: Array, grad_threshold: float, depth_threshold: float, extent: float) -> DoubleArray:
     """Return the larger of both mean gradients over their thresholds, (N,); 0 if it is small or not finite."""
-    least = np.maximum(stats[2], 1.0)
-    loud = stats[0] > 0.5 * grad_threshold * least
+    times = np.maximum(stats[2], 1.0)
+    loud = stats[0] > 0.5 * grad_threshold * times
     if depth_threshold > 0:
-        loud |= stats[1] * extent > 0.5 * depth_threshold * least
+        loud |= stats[1] * extent > 0.5 * depth_threshold * times
     rows = np.flatnonzero(loud)  # only these can exceed a threshold: few, so they may be in double precision
     screen, depth, seen = stats[:, rows]
     seen = np.maximum(seen.astype(np.float64), 1.0)
