@@ -5,7 +5,7 @@
     python benchmarks/gpu_model.py --measure      # render the frames whose work is counted, and store the counts
 
 The model is clsplat/profiling/gpu_model.py. A workload is a frame that was rendered on a processor: its splats, isects
-and useful pairs, the isects that its tiles look at, and the rows of its tiles that splats reach.
+and useful pairs, the isects that its tiles look at, and the strips of its tiles that splats reach.
 """
 
 from __future__ import annotations
@@ -15,22 +15,26 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import common
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.cameras.camera import Camera
 from clsplat.device.device import open_device
 from clsplat.device.memory import to_host
 from clsplat.device.opencl import Buffer
-from clsplat.device.schedule import SCHEDULES, TILE
+from clsplat.device.schedule import SCHEDULES
 from clsplat.profiling.bench import bench_trainer
 from clsplat.profiling.gpu_counts import Shares, counts_of
 from clsplat.profiling.gpu_model import Predicted, fastest_schedule, predict, total_ms
 from clsplat.profiling.gpus import GPUS, Gpu
 from clsplat.profiling.stages import Sizes
-from clsplat.rendering.build import BATCH, CULLED_KEY, RECORD_HEAD, KernelBuild
+from clsplat.rendering.build import BATCH, CULLED_KEY, KernelBuild
 from clsplat.rendering.overdraw import count_pairs
+from clsplat.rendering.pipeline import Pipeline
+from clsplat.rendering.splat_buffers import SplatBuffers
 from clsplat.scenes.random_scene import synthetic_scene
 from clsplat.training.trainer import Trainer
 
@@ -136,21 +140,31 @@ def frame_work(trainer: Trainer, scene: str) -> Workload:
     last = np.zeros(layout.n_tiles, np.int64)
     np.maximum.at(last, tile, np.where(blocks[order] != 0, place + 1, 0))
     looked = place < -(-last[tile] // BATCH) * BATCH
-    records = array(frame.projected.records, (n, trainer.kernels.record), np.float32)
-    splat = array(lists.isect_splat, n_isects, np.uint32)[ids[order]]
-    row = tile // layout.tiles_x * TILE
-    top = np.maximum(records[splat, RECORD_HEAD.index("top")] - row, 0)
-    bottom = np.minimum(records[splat, RECORD_HEAD.index("bottom")] - row, TILE - 1)
+    seen = np.zeros(n_isects, bool)
+    seen[ids[order]] = looked
 
-    def reached(rows: int) -> float:
-        share = (bottom // rows - top // rows + 1) * rows / TILE
-        return float(share[looked].mean())
+    def reached(schedule: str) -> float:
+        """Return the share of a tile's strips that a splat reaches, of the isects that are looked at."""
+        form = SCHEDULES[schedule]
+        strips = isect_strips(Pipeline(trainer.device, replace(trainer.kernels, schedule=form)), splats, camera)
+        if len(strips) == n_isects:  # else a box has rounded to another pixel: the isects have other numbers
+            strips = strips[seen]
+        return round(float(np.bitwise_count(strips).mean()) / form.vecs, 3)
 
     keys = array(frame.projected.depth_key, n, np.uint32)
     sizes = Sizes(n, n_isects, layout.width * layout.height, count_pairs(pipeline, frame), frame.sh_degree)
-    shares = Shares(round(float(looked.mean()), 3), round(reached(2), 3), round(reached(4), 3))
+    shares = Shares(round(float(looked.mean()), 3), *(reached(name) for name in ("gpu256", "gpu32", "gpu64")))
     visible = int((keys != CULLED_KEY).sum())
     return Workload(scene, trainer.kernels.shape, layout.width, layout.height, visible, sizes, shares)
+
+
+def isect_strips(pipeline: Pipeline, splats: SplatBuffers, camera: Camera) -> NDArray[np.uint32]:
+    """Return the set of strips of each isect of an image. Nothing is drawn: groups are slow on a processor."""
+    with mock.patch.object(pipeline, "_rasterize"):
+        frame = pipeline.forward(splats, camera)
+    ((_, lists),) = pipeline.bands(frame)
+    assert lists.strips is not None
+    return to_host(pipeline.device, lists.strips, np.empty(frame.n_isects, np.uint32))
 
 
 def tables(workloads: list[Workload]) -> Iterator[str]:
@@ -165,6 +179,7 @@ def tables(workloads: list[Workload]) -> Iterator[str]:
             "isects",
             "useful pairs a pixel",
             "looked at",
+            "tiles",
             "2 rows",
             "4 rows",
         ),
@@ -177,7 +192,10 @@ def tables(workloads: list[Workload]) -> Iterator[str]:
                 one.visible,
                 one.sizes.isects,
                 f"{one.sizes.pairs / one.sizes.pixels:.0f}",
-                *(f"{share:.0%}" for share in (one.shares.looked, one.shares.rows2, one.shares.rows4)),
+                *(
+                    f"{share:.0%}"
+                    for share in (one.shares.looked, one.shares.tiles, one.shares.rows2, one.shares.rows4)
+                ),
             )
             for one in workloads
         ),

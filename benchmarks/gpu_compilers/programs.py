@@ -41,12 +41,12 @@ def programs() -> dict[str, str]:
             for name in GPU_SCHEDULES:
                 KernelBuild(shape, _SH_DEGREE, SCHEDULES[name]).pixel_program(device)
                 texts[f"pixels {shape} {name}"] = built.pop()
+            group_binning_program(device, KernelBuild(shape, _SH_DEGREE, SCHEDULES["gpu32"]), SCAN_GROUP)
+            texts[f"bin {shape}"] = built.pop()
         loss_program(device, KernelBuild(SHAPES[0], _SH_DEGREE, gpu))
         texts["loss"] = built.pop()
         sort_program(device, SCAN_GROUP)
         texts["sort"] = built.pop()
-        group_binning_program(device, SCAN_GROUP)
-        texts["bin"] = built.pop()
     return texts
 
 

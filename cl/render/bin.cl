@@ -63,7 +63,8 @@ kernel void total_tiles(
 
 // Overwrites lists [n_isects], the numbers of the isects by tile from front to back, splat_isects, isect_splat and the
 // tile_ranges of the band: the result of emit_isects, a sort by tile and find_tile_ranges. It changes the counts of the
-// band's tiles to places in `lists`.
+// band's tiles to places in `lists`. CULLS_STRIPS: overwrites isect_blocks, too, with the strips that the splat reaches
+// (strips.clh).
 kernel void list_isects(
     global const uint *restrict order,
     global const uint *restrict n_visible,
@@ -74,6 +75,10 @@ kernel void list_isects(
     global uint2 *restrict splat_isects,
     global uint *restrict isect_splat,
     global uint *restrict lists,
+#if CULLS_STRIPS
+    global const real *restrict records,
+    global uint *restrict isect_blocks,
+#endif
     uint cells,
     int first_tile,
     int end_tile,
@@ -94,10 +99,17 @@ kernel void list_isects(
     for (uint rank = start; rank < end; ++rank) {
         const uint i = order[rank], first = at;
         const ushort4 rect = ranked_rect[rank];
+#if CULLS_STRIPS
+        real rec[RECORD];
+        read_splat(records, i, rec);
+#endif
         const int end_y = min((int)rect.w, end_row);
         for (int y = max((int)rect.y, first_row); y < end_y; ++y) {
             const int row = y * tiles_x, end_x = min((int)rect.z, end_tile - row);
             for (int x = max((int)rect.x, first_tile - row); x < end_x; ++x, ++at) {
+#if CULLS_STRIPS
+                isect_blocks[at] = strips_reached(rec, x * TILE, y * TILE);
+#endif
                 lists[place[row + x]++] = at;
                 isect_splat[at] = i;
             }

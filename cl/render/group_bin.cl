@@ -55,7 +55,8 @@ kernel void scan_isects(global uint *restrict block_counts, global ulong *restri
 }
 
 // Overwrites splat_isects [n], by splat, with the first isect and the end; and for each isect [n_isects] isect_tile, the key
-// of the sort, and isect_splat. block_starts [groups]: what scan_isects wrote.
+// of the sort, and isect_splat. CULLS_STRIPS: isect_blocks, too, with the strips that the splat reaches (strips.clh).
+// block_starts [groups]: what scan_isects wrote.
 SCAN_ATTRIBUTE
 kernel void emit_isects(
     global const uint *restrict order,
@@ -64,6 +65,10 @@ kernel void emit_isects(
     global uint2 *restrict splat_isects,
     global uint *restrict isect_tile,
     global uint *restrict isect_splat,
+#if CULLS_STRIPS
+    global const real *restrict records,
+    global uint *restrict isect_blocks,
+#endif
     uint n_splats,
     int first_tile,
     int end_tile,
@@ -76,10 +81,17 @@ kernel void emit_isects(
     for (ulong rank = first_rank; rank < first_rank + RUN && rank < n_splats; ++rank) {
         const uint i = order[rank], start = at;
         const int4 rect = tile_rect[i];
+#if CULLS_STRIPS
+        real rec[RECORD];
+        read_splat(records, i, rec);
+#endif
         const int end_y = min(rect.w, end_row_of(end_tile, tiles_x));
         for (int y = max(rect.y, first_row_of(first_tile, tiles_x)); y < end_y; ++y) {
             const int row = y * tiles_x, end_x = min(rect.z, end_tile - row);
             for (int x = max(rect.x, first_tile - row); x < end_x; ++x, ++at) {
+#if CULLS_STRIPS
+                isect_blocks[at] = strips_reached(rec, x * TILE, y * TILE);
+#endif
                 isect_tile[at] = (uint)(row + x);
                 isect_splat[at] = i;
             }

@@ -52,7 +52,8 @@ static inline void alpha_pass(
 }
 
 // Overwrites color [3 planes], transmittance [plane] with the final T, and depth [plane] with the sum of weight * z.
-// Overwrites isect_blocks [n_isects], by unsorted isect id, with the set of blocks in which the isect was blended.
+// isect_blocks [n_isects], by unsorted isect id: CULLS_BLOCKS overwrites it with the set of blocks in which the isect was
+// blended; CULLS_STRIPS reads the set of strips that its splat reaches (strips.clh).
 GROUP_ATTRIBUTE
 kernel void rasterize(
     global const uint2 *restrict tile_ranges,
@@ -66,6 +67,9 @@ kernel void rasterize(
 #endif
 #if CULLS_BLOCKS
     global uint *restrict isect_blocks,
+#endif
+#if CULLS_STRIPS
+    global const uint *restrict isect_blocks,
 #endif
     int width,
     int height,
@@ -102,7 +106,7 @@ kernel void rasterize(
 #else
         if (!group_any(any_live(T), scratch)) break;
 #endif
-        stage_batch(lists, isect_splat, records, start, n, batch);
+        stage_records(start, n);
 #if CULLS_BLOCKS  // for the whole batch first: the processor then knows early which blocks come next
         block_set reached[BATCH];
         for (int k = 0; k < n; ++k) {
@@ -113,12 +117,16 @@ kernel void rasterize(
         }
 #endif
         for (int k = 0; k < n; ++k) {
+#if CULLS_STRIPS
+            const block_set blocks = strips[k];
+            if (!blocks) continue;  // uniform over the group
+#endif
             real rec[RECORD];
             read_record(batch_record(k), rec);
 #if CULLS_BLOCKS
-            block_set blocks = reached[k];
-#else
-            block_set blocks = blocks_reached(rec, tile_x, tile_y);
+            const block_set blocks = reached[k];
+#elif !CULLS_STRIPS
+            const block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
             const bool plain = shape_is_plain(rec + HEAD);
             vreal alphas[VECS];
@@ -158,6 +166,10 @@ kernel void rasterize(
     }
 }
 
+static inline void zero_grads(global real *grads) {
+    for (int j = 0; j < V_RECORD; ++j) grads[j] = 0;
+}
+
 // Repeats the blending from front to back. With w_j = alpha_j T_j and g_j = c_j . v_color, the gradient of alpha_i is
 //   T_i g_i - (sum_{j>i} w_j g_j + T_final (background . v_color - v_alpha)) / (1 - alpha_i).
 // `rest` holds the sum in the brackets. Overwrites isect_grads [n_isects, V_RECORD], by unsorted isect id: moments of the
@@ -175,6 +187,9 @@ kernel void rasterize_vjp(
     global const real *restrict v_alpha,
 #endif
 #if CULLS_BLOCKS
+    global const uint *restrict isect_blocks,
+#endif
+#if CULLS_STRIPS
     global const uint *restrict isect_blocks,
 #endif
     global real *restrict isect_grads,
@@ -210,20 +225,27 @@ kernel void rasterize_vjp(
         const int n = min((int)(range.y - start), BATCH);
         finished = finished || !group_any(any_live(T), scratch);
         if (finished) {  // uniform over the group
-            for (int k = LID; k < n; k += GROUP)
-                for (int j = 0; j < V_RECORD; ++j) isect_grads[(ulong)lists[start + k] * V_RECORD + j] = 0;
+            for (int k = LID; k < n; k += GROUP) zero_grads(isect_grads + (ulong)lists[start + k] * V_RECORD);
             continue;
         }
-        stage_batch(lists, isect_splat, records, start, n, batch);
+        stage_records(start, n);
+#if CULLS_STRIPS
+        for (int k = LID; k < n; k += GROUP)
+            if (!strips[k]) zero_grads(isect_grads + (ulong)lists[start + k] * V_RECORD);
+#endif
         for (int k = 0; k < n; ++k) {
+#if CULLS_STRIPS
+            const block_set blocks = strips[k];
+            if (!blocks) continue;  // uniform over the group
+#endif
             real rec[RECORD];
             read_record(batch_record(k), rec);
             vreal sums[V_RECORD];
             UNROLL for (int j = 0; j < V_RECORD; ++j) sums[j] = (vreal)0;
 #if CULLS_BLOCKS
-            block_set blocks = isect_blocks[lists[start + k]];
-#else
-            block_set blocks = blocks_reached(rec, tile_x, tile_y);
+            const block_set blocks = isect_blocks[lists[start + k]];
+#elif !CULLS_STRIPS
+            const block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
             const bool plain = shape_is_plain(rec + HEAD);
             vreal alphas[VECS];

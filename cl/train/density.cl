@@ -20,8 +20,8 @@ kernel void summarise_splats(
     if (i >= n) return;
     real zero = zero_if_finite(geom, GEOM_ROWS, capacity, i) + zero_if_finite(sh, SH_ROWS, capacity, i);
     real farthest = 0, size = geom[ROW_LOG_SCALE * capacity + i];
-    for (uint c = 0; c < 3; ++c) farthest = fmax(farthest, fabs(geom[(ROW_MEAN + c) * capacity + i]));
-    for (uint c = 1; c < 3; ++c) size = fmax(size, geom[(ROW_LOG_SCALE + c) * capacity + i]);
+    for (uint c = 0; c < 3; ++c) farthest = max(farthest, fabs(geom[(ROW_MEAN + c) * capacity + i]));
+    for (uint c = 1; c < 3; ++c) size = max(size, geom[(ROW_LOG_SCALE + c) * capacity + i]);
     real opacity = geom[ROW_OPACITY_LOGIT * capacity + i];
 #ifdef ROW_OPACITY_MINUS_LOGIT
     const real other = geom[ROW_OPACITY_MINUS_LOGIT * capacity + i];
@@ -29,9 +29,9 @@ kernel void summarise_splats(
     const real other = opacity;
 #endif
 #if OPACITY_SIGNED
-    opacity = fmax(fabs(opacity), fabs(other));
+    opacity = max(fabs(opacity), fabs(other));
 #else
-    opacity = fmax(opacity, other);
+    opacity = max(opacity, other);
 #endif
     const bool sound = zero == 0 && farthest <= MAX_COORDINATE;
     summary[i] = sound ? size : (real)NAN;

@@ -25,6 +25,9 @@ _JOB = 20  # instructions of one such job
 _RECORD_READS = 11  # reads of a record by a warp; longer records are read 16 bytes at once
 _ROWS, _ROWS_VJP = 295, 193  # instructions of image_loss and image_loss_vjp for a pixel of a row and channel
 _WINDOW_ROWS = 10  # rows that a work-item of the loss reads besides its own
+_SKIPPED = 6  # instructions of an isect whose tile the splat does not reach
+_EMIT, _STRIP = 27, 56  # instructions of emit_isects for an isect, and for each of its strips
+_EMIT_SKEWED, _STRIP_SKEWED = 45, 87
 _PER_FLOP = 1.1  # instructions of a pixel for each operation; for shapes that the compilers were not asked about
 
 
@@ -34,22 +37,23 @@ class PixelLoop:
 
     Attributes
     ----------
-    single : with one block of pixels, which is not tested.
+    single : with one block of pixels, if the splat reaches it.
     isect : with several blocks, besides the blocks.
-    block : a block that the splat's rows reach.
+    block : a block that the splat reaches.
     """
 
     single: float
     isect: float
     block: float
 
-    def of(self, vecs: int, reached: float) -> float:
-        """Return the instructions with `vecs` blocks, if this share of them is reached."""
-        return self.single if vecs == 1 else self.isect + self.block * vecs * reached
+    def of(self, vecs: int, tiles: float, reached: float) -> float:
+        """Return the mean instructions with `vecs` blocks, if a tile and a block are reached in these shares."""
+        isect = tiles * self.single if vecs == 1 else tiles * self.isect + self.block * vecs * reached
+        return isect + (1 - tiles) * _SKIPPED
 
 
-FORWARD = {"gaussian": PixelLoop(39, 21, 32), "skew-normal": PixelLoop(96, 12, 70.5)}
-BACKWARD = {"gaussian": PixelLoop(189, 127, 57.5), "skew-normal": PixelLoop(266, 102, 119)}
+FORWARD = {"gaussian": PixelLoop(43.25, 18, 31.25), "skew-normal": PixelLoop(100, 1, 72)}
+BACKWARD = {"gaussian": PixelLoop(200, 117, 54.75), "skew-normal": PixelLoop(270, 114, 113)}
 
 
 @dataclass(frozen=True)
@@ -61,17 +65,19 @@ class Shares:
     Attributes
     ----------
     looked : isects that a tile looks at before all of its pixels are finished, of all.
-    rows2, rows4 : blocks of 2 and of 4 rows of a tile that the rows of a splat reach, of all.
+    tiles : of these isects, those whose splat reaches its tile.
+    rows2, rows4 : strips of 2 and of 4 rows of a tile that a splat reaches, of all.
     """
 
     looked: float = 1.0
-    rows2: float = 0.53
-    rows4: float = 0.6
+    tiles: float = 0.9
+    rows2: float = 0.4
+    rows4: float = 0.5
 
     def reached(self, schedule: Schedule) -> float:
         """Return the share of a work-item's blocks that it computes."""
         rows = WARP // 16 if schedule.group == WARP else schedule.group // 16
-        return {2: self.rows2, 4: self.rows4}.get(rows, 1.0)
+        return {2: self.rows2, 4: self.rows4}.get(rows, self.tiles)
 
 
 @dataclass(frozen=True)
@@ -107,19 +113,23 @@ def counts_of(
     work = work_of(kernels, sizes, is_cpu=False)
     forward, backward = loops_of(kernels.shape)
     looked, group = shares.looked * sizes.isects, schedule.group
-    warps, reached = group / WARP, shares.reached(schedule)
+    warps, tiles, reached = group / WARP, shares.tiles, shares.reached(schedule)
     jobs, sum_reads = sum_work(kernels.v_record, group)
     last_sum = 2 * parts_of(group)  # instructions of the sum over the parts: the first warp alone runs them
-    gradient = backward.of(schedule.vecs, reached) - last_sum * (1 - 1 / warps) + _JOB * jobs / warps
+    sums = _JOB * jobs / warps - last_sum * (1 - 1 / warps)
+    gradient = backward.of(schedule.vecs, tiles, reached) + tiles * sums
     reads = warps * _RECORD_READS
+    skewed = shape_named(kernels.shape).skew_form is not None
+    emit, strip = (_EMIT_SKEWED, _STRIP_SKEWED) if skewed else (_EMIT, _STRIP)
     instructions = {
-        "rasterize": looked * group * forward.of(schedule.vecs, reached),
+        "binning": sizes.isects * (emit + strip * schedule.vecs),
+        "rasterize": looked * group * forward.of(schedule.vecs, tiles, reached),
         "rasterize_vjp": looked * group * gradient,
         "loss": 3 * sizes.pixels * _halo(sizes.pixels, units) * (_ROWS + _ROWS_VJP),
     }
     local = {
-        "rasterize": looked * reads * 4 * WARP,
-        "rasterize_vjp": looked * (reads + sum_reads) * 4 * WARP,
+        "rasterize": looked * tiles * reads * 4 * WARP,
+        "rasterize_vjp": looked * tiles * (reads + sum_reads) * 4 * WARP,
     }
     waits = {"transfers": 1}
     return {

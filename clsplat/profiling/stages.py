@@ -104,8 +104,8 @@ def work_of(kernels: KernelBuild, sizes: Sizes, is_cpu: bool) -> dict[str, Work]
         listing = {
             # In each pass keys are read twice, values once except in the first pass, and both are written.
             "depth sort": Work(n * (20 * depth_passes - 4)),
-            # Order and boxes read twice, the range of each splat; two words of each isect written.
-            "binning": Work(48 * n + 8 * isects),
+            # Order and boxes read twice, the record and the range of each splat; three words of each isect written.
+            "binning": Work((48 + 4 * kernels.record) * n + 12 * isects),
             "tile sort": Work(20 * tile_passes * isects + 8 * tiles),
         }
     return listing | {

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device.memory import Pool
-from ..device.program import Define, build
+from ..device.program import Define
 from ..errors import FEWER_SPLATS, OTHER_DEVICE, DeviceError
-from .build import CULLED_KEY
+from .build import CULLED_KEY, KernelBuild
 from .frame import Band, ProjectedSplats, TileLists
 
 MAX_ISECTS = 2**31 - 1  # of a band: ids have 32 bits
@@ -87,11 +87,11 @@ class _Image:
 
 
 class ChunkBinner:
-    """The binner for CPUs (cl/render/order.cl, cl/render/bin.cl)."""
+    """The binner for CPUs (cl/render/order.cl, cl/render/bin.cl). kernels : the build that draws the isects."""
 
-    def __init__(self, pool: Pool) -> None:
-        self.units = max(pool.device.info.compute_units, 1)
-        self.program = build(pool.device, CHUNK_FILES, ORDER_DEFINES)
+    def __init__(self, pool: Pool, kernels: KernelBuild) -> None:
+        self.units, self.kernels = max(pool.device.info.compute_units, 1), kernels
+        self.program = kernels.binning_program(pool.device, CHUNK_FILES, ORDER_DEFINES)
         # Order by depth.
         self._span, self._bucket_counts = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 1 << BUCKET_BITS)
         self._bucket_starts, self._n_visible = pool.buffer(np.uint32), pool.buffer(np.uint32)
@@ -102,7 +102,7 @@ class ChunkBinner:
         self._tile_totals = pool.buffer(np.uint32)
         # Lists.
         self._ranges, self._splat_isects = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 2)
-        self._isects, self._isect_splat = pool.buffer(np.uint32), pool.buffer(np.uint32)
+        self._isects, self._isect_splat, self._isect_strips = (pool.buffer(np.uint32) for _ in range(3))
         self._splats: ProjectedSplats
         self._image: _Image
         self._isects_before: NDArray[np.int64] | None = None  # each tile of the image
@@ -192,6 +192,7 @@ class ChunkBinner:
             isects=self._isects.reserve(band.n_isects),
             isect_splat=self._isect_splat.reserve(band.n_isects),
             splat_isects=self._splat_isects.buffer,
+            strips=self._isect_strips.reserve(band.n_isects) if self.kernels.culls_strips else None,
         )
         self.program.list_isects.over(
             image.chunks,
@@ -205,6 +206,7 @@ class ChunkBinner:
             splat_isects=lists.splat_isects,
             isect_splat=lists.isect_splat,
             lists=lists.isects,
+            **({"records": self._splats.records, "isect_blocks": lists.strips} if lists.strips is not None else {}),
             cells=image.cells,
             first_tile=band.first,
             end_tile=band.end,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -36,6 +37,7 @@ _BELOW_SHAPE = (
     "camera/pinhole.clh",
     "render/blend.clh",
     "shape/contract.clh",
+    "shape/rectangle.clh",
 )
 _PROJECTION = ("render/antialias.clh", "render/project.cl")
 _PIXELS = ("render/batch.clh", "render/blocks.clh", "render/rasterize.cl")
@@ -88,6 +90,11 @@ class KernelBuild:
         return self.schedule.group == 1 and self.schedule.lanes > 1
 
     @property
+    def culls_strips(self) -> bool:
+        """Whether a group of work-items leaves out strips of a tile (cl/render/strips.clh)."""
+        return self.schedule.group > 1 and self.schedule.lanes == 1
+
+    @property
     def lanes(self) -> int:
         return self.schedule.lanes
 
@@ -103,6 +110,13 @@ class KernelBuild:
         """Rasterisation and its gradient. All SH degrees share one program, because colours are projected before."""
         return replace(self, sh_degree=0)._shape_program(device, *_PIXELS)
 
+    def binning_program(self, device: Device, files: tuple[str, ...], defines: Mapping[str, Define]) -> Program:
+        """A program that lists isects, with the strips that each reaches if `culls_strips`."""
+        if not self.culls_strips:
+            return build(device, files, {"CULLS_STRIPS": 0, **defines})
+        flat = replace(self, sh_degree=0, with_depth=False, with_v_alpha=False)
+        return flat._shape_program(device, "render/strips.clh", *files, more=defines)
+
     def count_program(self, device: Device) -> Program:
         """Count of the useful pairs of a frame (rendering/overdraw.py)."""
         return self._shape_program(device, "measure/count.cl")
@@ -111,10 +125,11 @@ class KernelBuild:
         """The same build with depth and with a gradient through alpha."""
         return replace(self, with_depth=True, with_v_alpha=True)
 
-    def _shape_program(self, device: Device, *files: str) -> Program:
-        """Program of these files above those of the shape."""
+    def _shape_program(self, device: Device, *files: str, more: Mapping[str, Define] | None = None) -> Program:
+        """Program of these files above those of the shape, with more defines."""
         shape = shape_named(self.shape)
-        return build(device, (*_BELOW_SHAPE, *shape.lower, shape.source, *files), self.defines(), self.real)
+        all_files = (*_BELOW_SHAPE, *shape.lower, shape.source, *files)
+        return build(device, all_files, {**self.defines(), **(more or {})}, self.real)
 
     def defines(self) -> dict[str, Define]:
         """Constants of the kernels, by name."""
@@ -137,6 +152,7 @@ class KernelBuild:
                 "VECS": self.schedule.vecs,
                 "LANES": self.lanes,
                 "CULLS_BLOCKS": int(self.culls_blocks),
+                "CULLS_STRIPS": int(self.culls_strips),
                 "WITH_DEPTH": int(self.with_depth),
                 "WITH_V_ALPHA": int(self.with_v_alpha),
                 "ANTIALIASED": int(self.antialiased),

@@ -170,12 +170,15 @@ class TileLists:
     isects : (isects,) uint32, isect ids by tile, front to back.
     isect_splat : (isects,) uint32, the splat of each isect id.
     splat_isects : (n, 2) uint32, first and end of the isect ids of each splat.
+    strips : (isects,) uint32, the strips of its tile that each isect id reaches, a bit each; None if the build does not
+        cull strips (KernelBuild.culls_strips).
     """
 
     ranges: Buffer
     isects: Buffer
     isect_splat: Buffer
     splat_isects: Buffer
+    strips: Buffer | None = None
 
 
 class Frame:

@@ -7,8 +7,9 @@ import numpy as np
 from ..device.device import Device
 from ..device.memory import Pool
 from ..device.opencl import Buffer
-from ..device.program import Program, build
+from ..device.program import Program
 from .binning import Binner, ChunkBinner
+from .build import KernelBuild
 from .frame import Band, ProjectedSplats, TileLists
 from .radix_sort import Sorter, SortMemory, sort_group
 
@@ -16,18 +17,18 @@ DEPTH_BITS = 30  # of a depth key above that of the near plane: all depths up to
 _RUN = 4  # splats of a work-item that counts or lists isects
 
 
-def make_binner(pool: Pool, near_plane: float) -> Binner:
+def make_binner(pool: Pool, kernels: KernelBuild) -> Binner:
     """Return the binner for a kind of device. The one for CPUs works with groups of one, too."""
     device = pool.device
     if device.info.type == "CPU" or not sort_group(device):
-        return ChunkBinner(pool)
-    return GroupBinner(pool, near_plane)
+        return ChunkBinner(pool, kernels)
+    return GroupBinner(pool, kernels)
 
 
-def group_binning_program(device: Device, group: int) -> Program:
+def group_binning_program(device: Device, kernels: KernelBuild, group: int) -> Program:
     """Return the program that lists isects by splat, for work-groups of `group` items."""
     files = ("render/scan.clh", "render/band.clh", "render/group_bin.cl")
-    return build(device, files, {"SCAN_GROUP": group, "RUN": _RUN})
+    return kernels.binning_program(device, files, {"SCAN_GROUP": group, "RUN": _RUN})
 
 
 class GroupBinner:
@@ -35,17 +36,17 @@ class GroupBinner:
 
     Parameters
     ----------
-    near_plane : smallest depth of a splat that is seen, in units of the scene.
+    kernels : the build that draws the isects.
     """
 
-    def __init__(self, pool: Pool, near_plane: float) -> None:
-        self.sorter = Sorter(pool)
-        self.group, self.smallest_key = self.sorter.group, int(np.float32(near_plane).view(np.uint32))
-        self.program = group_binning_program(pool.device, self.group)
+    def __init__(self, pool: Pool, kernels: KernelBuild) -> None:
+        self.sorter, self.kernels = Sorter(pool), kernels
+        self.group, self.smallest_key = self.sorter.group, int(np.float32(kernels.near_plane).view(np.uint32))
+        self.program = group_binning_program(pool.device, kernels, self.group)
         self._by_depth, self._by_tile = SortMemory(pool), SortMemory(pool)
         self._blocks, self._n_isects = pool.buffer(np.uint32), pool.buffer(np.uint64)
         self._ranges, self._splat_isects = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 2)
-        self._isect_splat = pool.buffer(np.uint32)
+        self._isect_splat, self._isect_strips = pool.buffer(np.uint32), pool.buffer(np.uint32)
         self._splats: ProjectedSplats
         self._order: Buffer
         self._tiles_x, self._n_tiles = 0, 0
@@ -70,6 +71,7 @@ class GroupBinner:
         ids = self._by_tile.values.reserve(n_isects)
         tiles = self._by_tile.keys.reserve(n_isects)
         splat_isects, isect_splat = self._splat_isects.reserve(splats.capacity), self._isect_splat.reserve(n_isects)
+        strips = self._isect_strips.reserve(n_isects) if self.kernels.culls_strips else None
         self.program.emit_isects(
             (self._n_blocks * self.group,),
             (self.group,),
@@ -79,6 +81,7 @@ class GroupBinner:
             splat_isects=splat_isects,
             isect_tile=tiles,
             isect_splat=isect_splat,
+            **({"records": splats.records, "isect_blocks": strips} if strips is not None else {}),
             n_splats=splats.n,
             first_tile=band.first,
             end_tile=band.end,
@@ -91,7 +94,7 @@ class GroupBinner:
         self.program.find_tile_ranges.over(
             self._n_tiles, sorted_tile=tiles, tile_ranges=ranges, n_isects=n_isects, n_tiles=self._n_tiles
         )
-        return TileLists(ranges, ids, isect_splat, splat_isects)
+        return TileLists(ranges, ids, isect_splat, splat_isects, strips)
 
     @property
     def _n_blocks(self) -> int:

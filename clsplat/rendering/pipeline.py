@@ -57,7 +57,7 @@ class Pipeline:
         self.group = lane_group(device)
         self.pool = pool = Pool(device)
         self.statistics = SplatStatistics(pool, kernels.dtype)
-        self.binner = make_binner(pool, kernels.near_plane)
+        self.binner = make_binner(pool, kernels)
         real = kernels.dtype
         self._camera, self._records = pool.buffer(real), pool.buffer(real, kernels.record)
         self._depth_key, self._tile_rect = pool.buffer(np.uint32), pool.buffer(np.int32, 4)
@@ -152,7 +152,7 @@ class Pipeline:
                 transmittance=frame.images.transmittance.buffer,
                 v_color=v_color,
                 **({} if v_alpha is None else {"v_alpha": v_alpha}),
-                **({"isect_blocks": self.isect_blocks.buffer} if self.kernels.culls_blocks else {}),
+                **self._block_sets(lists),
                 isect_grads=isect_grads,
                 width=layout.width,
                 height=layout.height,
@@ -237,7 +237,17 @@ class Pipeline:
         if frame.n_splats:
             return self.binner.list_isects(band)
         empty = self._no_isects.reserve(0)
-        return TileLists(self._no_ranges.zeros(frame.layout.n_tiles), empty, empty, empty)
+        strips = empty if self.kernels.culls_strips else None
+        return TileLists(self._no_ranges.zeros(frame.layout.n_tiles), empty, empty, empty, strips)
+
+    def _block_sets(self, lists: TileLists, n_isects: int | None = None) -> dict[str, Buffer]:
+        """Return the argument with the block sets of a band. n_isects : their number, if they are to be written."""
+        if lists.strips is not None:
+            return {"isect_blocks": lists.strips}
+        if self.kernels.culls_blocks:
+            sets = self.isect_blocks
+            return {"isect_blocks": sets.buffer if n_isects is None else sets.reserve(n_isects)}
+        return {}
 
     def _rasterize(self, frame: Frame, band: Band, images: RenderedImages, background: Color = BLACK) -> None:
         """Draw the tiles of a band, and those before it."""
@@ -250,7 +260,7 @@ class Pipeline:
             isect_splat=self._lists.isect_splat,
             records=frame.projected.records,
             **images.reserve(layout),
-            **({"isect_blocks": self.isect_blocks.reserve(band.n_isects)} if self.kernels.culls_blocks else {}),
+            **self._block_sets(self._lists, band.n_isects),
             width=layout.width,
             height=layout.height,
             tiles_x=layout.tiles_x,

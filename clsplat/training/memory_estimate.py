@@ -28,6 +28,7 @@ _MIN_ISECTS = 1 << 20  # isects that must fit; images with more are rendered in 
 # Words of a splat on the screen: key, order, two rectangles (6), two pairs (4), range of isects (2), statistics (3),
 # tile counts (4).
 _SCREEN_WORDS = 21
+_DENSIFY_WORDS = 4  # words of a splat while splats are added and removed: its summary (2), its source, new values
 _WAITING_WORDS = 4  # additional words of a splat with `visible_adam`, if a vector has one splat
 _MOST_SPLATS = 1 << 30  # upper end of the search for the number that fits
 
@@ -84,7 +85,7 @@ def estimate(
     real, n = kernels.dtype.itemsize, capacity_for(config.cap_max if splats is None else splats)
     rows = {group: kernels.schema.rows(group) for group in Group}
     screen = (kernels.record + kernels.v_record) * real + 4 * (
-        _SCREEN_WORDS + _WAITING_WORDS * config.optim.visible_adam
+        _SCREEN_WORDS + _DENSIFY_WORDS + _WAITING_WORDS * config.optim.visible_adam
     )
     isect = isect_bytes(kernels)
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n

@@ -117,15 +117,9 @@ class Trainer:
         self.average = ParameterAverage(config, self.schedule.densify_last)
         if checkpoint is not None and checkpoint.config["iterations"] == config.iterations:
             self.average.load_state(checkpoint.average)
+        statistics = self.pipeline.statistics
         self.density = DensityControl(
-            config,
-            self.kernels,
-            self.schedule,
-            self.splats,
-            self.optimizer,
-            self.pipeline.statistics,
-            self.rng,
-            scene.extent,
+            config, self.kernels, self.schedule, self.splats, self.optimizer, statistics, self.rng, scene.extent
         )
         self.clock = RunClock(config, self.schedule, self.views, self.pipeline, self.splats, self.iteration)
         self.running = RunningLoss(len(scene.train))

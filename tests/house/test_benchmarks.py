@@ -73,7 +73,7 @@ def test_gpu_model(tmp_path: Path) -> None:
     assert [row["shape"] for row in rows] == ["gaussian", "skew-normal"]
     for row in rows:
         assert 0 < row["visible"] <= row["sizes"]["splats"] == 500
-        assert 0 < row["shares"]["rows2"] <= row["shares"]["rows4"] <= row["shares"]["looked"] <= 1
+        assert 0 < row["shares"]["rows2"] <= row["shares"]["rows4"] <= row["shares"]["tiles"] <= 1
     assert "| rasterize_vjp |" in said
     assert "skew-normal at most 1.2 times" in said
 

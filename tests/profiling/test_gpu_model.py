@@ -135,11 +135,12 @@ def test_shares_scale_the_raster_stages() -> None:
     def instructions(shares: Shares) -> float:
         return counts_of(GAUSSIAN, SIZES, SCHEDULES["gpu32"], 100, shares)["rasterize"].instructions
 
-    full = instructions(Shares(1.0, 1.0, 1.0))
+    full = instructions(Shares(1.0, 1.0, 1.0, 1.0))
     assert full == SIZES.isects * 32 * (FORWARD["gaussian"].isect + 8 * FORWARD["gaussian"].block)
-    assert instructions(Shares(0.5, 1.0, 1.0)) == full / 2
-    assert instructions(Shares(1.0, 0.5, 1.0)) < full
-    assert instructions(Shares(1.0, 1.0, 0.5)) == full, "gpu32 has blocks of two rows"
+    assert instructions(Shares(0.5, 1.0, 1.0, 1.0)) == full / 2
+    assert instructions(Shares(1.0, 0.5, 1.0, 1.0)) < full
+    assert instructions(Shares(1.0, 1.0, 0.5, 1.0)) < full
+    assert instructions(Shares(1.0, 1.0, 1.0, 0.5)) == full, "gpu32 has blocks of two rows"
 
 
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])

@@ -174,7 +174,8 @@ def test_binning_is_that_of_numpy(device: Device, kind: str, n: int) -> None:
 
 def make_binner(device: Device, kind: str) -> ChunkBinner | GroupBinner:
     """Return the binner of a kind of device; depths start at NEAR."""
-    return ChunkBinner(Pool(device)) if kind == "CPU" else GroupBinner(Pool(device), NEAR)
+    kernels = KernelBuild("gaussian", 0, SCHEDULES["cpu16"], near_plane=NEAR)
+    return ChunkBinner(Pool(device), kernels) if kind == "CPU" else GroupBinner(Pool(device), kernels)
 
 
 def projected(device: Device, keys: NDArray[np.uint32], rect: NDArray[np.int32]) -> ProjectedSplats:

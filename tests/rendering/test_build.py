@@ -21,7 +21,7 @@ from clsplat.rendering.group_binner import group_binning_program
 from clsplat.rendering.radix_sort import sort_program
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.training.optim.skew_map import SKEW_MAPS
-from clsplat.training.programs import exposure_program, lazy_program, loss_program, optim_program
+from clsplat.training.programs import columns_program, exposure_program, lazy_program, loss_program, optim_program
 
 REALS = ("float", "double")
 
@@ -76,8 +76,11 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
     roofline_program(compiler, CHAINS[0])
     build(compiler, ("measure/smoke.cl",))
     sort_program(compiler, 64)
-    group_binning_program(compiler, 64)
-    build(compiler, CHUNK_FILES, ORDER_DEFINES)
+    for name in ("cpu16", "gpu32"):
+        kernels = KernelBuild(DEFAULT_SHAPE, 3, SCHEDULES[name])
+        group_binning_program(compiler, kernels, 64)
+        kernels.binning_program(compiler, CHUNK_FILES, ORDER_DEFINES)
+    columns_program(compiler, kernels)
     there = {
         f"{folder.name}/{file.name}"
         for folder in files("clsplat_cl").iterdir()
@@ -114,5 +117,7 @@ def test_every_kernel_builds_on_every_device(device: Device) -> None:
 @pytest.mark.parametrize("group", [64, 128])
 def test_sort_and_binning_build(device: Device, group: int) -> None:
     sort_program(device, group)
-    group_binning_program(device, group)
-    build(device, CHUNK_FILES, ORDER_DEFINES)
+    for name in ("cpu16", "gpu32"):
+        kernels = KernelBuild(DEFAULT_SHAPE, 3, SCHEDULES[name])
+        group_binning_program(device, kernels, group)
+        kernels.binning_program(device, CHUNK_FILES, ORDER_DEFINES)

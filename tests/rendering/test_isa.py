@@ -69,7 +69,7 @@ def test_an_index_that_is_not_known_is_found(tmp_path: Path) -> None:
     text = programs()[name]
     unrolled = "UNROLL for (int v = 0; v < VECS; ++v)"
     assert text.count(unrolled) == 1
-    walked = text.replace(unrolled, "for (int v = (set).x; v < (set).y; ++v)")
+    walked = text.replace(unrolled, "for (int v = (int)((set) & 1u); v < VECS; ++v)")
     usages = nvidia.NVIDIA.compile(name, walked, "sm_90", tmp_path)
     found = {f"sm_90 | {name} | {kernel}": usage for kernel, usage in usages.items()}
     assert any("rasterize_vjp" in line and "private memory" in line for line in isa.faults(found, STORED))

@@ -23,6 +23,7 @@ from clsplat.device.schedule import SCHEDULES, default_schedule
 from clsplat.errors import DeviceError
 from clsplat.rendering import tuning
 from clsplat.rendering.binning import ChunkBinner
+from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.group_binner import GroupBinner, make_binner
 from clsplat.rendering.radix_sort import Sorter, SortMemory, sort_group
 from clsplat.scenes.scene import Scene
@@ -171,7 +172,7 @@ def test_a_device_without_wide_lanes_works_in_groups_of_one(
     monkeypatch.setattr(tuning, "_MIN_TILES", 4)
     other = pretend(**OTHER, max_group=max_group)
     assert sort_group(other) == 0
-    assert isinstance(make_binner(Pool(other), 0.01), ChunkBinner)
+    assert isinstance(make_binner(Pool(other), KernelBuild("gaussian", 0, SCHEDULES["scalar"])), ChunkBinner)
     schedule = tuning.schedule_for(other)  # its self-test compares an image and its gradients
     assert schedule == SCHEDULES["scalar"]
     kernels = kernel_build(TrainConfig(), schedule)
@@ -182,7 +183,7 @@ def test_a_device_without_wide_lanes_works_in_groups_of_one(
 def test_groups_of_medium_size_sort_in_groups(pretend: Pretend) -> None:
     other = pretend(64, **OTHER, max_group=1024)
     assert sort_group(other) == 64
-    assert isinstance(make_binner(Pool(other), 0.01), GroupBinner)
+    assert isinstance(make_binner(Pool(other), KernelBuild("gaussian", 0, SCHEDULES["scalar"])), GroupBinner)
     pool = Pool(other)
     keys = np.random.default_rng(0).integers(0, 1 << 32, 5000, np.uint32)
     buffer = other.alloc(keys.nbytes)

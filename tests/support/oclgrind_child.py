@@ -22,7 +22,7 @@ from reference.scenes import for_shape, random_camera, random_splats
 from clsplat.device import memory, program
 from clsplat.device.device import Device, open_device
 from clsplat.device.schedule import Schedule
-from clsplat.rendering import binning, frame, pipeline, radix_sort, splat_buffers
+from clsplat.rendering import binning, build, frame, pipeline, radix_sort, splat_buffers
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.splats.splats import Splats
@@ -196,7 +196,7 @@ def sort_and_scan(device: Device, mode: str) -> None:
     keys = rng.choice(rng.integers(0, 2**31, 60, np.uint32), n)
     depth_key, unused = device.alloc(keys.nbytes), device.alloc(4)
     memory.to_device(device, depth_key, keys)
-    binner = binning.ChunkBinner(memory.Pool(device))
+    binner = binning.ChunkBinner(memory.Pool(device), build.KernelBuild("gaussian", 0, Schedule(1, 16, 16)))
     binner.order(frame.ProjectedSplats(n, n, unused, unused, depth_key, unused))
     got = binner.depth_order.read(n)
     assert np.array_equal(got, np.argsort(keys, kind="stable"))
