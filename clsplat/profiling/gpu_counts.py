@@ -70,9 +70,9 @@ class Shares:
     """
 
     looked: float = 1.0
-    tiles: float = 0.9
-    rows2: float = 0.4
-    rows4: float = 0.5
+    tiles: float = 0.93
+    rows2: float = 0.46
+    rows4: float = 0.53
 
     def reached(self, schedule: Schedule) -> float:
         """Return the share of a work-item's blocks that it computes."""
