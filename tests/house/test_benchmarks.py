@@ -78,6 +78,19 @@ def test_gpu_model(tmp_path: Path) -> None:
     assert "skew-normal at most 1.2 times" in said
 
 
+def test_densify(tmp_path: Path) -> None:
+    out = tmp_path / "densify.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "densify.py"), "--smoke", "--out", str(out), "--shapes", "gaussian"]
+    for _ in range(2):
+        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert len({row["action"] for row in rows}) == len(rows) == 6, "each once, also when it is called again"
+    for row in rows:
+        assert row["wall_ms"] == pytest.approx(row["host_ms"] + row["device_ms"], abs=0.1)
+        assert row["read_mb"] < 2000 * 59 * 4 / 1e6, "not all parameters of all splats"
+        assert f"| {row['action']} | gaussian | 2000 |" in said
+
+
 @pytest.mark.slow
 def test_systems(tmp_path: Path, capture_folder: Path) -> None:
     scene = capture_folder
