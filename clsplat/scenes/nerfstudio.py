@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..cameras.path import cam_from_world_of
 from ..cameras.rotations import NearestRotation, NotARotation, nearest_rotation, warn_of_corrections
 from ..errors import InputError
+from ..files.file_names import can_be_file
 from ..files.image_names import IMAGE_SUFFIXES
 from ..files.json_file import read_json, to_real
 from ..files.masks import is_same_file
@@ -37,7 +38,6 @@ from .undistort import Lens, RegisteredImage, make_lens
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _MAX_SIDE = 1 << 20  # largest side of an image [px]
-_MAX_NAME, _MAX_PATH = 240, 2000  # longest names and paths [bytes]; file systems allow 255 and 4096
 _LAST_ROW = 1e-6  # largest error of the last row of a pose
 _MAX_NUMBER = 1e30  # numbers are smaller than this, so that float32 can store them
 _LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists of photos
@@ -121,7 +121,7 @@ class _Frame:
         mask = self.values.get("mask_path")
         if mask is None:
             return None
-        if not isinstance(mask, str) or not mask.isprintable() or not _can_be_name(mask):
+        if not isinstance(mask, str) or not mask.isprintable() or not can_be_file(mask):
             raise InputError(f"{self.place}: mask_path {mask!r} is not the name of a file; name a mask, or remove it")
         file = self.document.path.parent / mask.replace("\\", "/")
         if not file.is_file():
@@ -238,7 +238,7 @@ class _Document:
 
     def photo_file(self, file_path: str, images: str | None = None) -> Path:
         """Return the photo's file; Blender sets omit the suffix. Raises InputError if no file can have the name."""
-        if not _can_be_name(file_path):
+        if not can_be_file(file_path):
             raise InputError(f"{self.path}: {ascii(file_path)[:60]} is not the name of a photo; name a file beside it")
         relative = Path(file_path.replace("\\", "/"))
         if images is not None and not relative.is_absolute():
@@ -288,7 +288,7 @@ class _Document:
         """Return the file's points, or the points of the COLMAP model behind it, or an empty point cloud."""
         folder, ply = self.path.parent, self.values.get("ply_file_path")
         if isinstance(ply, str) and ply:
-            if not ply.isprintable() or not _can_be_name(ply):
+            if not ply.isprintable() or not can_be_file(ply):
                 raise InputError(
                     f"{self.path}: ply_file_path {ply!r} is not the name of a file; name a PLY, or remove it"
                 )
@@ -308,17 +308,6 @@ class _Document:
         if matrix is None or scale is None or not 0 < scale < _MAX_NUMBER:
             raise InputError(f"{self.path}: applied_transform must be 3 x 4 numbers and applied_scale above 0")
         return scale * (xyz @ matrix[:3, :3].T + matrix[:3, 3])
-
-
-def _can_be_name(text: str) -> bool:
-    """Return whether a file can have this path, with a suffix added."""
-    path = PurePosixPath(text.replace("\\", "/"))
-    try:
-        parts = [len(os.fsencode(part)) for part in path.parts]
-        short = max(parts, default=0) <= _MAX_NAME and sum(parts) <= _MAX_PATH
-        return short and bool(path.name) and "\0" not in text
-    except UnicodeEncodeError:  # the text contains half of a surrogate pair
-        return False
 
 
 def _matrix(value: Any) -> NDArray[np.float64] | None:

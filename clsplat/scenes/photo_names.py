@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from ..errors import InputError
+from ..files.file_names import can_be_file
 
 
 def place_photos(folder: Path, stored: Sequence[str]) -> dict[str, tuple[str, Path]]:
@@ -23,8 +24,11 @@ def place_photos(folder: Path, stored: Sequence[str]) -> dict[str, tuple[str, Pa
 
     Raises
     ------
-    InputError : two photos get the same name.
+    InputError : two photos get the same name, or a name that no file can have.
     """
+    for name in stored:
+        if not can_be_file(name):
+            raise InputError(f"{folder}: {ascii(name)[:60]} in the model is not the name of a photo: is it damaged?")
     home = os.path.normpath(folder.absolute())
     files = {name: _file_of(folder, name) for name in stored}
     inside, outside = {}, {}

@@ -123,3 +123,10 @@ def test_a_link_that_leads_to_itself(garden: Path) -> None:
     photo.unlink()
     photo.symlink_to(photo.name)
     assert list(scene_info(garden).left_out) == [NAMES[2]]
+
+
+@pytest.mark.parametrize("name", ["1" * 300 + ".jpg", "a/" * 3000 + "b.jpg", "a\0b.jpg", "a\ud800.jpg"])
+def test_a_name_that_no_file_can_have_is_one_line(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match=r"is not the name of a photo: is it damaged\?") as found:
+        place_photos(tmp_path, ["a.jpg", name])
+    assert len(str(found.value)) < len(str(tmp_path)) + 150

@@ -41,7 +41,7 @@ class DensityControl:
     ) -> None:
         self.config, self.schedule, self.splats, self.optimizer = config, schedule, splats, optimizer
         self.statistics, self.rng, self.extent = statistics, rng, extent
-        self.table = DeviceSplats(splats, columns_program(splats.device, kernels))
+        self.kernels = kernels
 
     def is_due(self, iteration: int) -> bool:
         """Whether the strategy densifies after this iteration."""
@@ -63,7 +63,8 @@ class DensityControl:
                 f"iteration {iteration}: no image shows any splat (transparent, or outside of all images): "
                 "check the start (init) and the learning rates"
             )
-        edit = next_edit(self.config, self.table, statistics, self.rng, info)
+        table = DeviceSplats(self.splats, columns_program(self.splats.device, self.kernels))
+        edit = next_edit(self.config, table, statistics, self.rng, info)
         self.optimizer.apply(self.optimizer.arranged(edit))
         self.statistics.reset()
 
