@@ -33,6 +33,7 @@ from clsplat.training.run import train
 
 KEY = ("scene", "resolution", "cap", "iterations", "system", "seed", "views")
 TRAINING_VIEWS = 20  # training views that are measured, to see how far training and other views are apart
+NO_SMALL_IMAGES = ":coarse_to_fine=false"
 FULL_SIZE = ("lego_full", "fox", "kitchen_large", "south_building_large")  # scenes, in the order of the page
 PAGE = ROOT / "benchmarks" / "SYSTEMS.md"
 BEGIN, END = "<!-- table of defaults.py -->", "<!-- end of the table -->"
@@ -145,9 +146,12 @@ def page(rows: list[dict[str, Any]]) -> str:
 
 
 def full_size(rows: list[dict[str, Any]]) -> str:
-    """Return a Markdown table of the runs at full size on test views. Variants of a system are left out."""
+    """Return a Markdown table of the runs at full size on test views.
+
+    Variants of a system are left out, but for those without small images (NO_SMALL_IMAGES).
+    """
     plain = [r for r in rows if r["views"] == "test" and r["resolution"] == -1 and r["scene"] in FULL_SIZE]
-    plain = [r for r in plain if not set(r["system"]) & {" ", ":"}]
+    plain = [r for r in plain if not set(r["system"].removesuffix(NO_SMALL_IMAGES)) & {" ", ":"}]
     cases = groups(plain, "scene", "cap", "iterations").items()
     lines = []
     for (scene, cap, iterations), case in sorted(cases, key=lambda item: (FULL_SIZE.index(item[0][0]), *item[0][1:])):
