@@ -13,11 +13,12 @@ from reference.skewed import SKEWED
 from rendering.test_footprint import strongly_skewed
 
 from clsplat.device.device import Device
-from clsplat.device.memory import to_host
+from clsplat.device.memory import to_device, to_host
 from clsplat.device.schedule import TILE
 from clsplat.rendering.build import KernelBuild
+from clsplat.rendering.frame import DeviceImage
 from clsplat.rendering.pipeline import Pipeline
-from clsplat.rendering.splat_buffers import SplatBuffers
+from clsplat.rendering.splat_buffers import CompactGradients, SplatBuffers
 from clsplat.splats.shapes import SHAPES, shape_named
 
 WIDTH, HEIGHT = 83, 61
@@ -122,3 +123,31 @@ def test_strips_hold_their_splats_and_little_else(
     most = MOST_STRIPS_SKEWED if shape in SKEWED and shape != "gaussian" else MOST_STRIPS
     assert shows > 80
     assert shows <= looked_at <= most * shows, looked_at / shows
+
+
+@pytest.mark.parametrize("schedule", ["gpu64", "gpu256"])
+def test_an_isect_that_misses_its_tile_has_no_gradient(device: Device, schedule: str) -> None:
+    """Needles miss tiles of their boxes. What an earlier image left in the records of such isects does not count."""
+    kernels = KernelBuild("gaussian", 3, schedule_on(device, schedule))
+    pipeline, missed = Pipeline(device, kernels), 0
+    for seed in range(0, 40, 4):
+        case = one_splat("gaussian", seed, needle=True)
+        buffers = SplatBuffers.of(device, case.splats, kernels.dtype)
+        grads = CompactGradients(device, buffers.schema, 1, kernels.dtype)
+        found = []
+        for left in (0.0, np.nan):
+            frame = pipeline.forward(buffers, case.camera)
+            if not frame.n_isects:
+                continue
+            size = frame.n_isects * kernels.v_record
+            to_device(device, pipeline._isect_grads.reserve(frame.n_isects), np.full(size, left, kernels.dtype))
+            v_color = DeviceImage(pipeline.pool, kernels.dtype, 3).write(frame.layout, np.ones((HEIGHT, WIDTH, 3)))
+            pipeline.backward(frame, v_color, grads)
+            found.append(grads.download(1))
+            ((_, lists),) = pipeline.bands(frame)
+            assert lists.strips is not None
+            missed += (to_host(device, lists.strips, np.empty(frame.n_isects, np.uint32)) == 0).sum()
+        for name, array in found[0].items() if found else ():
+            assert np.isfinite(array).all()
+            np.testing.assert_array_equal(found[1][name], array, err_msg=name)
+    assert missed > 8
