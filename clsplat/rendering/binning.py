@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device.memory import Pool
+from ..device.opencl import Buffer
 from ..device.program import Define
 from ..errors import FEWER_SPLATS, OTHER_DEVICE, DeviceError
 from .build import CULLED_KEY, KernelBuild
@@ -74,6 +75,11 @@ def cut_bands(count: Callable[[int, int], int], tiles_x: int, tiles_y: int, limi
         return halved(first, middle) + halved(middle, end)
 
     return halved(0, tiles_x * tiles_y)
+
+
+def strip_arguments(splats: ProjectedSplats, strips: Buffer | None) -> dict[str, Buffer]:
+    """Return what the kernel that lists isects needs to write their strips; nothing without a buffer for them."""
+    return {} if strips is None else {"records": splats.records, "isect_blocks": strips}
 
 
 @dataclass(frozen=True)
@@ -206,7 +212,7 @@ class ChunkBinner:
             splat_isects=lists.splat_isects,
             isect_splat=lists.isect_splat,
             lists=lists.isects,
-            **({"records": self._splats.records, "isect_blocks": lists.strips} if lists.strips is not None else {}),
+            **strip_arguments(self._splats, lists.strips),
             cells=image.cells,
             first_tile=band.first,
             end_tile=band.end,

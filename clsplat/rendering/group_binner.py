@@ -8,7 +8,7 @@ from ..device.device import Device
 from ..device.memory import Pool
 from ..device.opencl import Buffer
 from ..device.program import Program
-from .binning import Binner, ChunkBinner
+from .binning import Binner, ChunkBinner, strip_arguments
 from .build import KernelBuild
 from .frame import Band, ProjectedSplats, TileLists
 from .radix_sort import Sorter, SortMemory, sort_group
@@ -81,7 +81,7 @@ class GroupBinner:
             splat_isects=splat_isects,
             isect_tile=tiles,
             isect_splat=isect_splat,
-            **({"records": splats.records, "isect_blocks": strips} if strips is not None else {}),
+            **strip_arguments(splats, strips),
             n_splats=splats.n,
             first_tile=band.first,
             end_tile=band.end,

@@ -17,7 +17,7 @@ class Columns:
 
     Parameters
     ----------
-    program : the program of the optimizer.
+    program : programs.columns_program.
     capacity : number of columns of a buffer.
     """
 

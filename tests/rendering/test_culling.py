@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from clsplat.device.device import Device
 from clsplat.device.memory import to_device, to_host
 from clsplat.device.schedule import TILE
 from clsplat.rendering.build import KernelBuild
-from clsplat.rendering.frame import DeviceImage
+from clsplat.rendering.frame import DeviceImage, Frame
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.splat_buffers import CompactGradients, SplatBuffers
 from clsplat.splats.shapes import SHAPES, shape_named
@@ -42,25 +43,29 @@ MOST_STRIPS, MOST_STRIPS_SKEWED = 1.04, 1.25
 
 # One shape for each kind of bound. The other shapes run with -m slow.
 FAMILIES = ("gaussian", "skew-normal", "half-gaussian", "generalised-exponential")
+ONE_OF_A_FAMILY = [shape if shape in FAMILIES else pytest.param(shape, marks=pytest.mark.slow) for shape in SHAPES]
+
+
+def drawn(pipeline: Pipeline) -> Iterator[tuple[Case, Frame, list[int]]]:
+    """Draw single splats. Yield those that the image may show, each with its frame and its rectangle of tiles."""
+    for seed in range(40):
+        case = one_splat(pipeline.kernels.shape, seed, needle=seed % 4 == 0)
+        frame = pipeline.forward(SplatBuffers.of(pipeline.device, case.splats, pipeline.kernels.dtype), case.camera)
+        if frame.n_isects:
+            rect = to_host(pipeline.device, frame.projected.tile_rect, np.empty(4, np.int32)).tolist()
+            yield case, frame, rect
 
 
 @pytest.mark.parametrize("schedule", ["cpu16", pytest.param("cpu8", marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "shape", [shape if shape in FAMILIES else pytest.param(shape, marks=pytest.mark.slow) for shape in SHAPES]
-)
+@pytest.mark.parametrize("shape", ONE_OF_A_FAMILY)
 def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, schedule: str) -> None:
     form = schedule_on(device, schedule)
     kernels = KernelBuild(shape, 3, form)
     pipeline = Pipeline(device, kernels)
     columns, block_height = TILE // 4, form.lanes // 4
     looked_at = shows = 0
-    for seed in range(40):
-        case = one_splat(shape, seed, needle=seed % 4 == 0)
-        frame = pipeline.forward(SplatBuffers.of(device, case.splats, kernels.dtype), case.camera)
-        if not frame.n_isects:
-            continue
+    for case, frame, (left, top, right, bottom) in drawn(pipeline):
         told = to_host(device, pipeline.isect_blocks.buffer, np.empty(frame.n_isects, np.uint32))
-        left, top, right, bottom = to_host(device, frame.projected.tile_rect, np.empty(4, np.int32)).tolist()
         assert frame.n_isects == (right - left) * (bottom - top)
         number = np.arange(form.vecs)
         bits = (told[:, None] >> number.astype(np.uint32)) & 1
@@ -90,9 +95,7 @@ def test_blocks_hold_their_splats_and_little_else(device: Device, shape: str, sc
         ),
     ],
 )
-@pytest.mark.parametrize(
-    "shape", [shape if shape in FAMILIES else pytest.param(shape, marks=pytest.mark.slow) for shape in SHAPES]
-)
+@pytest.mark.parametrize("shape", ONE_OF_A_FAMILY)
 def test_strips_hold_their_splats_and_little_else(
     device: Device, monkeypatch: pytest.MonkeyPatch, shape: str, schedule: str, kind: str
 ) -> None:
@@ -102,15 +105,10 @@ def test_strips_hold_their_splats_and_little_else(
     pipeline = Pipeline(device, kernels)
     rows = TILE // kernels.schedule.vecs
     looked_at = shows = 0
-    for seed in range(40):
-        case = one_splat(shape, seed, needle=seed % 4 == 0)
-        frame = pipeline.forward(SplatBuffers.of(device, case.splats, kernels.dtype), case.camera)
-        if not frame.n_isects:
-            continue
+    for case, frame, (left, top, right, bottom) in drawn(pipeline):
         ((_, lists),) = pipeline.bands(frame)
         assert lists.strips is not None
         told = to_host(device, lists.strips, np.empty(frame.n_isects, np.uint32))
-        left, top, right, bottom = to_host(device, frame.projected.tile_rect, np.empty(4, np.int32)).tolist()
         bits = told.reshape(bottom - top, 1, right - left) >> np.arange(kernels.schedule.vecs, dtype=np.uint32)[:, None]
         seen = np.zeros((frame.layout.tiles_y * kernels.schedule.vecs, frame.layout.tiles_x), bool)
         seen.reshape(frame.layout.tiles_y, kernels.schedule.vecs, -1)[top:bottom, :, left:right] = bits & 1

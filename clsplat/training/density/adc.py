@@ -38,7 +38,7 @@ from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical_depth
 from ...splats.quaternions import rotations
 from ...splats.shapes import Shape
-from .edit import DensifyEdit, NewValues
+from .edit import DensifyEdit, Indices, NewValues
 from .table import SplatTable, smallest
 
 # 3DGS's constants.
@@ -46,8 +46,6 @@ MIN_OPACITY = 0.005  # fainter splats are pruned
 SPLIT_SHRINK = 1.6
 WORLD_SIZE = 0.1  # larger splats are pruned, in scene extents
 RESET_OPACITY = 0.01
-
-Indices = NDArray[np.int64]
 
 
 def plan_adc(

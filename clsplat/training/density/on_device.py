@@ -16,7 +16,7 @@ from .table import Summary
 class DeviceSplats:
     """Splats on the device as a `SplatTable`. It equals `HostSplats` to the bit.
 
-    program : the program of the optimizer (programs.optim_program).
+    program : programs.columns_program.
     """
 
     def __init__(self, splats: SplatBuffers, program: Program) -> None:
