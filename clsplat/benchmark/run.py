@@ -22,6 +22,7 @@ from .measure import train_and_measure_in
 from .protocol import BenchmarkScene, find_scenes
 from .results import files_of_results, write_results
 from .sets import BenchmarkSet, benchmark_set
+from .start import with_start
 
 MODELS = "models"
 
@@ -100,7 +101,10 @@ def run_benchmark(
                         "differences": [*scene.differences, *_differences(chosen, scene, method, config)],
                     }
                     model = place / MODELS / f"{scene.scene.name}-{run.stem}-{_key_digest(record)}"
-                    record |= train_and_measure_in(model, loaded, config, open_device(config.device), metric, progress)
+                    started = loaded
+                    if chosen.start is not None and method.base in PRESETS:
+                        started = with_start(loaded, chosen.start, config.seed)
+                    record |= train_and_measure_in(model, started, config, open_device(config.device), metric, progress)
                     runs.add(record)
                     if on_run is not None:
                         on_run(run, record)

@@ -68,6 +68,20 @@ class Published:
 
 
 @dataclass(frozen=True)
+class StartCube:
+    """Random points that published runs start from, because the scenes have none.
+
+    Attributes
+    ----------
+    points : their number.
+    side : side of the cube around the origin that they fill [world units].
+    """
+
+    points: int
+    side: float
+
+
+@dataclass(frozen=True)
 class BenchmarkSet:
     """A set of scenes with its protocol.
 
@@ -81,6 +95,7 @@ class BenchmarkSet:
     scenes : by name.
     other_images : folders of photos to use if the folder of the protocol is missing.
     counted : whether the scenes' default caps are published numbers of splats.
+    start : the start of published runs; None if they start at the points of a scene.
     """
 
     name: str
@@ -93,6 +108,7 @@ class BenchmarkSet:
     published: Sequence[Published]
     other_images: Sequence[str] = ()
     counted: bool = True
+    start: StartCube | None = None
 
 
 @cache
@@ -119,6 +135,7 @@ def benchmark_set(name: str) -> BenchmarkSet:
         [_published(entry) for entry in values["published"]],
         tuple(values.get("other_images", ())),
         values.get("counted", True),
+        StartCube(**values["start"]) if "start" in values else None,
     )
 
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.seen import seen
 from ..evaluation.contributions import contributions
 from ..evaluation.floaters import is_near
 from ..rendering.build import ALPHA_MIN
@@ -144,13 +145,10 @@ def is_outside(splats: Splats, views: Sequence[View]) -> Mask:
         if view.alpha is None:
             continue
         camera, widened = view.camera, view.alpha
+        _, pixel, inside = seen(camera, mean)
         size = 2 * max(round(_MARGIN * max(camera.width, camera.height)), 1) + 1
         for axis in (0, 1):
             widened = maximum_filter1d(widened, size, axis=axis, mode="constant")
-        x, y, z = (mean @ camera.rotation.T + camera.translation).T
-        front = np.where(z > 0, z, np.inf)
-        column, row = np.floor(x / front * camera.fx + camera.cx), np.floor(y / front * camera.fy + camera.cy)
-        inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        shown = np.flatnonzero(inside)
-        outside[shown] += widened[row[shown].astype(np.int64), column[shown].astype(np.int64)] == 0
+        column, row = pixel[inside].astype(np.int64).T
+        outside[inside] += widened[row, column] == 0
     return outside >= min(_OUTSIDE_VIEWS, len(views))

@@ -27,9 +27,10 @@ from .near_plane import FARTHEST, choose_near_plane
 from .options.density import Adc, Mcmc
 from .options.groups import OptimConfig
 from .options.option import option_table
+from .silhouettes import TRANSPARENT_SHARE, transparent_share
 
 if TYPE_CHECKING:
-    from ..scenes.scene import Scene, View
+    from ..scenes.scene import Scene
 
 DECIDED = tuple(name for name, definition in OPTIONS.items() if definition.by_scene)
 FEW_POINTS = 0.05  # fewer points than this share of the cap are few
@@ -39,9 +40,6 @@ RANDOM_SHARE_OF_FEW = 0.1  # the same, if the scene has fewer points than this s
 RANDOM_START_RATES = 2.0  # factor on the learning rates of a run that starts at random
 FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
 _RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
-TRANSPARENT_SHARE = 0.01  # smallest share of transparent pixels of photos that are trained over random backgrounds
-_STEP = 8  # pixels between two that are looked at
-_OPAQUE = 250  # smallest alpha of a pixel that counts as opaque: photos are resampled and rounded
 
 
 @dataclass(frozen=True)
@@ -137,10 +135,3 @@ def share_beside(scene: Scene, config: TrainConfig, transparent: bool) -> float:
     if n_points < RANDOM_SHARE_OF_FEW * config.cap_max:
         return RANDOM_SHARE_OF_FEW
     return 0.0 if transparent else RANDOM_SHARE
-
-
-def transparent_share(views: list[View]) -> float:
-    """Return the share of transparent pixels in photos, 0 to 1, from every 8th row and column."""
-    samples = [view.alpha[::_STEP, ::_STEP] for view in views if view.alpha is not None]
-    total = sum(-(-view.camera.width // _STEP) * -(-view.camera.height // _STEP) for view in views)
-    return float(sum((sample < _OPAQUE).sum() for sample in samples)) / total if total else 0.0

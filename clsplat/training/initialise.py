@@ -106,16 +106,16 @@ def _points(
             return xyz, rgb, message
         placed = random_points(scene, n_random, rng)
         return (
-            np.concatenate([xyz, placed]),
-            np.concatenate([rgb, rgb[nearest_of(xyz, placed)]]),
-            (f"{message}, {n_random} at random where the cameras look"),
+            np.concatenate([xyz, placed.xyz]),
+            np.concatenate([rgb, rgb[nearest_of(xyz, placed.xyz)]]),
+            f"{message}, {len(placed.xyz)} at random {placed.where}",
         )
     count = min(cap, RANDOM_POINTS) if not random_share else max(round(random_share * cap), 1)
     placed = random_points(scene, count, rng)
-    rgb = rng.integers(0, 256, (count, 3), dtype=np.uint8)
+    rgb = rng.integers(0, 256, placed.xyz.shape, dtype=np.uint8) if placed.rgb is None else placed.rgb
     available = f"{n_points} points" if len(apart) == n_points else f"{n_points} points, {len(apart)} of them apart"
     why = "" if init == "random" else f" (the scene has {available}): expect less than from good points"
-    return placed, rgb, f"{count} splats at random where the cameras look{why}"
+    return placed.xyz, rgb, f"{len(placed.xyz)} splats at random {placed.where}{why}"
 
 
 def nearest_of(xyz: Array, to: Array) -> NDArray[np.int64]:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..cameras.seen import seen
 from ..errors import InputError, Remedy
 from ..splats.fields import Array
-from .random_points import seen
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
@@ -42,5 +42,5 @@ def check_near_plane(scene: Scene, near_plane: float) -> None:
 def _point_depths(scene: Scene) -> Array:
     """Return the depths of the scene's points in the images that they are in, at most 2000 points."""
     xyz = scene.points.xyz[:: -(-len(scene.points.xyz) // _SAMPLED_POINTS) or 1]
-    depths = [depth[inside] for depth, inside in (seen(view.camera, xyz) for view in scene.train)]
+    depths = [found.depth[found.inside] for found in (seen(view.camera, xyz) for view in scene.train)]
     return np.concatenate(depths) if depths else np.zeros(0)

@@ -1,15 +1,20 @@
-"""Random points where the cameras of a scene look, for scenes without points."""
+"""Random points where the cameras of a scene look, for scenes without points.
+
+If the photos are transparent around an object, the points are in its visual hull (silhouettes.py).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.orbits import where_axes_meet
-from ..splats.fields import Array
+from ..cameras.seen import seen
+from ..splats.fields import DoubleArray
+from .silhouettes import TRANSPARENT_SHARE, Silhouettes, transparent_share
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
@@ -17,61 +22,127 @@ if TYPE_CHECKING:
 
 SEEN_BY = 2  # smallest number of cameras that see a point: one camera alone does not determine its place
 CENTRAL_SHARE = 0.75  # half of the points are in the region that this share of the cameras sees, if it exists
+HULL_SHARE = 0.25  # share of the cameras that see a point of the visual hull: cones that few cameras see are empty
+_FEWEST = 0.01  # of the points: if fewer are found in the visual hull, the silhouettes contradict each other
+_FIRST_FOUND = 32  # points of the hull that are enough to begin with its box
 _FARTHEST = 9.0  # largest distance from the centre, in median distances of the cameras
 _AHEAD = 3.0  # distance of the centre in front of parallel cameras, in scene extents
 _DRAWS = 16  # number of draws of `count` points; points that cameras see are kept
+_HULL_DRAWS = 64  # the same in the box around the visual hull, of which thin objects fill little
 _TESTED_CAMERAS = 32  # cameras that the points are tested against
 
 
-def random_points(scene: Scene, count: int, rng: np.random.Generator) -> Array:
-    """Return (count, 3) points: half of them where most cameras look, the others where at least two cameras look.
+class RandomPoints(NamedTuple):
+    """Random points (P, 3), their colours (P, 3) if the photos show them, and words for the places where they are."""
 
-    The points are uniform in a contracted space around the point nearest to all optical axes (Barron et al. 2022,
-    Mip-NeRF 360, eq. 10). The unit of this space is the median distance of the cameras, so far points are rare.
+    xyz: DoubleArray
+    rgb: NDArray[np.uint8] | None
+    where: str
+
+
+def random_points(scene: Scene, count: int, rng: np.random.Generator) -> RandomPoints:
+    """Return random points of a scene.
+
+    Around an object in transparent photos, there are at most `count` points, uniform in its visual hull. Else there are
+    `count` points. Half of them are where most cameras look, the others where at least two cameras look.
     """
-    cameras = [view.camera for view in scene.train[:: -(-len(scene.train) // _TESTED_CAMERAS)]]
-    centres = np.array([view.camera.position for view in scene.train])
-    middle = _middle(cameras, scene.extent)
-    unit = float(np.median(np.linalg.norm(centres - middle, axis=1)))
-    unit = unit if unit > 0 else 1.0
-    min_cameras, half = min(SEEN_BY, len(cameras)), count // 2
+    sight = _Sight(scene)
+    if transparent_share(scene.train) >= TRANSPARENT_SHARE:
+        silhouettes = Silhouettes(scene.train)
+        xyz = _in_hull(sight, silhouettes, count, rng)
+        if len(xyz) > _FEWEST * count:
+            return RandomPoints(xyz, silhouettes.colors(xyz), "inside the silhouettes of the photos")
+    return RandomPoints(_in_sight(sight, count, rng), None, "where the cameras look")
+
+
+class _Sight:
+    """Cameras of a scene, and a contracted space around the point nearest to their axes.
+
+    The space is that of Mip-NeRF 360 (Barron et al. 2022, eq. 10). Its unit is the median distance of the cameras, so
+    far points are rare.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.cameras = [view.camera for view in scene.train[:: -(-len(scene.train) // _TESTED_CAMERAS)]]
+        centres = np.array([view.camera.position for view in scene.train])
+        self.middle = _middle(self.cameras, scene.extent)
+        unit = float(np.median(np.linalg.norm(centres - self.middle, axis=1)))
+        self.unit = unit if unit > 0 else 1.0
+        self.min_cameras = min(SEEN_BY, len(self.cameras))
+
+    def draw(self, count: int, rng: np.random.Generator) -> DoubleArray:
+        """Return (count, 3) points that are uniform in the contracted space."""
+        return self.middle + self.unit * _uncontracted(count, rng)
+
+    def distance(self, xyz: DoubleArray) -> float:
+        """Return the largest distance of points from the middle; 0 for none."""
+        return float(np.linalg.norm(xyz - self.middle, axis=1).max(initial=0.0))
+
+    def cameras_seeing(self, xyz: DoubleArray) -> NDArray[np.int64]:
+        """Return the number of cameras that see each point, (P,)."""
+        return np.asarray(np.sum([seen(camera, xyz).inside for camera in self.cameras], axis=0), np.int64)
+
+
+def _in_hull(sight: _Sight, silhouettes: Silhouettes, count: int, rng: np.random.Generator) -> DoubleArray:
+    """Return at most `count` points that are in the visual hull and that many cameras see.
+
+    An object nearer than the cameras gets uniform points in the box around it. What reaches farther, such as a
+    landscape without its sky, gets points of the contracted space.
+    """
+    min_cameras = max(sight.min_cameras, HULL_SHARE * len(sight.cameras))
+
+    def kept(drawn: DoubleArray) -> DoubleArray:
+        drawn = drawn[silhouettes.admit(drawn)]  # first, because it soon leaves few points
+        return drawn[sight.cameras_seeing(drawn) >= min_cameras]
+
+    def gather(draw: Callable[[], DoubleArray], enough: int, draws: int) -> DoubleArray:
+        points = np.zeros((0, 3))
+        for _ in range(draws):
+            points = np.concatenate([points, kept(draw())])
+            if len(points) >= enough:
+                break
+        return points[:count]
+
+    found = gather(lambda: sight.draw(count, rng), _FIRST_FOUND, _DRAWS)
+    for _ in range(_DRAWS if len(found) else 0):
+        low, high = found.min(axis=0), found.max(axis=0)
+        margin = 0.25 * (high - low)
+        more = kept(rng.uniform(low - margin, high + margin, (count, 3)))
+        found = np.concatenate([found, more])
+        if ((found.min(axis=0) >= low - 0.1 * margin) & (found.max(axis=0) <= high + 0.1 * margin)).all():
+            break  # the box does not grow any more
+    if not len(found):
+        return found
+    if sight.distance(found) > sight.unit:
+        return gather(lambda: sight.draw(count, rng), count, _DRAWS)
+    low, high = found.min(axis=0), found.max(axis=0)
+    return gather(lambda: rng.uniform(low, high, (count, 3)), count, _HULL_DRAWS)
+
+
+def _in_sight(sight: _Sight, count: int, rng: np.random.Generator) -> DoubleArray:
+    """Return (count, 3) points: half of them where most cameras look, the others where at least two cameras look."""
+    most, half = max(sight.min_cameras, CENTRAL_SHARE * len(sight.cameras)), count // 2
     central, outer, unseen = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
     for _ in range(_DRAWS):
-        drawn = middle + unit * _uncontracted(count, rng)
-        n_seeing = _cameras_seeing(cameras, drawn)
-        is_central = n_seeing >= max(min_cameras, CENTRAL_SHARE * len(cameras))
+        drawn = sight.draw(count, rng)
+        n_seeing = sight.cameras_seeing(drawn)
+        is_central = n_seeing >= most
         central = np.concatenate([central, drawn[is_central]])
-        outer = np.concatenate([outer, drawn[(n_seeing >= min_cameras) & ~is_central]])
-        unseen = drawn[n_seeing < min_cameras]
+        outer = np.concatenate([outer, drawn[(n_seeing >= sight.min_cameras) & ~is_central]])
+        unseen = drawn[n_seeing < sight.min_cameras]
         if len(outer) >= count - half:
             break
-    reach = float(np.linalg.norm(central - middle, axis=1).max(initial=0.0))
+    reach = sight.distance(central)
     for _ in range(_DRAWS if reach > 0 else 0):  # the central region is often a small part of the visible space
         if len(central) >= half:
             break
-        drawn = middle + reach * _in_ball(count, rng)
-        n_seeing = _cameras_seeing(cameras, drawn)
-        central = np.concatenate([central, drawn[n_seeing >= max(min_cameras, CENTRAL_SHARE * len(cameras))]])
+        drawn = sight.middle + reach * _in_ball(count, rng)
+        central = np.concatenate([central, drawn[sight.cameras_seeing(drawn) >= most]])
     half = min(half, len(central))
     return np.concatenate([central[:half], outer[: count - half], central[half:], unseen])[:count]
 
 
-def seen(camera: Camera, xyz: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the depths (P,) of points, and whether they are in front of the camera and inside its image."""
-    local = xyz @ camera.rotation.T + camera.translation
-    depth = local[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixel = local[:, :2] / depth[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    inside: NDArray[np.bool_] = (depth > 0) & ((pixel >= 0) & (pixel < (camera.width, camera.height))).all(axis=1)
-    return depth, inside
-
-
-def _cameras_seeing(cameras: Sequence[Camera], xyz: Array) -> NDArray[np.int64]:
-    """Return the number of cameras that see each point, (P,)."""
-    return np.asarray(np.sum([seen(camera, xyz)[1] for camera in cameras], axis=0), np.int64)
-
-
-def _middle(cameras: Sequence[Camera], extent: float) -> Array:
+def _middle(cameras: Sequence[Camera], extent: float) -> DoubleArray:
     """Return the point nearest to all optical axes, or a point in front of parallel cameras."""
     nearest = where_axes_meet(cameras)
     if nearest is not None:
@@ -80,7 +151,7 @@ def _middle(cameras: Sequence[Camera], extent: float) -> Array:
     return np.asarray(centre + _AHEAD * extent * np.mean([camera.rotation[2] for camera in cameras], axis=0))
 
 
-def _uncontracted(count: int, rng: np.random.Generator) -> Array:
+def _uncontracted(count: int, rng: np.random.Generator) -> DoubleArray:
     """Return (count, 3) points that are uniform in the contracted ball of radius 2."""
     ball = 2.0 * _in_ball(count, rng)
     radius = np.linalg.norm(ball, axis=1, keepdims=True)
@@ -88,7 +159,7 @@ def _uncontracted(count: int, rng: np.random.Generator) -> Array:
     return np.asarray(ball / radius * np.where(short > 1.0, 1.0 / (2.0 - short), short))
 
 
-def _in_ball(count: int, rng: np.random.Generator) -> Array:
+def _in_ball(count: int, rng: np.random.Generator) -> DoubleArray:
     """Return (count, 3) points that are uniform in the unit ball."""
     direction = rng.standard_normal((count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)

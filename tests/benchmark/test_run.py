@@ -7,13 +7,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from set_folders import as_blender, as_colmap
 
 from clsplat.benchmark import measure
 from clsplat.benchmark.results import result_notes, result_rows, result_tables
 from clsplat.benchmark.run import run_benchmark
-from clsplat.benchmark.sets import benchmark_set
+from clsplat.benchmark.sets import StartCube, benchmark_set
+from clsplat.benchmark.start import with_start
 from clsplat.comparison.runs import Run
 from clsplat.comparison.table import Record
 from clsplat.errors import InputError, OutputError, TrainingError
@@ -21,7 +23,7 @@ from clsplat.evaluation.evaluate import evaluate
 from clsplat.evaluation.metrics import PROTOCOLS
 from clsplat.files.stop_signals import forget
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.scene import Points, Scene, load_scene
 from clsplat.splats.color import BLACK, WHITE
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
@@ -72,9 +74,11 @@ def test_the_protocol_is_the_default(capture_folder: Path, tmp_path: Path, monke
     """Without options a run has the published iterations, background and number of splats, and no note."""
     scene = as_blender(capture_folder, tmp_path / "lego")
     configs: list[TrainConfig] = []
+    points: list[Points] = []
 
-    def stop(folder: Path, scene: object, config: TrainConfig, *more: object) -> Record:
+    def stop(folder: Path, scene: Scene, config: TrainConfig, *more: object) -> Record:
         configs.append(config)
+        points.append(scene.points)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("clsplat.benchmark.run.train_and_measure_in", stop)
@@ -93,6 +97,18 @@ def test_the_protocol_is_the_default(capture_folder: Path, tmp_path: Path, monke
     assert (second.iterations, second.background, second.cap_max) == (7, BLACK, 325_000)
     assert first.schedule.coarse_to_fine
     assert [config.schedule.coarse_to_fine for config in presets] == [False, True, True], "presets learn at full size"
+    assert [len(start) for start in points] == [0, 0, *[100_000] * 3], "presets start in a cube, as 3DGS does"
+    xyz = points[2].xyz
+    np.testing.assert_allclose([xyz.min(axis=0), xyz.max(axis=0)], [[-1.3] * 3, [1.3] * 3], atol=1e-3)
+    assert (points[2].rgb == 128).all()
+    again = with_start(load_scene(scene), StartCube(50, 2.0), seed=3).points.xyz
+    assert (again == with_start(load_scene(scene), StartCube(50, 2.0), seed=3).points.xyz).all()
+    assert (again != with_start(load_scene(scene), StartCube(50, 2.0), seed=4).points.xyz).all()
+
+
+def test_points_of_a_scene_are_its_start(capture_folder: Path) -> None:
+    scene = load_scene(capture_folder)
+    assert with_start(scene, StartCube(50, 2.0), seed=0) is scene
 
 
 def test_a_preset_that_learns_from_small_images_is_not_as_published(tanks: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from clsplat.cameras.seen import seen
 from clsplat.errors import InputError
 from clsplat.models.model import load_model
 from clsplat.rendering.renderer import Renderer
@@ -27,14 +28,13 @@ from clsplat.training.decisions import (
     Decision,
     as_decided,
     decide,
-    transparent_share,
 )
 from clsplat.training.folder import ModelFolder
 from clsplat.training.log import Progress
 from clsplat.training.near_plane import FARTHEST, check_near_plane
 from clsplat.training.presets import PRESETS, preset
-from clsplat.training.random_points import seen
 from clsplat.training.run import train
+from clsplat.training.silhouettes import transparent_share
 
 
 def without_points(scene: Scene) -> Scene:
@@ -143,7 +143,7 @@ def test_named_options_stay(scene: Scene) -> None:
 def test_the_near_plane_is_that_of_3dgs_unless_the_scene_is_small_or_near(scene: Scene) -> None:
     """0.2 units, a twentieth of the extent, or half of the depth up to which a hundredth of the points lie."""
     depths = [seen(view.camera, scene.points.xyz) for view in scene.train]
-    nearest = np.quantile(np.concatenate([depth[inside] for depth, inside in depths]), 0.01)
+    nearest = np.quantile(np.concatenate([found.depth[found.inside] for found in depths]), 0.01)
     assert FARTHEST == 0.2
     for size in (100.0, 1.0, 0.01, 1e-6):
         sized = of_size(scene, size)
@@ -207,7 +207,7 @@ def test_a_model_has_the_near_plane_of_its_run(scene: Scene, tmp_path: Path) -> 
     train(scene, config, output=tmp_path / "decided")
     assert load_model(tmp_path / "decided").splats.near_plane == decide(scene, config).config.near_plane
     depths = [seen(view.camera, scene.points.xyz) for view in scene.train]
-    near = 1.001 * float(np.quantile(np.concatenate([depth[inside] for depth, inside in depths]), 0.05))
+    near = 1.001 * float(np.quantile(np.concatenate([found.depth[found.inside] for found in depths]), 0.05))
     splats = train(scene, config.replace(near_plane=near, init=str(some_splats(scene, tmp_path / "s.ply")))).splats
     assert splats.near_plane == near
     camera, renderer = scene.train[0].camera, Renderer()

@@ -30,7 +30,7 @@ def scene(n_points: int, extent: float = 2.0) -> Any:
     for x in (4.0, 6.0):
         pose = np.eye(4)
         pose[0, 3] = -x
-        views.append(SimpleNamespace(camera=Camera(20, 10, 20, 20, 10, 5, pose)))
+        views.append(SimpleNamespace(camera=Camera(20, 10, 20, 20, 10, 5, pose), alpha=None))
     points = SimpleNamespace(
         xyz=rng.standard_normal((n_points, 3)),
         rgb=rng.integers(0, 256, (n_points, 3), dtype=np.uint8),

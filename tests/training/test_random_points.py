@@ -7,40 +7,30 @@ from typing import Any
 
 import numpy as np
 import pytest
+from looking_cameras import looking, ring
 
 from clsplat.cameras.camera import Camera
+from clsplat.cameras.seen import seen
 from clsplat.splats.splats import Splats
 from clsplat.training.initialise import RANDOM_POINTS
 from clsplat.training.options.density import Mcmc
-from clsplat.training.random_points import random_points, seen
-
-
-def looking(places: np.ndarray, at: np.ndarray, field: float = 0.7) -> list[Camera]:
-    """Square cameras with an angle of view [rad] that look at a point, y down."""
-    cameras = []
-    for place in places:
-        forward = (at - place) / np.linalg.norm(at - place)
-        right = np.cross([0.0, 0.0, 1.0], forward)
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
-        focal = 16 / np.tan(field / 2)
-        cameras.append(Camera(32, 32, focal, focal, 16, 16, pose))
-    return cameras
+from clsplat.training.random_points import random_points as random_points_of
 
 
 def scene(cameras: list[Camera], extent: float = 4.0) -> Any:
-    return SimpleNamespace(train=[SimpleNamespace(camera=camera) for camera in cameras], extent=extent)
+    return SimpleNamespace(train=[SimpleNamespace(camera=camera, alpha=None) for camera in cameras], extent=extent)
 
 
-def ring(n: int = 12, radius: float = 4.0) -> np.ndarray:
-    turn = np.linspace(0, 2 * np.pi, n, endpoint=False)
-    return np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(n, 1.0)], axis=1)
+def random_points(source: Any, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Random points of a scene with opaque photos."""
+    xyz, rgb, where = random_points_of(source, count, rng)
+    assert rgb is None
+    assert where == "where the cameras look"
+    return xyz
 
 
 def lookers(cameras: list[Camera], xyz: np.ndarray) -> np.ndarray:
-    return np.sum([seen(camera, xyz)[1] for camera in cameras], axis=0)
+    return np.sum([seen(camera, xyz).inside for camera in cameras], axis=0)
 
 
 @pytest.mark.parametrize("middle", [(0.0, 0.0, 0.0), (50.0, -20.0, 7.0)])

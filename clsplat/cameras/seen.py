@@ -1,0 +1,35 @@
+"""Points in the image of a camera."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import Camera
+
+
+class Seen(NamedTuple):
+    """Where P points are in an image.
+
+    Attributes
+    ----------
+    depth : (P,) camera z [world units].
+    pixel : (P, 2) x and y [px]. They mean nothing for points that are not in front of the camera.
+    inside : (P,) whether a point is in front of the camera and inside its image.
+    """
+
+    depth: NDArray[np.float64]
+    pixel: NDArray[np.float64]
+    inside: NDArray[np.bool_]
+
+
+def seen(camera: Camera, xyz: NDArray[np.float64]) -> Seen:
+    """Return where points (P, 3) in the world are in the image of a camera. Nothing hides them."""
+    local = xyz @ camera.rotation.T + camera.translation
+    depth = local[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixel = local[:, :2] / depth[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    inside: NDArray[np.bool_] = (depth > 0) & ((pixel >= 0) & (pixel < (camera.width, camera.height))).all(axis=1)
+    return Seen(depth, pixel, inside)
