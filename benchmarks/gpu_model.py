@@ -49,6 +49,7 @@ STEP_MS, SKEW_RATIO, TARGET_GPU = 4.0, 1.2, "H200"  # targets
 # Clocks for an isect in a tile as counted at 546ceb8 with gpu256, and the target's share of them.
 CYCLES = {"rasterize": (136, 0.45), "rasterize_vjp": (473, 0.35)}
 _LETTERS = {"bandwidth": "B", "instructions": "I", "local memory": "L", "launches": "–"}
+STEPPING = (0.65, 0.3, 0.12)  # shares of the splats that step, with visible_adam
 _BEGIN, _END = "<!-- table of gpu_model.py -->", "<!-- end of the table of gpu_model.py -->"
 
 
@@ -210,6 +211,8 @@ def tables(workloads: list[Workload]) -> Iterator[str]:
         title = f"{gaussian.scene}, {gaussian.sizes.splats} splats, {gaussian.sizes.isects} isects"
         yield f"#### {title}" + (" (assumed)" if gaussian is many[0] else "")
         yield times(gaussian, skewed)
+    yield "#### Steps of visible splats"
+    yield visible_steps(pairs[0][0])
     yield "#### Targets"
     yield targets(*pairs[0], many[0])
 
@@ -233,6 +236,20 @@ def times(gaussian: Workload, skewed: Workload) -> str:
     rows.append(["schedule", *schedules])
     names = [gpu.name for gpu in GPUS]
     return common.table(("stage [ms]", *names), rows, names)
+
+
+def visible_steps(workload: Workload) -> str:
+    """Return the time of Adam and of the whole step if only a share of the splats steps."""
+    names = [gpu.name for gpu in GPUS]
+    rows = []
+    for share in (None, *STEPPING):
+        one = replace(workload, shares=replace(workload.shares, stepping=share))
+        stages = [one.predicted(gpu) for gpu in GPUS]
+        times = (
+            f"{next(stage.ms for stage in each if stage.stage == 'step'):.2f}, {total_ms(each):.2f}" for each in stages
+        )
+        rows.append(("all" if share is None else f"{share:.0%}", *times))
+    return common.table(("splats that step: Adam, all stages [ms]", *names), rows, names)
 
 
 def cell(stage: Predicted) -> str:

@@ -15,7 +15,7 @@ from clsplat.device.schedule import SCHEDULES
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.group_binner import group_binning_program
 from clsplat.rendering.radix_sort import sort_program
-from clsplat.training.programs import columns_program, loss_program, optim_program
+from clsplat.training.programs import columns_program, lazy_program, loss_program, optim_program
 
 SHAPES = ("gaussian", "skew-normal")
 GPU_SCHEDULES = tuple(name for name, schedule in SCHEDULES.items() if schedule.group > 1)
@@ -36,6 +36,8 @@ def programs() -> dict[str, str]:
             texts[f"project {shape}"] = built.pop()
             optim_program(device, kernels)
             texts[f"optimize {shape}"] = built.pop()
+            lazy_program(device, kernels)
+            texts[f"optimize visible {shape}"] = built.pop()
             columns_program(device, kernels)
             texts[f"densify {shape}"] = built.pop()
             for name in GPU_SCHEDULES:

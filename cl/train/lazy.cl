@@ -1,31 +1,4 @@
-// lazy.cl: Adam for visible splats (clsplat/training/optim/lazy.py has the formula). A vector of splats skips its steps
-// while none of its splats is visible. Before its next step, the skipped steps are done in closed form.
-
-// Effect of a number of skipped steps: factors of both moments, and the drift of the value per unit of rate and of
-// m / sqrt(v). With `keeps_moments`, only the value changes.
-typedef struct {
-    real decay1, decay2, drift;
-    bool keeps_moments;
-} adam_skip;
-
-// Returns the effect of `steps` skipped steps. decays is [5, ADAM_WAITS]: its rows hold the factors of m and v, and
-// three drifts. DRIFT is the drift of most rows, DRIFT_MEAN that of the means (with the rate), DRIFT_SKEW that of the
-// skew.
-static inline adam_skip skipped_steps(constant real *decays, int steps, int drift, bool keeps_moments) {
-    return (adam_skip){decays[steps], decays[ADAM_WAITS + steps], decays[drift * ADAM_WAITS + steps], keeps_moments};
-}
-
-// Does the skipped steps of a row. `high` > 0 marks fields that are optimised in log space. Their drift is monotonic,
-// so one clamp at the end equals a clamp at every step.
-static inline void
-adam_catch_up(adam_skip skip, real lr, real low, real high, global real *value, adam_moments adam, const ulong at) {
-    const vreal m = lanes_load(adam.m + at), v = lanes_load(adam.v + at), old = lanes_load(value + at);
-    const vreal moved = lr * skip.drift * (m / (sqrt(v) + (vreal)ADAM_EPS));
-    lanes_store(high > 0 ? lanes_clamp(old * exp(-moved), low, high) : old - moved, value + at);
-    if (skip.keeps_moments) return;
-    lanes_store(m * skip.decay1, adam.m + at);
-    lanes_store(v * skip.decay2, adam.v + at);
-}
+// lazy.cl: which vectors of splats step, and skipped steps without a step (lazy.clh).
 
 // Selects the vectors that step now. A vector steps if one of its splats is visible (depth_key [n],
 // cl/render/project.cl) or if it has the maximum age. ages gets the numbers of skipped steps of the base parameters and
@@ -91,10 +64,8 @@ kernel void settle_color(
     const ulong i = get_global_id(0) * LANES;
     const uint k = get_global_id(1);
     const int2 age = ages[get_global_id(0)];
-    if (age.x <= 0) return;
     const adam_moments adam = {sh_m + i, sh_v + i, 0, 0};
-    const adam_skip skip = skipped_steps(decays, age.x, DRIFT, keeps_moments);
-    for (int c = 0; c < 3; ++c) adam_catch_up(skip, k == 0 ? lr : rest_lr, 0, 0, sh + i, adam, (3 * k + c) * capacity);
+    catch_up_coefficient(k, age.x, decays, k == 0 ? lr : rest_lr, sh + i, adam, capacity, keeps_moments);
 }
 kernel void settle_geometry(
     global real *restrict geom,
@@ -108,16 +79,8 @@ kernel void settle_geometry(
 ) {
     const ulong i = get_global_id(0) * LANES;
     const int2 age = ages[get_global_id(0)];
-    if (age.x <= 0) return;
-    const uint2 rows = part_rows(get_global_id(1));
-    const bool means = rows.x == ROW_MEAN;
     const adam_moments adam = {geom_m + i, geom_v + i, 0, 0};
-    const adam_skip skip = skipped_steps(decays, age.x, means ? DRIFT_MEAN : DRIFT, keeps_moments);
-    for (uint row = rows.x; row < rows.y; ++row)
-        adam_catch_up(
-            skip, means ? (real)1 : rates[row], rates[GEOM_ROWS + row], rates[2 * GEOM_ROWS + row], geom + i, adam,
-            row * capacity
-        );
+    catch_up_part(get_global_id(1), age.x, decays, rates, geom + i, adam, capacity, keeps_moments);
 }
 #ifdef ROW_SKEW
 kernel void settle_skew(
@@ -135,9 +98,7 @@ kernel void settle_skew(
     const int2 age = ages[get_global_id(0)];
     if (age.x < 0) return;
     const adam_moments adam = {skew_m + i, skew_v + i, 0, 0};
-    const adam_skip skip = skipped_steps(decays, age.y, DRIFT_SKEW, keeps_moments);
-    if (age.y > 0)
-        for (int row = 0; row < SKEW_WIDTH; ++row) adam_catch_up(skip, lr, 0, 0, skew_s + i, adam, row * capacity);
+    catch_up_skew(age.y, decays, lr, skew_s + i, adam, capacity, keeps_moments);
     if (age.y > 0 || SKEW_ROTATES) write_skew(geom + i, skew_s + i, capacity);
 }
 #endif

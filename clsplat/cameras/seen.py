@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,3 +34,8 @@ def seen(camera: Camera, xyz: NDArray[np.float64]) -> Seen:
         pixel = local[:, :2] / depth[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     inside: NDArray[np.bool_] = (depth > 0) & ((pixel >= 0) & (pixel < (camera.width, camera.height))).all(axis=1)
     return Seen(depth, pixel, inside)
+
+
+def mean_share_seen(cameras: Sequence[Camera], xyz: NDArray[np.float64]) -> float:
+    """Return the share of points (P, 3) in the image of a camera, 0 to 1, as a mean over cameras; 1 without points."""
+    return float(np.mean([seen(camera, xyz).inside.mean() for camera in cameras])) if len(xyz) else 1.0

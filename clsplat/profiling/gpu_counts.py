@@ -28,6 +28,7 @@ _WINDOW_ROWS = 10  # rows that a work-item of the loss reads besides its own
 _SKIPPED = 6  # instructions of an isect whose tile the splat does not reach
 _EMIT, _STRIP = 27, 56  # instructions of emit_isects for an isect, and for each of its strips
 _EMIT_SKEWED, _STRIP_SKEWED = 45, 87
+_WAITING = 28  # bytes of each splat that the selection of visible splats reads and writes
 _PER_FLOP = 1.1  # instructions of a pixel for each operation; for shapes that the compilers were not asked about
 
 
@@ -67,12 +68,14 @@ class Shares:
     looked : isects that a tile looks at before all of its pixels are finished, of all.
     tiles : of these isects, those whose splat reaches its tile.
     rows2, rows4 : strips of 2 and of 4 rows of a tile that a splat reaches, of all.
+    stepping : splats whose parameters step, of all; None if all do, without `visible_adam`.
     """
 
     looked: float = 1.0
     tiles: float = 0.93
     rows2: float = 0.46
     rows4: float = 0.53
+    stepping: float | None = None
 
     def reached(self, schedule: Schedule) -> float:
         """Return the share of a work-item's blocks that it computes."""
@@ -131,21 +134,20 @@ def counts_of(
         "rasterize": looked * tiles * reads * 4 * WARP,
         "rasterize_vjp": looked * tiles * (reads + sum_reads) * 4 * WARP,
     }
+    size = {stage: one.bytes for stage, one in work.items()}
+    if shares.stepping is not None:  # skipped steps are done in the launch of the next one, which reads no byte more
+        size["step"] = round(shares.stepping * size["step"]) + _WAITING * sizes.splats
     waits = {"transfers": 1}
     return {
         stage: Counts(
-            work[stage].bytes if stage in work else 0,
-            instructions.get(stage, 0),
-            local.get(stage, 0),
-            commands,
-            waits.get(stage, 0),
+            size.get(stage, 0), instructions.get(stage, 0), local.get(stage, 0), commands, waits.get(stage, 0)
         )
-        for stage, commands in commands_of(kernels, sizes.pixels).items()
+        for stage, commands in commands_of(kernels, sizes.pixels, shares.stepping is not None).items()
     }
 
 
-def commands_of(kernels: KernelBuild, pixels: int) -> dict[str, int]:
-    """Return the commands of each stage of a training step with the default optimizer on a GPU."""
+def commands_of(kernels: KernelBuild, pixels: int, visible_only: bool = False) -> dict[str, int]:
+    """Return the commands of each stage of a training step on a GPU. visible_only : with `visible_adam`."""
     tiles = -(-pixels // 256)
     depth_passes, tile_passes = (radix_passes(bits) for bits in (DEPTH_BITS, max((tiles - 1).bit_length(), 1)))
     return {
@@ -158,8 +160,8 @@ def commands_of(kernels: KernelBuild, pixels: int) -> dict[str, int]:
         "rasterize_vjp": 1,
         "gather": 1,
         "project_vjp": 1,
-        "step": 1,
-        "transfers": 3,  # the photo, the camera and the number of isects
+        "step": 1 + visible_only,
+        "transfers": 3 + visible_only,  # the photo, the camera and the number of isects; the table of skipped steps
     }
 
 

@@ -7,6 +7,8 @@
 - Beside the points of a scene, some splats start at random places too: a plain wall has no points, and would else get
   no splats. They also need the penalty.
 - Splats that start at random places have a longer way, so their learning rates are twice as high.
+- A step of Adam reads and writes every parameter, also of splats that the image does not show. On a GPU it takes a
+  large part of an iteration. If photos show a part of a large scene, only visible splats step (optim/lazy.py).
 - Splats very close to a camera are not drawn (`near_plane.py`): one of them can hide a whole scene from views between
   those of the photos.
 
@@ -20,6 +22,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from ..cameras.seen import mean_share_seen
+from ..device.device import open_device
 from .config import OPTIONS, TrainConfig
 from .initialise import MIN_POINTS
 from .log import Progress
@@ -38,6 +42,9 @@ PENALTY = Mcmc().opacity_reg  # weight of the mean opacity in a run with splats 
 RANDOM_SHARE = 0.05  # share of the cap that starts at random places beside the scene's points
 RANDOM_SHARE_OF_FEW = 0.1  # the same, if the scene has fewer points than this share
 RANDOM_START_RATES = 2.0  # factor on the learning rates of a run that starts at random
+SEEN_SHARE = 0.7  # of the scene's points in a photo: with a smaller share, only visible splats step on a GPU
+UNSEEN_SPLATS = 50_000  # fewer splats outside of a photo save less time than the two further commands take
+_SAMPLED_POINTS = 2000  # points that are looked at
 FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
 _RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
 
@@ -94,6 +101,9 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if why and config.iterations >= FEWEST_ITERATIONS and not {"lr_factor", *_RATES} & config.named_options.keys():
         chosen["lr_factor"] = RANDOM_START_RATES
         reasons.append(f"learning rates times {RANDOM_START_RATES:g}, because {why}")
+    if "visible_adam" not in config.named_options and (seen_by_photo := waits_for_sight(scene, config)):
+        chosen["visible_adam"] = True
+        reasons.append(f"steps of visible splats only, because a photo shows {seen_by_photo:.0%} of the points")
     if config.near_plane is None:
         chosen["near_plane"] = near = choose_near_plane(scene)
         if near < FARTHEST:
@@ -135,3 +145,16 @@ def share_beside(scene: Scene, config: TrainConfig, transparent: bool) -> float:
     if n_points < RANDOM_SHARE_OF_FEW * config.cap_max:
         return RANDOM_SHARE_OF_FEW
     return 0.0 if transparent else RANDOM_SHARE
+
+
+def waits_for_sight(scene: Scene, config: TrainConfig) -> float:
+    """Return the mean share of the scene's points in a photo if a GPU trains and many splats are not visible, else 0.
+
+    The points stand for the splats. Without points, nothing is known before the run.
+    """
+    xyz = scene.points.xyz
+    xyz = xyz[:: -(-len(xyz) // _SAMPLED_POINTS) or 1]
+    share = mean_share_seen([view.camera for view in scene.train], xyz)
+    if share >= SEEN_SHARE or (1.0 - share) * config.cap_max < UNSEEN_SPLATS:
+        return 0.0
+    return share if open_device(config.device).info.type == "GPU" else 0.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..cameras.seen import seen
 from ..errors import InputError, Remedy
-from ..splats.fields import Array
+from ..splats.fields import DoubleArray
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
@@ -39,7 +39,7 @@ def check_near_plane(scene: Scene, near_plane: float) -> None:
         )
 
 
-def _point_depths(scene: Scene) -> Array:
+def _point_depths(scene: Scene) -> DoubleArray:
     """Return the depths of the scene's points in the images that they are in, at most 2000 points."""
     xyz = scene.points.xyz[:: -(-len(scene.points.xyz) // _SAMPLED_POINTS) or 1]
     depths = [found.depth[found.inside] for found in (seen(view.camera, xyz) for view in scene.train)]

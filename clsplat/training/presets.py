@@ -34,6 +34,7 @@ _RATES = {
     "bisect_reg": 0.0,
     "average_last": 0.0,
     "random_points": 0.0,
+    "visible_adam": False,
     "random_background": False,
 }
 # 3DGS, code: densification every 100 iterations from 500 to 15 000 of 30 000, opacity reset every 3000 iterations.

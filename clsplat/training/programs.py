@@ -73,7 +73,7 @@ def exposure_program(device: Device, kernels: KernelBuild, group: int = EXPOSURE
 # Parts of a geometry step (cl/train/optim.cl): a work-item steps the rows of one part.
 PARTS = ("mean", "quat", "scale", "own")
 
-_OPTIM_FILES = (
+_BELOW_STEPS = (
     "math/lanes.clh",
     "math/algebra.clh",
     "math/opacity.clh",
@@ -81,14 +81,14 @@ _OPTIM_FILES = (
     "train/skew_map.clh",
     "math/noise.clh",
     "train/adam.clh",
-    "train/optim.cl",
-    "train/positions.cl",
+    "train/steps.clh",
 )
+_STEPS = ("train/optim.cl", "train/positions.cl")
 
 
 def optim_program(device: Device, kernels: KernelBuild) -> Program:
     """Return the program of the optimizer: steps of colour, geometry and skew, SGHMC and noise."""
-    return build(device, _OPTIM_FILES, _optim_defines(kernels) | {"LAZY": 0}, kernels.real)
+    return build(device, (*_BELOW_STEPS, *_STEPS), _optim_defines(kernels) | {"LAZY": 0}, kernels.real)
 
 
 def lazy_program(device: Device, kernels: KernelBuild) -> Program:
@@ -101,7 +101,7 @@ def lazy_program(device: Device, kernels: KernelBuild) -> Program:
         "DRIFT_MEAN": adam.DECAY_ROWS + adam.DRIFT_MEAN,
         "DRIFT_SKEW": adam.DECAY_ROWS + adam.DRIFT_SKEW,
     }
-    return build(device, (*_OPTIM_FILES, "train/lazy.cl"), defines, kernels.real)
+    return build(device, (*_BELOW_STEPS, "train/lazy.clh", *_STEPS, "train/lazy.cl"), defines, kernels.real)
 
 
 def columns_program(device: Device, kernels: KernelBuild) -> Program:

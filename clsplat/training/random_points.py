@@ -28,7 +28,7 @@ _FIRST_FOUND = 32  # points of the hull that are enough to begin with its box
 _FARTHEST = 9.0  # largest distance from the centre, in median distances of the cameras
 _AHEAD = 3.0  # distance of the centre in front of parallel cameras, in scene extents
 _DRAWS = 16  # number of draws of `count` points; points that cameras see are kept
-_HULL_DRAWS = 64  # the same in the box around the visual hull, of which thin objects fill little
+_HULL_DRAWS = 64  # the same in the box around the visual hull: thin objects fill little of it
 _TESTED_CAMERAS = 32  # cameras that the points are tested against
 
 
@@ -121,12 +121,12 @@ def _in_hull(sight: _Sight, silhouettes: Silhouettes, count: int, rng: np.random
 
 def _in_sight(sight: _Sight, count: int, rng: np.random.Generator) -> DoubleArray:
     """Return (count, 3) points: half of them where most cameras look, the others where at least two cameras look."""
-    most, half = max(sight.min_cameras, CENTRAL_SHARE * len(sight.cameras)), count // 2
+    min_central, half = max(sight.min_cameras, CENTRAL_SHARE * len(sight.cameras)), count // 2
     central, outer, unseen = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
     for _ in range(_DRAWS):
         drawn = sight.draw(count, rng)
         n_seeing = sight.cameras_seeing(drawn)
-        is_central = n_seeing >= most
+        is_central = n_seeing >= min_central
         central = np.concatenate([central, drawn[is_central]])
         outer = np.concatenate([outer, drawn[(n_seeing >= sight.min_cameras) & ~is_central]])
         unseen = drawn[n_seeing < sight.min_cameras]
@@ -137,7 +137,7 @@ def _in_sight(sight: _Sight, count: int, rng: np.random.Generator) -> DoubleArra
         if len(central) >= half:
             break
         drawn = sight.middle + reach * _in_ball(count, rng)
-        central = np.concatenate([central, drawn[sight.cameras_seeing(drawn) >= most]])
+        central = np.concatenate([central, drawn[sight.cameras_seeing(drawn) >= min_central]])
     half = min(half, len(central))
     return np.concatenate([central[:half], outer[: count - half], central[half:], unseen])[:count]
 

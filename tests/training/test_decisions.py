@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from clsplat.cameras.seen import seen
+from clsplat.cameras.seen import mean_share_seen, seen
 from clsplat.errors import InputError
 from clsplat.models.model import load_model
 from clsplat.rendering.renderer import Renderer
@@ -122,6 +124,28 @@ def test_transparent_photos_get_random_backgrounds(scene: Scene) -> None:
     assert "% of the photos' pixels are transparent" in str(decision)
     assert not decide(seen, TrainConfig(random_background=False)).config.random_background
     assert not decide(transparent(scene, 0.0), TrainConfig()).config.random_background, "an alpha of 255 is opaque"
+
+
+def test_only_visible_splats_step_on_a_gpu_that_sees_a_part(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photos show half of the points of this scene: the others are behind all cameras."""
+    points, device = scene.points, SimpleNamespace(info=SimpleNamespace(type="GPU"))
+    behind = points.xyz + 1e4
+    doubled = [
+        np.concatenate([a, b]) for a, b in ((points.xyz, behind), *[(a, a) for a in (points.rgb, points.track_length)])
+    ]
+    part = replace(scene, points=Points(*doubled))
+    assert mean_share_seen([view.camera for view in part.train], part.points.xyz) < 0.5
+    config = options_of(cap_max=200_000)
+    assert not decide(part, config).config.optim.visible_adam, "a CPU"
+    monkeypatch.setattr("clsplat.training.decisions.open_device", lambda name: device)
+    decision = decide(part, config)
+    assert decision.config.optim.visible_adam
+    assert re.search(r"steps of visible splats only, because a photo shows [34]\d% of the points", str(decision))
+    assert not decide(part, config.replace(visible_adam=False)).config.optim.visible_adam
+    assert not decide(part, config.replace(cap_max=60_000)).config.optim.visible_adam, "too few splats"
+    assert not decide(without_points(scene), config).config.optim.visible_adam
+    assert decide(part, decision.config).config == decision.config
+    assert all(not preset(name)["visible_adam"] for name in PRESETS)
 
 
 def test_named_options_stay(scene: Scene) -> None:

@@ -16,6 +16,7 @@ from training.test_optimizer import (
     config_of,
     gradients,
     growing,
+    kernels_of,
     shrinking,
     some_splats,
     started,
@@ -24,6 +25,7 @@ from training.test_optimizer import (
 
 from clsplat.device.device import Device
 from clsplat.device.memory import to_device
+from clsplat.device.schedule import SCHEDULES
 from clsplat.errors import InputError
 from clsplat.rendering.splat_buffers import CompactGradients, SplatBuffers
 from clsplat.scenes.random_scene import synthetic_scene
@@ -123,6 +125,16 @@ def test_lazy_steps_equal_dense_ones(device: Device, options: dict[str, object])
     for name, expected in states[1].items():
         near = 1e-4 if name == "momentum" else 1e-5  # the gate amplifies the rounding of an opacity a hundred times
         np.testing.assert_allclose(states[0][name], expected, near, 3e-6 * np.abs(expected).max(), err_msg=name)
+
+
+@pytest.mark.parametrize("options", VISIBLE[-2:], ids=words)
+def test_lazy_steps_equal_dense_ones_with_vectors_of_one_splat(
+    device: Device, options: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The schedules of GPUs have one splat in a vector."""
+    monkeypatch.setattr("training.test_optimizer.default_schedule", lambda info: SCHEDULES["gpu32"])
+    assert kernels_of(device, config_of(), 2).lanes == 1
+    test_lazy_steps_equal_dense_ones(device, options)
 
 
 def test_drifts_are_those_of_dense_adam() -> None:

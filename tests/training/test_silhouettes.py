@@ -57,7 +57,7 @@ def test_points_fill_the_object(at: tuple[float, float, float]) -> None:
 
 
 def test_large_photos_are_reduced() -> None:
-    """600 px are blocks of 3x3, of which the last is whole only with a margin. 50 px stay as they are."""
+    """Blocks of 3x3 pixels: the last ones of 599 px need a margin. 50 px stay as they are."""
     small, large = (Silhouettes(ball(size=size)) for size in (50, 599))
     xyz = np.random.default_rng(0).uniform(-1.2, 1.2, (20_000, 3))
     distance = np.linalg.norm(xyz, axis=1) / RADIUS
@@ -68,7 +68,7 @@ def test_large_photos_are_reduced() -> None:
 
 
 def test_some_silhouettes_may_be_wrong() -> None:
-    """One of 82 photos shows nothing where the ball is: a cut-out that failed. Of many, no hull is left."""
+    """One of 82 photos shows nothing where the ball is: a cut-out that failed. If nine fail, no hull is left."""
     for unlike, where in ((1, "inside the silhouettes of the photos"), (9, "where the cameras look")):
         assert random_points(scene_of(ball(unlike=unlike)), 500, np.random.default_rng(0)).where == where
 

@@ -73,7 +73,7 @@ class Drifts:
 
     @property
     def table(self) -> NDArray[np.float64]:
-        """Return the array `decays` of cl/train/lazy.cl, (2 + 3, WAITS): factors of m and of v, and the sums."""
+        """Return the array `decays` of cl/train/lazy.clh, (2 + 3, WAITS): factors of m and of v, and the sums."""
         return np.concatenate([_DECAYS, self.sums])
 
     def _add(self, kind: int, step: int, rate: float) -> None:
@@ -99,6 +99,7 @@ class VisibleOptimizer(FusedOptimizer):
         super().__init__(device, kernels, splats, rules)
         self.program = lazy_program(device, kernels)
         self.drifts = Drifts()
+        self._step_catches_up = False
         self._vectors = splats.capacity // kernels.lanes
         self.ages, self._last = (device.alloc(8 * self._vectors) for _ in range(2))
         self.table = device.alloc(self._table().nbytes)
@@ -109,7 +110,10 @@ class VisibleOptimizer(FusedOptimizer):
     ) -> None:
         groups = self.rules.groups(iteration)
         self._select("wake_visible", depth_key=depth_key, base_learns=int(groups.base), skew_learns=int(groups.skew))
-        self._catch_up(self.splats, None if self.skew is None else self.skew.s.buffer)
+        # One launch does skipped steps and the next one, if it steps all parameters.
+        self._step_catches_up = groups.base and (self.skew is None or (groups.skew and not self.skew.map.rotates))
+        if not self._step_catches_up:
+            self._catch_up(self.splats, None if self.skew is None else self.skew.s.buffer)
         super().step(grads, mean_lr, sh_degree, iteration)
         self.drifts.advance(groups, self.counts, mean_lr)
 
@@ -216,5 +220,10 @@ class VisibleOptimizer(FusedOptimizer):
             )
 
     def _arguments(self, grads: CompactGradients, mean_lr: float, sh_degree: int) -> dict[str, Any]:
-        waits = {"ages": self.ages, "geometry_waits": int(self.rules.geometry_waits)}
+        waits = {
+            "ages": self.ages,
+            "decays": self.table,
+            "geometry_waits": int(self.rules.geometry_waits),
+            "catches_up": int(self._step_catches_up),
+        }
         return super()._arguments(grads, mean_lr, sh_degree) | waits

@@ -129,6 +129,7 @@ class OptimConfig(OptionGroup):
         False,
         help="Update only splats that the image shows; the others catch up later. Regularisers, noise and SGHMC "
         "still update the geometry of all splats.",
+        by_scene=True,
     )
     optimizer: str = option(
         "fused", help="Implementation of the optimizer: fused (on the device) or numpy (reference).", choices=OPTIMIZERS
