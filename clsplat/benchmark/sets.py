@@ -69,7 +69,7 @@ class Published:
 
 @dataclass(frozen=True)
 class StartCube:
-    """Random points that published runs start from, because the scenes have none.
+    """Random points from which published runs start in scenes without points.
 
     Attributes
     ----------
