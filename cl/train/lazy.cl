@@ -52,8 +52,16 @@ kernel void wake_all(
 // skew, and of the skew. Global sizes: (capacity / LANES, coefficients of all bands), (capacity / LANES, parts), capacity / LANES.
 kernel void settle_color(
     global real *restrict sh,
+#if HALF_MOMENTS
+    global real *restrict sh_moments,
+    uint seed_lo,
+    uint seed_hi,
+    uint step,
+#endif
+#if FULL_MOMENTS
     global real *restrict sh_m,
     global real *restrict sh_v,
+#endif
     global const int2 *restrict ages,
     constant real *restrict decays,
     ulong capacity,
@@ -64,7 +72,11 @@ kernel void settle_color(
     const ulong i = get_global_id(0) * LANES;
     const uint k = get_global_id(1);
     const int2 age = ages[get_global_id(0)];
-    const adam_moments adam = {sh_m + i, sh_v + i, 0, 0};
+#if HALF_MOMENTS
+    const color_moments adam = {sh_moments + i, 0, 0, (uint2)(seed_lo, seed_hi), step, i};
+#else
+    const color_moments adam = {sh_m + i, sh_v + i, 0, 0};
+#endif
     catch_up_coefficient(k, age.x, decays, k == 0 ? lr : rest_lr, sh + i, adam, capacity, keeps_moments);
 }
 kernel void settle_geometry(

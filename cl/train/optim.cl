@@ -40,8 +40,16 @@ kernel void map_skew(global real *restrict geom, global const real *restrict ske
 kernel void step_splats(
     global real *restrict sh,
     global const real *restrict grad_sh,
+#if HALF_MOMENTS
+    global real *restrict sh_moments,
+    uint seed_lo,
+    uint seed_hi,
+    uint step,
+#endif
+#if FULL_MOMENTS
     global real *restrict sh_m,
     global real *restrict sh_v,
+#endif
     global real *restrict geom,
     global const real *restrict grad_geom,
     global real *restrict geom_m,
@@ -83,7 +91,11 @@ kernel void step_splats(
     const int2 skipped = catches_up ? age : (int2)(0, 0);
 #endif
     if (k < coefficients) {
-        const adam_moments adam = {sh_m + i, sh_v + i, correct1, correct2};
+#if HALF_MOMENTS
+        const color_moments adam = {sh_moments + i, correct1, correct2, (uint2)(seed_lo, seed_hi), step, i};
+#else
+        const color_moments adam = {sh_m + i, sh_v + i, correct1, correct2};
+#endif
 #if LAZY
         catch_up_coefficient(k, skipped.x, decays, k == 0 ? lr : rest_lr, sh + i, adam, capacity, false);
 #endif

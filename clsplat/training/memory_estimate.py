@@ -92,7 +92,8 @@ def estimate(
     extra = 6 * SkewMap(config.skew_map).width if config.skew_map else 0  # s and two moments, with spare copies
     extra += 0 if config.sghmc.position_optimizer == "adam" else 6  # momentum
     widest = max(*rows.values(), kernels.record, kernels.v_record)  # of the buffers with a column for each splat
-    splat = _ROLES * rows[Group.GEOM] + (_ROLES - 1) * rows[Group.SH] + COMPACT_ROWS + extra
+    color_roles = _ROLES - 1 - config.optim.half_moments  # two moments of 16 bits are one word
+    splat = _ROLES * rows[Group.GEOM] + color_roles * rows[Group.SH] + COMPACT_ROWS + extra
     return Estimate(
         n * (splat * real + screen),
         n_isects * isect,

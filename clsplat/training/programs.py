@@ -86,14 +86,17 @@ _BELOW_STEPS = (
 _STEPS = ("train/optim.cl", "train/positions.cl")
 
 
-def optim_program(device: Device, kernels: KernelBuild) -> Program:
-    """Return the program of the optimizer: steps of colour, geometry and skew, SGHMC and noise."""
-    return build(device, (*_BELOW_STEPS, *_STEPS), _optim_defines(kernels) | {"LAZY": 0}, kernels.real)
+def optim_program(device: Device, kernels: KernelBuild, half_moments: bool = False) -> Program:
+    """Return the program of the optimizer: steps of colour, geometry and skew, SGHMC and noise.
+
+    half_moments : whether the moments of colours have 16 bits.
+    """
+    return build(device, (*_BELOW_STEPS, *_STEPS), _optim_defines(kernels, half_moments) | {"LAZY": 0}, kernels.real)
 
 
-def lazy_program(device: Device, kernels: KernelBuild) -> Program:
+def lazy_program(device: Device, kernels: KernelBuild, half_moments: bool = False) -> Program:
     """Return the program of the optimizer with the kernels for visible splats (optim/lazy.py)."""
-    defines = _optim_defines(kernels) | {
+    defines = _optim_defines(kernels, half_moments) | {
         "LAZY": 1,
         "ADAM_WAITS": adam.WAITS,
         "CULLED_KEY": f"{CULLED_KEY:#x}u",
@@ -112,7 +115,7 @@ def columns_program(device: Device, kernels: KernelBuild) -> Program:
     return build(device, ("math/lanes.clh", "train/columns.cl", "train/density.cl"), defines, kernels.real)
 
 
-def _optim_defines(kernels: KernelBuild) -> dict[str, Define]:
+def _optim_defines(kernels: KernelBuild, half_moments: bool) -> dict[str, Define]:
     geometry = kernels.schema.group(Group.GEOM)
     widths = {field.name: field.width for field in geometry if field.name not in ("mean", "quat", "log_scale", "skew")}
     defines: dict[str, Define] = {f"PART_{name.upper()}": number for number, name in enumerate(PARTS)}
@@ -121,6 +124,8 @@ def _optim_defines(kernels: KernelBuild) -> dict[str, Define]:
     return defines | {
         "PART_ROWS": max(4, sum(widths.values())),
         "LANES": kernels.lanes,
+        "HALF_MOMENTS": int(half_moments),
+        "FULL_MOMENTS": int(not half_moments),
         "SKEW_MAP": SKEW_MAPS.index(kernels.skew_map),
         "ADAM_BETA1": adam.BETA1,
         "ADAM_BETA2": adam.BETA2,

@@ -82,6 +82,7 @@ DEFAULTS = {
     "skew_map": "auto",
     "average_last": 0.05,
     "visible_adam": False,
+    "half_moments": False,
     "optimizer": "fused",
     "position_optimizer": "adam",
     "sghmc_friction": 120.0,

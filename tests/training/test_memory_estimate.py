@@ -27,6 +27,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "gaussian": {"shape": "gaussian"},
     "skew-normal with exposure": {"shape": "skew-normal", "strategy": "mcmc", "exposure": True},
     "lazy steps": {"shape": "gaussian", "visible_adam": True},
+    "half moments": {"shape": "gaussian", "half_moments": True},
     "momentum": {"shape": "student-t", "position_optimizer": "sghmc"},
 }
 

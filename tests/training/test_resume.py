@@ -69,8 +69,8 @@ def edits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
 
 @pytest.mark.parametrize(
     "changes",
-    [MCMC, MCMC | {"optimizer": "numpy"}, MCMC | {"relocation_limit": 0.005}, ADC],
-    ids=["fused", "numpy", "relocation limit", "adc"],
+    [MCMC, MCMC | {"optimizer": "numpy"}, MCMC | {"relocation_limit": 0.005}, MCMC | {"half_moments": True}, ADC],
+    ids=["fused", "numpy", "relocation limit", "half moments", "adc"],
 )
 def test_a_crashed_run_resumes_to_the_same_model(
     scene: Scene,

@@ -11,12 +11,13 @@ from ...device.device import Device
 from ...device.memory import fill_zero, to_device, to_host
 from ...device.program import GROUP_ITEMS, Program, lane_group
 from ...rendering.build import KernelBuild
-from ...rendering.splat_buffers import CompactGradients, ParameterBuffers, SplatBuffers
+from ...rendering.splat_buffers import CompactGradients, SplatBuffers
 from ...splats.fields import Array, Group, Schema, sh_coefficients
 from ..columns import Columns
 from ..density.edit import DensifyEdit
 from ..programs import PARTS, columns_program, optim_program
 from .adam import BETA1, BETA2
+from .moments import AdamMoments
 from .rules import Rules, StepCounts, check_state
 from .sghmc import STREAM, Sghmc
 from .skew_map import SkewMap
@@ -62,14 +63,14 @@ class FusedOptimizer:
 
     def __init__(self, device: Device, kernels: KernelBuild, splats: SplatBuffers, rules: Rules) -> None:
         self.device, self.kernels, self.splats, self.rules = device, kernels, splats, rules
-        self.program: Program = optim_program(device, kernels)
+        half = rules.config.optim.half_moments
+        self.program: Program = optim_program(device, kernels, half)
         self._group = lane_group(device)
         self.columns = Columns(device, columns_program(device, kernels), splats.capacity, splats.dtype)
         self.steps = 0
         schema, dtype = splats.schema, splats.dtype
         # Moments have the size of the splat buffers, so one spare buffer serves all. The rows of the skew are not used.
-        self.first = ParameterBuffers(device, schema, splats.capacity, dtype)
-        self.second = ParameterBuffers(device, schema, splats.capacity, dtype)
+        self.moments = AdamMoments(device, schema, splats.capacity, dtype, half)
         self.spare = {group: device.alloc(splats.group_bytes(group)) for group in Group}
         self.skew = TrainableSkew(splats, rules.map) if rules.map is not None else None
         self.momentum = StateRows(splats, 3) if rules.sghmc is not None else None
@@ -130,7 +131,7 @@ class FusedOptimizer:
             splats.buffers[group], self.spare[group] = self._gather(
                 splats.buffers[group], source, self.spare[group], n_new, rows
             )
-            for moments in (self.first, self.second):
+            for moments in self.moments.of(group):
                 if state_source is not None:
                     moments.buffers[group], self.spare[group] = self._gather(
                         moments.buffers[group], state_source, self.spare[group], n_new, rows
@@ -147,8 +148,7 @@ class FusedOptimizer:
     def state(self) -> dict[str, NDArray[Any]]:
         n = self.splats.n
         state: dict[str, NDArray[Any]] = {"steps": np.array([self.steps, self.skew.steps if self.skew else 0])}
-        for role, buffers in (("first", self.first), ("second", self.second)):
-            state |= {f"{role}.{name}": array for name, array in buffers.download(n, self._base_names).items()}
+        state |= self.moments.state(n, self._base_names)
         if self.skew is not None:
             state |= {
                 "skew_s": self.skew.s.get(n),
@@ -162,8 +162,7 @@ class FusedOptimizer:
     def load_state(self, state: dict[str, NDArray[Any]]) -> None:
         check_state(state, self.state())
         self.steps = int(state["steps"][0])
-        for role, buffers in (("first", self.first), ("second", self.second)):
-            buffers.upload({name: state[f"{role}.{name}"] for name in self._base_names})
+        self.moments.load_state(state, self._base_names)
         if self.skew is not None:
             self.skew.steps = int(state["steps"][1])
             self.skew.s.set(state["skew_s"])
@@ -202,12 +201,11 @@ class FusedOptimizer:
         arguments = {
             "sh": self.splats.sh,
             "grad_sh": grads.sh,
-            "sh_m": self.first.sh,
-            "sh_v": self.second.sh,
+            **self.moments.color_arguments(self.rules.config.seed, self.steps),
             "geom": self.splats.geom,
             "grad_geom": grads.geom,
-            "geom_m": self.first.geom,
-            "geom_v": self.second.geom,
+            "geom_m": self.moments.first.geom,
+            "geom_v": self.moments.second.geom,
             "rates": self.rates,
             "capacity": self.splats.capacity,
             "sh_degree": sh_degree,
@@ -237,8 +235,8 @@ class FusedOptimizer:
             self._group,
             geom=self.splats.geom,
             grad_geom=grads.geom,
-            adam_m=self.first.geom,
-            adam_v=self.second.geom,
+            adam_m=self.moments.first.geom,
+            adam_v=self.moments.second.geom,
             momentum=momentum.buffer,
             capacity=self.splats.capacity,
             n_splats=self.splats.n,
@@ -294,9 +292,7 @@ class FusedOptimizer:
         }
 
     def _reset_fields(self, names: tuple[str, ...]) -> None:
-        n, schema = self.splats.n, self.splats.schema
-        for moments in (self.first, self.second):
-            moments.upload({name: np.zeros((n, schema[name].width)) for name in names})
+        self.moments.reset(self.splats.n, names)
         if self.skew is not None and "skew" in names:
             for rows in (self.skew.first, self.skew.second):
                 rows.set(np.zeros((0, rows.width)))

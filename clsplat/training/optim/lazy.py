@@ -97,7 +97,7 @@ class VisibleOptimizer(FusedOptimizer):
 
     def __init__(self, device: Device, kernels: KernelBuild, splats: SplatBuffers, rules: Rules) -> None:
         super().__init__(device, kernels, splats, rules)
-        self.program = lazy_program(device, kernels)
+        self.program = lazy_program(device, kernels, self.moments.half)
         self.drifts = Drifts()
         self._step_catches_up = False
         self._vectors = splats.capacity // kernels.lanes
@@ -191,8 +191,7 @@ class VisibleOptimizer(FusedOptimizer):
             GROUP_ITEMS,
             sh_coefficients(splats.schema.sh_degree),
             sh=splats.sh,
-            sh_m=self.first.sh,
-            sh_v=self.second.sh,
+            **self.moments.color_arguments(self.rules.config.seed, self.steps),
             **self.color_rates,
             **common,
         )
@@ -203,8 +202,8 @@ class VisibleOptimizer(FusedOptimizer):
             GROUP_ITEMS,
             len(PARTS),
             geom=splats.geom,
-            geom_m=self.first.geom,
-            geom_v=self.second.geom,
+            geom_m=self.moments.first.geom,
+            geom_v=self.moments.second.geom,
             rates=self.rates,
             **common,
         )
