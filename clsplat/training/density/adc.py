@@ -33,7 +33,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import TrainingError
 from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical_depth
 from ...splats.quaternions import rotations
@@ -87,9 +86,7 @@ def plan_adc(
     TrainingError : no splat is finite.
     """
     summary = splats.summary()
-    sound = summary.finite
-    if len(sound) and not sound.any():
-        raise TrainingError("no splat has finite parameters any more: lower the learning rates")
+    sound = summary.some_finite()
     log_size = summary.log_size.astype(np.float64)
     bright = summary.raw_opacity >= shape.raw_opacity(np.array(MIN_OPACITY))  # this is False for a NaN
     by_axis = depth_threshold > 0

@@ -24,7 +24,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError, TrainingError
+from ...errors import InputError
 from ...splats import profiles
 from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical_depth
@@ -97,10 +97,8 @@ def plan_relocation(
             f"growth {growth} must be at least 1, min_opacity {min_opacity} between 0 and 1, limit {limit} 0 to 1"
         )
     summary = splats.summary()
-    sound = summary.finite
+    sound = summary.some_finite()
     n = len(sound)
-    if n and not sound.any():
-        raise TrainingError("no splat has finite parameters any more: lower the learning rates")
     strength = np.where(sound, shape.opacity(summary.raw_opacity.astype(np.float64)), 0.0)
     alive = strength > min_opacity
     n_new = max(n, min(cap, math.ceil(growth * n - 1e-6)))  # 1.05 * 100 is a little above 105 in binary

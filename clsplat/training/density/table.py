@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import TrainingError
 from ...splats.fields import Array
 from ...splats.optical_depth import finite_rows, opacity_names
 from ...splats.shapes import Shape
@@ -36,6 +37,13 @@ class Summary:
     def finite(self) -> NDArray[np.bool_]:
         """Whether all parameters of a splat are finite, (N,)."""
         return ~np.isnan(self.log_size)
+
+    def some_finite(self) -> NDArray[np.bool_]:
+        """Return `finite`. Raise TrainingError if there are splats and none is finite."""
+        finite = self.finite
+        if len(finite) and not finite.any():
+            raise TrainingError("no splat has finite parameters any more: lower the learning rates")
+        return finite
 
 
 class SplatTable(Protocol):
