@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .fields import Array
+from .fields import Array, DoubleArray
 
 
 def gaussian(z: Array, fields: Mapping[str, Array]) -> Array:
@@ -23,18 +23,13 @@ def gaussian(z: Array, fields: Mapping[str, Array]) -> Array:
 
 
 def skew_normal(z: Array, fields: Mapping[str, Array]) -> Array:
-    """Return exp(-z^2/2) Phi(slope z) / peak.
-
-    The field `skew` is m. With t = |m|^2 and k = (pi/2) t / (1 + t), slope^2 = k / (1 - k).
-    """
-    t = np.sum(fields["skew"].astype(np.float64) ** 2, axis=1)
-    k = 0.5 * math.pi * t / (1.0 + t)
-    return _peak_normalised(z, np.sqrt(k / (1.0 - k)))
+    """Return exp(-z^2/2) Phi(slope z) / peak with the slope of the centred form."""
+    return _peak_normalised(z, centred_slope(fields))
 
 
 def skew_normal_direct(z: Array, fields: Mapping[str, Array]) -> Array:
-    """Return exp(-z^2/2) Phi(slope z) / peak with slope = |eta|, the length of the field `skew`."""
-    return _peak_normalised(z, np.linalg.norm(fields["skew"].astype(np.float64), axis=1))
+    """Return exp(-z^2/2) Phi(slope z) / peak with the slope of the direct form."""
+    return _peak_normalised(z, direct_slope(fields))
 
 
 def generalised_exponential(z: Array, fields: Mapping[str, Array]) -> Array:
@@ -60,9 +55,28 @@ def bisected_skew(z: Array, fields: Mapping[str, Array]) -> Array:
     """Return exp(-z^2/2) Phi(slope z) and exp(-z^2/2) Phi(-slope z), with slope = |eta|."""
     from scipy.special import ndtr  # imported late: slow to import
 
-    u = np.linalg.norm(fields["skew"].astype(np.float64), axis=1)[:, None] * z
+    u = direct_slope(fields)[:, None] * z
     parts: Array = np.exp(-0.5 * z * z) * np.stack([ndtr(u), ndtr(-u)], axis=1)
     return parts
+
+
+def centred_slope(fields: Mapping[str, Array]) -> DoubleArray:
+    """Return the slope of a skew m, (n,). With t = |m|^2 and k = (pi/2) t / (1 + t), slope^2 = k / (1 - k)."""
+    t = np.sum(fields["skew"].astype(np.float64) ** 2, axis=1)
+    k = 0.5 * math.pi * t / (1.0 + t)
+    slope: DoubleArray = np.sqrt(k / (1.0 - k))
+    return slope
+
+
+def direct_slope(fields: Mapping[str, Array]) -> DoubleArray:
+    """Return the slope of a slant eta, (n,): its length."""
+    slope: DoubleArray = np.linalg.norm(fields["skew"].astype(np.float64), axis=1)
+    return slope
+
+
+def no_slope(fields: Mapping[str, Array]) -> DoubleArray:
+    """Return the slope of all Gaussians: 0, (1,)."""
+    return np.zeros(1)
 
 
 def _peak_normalised(z: Array, slope: Array) -> Array:
@@ -80,6 +94,8 @@ def _peak_normalised(z: Array, slope: Array) -> Array:
     return np.exp(log_kernel)[:, None]
 
 
+# The slope of each profile that equals exp(-z^2/2) Phi(slope z) / peak. It is the only number that such a profile uses.
+SLOPES = {gaussian: no_slope, skew_normal: centred_slope, skew_normal_direct: direct_slope}
 EVEN = (gaussian, generalised_exponential, student_t)  # profiles with one opacity and the same values at z and -z
 SHORT = (gaussian, skew_normal, skew_normal_direct, half_gaussian, bisected_skew)  # below 1e-17 beyond REACH
 REACH = 9.0

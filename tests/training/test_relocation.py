@@ -44,7 +44,7 @@ def integral(f: Callable[[float], float]) -> float:
     return sum(quad(f, a, b, limit=400, epsabs=1e-10, epsrel=1e-9)[0] for a, b in itertools.pairwise(edges))
 
 
-# Shape, its own parameter, relative error (see _NODES in training/density/relocation.py).
+# Shape, its own parameter, relative error (see _NODES in training/density/length_factor.py).
 KERNELS = [
     (shapes.GAUSSIAN, 0.0, 1e-9),
     (shapes.GES_MODULATION, 3.0, 1e-9),

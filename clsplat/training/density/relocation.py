@@ -6,10 +6,10 @@ copies absorbs as much as the splat did. With g the profile of the kernel (splat
     1 - (1 - o')^N = o
     length factor = integral of o g  /  integral of 1 - (1 - o' g)^N
 
-Both integrals are numerical, so they exist for every profile. For the Gaussian they equal the published double sum. The
-factor applies to lengths (ubc-vision/3dgs-mcmc#37). Student splatting squares it, which is the rule "length-squared".
-If a splat has two opacities, each has its o', and the line crosses the plane between them. For negative opacities
-(the scooping of Student splatting) the formula applies to |o|, and the sign stays.
+Both integrals are numerical (length_factor.py), so they exist for every profile. For the Gaussian they equal the
+published double sum. The factor applies to lengths (ubc-vision/3dgs-mcmc#37). Student splatting squares it, which is
+the rule "length-squared". If a splat has two opacities, each has its o', and the line crosses the plane between them.
+For negative opacities (the scooping of Student splatting) the formula applies to |o|, and the sign stays.
 
 Beyond 3DGS-MCMC, splats still move once their number no longer grows. With a turnover the faintest ones count as dead
 then. Copies are drawn in proportion to the mean screen gradient, by which `adc` chooses too.
@@ -19,18 +19,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...splats import profiles
 from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical_depth
 from ...splats.shapes import Shape
 from ..methods import sss
 from .edit import DensifyEdit, NewValues
+from .length_factor import length_factor
 from .table import SplatTable, smallest
 
 # 3DGS-MCMC's constants.
@@ -40,14 +39,6 @@ N_MAX = 51  # largest number of copies in the formula; it also replaces larger n
 
 # Scales are multiplied by this power of the length factor. "opacity-only" is the rule of Deformable Beta Splatting.
 RULES = {"length": 1.0, "length-squared": sss.RELOCATION_POWER, "opacity-only": 0.0}
-
-# The nodes on each side of 0 are z = _KNEE sinh(asinh(_FARTHEST / _KNEE) u^3), with u the midpoints of equal cells. A
-# step or a cusp at 0 causes no error, because each side is smooth in u. The cube places nodes close to the cusp of
-# exp(-|z|^beta), beta < 1. tests/training/test_relocation.py compares the integrals with adaptive quadrature.
-_NODES = 96
-_KNEE = 3.0
-_FARTHEST = 4e3
-_CHUNK = 2048  # number of splats that are integrated at once, to limit the memory to some megabytes
 
 
 def plan_relocation(
@@ -157,52 +148,9 @@ def relocation(
     shared = np.maximum(old / count[:, None], 1e-300)
     thickest = shared.max(axis=1, initial=1e-300, keepdims=True)
     shared = shared * np.maximum(-math.log1p(-min_opacity) / thickest, 1.0)
-    factor = np.ones(len(count))
-    for first in range(0, len(count), _CHUNK):
-        rows = slice(first, first + _CHUNK)
-        part = {name: array[rows] for name, array in arrays.items()}
-        factor[rows] = _length_factor(shape, part, -np.expm1(-old[rows]), -np.expm1(-shared[rows]), count[rows])
+    factor = length_factor(shape.profile, arrays, old, shared, count)
     raw = {name: raw_of_optical_depth(shape, shared[:, side], arrays[name]) for side, name in enumerate(names)}
     return raw, factor
-
-
-def _length_factor(
-    shape: Shape,
-    arrays: Mapping[str, Array],
-    opacity: DoubleArray,
-    new_opacity: DoubleArray,
-    count: NDArray[np.integer],
-) -> DoubleArray:
-    """Return the integral of one splat divided by the integral of the stack; opacities are (N, S)."""
-    z, weight = _nodes(shape.profile in profiles.EVEN, shape.profile in profiles.SHORT)
-    profile = shape.profile(z, arrays)  # (N, S, K)
-    one = np.einsum("nsk,ns,k->n", profile, opacity, weight)
-    alpha = np.minimum(np.einsum("nsk,ns->nk", profile, new_opacity), 1.0)
-    with np.errstate(divide="ignore"):  # alpha = 1: an opaque splat has an opaque stack
-        stack = -np.expm1(count[:, None] * np.log1p(-alpha)) @ weight
-    factor: DoubleArray = one / np.maximum(stack, 1e-300)
-    return np.where(count > 1, factor, 1.0)
-
-
-@lru_cache
-def _nodes(even: bool, short: bool) -> tuple[DoubleArray, DoubleArray]:
-    """Return the nodes and weights of integrals over a line, (K,) each.
-
-    even : the integrand is even, so that nodes above 0 are enough. short : it is 0 beyond `profiles.REACH`.
-    """
-    u = (np.arange(_NODES) + 0.5) / _NODES
-    reach = math.asinh(_FARTHEST / _KNEE)
-    z = _KNEE * np.sinh(reach * u**3)
-    weight = _KNEE * np.cosh(reach * u**3) * reach * 3.0 * u**2 / _NODES
-    if short:
-        z, weight = z[z <= profiles.REACH], weight[z <= profiles.REACH]
-    if even:
-        nodes, weights = z, 2.0 * weight
-    else:
-        nodes, weights = np.concatenate([-z[::-1], z]), np.concatenate([weight[::-1], weight])
-    for array in (nodes, weights):
-        array.setflags(write=False)
-    return nodes, weights
 
 
 def _draw(weights: DoubleArray, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
