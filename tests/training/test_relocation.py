@@ -242,6 +242,19 @@ def test_draws_are_in_proportion_to_the_strength() -> None:
     np.testing.assert_allclose(share, np.abs(live), atol=5 * 0.5 / math.sqrt(n_dead))
 
 
+def test_small_gradients_beside_a_large_one_are_drawn() -> None:
+    n = 20_000
+    arrays = gaussians(np.linspace(0, 1, n))
+    gradient = np.ones(n, np.float32)
+    gradient[n // 2] = 2**24  # 1 more is not a float32
+    edit = planned(arrays, shapes.GAUSSIAN, np.random.default_rng(0), n, turnover=0.5, gradient=gradient)
+    places = edit.source[: edit.relocated]
+    late = np.count_nonzero(places > n // 2)
+    expected = len(places) * (n / 2) / (2**24 + n / 2)
+    assert abs(late - expected) < 4 * math.sqrt(expected)
+    assert late > 0
+
+
 def test_with_a_turnover_the_faintest_move_to_high_gradients_once_nothing_grows() -> None:
     arrays = gaussians(np.arange(20.0) - 4)  # none is dead
     gradient = np.zeros(20)

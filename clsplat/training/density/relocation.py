@@ -96,33 +96,35 @@ def plan_relocation(
     replacing = turnover > 0 and n_new == n
     if replacing:
         alive[smallest(strength, int(turnover * n))] = False
-    donors, dead = np.flatnonzero(alive), np.flatnonzero(sound & ~alive)
-    if not len(donors):
-        donors, dead, n_new = np.flatnonzero(sound), dead[:0], n
+    dead = np.flatnonzero(sound & ~alive)
+    if not alive.any():
+        alive, dead, n_new = sound, dead[:0], n
     weakest = dead[smallest(strength[dead], int(limit * n))]
     moving = np.sort(np.concatenate([np.flatnonzero(~sound), weakest]))
 
-    demand = strength if gradient is None or not replacing else np.where(np.isfinite(gradient), gradient, 0.0)
-    weights = demand[donors] if demand[donors].any() else np.ones(len(donors))
-    drawn = donors[_draw(weights, len(moving) + n_new - n, rng)]
+    if gradient is None or not replacing:
+        weights = np.where(alive, strength, 0.0)
+    else:
+        weights = np.where(alive & np.isfinite(gradient), gradient, 0.0)
+    drawn = _draw(weights if weights.any() else alive, len(moving) + n_new - n, rng)
     source = np.arange(n_new, dtype=np.int64)
     source[moving] = drawn[: len(moving)]
     source[n:] = drawn[len(moving) :]
 
-    copies = np.bincount(drawn, minlength=n)
-    targets = np.flatnonzero(copies)
+    targets, stack, copies = np.unique(drawn, return_inverse=True, return_counts=True)
     stacked = splats.take(targets)
-    raw, factor = relocation(shape, stacked, copies[targets] + 1, min_opacity)
+    raw, factor = relocation(shape, stacked, copies + 1, min_opacity)
     new: dict[str, Array] = {**raw}
     if RULES[rule]:
         log_scale = stacked["log_scale"]
         new["log_scale"] = log_scale + (RULES[rule] * np.log(factor))[:, None].astype(log_scale.dtype)
     rows = np.concatenate([targets, moving, np.arange(n, n_new)])  # the targets and their copies
-    of_target = np.concatenate([np.arange(len(targets)), np.searchsorted(targets, drawn)])
+    of_target = np.concatenate([np.arange(len(targets)), stack])
     values = {name: NewValues(rows, array[of_target]) for name, array in new.items()}
 
     fresh = np.zeros(n_new, np.bool_)
-    fresh[:n] = (copies > 0) | ~sound
+    fresh[targets] = True
+    fresh[:n] |= ~sound
     fresh[n:] = True
     return DensifyEdit(source, values, fresh, relocated=len(moving), added=n_new - n)
 
@@ -153,15 +155,13 @@ def relocation(
     return raw, factor
 
 
-def _draw(weights: DoubleArray, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _draw(weights: Array | NDArray[np.bool_], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Draw `count` indices in proportion to `weights` (at least 0, not all 0), with replacement."""
-    if count == 0:
-        return np.zeros(0, np.int64)
-    cumulative = np.cumsum(weights)
-    places = rng.random(count) * cumulative[-1]
-    order = np.argsort(places)  # a search in rising order reads the memory in order
     drawn = np.empty(count, np.int64)
-    drawn[order] = np.searchsorted(cumulative, places[order], side="right")
-    last = np.flatnonzero(weights)[-1]  # random() * total may round up to the total
-    indices: NDArray[np.int64] = np.minimum(drawn, last)
-    return indices
+    if count:
+        cumulative = np.cumsum(weights, dtype=np.float64)  # a float32 sum of all splats would lose small weights
+        places = rng.random(count) * cumulative[-1]
+        last = np.searchsorted(cumulative, cumulative[-1])  # random() * total may round up to the total
+        order = np.argsort(places)  # a search in rising order reads the memory in order
+        drawn[order] = np.minimum(np.searchsorted(cumulative, places[order], side="right"), last)
+    return drawn
