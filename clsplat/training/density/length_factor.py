@@ -86,7 +86,7 @@ def by_quadrature(
     one = np.einsum("nsk,ns,k->n", values, opacity, weight)
     alpha = np.minimum(np.einsum("nsk,ns->nk", values, new_opacity), 1.0)
     with np.errstate(divide="ignore"):  # alpha = 1: an opaque splat has an opaque stack
-        stack = -np.expm1(count[:, None] * np.log1p(-alpha)) @ weight
+        stack = np.einsum("nk,k->n", -np.expm1(count[:, None] * np.log1p(-alpha)), weight)
     factor: DoubleArray = one / np.maximum(stack, 1e-300)
     return factor
 
@@ -107,7 +107,7 @@ def _interpolated(slope: DoubleArray, new_opacity: DoubleArray, count: NDArray[n
             part = rows[first : first + _CHUNK]
             table = _coefficients(copies)
             x = _from_slope(slope if len(slope) == 1 else slope[part])
-            # einsum, not a product of BLAS: its threads wait for each other if another program uses the processor.
+            # einsum, not BLAS, whose threads wait for each other if another program uses the processor.
             by_opacity = np.einsum("so,ns->on", table, chebyshev.chebvander(x, len(table) - 1))
             factor[part] = chebyshev.chebval(_from_opacity(new_opacity[part], copies), by_opacity, tensor=False)
     return factor
@@ -131,8 +131,8 @@ def _coefficients(copies: int) -> DoubleArray:
 
 
 # The variables of the polynomials are between -1 and 1. Functions of the opacity turn from linear to logarithmic in
-# N o', because many copies absorb 1 - exp(-N o' g). Functions of the slope are even, with singularities
-# at negative squares, and approach a limit for steep slopes. Trials gave the constants: others need higher degrees.
+# N o', because many copies absorb 1 - exp(-N o' g). Functions of the slope are even, with singularities at negative
+# squares, and approach a limit for steep slopes. Trials gave the constants: others need higher degrees.
 _BEND = 0.2
 _CURVE, _POWER = 0.5, -1.0 / 3.0
 _LAST = (1.0 + _CURVE * SLANT_MAX**2) ** _POWER
