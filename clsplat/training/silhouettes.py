@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..cameras.seen import seen
-from ..files.images import ImageU8
 from ..splats.fields import DoubleArray
 
 if TYPE_CHECKING:
+    from ..files.images import ImageU8
     from ..scenes.view import View
 
 TRANSPARENT_SHARE = 0.01  # photos with a smaller share of transparent pixels count as opaque
