@@ -34,7 +34,11 @@ OTHER_PROGRAMS = {"measure/smoke.cl", "measure/roofline.cl", "measure/count.cl"}
 def test_every_kernel_has_one_stage() -> None:
     folder = Path(__file__).resolve().parents[2] / "cl"
     files = {str(path.relative_to(folder)) for path in folder.rglob("*.cl")}
-    defines = KernelBuild("gaussian", 1, SCHEDULES["cpu16"]).defines() | {"LAZY": 1, "HALF_MOMENTS": 0, "FULL_MOMENTS": 1}
+    defines = KernelBuild("gaussian", 1, SCHEDULES["cpu16"]).defines() | {
+        "LAZY": 1,
+        "HALF_MOMENTS": 0,
+        "FULL_MOMENTS": 1,
+    }
     kernels = {name for file in files - OTHER_PROGRAMS for name in parse_signatures(source(file), "float", defines)}
     assert len(kernels) > 20
     assert kernels <= set(STAGE_OF) | set(SHARED), "a kernel without a stage in clsplat/profiling/stages.py"
