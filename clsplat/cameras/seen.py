@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from .camera import Camera
 
+_SAMPLED_POINTS = 2000
+
 
 class Seen(NamedTuple):
     """Where P points are in an image.
@@ -34,6 +36,11 @@ def seen(camera: Camera, xyz: NDArray[np.float64]) -> Seen:
         pixel = local[:, :2] / depth[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     inside: NDArray[np.bool_] = (depth > 0) & ((pixel >= 0) & (pixel < (camera.width, camera.height))).all(axis=1)
     return Seen(depth, pixel, inside)
+
+
+def sampled(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return at most 2000 of the points (P, 3), evenly spread in their order: enough for what holds for all of them."""
+    return xyz[:: -(-len(xyz) // _SAMPLED_POINTS) or 1]
 
 
 def mean_share_seen(cameras: Sequence[Camera], xyz: NDArray[np.float64]) -> float:

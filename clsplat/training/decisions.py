@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from ..cameras.seen import mean_share_seen
+from ..cameras.seen import mean_share_seen, sampled
 from ..device.device import open_device
 from .config import OPTIONS, TrainConfig
 from .initialise import MIN_POINTS
@@ -44,7 +44,6 @@ RANDOM_SHARE_OF_FEW = 0.1  # the same, if the scene has fewer points than this s
 RANDOM_START_RATES = 2.0  # factor on the learning rates of a run that starts at random
 SEEN_SHARE = 0.7  # of the scene's points in a photo: with a smaller share, only visible splats step on a GPU
 UNSEEN_SPLATS = 50_000  # fewer splats outside of a photo save less time than the two further commands take
-_SAMPLED_POINTS = 2000  # points that are looked at
 FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
 _RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
 
@@ -152,9 +151,7 @@ def waits_for_sight(scene: Scene, config: TrainConfig) -> float:
 
     The points stand for the splats. Without points, nothing is known before the run.
     """
-    xyz = scene.points.xyz
-    xyz = xyz[:: -(-len(xyz) // _SAMPLED_POINTS) or 1]
-    share = mean_share_seen([view.camera for view in scene.train], xyz)
+    share = mean_share_seen([view.camera for view in scene.train], sampled(scene.points.xyz))
     if share >= SEEN_SHARE or (1.0 - share) * config.cap_max < UNSEEN_SPLATS:
         return 0.0
     return share if open_device(config.device).info.type == "GPU" else 0.0

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..cameras.seen import seen
+from ..cameras.seen import sampled, seen
 from ..errors import InputError, Remedy
 from ..splats.fields import DoubleArray
 
@@ -18,7 +18,6 @@ EXTENT_SHARE = 1 / 20  # of the extent: 3DGS's scenes have extents of 4 and more
 DEPTH_SHARE = 0.5  # of the depth up to which NEAREST_SHARE of the points lie
 NEAREST_SHARE = 0.01  # of the points in the images; single points may be wrong
 _MAX_NEARER = 0.1  # largest share of the points in the images that may be nearer than the near plane
-_SAMPLED_POINTS = 2000  # points that are looked at
 
 
 def choose_near_plane(scene: Scene) -> float:
@@ -41,6 +40,6 @@ def check_near_plane(scene: Scene, near_plane: float) -> None:
 
 def _point_depths(scene: Scene) -> DoubleArray:
     """Return the depths of the scene's points in the images that they are in, at most 2000 points."""
-    xyz = scene.points.xyz[:: -(-len(scene.points.xyz) // _SAMPLED_POINTS) or 1]
+    xyz = sampled(scene.points.xyz)
     depths = [found.depth[found.inside] for found in (seen(view.camera, xyz) for view in scene.train)]
     return np.concatenate(depths) if depths else np.zeros(0)

@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras.camera import Camera
 from ..cameras.seen import seen
 from ..splats.fields import DoubleArray
 
 if TYPE_CHECKING:
-    from ..files.images import ImageU8
     from ..scenes.view import View
 
 TRANSPARENT_SHARE = 0.01  # photos with a smaller share of transparent pixels count as opaque
@@ -46,20 +44,16 @@ class Silhouettes:
     """
 
     def __init__(self, views: Sequence[View]) -> None:
-        self._photos: list[tuple[Camera, _Silhouette]] = []
-        for view in views[:: -(-len(views) // _VIEWS)]:
-            pixels = view.loaded()
-            if pixels.alpha is not None:
-                self._photos.append((view.camera, _Silhouette.of(pixels.image, pixels.alpha)))
-        self._allowed = int(_WRONG * len(self._photos))
+        found = (_Silhouette.of(view) for view in views[:: -(-len(views) // _VIEWS)])
+        self._silhouettes = [silhouette for silhouette in found if silhouette is not None]
+        self._allowed = int(_WRONG * len(self._silhouettes))
 
     def admit(self, xyz: DoubleArray) -> NDArray[np.bool_]:
         """Return whether points (P, 3) are in the visual hull. Points outside all photos are."""
         rows = np.arange(len(xyz))  # of points that are not excluded yet
         excluded = np.zeros(len(xyz), np.int64)
-        for camera, silhouette in self._photos:
-            _, pixel, inside = seen(camera, xyz[rows])
-            y, x = silhouette.block(pixel[inside])
+        for silhouette in self._silhouettes:
+            inside, y, x = silhouette.blocks_at(xyz[rows])
             excluded[rows[inside]] += ~silhouette.shows[y, x]
             rows = rows[excluded[rows] <= self._allowed]
         admitted = np.zeros(len(xyz), np.bool_)
@@ -69,10 +63,9 @@ class Silhouettes:
     def colors(self, xyz: DoubleArray) -> NDArray[np.uint8]:
         """Return the mean colour (P, 3) that the photos have at points (P, 3). Points that no photo shows are black."""
         total, count = np.zeros((len(xyz), 3)), np.zeros((len(xyz), 1))
-        for camera, silhouette in self._photos[:: max(-(-len(self._photos) // _COLORED_BY), 1)]:
-            _, pixel, inside = seen(camera, xyz)
-            y, x = silhouette.block(pixel[inside])
-            total[inside] += silhouette.color[y, x] * silhouette.shows[y, x, None]
+        for silhouette in self._silhouettes[:: max(-(-len(self._silhouettes) // _COLORED_BY), 1)]:
+            inside, y, x = silhouette.blocks_at(xyz)
+            total[inside] += silhouette.colors()[y, x] * silhouette.shows[y, x, None]
             count[inside, 0] += silhouette.shows[y, x]
         return (total / np.maximum(count, 1.0)).round().astype(np.uint8)
 
@@ -83,33 +76,43 @@ class _Silhouette:
 
     Attributes
     ----------
+    view : the photo with its camera. Its pixels are not kept here.
     shows : (h, w) whether a pixel of the block is not wholly transparent.
-    color : (h, w, 3) float32, mean colour of these pixels by their alpha, 0..255.
     side : side of a block [px].
     """
 
+    view: View
     shows: NDArray[np.bool_]
-    color: NDArray[np.float32]
     side: int
 
     @classmethod
-    def of(cls, image: ImageU8, alpha: ImageU8) -> _Silhouette:
-        """Return the silhouette of an image (H, W, 3) with its alpha (H, W)."""
+    def of(cls, view: View) -> _Silhouette | None:
+        """Return the silhouette of a photo; None for a photo without transparency."""
+        alpha = view.alpha
+        if alpha is None:
+            return None
         side = -(-max(alpha.shape) // _SIDE)
-        height, width = (-(-length // side) for length in alpha.shape)
-        margin = ((0, height * side - alpha.shape[0]), (0, width * side - alpha.shape[1]))
+        return cls(view, _block_sums(alpha[:, :, None].astype(np.float32), side)[:, :, 0] > 0, side)
 
-        def block_sums(values: NDArray[np.float32]) -> NDArray[np.float32]:
-            padded = np.pad(values, (*margin, (0, 0)))
-            by_row = padded.reshape(height, side, width * side, -1).sum(axis=1)  # two sums are faster than one
-            return by_row.reshape(height, width, side, -1).sum(axis=2)
+    def blocks_at(self, xyz: DoubleArray) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+        """Return which of the points (P, 3) are in the photo, and the rows and columns of the blocks of these."""
+        _, pixel, inside = seen(self.view.camera, xyz)
+        x, y = (pixel[inside] // self.side).astype(np.int64).T
+        return inside, y, x
 
-        weight = alpha[:, :, None].astype(np.float32)
-        sums = block_sums(weight)
-        color = (block_sums(weight * image) / np.maximum(sums, 1.0)).astype(np.float32)
-        return cls(sums[:, :, 0] > 0, color, side)
+    def colors(self) -> NDArray[np.float32]:
+        """Return the mean colour of each block by the alpha of its pixels, (h, w, 3), 0..255."""
+        pixels = self.view.loaded()
+        assert pixels.alpha is not None
+        weight = pixels.alpha[:, :, None].astype(np.float32)
+        sums = _block_sums(weight, self.side)
+        return (_block_sums(weight * pixels.image, self.side) / np.maximum(sums, 1.0)).astype(np.float32)
 
-    def block(self, pixel: DoubleArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the rows and the columns of the blocks at pixel positions (P, 2)."""
-        x, y = (pixel // self.side).astype(np.int64).T
-        return y, x
+
+def _block_sums(values: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Return the sums over square blocks of an image (H, W, C). Blocks at its ends may be smaller."""
+    height, width = (-(-length // side) for length in values.shape[:2])
+    margin = [(0, blocks * side - length) for blocks, length in zip((height, width), values.shape[:2], strict=True)]
+    padded = np.pad(values, (*margin, (0, 0)))
+    by_row = padded.reshape(height, side, width * side, -1).sum(axis=1)  # two sums are faster than one
+    return by_row.reshape(height, width, side, -1).sum(axis=2)
