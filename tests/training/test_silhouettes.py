@@ -56,6 +56,15 @@ def test_points_fill_the_object(at: tuple[float, float, float]) -> None:
     np.testing.assert_array_equal(rgb, np.broadcast_to(RED, xyz.shape))
 
 
+def test_few_points_fill_the_object_too() -> None:
+    """The first draws find few points of the hull: their box must grow to its whole size."""
+    for seed in range(5):
+        xyz = random_points(scene_of(ball()), 300, np.random.default_rng(seed)).xyz / RADIUS
+        assert len(xyz) == 300
+        assert (xyz.min(axis=0) < -0.65).all()
+        assert (xyz.max(axis=0) > 0.65).all()
+
+
 def test_large_photos_are_reduced() -> None:
     """Blocks of 3x3 pixels: the last ones of 599 px need a margin. 50 px stay as they are."""
     small, large = (Silhouettes(ball(size=size)) for size in (50, 599))
@@ -65,6 +74,7 @@ def test_large_photos_are_reduced() -> None:
     assert large.admit(xyz[distance < 0.99]).all(), "no part of the object is left out"
     assert not large.admit(xyz[distance > 1.15]).any()
     assert large.admit(np.full((1, 3), 99.0)).all(), "outside all photos"
+    np.testing.assert_array_equal(np.unique(large.colors(xyz[distance < 1.05]), axis=0), [RED], "no background")
 
 
 def test_some_silhouettes_may_be_wrong() -> None:
@@ -84,7 +94,9 @@ def test_a_landscape_without_its_sky_reaches_far() -> None:
     assert transparent_share(views) == pytest.approx(0.5)
     xyz, _, where = random_points(scene_of(views), 2000, np.random.default_rng(0))
     assert where == "inside the silhouettes of the photos"
-    assert np.linalg.norm(xyz, axis=1).max() > 6
+    distance = np.linalg.norm(xyz, axis=1)
+    assert distance.max() > 6
+    assert np.mean(distance < 4) > 0.56, "uniform points would have less than half of them within the ring"
     for camera in cameras:
         _, pixel, inside = seen(camera, xyz)
         assert (pixel[inside, 1] >= 16).all()
