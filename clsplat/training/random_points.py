@@ -24,7 +24,9 @@ SEEN_BY = 2  # smallest number of cameras that see a point: one camera alone doe
 CENTRAL_SHARE = 0.75  # half of the points are in the region that this share of the cameras sees, if it exists
 HULL_SHARE = 0.25  # share of the cameras that see a point of the visual hull: cones that few cameras see are empty
 _FEWEST = 0.01  # of the points: if fewer are found in the visual hull, the silhouettes contradict each other
-_FIRST_FOUND = 32  # points of the hull that are enough to begin with its box
+_BOX_POINTS = 4096  # points of the hull that are enough to know its box
+_BOX_MARGIN = 0.1  # of the box's sides, for what these points do not reach
+_DEEPEST = 3.0  # largest depth of these points, in median distances of the cameras
 _FARTHEST = 9.0  # largest distance from the centre, in median distances of the cameras
 _AHEAD = 3.0  # distance of the centre in front of parallel cameras, in scene extents
 _DRAWS = 16  # number of draws of `count` points; points that cameras see are kept
@@ -101,22 +103,16 @@ def _in_hull(sight: _Sight, silhouettes: Silhouettes, count: int, rng: np.random
             points = np.concatenate([points, kept(draw())])
             if len(points) >= enough:
                 break
-        return points[:count]
+        return points[:enough]
 
-    found = gather(lambda: sight.draw(count, rng), _FIRST_FOUND, _DRAWS)
-    for _ in range(_DRAWS if len(found) else 0):
-        low, high = found.min(axis=0), found.max(axis=0)
-        margin = 0.25 * (high - low)
-        more = kept(rng.uniform(low - margin, high + margin, (count, 3)))
-        found = np.concatenate([found, more])
-        if ((found.min(axis=0) >= low - 0.1 * margin) & (found.max(axis=0) <= high + 0.1 * margin)).all():
-            break  # the box does not grow any more
+    found = gather(lambda: silhouettes.draw(_BOX_POINTS, _DEEPEST * sight.unit, rng), _BOX_POINTS, _DRAWS)
     if not len(found):
         return found
     if sight.distance(found) > sight.unit:
         return gather(lambda: sight.draw(count, rng), count, _DRAWS)
     low, high = found.min(axis=0), found.max(axis=0)
-    return gather(lambda: rng.uniform(low, high, (count, 3)), count, _HULL_DRAWS)
+    margin = _BOX_MARGIN * (high - low)
+    return gather(lambda: rng.uniform(low - margin, high + margin, (count, 3)), count, _HULL_DRAWS)
 
 
 def _in_sight(sight: _Sight, count: int, rng: np.random.Generator) -> DoubleArray:

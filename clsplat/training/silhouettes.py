@@ -60,6 +60,12 @@ class Silhouettes:
         admitted[rows] = True
         return admitted
 
+    def draw(self, count: int, far: float, rng: np.random.Generator) -> DoubleArray:
+        """Return at most `count` points (P, 3) that photos show, at random depths up to `far`: many are in the hull."""
+        share = count // max(len(self._silhouettes), 1)
+        drawn = [silhouette.draw(share, far, rng) for silhouette in self._silhouettes]
+        return np.concatenate([np.zeros((0, 3)), *drawn])
+
     def colors(self, xyz: DoubleArray) -> NDArray[np.uint8]:
         """Return the mean colour (P, 3) that the photos have at points (P, 3). Points that no photo shows are black."""
         total, count = np.zeros((len(xyz), 3)), np.zeros((len(xyz), 1))
@@ -99,6 +105,16 @@ class _Silhouette:
         _, pixel, inside = seen(self.view.camera, xyz)
         x, y = (pixel[inside] // self.side).astype(np.int64).T
         return inside, y, x
+
+    def draw(self, count: int, far: float, rng: np.random.Generator) -> DoubleArray:
+        """Return (count, 3) points at random in what the photo shows, and in depth; none if it shows nothing."""
+        shown = np.argwhere(self.shows)[:, ::-1]
+        if not len(shown):
+            return np.zeros((0, 3))
+        camera, depth = self.view.camera, rng.uniform(0.0, far, (count, 1))
+        pixel = self.side * (shown[rng.integers(len(shown), size=count)] + rng.uniform(size=(count, 2)))
+        local = np.concatenate([depth * (pixel - (camera.cx, camera.cy)) / (camera.fx, camera.fy), depth], axis=1)
+        return np.asarray((local - camera.translation) @ camera.rotation)
 
     def colors(self) -> NDArray[np.float32]:
         """Return the mean colour of each block by the alpha of its pixels, (h, w, 3), 0..255."""

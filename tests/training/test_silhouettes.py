@@ -20,23 +20,25 @@ RADIUS = 0.8  # of the ball in the photos
 RED = (200, 20, 10)
 
 
-def ball_photo(camera: Camera, at: np.ndarray, behind: int = 0) -> View:
+def ball_photo(camera: Camera, at: np.ndarray, behind: int = 0, radius: float = RADIUS) -> View:
     """Return a photo of a red ball. behind : alpha of the pixels around it."""
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     local = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)], axis=-1)
     centre = camera.rotation @ at + camera.translation
     along = local @ centre / np.linalg.norm(local, axis=-1)
-    hit = centre @ centre - along**2 < RADIUS**2
+    hit = centre @ centre - along**2 < radius**2
     image = np.where(hit[:, :, None], np.array(RED, np.uint8), np.uint8(255))
     return View("ball.png", camera, image, alpha=np.where(hit, 255, behind).astype(np.uint8))
 
 
-def ball(at: tuple[float, float, float] = (0.0, 0.0, 0.0), size: int = 50, unlike: int = 0) -> list[View]:
+def ball(
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0), size: int = 50, unlike: int = 0, radius: float = RADIUS
+) -> list[View]:
     """Return photos from a ring and from above. unlike : number of photos of a ball in another place."""
     middle = np.array(at)
     places = np.concatenate([ring(40), ring(40) * (1, 1, -1), [(0.01, 0.0, 4.0), (0.0, 0.01, -4.0)]])
     cameras = [camera.resized(size, size) for camera in looking(places + middle, middle)]
-    return [ball_photo(camera, middle + (n < unlike) * 9.0) for n, camera in enumerate(cameras)]
+    return [ball_photo(camera, middle + (n < unlike) * 9.0, radius=radius) for n, camera in enumerate(cameras)]
 
 
 def scene_of(views: list[View]) -> Any:
@@ -56,13 +58,17 @@ def test_points_fill_the_object(at: tuple[float, float, float]) -> None:
     np.testing.assert_array_equal(rgb, np.broadcast_to(RED, xyz.shape))
 
 
-def test_few_points_fill_the_object_too() -> None:
-    """The first draws find few points of the hull: their box must grow to its whole size."""
+@pytest.mark.parametrize(("radius", "size"), [(RADIUS, 50), (0.05, 200)])
+def test_few_points_fill_the_object_too(radius: float, size: int) -> None:
+    """The first draws find few points of the hull, of a small object hardly any: their box must grow."""
+    views = ball(radius=radius, size=size)
     for seed in range(5):
-        xyz = random_points(scene_of(ball()), 300, np.random.default_rng(seed)).xyz / RADIUS
+        xyz, _, where = random_points(scene_of(views), 300, np.random.default_rng(seed))
+        assert where == "inside the silhouettes of the photos"
+        xyz /= radius
         assert len(xyz) == 300
-        assert (xyz.min(axis=0) < -0.65).all()
-        assert (xyz.max(axis=0) > 0.65).all()
+        assert (xyz.min(axis=0) < -0.8).all()
+        assert (xyz.max(axis=0) > 0.8).all()
 
 
 def test_large_photos_are_reduced() -> None:
