@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from blender_python import blenders_python_or_skip
 from blender_scene import HEIGHT, WIDTH, encoded, facing, some_splats
 from clsplat_blender.lens import Lens, Raster, camera_of
 from clsplat_cli.blender_addon import addon_zip
@@ -32,20 +33,10 @@ from clsplat.splats.transform import joined, transformed
 CHILD = Path(__file__).parents[1] / "support" / "blender_child.py"
 
 
-def blenders_python() -> str | None:
-    """Return a Python with bpy, or None."""
-    python = os.environ.get("CLSPLAT_BLENDER_PYTHON", sys.executable)
-    asking = "import importlib.util, sys; sys.exit(importlib.util.find_spec('bpy') is None)"
-    found = subprocess.run([python, "-c", asking], check=False, capture_output=True)
-    return python if found.returncode == 0 else None
-
-
 @pytest.fixture(scope="module")
 def blender(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """The folder and the results of the child process."""
-    python = blenders_python()
-    if python is None:
-        pytest.skip("bpy is not installed: pip install bpy==5.0.* for Python 3.11, or set CLSPLAT_BLENDER_PYTHON")
+    python = blenders_python_or_skip()
     folder = tmp_path_factory.mktemp("blender")
     some_splats().save(folder / "model.ply")
     some_splats(1, "gaussian").save(folder / "other.ply")
