@@ -139,32 +139,6 @@ def metals(rng: np.random.Generator) -> None:
             add("uv_sphere", made_of, (x, y, -0.27), (0.29, 0.29, 0.29), segments=64, ring_count=32)
 
 
-def glass(rng: np.random.Generator) -> None:
-    """Drums of brass with clear walls and thin rods, and a glass ball: transparent parts, like drums."""
-    clear = material("clear", (0.9, 0.95, 1.0), 0.0)
-    for socket, value in (("Transmission Weight", 1.0), ("IOR", 1.1)):
-        clear.node_tree.nodes["Principled BSDF"].inputs[socket].default_value = value
-    brass, skin = (
-        material("brass", (0.8, 0.55, 0.2), 0.2, metallic=1.0),
-        textured("skin", "Voronoi", 5.0, (0.75, 0.7, 0.6), (0.95, 0.93, 0.9)),
-    )
-    steel = material("steel", (0.6, 0.6, 0.62), 0.15, metallic=1.0)
-    for x, y, size in ((-0.5, 0.3, 0.55), (0.6, 0.35, 0.45), (0.05, -0.6, 0.5)):
-        add(
-            "cylinder", clear, (x, y, -0.6), radius=size, depth=0.6, vertices=96, end_fill_type="NOTHING"
-        ).modifiers.new("t", "SOLIDIFY").thickness = 0.02
-        add("cylinder", skin, (x, y, -0.3), radius=0.96 * size, depth=0.02, vertices=96)
-        for z in (-0.9, -0.3):
-            add("torus", brass, (x, y, z), major_radius=size, minor_radius=0.03)
-        for angle in np.linspace(0, 2 * math.pi, 8, endpoint=False):
-            foot = np.array([x + 1.02 * size * math.cos(angle), y + 1.02 * size * math.sin(angle), -0.9])
-            add_wire("rod", [foot, foot + np.array([0, 0, 0.6])], 0.012, steel)
-    for x, y in ((-0.9, -0.5), (0.95, -0.35)):
-        add_wire("stand", [(x, y, -0.9), (x * 0.9, y * 0.9, 0.55)], 0.018, steel)
-        add("cone", brass, (x * 0.9, y * 0.9, 0.56), vertices=96, radius1=0.4, radius2=0.05, depth=0.05)
-    add("uv_sphere", clear, (0.05, -0.6, 0.0), (0.28, 0.28, 0.28), segments=64, ring_count=32)
-
-
 def wires(rng: np.random.Generator) -> None:
     """A microphone: a cage of thin wires over a dark core, a cable on the ground, like mic."""
     steel, dark = (
@@ -269,7 +243,6 @@ def room(rng: np.random.Generator) -> None:
 SCENES: dict[str, Callable[[np.random.Generator], None]] = {
     "plant": plant,
     "metals": metals,
-    "glass": glass,
     "wires": wires,
     "room": room,
 }

@@ -73,7 +73,7 @@ def prepare(size: int, field_of_view: float, indoors: bool) -> Any:
     scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.seed = SAMPLES, True, 0
     scene.cycles.max_bounces, scene.render.use_persistent_data = 6, True
     scene.render.resolution_x = scene.render.resolution_y = size
-    scene.render.film_transparent, scene.cycles.film_transparent_glass = not indoors, True
+    scene.render.film_transparent = not indoors
     scene.view_settings.view_transform = "Standard"
     scene.render.image_settings.color_mode = "RGB" if indoors else "RGBA"
     world = bpy.data.worlds.new("sky")

@@ -37,7 +37,7 @@ NO_SMALL_IMAGES = ":coarse_to_fine=false"
 FULL_SIZE = ("lego_full", "fox", "kitchen_large", "south_building_large")  # scenes, in the order of the page
 PAGE = ROOT / "benchmarks" / "SYSTEMS.md"
 BEGIN, END = "<!-- table of defaults.py -->", "<!-- end of the table -->"
-TRANSPARENT = ("lego", "lego_full", "plant", "metals", "glass", "wires")  # the last four: blender_scenes.py
+TRANSPARENT = ("lego", "lego_full", "plant", "metals", "wires")  # the last three: blender_scenes.py
 
 
 @dataclass(frozen=True)
