@@ -3,7 +3,7 @@
     python benchmarks/defaults.py --cases lego:-1:30000:1500 fox:2:20000:1000 --systems default,3dgs --seeds 0 1 2
     python benchmarks/defaults.py --cases lego_full:-1:100000:2000 --views test     # once, after the choice
     python benchmarks/defaults.py --table
-    python benchmarks/defaults.py --page       # write the table "Scenes at full size" of SYSTEMS.md
+    python benchmarks/defaults.py --page       # write the tables of SYSTEMS.md
 
 A case is scene:resolution:cap:iterations, with the resolution of `load_scene`. Systems are those of `clsplat compare`,
 such as default:strategy=mcmc. Transparent scenes have a white background, as published figures have. Runs are measured
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import statistics
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,9 +36,13 @@ KEY = ("scene", "resolution", "cap", "iterations", "system", "seed", "views")
 TRAINING_VIEWS = 20  # training views that are measured, to see how far training and other views are apart
 NO_SMALL_IMAGES = ":coarse_to_fine=false"
 FULL_SIZE = ("lego_full", "fox", "kitchen_large", "south_building_large")  # scenes, in the order of the page
+BLENDER = ("plant", "metals", "wires", "room")  # scenes of blender_scenes.py
 PAGE = ROOT / "benchmarks" / "SYSTEMS.md"
-BEGIN, END = "<!-- table of defaults.py -->", "<!-- end of the table -->"
-TRANSPARENT = ("lego", "lego_full", "plant", "metals", "wires")  # the last three: blender_scenes.py
+TABLES = {  # scenes by the marks around their table on the page
+    ("<!-- table of defaults.py -->", "<!-- end of the table -->"): FULL_SIZE,
+    ("<!-- table of new scenes -->", "<!-- end of the table of new scenes -->"): BLENDER,
+}
+TRANSPARENT = ("lego", "lego_full", *BLENDER[:-1])
 
 
 @dataclass(frozen=True)
@@ -145,16 +150,16 @@ def page(rows: list[dict[str, Any]]) -> str:
     return "\n".join(parts)
 
 
-def full_size(rows: list[dict[str, Any]]) -> str:
-    """Return a Markdown table of the runs at full size on test views.
+def test_table(rows: list[dict[str, Any]], scenes: Sequence[str]) -> str:
+    """Return a Markdown table of the runs at full size on test views of some scenes, in their order.
 
     Variants of a system are left out, but for those without small images (NO_SMALL_IMAGES).
     """
-    plain = [r for r in rows if r["views"] == "test" and r["resolution"] == -1 and r["scene"] in FULL_SIZE]
+    plain = [r for r in rows if r["views"] == "test" and r["resolution"] == -1 and r["scene"] in scenes]
     plain = [r for r in plain if not set(r["system"].removesuffix(NO_SMALL_IMAGES)) & {" ", ":"}]
     cases = groups(plain, "scene", "cap", "iterations").items()
     lines = []
-    for (scene, cap, iterations), case in sorted(cases, key=lambda item: (FULL_SIZE.index(item[0][0]), *item[0][1:])):
+    for (scene, cap, iterations), case in sorted(cases, key=lambda item: (scenes.index(item[0][0]), *item[0][1:])):
         means = {name: statistics.fmean(r["psnr"] for r in same) for (name,), same in groups(case, "system").items()}
         for system in sorted(means, key=means.__getitem__, reverse=True):
             same = [r for r in case if r["system"] == system]
@@ -170,7 +175,7 @@ def full_size(rows: list[dict[str, Any]]) -> str:
                     shown + (f" ± {statistics.stdev(psnr):.2f}" if len(psnr) > 1 else ""),
                     f"{statistics.fmean(r['ssim'] for r in same):.4f}",
                     f"{statistics.fmean(r['train_psnr'] for r in same):.2f}",
-                    f"{statistics.fmean(r['seconds'] for r in same) / 60:.0f}",
+                    f"{statistics.fmean(r['seconds'] for r in same) / 60:.1f}",
                 )
             )
     head = ("scene", "splats", "iterations", "system", "PSNR", "SSIM", "PSNR of training views", "minutes")
@@ -184,11 +189,12 @@ def main() -> None:
     flags.add_argument("--seeds", nargs="+", type=int, default=[0])
     flags.add_argument("--views", choices=("validation", "test"), default="validation")
     flags.add_argument("--work", type=Path, help="folder of the models, for runs that may be interrupted")
-    flags.add_argument("--page", action="store_true", help="write the table of SYSTEMS.md, and run nothing")
+    flags.add_argument("--page", action="store_true", help="write the tables of SYSTEMS.md, and run nothing")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
     if args.page:
-        write_between(PAGE, BEGIN, END, full_size(runs.rows))
+        for marks, scenes in TABLES.items():
+            write_between(PAGE, *marks, test_table(runs.rows, scenes))
         return
     if not args.table:
         for seed in args.seeds:

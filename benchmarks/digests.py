@@ -42,7 +42,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "length-squared": {"strategy": "mcmc", "relocation": "length-squared", "shape": "student-t"},
     "opacity-only": {"strategy": "mcmc", "relocation": "opacity-only"},
     "exposure": {"exposure": True},
-    "random-background": {"random_background": True},
+    "random-background": {"random_background": True, "random_background_until": 1.0},
     "antialiased": {"antialiased": True},
     "antialiased-direct": {"antialiased": True, "shape": "skew-normal-direct"},
     "visible-adam": {"visible_adam": True},

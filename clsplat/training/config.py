@@ -98,8 +98,16 @@ class TrainConfig:
     background: Color = option(BLACK, help="Colour behind the splats, each part 0 to 1.", metavar="R,G,B")  # noqa: RUF009
     random_background: bool = option(
         False,
-        help="Train with a random background colour in each iteration, also behind transparent photos.",
+        help="Train with a random background colour in each iteration, also behind transparent photos, until "
+        "--random-background-until.",
         by_scene=True,
+    )
+    random_background_until: float = option(
+        0.8,
+        help="End of the random backgrounds, as a fraction of the run. The rest of the run has --background. 1: the "
+        "model fits any background better, and this one less.",
+        at_least=0,
+        at_most=1,
     )
     seed: int = option(
         0,

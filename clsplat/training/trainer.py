@@ -295,7 +295,7 @@ class Trainer:
         target = self.targets.get(*self.views.next(it, self.splats.n))
         degree = self.sh_degree
         background = config.background
-        if config.random_background:
+        if config.random_background and it <= config.random_background_until * config.iterations:
             r, g, b = self.rng.random(3).tolist()
             background = r, g, b
         frame = self.pipeline.forward(self.splats, target.camera, background, degree)

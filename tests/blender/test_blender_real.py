@@ -10,13 +10,12 @@ import json
 import math
 import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from blender_python import blenders_python_or_skip
+from blender_python import blenders_python, blenders_python_or_skip
 from blender_scene import HEIGHT, WIDTH, encoded, facing, some_splats
 from clsplat_blender.lens import Lens, Raster, camera_of
 from clsplat_cli.blender_addon import addon_zip

@@ -59,6 +59,7 @@ DEFAULTS = {
     "near_plane": None,
     "background": (0.0, 0.0, 0.0),
     "random_background": False,
+    "random_background_until": 0.8,
     "seed": 0,
     "strategy": "adc",
     "init": "sfm",

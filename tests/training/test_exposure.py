@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -239,6 +240,28 @@ def test_what_a_mask_hides_is_not_learned(scene: Scene) -> None:
         )
     assert excess[False] > 0.02
     assert excess[True] < 0.2 * excess[False]
+
+
+@pytest.mark.parametrize(("until", "n_random"), [(0.0, 0), (0.25, 2), (0.8, 8), (1.0, 10)])
+def test_random_backgrounds_end(scene: Scene, monkeypatch: pytest.MonkeyPatch, until: float, n_random: int) -> None:
+    own = (0.25, 0.5, 0.75)
+    config = CONFIG.replace(
+        iterations=10, background=own, random_background=True, random_background_until=until, average_last=0.0
+    )
+    trainer = Trainer(scene, config)
+    used = []
+    forward = trainer.pipeline.forward
+
+    def recorded(splats: Any, camera: Any, background: Any, *others: Any) -> Any:
+        used.append(background)
+        return forward(splats, camera, background, *others)
+
+    monkeypatch.setattr(trainer.pipeline, "forward", recorded)
+    for _ in range(10):
+        trainer.step()
+    assert len(set(used[:n_random])) == n_random, "another colour in each iteration"
+    assert own not in used[:n_random]
+    assert used[n_random:] == [own] * (10 - n_random)
 
 
 def test_random_backgrounds_show_through_nothing_opaque(scene: Scene) -> None:
