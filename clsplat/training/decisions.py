@@ -90,8 +90,8 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
         reasons.append(f"random points beside the scene's ({beside:.0%} of the cap), because some parts may have none")
     if transparent and "random_background" not in config.named_options:
         chosen["random_background"] = True
-        most = "" if config.random_background_until == 1 else f" for {config.random_background_until:.0%} of the run"
-        reasons.append(f"random backgrounds{most}, because {share:.0%} of the photos' pixels are transparent")
+        part = "" if config.random_background_until == 1 else f" for {config.random_background_until:.0%} of the run"
+        reasons.append(f"random backgrounds{part}, because {share:.0%} of the photos' pixels are transparent")
     if transparent and why and "strategy" not in config.named_options:
         chosen["strategy"] = Mcmc.strategy
         reasons.append(f"strategy {Mcmc.strategy}, because {why}")

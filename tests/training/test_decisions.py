@@ -121,7 +121,9 @@ def test_transparent_photos_get_random_backgrounds(scene: Scene) -> None:
     assert transparent_share(seen.train) == pytest.approx(0.5, abs=0.1)
     decision = decide(seen, TrainConfig())
     assert decision.config.random_background
+    assert "random backgrounds for 80% of the run, because" in str(decision)
     assert "% of the photos' pixels are transparent" in str(decision)
+    assert "random backgrounds, because" in str(decide(seen, TrainConfig(random_background_until=1.0)))
     assert not decide(seen, TrainConfig(random_background=False)).config.random_background
     assert not decide(transparent(scene, 0.0), TrainConfig()).config.random_background, "an alpha of 255 is opaque"
 

@@ -1,0 +1,145 @@
+"""Cameras, photos and points of the scenes of blender_scenes.py."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from blender_objects import SCENES
+from mathutils import Matrix, Vector
+
+FIELD_OF_VIEW = 0.6911112  # of NeRF-synthetic, horizontal [radians]
+DISTANCE = 4.031  # of its cameras from the origin [world units]
+ROOM_FIELD_OF_VIEW = 1.1  # [radians]
+SAMPLES = 16  # paths of a pixel, before the denoiser
+POINTS = 12000  # of `room`
+NOISE = 0.003  # standard deviation of its points around the surfaces [world units]
+
+
+def look_at(eye: Any, target: Any) -> Matrix:
+    """Return the pose of a camera at `eye` that looks at `target`, with z up."""
+    return Matrix.Translation(eye) @ (Vector(target) - Vector(eye)).to_track_quat("-Z", "Y").to_matrix().to_4x4()
+
+
+def sphere_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[list[Matrix], list[Matrix]]:
+    """Return random poses on the upper half of a sphere, and a spiral over it."""
+    around, height = rng.uniform(0, 2 * math.pi, n_train), rng.uniform(0.0, 1.0, n_train)
+    turn = np.linspace(0, 2 * math.pi, n_test, endpoint=False)
+    spiral = 2 * turn, 0.1 + 0.8 * (0.5 - 0.5 * np.cos(turn))
+
+    def poses(angles: Any, heights: Any) -> list[Matrix]:
+        flat = np.sqrt(1 - heights**2)
+        eyes = DISTANCE * np.stack([flat * np.cos(angles), flat * np.sin(angles), heights], axis=1)
+        return [look_at(eye, (0, 0, 0)) for eye in eyes]
+
+    return poses(around, height), poses(*spiral)
+
+
+def room_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[list[Matrix], list[Matrix]]:
+    """Return poses on two rings inside the room; every test view lies between training views."""
+    n = n_train + n_test
+    every = max(2, round(n / max(n_test, 1)))
+    poses = []
+    for i in range(n):
+        angle = 4 * math.pi * i / n
+        eye = (2.1 * math.cos(angle), 2.1 * math.sin(angle), (1.2 if i < n / 2 else 1.9) + rng.normal(0, 0.05))
+        away = i % 3 == 2
+        target = (-0.9 * eye[0], -0.9 * eye[1], 1.4) if away else (rng.normal(0, 0.3), rng.normal(0, 0.3), 0.8)
+        poses.append(look_at(eye, target))
+    test = [pose for i, pose in enumerate(poses) if i % every == every - 1]
+    return [pose for i, pose in enumerate(poses) if i % every != every - 1], test
+
+
+def prepare(size: int, field_of_view: float, indoors: bool) -> Any:
+    """Set Cycles up, and return the camera's object."""
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
+    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.seed = SAMPLES, True, 0
+    scene.cycles.max_bounces, scene.render.use_persistent_data = 6, True
+    scene.render.resolution_x = scene.render.resolution_y = size
+    scene.render.film_transparent = not indoors
+    scene.view_settings.view_transform = "Standard"
+    scene.render.image_settings.color_mode = "RGB" if indoors else "RGBA"
+    world = bpy.data.worlds.new("sky")
+    scene.world, world.use_nodes = world, True
+    sky = world.node_tree.nodes.new("ShaderNodeTexSky")
+    sky.sky_type, sky.sun_elevation, sky.sun_rotation = "MULTIPLE_SCATTERING", 0.7, 0.6
+    world.node_tree.links.new(sky.outputs["Color"], world.node_tree.nodes["Background"].inputs["Color"])
+    world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.06
+    bpy.ops.object.camera_add()
+    scene.camera = bpy.context.object
+    scene.camera.data.angle, scene.camera.data.clip_start = field_of_view, 0.01
+    return scene.camera
+
+
+def surface_points(cameras: list[Matrix], field_of_view: float, rng: np.random.Generator) -> Any:
+    """Return points [n, 3] that rays through random pixels of the cameras hit, with noise, in textured parts or not."""
+    depsgraph, reach, found = bpy.context.evaluated_depsgraph_get(), math.tan(field_of_view / 2), []
+    for pose in cameras:
+        for x, y in rng.uniform(-reach, reach, (POINTS // len(cameras), 2)):
+            direction = pose.to_3x3() @ Vector((x, y, -1)).normalized()
+            hit, place, *_, of, _ = bpy.context.scene.ray_cast(depsgraph, pose.translation, direction)
+            plain = hit and of.data.materials[0].name in ("plain", "white", "ceiling", "mirror")
+            if hit and not (plain and rng.uniform() < 0.97):
+                found.append(place)
+    return np.array(found) + rng.normal(0, NOISE, (len(found), 3))
+
+
+def colors_of(points: Any, folder: Path, frames: list[dict[str, Any]], size: int, field_of_view: float) -> Any:
+    """Return colours [n, 3] uint8 of points: of the pixel in the middlemost photo that shows each."""
+    best, colors = np.full(len(points), np.inf), np.full((len(points), 3), 128, np.uint8)
+    for frame in frames:
+        local = np.c_[points, np.ones(len(points))] @ np.linalg.inv(np.array(frame["transform_matrix"])).T
+        depth = -local[:, 2]
+        place = local[:, :2] / depth[:, None] / math.tan(field_of_view / 2)
+        off = np.where((depth > 0) & (np.abs(place).max(axis=1) < 0.99), np.abs(place).max(axis=1), np.inf)
+        image = bpy.data.images.load(str(folder / frame["file_path"]))
+        pixels = np.array(image.pixels[:]).reshape(size, size, -1)[..., :3]
+        bpy.data.images.remove(image)
+        better = off < best
+        at = ((place[better] * 0.5 + 0.5) * size).astype(int)
+        colors[better], best[better] = (255 * pixels[at[:, 1], at[:, 0]]).round(), off[better]
+    return colors
+
+
+def write_ply(path: Path, points: Any, colors: Any) -> None:
+    """Write a cloud of coloured points."""
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "".join(f"property uchar {color}\n" for color in ("red", "green", "blue")) + "end_header\n"
+    rows = [f"{x:.5f} {y:.5f} {z:.5f} {r} {g} {b}" for (x, y, z), (r, g, b) in zip(points, colors, strict=True)]
+    path.write_text(head + "\n".join(rows) + "\n", encoding="ascii")
+
+
+def render(folder: Path, name: str, size: int, n_train: int, n_test: int) -> None:
+    """Build a scene and render what is missing of its photos."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    rng, indoors = np.random.default_rng(sum(map(ord, name))), name == "room"
+    SCENES[name](rng)
+    angle = ROOM_FIELD_OF_VIEW if indoors else FIELD_OF_VIEW
+    camera = prepare(size, angle, indoors)
+    poses = dict(
+        zip(("train", "test"), (room_cameras if indoors else sphere_cameras)(rng, n_train, n_test), strict=True)
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    bpy.context.view_layer.update()
+    for split, cameras in poses.items():
+        frames = []
+        for i, pose in enumerate(cameras):
+            file = f"{split}/r_{i}.png"
+            frames.append({"file_path": file, "transform_matrix": [list(row) for row in pose]})
+            if not (folder / file).is_file():
+                camera.matrix_world = pose
+                bpy.context.scene.render.filepath = str(folder / file)
+                bpy.ops.render.render(write_still=True)
+        head: dict[str, Any] = {"camera_angle_x": angle}
+        if indoors and split == "train":
+            points = surface_points(cameras, angle, rng)
+            write_ply(folder / "points3d.ply", points, colors_of(points, folder, frames, size, angle))
+        (folder / f"transforms_{split}.json").write_text(
+            json.dumps(head | {"frames": frames}, indent=1), encoding="utf-8"
+        )
