@@ -6,6 +6,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
+
 from clsplat.viewer.server import Server
 from clsplat.viewer.viewer import Viewer
 
