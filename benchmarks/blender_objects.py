@@ -178,7 +178,7 @@ def wires(rng: np.random.Generator) -> None:
 
 
 def room(rng: np.random.Generator) -> None:
-    """A furnished room with plain and patterned walls, two windows of light, and shiny things."""
+    """A furnished room with plain and patterned walls, two lamps, and shiny things."""
     walls = [
         textured("wall", "Brick", 3.0, (0.35, 0.12, 0.08), (0.6, 0.55, 0.5)),
         material("plain", (0.75, 0.72, 0.65)),

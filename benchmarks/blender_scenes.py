@@ -17,7 +17,8 @@ import argparse
 import importlib.util
 from pathlib import Path
 
-NAMES = ("plant", "metals", "wires", "room")
+OBJECTS = ("plant", "metals", "wires")  # with transparent photos
+NAMES = (*OBJECTS, "room")
 
 
 def main() -> None:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from blender_scenes import NAMES, OBJECTS
 from common import RESULTS, ROOT, Runs, data_folder, environment, groups, parser, table, write_between
 
 from clsplat.comparison.methods import Method, parse_methods
@@ -36,13 +37,12 @@ KEY = ("scene", "resolution", "cap", "iterations", "system", "seed", "views")
 TRAINING_VIEWS = 20  # training views that are measured, to see how far training and other views are apart
 NO_SMALL_IMAGES = ":coarse_to_fine=false"
 FULL_SIZE = ("lego_full", "fox", "kitchen_large", "south_building_large")  # scenes, in the order of the page
-BLENDER = ("plant", "metals", "wires", "room")  # scenes of blender_scenes.py
 PAGE = ROOT / "benchmarks" / "SYSTEMS.md"
 TABLES = {  # scenes by the marks around their table on the page
     ("<!-- table of defaults.py -->", "<!-- end of the table -->"): FULL_SIZE,
-    ("<!-- table of new scenes -->", "<!-- end of the table of new scenes -->"): BLENDER,
+    ("<!-- table of new scenes -->", "<!-- end of the table of new scenes -->"): NAMES,
 }
-TRANSPARENT = ("lego", "lego_full", *BLENDER[:-1])
+TRANSPARENT = ("lego", "lego_full", *OBJECTS)
 
 
 @dataclass(frozen=True)

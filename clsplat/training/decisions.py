@@ -1,7 +1,7 @@
 """What a run decides by itself: options that the caller did not name, from what the scene shows.
 
-- Transparent photos are trained over random backgrounds. Over one colour, a splat of that colour costs nothing wherever
-  it is, and other views see it before the object.
+- Transparent photos are trained over random backgrounds for most of the run. Over one colour, a splat of that colour
+  costs nothing wherever it is, and other views see it before the object.
 - A run that starts at random places, or at few points of the scene, has splats that no photo needs. Transparent photos
   get the strategy that relocates them (`mcmc`). With `adc` a penalty on opacity lets them fade until they are pruned.
 - Beside the points of a scene, some splats start at random places too: a plain wall has no points, and would else get

@@ -60,7 +60,7 @@ def test_points_fill_the_object(at: tuple[float, float, float]) -> None:
 
 @pytest.mark.parametrize(("radius", "size"), [(RADIUS, 50), (0.05, 200)])
 def test_few_points_fill_the_object_too(radius: float, size: int) -> None:
-    """The first draws find few points of the hull, of a small object hardly any: their box must grow."""
+    """They reach its ends, and an object that is small in its photos is found."""
     views = ball(radius=radius, size=size)
     for seed in range(5):
         xyz, _, where = random_points(scene_of(views), 300, np.random.default_rng(seed))
