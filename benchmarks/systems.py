@@ -47,6 +47,7 @@ BASE = {
     "grad_threshold": 2e-4,
     "opacity_reset": 10,
     "turnover": 0.0,
+    "split": "published",
 }
 
 

@@ -15,9 +15,11 @@ from clsplat.splats import shapes
 from clsplat.splats.optical_depth import opacity_names
 from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import Shape
-from clsplat.training.density.adc import MIN_OPACITY, RESET_OPACITY, SPLIT_SHRINK, WORLD_SIZE, plan_adc, with_reset
+from clsplat.training.density.adc import MIN_OPACITY, RESET_OPACITY, WORLD_SIZE, plan_adc, with_reset
 from clsplat.training.density.edit import DensifyEdit
+from clsplat.training.density.halves import SPLIT_SHRINK, split_along_axis
 from clsplat.training.density.table import HostSplats
+from clsplat.training.options.density import SPLITS
 
 EXTENT = 2.0
 THRESHOLD = 2e-4
@@ -61,10 +63,11 @@ def plain(n: int, scale: float, opacity: float = 0.5) -> Arrays:
     by_axis=st.booleans(),
     large=st.booleans(),
     turnover=st.sampled_from([0.0, 0.05, 0.5]),
+    split=st.sampled_from(SPLITS),
     shape=st.sampled_from(ALL_SHAPES),
 )
 def test_laws_of_a_plan(
-    n: int, seed: int, dead: float, spare: int, by_axis: bool, large: bool, turnover: float, shape: Shape
+    n: int, seed: int, dead: float, spare: int, by_axis: bool, large: bool, turnover: float, split: str, shape: Shape
 ) -> None:
     arrays = random_model(shape, n, seed, dead)
     rng = np.random.default_rng(seed)
@@ -75,6 +78,7 @@ def test_laws_of_a_plan(
         "dense_size": 0.02,
         "prune_large": large,
         "turnover": turnover,
+        "split": split,
     }
     edit = edited(arrays, shape, stats, cap, seed, **options)
     again = edited(arrays, shape, stats, cap, seed, **options)
@@ -88,7 +92,7 @@ def test_laws_of_a_plan(
     kept = shape.strength(arrays) >= MIN_OPACITY
     if large:
         kept &= np.exp(arrays["log_scale"].max(axis=1)) <= WORLD_SIZE * EXTENT
-    if kept.any() and not by_axis:  # a side's opacity may be faint: the next action removes it
+    if kept.any() and (split == "long-axis" or not by_axis):  # in 3DSGS a side's opacity may be faint: the next action removes it
         assert (shape.strength(moved) >= MIN_OPACITY * (1 - 1e-6)).all()
     # Survivors are first: they keep their order, values and optimizer states. New rows follow without state.
     old = np.flatnonzero(~edit.fresh)
@@ -119,6 +123,19 @@ def test_small_ones_are_cloned_in_place_and_large_ones_split() -> None:
                 moved["log_scale"][2:], arrays["log_scale"][:2] - math.log(SPLIT_SHRINK), rtol=1e-6
             )
             assert not np.array_equal(moved["mean"][2], moved["mean"][3])
+
+
+def test_small_and_large_ones_are_split_along_their_longest_axis() -> None:
+    for factor in (0.9, 1.1):
+        arrays = plain(3, factor * 0.01 * EXTENT)
+        edit = edited(arrays, shapes.GAUSSIAN, stats_of(np.array([0, 2, 0]) * THRESHOLD), split="long-axis")
+        assert edit.source.tolist() == [0, 2, 1, 1]
+        assert edit.fresh.tolist() == [False] * 2 + [True] * 2
+        moved, parents = edit.apply(arrays), {name: array[[1, 1]] for name, array in arrays.items()}
+        halves = parents | split_along_axis(parents, shapes.GAUSSIAN, MIN_OPACITY)
+        for name, array in halves.items():
+            np.testing.assert_array_equal(moved[name][2:], array.astype(np.float32), err_msg=name)
+        assert not np.array_equal(moved["mean"][2], moved["mean"][3])
 
 
 def test_the_mean_gradient_counts_not_the_sum() -> None:

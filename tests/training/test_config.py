@@ -112,6 +112,7 @@ DEFAULTS_OF_STRATEGY = {
         "depth_threshold": 0.0,
         "dense_size": 0.01,
         "turnover": 0.05,
+        "split": "long-axis",
         "opacity_reset": 0,
     },
     Mcmc: {
@@ -127,6 +128,7 @@ DEFAULTS_OF_STRATEGY = {
         "relocation": "length",
         "relocation_limit": 1.0,
         "turnover": 0.05,
+        "split": "long-axis",
     },
 }
 

@@ -19,6 +19,7 @@ from clsplat.splats import shapes
 from clsplat.splats.optical_depth import opacity_names
 from clsplat.splats.shapes import BETA_BOUNDS, NU_BOUNDS, SKEW_MAX, SLANT_MAX, Shape
 from clsplat.training.density.edit import DensifyEdit
+from clsplat.training.density.halves import split_along_axis
 from clsplat.training.density.relocation import MIN_OPACITY, N_MAX, RULES, plan_relocation, relocation
 from clsplat.training.density.table import HostSplats
 
@@ -221,6 +222,40 @@ def test_laws_of_a_plan(n: int, seed: int, dead: float, growth: float, spare: in
     # Optimizer states: the live row of each stack and the added rows have new states. Relocated rows keep theirs.
     np.testing.assert_array_equal(edit.fresh[:n], stack[:n] & (edit.source[:n] == np.arange(n)))
     assert edit.fresh[n:].all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    n=st.integers(1, 200),
+    seed=st.integers(0, 10_000),
+    growth=st.floats(1, 2),
+    rule=st.sampled_from(sorted(RULES)),
+    shape=st.sampled_from(ALL_SHAPES),
+)
+def test_with_long_axis_a_single_copy_makes_two_halves_and_more_make_a_stack(
+    n: int, seed: int, growth: float, rule: str, shape: Shape
+) -> None:
+    arrays = random_model(shape, n, seed, 0.3)
+    plans = [
+        planned(arrays, shape, np.random.default_rng(seed), 2 * n, growth=growth, rule=rule, split=split)
+        for split in ("published", "long-axis")
+    ]
+    piled, halved = plans
+    np.testing.assert_array_equal(halved.source, piled.source)
+    np.testing.assert_array_equal(halved.fresh, piled.fresh)
+    assert (halved.relocated, halved.added) == (piled.relocated, piled.added)
+    before, after = piled.apply(arrays), halved.apply(arrays)
+    size = np.bincount(piled.source, minlength=n)[piled.source]
+    target = piled.source[: min(n, len(size))] == np.arange(min(n, len(size)))
+    for name, array in after.items():
+        np.testing.assert_array_equal(array[size != 2], before[name][size != 2], err_msg=name)
+    first = np.flatnonzero((size[:n] == 2) & target)
+    copies = np.flatnonzero((size == 2) & (piled.source != np.arange(len(size))))
+    copies = copies[np.argsort(piled.source[copies])]
+    assert len(copies) == len(first)
+    parents = {name: array[np.concatenate([first, first])] for name, array in arrays.items()}
+    for name, array in (parents | split_along_axis(parents, shape, MIN_OPACITY)).items():
+        np.testing.assert_array_equal(after[name][np.concatenate([first, copies])], array.astype(np.float32))
 
 
 def gaussians(logit: np.ndarray) -> Arrays:

@@ -61,10 +61,18 @@ def test_the_device_reads_what_the_host_reads(devices: list[Device], shape: Shap
 
 
 CONFIGS = {
-    "clone and split": {"grad_threshold": 1e-4, "cap_max": 2 * N},
+    "clone and split": {"grad_threshold": 1e-4, "cap_max": 2 * N, "split": "published"},
+    "split along the longest axis": {"grad_threshold": 1e-4, "cap_max": 2 * N},
     "turnover": {"grad_threshold": 1e-5, "cap_max": N},
-    "along an axis, with a reset": {"depth_threshold": 0.1, "opacity_reset": 1, "iterations": 1000, "cap_max": 2 * N},
+    "3DSGS, with a reset": {
+        "depth_threshold": 0.1,
+        "opacity_reset": 1,
+        "iterations": 1000,
+        "cap_max": 2 * N,
+        "split": "published",
+    },
     "relocation": {"strategy": "mcmc", "cap_max": N + 60},
+    "relocation in one place": {"strategy": "mcmc", "cap_max": N + 60, "split": "published"},
     "relocation at the cap": {"strategy": "mcmc", "cap_max": N},
 }
 

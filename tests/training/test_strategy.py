@@ -45,7 +45,7 @@ def test_mcmc_relocates_and_grows_by_the_options() -> None:
     assert edit.relocated == dead > 10
     _, few = action(mcmc(shape="gaussian", cap_max=130, relocation_limit=0.05))
     assert few.relocated == 5
-    _, flat = action(mcmc(shape="gaussian", cap_max=130, relocation="opacity-only"))
+    _, flat = action(mcmc(shape="gaussian", cap_max=130, relocation="opacity-only", split="published"))
     assert "log_scale" not in flat.values
 
 
@@ -60,10 +60,16 @@ def test_mcmc_moves_splats_at_the_cap_to_high_mean_gradients() -> None:
     assert not action(mcmc(shape="gaussian", cap_max=N, turnover=0.0), arrays=arrays, stats=stats)[1].relocated
 
 
+def test_mcmc_splits_or_piles_by_the_option() -> None:
+    for split, apart in (("long-axis", True), ("published", False)):
+        _, edit = action(mcmc(shape="gaussian", cap_max=130, split=split))
+        assert ("mean" in edit.values) == apart
+
+
 def test_length_squared_is_twice_the_log_factor() -> None:
     shifts = []
     for rule in ("length", "length-squared"):
-        arrays, edit = action(mcmc(shape="gaussian", cap_max=130, relocation=rule))
+        arrays, edit = action(mcmc(shape="gaussian", cap_max=130, relocation=rule, split="published"))
         shifts.append(edit.after("log_scale", arrays["log_scale"]) - arrays["log_scale"][edit.source])
     assert shifts[0].min() < -0.01
     np.testing.assert_allclose(shifts[1], 2 * shifts[0], atol=1e-5)
@@ -75,7 +81,7 @@ def test_length_squared_is_twice_the_log_factor() -> None:
 
 @pytest.mark.parametrize(("normalisation", "scaled"), [("peak", True), ("pdf", False), ("none", False)])
 def test_a_kernel_without_peak_one_keeps_its_scale(normalisation: str, scaled: bool) -> None:
-    _, edit = action(mcmc(shape="skew-normal", normalisation=normalisation, cap_max=130))
+    _, edit = action(mcmc(shape="skew-normal", normalisation=normalisation, cap_max=130, split="published"))
     assert ("log_scale" in edit.values) == scaled
 
 
@@ -117,9 +123,12 @@ def test_adc_hands_on_its_options() -> None:
     assert not action(adc(cap_max=N, turnover=0.0), arrays=arrays, stats=stats)[1].added
     assert action(adc(cap_max=N, turnover=0.01), arrays=arrays, stats=stats)[1].added
     size = float(np.exp(arrays["log_scale"][5].max()))
-    assert "log_scale" in action(adc(dense_size=size / 2), arrays=arrays, stats=stats)[1].values
-    cloned = action(adc(dense_size=size * 2), arrays=arrays, stats=stats)[1]
+    drawn = action(adc(dense_size=size / 2, split="published"), arrays=arrays, stats=stats)[1]
+    assert "log_scale" in drawn.values
+    assert "opacity_logit" not in drawn.values
+    cloned = action(adc(dense_size=size * 2, split="published"), arrays=arrays, stats=stats)[1]
     assert np.array_equal(cloned.apply(arrays)["log_scale"], arrays["log_scale"][cloned.source])
+    assert "opacity_logit" in action(adc(), arrays=arrays, stats=stats)[1].values  # side by side, and fainter
 
 
 def test_short_runs_leave_opacities_the_time_to_recover() -> None:

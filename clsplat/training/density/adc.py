@@ -1,48 +1,39 @@
 """Adaptive density control of 3DGS (Kerbl et al. 2023), and the depth criterion of 3DSGS, as edits made on the host.
 
 Splats with a high mean screen gradient are densified. A small splat is cloned: it gets a copy in the same place. A
-large splat is split into two halves, which are drawn from its Gaussian and smaller by a factor of 1.6. Nearly
+large splat is split into two halves, which are drawn from its Gaussian and smaller by a factor of 1.6 (halves.py). Nearly
 transparent splats are pruned. After the first opacity reset, very large splats are pruned too. Sizes are in world
 units. 3DGS also has a limit on the screen (20 px), which has no effect in its released code
 (graphdeco-inria/gaussian-splatting#123, #643). With few splats that limit would remove most of them.
 
-With a depth threshold (3DSGS, arXiv 2605.18334) a splat is split if either gradient is high, always along its longest
-axis. The paper does not define the two halves. Here they preserve these properties of the parent:
+With a depth threshold (3DSGS, arXiv 2505.18334) a splat is split if either gradient is high, always along its longest
+axis.
 
-    place    mean +- s/2 along the axis, where s is the parent's standard deviation along it
-    scale    s sqrt(3)/2 along the axis, so that the pair has the variance of the parent
-    skew     the part across the axis stays. The part along it is halved, because a piece of a skewed density is less
-             skewed than the whole. The opacities and colours of the halves learn the difference.
-    two opacities    each half takes the opacity of its side of the plane, if the plane faces the axis. In general,
-             the optical depths are mixed, with the square of delta's component along the axis as the weight. delta is
-             the unit normal of the plane, or eta / sqrt(1 + |eta|^2) for a soft plane. A soft plane without skew
-             changes neither opacity.
+Beyond 3DGS, all splats with a high gradient may be split along their longest axis, small ones too, as in Deng et al. 2025
+(arXiv 2508.12313). Two copies in one place have the same gradients, and take long to part. Halves side by side have
+different ones.
 
-Beyond 3DGS, the cap does not end densification. If it has no room for the splats with a high gradient, the faintest
-splats are pruned for them. 3DGS has no cap.
-
-In the direct form of skew, "mean" is the centroid, location + sqrt(2/pi) R S delta.
+The cap does not end densification either. If it has no room for the splats with a high gradient, the faintest splats are
+pruned for them. 3DGS has no cap.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...splats.fields import Array, DoubleArray
-from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical_depth
-from ...splats.quaternions import rotations
+from ...splats.optical_depth import opacity_names, raw_of_optical_depth
 from ...splats.shapes import Shape
 from .edit import DensifyEdit, Indices, NewValues
+from .halves import PUBLISHED_DISTANCE, SPLIT_SHRINK, drawn_halves, halves_along_axis, split_along_axis
 from .table import SplatTable, smallest
 
 # 3DGS's constants.
 MIN_OPACITY = 0.005  # fainter splats are pruned
-SPLIT_SHRINK = 1.6
 WORLD_SIZE = 0.1  # larger splats are pruned, in scene extents
 RESET_OPACITY = 0.01
 
@@ -60,6 +51,7 @@ def plan_adc(
     dense_size: float = 0.01,
     prune_large: bool = False,
     turnover: float = 0.0,
+    split: str = "published",
 ) -> DensifyEdit:
     """Return the edit that clones, splits and prunes.
 
@@ -80,6 +72,7 @@ def plan_adc(
     prune_large : whether splats larger than WORLD_SIZE are pruned.
     turnover : largest number of splats that are pruned to make room under the cap, the faintest first, as a fraction
         of the cap, 0 to 0.5. It has no effect on more splats than the cap.
+    split : "published", or "long-axis": all splats with a high gradient are split along their longest axis.
 
     Raises
     ------
@@ -89,7 +82,8 @@ def plan_adc(
     sound = summary.some_finite()
     log_size = summary.log_size.astype(np.float64)
     bright = summary.raw_opacity >= shape.raw_opacity(np.array(MIN_OPACITY))  # this is False for a NaN
-    by_axis = depth_threshold > 0
+    side_by_side = split == "long-axis"
+    by_axis = side_by_side or depth_threshold > 0
     limit = _log(WORLD_SIZE * extent) if prune_large else math.inf
     keep = bright & (log_size <= limit)
     splittable = bright & (log_size - (0.0 if by_axis else math.log(SPLIT_SHRINK)) <= limit)
@@ -106,20 +100,25 @@ def plan_adc(
         faint = among[smallest(summary.raw_opacity[among], min(missing, int(turnover * cap)))]
         for rows in (keep, splits, clones):
             rows[faint] = False
-    split, clone = _best(score, splits, clones, keep, cap)
+    halved, cloned = _best(score, splits, clones, keep, cap)
     stays = keep.copy()
-    stays[split] = False
+    stays[halved] = False
     stay = np.flatnonzero(stays)
-    source = np.concatenate([stay, clone, split, split])
+    source = np.concatenate([stay, cloned, halved, halved])
 
-    parents = {name: np.concatenate([array, array]) for name, array in splats.take(split).items()}
-    changed = _halves_along_axis(parents, shape) if by_axis else _drawn_halves(parents, shape, rng)
-    halves = np.arange(len(stay) + len(clone), len(source))
-    values = {name: NewValues(halves, array) for name, array in changed.items()}
+    parents = {name: np.concatenate([array, array]) for name, array in splats.take(halved).items()}
+    if side_by_side:
+        changed = split_along_axis(parents, shape, MIN_OPACITY)
+    elif by_axis:
+        changed = halves_along_axis(parents, shape, PUBLISHED_DISTANCE)
+    else:
+        changed = drawn_halves(parents, shape, rng)
+    rows = np.arange(len(stay) + len(cloned), len(source))
+    values = {name: NewValues(rows, array) for name, array in changed.items()}
     fresh = np.zeros(len(source), np.bool_)
     fresh[len(stay) :] = True
     return DensifyEdit(
-        source, values, fresh, state_source=source, added=len(clone) + 2 * len(split), removed=len(keep) - len(stay)
+        source, values, fresh, state_source=source, added=len(cloned) + 2 * len(halved), removed=len(keep) - len(stay)
     )
 
 
@@ -171,66 +170,3 @@ def _best(
         order = np.argsort(-score[rows], kind="stable")
         rows = np.sort(rows[order[np.cumsum(cost[order]) <= room]])
     return rows[splits[rows]], rows[clones[rows]]
-
-
-def _drawn_halves(parents: Mapping[str, Array], shape: Shape, rng: np.random.Generator) -> dict[str, Array]:
-    """Return the changed fields of the halves of 3DGS: smaller scales, and places drawn from the parents' Gaussians."""
-    shift = rng.standard_normal(parents["mean"].shape)
-    return _placed(parents, shape, shift, {"log_scale": parents["log_scale"] - math.log(SPLIT_SHRINK)})
-
-
-def _halves_along_axis(parents: Mapping[str, Array], shape: Shape) -> dict[str, Array]:
-    """Return the changed fields of the halves of 3DSGS. The first half of the rows is at +s/2, the second at -s/2."""
-    n = len(parents["mean"])
-    row, axis = np.arange(n), parents["log_scale"].argmax(axis=1)
-    side = np.where(row < n // 2, 1.0, -1.0)
-    shift = np.zeros((n, 3))
-    shift[row, axis] = 0.5 * side
-    changed = {"log_scale": parents["log_scale"].copy()}
-    changed["log_scale"][row, axis] += 0.5 * math.log(0.75)
-    if "skew" in parents:
-        changed["skew"] = parents["skew"].copy()
-        changed["skew"][row, axis] *= 0.5
-    names = opacity_names(parents)
-    if len(names) == 2:
-        delta = _delta(parents)[row, axis]
-        thick = [optical_depth(shape, parents[name]) for name in names]
-        beyond = np.where(side * delta > 0, thick[0], thick[1])
-        for name, depth in zip(names, thick, strict=True):
-            changed[name] = raw_of_optical_depth(shape, depth + delta**2 * (beyond - depth), parents[name])
-    return _placed(parents, shape, shift, changed)
-
-
-def _placed(
-    parents: Mapping[str, Array], shape: Shape, shift: DoubleArray, changed: dict[str, Array]
-) -> dict[str, Array]:
-    """Return `changed` with the means. Centroids move by `shift`, in the parents' deviations along their axes.
-
-    The rows of `parents` are all parents twice.
-    """
-    old, new = (np.exp(of["log_scale"].astype(np.float64)) for of in (parents, changed))
-    step = old * (shift + _centroid(parents, shape)) - new * _centroid({**parents, **changed}, shape)
-    turn = rotations(parents["quat"][: len(step) // 2].astype(np.float64))
-    step = np.einsum("nij,hnj->hni", turn, step.reshape(2, -1, 3)).reshape(-1, 3)
-    return changed | {"mean": parents["mean"] + step}
-
-
-def _delta(arrays: Mapping[str, Array]) -> DoubleArray:
-    """Return delta of the direct form in the frame of the splat, (N, 3), from a slant or from a plane's normal."""
-    if "normal" in arrays:
-        normal = arrays["normal"].astype(np.float64)
-        unit: DoubleArray = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        return unit
-    slant = arrays["skew"].astype(np.float64)
-    delta: DoubleArray = slant / np.sqrt(1.0 + np.sum(slant**2, axis=1, keepdims=True))
-    return delta
-
-
-def _centroid(arrays: Mapping[str, Array], shape: Shape) -> DoubleArray:
-    """Return the vector from the stored position to the centroid, (N, 3), in deviations along the axes of the splat.
-
-    It is zero for splats with two opacities, because their halves are placed relative to the plane.
-    """
-    if shape.skew_form != "direct" or len(opacity_names(arrays)) == 2:
-        return np.zeros((len(arrays["mean"]), 3))
-    return math.sqrt(2.0 / math.pi) * _delta(arrays)

@@ -12,7 +12,9 @@ the rule "length-squared". If a splat has two opacities, each has its o', and th
 For negative opacities (the scooping of Student splatting) the formula applies to |o|, and the sign stays.
 
 Beyond 3DGS-MCMC, splats still move once their number no longer grows. With a turnover the faintest ones count as dead
-then. Copies are drawn in proportion to the mean screen gradient, by which `adc` chooses too.
+then. Copies are drawn in proportion to the mean screen gradient, by which `adc` chooses too. A splat with a single copy
+may be split along its longest axis instead (halves.py): two splats in one place have the same gradients, and take long to
+part.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical_depth
 from ...splats.shapes import Shape
 from ..methods import sss
-from .edit import DensifyEdit, NewValues
+from .edit import DensifyEdit, Indices, NewValues
+from .halves import split_along_axis
 from .length_factor import length_factor
 from .table import SplatTable, smallest
 
@@ -53,6 +56,7 @@ def plan_relocation(
     limit: float = 1.0,
     turnover: float = 0.0,
     gradient: Array | None = None,
+    split: str = "published",
 ) -> DensifyEdit:
     """Return the edit that moves dead splats onto live ones and grows towards the cap.
 
@@ -75,6 +79,7 @@ def plan_relocation(
     turnover : number of the faintest splats that count as dead if the number of splats does not grow, as a fraction of
         all splats, 0 to 0.5.
     gradient : (N,) mean screen gradient, which draws the copies if there is a turnover.
+    split : "published", or "long-axis": a splat with a single copy is split along its longest axis.
 
     Raises
     ------
@@ -112,21 +117,57 @@ def plan_relocation(
     source[n:] = drawn[len(moving) :]
 
     targets, stack, copies = np.unique(drawn, return_inverse=True, return_counts=True)
-    stacked = splats.take(targets)
-    raw, factor = relocation(shape, stacked, copies + 1, min_opacity)
-    new: dict[str, Array] = {**raw}
-    if RULES[rule]:
-        log_scale = stacked["log_scale"]
-        new["log_scale"] = log_scale + (RULES[rule] * np.log(factor))[:, None].astype(log_scale.dtype)
-    rows = np.concatenate([targets, moving, np.arange(n, n_new)])  # the targets and their copies
-    of_target = np.concatenate([np.arange(len(targets)), stack])
-    values = {name: NewValues(rows, array[of_target]) for name, array in new.items()}
+    places = np.concatenate([moving, np.arange(n, n_new)])  # of the copies
+    old = splats.take(targets)
+    halved = (copies == 1) & (split == "long-axis")
+    piled = np.concatenate([~halved, ~halved[stack]])
+    rows, of_target = (np.concatenate(of)[piled] for of in ((targets, places), (np.arange(len(targets)), stack)))
+    values = _stacks(rows, of_target, old, copies, shape, rule, min_opacity)
+    if halved.any():
+        beside = np.empty_like(targets)
+        beside[stack] = places
+        pairs = np.concatenate([targets[halved], beside[halved]])
+        parents = {name: np.concatenate([array[halved], array[halved]]) for name, array in old.items()}
+        values = _merged(values, pairs, split_along_axis(parents, shape, min_opacity))
 
     fresh = np.zeros(n_new, np.bool_)
     fresh[targets] = True
     fresh[:n] |= ~sound
     fresh[n:] = True
     return DensifyEdit(source, values, fresh, relocated=len(moving), added=n_new - n)
+
+
+def _stacks(
+    rows: Indices,
+    of_target: Indices,
+    targets: Mapping[str, Array],
+    copies: NDArray[np.integer],
+    shape: Shape,
+    rule: str,
+    min_opacity: float,
+) -> dict[str, NewValues]:
+    """Return the new values of stacks. of_target : (rows,) indices into the targets and the numbers of their copies."""
+    members, place = np.unique(of_target, return_inverse=True)
+    stacked = {name: array[members] for name, array in targets.items()}
+    raw, factor = relocation(shape, stacked, copies[members] + 1, min_opacity)
+    new: dict[str, Array] = {**raw}
+    if RULES[rule]:
+        log_scale = stacked["log_scale"]
+        new["log_scale"] = log_scale + (RULES[rule] * np.log(factor))[:, None].astype(log_scale.dtype)
+    return {name: NewValues(rows, array[place]) for name, array in new.items()}
+
+
+def _merged(values: Mapping[str, NewValues], rows: Indices, more: Mapping[str, Array]) -> dict[str, NewValues]:
+    """Return `values` with the new values `more` of other rows."""
+    merged = dict(values)
+    for name, array in more.items():
+        known = merged.get(name)
+        merged[name] = (
+            NewValues(rows, array)
+            if known is None
+            else NewValues(np.concatenate([known.rows, rows]), np.concatenate([known.values, array]))
+        )
+    return merged
 
 
 def relocation(

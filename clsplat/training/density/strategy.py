@@ -67,6 +67,7 @@ def next_edit(
             limit=density.relocation_limit,
             rule=density.relocation if scaled else "opacity-only",
             turnover=density.turnover,
+            split=density.split,
             gradient=stats[SplatStatistics.SCREEN_GRADIENT] / np.maximum(stats[SplatStatistics.TIMES_SEEN], 1.0),
         )
     every = reset_interval(density, config.iterations)
@@ -81,6 +82,7 @@ def next_edit(
         depth_threshold=density.depth_threshold,
         dense_size=density.dense_size,
         turnover=density.turnover,
+        split=density.split,
         prune_large=0 < every < info.iteration,
     )
     return with_reset(grown, splats, shape) if resets(density, config.iterations, info) else grown

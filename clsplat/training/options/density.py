@@ -10,6 +10,7 @@ from typing import ClassVar
 
 from .option import OptionGroup, option
 
+SPLITS = ("long-axis", "published")
 RELOCATIONS = ("length", "length-squared", "opacity-only")
 
 
@@ -40,11 +41,17 @@ class DensityConfig(OptionGroup):
         at_least=0,
         at_most=0.5,
     )
+    split: str = option(
+        "long-axis",
+        help="How one splat becomes two. long-axis: two halves side by side along its longest axis. published: as in "
+        "3DGS (copies of small splats, halves at random places in large ones) and 3DGS-MCMC (copies in one place).",
+        choices=SPLITS,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Adc(DensityConfig):
-    """Adaptive density control of 3DGS: clone, split and prune splats, and reset opacities."""
+    """Adaptive density control of 3DGS: split, clone and prune splats, and reset opacities."""
 
     title: ClassVar[str] = "Densification with strategy adc"
     strategy: ClassVar[str] = "adc"
@@ -56,7 +63,7 @@ class Adc(DensityConfig):
     noise_lr: float = 0.0
     grad_threshold: float = option(
         2e-4,
-        help="Threshold of the mean gradient of the screen position. Splats above it are cloned or split.",
+        help="Threshold of the mean gradient of the screen position. Splats above it are split or cloned.",
         at_least=0,
     )
     depth_threshold: float = option(
@@ -65,7 +72,10 @@ class Adc(DensityConfig):
         at_least=0,
     )
     dense_size: float = option(
-        0.01, help="Splats larger than this fraction of the scene extent are split, others are cloned.", at_least=0
+        0.01,
+        help="With --split published, splats larger than this fraction of the scene extent are split, others are "
+        "cloned.",
+        at_least=0,
     )
     opacity_reset: int = option(
         0,

@@ -1,0 +1,133 @@
+"""Two halves in place of one splat: drawn as in 3DGS, or side by side along the longest axis.
+
+Halves along an axis preserve these properties of the parent, at any distance d between 0 and 1:
+
+    place    mean +- d s along the axis, where s is the parent's standard deviation along it
+    scale    s sqrt(1 - d^2) along the axis, so that the pair has the variance of the parent
+    skew     the part across the axis stays. The part along it is halved, because a piece of a skewed density is less
+             skewed than the whole. The opacities and colours of the halves learn the difference.
+    two opacities    each half takes the opacity of its side of the plane, if the plane faces the axis. In general,
+             the optical depths are mixed, with the square of delta's component along the axis as the weight. delta is
+             the unit normal of the plane, or eta / sqrt(1 + |eta|^2) for a soft plane. A soft plane without skew
+             changes neither opacity.
+
+3DSGS (arXiv 2505.18334) splits along the longest axis and does not define the halves. There, d is 1/2 and the opacity
+is the parent's. `split_along_axis` has d = 4/5, and also preserves the absorption of a Gaussian along the axis.
+
+In the direct form of skew, "mean" is the centroid, location + sqrt(2/pi) R S delta.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from ...splats.fields import Array, DoubleArray
+from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical_depth
+from ...splats.quaternions import rotations
+from ...splats.shapes import Shape
+
+SPLIT_SHRINK = 1.6  # 3DGS: the drawn halves are smaller by this factor
+PUBLISHED_DISTANCE = 0.5  # 3DSGS
+DISTANCE = 0.8  # of `split_along_axis`
+FULL_OPACITY = 1.0 - 1e-6  # largest opacity of a half, whose optical depth is finite
+
+
+def drawn_halves(parents: Mapping[str, Array], shape: Shape, rng: np.random.Generator) -> dict[str, Array]:
+    """Return the changed fields of the halves of 3DGS: smaller scales, and places drawn from the parents' Gaussians.
+
+    parents : public arrays of all parents twice, here and below.
+    """
+    shift = rng.standard_normal(parents["mean"].shape)
+    return _placed(parents, shape, shift, {"log_scale": parents["log_scale"] - math.log(SPLIT_SHRINK)})
+
+
+def halves_along_axis(parents: Mapping[str, Array], shape: Shape, distance: float) -> dict[str, Array]:
+    """Return the changed fields of the halves along the longest axis, without a change of the absorption.
+
+    The first half of the rows is at +d s, the second at -d s.
+
+    distance : d, above 0 and below 1.
+    """
+    n = len(parents["mean"])
+    row, axis = np.arange(n), parents["log_scale"].argmax(axis=1)
+    side = np.where(row < n // 2, 1.0, -1.0)
+    shift = np.zeros((n, 3))
+    shift[row, axis] = distance * side
+    changed = {"log_scale": parents["log_scale"].copy()}
+    changed["log_scale"][row, axis] += 0.5 * math.log1p(-(distance**2))
+    if "skew" in parents:
+        changed["skew"] = parents["skew"].copy()
+        changed["skew"][row, axis] *= 0.5
+    names = opacity_names(parents)
+    if len(names) == 2:
+        delta = _delta(parents)[row, axis]
+        thick = [optical_depth(shape, parents[name]) for name in names]
+        beyond = np.where(side * delta > 0, thick[0], thick[1])
+        for name, depth in zip(names, thick, strict=True):
+            changed[name] = raw_of_optical_depth(shape, depth + delta**2 * (beyond - depth), parents[name])
+    return _placed(parents, shape, shift, changed)
+
+
+def split_along_axis(parents: Mapping[str, Array], shape: Shape, min_opacity: float) -> dict[str, Array]:
+    """Return the changed fields of halves side by side, which absorb together as much as the parent did.
+
+    min_opacity : minimum of the new |opacity|. With two opacities, it is the minimum of the larger one.
+    """
+    changed = halves_along_axis(parents, shape, DISTANCE)
+    names = opacity_names(parents)
+    old = np.stack([optical_depth(shape, changed.get(name, parents[name])) for name in names], axis=1)
+    opacity = opacity_of_half(-np.expm1(-old), DISTANCE)
+    largest = opacity.max(axis=1, keepdims=True)
+    opacity = np.where(largest < min_opacity, opacity * (min_opacity / np.maximum(largest, 1e-300)), opacity)
+    depth = -np.log1p(-np.minimum(opacity, FULL_OPACITY))
+    return changed | {
+        name: raw_of_optical_depth(shape, depth[:, side], parents[name]) for side, name in enumerate(names)
+    }
+
+
+def opacity_of_half(opacity: DoubleArray, distance: float) -> DoubleArray:
+    """Return the opacity of two halves that absorb as much as a Gaussian along the line through all three centres.
+
+    With o' the opacity of a half, b = sqrt(1 - d^2) and e = exp(-d^2 / b^2), the integrals along the line, over
+    s sqrt(2 pi), are o for the Gaussian and 2 b o' - b e o'^2 / sqrt(2) for the pair. The smaller root is o'.
+    """
+    b = math.sqrt(1.0 - distance**2)
+    e = math.exp(-((distance / b) ** 2)) / math.sqrt(2.0)
+    # In this form of the root, small opacities keep their digits.
+    root: DoubleArray = opacity / (b * (1.0 + np.sqrt(np.maximum(1.0 - e * opacity / b, 0.0))))
+    return np.minimum(root, 1.0)
+
+
+def _placed(
+    parents: Mapping[str, Array], shape: Shape, shift: DoubleArray, changed: dict[str, Array]
+) -> dict[str, Array]:
+    """Return `changed` with the means. Centroids move by `shift`, in the parents' deviations along their axes."""
+    old, new = (np.exp(of["log_scale"].astype(np.float64)) for of in (parents, changed))
+    step = old * (shift + _centroid(parents, shape)) - new * _centroid({**parents, **changed}, shape)
+    turn = rotations(parents["quat"][: len(step) // 2].astype(np.float64))
+    step = np.einsum("nij,hnj->hni", turn, step.reshape(2, -1, 3)).reshape(-1, 3)
+    return changed | {"mean": parents["mean"] + step}
+
+
+def _delta(arrays: Mapping[str, Array]) -> DoubleArray:
+    """Return delta of the direct form in the frame of the splat, (N, 3), from a slant or from a plane's normal."""
+    if "normal" in arrays:
+        normal = arrays["normal"].astype(np.float64)
+        unit: DoubleArray = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        return unit
+    slant = arrays["skew"].astype(np.float64)
+    delta: DoubleArray = slant / np.sqrt(1.0 + np.sum(slant**2, axis=1, keepdims=True))
+    return delta
+
+
+def _centroid(arrays: Mapping[str, Array], shape: Shape) -> DoubleArray:
+    """Return the vector from the stored position to the centroid, (N, 3), in deviations along the axes of the splat.
+
+    It is zero for splats with two opacities, because their halves are placed relative to the plane.
+    """
+    if shape.skew_form != "direct" or len(opacity_names(arrays)) == 2:
+        return np.zeros((len(arrays["mean"]), 3))
+    return math.sqrt(2.0 / math.pi) * _delta(arrays)
