@@ -111,7 +111,7 @@ DEFAULTS_OF_STRATEGY = {
         "grad_threshold": 2e-4,
         "depth_threshold": 0.0,
         "dense_size": 0.01,
-        "turnover": 0.05,
+        "turnover": None,
         "split": "long-axis",
         "opacity_reset": 0,
     },
@@ -127,7 +127,7 @@ DEFAULTS_OF_STRATEGY = {
         "growth": 1.05,
         "relocation": "length",
         "relocation_limit": 1.0,
-        "turnover": 0.05,
+        "turnover": None,
         "split": "long-axis",
     },
 }

@@ -55,7 +55,7 @@ def test_mcmc_moves_splats_at_the_cap_to_high_mean_gradients() -> None:
     stats = np.zeros((3, N))
     stats[:, row] = (1.0, 0.0, 4.0)
     _, edit = action(mcmc(shape="gaussian", cap_max=N), arrays=arrays, stats=stats)
-    assert edit.relocated == 5
+    assert edit.relocated == 5  # 7000 iterations
     assert np.flatnonzero(np.bincount(edit.source) == 6).tolist() == [row]
     assert not action(mcmc(shape="gaussian", cap_max=N, turnover=0.0), arrays=arrays, stats=stats)[1].relocated
 
@@ -64,6 +64,18 @@ def test_mcmc_splits_or_piles_by_the_option() -> None:
     for split, apart in (("long-axis", True), ("published", False)):
         _, edit = action(mcmc(shape="gaussian", cap_max=130, split=split))
         assert ("mean" in edit.values) == apart
+
+
+def test_the_default_turnover_falls_with_the_length_of_the_run() -> None:
+    arrays, stats = random_model(shapes.GAUSSIAN, N, 1, dead=0), np.ones((3, N))
+
+    def moved(**options: Any) -> int:
+        config = mcmc(shape="gaussian", cap_max=N, **options)
+        return action(config, arrays=arrays, stats=stats)[1].relocated
+
+    assert [moved(iterations=n) for n in (100, 2000, 7000, 15_000, 30_000)] == [8, 8, 5, 2, 1]
+    assert moved(iterations=30_000, densify_interval=500) == 5
+    assert [moved(iterations=30_000, turnover=part) for part in (0.0, 0.2)] == [0, 20]
 
 
 def test_length_squared_is_twice_the_log_factor() -> None:

@@ -19,6 +19,9 @@ from .table import SplatTable
 # Minimum number of iterations between opacity resets. The learning rate of opacities is the same in short runs, so
 # opacities always need this time to recover.
 RESET_INTERVAL_MIN = 1000
+# The default turnover: in units of the cap, if a run densified from its first iteration to the last, and in one step.
+TURNOVER = 3.5
+LARGEST_TURNOVER = 0.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +69,7 @@ def next_edit(
             growth=info.growth,
             limit=density.relocation_limit,
             rule=density.relocation if scaled else "opacity-only",
-            turnover=density.turnover,
+            turnover=turnover(density, config.iterations),
             split=density.split,
             gradient=stats[SplatStatistics.SCREEN_GRADIENT] / np.maximum(stats[SplatStatistics.TIMES_SEEN], 1.0),
         )
@@ -81,11 +84,21 @@ def next_edit(
         grad_threshold=density.grad_threshold,
         depth_threshold=density.depth_threshold,
         dense_size=density.dense_size,
-        turnover=density.turnover,
+        turnover=turnover(density, config.iterations),
         split=density.split,
         prune_large=0 < every < info.iteration,
     )
     return with_reset(grown, splats, shape) if resets(density, config.iterations, info) else grown
+
+
+def turnover(density: Adc | Mcmc, iterations: int) -> float:
+    """Return the part of the cap that a densification may replace: the option, or a default by the length of the run.
+
+    By default, all densifications of a run together may replace about the same number of splats.
+    """
+    if density.turnover is not None:
+        return density.turnover
+    return min(TURNOVER * density.densify_interval / iterations, LARGEST_TURNOVER)
 
 
 def reset_interval(density: Adc, iterations: int) -> int:
