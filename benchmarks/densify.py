@@ -39,14 +39,19 @@ LOUD = 0.05  # share of the splats with a gradient above the threshold
 ROOM = 1.1  # capacity over number of splats
 _BEGIN, _END = "<!-- table of densify.py -->", "<!-- end of the table of densify.py -->"
 
+PUBLISHED: dict[str, Any] = {"split": "published", "turnover": 0.05}
+
 # Options of the run, and the iteration of the action.
 ACTIONS: dict[str, tuple[dict[str, Any], int]] = {
-    "clone, split, prune": ({"strategy": "adc"}, 1000),
-    "the same at the cap": ({"strategy": "adc", "cap_max": 1.0}, 1000),
-    "with an opacity reset": ({"strategy": "adc", "opacity_reset": 10}, 3000),
-    "split along an axis": ({"strategy": "adc", "depth_threshold": 1e9, "turnover": 0.0}, 1000),
-    "relocate, grow": ({"strategy": "mcmc"}, 1000),
-    "relocate at the cap": ({"strategy": "mcmc", "cap_max": 1.0}, 1000),
+    "clone, split, prune": ({"strategy": "adc"} | PUBLISHED, 1000),
+    "the same at the cap": ({"strategy": "adc", "cap_max": 1.0} | PUBLISHED, 1000),
+    "with an opacity reset": ({"strategy": "adc", "opacity_reset": 10} | PUBLISHED, 3000),
+    "split along an axis": ({"strategy": "adc"}, 1000),
+    "split along an axis at the cap": ({"strategy": "adc", "cap_max": 1.0}, 1000),
+    "relocate, grow": ({"strategy": "mcmc"} | PUBLISHED, 1000),
+    "relocate at the cap": ({"strategy": "mcmc", "cap_max": 1.0} | PUBLISHED, 1000),
+    "relocate halves, grow": ({"strategy": "mcmc"}, 1000),
+    "relocate halves at the cap": ({"strategy": "mcmc", "cap_max": 1.0}, 1000),
 }
 
 
