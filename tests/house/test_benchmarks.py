@@ -84,7 +84,7 @@ def test_densify(tmp_path: Path) -> None:
     for _ in range(2):
         said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     rows = [json.loads(line) for line in out.read_text().splitlines()]
-    assert len({row["action"] for row in rows}) == len(rows) == 6, "each once, also when it is called again"
+    assert len({row["action"] for row in rows}) == len(rows) == 9, "each once, also when it is called again"
     for row in rows:
         assert row["wall_ms"] == pytest.approx(row["host_ms"] + row["device_ms"], abs=0.1)
         assert row["read_mb"] < 2000 * 59 * 4 / 1e6, "not all parameters of all splats"

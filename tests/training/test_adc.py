@@ -92,7 +92,9 @@ def test_laws_of_a_plan(
     kept = shape.strength(arrays) >= MIN_OPACITY
     if large:
         kept &= np.exp(arrays["log_scale"].max(axis=1)) <= WORLD_SIZE * EXTENT
-    if kept.any() and (split == "long-axis" or not by_axis):  # in 3DSGS a side's opacity may be faint: the next action removes it
+    if kept.any() and (
+        split == "long-axis" or not by_axis
+    ):  # in 3DSGS a side's opacity may be faint: the next action removes it
         assert (shape.strength(moved) >= MIN_OPACITY * (1 - 1e-6)).all()
     # Survivors are first: they keep their order, values and optimizer states. New rows follow without state.
     old = np.flatnonzero(~edit.fresh)

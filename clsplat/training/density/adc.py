@@ -1,20 +1,20 @@
 """Adaptive density control of 3DGS (Kerbl et al. 2023), and the depth criterion of 3DSGS, as edits made on the host.
 
 Splats with a high mean screen gradient are densified. A small splat is cloned: it gets a copy in the same place. A
-large splat is split into two halves, which are drawn from its Gaussian and smaller by a factor of 1.6 (halves.py). Nearly
-transparent splats are pruned. After the first opacity reset, very large splats are pruned too. Sizes are in world
-units. 3DGS also has a limit on the screen (20 px), which has no effect in its released code
+large splat is split into two halves (halves.py), which are drawn from its Gaussian and smaller by a factor of 1.6.
+Nearly transparent splats are pruned. After the first opacity reset, very large splats are pruned too. Sizes are in
+world units. 3DGS also has a limit on the screen (20 px), which has no effect in its released code
 (graphdeco-inria/gaussian-splatting#123, #643). With few splats that limit would remove most of them.
 
-With a depth threshold (3DSGS, arXiv 2505.18334) a splat is split if either gradient is high, always along its longest
+With a depth threshold (3DSGS, arXiv 2605.18334) a splat is split if either gradient is high, always along its longest
 axis.
 
-Beyond 3DGS, all splats with a high gradient may be split along their longest axis, small ones too, as in Deng et al. 2025
-(arXiv 2508.12313). Two copies in one place have the same gradients, and take long to part. Halves side by side have
-different ones.
+Beyond 3DGS, all splats with a high gradient may be split along their longest axis, small ones too, as in Deng et al.
+2025 (arXiv 2508.12313). Two copies in one place have the same gradients, and take long to part. Halves side by side
+have different ones.
 
-The cap does not end densification either. If it has no room for the splats with a high gradient, the faintest splats are
-pruned for them. 3DGS has no cap.
+The cap does not end densification either. If it has no room for the splats with a high gradient, the faintest splats
+are pruned for them. 3DGS has no cap.
 """
 
 from __future__ import annotations
@@ -113,8 +113,8 @@ def plan_adc(
         changed = halves_along_axis(parents, shape, PUBLISHED_DISTANCE)
     else:
         changed = drawn_halves(parents, shape, rng)
-    rows = np.arange(len(stay) + len(cloned), len(source))
-    values = {name: NewValues(rows, array) for name, array in changed.items()}
+    new = np.arange(len(stay) + len(cloned), len(source))
+    values = {name: NewValues(new, array) for name, array in changed.items()}
     fresh = np.zeros(len(source), np.bool_)
     fresh[len(stay) :] = True
     return DensifyEdit(

@@ -11,7 +11,7 @@ Halves along an axis preserve these properties of the parent, at any distance d 
              the unit normal of the plane, or eta / sqrt(1 + |eta|^2) for a soft plane. A soft plane without skew
              changes neither opacity.
 
-3DSGS (arXiv 2505.18334) splits along the longest axis and does not define the halves. There, d is 1/2 and the opacity
+3DSGS (arXiv 2605.18334) splits along the longest axis and does not define the halves. There, d is 1/2 and the opacity
 is the parent's. `split_along_axis` has d = 4/5, and also preserves the absorption of a Gaussian along the axis.
 
 In the direct form of skew, "mean" is the centroid, location + sqrt(2/pi) R S delta.

@@ -13,8 +13,8 @@ For negative opacities (the scooping of Student splatting) the formula applies t
 
 Beyond 3DGS-MCMC, splats still move once their number no longer grows. With a turnover the faintest ones count as dead
 then. Copies are drawn in proportion to the mean screen gradient, by which `adc` chooses too. A splat with a single copy
-may be split along its longest axis instead (halves.py): two splats in one place have the same gradients, and take long to
-part.
+may be split along its longest axis instead (halves.py): two splats in one place have the same gradients, and take long
+to part.
 """
 
 from __future__ import annotations
