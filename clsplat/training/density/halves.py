@@ -32,7 +32,6 @@ from ...splats.shapes import Shape
 SPLIT_SHRINK = 1.6  # 3DGS: the drawn halves are smaller by this factor
 PUBLISHED_DISTANCE = 0.5  # 3DSGS
 DISTANCE = 0.8  # of `split_along_axis`
-FULL_OPACITY = 1.0 - 1e-6  # largest opacity of a half, whose optical depth is finite
 
 
 def drawn_halves(parents: Mapping[str, Array], shape: Shape, rng: np.random.Generator) -> dict[str, Array]:
@@ -82,7 +81,7 @@ def split_along_axis(parents: Mapping[str, Array], shape: Shape, min_opacity: fl
     opacity = opacity_of_half(-np.expm1(-old), DISTANCE)
     largest = opacity.max(axis=1, keepdims=True)
     opacity = np.where(largest < min_opacity, opacity * (min_opacity / np.maximum(largest, 1e-300)), opacity)
-    depth = -np.log1p(-np.minimum(opacity, FULL_OPACITY))
+    depth = -np.log1p(-opacity)  # halves at this distance are never opaque
     return changed | {
         name: raw_of_optical_depth(shape, depth[:, side], parents[name]) for side, name in enumerate(names)
     }
