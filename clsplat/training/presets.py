@@ -36,6 +36,8 @@ _RATES = {
     "random_points": 0.0,
     "visible_adam": False,
     "random_background": False,
+    "turnover": 0.0,
+    "split": "published",
 }
 # 3DGS, code: densification every 100 iterations from 500 to 15 000 of 30 000, opacity reset every 3000 iterations.
 _CLONE_AND_SPLIT = {
@@ -46,8 +48,6 @@ _CLONE_AND_SPLIT = {
     "grad_threshold": 2e-4,
     "depth_threshold": 0.0,
     "dense_size": 0.01,
-    "turnover": 0.0,
-    "split": "published",
     "opacity_reset": 10,
     "init_opacity": 0.1,
     "init_scale": 1.0,
@@ -64,8 +64,6 @@ _RELOCATE = {
     "growth": 1.05,
     "relocation": "length",
     "relocation_limit": 1.0,
-    "turnover": 0.0,
-    "split": "published",
     "init_opacity": 0.5,
     "init_scale": 0.1,
     "opacity_reg": 0.01,
@@ -195,8 +193,6 @@ def _skew_normal() -> Values:
             "relocation": "length",
             "relocation_limit": 0.05,
             "growth": 1.05,
-            "turnover": 0.0,
-            "split": "published",
             "init_opacity": 0.5,
             "init_scale": 0.5,
             "position_optimizer": "sghmc",

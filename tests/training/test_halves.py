@@ -15,13 +15,9 @@ from clsplat.splats import shapes
 from clsplat.splats.optical_depth import opacity_names
 from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import Shape
-from clsplat.training.density.halves import DISTANCE, halves_along_axis, opacity_of_half, split_along_axis
+from clsplat.training.density.halves import DISTANCE, halves_along_axis, opacity_of_half, split_along_axis, twice
 
 MIN_OPACITY = 0.005
-
-
-def twice(arrays: Arrays) -> Arrays:
-    return {name: np.concatenate([array, array]) for name, array in arrays.items() if name != "sh"}
 
 
 def split(arrays: Arrays, shape: Shape, min_opacity: float = MIN_OPACITY) -> Arrays:

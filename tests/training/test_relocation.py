@@ -246,11 +246,10 @@ def test_with_long_axis_a_single_copy_makes_two_halves_and_more_make_a_stack(
     assert (halved.relocated, halved.added) == (piled.relocated, piled.added)
     before, after = piled.apply(arrays), halved.apply(arrays)
     size = np.bincount(piled.source, minlength=n)[piled.source]
-    target = piled.source[: min(n, len(size))] == np.arange(min(n, len(size)))
+    own = piled.source == np.arange(len(size))
     for name, array in after.items():
         np.testing.assert_array_equal(array[size != 2], before[name][size != 2], err_msg=name)
-    first = np.flatnonzero((size[:n] == 2) & target)
-    copies = np.flatnonzero((size == 2) & (piled.source != np.arange(len(size))))
+    first, copies = np.flatnonzero((size == 2) & own), np.flatnonzero((size == 2) & ~own)
     copies = copies[np.argsort(piled.source[copies])]
     assert len(copies) == len(first)
     parents = {name: array[np.concatenate([first, first])] for name, array in arrays.items()}

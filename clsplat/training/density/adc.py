@@ -29,7 +29,7 @@ from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import opacity_names, raw_of_optical_depth
 from ...splats.shapes import Shape
 from .edit import DensifyEdit, Indices, NewValues
-from .halves import PUBLISHED_DISTANCE, SPLIT_SHRINK, drawn_halves, halves_along_axis, split_along_axis
+from .halves import PUBLISHED_DISTANCE, SPLIT_SHRINK, drawn_halves, halves_along_axis, split_along_axis, twice
 from .table import SplatTable, smallest
 
 # 3DGS's constants.
@@ -106,7 +106,7 @@ def plan_adc(
     stay = np.flatnonzero(stays)
     source = np.concatenate([stay, cloned, halved, halved])
 
-    parents = {name: np.concatenate([array, array]) for name, array in splats.take(halved).items()}
+    parents = twice(splats.take(halved))
     if side_by_side:
         changed = split_along_axis(parents, shape, MIN_OPACITY)
     elif by_axis:

@@ -34,10 +34,15 @@ PUBLISHED_DISTANCE = 0.5  # 3DSGS
 DISTANCE = 0.8  # of `split_along_axis`
 
 
+def twice(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """Return all rows, and then all rows again: the parents of first and of second halves."""
+    return {name: np.concatenate([array, array]) for name, array in arrays.items()}
+
+
 def drawn_halves(parents: Mapping[str, Array], shape: Shape, rng: np.random.Generator) -> dict[str, Array]:
     """Return the changed fields of the halves of 3DGS: smaller scales, and places drawn from the parents' Gaussians.
 
-    parents : public arrays of all parents twice, here and below.
+    parents : public arrays of the parents, `twice`, here and below.
     """
     shift = rng.standard_normal(parents["mean"].shape)
     return _placed(parents, shape, shift, {"log_scale": parents["log_scale"] - math.log(SPLIT_SHRINK)})

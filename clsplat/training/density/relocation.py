@@ -31,7 +31,7 @@ from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical
 from ...splats.shapes import Shape
 from ..methods import sss
 from .edit import DensifyEdit, Indices, NewValues
-from .halves import split_along_axis
+from .halves import split_along_axis, twice
 from .length_factor import length_factor
 from .table import SplatTable, smallest
 
@@ -120,15 +120,18 @@ def plan_relocation(
     places = np.concatenate([moving, np.arange(n, n_new)])  # of the copies
     old = splats.take(targets)
     halved = (copies == 1) & (split == "long-axis")
-    piled = np.concatenate([~halved, ~halved[stack]])
-    rows, of_target = (np.concatenate(of)[piled] for of in ((targets, places), (np.arange(len(targets)), stack)))
-    values = _stacks(rows, of_target, old, copies, shape, rule, min_opacity)
+    piled = ~halved
+    stacks = _stacks({name: array[piled] for name, array in old.items()}, copies[piled] + 1, shape, rule, min_opacity)
+    number = np.cumsum(piled) - 1  # of the stack of a target
+    rows = np.concatenate([targets[piled], places[piled[stack]]])
+    of_stack = np.concatenate([number[piled], number[stack][piled[stack]]])
+    values = {name: NewValues(rows, array[of_stack]) for name, array in stacks.items()}
     if halved.any():
         beside = np.empty_like(targets)
         beside[stack] = places
-        pairs = np.concatenate([targets[halved], beside[halved]])
-        parents = {name: np.concatenate([array[halved], array[halved]]) for name, array in old.items()}
-        values = _merged(values, pairs, split_along_axis(parents, shape, min_opacity))
+        parents = twice({name: array[halved] for name, array in old.items()})
+        rows = np.concatenate([targets[halved], beside[halved]])
+        values = _merged(values, rows, split_along_axis(parents, shape, min_opacity))
 
     fresh = np.zeros(n_new, np.bool_)
     fresh[targets] = True
@@ -138,35 +141,23 @@ def plan_relocation(
 
 
 def _stacks(
-    rows: Indices,
-    of_target: Indices,
-    targets: Mapping[str, Array],
-    copies: NDArray[np.integer],
-    shape: Shape,
-    rule: str,
-    min_opacity: float,
-) -> dict[str, NewValues]:
-    """Return the new values of stacks. of_target : (rows,) indices into the targets and the numbers of their copies."""
-    members, place = np.unique(of_target, return_inverse=True)
-    stacked = {name: array[members] for name, array in targets.items()}
-    raw, factor = relocation(shape, stacked, copies[members] + 1, min_opacity)
+    targets: Mapping[str, Array], ratio: NDArray[np.integer], shape: Shape, rule: str, min_opacity: float
+) -> dict[str, Array]:
+    """Return the changed fields of each stack's splats. ratio : number of splats that replace each target."""
+    raw, factor = relocation(shape, targets, ratio, min_opacity)
     new: dict[str, Array] = {**raw}
     if RULES[rule]:
-        log_scale = stacked["log_scale"]
+        log_scale = targets["log_scale"]
         new["log_scale"] = log_scale + (RULES[rule] * np.log(factor))[:, None].astype(log_scale.dtype)
-    return {name: NewValues(rows, array[place]) for name, array in new.items()}
+    return new
 
 
 def _merged(values: Mapping[str, NewValues], rows: Indices, more: Mapping[str, Array]) -> dict[str, NewValues]:
     """Return `values` with the new values `more` of other rows."""
     merged = dict(values)
     for name, array in more.items():
-        known = merged.get(name)
-        merged[name] = (
-            NewValues(rows, array)
-            if known is None
-            else NewValues(np.concatenate([known.rows, rows]), np.concatenate([known.values, array]))
-        )
+        known = values.get(name, NewValues(rows[:0], array[:0]))
+        merged[name] = NewValues(np.concatenate([known.rows, rows]), np.concatenate([known.values, array]))
     return merged
 
 

@@ -19,7 +19,8 @@ from .table import SplatTable
 # Minimum number of iterations between opacity resets. The learning rate of opacities is the same in short runs, so
 # opacities always need this time to recover.
 RESET_INTERVAL_MIN = 1000
-# The default turnover: in units of the cap, if a run densified from its first iteration to the last, and in one step.
+# Default turnover, as parts of the cap: of a whole run that densifies from its first iteration to its last, and the
+# most of one densification.
 TURNOVER = 3.5
 LARGEST_TURNOVER = 0.08
 
