@@ -105,7 +105,7 @@ def _try(info: DeviceInfo) -> dict[str, str]:
     check_rendering(device, schedule)
     config = TrainConfig()
     kernels = kernel_build(config, schedule)
-    check_loss(device, kernels, config.loss.lambda_dssim)
+    check_loss(device, kernels, config.loss.lambda_dssim, config.loss.smooth_l1)
     check_step(device, kernels, config.sghmc.position_optimizer)
     name = next((name for name, known in SCHEDULES.items() if known == schedule), "set by hand")
     return {

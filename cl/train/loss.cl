@@ -1,4 +1,7 @@
-// loss.cl: (1 - lambda) L1 + lambda (1 - SSIM), its value and gradient with respect to the rendered image.
+// loss.cl: (1 - lambda) smooth L1 + lambda (1 - SSIM), its value and gradient with respect to the rendered image.
+//
+// Smooth L1 of an error e is e^2 / (2 beta) below beta, and |e| - beta / 2 from there on. Kernels get beta and
+// steepness = 1 / beta, or 0 and a huge number, which makes it L1.
 //
 // SSIM: 11 x 11 Gaussian window, sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, zero padding, mean over pixels and channels
 // (Wang et al. 2004, with the constants of 3DGS). The formulas use the sum s = x + y and the difference d = x - y of
@@ -74,7 +77,7 @@ kernel void unpack_image(
         truth[c * plane + at] = inside ? bytes[channels * ((ulong)y * width + x) + c] : (uchar)0;
 }
 
-// Overwrites partial [3, channels, segments, strips] with the sums of |x - y|, SSIM and (x - y)^2. Overwrites v_maps
+// Overwrites partial [4, channels, segments, strips] with the sums of smooth L1, SSIM, |x - y| and (x - y)^2. Overwrites v_maps
 // [3, 3 planes] with the gradients of SSIM with respect to the window's mean of x, h_s and h_d, zero outside the image.
 kernel void image_loss(
     global const real *restrict rendered,
@@ -85,14 +88,16 @@ kernel void image_loss(
     int height,
     int stride,
     ulong plane,
-    int segment
+    int segment,
+    real beta,
+    real steepness
 ) {
     const int strips = strips_of(stride);
     if (get_global_id(0) >= strips) return;
     const strip item = item_strip(height, stride, plane, segment);
     vreal ring[RING][STRIP][4];  // s, d, s^2, d^2
     real s_row[(STRIP + 2 * SIDE) * LANES], d_row[(STRIP + 2 * SIDE) * LANES];
-    vreal l1 = (vreal)0, ssims = (vreal)0, squares = (vreal)0;
+    vreal smooth = (vreal)0, ssims = (vreal)0, l1 = (vreal)0, squares = (vreal)0;
     const vreal zero = (vreal)0;
     int slot = 0;
     for (int row = item.top - REACH; row < item.end + REACH; ++row) {
@@ -156,16 +161,19 @@ kernel void image_loss(
             lanes_store(lanes_if(inside, v_hs, zero), v_maps + at + 3 * plane);
             lanes_store(lanes_if(inside, v_hd, zero), v_maps + at + 6 * plane);
             const vreal error = lanes_load(rendered + at) - truth_load(truth + at);  // 0 outside
-            l1 += fabs(error);
+            const vreal size = fabs(error), slope = min(size * steepness, (vreal)1);
+            smooth = lanes_mad(slope, lanes_mad(R(-0.5) * beta, slope, size), smooth);
             ssims += lanes_if(inside, ssim, zero);
+            l1 += size;
             squares = lanes_mad(error, error, squares);
         }
     }
     const ulong n_parts = strips * get_global_size(1) * get_global_size(2);
     const ulong part = (get_global_id(2) * get_global_size(1) + get_global_id(1)) * strips + get_global_id(0);
-    partial[part] = lanes_sum(l1);
+    partial[part] = lanes_sum(smooth);
     partial[n_parts + part] = lanes_sum(ssims);
-    partial[2 * n_parts + part] = lanes_sum(squares);
+    partial[2 * n_parts + part] = lanes_sum(l1);
+    partial[3 * n_parts + part] = lanes_sum(squares);
 }
 
 // Overwrites v_color with the gradient of the loss. It blurs v_maps, because a symmetric window is its own adjoint.
@@ -180,6 +188,7 @@ kernel void image_loss_vjp(
     int stride,
     ulong plane,
     int segment,
+    real steepness,
     real l1_scale,
     real ssim_scale
 ) {
@@ -225,9 +234,9 @@ kernel void image_loss_vjp(
             const ulong at = centre + v * LANES;
             const vreal x = lanes_load(rendered + at), y = truth_load(truth + at);
             const vreal v_ssim = lanes_mad(x + y, v_hs, lanes_mad(x - y, v_hd, v_mean));
-            const vreal sign_l1 = lanes_if(x > y, (vreal)1, lanes_if(x < y, (vreal)-1, zero));
+            const vreal slope = max(min((x - y) * steepness, (vreal)1), (vreal)-1);
             lanes_store(
-                lanes_if(lanes_before((item.first + v) * LANES, width), l1_scale * sign_l1 - ssim_scale * v_ssim, zero),
+                lanes_if(lanes_before((item.first + v) * LANES, width), l1_scale * slope - ssim_scale * v_ssim, zero),
                 v_color + at
             );
         }

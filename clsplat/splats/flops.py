@@ -26,6 +26,6 @@ BLEND_VJP = 20
 
 # Operations of the loss per pixel and channel. Each of the five pairs of the window: four maps along rows 16 and along
 # columns 12, three gradient maps 9 and 9. The centre of the window: 4, 4, 3 and 3. Sum and difference of the images 3,
-# SSIM with its gradient and the sums 41, the final gradient 10.
-LOSS = 5 * (16 + 12 + 9 + 9) + 4 + 4 + 3 + 3 + 3 + 41 + 10
+# SSIM with its gradient and the sums 47, the final gradient 11.
+LOSS = 5 * (16 + 12 + 9 + 9) + 4 + 4 + 3 + 3 + 3 + 47 + 11
 ADAM = 14  # moments 7; corrections, root, epsilon and quotient 5; step 2

@@ -1,4 +1,8 @@
-"""The training loss on the device: (1 - lambda) L1 + lambda (1 - SSIM), its gradient, and the values for the log."""
+"""The training loss on the device, its gradient, and the values for the log.
+
+The loss is (1 - lambda) L1 + lambda (1 - SSIM), the loss of 3DGS. L1 may be smooth: e^2 / (2 beta) for an error e below
+beta, and |e| - beta / 2 from there on (Girshick 2015, arXiv 1504.08083).
+"""
 
 from __future__ import annotations
 
@@ -17,6 +21,7 @@ from ..rendering.frame import DeviceImage, ImageLayout
 from .programs import loss_program, loss_strip
 
 MIN_ROWS = 32  # minimum rows of a work-item, which also blurs ten rows outside of them
+STEEPEST = 1e30  # slope of L1 near 0, in place of 1 / beta
 ITEMS_PER_UNIT = {"CPU": 6, "GPU": 2048}  # enough work-items that no compute unit waits long for the last one
 
 
@@ -48,7 +53,7 @@ class LossResult:
     Attributes
     ----------
     v_color : buffer with the gradient of the loss with respect to the image.
-    partial : buffer (3, n_parts) with sums of L1, SSIM and squared error.
+    partial : buffer (4, n_parts) with sums of smooth L1, SSIM, L1 and squared error.
     count : pixels times channels.
     unmasked : fraction of the pixels that are not masked.
     number : position among the evaluations of its `ImageLoss`.
@@ -75,8 +80,8 @@ class PendingValue:
         """Return the values after waiting for the device."""
         self.event.wait()
         result = self.result
-        l1, ssim, mse = (self.parts.astype(np.float64).sum(axis=1) / result.count).tolist()
-        total = (1 - self.weight) * l1 + self.weight * (1 - ssim)
+        smooth, ssim, l1, mse = (self.parts.astype(np.float64).sum(axis=1) / result.count).tolist()
+        total = (1 - self.weight) * smooth + self.weight * (1 - ssim)
         return LossValue(total, l1 / result.unmasked, 1 - (1 - ssim) / result.unmasked, mse / result.unmasked)
 
 
@@ -87,15 +92,17 @@ class ImageLoss:
     ----------
     pool : owner of the device memory.
     weight : lambda, the weight of 1 - SSIM.
+    beta : error below which L1 is quadratic; 0 means L1 throughout.
     """
 
-    def __init__(self, pool: Pool, kernels: KernelBuild, weight: float) -> None:
-        self.device, self.pool, self.kernels, self.weight = pool.device, pool, kernels, weight
+    def __init__(self, pool: Pool, kernels: KernelBuild, weight: float, beta: float = 0.0) -> None:
+        self.device, self.pool, self.kernels = pool.device, pool, kernels
+        self.weight, self.beta = weight, beta
         self.program = loss_program(self.device, self.kernels)
         # With one lane, a work-item is a column of pixels. A group then reads whole lines of memory.
         self._group = lane_group(self.device) if self.kernels.lanes > 1 else GROUP_ITEMS
         self._v_color, self._v_maps = DeviceImage(pool, kernels.dtype, 3), DeviceImage(pool, kernels.dtype, 9)
-        self._partial = pool.buffer(kernels.dtype, 3)
+        self._partial = pool.buffer(kernels.dtype, 4)
         self._evaluations = 0
 
     def evaluate(self, layout: ImageLayout, rendered: Buffer, target: Buffer, unmasked: float = 1.0) -> LossResult:
@@ -111,7 +118,7 @@ class ImageLoss:
         strips = -(-layout.tiles_x * TILE // (kernels.lanes * loss_strip(kernels)))
         segment = self._rows(strips, layout.height)
         segments = -(-layout.height // segment)
-        n_parts = 3 * segments * strips
+        n_parts = 3 * segments * strips  # for each channel
         partial = self._partial.reserve(n_parts)
         group, count = self._group, 3 * layout.width * layout.height
         v_color = self._v_color.reserve(layout)
@@ -124,8 +131,9 @@ class ImageLoss:
             "stride": layout.stride,
             "plane": layout.plane,
             "segment": segment,
+            "steepness": 1 / self.beta if self.beta else STEEPEST,
         }
-        self.program.image_loss.over(strips, group, segments, 3, partial=partial, **common)
+        self.program.image_loss.over(strips, group, segments, 3, partial=partial, beta=self.beta, **common)
         self.program.image_loss_vjp.over(
             strips,
             group,
@@ -157,7 +165,7 @@ class ImageLoss:
         """Return the values of the latest evaluation without waiting for the device; raises as `value`."""
         if result.number != self._evaluations:
             raise RuntimeError(f"loss result {result.number} was overwritten by evaluation {self._evaluations}")
-        parts = np.empty((3, result.n_parts), self.kernels.dtype)
+        parts = np.empty((4, result.n_parts), self.kernels.dtype)
         return PendingValue(result, self.weight, parts, send_to_host(self.device, result.partial, parts))
 
     def _rows(self, strips: int, height: int) -> int:

@@ -31,6 +31,7 @@ _RATES = {
     "scaling_lr": 5e-3,
     "rotation_lr": 1e-3,
     "lambda_dssim": 0.2,
+    "smooth_l1": 0.0,
     "bisect_reg": 0.0,
     "average_last": 0.0,
     "random_points": 0.0,

@@ -1,4 +1,4 @@
-"""Value and gradient of 3DGS's loss, (1 - weight) L1 + weight (1 - SSIM), by independent methods.
+"""Value and gradient of 3DGS's loss, (1 - weight) L1 + weight (1 - SSIM), by independent methods. L1 may be smooth.
 
 SSIM is computed as in 3DGS (Wang et al. 2004): 11 x 11 Gaussian window of sigma 1.5, zero padding,
 K = (.01, .03), data range 1, mean over pixels and channels. Dense banded matrices compute the means.
@@ -43,13 +43,26 @@ def ssim_map(image: Array, target: Array) -> Array:
     return above / ((mu_x * mu_x + mu_y * mu_y + C1) * (var_x + var_y + C2))
 
 
-def reference_loss(image: ArrayLike, target: ArrayLike, weight: float = 0.2) -> float:
+def smooth_l1(error: Array, beta: float) -> NDArray[np.float64]:
+    """Return the integral of min(t / beta, 1) over t from 0 to each |error|; |error| if beta is 0."""
+    size = np.abs(error)
+    return size - beta / 2 + np.maximum(beta - size, 0.0) ** 2 / (2 * beta) if beta else size
+
+
+def smooth_sign(error: Array, beta: float) -> NDArray[np.float64]:
+    """Return the derivative of `smooth_l1`; 0 at 0."""
+    return np.sign(error) * np.where(np.abs(error) < beta, np.abs(error) / (beta or 1.0), 1.0)
+
+
+def reference_loss(image: ArrayLike, target: ArrayLike, weight: float = 0.2, beta: float = 0.0) -> float:
     """Return the loss of an image against its target, both (H, W, 3) in 0..1. `weight` is 3DGS's lambda_dssim."""
     x, y = np.asarray(image, dtype=np.float64), np.asarray(target, dtype=np.float64)
-    return float((1.0 - weight) * np.abs(x - y).mean() + weight * (1.0 - ssim_map(x, y).mean()))
+    return float((1.0 - weight) * smooth_l1(x - y, beta).mean() + weight * (1.0 - ssim_map(x, y).mean()))
 
 
-def reference_loss_gradient(image: ArrayLike, target: ArrayLike, weight: float = 0.2) -> NDArray[np.float64]:
+def reference_loss_gradient(
+    image: ArrayLike, target: ArrayLike, weight: float = 0.2, beta: float = 0.0
+) -> NDArray[np.float64]:
     """Return the (H, W, 3) gradient of `reference_loss` with respect to the image.
 
     The gradient of L1 is 0 where image and target are equal. The method takes complex steps on every 11th pixel of
@@ -59,7 +72,7 @@ def reference_loss_gradient(image: ArrayLike, target: ArrayLike, weight: float =
     x, y = np.asarray(image, dtype=np.float64), np.asarray(target, dtype=np.float64)
     height, width, channels = x.shape
     half = WINDOW // 2
-    gradient = (1.0 - weight) * np.sign(x - y) / x.size
+    gradient = (1.0 - weight) * smooth_sign(x - y, beta) / x.size
     for row in range(min(WINDOW, height)):
         for column in range(min(WINDOW, width)):
             bumped = x.astype(np.complex128)

@@ -67,6 +67,7 @@ DEFAULTS = {
     "sh_interval": 0,
     "coarse_to_fine": True,
     "lambda_dssim": 0.2,
+    "smooth_l1": 0.05,
     "bisect_reg": 0.0,
     "position_lr_init": 1.6e-4,
     "position_lr_final": 1.6e-6,

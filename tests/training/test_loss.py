@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from device_schedules import schedule_on
 from numpy.typing import NDArray
-from reference.loss import reference_loss, reference_loss_gradient
+from reference.loss import reference_loss, reference_loss_gradient, smooth_sign
 from reference.tolerances import ROUNDING, relative_error
 
 from clsplat.device.device import Device
@@ -23,12 +23,14 @@ from clsplat.training.loss import ImageLoss, LossValue
 SIZES = [(1, 1), (2, 3), (7, 40), (19, 27), (16, 16), (5, 97), (70, 37)]
 
 
-def loss_of(device: Device, schedule: Schedule | None = None, real: Real = "float", weight: float = 0.2) -> ImageLoss:
+def loss_of(
+    device: Device, schedule: Schedule | None = None, real: Real = "float", weight: float = 0.2, beta: float = 0.0
+) -> ImageLoss:
     """Return a loss with the device's default schedule, or another one."""
     if real == "double" and not device.has_fp64:
         pytest.skip("no double precision")
     schedule = schedule or default_schedule(device.info)
-    return ImageLoss(Pool(device), KernelBuild("gaussian", 0, schedule, real=real), weight)
+    return ImageLoss(Pool(device), KernelBuild("gaussian", 0, schedule, real=real), weight, beta)
 
 
 def compared(
@@ -64,27 +66,29 @@ def expected_of_ssim(height: int, width: int) -> NDArray[np.float64]:
     return reference_loss_gradient(color, truth / 255, 1.0)
 
 
-def expected(height: int, width: int, weight: float) -> tuple[float, NDArray[np.float64]]:
+def expected(height: int, width: int, weight: float, beta: float) -> tuple[float, NDArray[np.float64]]:
     """Return the reference's loss and gradient of `pair`."""
     color, truth = pair(height, width)
-    of_l1 = np.sign(color - truth / 255) / color.size
-    return (reference_loss(color, truth / 255, weight), (1 - weight) * of_l1 + weight * expected_of_ssim(height, width))
+    of_l1 = (1 - weight) * smooth_sign(color - truth / 255, beta) / color.size
+    return reference_loss(color, truth / 255, weight, beta), of_l1 + weight * expected_of_ssim(height, width)
 
 
+@pytest.mark.parametrize("beta", [0.0, 0.1])
 @pytest.mark.parametrize(
     ("real", "weight", "tolerance"), [("double", 0.2, ROUNDING), ("double", 1.0, ROUNDING), ("float", 0.2, 2e-5)]
 )
 def test_loss_and_gradient_equal_the_reference(
-    scheduled: tuple[Device, Schedule], real: Real, weight: float, tolerance: float
+    scheduled: tuple[Device, Schedule], real: Real, weight: float, tolerance: float, beta: float
 ) -> None:
     """One object computes all sizes, so its buffers are reused."""
-    loss = loss_of(*scheduled, real, weight)
+    loss = loss_of(*scheduled, real, weight, beta)
     for height, width in SIZES:
         color, truth = pair(height, width)
         value, gradient = compared(loss, color, truth)
-        total, wanted = expected(height, width, weight)
+        total, wanted = expected(height, width, weight, beta)
         name = f"{width}x{height}"
         assert value.total == pytest.approx(total, rel=max(tolerance, 1e-9)), name
+        assert value.l1 == pytest.approx(np.abs(color - truth / 255).mean(), rel=1e-5), name
         assert value.psnr == pytest.approx(-10 * np.log10(np.mean((color - truth / 255) ** 2)), abs=1e-3), name
         assert relative_error(gradient, wanted) < tolerance, name
 

@@ -69,6 +69,9 @@ class LossConfig(OptionGroup):
     title: ClassVar[str] = "Loss"
 
     lambda_dssim: float = option(0.2, help="Weight of 1 - SSIM in the loss; L1 has the rest.", at_least=0, at_most=1)
+    smooth_l1: float = option(
+        0.05, help="Error of a colour, 0 to 1, below which L1 is quadratic. 0: nowhere (3DGS).", at_least=0, at_most=1
+    )
     bisect_reg: float = option(
         0.0, help="Weight of the mean squared difference between the two opacities of a splat (3DSGS).", at_least=0
     )
