@@ -173,8 +173,8 @@ def test_without_any_of_it_no_kernel_runs(device: Device) -> None:
 # --- learning ------------------------------------------------------------------------------
 
 
-# Splats stay: new ones at iteration 100 would not be learned yet, and differ between the runs that are compared. L1 is not
-# smooth, because the mean of photos with different gains is close to that of smooth L1 even without exposures.
+# Splats stay: new ones at iteration 100 would not be learned yet, and differ between the runs that are compared.
+# L1 is not smooth: smooth L1 draws splats to the mean of the photos, which is nearly right here even without exposures.
 CONFIG = TrainConfig(
     iterations=200, cap_max=2500, sh_degree=0, coarse_to_fine=False, turnover=0.0, smooth_l1=0.0, seed=1
 )
