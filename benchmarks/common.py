@@ -17,6 +17,7 @@ from clsplat.comparison.table import Record, markdown_table
 from clsplat.device.device import Device
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.scenes.split import hold_out
+from clsplat.splats.color import BLACK, Color
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -53,16 +54,17 @@ def data_folder() -> Path:
     return Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data")
 
 
-def real_scene(name: str, resolution: int | None = None, *, validate: bool = False) -> Scene:
+def real_scene(name: str, resolution: int | None = None, *, validate: bool = False, background: Color = BLACK) -> Scene:
     """Read a scene of the data folder, with every 8th view as a test view.
 
     Parameters
     ----------
     resolution : as of `load_scene`; None: the size at which benchmarks train this scene.
     validate : replace the test views by held-out training views, so that choices can be made on them.
+    background : color behind transparent photos.
     """
     resolution = REDUCTION.get(name, -1) if resolution is None else resolution
-    scene = load_scene(data_folder() / name, resolution=resolution, eval=True)
+    scene = load_scene(data_folder() / name, resolution=resolution, eval=True, background=background)
     return hold_out(scene) if validate else scene
 
 

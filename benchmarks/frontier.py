@@ -1,13 +1,14 @@
 """Quality against time, bytes and splats on the real scenes, and the effect of seeds: the charts of the README.
 
-    python benchmarks/frontier.py [--scenes fox kitchen sceaux_castle] [--groups presets caps seeds] [--device 0:0]
+    python benchmarks/frontier.py [--scenes fox kitchen lego] [--groups lengths caps seeds] [--device 0:0]
     python benchmarks/frontier.py --charts      # draw finished runs: results/frontier/report.html and charts/
     python benchmarks/frontier.py --table       # print them
     python benchmarks/frontier.py --smoke --scenes NAME --out DIR
 
 Every run is a line of results/frontier/runs.jsonl (see `clsplat compare`) and is made once: kill and restart at will.
 The charts also show the runs of results/budget (`--budget auto`, benchmarks/budget.py) and results/arithmetic.jsonl,
-if these files exist. Fox is read at half size, for seeds at a quarter, to save time.
+if these files exist. Fox is read at half size, for seeds at a quarter, to save time. Transparent scenes have a white
+background.
 """
 
 from __future__ import annotations
@@ -19,18 +20,21 @@ from typing import NamedTuple
 import common
 
 from clsplat.comparison.compare import compare
-from clsplat.comparison.methods import parse_methods
+from clsplat.comparison.length_rows import equal_time_rows, length_rows
+from clsplat.comparison.methods import DEFAULT, parse_methods
 from clsplat.comparison.runs import distinct, read_runs
 from clsplat.comparison.sweep import write_report
 from clsplat.comparison.sweep_rows import auto_rows, equal_rows, point_rows, seed_rows
-from clsplat.comparison.sweep_tables import TextTable, auto_table, equal_table, seed_table
+from clsplat.comparison.sweep_tables import TextTable, auto_table, equal_table, equal_time_table, seed_table
 from clsplat.comparison.table import HEAD, Record, cells, notes, repeats, summarise
+from clsplat.splats.color import BLACK, WHITE
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.presets import PRESETS
 
 OUT = common.RESULTS / "frontier"
-REFERENCE = "gaussian"
-KERNELS = (REFERENCE, "skew-normal", "generalised-exponential")
+REFERENCE = "3dgs"
+SYSTEMS = (REFERENCE, "gaussian", DEFAULT, *(name for name in PRESETS if name != REFERENCE))
+TRANSPARENT = ("lego",)
 
 
 class Group(NamedTuple):
@@ -38,29 +42,27 @@ class Group(NamedTuple):
 
     methods: tuple[str, ...]
     caps: tuple[int, ...]
-    iterations: int = 1000
+    lengths: tuple[int, ...] = (1000,)  # iterations
     seeds: int = 1
     repeat: int = 1
-    curve: int = 0
     scenes: dict[str, int] | None = None  # with their resolution; None: those of --scenes
 
 
-# `presets` comes before `caps`, so that the runs of both groups are made once and have curves.
 GROUPS = {
-    "presets": Group((*KERNELS, *PRESETS), (5000,), curve=12),
-    "caps": Group(KERNELS, (500, 1000, 2500, 5000, 10_000, 20_000, 50_000)),
-    "seeds": Group(tuple(SHAPES), (1000,), 300, seeds=5, repeat=3, scenes={"fox": 4}),
+    "lengths": Group(SYSTEMS, (20_000,), (250, 500, 1000, 2000)),
+    "caps": Group(SYSTEMS, (1000, 5000, 20_000, 50_000)),
+    "seeds": Group(tuple(SHAPES), (1000,), (300,), seeds=5, repeat=3, scenes={"fox": 4}),
 }
 SMOKE = {
-    "presets": Group(KERNELS[:2], (60,), 4, curve=2),
-    "caps": Group(KERNELS[:2], (30, 60), 4),
-    "seeds": Group(KERNELS[:1], (30,), 3, seeds=3, repeat=2),
+    "lengths": Group(SYSTEMS[:2], (60,), (2, 4)),
+    "caps": Group(SYSTEMS[:2], (30, 60), (4,)),
+    "seeds": Group(SYSTEMS[:1], (30,), (3,), seeds=3, repeat=2),
 }
 
 
 def main() -> None:
     parser = common.parser(__doc__, OUT)
-    parser.add_argument("--scenes", nargs="+", default=["fox", "kitchen", "sceaux_castle"])
+    parser.add_argument("--scenes", nargs="+", default=["fox", "kitchen", "lego"])
     parser.add_argument("--groups", nargs="+", choices=tuple(GROUPS), default=list(GROUPS))
     parser.add_argument("--charts", action="store_true", help="draw the finished runs, train nothing")
     args = parser.parse_args()
@@ -82,26 +84,29 @@ def main() -> None:
 
 def train_group(group: Group, args: argparse.Namespace) -> None:
     """Train the missing runs of one group."""
-    sizes = group.scenes or dict.fromkeys(args.scenes)
-    compare(
-        (common.real_scene(name, resolution) for name, resolution in sizes.items()),
-        parse_methods(",".join(group.methods)),
-        args.out,
-        group.caps,
-        range(group.seeds),
-        {"iterations": group.iterations, "device": args.device},
-        curve=group.curve,
-        repeat=group.repeat,
-        extra={"commit": common.commit()},
-        on_run=common.print_run,
-    )
+    for name, resolution in (group.scenes or dict.fromkeys(args.scenes)).items():
+        background = WHITE if name in TRANSPARENT else BLACK
+        compare(
+            [common.real_scene(name, resolution, background=background)],
+            parse_methods(",".join(group.methods)),
+            args.out,
+            group.caps,
+            range(group.seeds),
+            {"background": background, "device": args.device},
+            lengths=group.lengths,
+            repeat=group.repeat,
+            extra={"commit": common.commit()},
+            on_run=common.print_run,
+        )
 
 
 def print_tables(records: Sequence[Record]) -> None:
     """Print all runs, splats at equal quality, automatic runs and seeds."""
     rows, points = summarise(records), point_rows(records)
+    leads = equal_time_rows(length_rows(records), REFERENCE)
     tables: list[tuple[str, TextTable]] = [
         ("", (HEAD, [cells(row) for row in rows])),
+        (f"lead over {REFERENCE} in equal time [dB]", equal_time_table(leads, REFERENCE)),
         (f"splats for the PSNR of {REFERENCE}", equal_table(equal_rows(points, REFERENCE), REFERENCE)),
         ("automatic runs", auto_table(auto_rows(points))),
         ("seeds", seed_table(seed_rows(records))),

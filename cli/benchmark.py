@@ -47,6 +47,7 @@ _COMMON = (
     also_systems=("--preset",),
     about_systems="Systems to train, as in `clsplat compare`.",
     caps="the published number of each scene",
+    lengths=False,
 )
 @click.option(
     "--iterations",

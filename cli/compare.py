@@ -58,7 +58,8 @@ SYSTEMS = (DEFAULT, *PRESETS)
 @click.option("--save-models", is_flag=True, help="Keep the splats of each run, in DIR/models.")
 @quiet_option
 @config_options(
-    "shape", "cap_max", "seed", "save_iterations", "test_iterations", "checkpoint_interval", "checkpoint_minutes"
+    *("shape", "cap_max", "seed", "iterations", "save_iterations", "test_iterations"),
+    *("checkpoint_interval", "checkpoint_minutes"),
 )
 @click.pass_context
 def compare_systems(
@@ -68,6 +69,7 @@ def compare_systems(
     output: Path,
     systems: str,
     caps: tuple[tuple[int, ...], ...],
+    lengths: tuple[tuple[int, ...], ...],
     seeds: tuple[tuple[int, ...], ...],
     save_models: bool,
     quiet: bool,
@@ -92,6 +94,7 @@ def compare_systems(
             distinct_numbers(caps) or CAPS,
             distinct_numbers(seeds) or [0],
             common,
+            lengths=distinct_numbers(lengths),
             save_models=save_models,
             progress=display,
             on_run=None if quiet else report_run,

@@ -7,6 +7,8 @@ from typing import Any, TypeVar
 
 import click
 
+from clsplat.training.config import TrainConfig
+
 from .options import PATH, Numbers
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -14,7 +16,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def comparison_sections(*others: str) -> dict[str, tuple[str, ...]]:
     """Return the sections of a command's help. others : names of the common options that only this command has."""
-    grid = ("output", "systems", "caps", "seeds", "iterations", "resolution")
+    grid = ("output", "systems", "caps", "seeds", "lengths", "resolution")
     return {
         "Common options": (*grid, *others, "device", "quiet"),
         "Photos and test views": ("images", "masks", "alpha", "test_every", "test_list"),
@@ -30,8 +32,9 @@ def grid_options(
     about_seeds: str = "",
     default_output: bool = False,
     also_systems: Sequence[str] = (),
+    lengths: bool = True,
 ) -> Callable[[F], F]:
-    """Add `--output`, `--systems`, `--cap-max` and `--seeds`.
+    """Add `--output`, `--systems`, `--cap-max`, `--iterations` (if `lengths`) and `--seeds`.
 
     Parameters
     ----------
@@ -40,6 +43,7 @@ def grid_options(
     about_seeds : more of the help text of `--seeds`.
     default_output : whether the command has a folder of its own if `--output` is left out.
     also_systems : other names of `--systems`.
+    lengths : whether `--iterations` is a list. Leave the training option of this name out then.
     """
     shown = caps if isinstance(caps, str) else ",".join(map(str, caps))
     options = [
@@ -67,6 +71,18 @@ def grid_options(
             help=f"Seeds: a run for each.{about_seeds}  [default: 0]",
         ),
     ]
+
+    if lengths:
+        options.append(
+            click.option(
+                "--iterations",
+                "--steps",
+                "lengths",
+                type=Numbers("iterations"),
+                multiple=True,
+                help=f"Numbers of iterations: a run for each.  [default: {TrainConfig().iterations}]",
+            )
+        )
 
     def add(function: F) -> F:
         for option in reversed(options):

@@ -1,4 +1,4 @@
-"""`clsplat frontier`: train systems at several caps, and write charts and a page that shows them."""
+"""`clsplat frontier`: train systems at several caps or lengths, and write charts and a page that shows them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 @grid_options(
     output="Folder of the runs, charts and page.",
     systems=SYSTEMS,
-    about_systems="Systems as in `clsplat compare`. The first one is the reference for splats at equal quality.",
+    about_systems="Systems as in `clsplat compare`. The first one is the reference for equal quality and equal time.",
     caps=CAPS,
     about_seeds=" Three or more also make a chart of their spread.",
 )
@@ -68,7 +68,8 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 @split_options
 @quiet_option
 @config_options(
-    "shape", "cap_max", "seed", "save_iterations", "test_iterations", "checkpoint_interval", "checkpoint_minutes"
+    *("shape", "cap_max", "seed", "iterations", "save_iterations", "test_iterations"),
+    *("checkpoint_interval", "checkpoint_minutes"),
 )
 @click.pass_context
 def draw_frontier(
@@ -78,6 +79,7 @@ def draw_frontier(
     output: Path,
     systems: str,
     caps: tuple[tuple[int, ...], ...],
+    lengths: tuple[tuple[int, ...], ...],
     seeds: tuple[tuple[int, ...], ...],
     repeat: int,
     curve: int,
@@ -86,7 +88,10 @@ def draw_frontier(
     quiet: bool,
     **values: Any,
 ) -> None:
-    """Train the systems on SCENES at several caps and chart quality against time, render time, bytes and splats.
+    """Train the systems on SCENES and chart quality against time, render time, bytes and splats.
+
+    Several caps (--cap-max) make the charts of render time, bytes and splats, and several lengths of the runs
+    (--iterations) the chart of training time.
 
     The command writes DIR/report.html, DIR/charts (PNG, SVG, and their data as CSV and JSON) and the files of `clsplat
     compare`. Existing runs are not repeated. After Ctrl-C, the charts show the finished runs, and the same command
@@ -112,6 +117,7 @@ def draw_frontier(
                 distinct_numbers(caps) or CAPS,
                 distinct_numbers(seeds) or [0],
                 common,
+                lengths=distinct_numbers(lengths),
                 curve=curve,
                 repeat=repeat,
                 more=more,
@@ -124,12 +130,16 @@ def draw_frontier(
 
 
 def report(records: list[Record], reference: str) -> None:
-    """Print the tables that the charts do not show: all runs, and splats at equal quality."""
+    """Print the tables that the charts do not show: all runs, splats at equal quality, and quality in equal time."""
+    from clsplat.comparison.length_rows import equal_time_rows, length_rows
     from clsplat.comparison.sweep_rows import equal_rows, point_rows
-    from clsplat.comparison.sweep_tables import equal_table
+    from clsplat.comparison.sweep_tables import equal_table, equal_time_table
     from clsplat.comparison.table import HEAD, cells, summarise
 
     click.echo(table(HEAD, map(cells, summarise(records))))
     equal = equal_rows(point_rows(records), reference)
     if equal:
         click.echo("\nsplats needed for the PSNR of the first system:\n" + table(*equal_table(equal, reference)))
+    leads = equal_time_rows(length_rows(records), reference)
+    if leads:
+        click.echo("\nlead over the first system in equal time [dB]:\n" + table(*equal_time_table(leads, reference)))

@@ -1,4 +1,4 @@
-"""Methods trained side by side: same scenes, caps, iterations and seeds. An interrupted comparison can go on."""
+"""Methods trained side by side: same scenes, caps, lengths and seeds. An interrupted comparison can go on."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ def compare(
     seeds: Sequence[int],
     common: Mapping[str, Any] | None = None,
     *,
+    lengths: Sequence[int] = (),
     save_models: bool = False,
     curve: int = 0,
     repeat: int = 1,
@@ -37,7 +38,7 @@ def compare(
     progress: Callable[[Progress], None] | None = None,
     on_run: Callable[[Run, Record | None], None] | None = None,
 ) -> list[Record]:
-    """Train every method at every cap with every seed on every scene, and measure it on the test views.
+    """Train every method at every cap and length with every seed on every scene, and measure it on the test views.
 
     Finished runs in `output` are not repeated. The table shows all runs there, new and earlier ones.
 
@@ -46,6 +47,7 @@ def compare(
     scenes : with test views. An iterator can load them one after the other.
     output : folder of runs.jsonl, table.md and results.json, which are also written after Ctrl-C.
     common : options of all methods, by the names of TrainConfig.
+    lengths : iterations of the runs; without any, those of `common` or the default.
     save_models : keep the splats of each run in `output`/models.
     curve : number of measurements of the test views along each run; a run without a curve is repeated.
     repeat : how often to train the first seed: on one device the splats have the same bits each time.
@@ -66,8 +68,9 @@ def compare(
     folder = Path(output)
     # The loop over methods is the innermost: an interrupted comparison has equally many runs of each.
     configs = [
-        (method.label, method.config(cap, seed, common), again)
+        (method.label, method.config(cap, seed, options), again)
         for cap in caps
+        for options in with_lengths(common, lengths)
         for seed in seeds
         for again in range(repeat if seed == seeds[0] else 1)
         for method in methods
@@ -109,6 +112,11 @@ def compare(
         finally:
             write_table(folder, runs.records)
     return runs.records
+
+
+def with_lengths(common: Mapping[str, Any] | None, lengths: Sequence[int]) -> list[dict[str, Any]]:
+    """Return the common options once for each number of iterations, or as they are without any."""
+    return [{**(common or {}), "iterations": length} for length in lengths] or [dict(common or {})]
 
 
 def write_table(folder: Path, records: Sequence[Record]) -> None:

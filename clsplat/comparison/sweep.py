@@ -1,4 +1,4 @@
-"""A sweep of methods, caps and seeds, and its charts: quality against time, render time, bytes and splats."""
+"""A sweep of methods, caps, lengths and seeds, and its charts: quality against time, render time, bytes and splats."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from ..scenes.scene import Scene
 from ..training.log import Progress
 from .charts import arithmetic_chart, seeds_chart
 from .compare import compare
+from .length_rows import equal_time_rows, length_rows
 from .methods import Method
 from .runs import RUNS, Run, distinct, read_runs, refuse_foreign
-from .sweep_charts import equal_chart, size_chart, time_chart
+from .sweep_charts import equal_chart, length_chart, size_chart, time_chart
 from .sweep_rows import (
     ChartRow,
     arithmetic_rows,
@@ -27,13 +28,19 @@ from .sweep_rows import (
     seed_rows,
     write_rows,
 )
-from .sweep_tables import NONE, TextTable, arithmetic_table, auto_table, equal_table, seed_table
+from .sweep_tables import NONE, TextTable, arithmetic_table, auto_table, equal_table, equal_time_table, seed_table
 from .table import HEAD, Record, cells, notes, summarise
 
 CHARTS, REPORT = "charts", "report.html"
 CURVE = 12  # points along a run
 
 _TEXT = {
+    "length": (
+        "Quality against the time of a whole run",
+        "Each point is a run of another length, or the mean over its seeds: test PSNR and SSIM against seconds of "
+        "training. Grey: the Pareto front of PSNR. The table has the lead in PSNR [dB] over the reference in as many "
+        "seconds, linear in log seconds between runs; empty: the system has only shorter or only longer runs.",
+    ),
     "time": (
         "Quality along the training",
         "Test PSNR and SSIM against seconds of training, without the time of these measurements. Each point was "
@@ -75,6 +82,7 @@ def sweep(
     seeds: Sequence[int],
     common: Mapping[str, Any] | None = None,
     *,
+    lengths: Sequence[int] = (),
     curve: int = CURVE,
     repeat: int = 1,
     more: Sequence[Record] = (),
@@ -86,7 +94,7 @@ def sweep(
 
     Parameters
     ----------
-    scenes, methods, output, caps, seeds, common, curve, repeat, extra, progress, on_run : as of `compare`.
+    scenes, methods, output, caps, seeds, common, lengths, curve, repeat, extra, progress, on_run : as of `compare`.
     more : records of other comparisons, which are drawn too; see `read_runs`.
 
     Returns
@@ -109,6 +117,7 @@ def sweep(
             caps,
             seeds,
             common,
+            lengths=lengths,
             curve=curve,
             repeat=repeat,
             extra=extra,
@@ -128,7 +137,8 @@ def write_report(
     Parameters
     ----------
     records : of `compare` or `read_runs`; the first of equal runs counts.
-    reference : system whose PSNR the others must reach; None: the first one with a cap.
+    reference : system that the others are compared with, at equal PSNR and at equal seconds; None: the first one with
+        a cap.
     arithmetic : records for `sweep_rows.arithmetic_rows`.
 
     Returns
@@ -142,10 +152,11 @@ def write_report(
     if not records:
         raise InputError(f"{folder}: no runs to draw")
     folder, kept = Path(folder), distinct(records)
-    points, seeds = point_rows(kept), seed_rows(kept)
+    points, lengths, seeds = point_rows(kept), length_rows(kept), seed_rows(kept)
     first = reference or next((point["system"] for point in points if not point["auto"]), "")
     equal, auto, forms = equal_rows(points, first), auto_rows(points), arithmetic_rows(arithmetic)
     parts: list[tuple[str, Sequence[ChartRow], Callable[[Any, Path], list[Path]], TextTable]] = [
+        ("length", lengths, length_chart, equal_time_table(equal_time_rows(lengths, first), first)),
         ("size", points, size_chart, auto_table(auto)),
         ("equal", equal, lambda rows, out: equal_chart(rows, first, out), equal_table(equal, first)),
         ("time", curve_rows(kept), time_chart, NONE),

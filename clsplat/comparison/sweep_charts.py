@@ -52,28 +52,35 @@ def time_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
             runs: dict[tuple[str, int], list[ChartRow]] = {}
             for row in shown:
                 runs.setdefault((row["system"], row["seed"]), []).append(row)
-            for axes, key, name, height in (
-                (panels[0][column], "psnr", "test PSNR [dB]", _DB_SHOWN),
-                (panels[1][column], "ssim", "test SSIM", _SSIM_SHOWN),
-            ):
-                for (system, _), run in runs.items():
-                    axes.plot(
-                        [row["seconds"] for row in run],
-                        [row[key] for row in run],
-                        **styles[system] | {"markersize": 3, "linewidth": 1.3},
-                    )
-                best = max(row[key] for row in shown)
-                visible = [row for row in shown if row[key] >= best - height]
-                low, high = min(row["seconds"] for row in visible) / 1.1, max(row["seconds"] for row in visible) * 1.1
-                bottom = min(row[key] for row in visible)
-                axes.set(
-                    xscale="log",
-                    xlim=(low, high),
-                    ylim=(bottom - 0.03 * (best - bottom) - 1e-3, best + 0.04 * (best - bottom) + 1e-3),
-                )
-                log_axis(axes.xaxis, low, high)
-                if column == 0:
-                    axes.set_ylabel(name)
+            lines = [(system, run) for (system, _), run in runs.items()]
+            _quality_panels(panels[:, column], lines, styles, column == 0)
+            panels[0][column].set_title(f"{scene}, cap {short_count(shown[0]['cap'])}")
+            panels[1][column].set_xlabel("training time [s]")
+        system_legend(figure, styles)
+    return chart_paths(out)
+
+
+def length_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
+    """Draw test PSNR (above) and SSIM (below) of whole runs against seconds of training; a column for each scene.
+
+    Runs of a system that differ in their length are joined. The Pareto front of PSNR is grey. The axes begin 5 dB (0.3)
+    below the best.
+
+    Parameters
+    ----------
+    rows : of `length_rows.length_rows`. out : path without a suffix. Raises as `time_chart`.
+    """
+    scenes, styles = _scenes(rows, out), looks({row["system"]: row["shape"] for row in rows})
+    with drawing(out, WIDTH, 5.6 + 0.2 * legend_rows(len(styles))) as figure:
+        panels = figure.subplots(2, len(scenes), squeeze=False, sharex="col")
+        for column, scene in enumerate(scenes):
+            shown = sorted((row for row in rows if row["scene"] == scene), key=lambda row: float(row["seconds"]))
+            runs = {system: [row for row in shown if row["system"] == system] for system in styles}
+            front = [row for row in shown if row["front"]]
+            panels[0][column].plot(
+                [row["seconds"] for row in front], [row["psnr"] for row in front], color=FRONT, linewidth=5, zorder=1
+            )
+            _quality_panels(panels[:, column], list(runs.items()), styles, column == 0)
             panels[0][column].set_title(f"{scene}, cap {short_count(shown[0]['cap'])}")
             panels[1][column].set_xlabel("training time [s]")
         system_legend(figure, styles)
@@ -155,6 +162,38 @@ def equal_chart(rows: Sequence[ChartRow], reference: str, out: str | Path) -> li
         panels[0].set_ylabel(f"splats for the same PSNR\n[% of {reference}'s]")
         system_legend(figure, styles)
     return chart_paths(out)
+
+
+def _quality_panels(
+    panels: Sequence[Any], lines: Sequence[tuple[str, list[ChartRow]]], styles: dict[str, dict[str, Any]], named: bool
+) -> None:
+    """Draw PSNR (above) and SSIM (below) of some lines (system, points) against seconds, with the axes of `time_chart`.
+
+    named : whether the vertical axes have their names.
+    """
+    shown = [row for _, line in lines for row in line]
+    for axes, key, name, height in (
+        (panels[0], "psnr", "test PSNR [dB]", _DB_SHOWN),
+        (panels[1], "ssim", "test SSIM", _SSIM_SHOWN),
+    ):
+        for system, line in lines:
+            axes.plot(
+                [row["seconds"] for row in line],
+                [row[key] for row in line],
+                **styles[system] | {"markersize": 3, "linewidth": 1.3},
+            )
+        best = max(row[key] for row in shown)
+        visible = [row for row in shown if row[key] >= best - height]
+        low, high = min(row["seconds"] for row in visible) / 1.1, max(row["seconds"] for row in visible) * 1.1
+        bottom = min(row[key] for row in visible)
+        axes.set(
+            xscale="log",
+            xlim=(low, high),
+            ylim=(bottom - 0.03 * (best - bottom) - 1e-3, best + 0.04 * (best - bottom) + 1e-3),
+        )
+        log_axis(axes.xaxis, low, high)
+        if named:
+            axes.set_ylabel(name)
 
 
 def _cost_panel(

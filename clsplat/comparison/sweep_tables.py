@@ -24,6 +24,23 @@ def equal_table(rows: Sequence[ChartRow], reference: str) -> TextTable:
     return ("scene", "system", *(f"{reference}, cap {cap}" for cap in caps)), lines
 
 
+def equal_time_table(rows: Sequence[ChartRow], reference: str) -> TextTable:
+    """Return the lead over the reference [dB] in as many seconds; a column for each length of its runs.
+
+    rows : of `length_rows.equal_time_rows`.
+    """
+    lengths = sorted({row["reference_iterations"] for row in rows})
+    lines: list[tuple[str, ...]] = []
+    for scene, system in dict.fromkeys((row["scene"], row["system"]) for row in rows):
+        leads = {
+            row["reference_iterations"]: row["lead"]
+            for row in rows
+            if (row["scene"], row["system"]) == (scene, system) and row["lead"] is not None
+        }
+        lines.append((scene, system, *(f"{leads[length]:+.2f}" if length in leads else "" for length in lengths)))
+    return ("scene", "system", *(f"{reference}, {length} iterations" for length in lengths)) if rows else (), lines
+
+
 def auto_table(rows: Sequence[ChartRow]) -> TextTable:
     """Return automatic runs beside the best run of the sweep. rows : of `sweep_rows.auto_rows`."""
     head = (

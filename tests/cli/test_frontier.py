@@ -38,6 +38,19 @@ def test_frontier_sweeps_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert {path.name: path.read_text() for path in (out / "charts").iterdir()} == data
 
 
+def test_frontier_of_several_lengths(tmp_path: Path, capture_folder: Path) -> None:
+    arguments = ("frontier", capture_folder, "-o", tmp_path, "--cap-max", "30", "--curve", "0", "--sh-degree", "0")
+    done = run(*arguments, "--iterations", "6,12", "--densify-interval", "5")
+    assert done.exit_code == 0, done.output
+    assert "lead over the first system in equal time [dB]:" in done.stdout
+    assert "gaussian, 6 iterations" in done.stdout
+    rows = json.loads((tmp_path / "charts" / "length.json").read_text())
+    assert [(row["system"], row["iterations"]) for row in rows] == [
+        (system, n) for n in (6, 12) for system in ("gaussian", "skew-normal")
+    ]
+    assert all(row["seconds"] > 0 for row in rows)
+
+
 def test_frontier_without_matplotlib_warns_and_writes_the_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capture_folder: Path
 ) -> None:
@@ -67,6 +80,7 @@ def test_frontier_names_each_mistake(tmp_path: Path, capture_folder: Path) -> No
     assert f"{tmp_path / 'out'}: cannot be read" in error_of("frontier", "-o", tmp_path / "out", "--charts-only")
     assert "runs.jsonl: cannot be read" in error_of("frontier", scene, "-o", tmp_path / "out", "--add", tmp_path)
     assert "unknown system 'cube'" in error_of("frontier", scene, "-o", tmp_path / "out", "--systems", "cube")
+    assert "'0' is not a list of iterations" in error_of("frontier", scene, "-o", tmp_path, "--iterations", "0", code=2)
     assert "two scenes are called yard" in error_of("frontier", scene, scene, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

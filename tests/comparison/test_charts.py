@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sweep_records import run_record, seed_records, sweep_records
+from sweep_records import length_records, run_record, seed_records, sweep_records
 
 from clsplat.comparison import charts, sweep_charts
 from clsplat.comparison.charts import arithmetic_chart, growth_chart, seeds_chart
-from clsplat.comparison.sweep_charts import equal_chart, size_chart, time_chart
+from clsplat.comparison.length_rows import length_rows
+from clsplat.comparison.sweep_charts import equal_chart, length_chart, size_chart, time_chart
 from clsplat.comparison.sweep_rows import arithmetic_rows, curve_rows, equal_rows, point_rows, seed_rows
 from clsplat.comparison.sweep_tables import arithmetic_table
 from clsplat.errors import InputError, OutputError
@@ -116,6 +117,18 @@ def test_time_chart(tmp_path: Path, drawn: list[Any]) -> None:
     assert psnr.lines[0].get_linestyle() != psnr.lines[1].get_linestyle()
     best = max(row["psnr"] for row in runs[1]["curve"])
     assert best - 5.2 < psnr.get_ylim()[0] < best - 1 < best < psnr.get_ylim()[1]
+
+
+def test_length_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    length_chart(length_rows(length_records()), tmp_path / "length")
+    psnr, ssim = drawn[0].axes
+    assert ssim.get_xlabel() == "training time [s]"
+    front, gaussian, default = psnr.lines
+    assert list(front.get_xdata()) == [1.0, 2.0, 4.0, 8.0]
+    assert (list(gaussian.get_xdata()), list(gaussian.get_ydata())) == ([1.0, 2.0, 4.0], [20.0, 21.0, 22.0])
+    assert list(default.get_ydata()) == [21.5, 22.5, 23.5]
+    assert len(ssim.lines) == 2, "the front is that of PSNR"
+    assert psnr.get_title() == "yard 8x6, cap 1k"
 
 
 def test_equal_chart(tmp_path: Path, drawn: list[Any]) -> None:

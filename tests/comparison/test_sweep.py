@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sweep_records import curve_points, run_record, seed_records, sweep_records
+from sweep_records import curve_points, length_records, run_record, seed_records, sweep_records
 
 from clsplat.comparison import compare as compare_module
+from clsplat.comparison.length_rows import equal_time_rows, length_rows, quality_at
 from clsplat.comparison.methods import parse_methods
 from clsplat.comparison.runs import read_runs
 from clsplat.comparison.sweep import sweep, write_report
@@ -25,7 +26,7 @@ from clsplat.comparison.sweep_rows import (
     splats_needed,
     write_rows,
 )
-from clsplat.comparison.sweep_tables import auto_table, equal_table, seed_table
+from clsplat.comparison.sweep_tables import auto_table, equal_table, equal_time_table, seed_table
 from clsplat.comparison.table import Record
 from clsplat.errors import InputError
 from clsplat.evaluation import chart_style
@@ -46,6 +47,54 @@ def test_pareto_keeps_what_nothing_beats() -> None:
     assert pareto([(1, 20), (2, 21), (2, 22), (3, 21.5), (4, 22), (5, 23)]) == {0, 2, 5}
     assert pareto([(2, 20), (1, 20), (1, 20)]) == {1}, "of equal points the first"
     assert pareto([]) == set()
+
+
+def test_quality_in_equal_time_is_linear_in_log_seconds() -> None:
+    line = [(4.0, 22.0), (1.0, 20.0), (2.0, 21.0)]
+    assert quality_at(line, 2**0.5) == pytest.approx(20.5)
+    assert quality_at(line, 2.0) == pytest.approx(21.0)
+    assert (quality_at(line, 1.0), quality_at(line, 4.0)) == (20.0, 22.0)
+    assert quality_at(line, 0.99) is None, "all runs are longer"
+    assert quality_at(line, 4.01) is None, "all runs are shorter"
+    assert quality_at([], 1.0) is None
+
+
+def test_runs_of_several_lengths() -> None:
+    """The cap with most systems counts. A run of one length, an automatic and a failed run are left out."""
+    others = [
+        run_record("gaussian", 2000, 25.0, iterations=100),
+        run_record("gaussian", 2000, 26.0, iterations=200),
+        run_record("3dgs", 1000, 25.0, iterations=100),
+        run_record("auto default", 1000, 27.0, iterations=100),
+        run_record("auto default", 1000, 28.0, iterations=200),
+        run_record("default", 1000, 0.0, iterations=800, shape="skew-normal", failed="no memory")
+        | {"psnr": None, "ssim": None},
+        run_record("gaussian", 1000, 30.0, iterations=100, scene="attic"),
+    ]
+    rows = length_rows([*length_records(), *others])
+    assert {(row["scene"], row["cap"]) for row in rows} == {("yard 8x6", 1000)}
+    assert [(row["system"], row["iterations"]) for row in rows] == [
+        (system, n) for n in (100, 200, 400) for system in ("gaussian", "default")
+    ]
+    # 1 s: 20 dB. 2 s: 21 and 21.5. 4 s: 22 and 22.5. 8 s: 23.5.
+    assert [row["front"] for row in rows] == [True, True, False, True, False, True]
+    assert length_rows(sweep_records()) == []
+
+
+def test_leads_in_equal_time() -> None:
+    rows = equal_time_rows(length_rows(length_records()), "gaussian")
+    assert [(row["system"], row["reference_iterations"], row["seconds"]) for row in rows] == [
+        ("default", 100, 1.0),
+        ("default", 200, 2.0),
+        ("default", 400, 4.0),
+    ]
+    assert rows[0]["lead"] is None, "its shortest run takes twice as long"
+    assert [row["lead"] for row in rows[1:]] == [pytest.approx(0.5)] * 2
+    head, lines = equal_time_table(rows, "gaussian")
+    assert head == ("scene", "system", *(f"gaussian, {n} iterations" for n in (100, 200, 400)))
+    assert lines == [("yard 8x6", "default", "", "+0.50", "+0.50")]
+    assert equal_time_rows(length_rows(length_records()), "3dgs") == []
+    assert equal_time_table([], "3dgs") == ((), [])
 
 
 def test_splats_needed_is_linear_in_log_splats() -> None:

@@ -68,6 +68,22 @@ def sweep_records(scene: str = "yard") -> list[Record]:
     return [*runs, run_record("auto default", 1500, 22.45, scene=scene, shape="skew-normal", iterations=300)]
 
 
+def length_records(scene: str = "yard") -> list[Record]:
+    """Runs of two systems at three lengths.
+
+    The second one takes twice the time of the first and gains 1 dB with each doubling of its length, as the first does.
+    With as many iterations it is 1.5 dB ahead, so 0.5 dB in as many seconds.
+    """
+    return [
+        run_record(system, 1000, psnr, iterations=n, seconds=seconds * n, scene=scene, shape=shape)
+        for n, psnr in ((100, 20.0), (200, 21.0), (400, 22.0))
+        for system, shape, seconds, psnr in (
+            ("gaussian", "gaussian", 0.01, psnr),
+            ("default", "skew-normal", 0.02, psnr + 1.5),
+        )
+    ]
+
+
 def seed_records() -> list[Record]:
     """Five seeds of two systems, and two repeats of the first one."""
     runs = [

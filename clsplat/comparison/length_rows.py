@@ -1,0 +1,100 @@
+"""Data of whole runs of several lengths, as flat rows: quality against seconds of training, and at equal seconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from .sweep_rows import ChartRow, is_auto, pareto
+from .table import Record, summarise
+
+
+def length_rows(records: Sequence[Record]) -> list[ChartRow]:
+    """Return a point for each system and length of the run, as means over the seeds.
+
+    Each scene has the cap with the largest number of systems that have runs of several lengths. Other systems and
+    scenes are left out.
+
+    Returns
+    -------
+    "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "seconds", "psnr" [dB] and "ssim". "front":
+    whether the point is on the Pareto front of seconds and PSNR in its scene.
+    """
+    done = [row for row in summarise(records) if row["psnr"] is not None and not is_auto(row["system"])]
+    rows: list[ChartRow] = []
+    for scene in dict.fromkeys(row["scene"] for row in done):
+        lengths: dict[tuple[int, str], set[int]] = {}
+        for row in done:
+            if row["scene"] == scene:
+                lengths.setdefault((row["cap"], row["system"]), set()).add(row["iterations"])
+        several = [cap for (cap, _), known in lengths.items() if len(known) > 1]
+        if not several:
+            continue
+        cap = max(several, key=lambda cap: (several.count(cap), cap))
+        group = [
+            {
+                "scene": scene,
+                "system": row["system"],
+                "shape": row["config"]["shape"],
+                "cap": cap,
+                "iterations": row["iterations"],
+                "seeds": len(row["seeds"]) - len(row["failed"]),
+                **{key: row[key]["mean"] for key in ("seconds", "psnr", "ssim")},
+            }
+            for row in done
+            if (row["scene"], row["cap"]) == (scene, cap) and len(lengths[cap, row["system"]]) > 1
+        ]
+        best = pareto([(row["seconds"], row["psnr"]) for row in group])
+        rows += [row | {"front": place in best} for place, row in enumerate(group)]
+    return rows
+
+
+def equal_time_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow]:
+    """Return the PSNR of each system at the seconds of the runs of the reference.
+
+    Parameters
+    ----------
+    points : of `length_rows`. reference : label of a system.
+
+    Returns
+    -------
+    For each scene, other system and run of the reference: "scene", "system", "shape", "reference_iterations",
+    "seconds", "reference_psnr", "psnr" and "lead" [dB]. "psnr" and "lead" are None if the runs of the system are all
+    shorter or all longer.
+    """
+    rows: list[ChartRow] = []
+    for scene, system in dict.fromkeys((point["scene"], point["system"]) for point in points):
+        runs = [point for point in points if (point["scene"], point["system"]) == (scene, system)]
+        aims = [point for point in points if (point["scene"], point["system"]) == (scene, reference)]
+        for aim in sorted(aims, key=lambda point: float(point["seconds"])) if system != reference else ():
+            psnr = quality_at([(run["seconds"], run["psnr"]) for run in runs], aim["seconds"])
+            rows.append(
+                {
+                    "scene": scene,
+                    "system": system,
+                    "shape": runs[0]["shape"],
+                    "reference_iterations": aim["iterations"],
+                    "seconds": aim["seconds"],
+                    "reference_psnr": aim["psnr"],
+                    "psnr": psnr,
+                    "lead": None if psnr is None else psnr - aim["psnr"],
+                }
+            )
+    return rows
+
+
+def quality_at(curve: Sequence[tuple[float, Any]], seconds: float) -> float | None:
+    """Return the quality of a curve (seconds, quality) at `seconds`: linear in log seconds between its points.
+
+    None beyond its first and last point.
+    """
+    before: tuple[float, float] | None = None
+    for time, quality in sorted(curve):
+        if time >= seconds:
+            if before is None:
+                return float(quality) if time == seconds else None
+            share = math.log(seconds / before[0]) / math.log(time / before[0])
+            return float(before[1] + share * (quality - before[1]))
+        before = (time, quality)
+    return None
