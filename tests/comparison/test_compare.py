@@ -137,6 +137,17 @@ def test_all_systems_caps_and_seeds_are_run_systems_innermost(scene: Scene, coun
     assert counted == expected
 
 
+def test_each_length_is_run_for_all_systems(scene: Scene, counted: list[Any], tmp_path: Path) -> None:
+    """A length replaces the iterations of the common options."""
+    systems = parse_methods("gaussian,default")
+    records = compare([scene], systems, tmp_path, [CAP], [0], SHORT, lengths=[9, 4])
+    expected = [(system, n) for n in (9, 4) for system in ("gaussian", "default")]
+    assert [(record["system"], record["config"]["iterations"]) for record in records] == expected
+    assert all(record["config"]["sh_degree"] == SHORT["sh_degree"] for record in records)
+    compare([scene], systems, tmp_path, [CAP], [0], SHORT, lengths=[4, 9])
+    assert len(counted) == 4, "the order of the lengths makes no new run"
+
+
 def test_an_interrupted_comparison_goes_on(scene: Scene, counted: list[Any], tmp_path: Path) -> None:
     systems = parse_methods("gaussian,default,gaussian:dense_size=0.02")
 
