@@ -1,14 +1,13 @@
 """Quality against time, bytes and splats on the real scenes, and the effect of seeds: the charts of the README.
 
-    python benchmarks/frontier.py [--scenes fox kitchen lego] [--groups lengths caps seeds] [--device 0:0]
+    python benchmarks/frontier.py [--scenes fox kitchen lego] [--groups lengths caps table seeds] [--device 0:0]
     python benchmarks/frontier.py --charts      # draw finished runs: results/frontier/report.html and charts/
     python benchmarks/frontier.py --table       # print them
     python benchmarks/frontier.py --smoke --scenes NAME --out DIR
 
 Every run is a line of results/frontier/runs.jsonl (see `clsplat compare`) and is made once: kill and restart at will.
-The charts also show the runs of results/budget (`--budget auto`, benchmarks/budget.py) and results/arithmetic.jsonl,
-if these files exist. Fox is read at half size, for seeds at a quarter, to save time. Transparent scenes have a white
-background.
+The charts also show results/arithmetic.jsonl, if it exists. Fox is read at half size, for seeds at a quarter, to save
+time. Transparent scenes have a white background.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from clsplat.comparison.length_rows import equal_time_rows, length_rows
 from clsplat.comparison.methods import DEFAULT, parse_methods
 from clsplat.comparison.runs import distinct, read_runs
 from clsplat.comparison.sweep import write_report
-from clsplat.comparison.sweep_rows import auto_rows, equal_rows, point_rows, seed_rows
-from clsplat.comparison.sweep_tables import TextTable, auto_table, equal_table, equal_time_table, seed_table
+from clsplat.comparison.sweep_rows import equal_rows, point_rows, seed_rows
+from clsplat.comparison.sweep_tables import TextTable, equal_table, equal_time_table, seed_table
 from clsplat.comparison.table import HEAD, Record, cells, notes, repeats, summarise
 from clsplat.splats.color import BLACK, WHITE
 from clsplat.splats.shapes import SHAPES
@@ -50,12 +49,14 @@ class Group(NamedTuple):
 
 GROUPS = {
     "lengths": Group(SYSTEMS, (20_000,), (250, 500, 1000, 2000)),
-    "caps": Group(SYSTEMS, (1000, 5000, 20_000, 50_000), seeds=3),
+    "caps": Group(SYSTEMS, (1000, 5000, 20_000, 50_000)),
+    "table": Group(SYSTEMS, (5000, 20_000), seeds=3, scenes={"fox": 2, "kitchen": -1}),
     "seeds": Group(tuple(SHAPES), (1000,), (300,), seeds=5, repeat=3, scenes={"fox": 4}),
 }
 SMOKE = {
     "lengths": Group(SYSTEMS[:2], (60,), (2, 4)),
     "caps": Group(SYSTEMS[:2], (30, 60), (4,)),
+    "table": Group(SYSTEMS[:1], (30,), (4,), seeds=2),
     "seeds": Group(SYSTEMS[:1], (30,), (3,), seeds=3, repeat=2),
 }
 
@@ -70,16 +71,14 @@ def main() -> None:
         for name in args.groups:
             train_group((SMOKE if args.smoke else GROUPS)[name], args)
     records = read_runs(args.out)
-    # Automatic runs are drawn with the sweep that lies in the folder beside theirs.
-    automatic = [run for path in sorted((args.out.parent / "budget").rglob("*.jsonl")) for run in read_runs(path)]
     if not args.table:
         write_report(
             args.out,
-            [*records, *automatic],
+            records,
             reference=REFERENCE,
             arithmetic=common.read(args.out.parent / "arithmetic.jsonl"),
         )
-    print_tables(distinct([*records, *automatic]))
+    print_tables(distinct(records))
 
 
 def train_group(group: Group, args: argparse.Namespace) -> None:
@@ -108,7 +107,6 @@ def print_tables(records: Sequence[Record]) -> None:
         ("", (HEAD, [cells(row) for row in rows])),
         (f"lead over {REFERENCE} in equal time [dB]", equal_time_table(leads, REFERENCE)),
         (f"splats for the PSNR of {REFERENCE}", equal_table(equal_rows(points, REFERENCE), REFERENCE)),
-        ("automatic runs", auto_table(auto_rows(points))),
         ("seeds", seed_table(seed_rows(records))),
     ]
     for title, (head, lines) in tables:
