@@ -28,7 +28,7 @@ _MIN_ISECTS = 1 << 20  # isects that must fit; images with more are rendered in 
 # Words of a splat on the screen: key, order, two rectangles (6), two pairs (4), range of isects (2), statistics (3),
 # tile counts (4).
 _SCREEN_WORDS = 21
-_DENSIFY_WORDS = 5  # words of a splat while splats are added and removed: its summary (2), its source, new values (2)
+_DENSIFY_WORDS = 6  # words of a splat while splats are added and removed: its summary (2), its source, new values (3)
 _WAITING_WORDS = 4  # additional words of a splat with `visible_adam`, if a vector has one splat
 _MOST_SPLATS = 1 << 30  # upper end of the search for the number that fits
 
