@@ -82,6 +82,12 @@ class Commands(click.Group):
                 raise
             raise click.UsageError(f"no command {args[0]!r}{nearest_command(args[0], list(COMMANDS))}", ctx) from None
 
+    def make_context(self, *args: Any, **extra: Any) -> click.Context:
+        try:
+            return super().make_context(*args, **extra)
+        except KeyboardInterrupt:  # click would write an empty line before the message
+            raise click.Abort from None
+
     def invoke(self, ctx: click.Context) -> Any:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning

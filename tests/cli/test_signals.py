@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_runner import SHORT, last_iteration, run
+from clsplat_cli.main import Commands
 from signal_moments import count_moments, fault_of, run_until
 
 import clsplat.scenes.scene as scene_module
@@ -140,3 +141,14 @@ def test_a_signal_outside_training_names_itself(monkeypatch: pytest.MonkeyPatch)
         assert result.stderr.splitlines()[-1] == f"error: {words}"
     monkeypatch.undo()
     assert run("info", "nowhere").exit_code == 1
+
+
+def test_ctrl_c_while_the_command_line_is_read_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Click itself would write an empty line first."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Commands, "parse_args", interrupted)
+    done = run("info", "scene")
+    assert (done.exit_code, done.stdout, done.stderr) == (130, "", "error: interrupted\n")
