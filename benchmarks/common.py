@@ -12,17 +12,20 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from blender_scenes import OBJECTS
+
 from clsplat.comparison.runs import Run
 from clsplat.comparison.table import Record, markdown_table
 from clsplat.device.device import Device
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.scenes.split import hold_out
-from clsplat.splats.color import BLACK, Color
+from clsplat.splats.color import BLACK, WHITE, Color
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 TEST_HELPERS = [str(ROOT / "tests"), str(ROOT / "tests" / "support")]  # for sys.path: the reference and the helpers
 CLSPLAT = [sys.executable, "-c", "from clsplat_cli.start import main; main()"]  # the command line, for subprocesses
+TRANSPARENT = ("lego", "lego_full", *OBJECTS)  # scenes with transparent photos
 REDUCTION = {"fox": 2}  # `resolution` of load_scene; the other scenes are read as they are
 
 
@@ -52,6 +55,11 @@ def parser(
 def data_folder() -> Path:
     """Return the folder of the real scenes: CLSPLAT_DATA, or shared/data beside the repository."""
     return Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data")
+
+
+def background_of(name: str) -> Color:
+    """Return the background of a scene: white behind transparent photos, as published figures have, else black."""
+    return WHITE if name in TRANSPARENT else BLACK
 
 
 def real_scene(name: str, resolution: int | None = None, *, validate: bool = False, background: Color = BLACK) -> Scene:

@@ -20,15 +20,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from blender_scenes import NAMES, OBJECTS
-from common import RESULTS, ROOT, Runs, data_folder, environment, groups, parser, table, write_between
+from blender_scenes import NAMES
+from common import RESULTS, ROOT, Runs, background_of, data_folder, environment, groups, parser, table, write_between
 
 from clsplat.comparison.methods import Method, parse_methods
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.scenes.split import hold_out
-from clsplat.splats.color import BLACK, WHITE
 from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import decide
 from clsplat.training.run import train
@@ -42,7 +41,6 @@ TABLES = {  # scenes by the marks around their table on the page
     ("<!-- table of defaults.py -->", "<!-- end of the table -->"): FULL_SIZE,
     ("<!-- table of new scenes -->", "<!-- end of the table of new scenes -->"): NAMES,
 }
-TRANSPARENT = ("lego", "lego_full", *OBJECTS)
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class Case:
 
     def load(self, views: str) -> Scene:
         """Return the scene with its test views, or with held-out training views in their place."""
-        background = WHITE if self.scene in TRANSPARENT else BLACK
+        background = background_of(self.scene)
         loaded = load_scene(data_folder() / self.scene, resolution=self.resolution, eval=True, background=background)
         return hold_out(loaded) if views == "validation" else loaded
 
@@ -105,7 +103,7 @@ def run(case: Case, method: Method, seed: int, args: Any, runs: Runs) -> None:
     if row in runs:
         return
     scene = case.load(args.views)
-    background = WHITE if case.scene in TRANSPARENT else BLACK
+    background = background_of(case.scene)
     config = method.config(case.cap, seed, {"iterations": case.iterations, "background": background})
     decision = decide(scene, config.replace(device=args.device))
     folder = None if args.work is None else args.work / "-".join(str(row[name]) for name in KEY).replace(":", "+")

@@ -26,14 +26,12 @@ from clsplat.comparison.sweep import write_report
 from clsplat.comparison.sweep_rows import equal_rows, point_rows, seed_rows
 from clsplat.comparison.sweep_tables import TextTable, equal_table, equal_time_table, seed_table
 from clsplat.comparison.table import HEAD, Record, cells, notes, repeats, summarise
-from clsplat.splats.color import BLACK, WHITE
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.presets import PRESETS
 
 OUT = common.RESULTS / "frontier"
 REFERENCE = "3dgs"
 SYSTEMS = (REFERENCE, "gaussian", DEFAULT, *(name for name in PRESETS if name != REFERENCE))
-TRANSPARENT = ("lego",)
 
 
 class Group(NamedTuple):
@@ -84,7 +82,7 @@ def main() -> None:
 def train_group(group: Group, args: argparse.Namespace) -> None:
     """Train the missing runs of one group."""
     for name, resolution in (group.scenes or dict.fromkeys(args.scenes)).items():
-        background = WHITE if name in TRANSPARENT else BLACK
+        background = common.background_of(name)
         compare(
             [common.real_scene(name, resolution, background=background)],
             parse_methods(",".join(group.methods)),
@@ -100,7 +98,7 @@ def train_group(group: Group, args: argparse.Namespace) -> None:
 
 
 def print_tables(records: Sequence[Record]) -> None:
-    """Print all runs, splats at equal quality, automatic runs and seeds."""
+    """Print all runs, leads in equal time, splats at equal quality, and seeds."""
     rows, points = summarise(records), point_rows(records)
     leads = equal_time_rows(length_rows(records), REFERENCE)
     tables: list[tuple[str, TextTable]] = [

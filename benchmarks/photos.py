@@ -21,11 +21,10 @@ from typing import Any
 
 import common
 
-from clsplat.splats.color import BLACK, Color
+from clsplat.splats.color import Color
 
 KEY = ("scene", "shape", "options", "seed", "iterations", "cap", "platform", "schedule", "commit")
 REDUCTIONS = (1, 2, 4)  # of the size that test views are rendered in
-WHITE = {"lego"}
 SSIM_WINDOW = 11  # px: no smaller image is measured
 
 
@@ -70,7 +69,7 @@ def train(runs: common.Runs, place: str, shape: str, options: str, seed: int, ar
     }
     if case in runs:
         return
-    background: Color = (1.0, 1.0, 1.0) if name in WHITE else BLACK
+    background = common.background_of(name)
     scene = load_scene(common.data_folder() / name, resolution=int(reduction), background=background)
     (method,) = parse_methods(f"{shape}:{options}" if options else shape)
     trainer = Trainer(

@@ -70,7 +70,7 @@ def compare(
     configs = [
         (method.label, method.config(cap, seed, options), again)
         for cap in caps
-        for options in with_lengths(common, lengths)
+        for options in _with_lengths(common, lengths)
         for seed in seeds
         for again in range(repeat if seed == seeds[0] else 1)
         for method in methods
@@ -114,7 +114,7 @@ def compare(
     return runs.records
 
 
-def with_lengths(common: Mapping[str, Any] | None, lengths: Sequence[int]) -> list[dict[str, Any]]:
+def _with_lengths(common: Mapping[str, Any] | None, lengths: Sequence[int]) -> list[dict[str, Any]]:
     """Return the common options once for each number of iterations, or as they are without any."""
     return [{**(common or {}), "iterations": length} for length in lengths] or [dict(common or {})]
 

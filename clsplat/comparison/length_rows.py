@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any
 
-from .sweep_rows import ChartRow, is_auto, pareto
+import numpy as np
+
+from .sweep_rows import ChartRow, chart_point, is_auto, with_front
 from .table import Record, summarise
 
 
@@ -33,20 +33,11 @@ def length_rows(records: Sequence[Record]) -> list[ChartRow]:
             continue
         cap = max(several, key=lambda cap: (several.count(cap), cap))
         group = [
-            {
-                "scene": scene,
-                "system": row["system"],
-                "shape": row["config"]["shape"],
-                "cap": cap,
-                "iterations": row["iterations"],
-                "seeds": len(row["seeds"]) - len(row["failed"]),
-                **{key: row[key]["mean"] for key in ("seconds", "psnr", "ssim")},
-            }
+            chart_point(row, ("seconds", "psnr", "ssim"))
             for row in done
             if (row["scene"], row["cap"]) == (scene, cap) and len(lengths[cap, row["system"]]) > 1
         ]
-        best = pareto([(row["seconds"], row["psnr"]) for row in group])
-        rows += [row | {"front": place in best} for place, row in enumerate(group)]
+        rows += with_front(group, "seconds", "front")
     return rows
 
 
@@ -63,11 +54,15 @@ def equal_time_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow
     "seconds", "reference_psnr", "psnr" and "lead" [dB]. "psnr" and "lead" are None if the runs of the system are all
     shorter or all longer.
     """
+    of_system: dict[tuple[str, str], list[ChartRow]] = {}
+    for point in sorted(points, key=lambda point: float(point["seconds"])):
+        of_system.setdefault((point["scene"], point["system"]), []).append(point)
     rows: list[ChartRow] = []
     for scene, system in dict.fromkeys((point["scene"], point["system"]) for point in points):
-        runs = [point for point in points if (point["scene"], point["system"]) == (scene, system)]
-        aims = [point for point in points if (point["scene"], point["system"]) == (scene, reference)]
-        for aim in sorted(aims, key=lambda point: float(point["seconds"])) if system != reference else ():
+        if system == reference:
+            continue
+        runs = of_system[scene, system]
+        for aim in of_system.get((scene, reference), ()):
             psnr = quality_at([(run["seconds"], run["psnr"]) for run in runs], aim["seconds"])
             rows.append(
                 {
@@ -84,17 +79,12 @@ def equal_time_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow
     return rows
 
 
-def quality_at(curve: Sequence[tuple[float, Any]], seconds: float) -> float | None:
+def quality_at(curve: Sequence[tuple[float, float]], seconds: float) -> float | None:
     """Return the quality of a curve (seconds, quality) at `seconds`: linear in log seconds between its points.
 
     None beyond its first and last point.
     """
-    before: tuple[float, float] | None = None
-    for time, quality in sorted(curve):
-        if time >= seconds:
-            if before is None:
-                return float(quality) if time == seconds else None
-            share = math.log(seconds / before[0]) / math.log(time / before[0])
-            return float(before[1] + share * (quality - before[1]))
-        before = (time, quality)
-    return None
+    times, qualities = zip(*sorted(curve), strict=True) if curve else ((), ())
+    if not times or not times[0] <= seconds <= times[-1]:
+        return None
+    return float(np.interp(np.log(seconds), np.log(times), qualities))

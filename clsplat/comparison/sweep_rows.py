@@ -62,17 +62,10 @@ def point_rows(records: Sequence[Record]) -> list[ChartRow]:
     "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "auto", "psnr" [dB], "ssim", "seconds",
     "parameters" and COSTS. "front_C" for each cost C: whether the point is on the Pareto front of its scene.
     """
-    rows = []
-    for row in summarise(records):
-        if row["psnr"] is not None:
-            means = {key: row[key]["mean"] for key in ("psnr", "ssim", "seconds", "parameters", *COSTS)}
-            rows.append(
-                {key: row[key] for key in ("scene", "system")}
-                | {"shape": row["config"]["shape"]}
-                | {key: row[key] for key in ("cap", "iterations")}
-                | {"seeds": len(row["seeds"]) - len(row["failed"]), "auto": is_auto(row["system"])}
-                | means
-            )
+    measured = ("psnr", "ssim", "seconds", "parameters", *COSTS)
+    rows = [
+        chart_point(row, measured, auto=is_auto(row["system"])) for row in summarise(records) if row["psnr"] is not None
+    ]
     kept: list[ChartRow] = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         group = [row for row in rows if row["scene"] == scene]
@@ -82,10 +75,35 @@ def point_rows(records: Sequence[Record]) -> list[ChartRow]:
         usual = Counter(row["iterations"] for row in swept).most_common(1)[0][0]
         group = [row for row in group if row["auto"] or row["iterations"] == usual]
         for cost in COSTS:
-            best = pareto([(row[cost], row["psnr"]) for row in group])
-            group = [row | {f"front_{cost}": place in best} for place, row in enumerate(group)]
+            group = with_front(group, cost, f"front_{cost}")
         kept += group
     return kept
+
+
+def chart_point(row: Record, measured: Sequence[str], **more: Any) -> ChartRow:
+    """Return a row of `table.summarise` as a point of a chart.
+
+    Returns
+    -------
+    "scene", "system", "shape", "cap", "iterations", "seeds" (the number of those that did not fail), `more`, and the
+    mean of each value measured.
+    """
+    return {
+        "scene": row["scene"],
+        "system": row["system"],
+        "shape": row["config"]["shape"],
+        "cap": row["cap"],
+        "iterations": row["iterations"],
+        "seeds": len(row["seeds"]) - len(row["failed"]),
+        **more,
+        **{key: row[key]["mean"] for key in measured},
+    }
+
+
+def with_front(points: Sequence[ChartRow], cost: str, name: str) -> list[ChartRow]:
+    """Return the points, each with `name`: whether it is on the Pareto front of `cost` and PSNR."""
+    best = pareto([(point[cost], point["psnr"]) for point in points])
+    return [point | {name: place in best} for place, point in enumerate(points)]
 
 
 def is_auto(system: str) -> bool:
