@@ -9,6 +9,7 @@ rounded to float32, in double arithmetic; the rounding of the operations in floa
 exp   2^n P(r), |r| <= ln(2)/2: P of degree 5 with P(0) = 1, relative error
 log   f - f^2/2 + f^3 P(f), f in [sqrt(1/2) - 1, sqrt(2) - 1]: P of degree 6, relative error of the logarithm
 Phi   1/2 + z P(2 z^2/25 - 1), |z| <= 5: P of degree 12, absolute error
+odds  1 / (1 + 2^(z P(z^2))), z <= 7: P of degree 6, absolute error of Phi to first order
 
 tests/rendering/test_polynomials.py holds the source to these errors.
 """
@@ -22,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import log_ndtr, ndtr
 
 from clsplat.device.program import source
 
@@ -63,7 +64,7 @@ class Fit:
     def committed(self) -> tuple[float, ...]:
         """Coefficients of the source, of increasing power, rounded to float32."""
         text = source("math/approx.clh").split(f" {self.function_name}(", 1)[1].split(self.after, 1)[1]
-        numbers = [float(np.float32(number)) for number in re.findall(r"\((-?\d+\.\d+)f\)", text)]
+        numbers = [float(np.float32(number)) for number in re.findall(r"[( ](-?\d+\.\d+(?:e-\d+)?)f\)?[,)]", text)]
         return tuple(number for _, number in sorted(zip(self.order, numbers, strict=False)))
 
     def error(self, coefficients: tuple[float, ...]) -> float:
@@ -159,7 +160,22 @@ PHI = Fit(
     weight=_one,
     stated=1.8e-7,
 )
-FITS = (EXP, LOG, PHI)
+ODDS = Fit(
+    "odds",
+    "native_phi",
+    "real p",
+    (6, 5, 4, 3, 2, 1, 0),
+    (),
+    0.0,
+    7.0,
+    argument=lambda x: x * x,
+    factor=lambda x: x,
+    rest=_zero,
+    function=lambda x: (log_ndtr(-x) - log_ndtr(x)) / np.log(2.0),
+    weight=lambda x: np.log(2.0) * ndtr(x) * ndtr(-x),
+    stated=3.6e-8,
+)
+FITS = (EXP, LOG, PHI, ODDS)
 
 
 def main() -> None:

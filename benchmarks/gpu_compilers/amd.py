@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from . import commands
+from .programs import OPTIONS
 from .usage import Compiler, CompilerError, Usage
 
 _LIBRARIES = Path("/usr/lib/x86_64-linux-gnu/amdgcn/bitcode")
@@ -30,7 +31,7 @@ def _compile(_name: str, text: str, target: str, folder: Path) -> Mapping[str, U
     report = commands.run(
         [
             commands.CLANG,
-            *("-x", "cl", "-cl-std=CL1.2", "-cl-mad-enable", "-Xclang", "-finclude-default-header", "-O3"),
+            *("-x", "cl", *OPTIONS, "-Xclang", "-finclude-default-header", "-O3"),
             *("--target=amdgcn-amd-amdhsa", f"-mcpu={target}", "-mcode-object-version=4"),
             f"--rocm-device-lib-path={_libraries(target, folder)}",
             *("-Rpass-analysis=kernel-resource-usage", "-S", source, "-o", assembly),

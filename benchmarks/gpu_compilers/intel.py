@@ -14,6 +14,7 @@ from unittest import mock
 from clsplat.device.program_cache import cache_folder
 
 from . import commands
+from .programs import OPTIONS
 from .usage import Compiler, CompilerError, Usage
 
 _PACKAGES = (
@@ -60,7 +61,7 @@ def _compile(_name: str, text: str, target: str, folder: Path) -> Mapping[str, U
         commands.run(
             [
                 _place() / "usr" / "bin" / "ocloc",
-                *("compile", "-file", source, "-device", target, "-options", "-cl-std=CL1.2 -cl-mad-enable"),
+                *("compile", "-file", source, "-device", target, "-options", " ".join(OPTIONS)),
                 *("-internal_options", "-cl-intel-allow-zebin", "-output", "program", "-output_no_suffix"),
                 *("-out_dir", out),
             ]

@@ -8,13 +8,13 @@ from functools import cache
 from pathlib import Path
 
 from . import commands
-from .programs import group_size
+from .programs import OPTIONS, group_size
 from .usage import Compiler, CompilerError, Usage
 
 _BUILTINS = Path(__file__).with_name("nvidia_builtins.cl")
 _CLANG = (
     commands.CLANG,
-    *("-x", "cl", "-cl-std=CL1.2", "-cl-mad-enable", "-Xclang", "-finclude-default-header"),
+    *("-x", "cl", *OPTIONS, "-Xclang", "-finclude-default-header"),
     *("--target=nvptx64-nvidia-nvcl", "-Xclang", "-cl-ext=+cl_khr_fp64", "-O3", "-emit-llvm", "-c"),
     *("-Xclang", "-disable-llvm-passes", "-Wno-unused-function"),
 )

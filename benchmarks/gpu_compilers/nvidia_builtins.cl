@@ -21,6 +21,12 @@ BY_LIBDEVICE(sin)
 BY_LIBDEVICE(cos)
 BY_LIBDEVICE(erfc)
 
+// The instructions of the GPU, with denormal numbers as zero: -cl-denorms-are-zero.
+float __nvvm_ex2_approx_ftz_f(float);
+float __nvvm_rcp_approx_ftz_f(float);
+float OVERLOADED native_exp2(float x) { return __nvvm_ex2_approx_ftz_f(x); }
+float OVERLOADED native_recip(float x) { return __nvvm_rcp_approx_ftz_f(x); }
+
 #define BY_CLANG(name, function) \
     float OVERLOADED name(float x) { return __builtin_elementwise_##function(x); } \
     double OVERLOADED name(double x) { return __builtin_elementwise_##function(x); }

@@ -10,13 +10,15 @@ from unittest import mock
 
 import clsplat.device.program
 from clsplat.device.device import Device
-from clsplat.device.program import OPTIONS as OPTIONS  # of this module's interface
+from clsplat.device.program import GPU_OPTIONS
+from clsplat.device.program import OPTIONS as COMMON_OPTIONS
 from clsplat.device.schedule import SCHEDULES
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.group_binner import group_binning_program
 from clsplat.rendering.radix_sort import sort_program
 from clsplat.training.programs import columns_program, lazy_program, loss_program, optim_program
 
+OPTIONS = (*COMMON_OPTIONS, *GPU_OPTIONS)
 SHAPES = ("gaussian", "skew-normal")
 GPU_SCHEDULES = tuple(name for name, schedule in SCHEDULES.items() if schedule.group > 1)
 SCAN_GROUP, ITEM_GROUP = 128, 64
@@ -69,7 +71,7 @@ def _recorded() -> Iterator[tuple[Device, list[str]]]:
         return object()
 
     device: Any = SimpleNamespace(
-        info=SimpleNamespace(has_prefetch=False, type="GPU"),
+        info=SimpleNamespace(has_prefetch=False, has_exact_native=True, type="GPU"),
         shared=SimpleNamespace(built={}),
         programs={},
         has_fp64=False,

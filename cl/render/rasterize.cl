@@ -22,11 +22,17 @@
 
 #define V_RECORD (SHAPE_V + 3)  // an isect's gradient record: the shape's moments, then the gradient of the colour
 
+// Groups of work-items do not ask for it: the test of each block costs more than the formula saves.
 #ifndef SHAPE_PLAIN  // the shape has no cheaper formula for some splats
 #define shape_is_plain(p) false
 #define shape_alpha_plain(dx, dy, p) ((vreal)0)
 #define shape_alpha_plain_vjp(dx, dy, alpha, v_alpha, v)
 #define shape_sums_plain(sums)
+#endif
+
+#ifndef SHAPE_COLUMN
+static inline void shape_to_column(real dx, real *p) { form_to_column(dx, p + P_FORM); }
+static inline void column_sums(real dx, vreal *v) { column_moments(dx, v + V_MOMENTS); }
 #endif
 
 static inline vreal pixel_alpha(vreal dx, vreal dy, const real *rec, bool plain, shape_pixel *pixel) {
@@ -44,10 +50,11 @@ static inline void alpha_pass(
     vreal *alphas,
     shape_pixel *pixels
 ) {
+    const real x = rec[HEAD_X], y = rec[HEAD_Y];
     if (plain) {
-        for_blocks(v, blocks) alphas[v] = shape_alpha_plain(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD);
+        for_blocks(v, blocks) alphas[v] = shape_alpha_plain(from_x(px, v, x), from_y(py, v, y), rec + HEAD);
     } else {
-        for_blocks(v, blocks) alphas[v] = shape_alpha(px[v] - rec[HEAD_X], py[v] - rec[HEAD_Y], rec + HEAD, &pixels[v]);
+        for_blocks(v, blocks) alphas[v] = shape_alpha(from_x(px, v, x), from_y(py, v, y), rec + HEAD, &pixels[v]);
     }
 }
 
@@ -128,12 +135,16 @@ kernel void rasterize(
 #elif !CULLS_STRIPS
             const block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
-            const bool plain = shape_is_plain(rec + HEAD);
+#if COLUMNS
+            const real column_dx = from_x(px, 0, rec[HEAD_X]);
+            shape_to_column(column_dx, rec + HEAD);
+#endif
+            const bool plain = ALONE && shape_is_plain(rec + HEAD);
             vreal alphas[VECS];
             shape_pixel pixels[VECS];
             if (ALONE) alpha_pass(blocks, px, py, rec, plain, alphas, pixels);
             for_blocks(v, blocks) {
-                const vreal dx = px[v] - rec[HEAD_X], dy = py[v] - rec[HEAD_Y];
+                const vreal dx = from_x(px, v, rec[HEAD_X]), dy = from_y(py, v, rec[HEAD_Y]);
                 vreal alpha = ALONE ? alphas[v] : pixel_alpha(dx, dy, rec, plain, &pixels[v]);
                 vmask hit;
                 const vreal weight = blend(&alpha, &T[v], &hit);
@@ -148,7 +159,7 @@ kernel void rasterize(
     }
 
     for (int v = 0; v < VECS; ++v) {
-        const vmask inside = (px[v] < (vreal)width) & (py[v] < (vreal)height);
+        const vmask inside = (from_x(px, v, width) < (vreal)0) & (from_y(py, v, height) < (vreal)0);
         const ulong at = block_at(block_column(tile_x, v), block_row(tile_y, v), stride);
         const vreal zero = (vreal)0;
         T[v] = fabs(T[v]);
@@ -247,12 +258,16 @@ kernel void rasterize_vjp(
 #elif !CULLS_STRIPS
             const block_set blocks = blocks_reached(rec, tile_x, tile_y);
 #endif
-            const bool plain = shape_is_plain(rec + HEAD);
+#if COLUMNS
+            const real column_dx = from_x(px, 0, rec[HEAD_X]);
+            shape_to_column(column_dx, rec + HEAD);
+#endif
+            const bool plain = ALONE && shape_is_plain(rec + HEAD);
             vreal alphas[VECS];
             shape_pixel pixels[VECS];
             if (ALONE) alpha_pass(blocks, px, py, rec, plain, alphas, pixels);
             for_blocks(v, blocks) {
-                const vreal dx = px[v] - rec[HEAD_X], dy = py[v] - rec[HEAD_Y];
+                const vreal dx = from_x(px, v, rec[HEAD_X]), dy = from_y(py, v, rec[HEAD_Y]);
                 const vreal raw_alpha = ALONE ? alphas[v] : pixel_alpha(dx, dy, rec, plain, &pixels[v]);
                 vreal alpha = raw_alpha;
                 const vreal T_before = T[v];
@@ -262,14 +277,17 @@ kernel void rasterize_vjp(
                     v_red[v], rec[HEAD_RED], lanes_mad(v_green[v], rec[HEAD_GREEN], v_blue[v] * rec[HEAD_BLUE])
                 );
                 rest[v] = lanes_mad(-weight, g, rest[v]);
-                const vreal v_a = lanes_mad(T_before, g, -rest[v] / ((vreal)1 - alpha));
-                const vreal v_raw = lanes_if(hit, blend_clamp_vjp(raw_alpha, v_a), (vreal)0);
+                const vreal v_a = lanes_mad(T_before, g, pixel_ratio(-rest[v], (vreal)1 - alpha));
+                const vreal v_raw = blend_clamp_vjp(raw_alpha, hit, v_a);
                 if (plain) shape_alpha_plain_vjp(dx, dy, raw_alpha, v_raw, sums);
                 else shape_alpha_vjp(dx, dy, rec + HEAD, pixels[v], v_raw, sums);
                 sums[SHAPE_V] = lanes_mad(weight, v_red[v], sums[SHAPE_V]);
                 sums[SHAPE_V + 1] = lanes_mad(weight, v_green[v], sums[SHAPE_V + 1]);
                 sums[SHAPE_V + 2] = lanes_mad(weight, v_blue[v], sums[SHAPE_V + 2]);
             }
+#if COLUMNS
+            column_sums(column_dx, sums);
+#endif
             real item_sums[V_RECORD];  // over the blocks of this work-item
             lanes_sums(sums, V_RECORD, item_sums);
             if (plain) shape_sums_plain(item_sums);

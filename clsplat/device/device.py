@@ -35,6 +35,10 @@ BROKEN_POCL = (
 )
 _CLANG_PLATFORMS = ("Portable Computing Language", "Intel(R) OpenCL")  # they compile CPU kernels by clang alone
 _SCALAR_PLATFORMS = ("rusticl", "Clover")  # of Mesa: their compilers take vectors apart
+_NATIVE_PLATFORMS = (  # their GPUs have instructions for 2^x and 1/x with errors of about 2e-7
+    *("NVIDIA CUDA", "AMD Accelerated Parallel Processing", "rusticl", "Portable Computing Language"),
+    *("Intel(R) OpenCL Graphics", "Intel(R) OpenCL HD Graphics"),
+)
 LESS_MEMORY = (FEWER_SPLATS, SMALLER_IMAGES, OTHER_DEVICE)
 
 
@@ -75,6 +79,14 @@ class DeviceInfo:
     def has_prefetch(self) -> bool:
         """Whether kernels may call clang's __builtin_prefetch. Compilers with SPIR-V end the process at it (Mesa)."""
         return self.type == "CPU" and self.platform in _CLANG_PLATFORMS
+
+    @property
+    def has_exact_native(self) -> bool:
+        """Whether native_exp2 and native_recip have three wrong bits at most. OpenCL leaves their errors open.
+
+        Intel's runtime for CPUs has only eleven right bits.
+        """
+        return self.type == "GPU" and self.platform in _NATIVE_PLATFORMS
 
     @property
     def has_wide_lanes(self) -> bool:

@@ -23,7 +23,7 @@ import numpy as np
 
 from .. import activity
 from ..errors import OTHER_DEVICE, DeviceError, Remedy
-from .device import BROKEN_POCL, LESS_MEMORY, Device
+from .device import BROKEN_POCL, LESS_MEMORY, Device, DeviceInfo
 from .kernel_args import Parameter, Signatures, parse_signatures
 from .kernel_args import Real as Real  # of this module's interface
 from .memory import to_device, to_host
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 Define = int | float | str
 
 OPTIONS = ("-cl-std=CL1.2", "-cl-mad-enable")  # never fast-relaxed-math: infinities and NaN have meaning
+GPU_OPTIONS = ("-cl-denorms-are-zero",)  # denormal numbers take three more instructions for each exp
 OPTIONS_VARIABLE = "CLSPLAT_BUILD_OPTIONS"  # further options from the environment: -Werror in tests
 
 SMOKE_TOLERANCE = 1e-5  # relative; OpenCL allows an error of 16 ulp in erfc, 6e-8 each
@@ -65,14 +66,16 @@ def build(
     ----------
     files : names as for `source`; a file stands after those that it uses.
     defines : become `#define` lines before the text; floats become literals of type `real`.
-    real : type of the kernels' real numbers; REAL_DOUBLE is defined as 0 or 1, and so is HAS_PREFETCH of the device.
+    real : type of the kernels' real numbers. REAL_DOUBLE is defined as 0 or 1, and so are HAS_PREFETCH and
+        HAS_EXACT_NATIVE of the device.
 
     Raises
     ------
     DeviceError : the device has no doubles, or the build failed (device, first error line, defines).
     """
     defines = dict(defines or {})
-    options = (tuple(sorted(defines.items())), real, os.environ.get(OPTIONS_VARIABLE, ""))
+    kind = (device.info.type, *_flags(device.info, real).values())
+    options = (tuple(sorted(defines.items())), real, os.environ.get(OPTIONS_VARIABLE, ""), kind)
     if (files, *options) not in device.programs:
         built, text = device.shared.built, source(*files)
         if (text, *options) not in built:
@@ -93,21 +96,34 @@ def _built(device: Device, text: str, defines: Mapping[str, Define], real: Real)
 
     if real == "double" and not device.has_fp64:
         raise DeviceError(f"device {device.info} has no double precision", Remedy("use float32"), OTHER_DEVICE)
-    options = [*OPTIONS, *os.environ.get(OPTIONS_VARIABLE, "").split()]
+    options = [
+        *OPTIONS,
+        *(GPU_OPTIONS if device.info.type == "GPU" else ()),
+        *os.environ.get(OPTIONS_VARIABLE, "").split(),
+    ]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)  # some compilers warn at every success
-            built = _compiled(device, with_defines(text, defines, real, device.info.has_prefetch), options)
+            built = _compiled(device, with_defines(text, defines, real, device.info), options)
     except cl.Error as error:
         raise _build_error(device, error, defines, real) from None
     return built, parse_signatures(text, real, defines)
 
 
-def with_defines(text: str, defines: Mapping[str, Define], real: Real, has_prefetch: bool) -> str:
+def with_defines(text: str, defines: Mapping[str, Define], real: Real, info: DeviceInfo) -> str:
     """Return the text that a compiler reads: `#define` lines, then OpenCL C."""
-    lines = [f"#define REAL_DOUBLE {int(real == 'double')}", f"#define HAS_PREFETCH {int(has_prefetch)}"]
+    lines = [f"#define {name} {int(flag)}" for name, flag in _flags(info, real).items()]
     lines += [f"#define {name} {_literal(name, value, real)}" for name, value in defines.items()]
     return "\n".join([*lines, text])
+
+
+def _flags(info: DeviceInfo, real: Real) -> dict[str, bool]:
+    """Defines that a device decides, and the one of `real`."""
+    return {
+        "REAL_DOUBLE": real == "double",
+        "HAS_PREFETCH": info.has_prefetch,
+        "HAS_EXACT_NATIVE": info.has_exact_native,
+    }
 
 
 def lane_group(device: Device) -> int:

@@ -36,6 +36,7 @@ _BELOW_SHAPE = (
     "math/harmonics.clh",
     "camera/pinhole.clh",
     "render/blend.clh",
+    "shape/forms.clh",
     "shape/contract.clh",
     "shape/rectangle.clh",
 )
@@ -119,7 +120,8 @@ class KernelBuild:
 
     def count_program(self, device: Device) -> Program:
         """Count of the useful pairs of a frame (rendering/overdraw.py)."""
-        return self._shape_program(device, "measure/count.cl")
+        alone = replace(self, schedule=Schedule(1, TILE * TILE // self.lanes, self.lanes))
+        return alone._shape_program(device, "measure/count.cl")
 
     def for_rendering(self) -> KernelBuild:
         """The same build with depth and with a gradient through alpha."""
@@ -153,6 +155,7 @@ class KernelBuild:
                 "LANES": self.lanes,
                 "CULLS_BLOCKS": int(self.culls_blocks),
                 "CULLS_STRIPS": int(self.culls_strips),
+                "COLUMNS": int(self.culls_strips),
                 "WITH_DEPTH": int(self.with_depth),
                 "WITH_V_ALPHA": int(self.with_v_alpha),
                 "ANTIALIASED": int(self.antialiased),

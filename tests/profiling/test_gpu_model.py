@@ -114,7 +114,7 @@ def test_loops_are_those_of_the_compiler(shape: str) -> None:
     four, eight = (usage(name, "rasterize").loops[-1] for name in ("gpu64", "gpu32"))
     block = (eight - four) / 4
     assert (FORWARD[shape].block, FORWARD[shape].isect) == (block, four - 4 * block)
-    unrolled = {"gaussian": 4}.get(shape, 1)  # isects of a round of the loop
+    unrolled = 4  # isects of a round of the loop
     assert FORWARD[shape].single == usage("gpu256", "rasterize").loops[0] / unrolled
     one, four, eight = (usage(name, "rasterize_vjp").around[0] for name in ("gpu256", "gpu64", "gpu32"))
     assert 2 * usage("gpu32", "rasterize_vjp").loops[-1] == SUM_JOBS

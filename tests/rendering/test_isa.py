@@ -62,14 +62,14 @@ def test_a_kernel_that_needs_more_is_named(change: dict[str, float], message: st
 
 
 def test_an_index_that_is_not_known_is_found(tmp_path: Path) -> None:
-    """A planted fault: the blocks of a group walked from the first to the last one, as gpu64 had them."""
+    """A planted fault: the blocks of a work-item are walked with a start and a step that no compiler knows."""
     if nvidia.NVIDIA.missing() is not None:
         pytest.skip(str(nvidia.NVIDIA.missing()))
     name = "pixels gaussian gpu64"
     text = programs()[name]
     unrolled = "UNROLL for (int v = 0; v < VECS; ++v)"
     assert text.count(unrolled) == 1
-    walked = text.replace(unrolled, "for (int v = (int)((set) & 1u); v < VECS; ++v)")
+    walked = text.replace(unrolled, "for (int v = (set) & 1u; v < VECS; v += 1 + ((set) & 2u))")
     usages = nvidia.NVIDIA.compile(name, walked, "sm_90", tmp_path)
     found = {f"sm_90 | {name} | {kernel}": usage for kernel, usage in usages.items()}
     assert any("rasterize_vjp" in line and "private memory" in line for line in isa.faults(found, STORED))

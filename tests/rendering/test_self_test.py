@@ -32,9 +32,9 @@ FAULTS = {
     "wrong sign of a harmonic": ("basis[2] = SH_1 * z", "basis[2] = -SH_1 * z", "image"),
     "pixels finish early": ("(behind > (vreal)T_MIN)", "(behind > (vreal)0.5f)", "image"),
     "batches are left out": ("start < range.y; start += BATCH", "start < range.y; start += 1000 * BATCH", "image"),
-    "alpha without its denominator": ("-rest[v] / ((vreal)1 - alpha)", "-rest[v]", "gradient of mean"),
+    "alpha without its denominator": ("pixel_ratio(-rest[v], (vreal)1 - alpha)", "-rest[v]", "gradient of mean"),
     "the last isect is not summed": ("isect < range.y; ++isect", "isect + 1 < range.y; ++isect", "gradient of mean"),
-    "a division by zero": ("-rest[v] / ((vreal)1 - alpha)", "-rest[v] / (vreal)0", "gradient of mean"),
+    "a division by zero": ("pixel_ratio(-rest[v], (vreal)1 - alpha)", "-rest[v] / (vreal)0", "gradient of mean"),
     "the norm of a quaternion": ("(vx - along * q.x) * q.inv_norm", "(vx - along * q.x)", "gradient of quat"),
     "scale is not its logarithm": ("= mul3(v_scale, s.scale);", "= v_scale;", "gradient of log_scale"),
     "colours are swapped": (
