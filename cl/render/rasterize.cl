@@ -295,27 +295,3 @@ kernel void rasterize_vjp(
         }
     }
 }
-
-// moments [V_RECORD, capacity]: the sum over each splat's isects, in order. Overwrites, or adds to the sum if `go_on`.
-// Global size: splats / LANES.
-kernel void gather_isect_grads(
-    global const uint2 *restrict splat_isects,
-    global const real *restrict isect_grads,
-    global real *restrict moments,
-    ulong capacity,
-    uint n_splats,
-    int go_on
-) {
-    const uint first = get_global_id(0) * LANES;
-    if (first >= n_splats) return;
-    real sums[V_RECORD][LANES];
-    for (uint l = 0; l < LANES; ++l) {
-        const uint2 range = first + l < n_splats ? splat_isects[first + l] : (uint2)(0, 0);
-        real record[V_RECORD];
-        for (int j = 0; j < V_RECORD; ++j) record[j] = go_on ? moments[first + l + j * capacity] : 0;
-        for (uint isect = range.x; isect < range.y; ++isect)
-            UNROLL for (int j = 0; j < V_RECORD; ++j) record[j] += isect_grads[(ulong)isect * V_RECORD + j];
-        for (int j = 0; j < V_RECORD; ++j) sums[j][l] = record[j];
-    }
-    for (int j = 0; j < V_RECORD; ++j) lanes_store(lanes_load(sums[j]), moments + first + j * capacity);
-}

@@ -169,7 +169,7 @@ class Kernel:
     Attributes
     ----------
     max_group : largest work-group. Apple's CPU devices have groups of one in kernels with barriers.
-    item_group : group size if the work-items share nothing, at most GROUP_ITEMS.
+    item_group : group size of kernels that work with any size, at most GROUP_ITEMS.
     """
 
     def __init__(self, device: Device, built: pyopencl.Program, name: str, parameters: tuple[Parameter, ...]) -> None:
@@ -230,7 +230,7 @@ class Kernel:
     def over(self, n: int, group: int = GROUP_ITEMS, /, *more: int, **args: KernelArgument) -> Event:
         """Enqueue at least `n` work-items in whole groups; the kernel must ignore the items from n on.
 
-        The work-items share nothing, so that groups may be smaller than `group`, where a device has only small ones.
+        Groups may be smaller than `group`, where a device has only small ones: the kernel must work with any size.
         The size is fixed, because PoCL compiles a kernel again for each size that it chooses itself.
 
         Parameters

@@ -53,8 +53,8 @@ class PixelLoop:
         return isect + (1 - tiles) * _SKIPPED
 
 
-FORWARD = {"gaussian": PixelLoop(36.25, 24, 18.25), "skew-normal": PixelLoop(50.25, 24, 32.25)}
-BACKWARD = {"gaussian": PixelLoop(186, 90, 38.5), "skew-normal": PixelLoop(211, 133, 52.25)}
+FORWARD = {"gaussian": PixelLoop(36.25, 24, 18.25), "skew-normal": PixelLoop(50.25, 21, 33)}
+BACKWARD = {"gaussian": PixelLoop(186, 90, 38.5), "skew-normal": PixelLoop(205, 133, 52.25)}
 
 
 @dataclass(frozen=True)

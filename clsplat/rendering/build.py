@@ -41,7 +41,7 @@ _BELOW_SHAPE = (
     "shape/rectangle.clh",
 )
 _PROJECTION = ("render/antialias.clh", "render/project.cl")
-_PIXELS = ("render/batch.clh", "render/blocks.clh", "render/rasterize.cl")
+_PIXELS = ("render/batch.clh", "render/blocks.clh", "render/rasterize.cl", "render/gather.cl")
 
 
 @dataclass(frozen=True)
