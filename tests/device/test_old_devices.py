@@ -47,7 +47,7 @@ def test_an_old_device_builds_kernels_without_options_of_later_versions(
     assert old.info.fault is None
     program.build_text(old, "kernel void nothing(float x) { }")
     ((text, options),) = built
-    assert options == ["-cl-std=CL1.2", "-cl-mad-enable"]
+    assert options == ["-cl-std=CL1.2", "-cl-mad-enable", "-cl-denorms-are-zero"]
     assert text.startswith("#define REAL_DOUBLE 0\n#define HAS_PREFETCH 0\n")
 
 

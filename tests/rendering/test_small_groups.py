@@ -42,6 +42,7 @@ WITH_BARRIERS = {
     "scan_isects",
     "emit_isects",
     "step_exposure",
+    "gather_isect_grads",  # on schedules with groups
 }
 IN_GROUPS = {"rasterize", "rasterize_vjp"}
 Pretend = Callable[..., Device]
