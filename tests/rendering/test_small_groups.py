@@ -160,12 +160,9 @@ def test_exposures_are_found_in_groups_of_one(
 OTHER = {"platform": "Acme", "type": "GPU"}  # neither wide lanes nor the binner of CPUs
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("nothing_chosen")
-@pytest.mark.parametrize(
-    "max_group",
-    [pytest.param(1, marks=pytest.mark.slow), 1024],
-    ids=["all kernels", "kernels with barriers"],
-)
+@pytest.mark.parametrize("max_group", [1, 1024], ids=["all kernels", "kernels with barriers"])
 def test_a_device_without_wide_lanes_works_in_groups_of_one(
     pretend: Pretend, monkeypatch: pytest.MonkeyPatch, max_group: int
 ) -> None:
