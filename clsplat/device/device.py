@@ -89,6 +89,11 @@ class DeviceInfo:
         return self.type == "GPU" and self.platform in _NATIVE_PLATFORMS
 
     @property
+    def ends_long_loops(self) -> bool:
+        """Whether the loops of a work-item end after 65 535 turns in all, without a word: Mesa on CPUs."""
+        return self.type == "CPU" and self.platform in _SCALAR_PLATFORMS
+
+    @property
     def has_wide_lanes(self) -> bool:
         """Whether a work-item may compute wide vectors: on CPUs, except with Mesa, which compiles them for minutes."""
         return self.type == "CPU" and self.platform not in _SCALAR_PLATFORMS

@@ -20,7 +20,8 @@ _RUN = 4  # splats of a work-item that counts or lists isects
 def make_binner(pool: Pool, kernels: KernelBuild) -> Binner:
     """Return the binner for a kind of device. The one for CPUs works with groups of one, too."""
     device = pool.device
-    if device.info.type == "CPU" or not sort_group(device):
+    few_items = device.info.type == "CPU" and not device.info.ends_long_loops
+    if few_items or not sort_group(device):
         return ChunkBinner(pool, kernels)
     return GroupBinner(pool, kernels)
 
