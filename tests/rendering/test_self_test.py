@@ -116,7 +116,9 @@ def test_a_wrong_stage_is_named(device: Device, fault: str, monkeypatch: pytest.
         check_rendering(other, default_schedule(device.info))
 
 
-@pytest.mark.parametrize(("kind", "old", "new"), OF_A_KIND)
+@pytest.mark.parametrize(
+    ("kind", "old", "new"), OF_A_KIND, ids=[f"{kind}-{n}" for n, (kind, *_) in enumerate(OF_A_KIND)]
+)
 def test_wrong_lists_are_named(device: Device, kind: str, old: str, new: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if replace(device.info, type=kind).ends_long_loops:
         pytest.skip("the binner of CPUs is not used on this device")
