@@ -74,15 +74,15 @@ def build(
     DeviceError : the device has no doubles, or the build failed (device, first error line, defines).
     """
     defines = dict(defines or {})
-    kind = (device.info.type, *_flags(device.info, real).values())
-    options = (tuple(sorted(defines.items())), real, os.environ.get(OPTIONS_VARIABLE, ""), kind)
-    if (files, *options) not in device.programs:
+    key = (files, tuple(sorted(defines.items())), real, os.environ.get(OPTIONS_VARIABLE, ""))
+    if key not in device.programs:
         built, text = device.shared.built, source(*files)
-        if (text, *options) not in built:
+        read = (with_defines(text, defines, real, device.info), *_options(device.info))  # all that the compiler reads
+        if read not in built:
             activity.report(f"compiling kernels: {Path(files[-1]).stem}")
-            built[text, *options] = _built(device, text, defines, real)
-        device.programs[files, *options] = Program(device, *built[text, *options])
-    return device.programs[files, *options]
+            built[read] = _built(device, text, defines, real)
+        device.programs[key] = Program(device, *built[read])
+    return device.programs[key]
 
 
 def build_text(device: Device, text: str, defines: Mapping[str, Define] | None = None, real: Real = "float") -> Program:
@@ -96,15 +96,10 @@ def _built(device: Device, text: str, defines: Mapping[str, Define], real: Real)
 
     if real == "double" and not device.has_fp64:
         raise DeviceError(f"device {device.info} has no double precision", Remedy("use float32"), OTHER_DEVICE)
-    options = [
-        *OPTIONS,
-        *(GPU_OPTIONS if device.info.type == "GPU" else ()),
-        *os.environ.get(OPTIONS_VARIABLE, "").split(),
-    ]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)  # some compilers warn at every success
-            built = _compiled(device, with_defines(text, defines, real, device.info), options)
+            built = _compiled(device, with_defines(text, defines, real, device.info), _options(device.info))
     except cl.Error as error:
         raise _build_error(device, error, defines, real) from None
     return built, parse_signatures(text, real, defines)
@@ -112,18 +107,20 @@ def _built(device: Device, text: str, defines: Mapping[str, Define], real: Real)
 
 def with_defines(text: str, defines: Mapping[str, Define], real: Real, info: DeviceInfo) -> str:
     """Return the text that a compiler reads: `#define` lines, then OpenCL C."""
-    lines = [f"#define {name} {int(flag)}" for name, flag in _flags(info, real).items()]
-    lines += [f"#define {name} {_literal(name, value, real)}" for name, value in defines.items()]
-    return "\n".join([*lines, text])
-
-
-def _flags(info: DeviceInfo, real: Real) -> dict[str, bool]:
-    """Defines that a device decides, and the one of `real`."""
-    return {
+    flags = {
         "REAL_DOUBLE": real == "double",
         "HAS_PREFETCH": info.has_prefetch,
         "HAS_EXACT_NATIVE": info.has_exact_native,
     }
+    lines = [f"#define {name} {int(flag)}" for name, flag in flags.items()]
+    lines += [f"#define {name} {_literal(name, value, real)}" for name, value in defines.items()]
+    return "\n".join([*lines, text])
+
+
+def _options(info: DeviceInfo) -> list[str]:
+    """Options of a build for a device."""
+    for_type = GPU_OPTIONS if info.type == "GPU" else ()
+    return [*OPTIONS, *for_type, *os.environ.get(OPTIONS_VARIABLE, "").split()]
 
 
 def lane_group(device: Device) -> int:

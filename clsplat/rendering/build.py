@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ..device.device import Device
-from ..device.program import Define, Program, Real, build
+from ..device.program import GROUP_ITEMS, Define, Program, Real, build
 from ..device.schedule import TILE, Schedule
 from ..splats.fields import Group, Schema
 from ..splats.near_plane import NEAR_PLANE
@@ -156,6 +156,7 @@ class KernelBuild:
                 "CULLS_BLOCKS": int(self.culls_blocks),
                 "CULLS_STRIPS": int(self.culls_strips),
                 "COLUMNS": int(self.culls_strips),
+                "GATHER_ITEMS": GROUP_ITEMS,
                 "WITH_DEPTH": int(self.with_depth),
                 "WITH_V_ALPHA": int(self.with_v_alpha),
                 "ANTIALIASED": int(self.antialiased),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from device_schedules import schedule_on
+from device_schedules import as_kind, schedule_on
 from numpy.typing import NDArray
 from reference.scenes import for_shape, random_camera, random_splats
 from reference.tolerances import relative_error
@@ -16,7 +16,7 @@ from small_scene import write_garden
 
 from clsplat.device import device as device_module
 from clsplat.device import program
-from clsplat.device.device import Device, open_device
+from clsplat.device.device import Device
 from clsplat.device.memory import Pool, to_device, to_host
 from clsplat.device.schedule import SCHEDULES, Schedule, default_schedule
 from clsplat.errors import DeviceError
@@ -45,13 +45,6 @@ NEAR = 0.01  # the nearest depth of the tests of binners
 POCL = "Portable Computing Language"
 
 Arrays = dict[str, NDArray[Any]]
-
-
-def as_kind(device: Device, kind: str) -> Device:
-    """Return the device opened once more, with this type."""
-    other = open_device(device.info.index)
-    other.info = replace(other.info, type=kind)
-    return other
 
 
 def rendered(device: Device, shape: str, schedule: str, max_isects: int | None) -> tuple[Pipeline, Frame, Arrays]:

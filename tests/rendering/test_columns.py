@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import MakeRenderer
+from device_schedules import as_kind
 from kernel_checks import Case
 from reference.scenes import random_camera, random_splats
 from reference.tolerances import GRADIENT_FLOAT32, IMAGE_FLOAT32, SAME_FLOAT32
 from scipy.special import ndtr
 
-from clsplat.device.device import Device, open_device
+from clsplat.device.device import Device
 from clsplat.device.memory import to_device, to_host
 from clsplat.device.program import build_text, source
 from clsplat.device.schedule import SCHEDULES
@@ -36,8 +37,7 @@ def as_gpu(device: Device) -> Device:
     """Return another object for this device, which says that it is a GPU."""
     if device.info.platform == INTEL_CPU:
         pytest.skip("native functions of this runtime have eleven right bits")
-    gpu = open_device(device.info.index)
-    gpu.info = replace(gpu.info, type="GPU")
+    gpu = as_kind(device, "GPU")
     assert gpu.info.has_exact_native
     return gpu
 

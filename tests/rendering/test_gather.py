@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from device_schedules import as_kind
 from numpy.typing import NDArray
 
-from clsplat.device.device import Device, open_device
+from clsplat.device.device import Device
 from clsplat.device.memory import to_device, to_host
 from clsplat.device.schedule import SCHEDULES
 from clsplat.rendering.build import KernelBuild
@@ -33,9 +32,7 @@ def test_sums_are_those_of_numpy(device: Device, name: str, group: int, go_on: i
     if (group > 1) != (schedule.group > 1) or group > device.info.max_group:
         pytest.skip("not a group of this schedule")
     kernels = KernelBuild("skew-normal", 0, schedule)
-    device = open_device(device.info.index)
-    if group > 1:
-        device.info = replace(device.info, type="GPU")
+    device = as_kind(device, "GPU" if group > 1 else device.info.type)
     rng, n, capacity = np.random.default_rng(4), 70, 96
     counts = counts_of(n)
     ends = np.cumsum(counts)

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import self_test_numbers
+from device_schedules import as_kind
 
 from clsplat.device import program
-from clsplat.device.device import Device, open_device
+from clsplat.device.device import Device
 from clsplat.device.schedule import Schedule, default_schedule
 from clsplat.errors import DeviceError
 from clsplat.rendering import self_test, tuning
@@ -65,8 +66,7 @@ def broken(device: Device, monkeypatch: pytest.MonkeyPatch, old: str, new: str, 
         return text.replace(old, new)
 
     monkeypatch.setattr(program, "source", source)
-    other = open_device(device.info.index)
-    other.info = replace(other.info, type=kind or other.info.type)
+    other = as_kind(device, kind or device.info.type)
     with pytest.raises(DeviceError) as caught:
         check_rendering(other, default_schedule(device.info))
     assert changed, "the kernels have this text"
@@ -103,8 +103,7 @@ def test_every_schedule_passes(scheduled: tuple[Device, Schedule]) -> None:
 
 @pytest.mark.parametrize("kind", ["CPU", "GPU"])
 def test_both_binners_pass(device: Device, kind: str) -> None:
-    other = open_device(device.info.index)
-    other.info = replace(other.info, type=kind)
+    other = as_kind(device, kind)
     check_rendering(other, default_schedule(device.info))
 
 

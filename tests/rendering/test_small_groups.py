@@ -42,9 +42,8 @@ WITH_BARRIERS = {
     "scan_isects",
     "emit_isects",
     "step_exposure",
-    "gather_isect_grads",  # on schedules with groups
 }
-IN_GROUPS = {"rasterize", "rasterize_vjp"}
+IN_GROUPS = {"rasterize", "rasterize_vjp", "gather_isect_grads"}
 Pretend = Callable[..., Device]
 
 

@@ -1,10 +1,12 @@
-"""The schedules that a device is tested with."""
+"""The schedules that a device is tested with, and devices that pretend to be of another kind."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from clsplat.device.device import Device, DeviceInfo
+from clsplat.device.device import Device, DeviceInfo, open_device
 from clsplat.device.schedule import SCHEDULES, Schedule
 
 
@@ -23,3 +25,10 @@ def schedule_on(device: Device, name: str) -> Schedule:
     if SCHEDULES[name].group > device.info.max_group:
         pytest.skip(f"{device.info} has groups of {device.info.max_group} at most")
     return SCHEDULES[name]
+
+
+def as_kind(device: Device, kind: str) -> Device:
+    """Return the device opened once more, with this type."""
+    other = open_device(device.info.index)
+    other.info = replace(other.info, type=kind)
+    return other
