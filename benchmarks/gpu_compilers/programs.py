@@ -16,7 +16,7 @@ from clsplat.device.schedule import SCHEDULES
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.group_binner import group_binning_program
 from clsplat.rendering.radix_sort import sort_program
-from clsplat.training.programs import columns_program, lazy_program, loss_program, optim_program
+from clsplat.training.programs import columns_program, dropout_program, lazy_program, loss_program, optim_program
 
 OPTIONS = (*COMMON_OPTIONS, *GPU_OPTIONS)
 SHAPES = ("gaussian", "skew-normal")
@@ -49,6 +49,8 @@ def programs() -> dict[str, str]:
             texts[f"bin {shape}"] = built.pop()
         loss_program(device, KernelBuild(SHAPES[0], _SH_DEGREE, gpu))
         texts["loss"] = built.pop()
+        dropout_program(device)
+        texts["dropout"] = built.pop()
         sort_program(device, SCAN_GROUP)
         texts["sort"] = built.pop()
     return texts

@@ -14,7 +14,7 @@ from ..splats.flops import ADAM, BLEND, BLEND_VJP, LOSS
 from ..splats.shapes import shape_named
 
 STAGES = {
-    "project": ("project_splats",),
+    "project": ("project_splats", "drop_splats"),
     "depth sort": ("depth_span", "depth_histogram", "depth_scatter", "depth_buckets"),
     "binning": ("count_tiles", "total_tiles", "count_isects", "scan_isects", "emit_isects"),
     "tile sort": ("list_isects", "find_tile_ranges"),

@@ -10,7 +10,7 @@ buffer holds is made in bands of tiles. Each band is listed and rasterized, and 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -71,13 +71,19 @@ class Pipeline:
         self._camera_event: Event | None = None
 
     def forward(
-        self, splats: SplatBuffers, camera: Camera, background: Color = BLACK, sh_degree: int | None = None
+        self,
+        splats: SplatBuffers,
+        camera: Camera,
+        background: Color = BLACK,
+        sh_degree: int | None = None,
+        hide: Callable[[ProjectedSplats], None] | None = None,
     ) -> Frame:
         """Render an image. The previous frame of this pipeline is overwritten.
 
         Parameters
         ----------
         sh_degree : highest band of spherical harmonics in use; None for all.
+        hide : called with the projected splats before they are sorted; it may set some to CULLED_KEY and no tiles.
 
         Raises
         ------
@@ -90,6 +96,8 @@ class Pipeline:
         self._images.reserve(layout)  # an image that does not fit is refused before its tiles are counted
         degree = self.kernels.sh_degree if sh_degree is None else min(sh_degree, self.kernels.sh_degree)
         projected = self._project(splats, camera, layout, degree)
+        if hide is not None and projected.n:
+            hide(projected)
         frame = Frame(layout, degree, splats, projected, self._images, self._bands(projected, layout))
         self._frame = weakref.ref(frame)
         # The last band comes first: each launch also covers the tiles before its band, as tiles without isects.

@@ -24,6 +24,7 @@ from .options.groups import (
     SghmcConfig,
     StartConfig,
     ValidationConfig,
+    ViewsConfig,
 )
 from .options.option import Option, OptionGroup, check_options, option, option_table
 
@@ -122,6 +123,7 @@ class TrainConfig:
     start: StartConfig
     schedule: ScheduleConfig
     loss: LossConfig
+    views: ViewsConfig
     optim: OptimConfig
     sghmc: SghmcConfig
     phases: AlternationConfig
@@ -277,6 +279,7 @@ GROUPS: dict[str, type[OptionGroup]] = {
     "start": StartConfig,
     "schedule": ScheduleConfig,
     "loss": LossConfig,
+    "views": ViewsConfig,
     "optim": OptimConfig,
     "sghmc": SghmcConfig,
     "phases": AlternationConfig,

@@ -6,6 +6,8 @@
   get the strategy that relocates them (`mcmc`). With `adc` a penalty on opacity lets them fade until they are pruned.
 - Beside the points of a scene, some splats start at random places too: a plain wall has no points, and would else get
   no splats. They also need the penalty.
+- With few photos, splats that fit a single photo are cheap, and other views see them. A part of the splats is not drawn
+  in each iteration (dropout.py). With very few photos, no splat starts at a random place beside the scene's points.
 - Splats that start at random places have a longer way, so their learning rates are twice as high.
 - A step of Adam reads and writes every parameter, also of splats that the image does not show. On a GPU it takes a
   large part of an iteration. If photos show a part of a large scene, only visible splats step (optim/lazy.py).
@@ -41,6 +43,9 @@ FEW_POINTS = 0.05  # fewer points than this share of the cap are few
 PENALTY = Mcmc().opacity_reg  # weight of the mean opacity in a run with splats that start at random and adc
 RANDOM_SHARE = 0.05  # share of the cap that starts at random places beside the scene's points
 RANDOM_SHARE_OF_FEW = 0.1  # the same, if the scene has fewer points than this share
+FEW_VIEWS = 12  # with more training views, dropout costs more than it gains
+VERY_FEW_VIEWS = 6  # with more training views, random points beside the scene's gain more than they cost
+DROPOUT = 0.3  # part of the splats that is not drawn in an iteration of a run with few views
 RANDOM_START_RATES = 2.0  # factor on the learning rates of a run that starts at random
 SEEN_SHARE = 0.7  # of the scene's points in a photo: with a smaller share, only visible splats step on a GPU
 UNSEEN_SPLATS = 50_000  # fewer splats outside of a photo save less time than the two further commands take
@@ -88,6 +93,9 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if "random_points" not in config.named_options and (beside := share_beside(scene, config, transparent)):
         chosen["random_points"] = share_random = beside
         reasons.append(f"random points beside the scene's ({beside:.0%} of the cap), because some parts may have none")
+    if len(scene.train) <= FEW_VIEWS and "dropout" not in config.named_options:
+        chosen["dropout"] = DROPOUT
+        reasons.append(f"a dropout of {DROPOUT:.0%} of the splats, because there are only {len(scene.train)} photos")
     if transparent and "random_background" not in config.named_options:
         chosen["random_background"] = True
         part = "" if config.random_background_until == 1 else f" for {config.random_background_until:.0%} of the run"
@@ -137,10 +145,11 @@ def random_start(scene: Scene, config: TrainConfig) -> str:
 def share_beside(scene: Scene, config: TrainConfig, transparent: bool) -> float:
     """Return the share of the cap that starts at random places beside the points of a scene.
 
-    Where photos are transparent, nothing is missing that good points do not show.
+    Where photos are transparent, nothing is missing that good points do not show. With very few photos, no
+    second one shows whether the depth of a random point is right.
     """
     n_points = len(scene.points.xyz)
-    if config.start.init != "sfm" or n_points < MIN_POINTS:
+    if config.start.init != "sfm" or n_points < MIN_POINTS or len(scene.train) <= VERY_FEW_VIEWS:
         return 0.0
     if n_points < RANDOM_SHARE_OF_FEW * config.cap_max:
         return RANDOM_SHARE_OF_FEW

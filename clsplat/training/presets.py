@@ -35,6 +35,7 @@ _RATES = {
     "bisect_reg": 0.0,
     "average_last": 0.0,
     "random_points": 0.0,
+    "dropout": 0.0,
     "visible_adam": False,
     "random_background": False,
     "turnover": 0.0,

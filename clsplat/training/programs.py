@@ -13,7 +13,7 @@ from ..splats.near_plane import NEAR_PLANE
 from ..splats.optical_depth import MAX_COORDINATE
 from ..splats.shapes import shape_named
 from .config import TrainConfig
-from .optim import adam
+from .optim import adam, noise
 from .optim.skew_map import SKEW_MAPS
 
 EXPOSURE_VECS = 8  # vectors of a work-item of cl/train/exposure.cl
@@ -79,6 +79,7 @@ _BELOW_STEPS = (
     "math/opacity.clh",
     "math/harmonics.clh",
     "train/skew_map.clh",
+    "math/philox.clh",
     "math/noise.clh",
     "train/adam.clh",
     "train/steps.clh",
@@ -113,6 +114,16 @@ def columns_program(device: Device, kernels: KernelBuild) -> Program:
     defines = layout_defines(shape_named(kernels.shape), schema)
     defines |= {"LANES": 1, "SH_ROWS": schema.rows(Group.SH), "MAX_COORDINATE": MAX_COORDINATE}
     return build(device, ("math/lanes.clh", "train/columns.cl", "train/density.cl"), defines, kernels.real)
+
+
+def dropout_program(device: Device) -> Program:
+    """Return the program that hides splats for one iteration."""
+    defines: dict[str, Define] = {
+        "LANES": 1,
+        "CULLED_KEY": f"{CULLED_KEY:#x}u",
+        "DROPOUT_STREAM": f"{noise.DROPOUT_STREAM}u",
+    }
+    return build(device, ("math/lanes.clh", "math/philox.clh", "train/dropout.cl"), defines)
 
 
 def _optim_defines(kernels: KernelBuild, half_moments: bool) -> dict[str, Define]:

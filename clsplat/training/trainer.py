@@ -31,6 +31,7 @@ from .checkpoint import Checkpoint
 from .checkpoint_times import CheckpointTimes
 from .config import TrainConfig
 from .density.control import DensityControl, ExplorationNoise
+from .dropout import SplatDropout
 from .exposure import ExposureLoss, exposures_json
 from .extension import reached_by
 from .folder import ModelFolder
@@ -124,6 +125,7 @@ class Trainer:
         self.clock = RunClock(config, self.schedule, self.views, self.pipeline, self.splats, self.iteration)
         self.running = RunningLoss(len(scene.train))
         self.noise = ExplorationNoise(config, self.kernels, self.splats, scene.extent)
+        self.dropout = SplatDropout(config, self.splats)
         self.renderer = Renderer(self.device)
         self.validation = RunValidation(
             self.renderer, scene.validation, config.background, config.iterations, config.output.save_iterations
@@ -298,7 +300,7 @@ class Trainer:
         if config.random_background and it <= config.random_background_until * config.iterations:
             r, g, b = self.rng.random(3).tolist()
             background = r, g, b
-        frame = self.pipeline.forward(self.splats, target.camera, background, degree)
+        frame = self.pipeline.forward(self.splats, target.camera, background, degree, self.dropout.of(it))
         self.loss_result = self.exposure.evaluate(target, frame.images.color.buffer, background)
         self.pipeline.backward(frame, self.loss_result.v_color, self.grads)
         mean_lr = self.scene.extent * self.schedule.mean_rate(it)

@@ -9,7 +9,10 @@ import sys
 from pathlib import Path
 
 import defaults
+import few_views
 import pytest
+
+from clsplat.scenes.scene import load_scene
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -297,6 +300,45 @@ def test_the_page_has_the_stored_runs_at_full_size() -> None:
     rows = defaults.Runs(BENCHMARKS / "results" / "defaults.jsonl", defaults.KEY).rows
     for scenes in defaults.TABLES.values():
         assert defaults.test_table(rows, scenes) in defaults.PAGE.read_text(encoding="utf-8"), "run defaults.py --page"
+
+
+def test_the_page_has_the_stored_runs_with_few_photos() -> None:
+    rows = few_views.Runs(BENCHMARKS / "results" / "few_views.jsonl", few_views.KEY).rows
+    assert rows
+    assert few_views.page(rows) in few_views.PAGE.read_text(encoding="utf-8"), "run few_views.py --page"
+
+
+@pytest.mark.slow
+def test_few_views(tmp_path: Path, capture_folder: Path) -> None:
+    out = tmp_path / "few.jsonl"
+    environment = os.environ | {"CLSPLAT_DATA": str(capture_folder.parent)}
+    case = f"{capture_folder.name}:-1:200:4:3"
+    command = [sys.executable, str(BENCHMARKS / "few_views.py"), "--out", str(out), "--cases", case]
+    for views in ("validation", "test", "test"):
+        done = subprocess.run([*command, "--views", views], env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [(row["views"], row["system"]) for row in rows] == [
+        (views, system) for views in ("validation", "test") for system in ("default", "default:dropout=0")
+    ], "each once"
+    assert "there are only 3 photos" in " ".join(rows[0]["decided"])
+    for row in rows:
+        assert {"device", "driver", "schedule", "commit", "train_psnr", "seconds"} <= set(row)
+        assert f"{row['psnr']:.2f}, {row['ssim']:.3f}" in done.stdout
+
+
+@pytest.mark.parametrize("photos", [2, 5])
+def test_a_case_of_few_photos_has_the_points_of_two_of_them(
+    capture_folder: Path, monkeypatch: pytest.MonkeyPatch, photos: int
+) -> None:
+    monkeypatch.setenv("CLSPLAT_DATA", str(capture_folder.parent))
+    scene = few_views.Case(capture_folder.name, -1, 9, 1, photos).load()
+    whole = load_scene(capture_folder)
+    assert len(scene.train) == photos
+    assert [view.name for view in scene.test] == [view.name for view in whole.test]
+    assert len(scene.train) + len(scene.validation) == len(whole.train)
+    assert {scene.train[0].name, scene.train[-1].name} == {whole.train[0].name, whole.train[-1].name}
+    assert len(scene.points) <= len(whole.points)
+    assert set(map(tuple, scene.points.xyz)) <= set(map(tuple, whole.points.xyz))
 
 
 @pytest.mark.slow

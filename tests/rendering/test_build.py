@@ -21,7 +21,14 @@ from clsplat.rendering.group_binner import group_binning_program
 from clsplat.rendering.radix_sort import sort_program
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.training.optim.skew_map import SKEW_MAPS
-from clsplat.training.programs import columns_program, exposure_program, lazy_program, loss_program, optim_program
+from clsplat.training.programs import (
+    columns_program,
+    dropout_program,
+    exposure_program,
+    lazy_program,
+    loss_program,
+    optim_program,
+)
 
 REALS = ("float", "double")
 
@@ -81,6 +88,7 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
         group_binning_program(compiler, kernels, 64)
         kernels.binning_program(compiler, CHUNK_FILES, ORDER_DEFINES)
     columns_program(compiler, kernels)
+    dropout_program(compiler)
     there = {
         f"{folder.name}/{file.name}"
         for folder in files("clsplat_cl").iterdir()

@@ -22,11 +22,14 @@ from clsplat.splats.splats import Splats
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import (
+    DROPOUT,
+    FEW_VIEWS,
     FEWEST_ITERATIONS,
     PENALTY,
     RANDOM_SHARE,
     RANDOM_SHARE_OF_FEW,
     RANDOM_START_RATES,
+    VERY_FEW_VIEWS,
     Decision,
     as_decided,
     decide,
@@ -45,8 +48,8 @@ def without_points(scene: Scene) -> Scene:
 
 
 def options_of(**named: Any) -> TrainConfig:
-    """Return options with a near plane, which else depends on the scene."""
-    return TrainConfig(near_plane=0.1, **named)
+    """Return options with a near plane and without dropout, which else depend on the scene."""
+    return TrainConfig(**{"near_plane": 0.1, "dropout": 0.0} | named)
 
 
 def some_splats(scene: Scene, file: Path) -> Path:
@@ -98,6 +101,46 @@ def test_some_points_are_random_beside_good_ones(scene: Scene) -> None:
     assert decide(scene, options_of(init="model.ply", random_points=0.1)).reasons == ()
     by_relocation = config.replace(strategy="mcmc")
     assert decide(scene, by_relocation).config == by_relocation.replace(random_points=RANDOM_SHARE)
+
+
+def with_views(scene: Scene, count: int) -> Scene:
+    """Return the scene with that many training views, some of them under two names."""
+    views = [
+        replace(view, name=f"{round}-{view.name}")
+        for round in range(-(-count // len(scene.train)))
+        for view in scene.train
+    ]
+    return replace(scene, views=views[:count], test_names=frozenset())
+
+
+@pytest.mark.parametrize(
+    ("count", "dropout", "share"),
+    [
+        (3, DROPOUT, 0.0),
+        (VERY_FEW_VIEWS, DROPOUT, 0.0),
+        (VERY_FEW_VIEWS + 1, DROPOUT, RANDOM_SHARE),
+        (FEW_VIEWS, DROPOUT, RANDOM_SHARE),
+        (FEW_VIEWS + 1, 0.0, RANDOM_SHARE),
+    ],
+)
+def test_few_photos_get_dropout_and_very_few_no_random_points(
+    scene: Scene, count: int, dropout: float, share: float
+) -> None:
+    few = with_views(scene, count)
+    config = TrainConfig(near_plane=0.1, cap_max=len(scene.points))
+    decision = decide(few, config)
+    assert decision.config == config.replace(
+        dropout=dropout, random_points=share or None, opacity_reg=PENALTY if share else 0.0
+    )
+    assert (f"a dropout of 30% of the splats, because there are only {count} photos" in str(decision)) == (dropout > 0)
+    assert decide(few, config.replace(dropout=0.1)).config.views.dropout == 0.1
+
+
+def test_test_and_validation_views_do_not_count(scene: Scene) -> None:
+    many = with_views(scene, FEW_VIEWS + 2)
+    held_out = replace(many, test_names=frozenset({many.names[0]}), validation_names=frozenset({many.names[1]}))
+    assert decide(many, TrainConfig()).config.views.dropout == 0
+    assert decide(held_out, TrainConfig()).config.views.dropout == DROPOUT
 
 
 @pytest.mark.parametrize("options", [{"init": "random"}, {"cap_max": 1_000_000}, {}])

@@ -1,4 +1,4 @@
-"""The exploration noise of 3DGS-MCMC, with random numbers that a kernel can repeat (cl/math/noise.clh).
+"""The exploration noise of 3DGS-MCMC, with random numbers that a kernel can repeat (cl/math/philox.clh).
 
 Random integers come from Philox4x32-10 (Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"). They are a
 pure function of (seed, iteration, splat), so they do not depend on order, device or number of threads. The uniform
@@ -20,6 +20,8 @@ _MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
 _WEYL = (0x9E3779B9, 0xBB67AE85)  # added to the key after each round: golden ratio, sqrt(3) - 1
 _ROUNDS = 10
 _MASK = 0xFFFFFFFF
+
+DROPOUT_STREAM = 2  # of the words that hide splats (dropout.py)
 
 # The gate of 3DGS-MCMC (ubc-vision/3dgs-mcmc): sigmoid(100 ((1 - o) - 0.995)) = sigmoid(0.5 - 100 o). It is open only
 # for nearly transparent splats.
@@ -59,7 +61,8 @@ def normal3(seed: int, iteration: int, n: int, stream: int = 0) -> NDArray[np.fl
     Parameters
     ----------
     seed : 0 <= seed < 2^64. iteration : 0 <= iteration < 2^32.
-    stream : number of the use in an iteration, for independent numbers: 0 for this noise, 1 for SGHMC (sghmc.py).
+    stream : number of the use in an iteration, for independent numbers: 0 for this noise, 1 for SGHMC (sghmc.py), and
+        DROPOUT_STREAM.
     """
     index = np.arange(n, dtype=np.uint32)
     rest = [np.asarray(word, np.uint32) for word in (iteration, stream, 0)]

@@ -78,6 +78,22 @@ class LossConfig(OptionGroup):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ViewsConfig(OptionGroup):
+    """What keeps a run from fitting each of a few photos by splats of its own."""
+
+    title: ClassVar[str] = "Few photos"
+
+    dropout: float = option(
+        0.0,
+        help="Part of the splats, chosen at random, that an iteration does not draw, until 0.9 of the run. Then splats "
+        "that fit one photo alone are worth less.",
+        at_least=0,
+        below=1,
+        by_scene=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class OptimConfig(OptionGroup):
     """Adam's learning rates, with the values of 3DGS, and how the optimizer runs."""
 
