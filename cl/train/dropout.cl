@@ -1,8 +1,8 @@
 // dropout.cl: hides some projected splats for one iteration (clsplat/training/dropout.py).
 
-// Overwrites depth_key [n] and tile_rect [n] of the splats whose random word is below `below`, so that they are culled, as
-// project_splats culls splats that the image does not show. The word depends on seed, iteration and splat only. Global size:
-// at least n.
+// Overwrites depth_key [n] and tile_rect [n] of some splats, as project_splats does for splats that the image does not show.
+// Those are the splats whose random word is below `below`. The word depends on seed, iteration and splat only. Global size: at
+// least n.
 kernel void drop_splats(
     global uint *restrict depth_key,
     global int4 *restrict tile_rect,
