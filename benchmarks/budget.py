@@ -1,167 +1,179 @@
-"""`--budget auto` on the real scenes, beside the sweep of caps of benchmarks/frontier.py; a line of JSON a search.
+"""`--budget auto` beside runs at several caps: what the search keeps, what it loses, and how long it takes.
 
-    python benchmarks/budget.py [--scenes fox kitchen sceaux_castle] [--shapes skew-normal gaussian] [--device 0:0]
-        [--iterations 1000] [--cap 50000] [--tolerance 0.1] [--work DIR]
-    python benchmarks/budget.py --table        # print the finished searches, run nothing
-    python benchmarks/budget.py --smoke --scenes NAME --out DIR
+    python benchmarks/budget.py --cases fox:4:12000:1000 kitchen:-1:20000:1000 --seeds 0 1 2
+    python benchmarks/budget.py --cases fox:2:50000:1000 --views test      # once, after the choice
+    python benchmarks/budget.py --table
+    python benchmarks/budget.py --page         # write the table of docs/small-models.md
 
-Records have the keys of `clsplat compare`'s runs, with system "auto SHAPE", and "budget": the report of the search. A
-finished search is not repeated. A search that was killed continues after its last finished stage (in --work). Seconds
-are those of the whole search: growth, held-out run, rounds, refit. The table shows each search beside the best cap of
-the sweep for its scene, shape and iterations. Both are measured on test views, and neither was chosen on them.
+A case is scene:resolution:cap:iterations. The search stands beside runs of the default at the cap and at parts of it,
+with the same seed and photos. Both are measured on test views, or on validation views that neither has seen: the search
+holds out views of its own. A search that was killed continues (in --work). The time of the search is divided by that of
+the run at the cap.
 """
 
 from __future__ import annotations
 
-import argparse
+import statistics
+import sys
 import tempfile
-import time
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import common
+from common import RESULTS, ROOT, Runs, background_of, environment, groups, parser, real_scene, table, write_between
 
-from clsplat.comparison.measure import empty_record, measure_model, warm_up
-from clsplat.comparison.runs import RUNS, RunFile, scene_identity
-from clsplat.comparison.table import Record
-from clsplat.compression.rules import BudgetOptions
+from clsplat.comparison.measure import warm_up
+from clsplat.compression.rules import TOLERANCE, BudgetOptions
 from clsplat.compression.search import train_budget
 from clsplat.compression.state import FILE
-from clsplat.device.device import open_device
-from clsplat.files.host_memory import peak_bytes
+from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer
-from clsplat.rendering.tuning import schedule_for
-from clsplat.splats.shapes import SHAPES
+from clsplat.scenes.scene import Scene
 from clsplat.training.config import TrainConfig
+from clsplat.training.run import train
 
-OUT = common.RESULTS / "budget"
-HEAD = (
-    "scene",
-    "shape",
-    "system",
-    "PSNR [dB]",
-    "SSIM",
-    "splats",
-    "MB",
-    "render ms",
-    "seconds",
-    "PSNR less best",
-    "splats of best",
-    "bytes of best",
-    "time of best",
-)
+KEY = ("scene", "resolution", "cap", "iterations", "shape", "tolerance", "seed", "views")
+SHARES = (1.0, 0.4, 0.1)  # of the cap: the runs beside a search
+PAGE = ROOT / "docs" / "small-models.md"
+MARKS = ("<!-- table of budget.py -->", "<!-- end of the table of budget.py -->")
+HEAD = ("scene", "kernel", "views", "seeds", "best cap: PSNR [dB]", "auto: PSNR [dB]", "splats", "bytes", "time")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene at one size with the largest cap and the length of its runs."""
+
+    scene: str
+    resolution: int
+    cap: int
+    iterations: int
+
+    @classmethod
+    def parse(cls, text: str) -> Case:
+        """Return the case of scene:resolution:cap:iterations."""
+        name, *numbers = text.split(":")
+        return cls(name, *map(int, numbers))
+
+
+def search(case: Case, seed: int, args: Any, runs: Runs) -> None:
+    """Run a search and the runs beside it, if they are not among `runs`."""
+    row: dict[str, Any] = vars(case) | {
+        "shape": args.shape,
+        "tolerance": args.tolerance,
+        "seed": seed,
+        "views": args.views,
+    }
+    if row in runs:
+        return
+    background = background_of(case.scene)
+    scene = real_scene(case.scene, case.resolution, validate=args.views == "validation", background=background)
+    config = TrainConfig(
+        shape=args.shape,
+        iterations=case.iterations,
+        cap_max=case.cap,
+        seed=seed,
+        background=background,
+        device=args.device,
+    )
+    renderer = Renderer(config.device)
+    warm_up(scene, config, renderer.device)
+    plain = [plain_run(scene, config.replace(cap_max=max(round(share * case.cap), 1)), renderer) for share in SHARES]
+    work = args.work / "-".join(str(row[name]) for name in KEY)
+    resume = (work / FILE).is_file()
+    result = train_budget(
+        scene, config, BudgetOptions(args.tolerance), output=work, resume=resume, overwrite=not resume
+    )
+    found = evaluate(renderer, result.splats, scene.test, background)
+    best = max(plain, key=lambda run: float(run["psnr"]))
+    row |= {
+        "plain": plain,
+        "psnr": round(found.psnr, 3),
+        "ssim": round(found.ssim, 4),
+        "splats": len(result.splats),
+        "bytes": result.path.stat().st_size,
+        "seconds": round(result.seconds, 1),
+        "search": {key: result.report[key] for key in ("rounds", "chosen", "held_out", "final")},
+    }
+    runs.add(row | environment(renderer.device, renderer.schedule))
+    print(
+        f"{case} seed {seed}: {found.psnr:.2f} dB with {len(result.splats)} splats in {row['seconds']} s; best cap "
+        f"{best['cap']}: {best['psnr']:.2f} dB in {best['seconds']} s",
+        file=sys.stderr,
+    )
+
+
+def plain_run(scene: Scene, config: TrainConfig, renderer: Renderer) -> dict[str, Any]:
+    """Train with one cap and return what the model is like."""
+    with tempfile.TemporaryDirectory() as folder:
+        model = train(scene, config, output=Path(folder) / "model")
+        assert model.path is not None
+        size = sum(file.stat().st_size for file in model.path.glob("point_cloud/*/point_cloud.ply"))
+    return {
+        "cap": config.cap_max,
+        "splats": len(model.splats),
+        "bytes": size,
+        "psnr": round(evaluate(renderer, model.splats, scene.test, config.background).psnr, 3),
+        "seconds": round(model.seconds, 3),
+    }
+
+
+def page(rows: list[dict[str, Any]]) -> str:
+    """Return a Markdown table with a row for each case: means over the seeds, and the best of its caps."""
+    lines = []
+    for (scene, resolution, iterations, shape, tolerance, views), case in groups(
+        sorted(rows, key=lambda row: row["views"] == "test"),
+        "scene",
+        "resolution",
+        "iterations",
+        "shape",
+        "tolerance",
+        "views",
+    ).items():
+        plain = [
+            (statistics.fmean(run["psnr"] for run in same), same)
+            for same in zip(*(row["plain"] for row in case), strict=True)
+        ]
+        best, runs = max(plain, key=lambda item: item[0])
+        whole = statistics.fmean(row["plain"][0]["seconds"] for row in case)
+        lines.append(
+            (
+                f"`{scene}`{'' if resolution == -1 else f' `-r {resolution}`'}, {iterations} iterations"
+                + ("" if tolerance == TOLERANCE else f", {tolerance:g} dB"),
+                shape,
+                views,
+                len(case),
+                f"{runs[0]['cap']}: {best:.2f}",
+                f"{statistics.fmean(row['psnr'] for row in case):.2f}",
+                f"{sum(row['splats'] for row in case) / sum(run['splats'] for run in runs):.0%}",
+                f"{sum(row['bytes'] for row in case) / sum(run['bytes'] for run in runs):.0%}",
+                f"{statistics.fmean(row['seconds'] for row in case) / whole:.1f}",
+            )
+        )
+    return table(HEAD, lines, right=HEAD[3:])
 
 
 def main() -> None:
-    parser = common.parser(__doc__, OUT)
-    parser.add_argument("--scenes", nargs="+", default=["fox", "kitchen", "sceaux_castle"])
-    parser.add_argument("--shapes", nargs="+", default=["skew-normal", "gaussian"], choices=list(SHAPES))
-    parser.add_argument("--iterations", type=int, default=1000)
-    parser.add_argument("--cap", type=int, default=50_000)
-    parser.add_argument("--tolerance", type=float, default=0.1)
-    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "clsplat-budget")
-    args = parser.parse_args()
-    if args.smoke:
-        args.shapes, args.iterations, args.cap, args.tolerance = ["skew-normal"], 8, 60, 1.0
-    for name in args.scenes if not args.table else ():
-        for shape in args.shapes:
-            search(name, shape, args)
-    print_table(common.read(args.out / RUNS), common.read(args.out.parent / "frontier" / RUNS))
-
-
-def search(name: str, shape: str, args: argparse.Namespace) -> None:
-    """Run one search and append its line."""
-    scene = common.real_scene(name)
-    config = TrainConfig(shape=shape, iterations=args.iterations, cap_max=args.cap, device=args.device)
-    options = BudgetOptions(args.tolerance)
-    label = f"auto {shape}" + ("" if args.tolerance == BudgetOptions().tolerance else f" {args.tolerance:g} dB")
-    runs, identity = RunFile(args.out), scene_identity(scene)
-    if runs.find(identity, label, config) is not None:
+    flags = parser(__doc__, RESULTS / "budget.jsonl")
+    flags.add_argument("--cases", nargs="+", default=["fox:4:12000:1000"])
+    flags.add_argument("--shape", default=TrainConfig().shape)
+    flags.add_argument("--seeds", nargs="+", type=int, default=[0])
+    flags.add_argument("--tolerance", type=float, default=TOLERANCE)
+    flags.add_argument("--views", choices=("validation", "test"), default="validation")
+    flags.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "clsplat-budget")
+    flags.add_argument("--page", action="store_true", help="write the table of docs/small-models.md, and run nothing")
+    args = flags.parse_args()
+    runs = Runs(args.out, KEY)
+    if args.page:
+        write_between(PAGE, *MARKS, page(runs.rows))
         return
-    device = open_device(args.device)
-    warm_up(scene, config, device)
-    work = args.work / f"{name}-{shape}-{args.iterations}-{args.cap}-{args.tolerance:g}"
-    resume = (work / FILE).is_file()
-    started = time.process_time()
-    result = train_budget(
-        scene,
-        config,
-        options,
-        lambda progress: print_message(name, progress.message),
-        output=work,
-        resume=resume,
-        overwrite=not resume,
-    )
-    cpu_seconds = time.process_time() - started
-    report = {key: value for key, value in result.report.items() if key not in ("config", "options", "scene")}
-    record = empty_record(device, schedule_for(device))
-    record |= measure_model(Renderer(device), result.splats, result.path, scene, config)
-    record |= {
-        "scene": identity,
-        "system": label,
-        "config": config.to_json(),
-        "failed": report["final"]["missed"],
-        "seconds": result.seconds,
-        "cpu_seconds": None if resume else cpu_seconds,
-        "parameters": report["final"]["parameters_in_use"],  # a compact file leaves out neutral ones
-        "device_bytes": 0,
-        "peak_bytes": peak_bytes(),
-        "commit": common.commit(),
-        "budget": {"options": asdict(options), **report},
-    }
-    runs.add(record)
-
-
-def print_message(scene: str, message: str) -> None:
-    """Print a stage of a search."""
-    if message:
-        print(f"{scene}: {message}", flush=True)
-
-
-def best_of(record: Record, sweep: list[Record]) -> Record | None:
-    """Return the run of the sweep with the highest PSNR for the same scene, shape and iterations."""
-    same = [
-        run
-        for run in sweep
-        if run["scene"] == record["scene"]
-        and not run["failed"]
-        and run["system"] == record["config"]["shape"]
-        and run["config"]["iterations"] == record["config"]["iterations"]
-    ]
-    return max(same, key=lambda run: float(run["psnr"]), default=None)
-
-
-def print_table(records: list[Record], sweep: list[Record]) -> None:
-    """Print a line for each search, after the line of the best cap if the sweep is there."""
-    lines = []
-    for record in records:
-        best, against = best_of(record, sweep), ("", "", "", "")
-        if best is not None:
-            lines.append(cells(best, record, f"best cap: {best['config']['cap_max']}", against))
-            against = (
-                f"{record['psnr'] - best['psnr']:+.2f}",
-                f"{record['splats'] / best['splats']:.0%}",
-                f"{record['bytes'] / best['bytes']:.0%}",
-                f"{record['seconds'] / best['seconds']:.1f}",
-            )
-        lines.append(cells(record, record, record["system"], against))
-    print(common.table(HEAD, lines))
-
-
-def cells(run: Record, searched: Record, system: str, against: tuple[str, ...]) -> list[object]:
-    """Return the cells of a run, which stands in the lines of the search `searched`."""
-    return [
-        searched["scene"]["name"],
-        searched["config"]["shape"],
-        system,
-        f"{run['psnr']:.2f}",
-        f"{run['ssim']:.4f}",
-        run["splats"],
-        f"{run['bytes'] / 1e6:.2f}",
-        f"{run['render_ms']:.1f}",
-        f"{run['seconds']:.1f}",
-        *against,
-    ]
+    if args.smoke:
+        args.tolerance = 1.0
+        args.cases = [f"{text.split(':')[0]}:-1:60:8" for text in args.cases]
+    if not args.table:
+        for case in map(Case.parse, args.cases):
+            for seed in args.seeds:
+                search(case, seed, args, runs)
+    print(page(runs.rows))
 
 
 if __name__ == "__main__":

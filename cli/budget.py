@@ -47,7 +47,7 @@ def budget_options(function: F) -> F:
             "--budget",
             type=click.Choice(["auto"]),
             help="Search for the smallest model that is as good as the one with --cap-max splats, on views held out of "
-            "training for it. Test views may lose more. The search takes the time of five to nine runs.",
+            "training for it. Test views may lose more. The search takes the time of two to three runs.",
         ),
     ):
         function = option(function)
@@ -74,11 +74,10 @@ def run_search(
     quiet: bool,
 ) -> None:
     """Run the search with a live display, and print its result."""
-    from clsplat.comparison.growth import draw_growth
+    from clsplat.comparison.search_chart import draw_search
     from clsplat.compression.search import train_budget
     from clsplat.training.run import evaluate_test_views
 
-    result: Budgeted | None = None
     try:
         with TrainingDisplay(quiet) as display:
             result = train_budget(
@@ -86,15 +85,13 @@ def run_search(
             )
     except KeyboardInterrupt:
         _report_interruption(ctx, model_path)
-    if not result.finished:
-        _report_interruption(ctx, model_path)
-    charts = draw_growth(result, model_path)
+    charts = draw_search(result.report, model_path)
     if quiet:
         return
     for line in result_lines(result):
         click.echo(line)
     if charts:
-        click.echo(f"growth curve: {', '.join(str(file) for file in charts)}")
+        click.echo(f"chart of the rounds: {', '.join(str(file) for file in charts)}")
     metrics = evaluate_test_views(result.splats, scene, config)
     if metrics is not None:
         click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
@@ -105,7 +102,6 @@ def result_lines(result: Budgeted) -> list[str]:
     report, final = result.report, result.report["final"]
     held_out = report["held_out"]
     lines = [
-        f"growth: more than {report['knee']} splats gain too little",
         f"rounds: {report['rounds'][report['chosen']]['splats']} of {report['rounds'][0]['splats']} splats remain",
         f"validation views: PSNR {held_out['psnr_pruned']:.2f} dB, with all splats and parameters "
         f"{report['rounds'][0]['psnr']:.2f} dB",

@@ -148,8 +148,8 @@ def train(
     reconstructed first, into MODEL/scene (see clsplat reconstruct).
 
     The model's folder gets config.json, cameras.json, log.jsonl, checkpoint.npz and
-    point_cloud/iteration_N/point_cloud.ply. With --budget auto, the folder also gets budget.json and the growth curve;
-    the small model is the last point cloud.
+    point_cloud/iteration_N/point_cloud.ply. With --budget auto, the folder also gets budget.json and a chart of the
+    rounds; the small model is the last point cloud.
     """
     from clsplat.scenes.changed_photos import check_photos
     from clsplat.scenes.reconstruct.photo_files import is_photographs

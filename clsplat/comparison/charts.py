@@ -1,4 +1,4 @@
-"""Charts of growth with its knee, of seeds and of arithmetic, from plain rows to PNG and SVG."""
+"""Charts of seeds and of arithmetic, from plain rows to PNG and SVG."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from typing import Any
 from ..errors import InputError
 from ..evaluation.chart_style import (
     INK,
-    MARK,
     WIDTH,
     Label,
     category_colour,
     chart_paths,
     drawing,
-    log_axis,
     place_labels,
     shape_colour,
     short_count,
@@ -27,79 +25,6 @@ _ARITHMETIC = (
     ("image_error", "raster", "image", "rendering"),
     ("gradient_error", "raster_vjp", "gradient", "its gradient"),
 )
-
-
-def growth_chart(
-    records: Sequence[Mapping[str, Any]], knee: int | None, out: str | Path, rounds: Sequence[Mapping[str, Any]] = ()
-) -> list[Path]:
-    """Draw validation PSNR against splats, with the knee marked.
-
-    Parameters
-    ----------
-    records : each with "splats" and "psnr" [dB]. A record with a "label" (such as "pruned") is not on the curve: it is
-        drawn as a star with that name.
-    knee : splats of the chosen record; None marks no record.
-    out : path without a suffix.
-    rounds : "splats" and "psnr" of a longer run that removed splats again, drawn as a second curve.
-
-    Returns
-    -------
-    The files written.
-
-    Raises
-    ------
-    InputError : no records, or `knee` is not on the curve. OutputError : no matplotlib, or not writable.
-    """
-    curve = sorted((record["splats"], record["psnr"]) for record in records if not record.get("label"))
-    chosen = [psnr for splats, psnr in curve if splats == knee]
-    if not curve or (knee is not None and not chosen):
-        raise InputError(f"{out}: a growth chart needs a curve, and a knee that is on it")
-    with drawing(out, 6.4, 4.0) as figure:
-        axes = figure.add_subplot(xlabel="splats", ylabel="validation PSNR [dB]", xscale="log")
-        axes.plot(*zip(*curve, strict=True), marker="o", color=INK, clip_on=False, label="growth")
-        if knee is not None:
-            axes.axvline(knee, color=MARK, linewidth=1, linestyle=(0, (4, 2)), zorder=0.5)
-            axes.plot(
-                [knee],
-                chosen[:1],
-                marker="o",
-                markersize=11,
-                markerfacecolor="none",
-                markeredgewidth=2,
-                color=MARK,
-                linestyle="none",
-                label=f"knee: {short_count(knee)} splats, {chosen[0]:.2f} dB",
-            )
-        if rounds:
-            axes.plot(
-                [row["splats"] for row in rounds],
-                [row["psnr"] for row in rounds],
-                marker="s",
-                markersize=5,
-                color="#0072b2",
-                linestyle="--",
-                clip_on=False,
-                label="whole run, then fewer splats",
-            )
-        stars = [record for record in records if record.get("label")]
-        for star in stars:
-            axes.plot(
-                [star["splats"]],
-                [star["psnr"]],
-                marker="*",
-                markersize=13,
-                linestyle="none",
-                color="#0072b2",
-                markeredgecolor="white",
-                zorder=4,
-                label=f"{star['label']}: {short_count(star['splats'])} splats, {star['psnr']:.2f} dB",
-            )
-        sizes = [splats for splats, _ in curve] + [row["splats"] for row in (*stars, *rounds)]
-        low, high = min(sizes) / 1.2, max(sizes) * 1.2
-        axes.set_xlim(low, high)
-        log_axis(axes.xaxis, low, high)
-        axes.legend(loc="best")
-    return chart_paths(out)
 
 
 def seeds_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path]:

@@ -1,13 +1,15 @@
 """Rounds of pruning: the least important splats are removed, and the others are trained on to replace them.
 
-A round removes a quarter of the splats and trains the others for a tenth of the run. The model stays as good as before
-for several rounds, and is then better than a run with that number of splats.
+A round removes a quarter of the splats. It trains the others for a tenth of the run at its last rates, then for another
+tenth at lower ones. The model stays as good as before for some rounds, and is better than a run with that number of
+splats.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..device.device import Device
@@ -25,8 +27,26 @@ from .importance import measure_importance
 from .prune import Validation, splat_scores, strongest
 
 KEPT = 0.75  # share of the splats that a round keeps
-FINAL_RATE = 0.3  # factor on the rates of the last part, which removes no splat
 _WARM = 10.0  # first rate of positions over the last: removed splats leave gaps, which positions must close
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of fine-tuning. share : its iterations over those of the run. rate : factor on the run's last rates."""
+
+    share: float
+    rate: float
+
+    def iterations(self, config: TrainConfig) -> int:
+        """Return the iterations of the part after a run with these options."""
+        return max(round(self.share * config.iterations), 1)
+
+
+Parts = tuple[Part, ...]
+_COOL = Part(0.1, 0.3)  # lower rates at the end, so that models of all stages can be compared
+ROUND: Parts = (Part(0.1, 1.0), _COOL)
+_RUN = 5  # iterations of a run over those of a round
+ALL_VIEWS: Parts = (Part(0.5, 1.0), _COOL)  # the last stage of a search, with the views that were held out
 
 
 def without_quarter(
@@ -54,8 +74,8 @@ def prune_in_rounds(
 ) -> Splats:
     """Run rounds on a model until the validation PSNR falls below the floor, and return the last good model.
 
-    The training run of the model is not known. Rates are those at the end of a run with clsplat's defaults that is ten
-    times as long as a round.
+    The training run of the model is not known. Rates are those at the end of a run with clsplat's defaults that is
+    _RUN times as long as a round.
 
     Parameters
     ----------
@@ -66,15 +86,15 @@ def prune_in_rounds(
         normalisation=splats.normalisation,
         antialiased=splats.antialiased,
         near_plane=splats.near_plane,
-        iterations=10 * iterations,
+        iterations=_RUN * iterations,
         background=validation.background,
         strategy=Adc.strategy,  # rounds add no splats, and adc has no penalties
     )
-    config = decide(scene, config).config
-    good = splats
+    config, good = decide(scene, config).config, splats
     while len(splats) > 1:
-        fewer = without_quarter(splats, scene.train, validation.renderer, validation.background)
-        splats = fine_tune(scene, fewer, config, iterations, device, progress)
+        splats = without_quarter(splats, scene.train, validation.renderer, validation.background)
+        for part in ROUND:
+            splats = fine_tune(scene, splats, config, part, device, progress)
         if validation.psnr(splats) < floor:
             break
         good = splats
@@ -85,29 +105,16 @@ def fine_tune(
     scene: Scene,
     splats: Splats,
     config: TrainConfig,
-    iterations: int,
+    part: Part,
     device: Device,
     progress: Callable[[Progress], None] | None = None,
-    rate: float = 1.0,
 ) -> Splats:
-    """Train `splats` on, at the rates at the end of `config`'s run; their number does not change.
-
-    Parameters
-    ----------
-    scene : its training views are used. config : options of the run that made the splats.
-    iterations : 0 returns the splats unchanged. rate : factor on all rates but that of the positions.
-    """
-    if not iterations:
-        return splats
+    """Train `splats` on with a scene's training views; their number does not change. config : see `fine_tuning`."""
     with tempfile.TemporaryDirectory() as folder:
         start = Path(folder) / "start.ply"
         splats.save(start)
-        trainer = Trainer(
-            scene,
-            fine_tuning(config, splats, iterations, start, rate),
-            device=device,
-            progress=without_messages(progress),
-        )
+        options = fine_tuning(config, splats, part.iterations(config), start, part.rate)
+        trainer = Trainer(scene, options, device=device, progress=without_messages(progress))
     return trainer.run().splats
 
 
@@ -124,7 +131,12 @@ def without_messages(progress: Callable[[Progress], None] | None) -> Callable[[P
 
 
 def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Path, rate: float = 1.0) -> TrainConfig:
-    """Return options that train the splats in the file `start`: full images, all bands, no strategy, no noise."""
+    """Return options that train the splats in the file `start`: full images, all bands, no strategy, no noise.
+
+    Parameters
+    ----------
+    config : options of the run that made the splats. rate : factor on all its last rates but that of the positions.
+    """
     short = config.replace(iterations=iterations)
     # Rates of short runs are larger: the short run gets options that lead to the rates of the long one.
     rates = {

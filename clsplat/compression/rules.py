@@ -10,13 +10,13 @@ from typing import Any
 from ..errors import InputError
 
 TOLERANCE = 0.1  # dB
-KNEE_SHARE, ROUNDS_SHARE, PARTS_SHARE = 0.5, 0.25, 0.25  # shares of the tolerance that the stages may use
-FIRST_CAP = 1000
-PATIENCE = 2  # bad doublings before growth stops, and bad rounds before the rounds stop
+ROUNDS_SHARE, PARTS_SHARE = 0.75, 0.25  # shares of the tolerance that the stages may use
+CHANCE = 2.0  # the loss and its standard error together may be this many tolerances
+PATIENCE = 2  # bad rounds before the rounds stop
 MIN_SPLATS = 50  # the rounds stop at this number
 
-# A model: "splats" and "psnr"; "cap" (growth and whole runs); "views", the PSNR of each view (growth); "fitted_psnr"
-# (with a limit of bytes); "lost", the PSNR below the best whole run (first of the rounds).
+# A model of the rounds: "splats"; "psnr", the mean, and "views", the PSNR of each validation view [dB]; "seconds";
+# with a limit of bytes "fitted_psnr", the mean of the model without parts, or None if it still has too many splats.
 ModelRow = dict[str, Any]
 
 
@@ -26,7 +26,7 @@ class BudgetOptions:
 
     Parameters
     ----------
-    tolerance : allowed loss of PSNR to the best model, on validation views [dB].
+    tolerance : allowed loss of PSNR to the model with all splats, on validation views [dB].
     target_psnr : replaces the tolerance: find the smallest model with this PSNR on validation views [dB].
     max_bytes : size of the file: find the best model that fits.
 
@@ -48,43 +48,6 @@ class BudgetOptions:
             raise InputError(f"max bytes {self.max_bytes}: must be at least 1")
 
 
-def growth_caps(largest: int) -> list[int]:
-    """Return the caps of the growth: doubling, and the largest itself."""
-    caps = [FIRST_CAP * 2**step for step in range(64) if FIRST_CAP * 2**step < largest]
-    return [*caps, largest]
-
-
-def growth_is_over(rows: list[ModelRow], options: BudgetOptions) -> bool:
-    """Return whether the last doublings gained too little, or the target is reached."""
-    if options.target_psnr is not None and rows and rows[-1]["psnr"] >= options.target_psnr:
-        return True
-    before = [row["psnr"] for row in rows[:-PATIENCE]]
-    return bool(before) and max(row["psnr"] for row in rows) - max(before) < options.tolerance
-
-
-def candidates(rows: list[ModelRow], options: BudgetOptions) -> list[int]:
-    """Return the possible knees: one cap, or two rising ones.
-
-    The larger one is the smallest cap that is as good as the best. The smaller one is the smallest cap that differs
-    from the best by less than the standard error: only whole runs can decide between the two.
-    """
-    for row in rows:
-        if options.target_psnr is not None and row["psnr"] >= options.target_psnr:
-            return [row["cap"]]
-    best = max(rows, key=lambda row: float(row["psnr"]))
-    gaps = [(row["cap"], best["psnr"] - row["psnr"], standard_error(best["views"], row["views"])) for row in rows]
-    share = KNEE_SHARE * options.tolerance
-    may_be = next(cap for cap, gap, error in gaps if gap <= max(share, error))
-    sure = next(cap for cap, gap, _ in gaps if gap <= share)
-    return sorted({may_be, sure})
-
-
-def knee_of(whole: list[ModelRow], options: BudgetOptions) -> int:
-    """Return the smallest cap of whole runs that is as good as the best of them."""
-    best = max(float(row["psnr"]) for row in whole)
-    return next(int(row["cap"]) for row in whole if row["psnr"] >= best - KNEE_SHARE * options.tolerance)
-
-
 def standard_error(first: list[float], second: list[float]) -> float:
     """Return the standard error of the mean difference of two models on the same views; 0 for a single view."""
     differences = [a - b for a, b in zip(first, second, strict=True)]
@@ -92,35 +55,44 @@ def standard_error(first: list[float], second: list[float]) -> float:
 
 
 def rounds_are_over(rows: list[ModelRow], options: BudgetOptions) -> bool:
-    """Return whether the last models were not good enough, or hardly a splat is left."""
-    last = rows[-PATIENCE:]
+    """Return whether the last models were not good enough, or hardly a splat is left.
+
+    Parameters
+    ----------
+    rows : the model with all splats, then the model after each round.
+    """
+    last = rows[1:][-PATIENCE:]
     return rows[-1]["splats"] <= MIN_SPLATS or (
         len(last) == PATIENCE and all(meets(row, rows, options) is False for row in last)
     )
 
 
 def meets(row: ModelRow, rows: list[ModelRow], options: BudgetOptions) -> bool | None:
-    """Return whether a model of the rounds is good enough compared with the others; None if it is still too large."""
-    floor = options.target_psnr
-    if floor is None:
-        floor = max(other["psnr"] for other in rows) - rounds_allowed(rows, options)
+    """Return whether a model of the rounds is good enough; None if it does not fit the limit of bytes yet.
+
+    A model is compared with the one with all splats, view by view. Its mean loss must be within the share of the
+    rounds. With few views the mean is uncertain, so the loss with its standard error must be below CHANCE tolerances.
+    """
     if options.max_bytes is not None and row["fitted_psnr"] is None:
         return None
-    return bool(row["psnr"] >= floor)
-
-
-def rounds_allowed(rows: list[ModelRow], options: BudgetOptions) -> float:
-    """Return the PSNR that rounds may lose [dB]: their share of the tolerance and the rest of the knee's share."""
-    return (KNEE_SHARE + ROUNDS_SHARE) * options.tolerance - float(rows[0].get("lost", KNEE_SHARE * options.tolerance))
+    if options.target_psnr is not None:
+        return bool(row["psnr"] >= options.target_psnr)
+    loss = rows[0]["psnr"] - row["psnr"]
+    uncertain = loss + standard_error(rows[0]["views"], row["views"])
+    return bool(loss <= ROUNDS_SHARE * options.tolerance and uncertain <= CHANCE * options.tolerance)
 
 
 def chosen_of(rows: list[ModelRow], options: BudgetOptions) -> int:
-    """Return the number of rounds that lead to the chosen model; if no model is good enough, to the best one."""
+    """Return the number of rounds that lead to the chosen model.
+
+    It is the smallest model that is good enough. With a limit of bytes it is the smallest one within the share of the
+    rounds of the best that fits. If no model is good enough, it is the best one.
+    """
     if options.max_bytes is not None:
         fitting = [row["fitted_psnr"] for row in rows if row["fitted_psnr"] is not None]
         if not fitting:
             return len(rows) - 1
-        floor = max(fitting) - rounds_allowed(rows, options)
+        floor = max(fitting) - ROUNDS_SHARE * options.tolerance
         if options.target_psnr is not None:
             floor = min(options.target_psnr, max(fitting))
         return max(i for i, row in enumerate(rows) if row["fitted_psnr"] is not None and row["fitted_psnr"] >= floor)

@@ -13,6 +13,7 @@ from ..files.json_file import read_object, write_json
 from ..files.lock import folder_lock
 from ..splats.splats import Splats
 from ..training.config import FREE_OPTIONS, TrainConfig
+from ..training.folder import ModelFolder
 from ..training.stored_run import DAMAGE, StoredRun
 from .rules import BudgetOptions
 
@@ -20,7 +21,7 @@ FILE, FOLDER = "budget.json", "budget"
 
 
 class BudgetState:
-    """budget.json in a model's folder, written after every stage, and the PLY files of the stages.
+    """budget.json in a model's folder, written after every stage, and the models and runs of the stages.
 
     Attributes
     ----------
@@ -63,13 +64,26 @@ class BudgetState:
         self.values[stage] = value
         write_json(self.path, self.values)
 
-    def save(self, name: str, splats: Splats) -> None:
-        """Save the model of a stage."""
-        splats.save(self.folder / f"{name}.ply")
+    def save(self, name: str, splats: Splats) -> Path:
+        """Save the model of a stage, and return its file."""
+        path = self.folder / f"{name}.ply"
+        splats.save(path)
+        return path
 
     def model(self, name: str) -> Splats:
         """Load the model of a finished stage."""
         return Splats.load(self.folder / f"{name}.ply")
+
+    def run_folder(self, name: str) -> ModelFolder:
+        """Return the folder of a stage's run."""
+        return ModelFolder(self.folder / name)
+
+    def can_resume(self, folder: ModelFolder, config: TrainConfig) -> bool:
+        """Whether a stage's run has a checkpoint of the same options. If the model's folder was moved, it has not."""
+        if not folder.checkpoint_path.is_file():
+            return False
+        stored = TrainConfig.from_json(folder.read_config()["config"]).to_json()
+        return all(stored[key] == value for key, value in config.to_json().items() if key not in FREE_OPTIONS)
 
     def remove(self) -> None:
         """Delete budget.json and the models of the stages."""

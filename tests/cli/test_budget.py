@@ -113,7 +113,8 @@ def test_a_search_writes_a_smaller_model(found: tuple[Path, str]) -> None:
     splats = Splats.load(last)
     assert len(splats) == report["final"]["splats"] < 150
     assert f"{last}: {len(splats)} splats, " in output
-    assert "growth: more than 150 splats gain too little" in output
+    assert f"rounds: {len(splats)} of 150 splats remain" in output
+    assert f"chart of the rounds: {folder / 'rounds.png'}" in output
     assert "test views (2): PSNR " in output
     entry = json.loads(clsplat("info", folder, "--json"))
     assert entry["splats"] == len(splats)

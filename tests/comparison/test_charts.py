@@ -9,22 +9,16 @@ from typing import Any
 import pytest
 from sweep_records import length_records, run_record, seed_records, sweep_records
 
-from clsplat.comparison import charts, sweep_charts
-from clsplat.comparison.charts import arithmetic_chart, growth_chart, seeds_chart
+from clsplat.comparison import charts, search_chart, sweep_charts
+from clsplat.comparison.charts import arithmetic_chart, seeds_chart
 from clsplat.comparison.length_rows import length_rows
+from clsplat.comparison.search_chart import draw_search, rounds_chart
 from clsplat.comparison.sweep_charts import equal_chart, length_chart, size_chart, time_chart
 from clsplat.comparison.sweep_rows import arithmetic_rows, curve_rows, equal_rows, point_rows, seed_rows
 from clsplat.comparison.sweep_tables import arithmetic_table
 from clsplat.errors import InputError, OutputError
 from clsplat.evaluation.chart_style import _STYLE, chart_paths, drawing, looks, place_labels, shape_colour, short_count
 from clsplat.splats.shapes import SHAPES
-
-CURVE: list[dict[str, Any]] = [
-    {"splats": 4000, "psnr": 21.5},
-    {"splats": 1000, "psnr": 18.0},
-    {"splats": 9000, "psnr": 21.6},
-    {"splats": 3000, "psnr": 21.45, "label": "pruned"},
-]
 
 
 @pytest.fixture
@@ -44,7 +38,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         def __exit__(self, *error: Any) -> Any:
             return self.context.__exit__(*error)
 
-    for module in (charts, sweep_charts):
+    for module in (charts, search_chart, sweep_charts):
         monkeypatch.setattr(module, "drawing", Kept)
     monkeypatch.setitem(_STYLE, "savefig.dpi", 40)
     return figures
@@ -58,29 +52,33 @@ def legend_of(figure: Any) -> list[str]:
     return [text.get_text() for text in figure.legends[0].texts]
 
 
-def test_growth_chart(tmp_path: Path, drawn: list[Any]) -> None:
-    paths = growth_chart(CURVE, 4000, tmp_path / "growth")
-    assert [path.name for path in paths] == ["growth.png", "growth.svg"]
+def search_report() -> dict[str, Any]:
+    rows = [(9000, [20.0, 23.0]), (6750, [20.1, 23.1]), (5062, [19.0, 22.4])]
+    return {
+        "rounds": [{"splats": n, "psnr": sum(views) / 2, "views": views} for n, views in rows],
+        "chosen": 1,
+        "held_out": {"splats": 6750, "psnr_pruned": 21.55},
+    }
+
+
+def test_rounds_chart(tmp_path: Path, drawn: list[Any]) -> None:
+    paths = rounds_chart(search_report(), tmp_path / "rounds")
+    assert [path.name for path in paths] == ["rounds.png", "rounds.svg"]
     assert paths[0].read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in paths[1].read_bytes()[:600]
     (axes,) = drawn[0].axes
-    assert list(axes.lines[0].get_xdata()) == [1000, 4000, 9000], "the curve rises and has no named points"
+    (curve, _, (bars,)) = axes.containers[0]
+    assert (list(curve.get_xdata()), list(curve.get_ydata())) == ([9000, 6750, 5062], pytest.approx([21.5, 21.6, 20.7]))
+    heights = [segment[1][1] - segment[0][1] for segment in bars.get_segments()]
+    assert heights == pytest.approx([0, 0, 2 * 0.2]), "losses of 1.0 and 0.6 dB: their standard error is 0.2"
     legend = [text.get_text() for text in axes.get_legend().texts]
-    assert legend == ["growth", "knee: 4k splats, 21.50 dB", "pruned: 3k splats, 21.45 dB"]
+    assert legend == ["chosen: 6.75k splats, 21.60 dB", "without parts: 6.75k splats, 21.55 dB", "rounds of pruning"]
     assert "[dB]" in axes.get_ylabel()
 
 
 def test_charts_are_the_same_bytes(tmp_path: Path, drawn: list[Any]) -> None:
-    first, second = (growth_chart(CURVE, None, tmp_path / name) for name in "ab")
+    first, second = (rounds_chart(search_report(), tmp_path / name) for name in "ab")
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
-
-
-def test_a_knee_lies_on_the_curve(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="knee"):
-        growth_chart(CURVE, 3000, tmp_path / "growth")
-    with pytest.raises(InputError, match="needs a curve"):
-        growth_chart([], None, tmp_path / "growth")
-    assert not list(tmp_path.iterdir())
 
 
 def test_size_chart(tmp_path: Path, drawn: list[Any]) -> None:
@@ -252,7 +250,8 @@ def test_suffixes_are_taken_off_once() -> None:
 def test_a_missing_matplotlib_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(OutputError, match=r"pip install 'clsplat\[charts\]'"):
-        growth_chart(CURVE, None, tmp_path / "growth")
+        rounds_chart(search_report(), tmp_path / "rounds")
+    assert draw_search(search_report(), tmp_path) == [], "a search without a chart is a search"
 
 
 def test_an_unfinished_drawing_leaves_nothing(tmp_path: Path) -> None:

@@ -3,114 +3,97 @@
 from __future__ import annotations
 
 import json
-import re
+import signal
+import threading
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import clsplat
+from clsplat.cameras.cameras_json import read_cameras
 from clsplat.compression import search
 from clsplat.compression.prune_and_refine import fine_tuning
-from clsplat.compression.rules import (
-    BudgetOptions,
-    candidates,
-    chosen_of,
-    growth_caps,
-    growth_is_over,
-    knee_of,
-    meets,
-    rounds_allowed,
-    rounds_are_over,
-    standard_error,
-)
-from clsplat.compression.search import _Search, train_budget
-from clsplat.compression.state import BudgetState
+from clsplat.compression.rules import BudgetOptions, chosen_of, meets, rounds_are_over, standard_error
+from clsplat.compression.search import train_budget
 from clsplat.errors import InputError, OutputError
 from clsplat.scenes.scene import Scene
+from clsplat.scenes.split import hold_out
 from clsplat.splats.splats import Splats
+from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 from clsplat.training.folder import ModelFolder
 from clsplat.training.log import Progress
+from clsplat.training.run import train
+from clsplat.training.trainer import Trainer
 
 AUTO = BudgetOptions()
 CONFIG = TrainConfig(iterations=30, cap_max=200, sh_degree=1, densify_interval=5)
 
 
 def rows(*psnr: float, **more: Any) -> list[dict[str, Any]]:
+    """Return the model with all splats and those after its rounds; all views have the same PSNR."""
     return [
-        {"cap": 1000 * 2**i, "splats": 1000 * 2**i, "psnr": value, "views": [value], **more}
+        {"splats": round(10_000 * 0.75**i), "psnr": value, "views": [value, value], **more}
         for i, value in enumerate(psnr)
     ]
 
 
-def test_caps_double_up_to_the_largest() -> None:
-    assert growth_caps(9000) == [1000, 2000, 4000, 8000, 9000]
-    assert growth_caps(8000) == [1000, 2000, 4000, 8000]
-    assert growth_caps(300) == [300]
-
-
-def test_growth_goes_on_while_two_doublings_gain() -> None:
-    assert not growth_is_over([], AUTO)
-    assert not growth_is_over(rows(20.0, 20.0), AUTO)
-    assert growth_is_over(rows(20.0, 20.0, 20.05), AUTO)
-    assert not growth_is_over(rows(20.0, 19.9, 20.2), AUTO)
-    assert growth_is_over(rows(20.0, 21.0, 20.8, 21.05), AUTO)
-    assert growth_is_over(rows(20.0, 25.0), BudgetOptions(target_psnr=24))
-
-
-def test_the_knee_is_the_smallest_cap_that_is_good_enough() -> None:
-    growth = rows(20.0, 21.0, 21.5, 21.53)
-    assert candidates(growth, AUTO) == [4000]
-    assert candidates(growth, BudgetOptions(1.2)) == [2000]
-    assert candidates(growth, BudgetOptions(target_psnr=20.5)) == [2000]
-    assert candidates(growth, BudgetOptions(target_psnr=30)) == [4000]
-    assert knee_of(rows(21.0, 21.04), AUTO) == 1000
-    assert knee_of(rows(21.0, 21.06), AUTO) == 2000
-    assert knee_of(rows(21.06, 21.0), AUTO) == 1000
-
-
-def test_whole_runs_decide_where_views_disagree() -> None:
-    noisy, clear = rows(20.0, 20.3), rows(20.0, 20.3)
-    for row, views in zip(noisy, ([18.0, 20.0, 22.0], [19.0, 19.9, 22.0]), strict=True):
-        row["views"] = views
-    for row, views in zip(clear, ([18.0, 20.0, 22.0], [18.3, 20.3, 22.3]), strict=True):
-        row["views"] = views
-    assert standard_error(noisy[0]["views"], noisy[1]["views"]) == pytest.approx(np.std([1, -0.1, 0], ddof=1) / 3**0.5)
-    assert candidates(noisy, AUTO) == [1000, 2000]
-    assert candidates(clear, AUTO) == [2000]
-
-
-def test_rounds_go_on_until_two_have_lost_too_much() -> None:
+def test_rounds_go_on_until_two_in_a_row_have_lost_too_much() -> None:
     assert not rounds_are_over(rows(30.0), AUTO)
-    assert not rounds_are_over(rows(30.0, 29.0), AUTO)
+    assert not rounds_are_over(rows(30.0, 29.0), AUTO), "one bad round may be chance"
     assert not rounds_are_over(rows(30.0, 29.0, 30.0, 29.9), AUTO)
     assert rounds_are_over(rows(30.0, 30.0, 29.9, 29.9), AUTO)
-    assert rounds_are_over([{"splats": 50, "psnr": 30.0}], AUTO)
+    assert rounds_are_over([{"splats": 50, "psnr": 30.0}], AUTO), "hardly a splat is left"
     assert not rounds_are_over(rows(30.0, 20.0, 10.0, fitted_psnr=None), BudgetOptions(max_bytes=1))
+    assert rounds_are_over(rows(30.0, 29.9, 29.9, fitted_psnr=20.0), BudgetOptions(max_bytes=1))
+
+
+def test_a_target_ends_the_rounds() -> None:
+    target = BudgetOptions(target_psnr=25)
+    assert not rounds_are_over(rows(30.0, 28.0, 26.0), target)
+    assert not rounds_are_over(rows(30.0, 24.0, 26.0, 24.9), target)
+    assert rounds_are_over(rows(30.0, 26.0, 24.9, 24.0), target)
+    assert chosen_of(rows(30.0, 26.0, 24.9, 24.0), target) == 1
+    unreachable = rows(20.0, 21.0, 19.0)
+    assert rounds_are_over(unreachable, target)
+    assert chosen_of(unreachable, target) == 1, "the best"
 
 
 def test_the_fewest_splats_that_are_good_enough() -> None:
-    shrinking = rows(30.0, 30.2, 30.1, 29.96, 29.8)
-    assert [meets(row, shrinking, AUTO) for row in shrinking] == [False, True, False, False, False]
-    assert chosen_of(shrinking, AUTO) == 1, "the best seen counts, not the first"
-    assert chosen_of(shrinking, BudgetOptions(1.0)) == 3
-    knee = [shrinking[0] | {"lost": 0.0}, *shrinking[1:]]
-    assert rounds_allowed(shrinking, AUTO) == pytest.approx(0.025)
-    assert rounds_allowed(knee, AUTO) == pytest.approx(0.075), "the knee has left its half"
-    assert chosen_of(knee, BudgetOptions(0.3)) > chosen_of(shrinking, BudgetOptions(0.3))
+    shrinking = rows(30.0, 30.2, 30.1, 29.94, 29.92, 29.8)
+    assert [meets(row, shrinking, AUTO) for row in shrinking] == [True, True, True, True, False, False]
+    assert chosen_of(shrinking, AUTO) == 3, "rounds have three quarters of the tolerance"
+    assert chosen_of(shrinking, BudgetOptions(0.3)) == 5
     assert chosen_of(shrinking, BudgetOptions(target_psnr=30.15)) == 1
-    assert chosen_of(shrinking, BudgetOptions(target_psnr=40)) == 1, "out of reach: the best"
+
+
+def test_a_limit_of_bytes_takes_the_best_that_fits() -> None:
     limited = rows(30.0, 30.2, 30.1, 29.96, 29.8)
-    for row, fitted in zip(limited, (None, None, 25.0, 28.0, 27.5), strict=True):
+    for row, fitted in zip(limited, (None, None, 25.0, 28.0, 27.95), strict=True):
         row["fitted_psnr"] = fitted
-    assert chosen_of(limited, BudgetOptions(max_bytes=1000)) == 3
-    assert chosen_of(limited, BudgetOptions(max_bytes=1000, target_psnr=27.2)) == 4
+    assert chosen_of(limited, BudgetOptions(max_bytes=1000)) == 4, "as good as the best, and smaller"
+    assert chosen_of(limited, BudgetOptions(0.05, max_bytes=1000)) == 3
+    assert chosen_of(limited, BudgetOptions(max_bytes=1000, target_psnr=24.0)) == 4
     assert meets(limited[0], limited, BudgetOptions(max_bytes=1000)) is None
     assert chosen_of(rows(30.0, 29.0, fitted_psnr=None), BudgetOptions(max_bytes=1)) == 1
+
+
+def test_views_that_disagree_keep_more_splats() -> None:
+    """The mean loss of both is 0.05 dB; one is within chance."""
+    sure, unsure = rows(30.0, 29.95), rows(30.0, 29.95)
+    for row, views in zip(
+        (*sure, *unsure), ([29, 30, 31], [28.95, 29.94, 30.96], [29, 30, 31], [29.3, 29.55, 31]), strict=True
+    ):
+        row["views"] = views
+    differences = [-0.3, 0.45, 0.0]
+    assert standard_error(unsure[0]["views"], unsure[1]["views"]) == pytest.approx(np.std(differences, ddof=1) / 3**0.5)
+    assert standard_error([1.0], [2.0]) == 0
+    assert meets(sure[1], sure, AUTO)
+    assert not meets(unsure[1], unsure, AUTO)
+    assert (chosen_of(sure, AUTO), chosen_of(unsure, AUTO)) == (1, 0)
 
 
 @pytest.mark.parametrize(
@@ -160,42 +143,48 @@ def searched(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> clsplat.
 
 def test_a_search_finds_a_smaller_model(searched: clsplat.Budgeted) -> None:
     report = searched.report
-    assert searched.finished
-    assert report["knee"] == 200 == report["growth"][-1]["cap"]
-    assert report["rounds"][0]["splats"] == report["refit"]["splats"] == 200
     rounds = report["chosen"]
+    assert report["rounds"][0]["splats"] == 200
     assert rounds >= 1
     assert report["rounds"][1]["splats"] == 150, "a round removes a quarter"
     assert len(searched.splats) == report["rounds"][rounds]["splats"] == report["final"]["splats"]
     assert report["held_out"]["psnr_pruned"] >= report["held_out"]["psnr"] - 0.1
     assert report["final"]["bytes"] == searched.path.stat().st_size
     assert report["final"]["missed"] is None
-    loaded = Splats.load(searched.path)
-    np.testing.assert_array_equal(loaded.mean, searched.splats.mean)
-    folder = searched.path.parents[2]
-    assert json.loads((folder / "budget.json").read_text()) == report
-    assert json.loads((folder / "config.json").read_text())["config"]["cap_max"] == 200
-    assert not (folder / "budget").exists(), "models of stages are removed"
+    assert searched.seconds > 0
+    np.testing.assert_array_equal(Splats.load(searched.path).mean, searched.splats.mean)
+
+
+def test_a_search_leaves_the_files_of_a_run(searched: clsplat.Budgeted, scene: Scene) -> None:
+    folder = ModelFolder(searched.path.parents[2])
+    assert json.loads((folder.path / "budget.json").read_text()) == searched.report
+    assert not (folder.path / "budget").exists(), "models and runs of stages are removed"
+    config = TrainConfig.from_json(folder.read_config()["config"])
+    assert (config.cap_max, config.iterations, config.start.init) == (200, 30, "sfm"), "the options of the caller"
+    names = {camera.name for camera in read_cameras(folder.cameras_path)}
+    assert names == {Path(view.name).stem for view in scene.views} or names == {view.name for view in scene.views}
+    assert len(folder.log_path.read_text().splitlines()) >= 1
+    assert searched.path == folder.ply_path(30 + 6 * searched.report["chosen"] + 15 + 3), "all its iterations"
 
 
 class Stop:
-    """A progress callback that stops the search at the start of its `number`th stage."""
+    """A progress callback that stops the search at its `number`th report that a training run makes."""
 
     def __init__(self, number: int) -> None:
         self.left = number
 
     def __call__(self, progress: Progress) -> None:
-        self.left -= bool(re.match(r"step \d of 5, (growth|held out|round|last part|refit)", progress.message))
+        self.left -= not progress.message
         if not self.left:
             raise KeyboardInterrupt
 
 
 def test_an_interrupted_search_goes_on(scene: Scene, searched: clsplat.Budgeted, tmp_path: Path) -> None:
-    """A search that stops at the start of every stage in turn ends with the same bits."""
+    """A search that stops in one run after the other ends with the same bits."""
     resume, stops = False, 0
     while True:
         try:
-            again = train_budget(scene, CONFIG, BudgetOptions(0.4), Stop(5), output=tmp_path, resume=resume)
+            again = train_budget(scene, CONFIG, BudgetOptions(0.4), Stop(4), output=tmp_path, resume=resume)
             break
         except KeyboardInterrupt:
             resume, stops = True, stops + 1
@@ -204,49 +193,72 @@ def test_an_interrupted_search_goes_on(scene: Scene, searched: clsplat.Budgeted,
     assert again.path.read_bytes() == searched.path.read_bytes()
 
 
-def search_of(scene: Scene, folder: Path, **values: Any) -> _Search:
-    """Return a search with finished stages."""
-    state = BudgetState(folder)
-    state.begin(CONFIG, AUTO, {})
-    state.values |= values
-    return _Search(scene, CONFIG, AUTO, None, state, ModelFolder(folder))
+def test_ctrl_c_in_the_whole_run_keeps_its_iterations(
+    scene: Scene, searched: clsplat.Budgeted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The whole run is the longest stage: it goes on from its checkpoint."""
+    with monkeypatch.context() as patch:
+        trained_runs(patch, visit=press_ctrl_c_at_10)
+        with pytest.raises(KeyboardInterrupt):
+            train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path)
+    reached = Checkpoint.load(tmp_path / "budget" / "whole" / "checkpoint.npz").iteration
+    assert 0 < reached < CONFIG.iterations
+    runs = trained_runs(monkeypatch)
+    again = train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path, resume=True)
+    assert [run["resume"] for run in runs] == [True] + [False] * (len(runs) - 1)
+    assert again.path.read_bytes() == searched.path.read_bytes()
 
 
-def test_held_out_views_are_not_trained_on(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trained: list[Scene] = []
-    splats = Splats.from_points(np.eye(3), np.full((3, 3), 0.5), sh_degree=0)
-
-    class Runs:
-        def __init__(self, scene: Scene, *args: Any, **options: Any) -> None:
-            trained.append(scene)
-
-        def run(self) -> Any:
-            return SimpleNamespace(splats=splats, seconds=1.0)
-
-    monkeypatch.setattr(search, "Trainer", Runs)
-    stages = search_of(scene, tmp_path)
-    stages.grow()
-    judges = {view.name for view in stages.validation.views}
-    assert trained
-    for one in trained:
-        names = {view.name for view in one.train}
-        assert names
-        assert not names & (judges | scene.test_names)
+def test_a_moved_search_goes_on(
+    scene: Scene, searched: clsplat.Budgeted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A round has the path of its first splats among its options, so its checkpoint is of no use elsewhere."""
+    with monkeypatch.context() as patch:
+        trained_runs(patch, visit=press_ctrl_c_in_a_round)
+        with pytest.raises(KeyboardInterrupt):
+            train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path / "here")
+    assert (tmp_path / "here" / "budget" / "round_1_0" / "checkpoint.npz").is_file()
+    (tmp_path / "here").rename(tmp_path / "there")
+    again = train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path / "there", resume=True)
+    assert again.path.read_bytes() == searched.path.read_bytes()
 
 
-def test_the_refit_has_all_views_and_the_cap_of_the_knee(
+def press_ctrl_c_in_a_round(trainer: Trainer, stop: threading.Event) -> None:
+    if trainer.config.iterations < CONFIG.iterations:
+        signal.raise_signal(signal.SIGINT)
+
+
+def press_ctrl_c_at_10(trainer: Trainer, stop: threading.Event) -> None:
+    if trainer.iteration == 10:
+        signal.raise_signal(signal.SIGINT)
+
+
+def trained_runs(monkeypatch: pytest.MonkeyPatch, **more: Any) -> list[dict[str, Any]]:
+    """Return a list that gets scene, config and options of each run of a search. more : further options of `train`."""
+    runs: list[dict[str, Any]] = []
+
+    def recorded(scene: Scene, config: TrainConfig, progress: Any, **options: Any) -> Any:
+        runs.append({"scene": scene, "config": config, **options})
+        return train(scene, config, progress, **options, **more)
+
+    monkeypatch.setattr(search, "train", recorded)
+    return runs
+
+
+def test_held_out_views_are_seen_in_the_last_stage_only(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    runs: list[tuple[Scene, TrainConfig]] = []
-
-    def stops(scene: Scene, config: TrainConfig, *args: Any, **options: Any) -> None:
-        runs.append((scene, config))
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(search, "train", stops)
-    with pytest.raises(KeyboardInterrupt):
-        search_of(scene, tmp_path, candidates=[70], knee=70, chosen=0, thresholds={}).run()
-    assert runs == [(scene, CONFIG.replace(cap_max=70))]
+    runs = trained_runs(monkeypatch)
+    train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path)
+    judges = hold_out(scene).test_names
+    assert judges
+    for run in runs:
+        names = {view.name for view in run["scene"].train}
+        last = Path(run["output"]).name.startswith("all_views")
+        assert names
+        assert not names & scene.test_names
+        assert (judges <= names) if last else not names & judges
+    assert [Path(run["output"]).name for run in runs][-2:] == ["all_views_0", "all_views_1"]
 
 
 def test_targets_out_of_reach_keep_the_best(scene: Scene, tmp_path: Path) -> None:

@@ -118,31 +118,24 @@ def test_systems(tmp_path: Path, capture_folder: Path) -> None:
 def test_budget(tmp_path: Path, capture_folder: Path) -> None:
     scene = capture_folder
     environment = os.environ | {"CLSPLAT_DATA": str(scene.parent)}
-    out = tmp_path / "budget"
-    command = [sys.executable, str(BENCHMARKS / "budget.py"), "--out", str(out)]
+    out = tmp_path / "budget.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "budget.py"), "--out", str(out), "--cases", f"{scene.name}:-1:0:0"]
     for _ in range(2):
-        subprocess.run(
-            [*command, "--smoke", "--scenes", scene.name, "--work", str(tmp_path / "work")],
+        printed = subprocess.run(
+            [*command, "--smoke", "--work", str(tmp_path / "work")],
             env=environment,
             capture_output=True,
             text=True,
             check=True,
-        )
-    (row,) = [json.loads(line) for line in (out / "runs.jsonl").read_text().splitlines()]
-    assert row["system"].startswith("auto skew-normal")
-    assert row["splats"] == row["budget"]["final"]["splats"] <= 60
-    assert {"device", "driver", "schedule", "commit", "psnr", "render_ms"} <= set(row)
-    best = row | {
-        "system": "skew-normal",
-        "splats": 2 * row["splats"],
-        "bytes": 4 * row["bytes"],
-        "psnr": row["psnr"] + 0.5,
-        "seconds": 0.5 * row["seconds"],
-    }
-    (tmp_path / "frontier").mkdir()
-    (tmp_path / "frontier" / "runs.jsonl").write_text(json.dumps(best) + "\n")
-    printed = subprocess.run([*command, "--table"], capture_output=True, text=True, check=True).stdout
-    assert "| -0.50 | 50% | 25% | 2.0 |" in printed.splitlines()[-1], printed
+        ).stdout
+    (row,) = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [run["cap"] for run in row["plain"]] == [60, 24, 6]
+    assert row["splats"] == row["search"]["final"]["splats"] <= 60
+    assert {"device", "driver", "schedule", "commit", "psnr", "seconds"} <= set(row)
+    best = max(row["plain"], key=lambda run: run["psnr"])
+    cells = [cell.strip() for cell in printed.splitlines()[-1].split("|")[1:-1]]
+    assert cells[2:6] == ["validation", "1", f"{best['cap']}: {best['psnr']:.2f}", f"{row['psnr']:.2f}"]
+    assert cells[6:8] == [f"{row['splats'] / best['splats']:.0%}", f"{row['bytes'] / best['bytes']:.0%}"]
 
 
 @pytest.mark.slow
