@@ -19,6 +19,7 @@ from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import decide
 from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
+from clsplat.training.quality import NORMAL, QUALITIES, quality
 from clsplat.training.stored_run import load_recorded_scene, read_options_file
 from clsplat.viewer.options import ServerOptions
 
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 SECTIONS = {
     "Common options": (
         "model_path",
+        "quality_name",
         "iterations",
         "cap_max",
         "resolution",
@@ -78,6 +80,14 @@ SECTIONS = {
 }
 
 
+def _qualities() -> str:
+    """Return the values of the dial, for its help."""
+    return "; ".join(
+        f"{name} has {values['iterations']} iterations and at most {values['cap_max']} splats"
+        for name, values in QUALITIES.items()
+    )
+
+
 @click.command(cls=TrainingCommand, sections=SECTIONS)
 @click.argument("scene", required=False, type=PATH)
 @click.option(
@@ -90,6 +100,12 @@ SECTIONS = {
 )
 @scene_options
 @hiding_options
+@click.option(
+    "--quality",
+    "quality_name",
+    type=click.Choice(list(QUALITIES)),
+    help=f"How long to train, and with how many splats: {_qualities()}. Flags replace them.  [default: {NORMAL}]",
+)
 @click.option("--eval", is_flag=True, help="Hold test views out of training, and measure them at the end.")
 @split_options
 @click.option("--resume", is_flag=True, help="Continue from the model's checkpoint, with the options of its run.")
@@ -128,6 +144,7 @@ def train(
     allow_changed_photos: bool,
     overwrite: bool,
     quiet: bool,
+    quality_name: str | None,
     preset: str | None,
     config_file: Path | None,
     view: bool,
@@ -160,6 +177,8 @@ def train(
         raise click.UsageError(f"two scenes: {scene} and {source_path}")
     if allow_changed_photos and not resume:
         raise click.UsageError("--allow-changed-photos is for --resume")
+    if resume and quality_name is not None:
+        raise click.UsageError("--quality is for new runs: to train longer, give --resume and --iterations")
     if stay is not None and not view:
         raise click.UsageError("--stay and --no-stay need --view")
     path = scene or source_path
@@ -169,7 +188,8 @@ def train(
     if view and search is not None:
         raise click.UsageError("--view shows one run: remove --budget, or show the result with clsplat view")
     flags = config_values(ctx, values)
-    options = flags if config_file is None else read_options_file(config_file) | flags
+    options = {} if config_file is None else read_options_file(config_file)
+    options |= ({} if quality_name is None else quality(quality_name)) | flags
     if preset is not None:
         options = with_preset(preset, options)
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}

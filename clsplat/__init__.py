@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .splats.splats import Splats
     from .training.config import TrainConfig
     from .training.progress import TrainingDisplay
+    from .training.quality import quality
     from .training.run import Model, train
 
 
@@ -56,6 +57,7 @@ _HOME = {
     "Budgeted": "compression.search",
     "train_budget": "compression.search",
     "TrainingDisplay": "training.progress",
+    "quality": "training.quality",
     "LoadedModel": "models.model",
     "SceneChoice": "models.model",
     "load_model": "models.model",
@@ -111,6 +113,7 @@ __all__ = [
     "load_scene",
     "make_demo_scene",
     "prune_model",
+    "quality",
     "reconstruct",
     "render_views",
     "resume",

@@ -8,6 +8,10 @@ from pathlib import Path
 import pytest
 from cli_runner import CAP, clsplat, error_of, run
 
+from clsplat.errors import InputError
+from clsplat.training.config import TrainConfig
+from clsplat.training.quality import QUALITIES, quality
+
 
 def config_of(model: Path) -> dict[str, object]:
     config: dict[str, object] = json.loads((model / "config.json").read_text())["config"]
@@ -48,6 +52,30 @@ def test_a_wrong_file_of_options_is_named(scene: Path, tmp_path: Path, text: str
     assert expected in message
     assert str(file) in message
     assert not (tmp_path / "model").exists()
+
+
+def test_the_dial_of_quality(scene: Path, tmp_path: Path) -> None:
+    """It replaces a file of options, and flags replace it. The runs are short, so a flag is always there."""
+    file = tmp_path / "long.json"
+    file.write_text('{"iterations": 9, "cap_max": 50, "sh_degree": 1}')
+    clsplat("train", scene, "-m", tmp_path / "a", "--quality", "draft", "--config", file, "--iterations", 2, "-q")
+    config = config_of(tmp_path / "a")
+    assert (config["iterations"], config["cap_max"], config["sh_degree"]) == (2, QUALITIES["draft"]["cap_max"], 1)
+    options = ("--quality", "best", "--preset", "3dgs", "--iterations", 2, "--cap-max", 60)
+    clsplat("train", scene, "-m", tmp_path / "b", *options, "-q")
+    assert (config_of(tmp_path / "b")["iterations"], config_of(tmp_path / "b")["cap_max"]) == (2, 60)
+    message = error_of("train", "--resume", "-m", tmp_path / "b", "--quality", "best", code=2)
+    assert "--quality is for new runs: to train longer, give --resume and --iterations" in message
+    assert "'great'" in error_of("train", scene, "--quality", "great", code=2)
+
+
+def test_the_qualities_rise() -> None:
+    draft, normal, best = (TrainConfig(**quality(name)) for name in ("draft", "normal", "best"))
+    assert normal == TrainConfig()
+    assert draft.iterations < normal.iterations < best.iterations
+    assert draft.cap_max < normal.cap_max < best.cap_max
+    with pytest.raises(InputError, match="unknown quality 'good': choose one of draft, normal, best"):
+        quality("good")
 
 
 def test_train_says_what_it_decided_by_the_scene(scene: Path, tmp_path: Path) -> None:

@@ -141,6 +141,7 @@ SANE = {
     "--keys": ("0,3,5",),
     "--systems": ("3dgs,3d-hgs", "default"),
     "--preset": ("3dgs", "sss"),
+    "--quality": ("draft", "best"),
     "--test-list": ("files/test.txt",),
     "--config": ("files/config.json",),
     "--cameras": ("files/cameras.json", "files/path.json"),
