@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..compression.rules import standard_error
+from ..compression.rules import loss_of
 from ..errors import OutputError
 from ..evaluation.chart_style import INK, MARK, chart_paths, drawing, log_axis, short_count
 
@@ -31,8 +31,8 @@ def draw_search(report: Mapping[str, Any], folder: Path) -> list[Path]:
 def rounds_chart(report: Mapping[str, Any], out: Path) -> list[Path]:
     """Draw the validation PSNR of the models of a search against their splats.
 
-    Bars are the standard error of the mean loss against the whole run, over the validation views. A circle marks the
-    chosen model, and a star what is left of it without parts.
+    Bars are the standard error of the mean loss against the best of the models, over the validation views. A circle
+    marks the chosen model, and a star what is left of it without parts.
 
     Parameters
     ----------
@@ -44,14 +44,14 @@ def rounds_chart(report: Mapping[str, Any], out: Path) -> list[Path]:
     """
     rows, held_out = report["rounds"], report["held_out"]
     chosen = rows[report["chosen"]]
-    errors = [standard_error(rows[0]["views"], row["views"]) for row in rows]
+    errors = [loss_of(row, rows)[1] for row in rows]
     counts, values = [row["splats"] for row in rows], [row["psnr"] for row in rows]
     with drawing(out, 6.4, 4.0) as figure:
         axes = figure.add_subplot(xlabel="splats", ylabel="validation PSNR [dB]", xscale="log")
         axes.errorbar(
             counts, values, yerr=errors, marker="o", color=INK, capsize=2, linewidth=1.5, label="rounds of pruning"
         )
-        axes.axhline(values[0], color=INK, linewidth=0.8, linestyle=(0, (4, 2)), zorder=0.5)
+        axes.axhline(max(values), color=INK, linewidth=0.8, linestyle=(0, (4, 2)), zorder=0.5)
         for kind, row, looks in (
             ("chosen", chosen, {"marker": "o", "markersize": 11, "markerfacecolor": "none", "markeredgewidth": 2}),
             (

@@ -11,7 +11,6 @@ from ..errors import InputError
 
 TOLERANCE = 0.1  # dB
 ROUNDS_SHARE, PARTS_SHARE = 0.75, 0.25  # shares of the tolerance that the stages may use
-CHANCE = 2.0  # the loss and its standard error together may be this many tolerances
 PATIENCE = 2  # bad rounds before the rounds stop
 MIN_SPLATS = 50  # the rounds stop at this number
 
@@ -54,47 +53,51 @@ def standard_error(first: list[float], second: list[float]) -> float:
     return statistics.stdev(differences) / math.sqrt(len(differences)) if len(differences) > 1 else 0.0
 
 
+def loss_of(row: ModelRow, rows: list[ModelRow]) -> tuple[float, float]:
+    """Return how much less PSNR a model has than the best of the rounds, and the standard error of that loss [dB]."""
+    best = max(rows, key=lambda other: float(other["psnr"]))
+    return best["psnr"] - row["psnr"], standard_error(best["views"], row["views"])
+
+
 def rounds_are_over(rows: list[ModelRow], options: BudgetOptions) -> bool:
-    """Return whether the last models were not good enough, or hardly a splat is left.
+    """Return whether the last models lost too much, or hardly a splat is left.
 
     Parameters
     ----------
     rows : the model with all splats, then the model after each round.
     """
     last = rows[1:][-PATIENCE:]
-    return rows[-1]["splats"] <= MIN_SPLATS or (
-        len(last) == PATIENCE and all(meets(row, rows, options) is False for row in last)
-    )
+    if rows[-1]["splats"] <= MIN_SPLATS:
+        return True
+    if options.max_bytes is not None and any(row["fitted_psnr"] is None for row in last):
+        return False
+    return len(last) == PATIENCE and all(lost_too_much(row, rows, options) for row in last)
 
 
-def meets(row: ModelRow, rows: list[ModelRow], options: BudgetOptions) -> bool | None:
-    """Return whether a model of the rounds is good enough; None if it does not fit the limit of bytes yet.
-
-    A model is compared with the one with all splats, view by view. Its mean loss must be within the share of the
-    rounds. With few views the mean is uncertain, so the loss with its standard error must be below CHANCE tolerances.
-    """
-    if options.max_bytes is not None and row["fitted_psnr"] is None:
-        return None
+def lost_too_much(row: ModelRow, rows: list[ModelRow], options: BudgetOptions) -> bool:
+    """Return whether the mean PSNR of a model is below the target, or below the share of the rounds."""
     if options.target_psnr is not None:
-        return bool(row["psnr"] >= options.target_psnr)
-    loss = rows[0]["psnr"] - row["psnr"]
-    uncertain = loss + standard_error(rows[0]["views"], row["views"])
-    return bool(loss <= ROUNDS_SHARE * options.tolerance and uncertain <= CHANCE * options.tolerance)
+        return bool(row["psnr"] < options.target_psnr)
+    return loss_of(row, rows)[0] > ROUNDS_SHARE * options.tolerance
 
 
 def chosen_of(rows: list[ModelRow], options: BudgetOptions) -> int:
     """Return the number of rounds that lead to the chosen model.
 
-    It is the smallest model that is good enough. With a limit of bytes it is the smallest one within the share of the
-    rounds of the best that fits. If no model is good enough, it is the best one.
+    It is the smallest model whose loss, with its standard error, is within the share of the rounds. With few views the
+    mean alone may be chance. A target replaces the loss. With a limit of bytes it is the smallest model that is within
+    the share of the best that fits. If no model reaches the target or fits, it is the best one or the smallest one.
     """
+    allowed = ROUNDS_SHARE * options.tolerance
     if options.max_bytes is not None:
         fitting = [row["fitted_psnr"] for row in rows if row["fitted_psnr"] is not None]
         if not fitting:
             return len(rows) - 1
-        floor = max(fitting) - ROUNDS_SHARE * options.tolerance
+        floor = max(fitting) - allowed
         if options.target_psnr is not None:
             floor = min(options.target_psnr, max(fitting))
         return max(i for i, row in enumerate(rows) if row["fitted_psnr"] is not None and row["fitted_psnr"] >= floor)
-    good = [i for i, row in enumerate(rows) if meets(row, rows, options)]
-    return good[-1] if good else max(range(len(rows)), key=lambda i: rows[i]["psnr"])
+    if options.target_psnr is not None:
+        good = [i for i, row in enumerate(rows) if row["psnr"] >= options.target_psnr]
+        return good[-1] if good else max(range(len(rows)), key=lambda i: rows[i]["psnr"])
+    return max(i for i, row in enumerate(rows) if sum(loss_of(row, rows)) <= allowed)

@@ -4,8 +4,8 @@ All decisions are made on validation views, held out of the training set (scenes
 
 1. Whole run. A run with all splats, without the validation views.
 2. Rounds. Each removes a quarter of the splats and fine-tunes the others (prune_and_refine.py). The rounds stop after
-   two models that lost more than their share of the tolerance against the whole run (rules.py). The smallest model that
-   did not is chosen.
+   two models that lost more than their share of the tolerance against the best one. The smallest model that surely did
+   not is chosen (rules.py).
 3. Parts. The last quarter of the tolerance allows fields and bands of that model to be removed (prune.py).
 4. All views. The chosen model is trained on with all training views, and loses the same parts.
 

@@ -70,7 +70,7 @@ def test_rounds_chart(tmp_path: Path, drawn: list[Any]) -> None:
     (curve, _, (bars,)) = axes.containers[0]
     assert (list(curve.get_xdata()), list(curve.get_ydata())) == ([9000, 6750, 5062], pytest.approx([21.5, 21.6, 20.7]))
     heights = [segment[1][1] - segment[0][1] for segment in bars.get_segments()]
-    assert heights == pytest.approx([0, 0, 2 * 0.2]), "losses of 1.0 and 0.6 dB: their standard error is 0.2"
+    assert heights == pytest.approx([0, 0, 2 * 0.2]), "losses of 1.1 and 0.7 dB: their standard error is 0.2"
     legend = [text.get_text() for text in axes.get_legend().texts]
     assert legend == ["chosen: 6.75k splats, 21.60 dB", "without parts: 6.75k splats, 21.55 dB", "rounds of pruning"]
     assert "[dB]" in axes.get_ylabel()
