@@ -17,13 +17,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 from common import RESULTS, ROOT, Runs, background_of, data_folder, environment, groups, parser, table, write_between
 
 from clsplat.comparison.methods import Method, parse_methods
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import Points, Scene, load_scene
+from clsplat.scenes.few_photos import few_photos
+from clsplat.scenes.scene import Scene, load_scene
 from clsplat.training.decisions import decide
 from clsplat.training.run import train
 
@@ -55,30 +55,9 @@ class Case:
         """Return the scene with few training views; the other training views are validation views."""
         background = background_of(self.scene)
         whole = load_scene(data_folder() / self.scene, resolution=self.resolution, eval=True, background=background)
-        steps = np.linspace(0, len(whole.train) - 1, self.photos).round().astype(int)
-        chosen = {whole.train[step].name for step in steps}
-        others = frozenset(view.name for view in whole.train) - chosen
-        return replace(whole, points=self.points(whole, chosen), validation_names=others)
-
-    def points(self, whole: Scene, chosen: set[str]) -> Points:
-        """Return the points that at least two of the photos show."""
-        model = data_folder() / self.scene / "sparse" / "0"
-        if not model.is_dir():
-            return whole.points
-        import pycolmap
-
-        stored = pycolmap.Reconstruction(str(model))
-        images = {number for number, image in stored.images.items() if image.name in chosen}
-        seen = [
-            point
-            for _, point in sorted(stored.points3D.items())
-            if len({element.image_id for element in point.track.elements} & images) >= 2
-        ]
-        return Points(
-            np.array([point.xyz for point in seen], np.float64).reshape(-1, 3),
-            np.array([point.color for point in seen], np.uint8).reshape(-1, 3),
-            np.array([point.track.length() for point in seen], np.int64),
-        )
+        few = few_photos(whole, self.photos)
+        others = frozenset(view.name for view in whole.train) - frozenset(view.name for view in few.train)
+        return replace(whole, points=few.points, validation_names=others)
 
 
 def run(case: Case, method: Method, seed: int, args: Any, runs: Runs) -> None:

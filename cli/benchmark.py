@@ -31,6 +31,7 @@ _COMMON = (
     "iterations",
     "images",
     "resolution",
+    "photos",
     "lpips",
     "device",
     "quiet",
@@ -57,6 +58,13 @@ _COMMON = (
     help="Number of training steps.  [default: as published, 30000]",
 )
 @photo_options
+@click.option(
+    "--photos",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Train on N photos of each scene: 3, 6 or 9 of LLFF, 12 or 24 of Mip-NeRF 360 have published figures.  "
+    "[default: all]",
+)
 @click.option("--lpips", is_flag=True, help="Measure LPIPS too; needs the extra lpips.")
 @quiet_option
 @config_options("shape", "cap_max", "seed", "iterations", "save_iterations", "test_iterations")
@@ -73,6 +81,7 @@ def benchmark(
     iterations: int | None,
     images: str | None,
     resolution: int | None,
+    photos: int | None,
     lpips: bool,
     quiet: bool,
     **values: Any,
@@ -106,13 +115,14 @@ def benchmark(
             common=common,
             images=images,
             resolution=resolution,
+            photos=photos,
             lpips=lpips,
             progress=display,
             on_run=None if quiet else report_run,
         )
     if quiet:
         return
-    chosen = benchmark_set(name)
+    chosen = benchmark_set(name) if photos is None else benchmark_set(name).with_photos(photos)
     for each in result_tables(chosen, records):
         click.echo(f"{each.title}\n{table(each.head, each.rows, WORDS)}\n")
     for note in result_notes(chosen, records):

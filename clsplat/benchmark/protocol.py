@@ -11,6 +11,7 @@ from typing import Any
 
 from ..errors import InputError, Remedy
 from ..files.masks import NO_MASKS
+from ..scenes.few_photos import few_photos
 from ..scenes.photo_size import target_size
 from ..scenes.scene import Scene, load_scene, read_posed_images, select_test_names
 from ..scenes.transforms_files import TEST, TRAIN
@@ -33,6 +34,7 @@ class BenchmarkScene:
     resolution : as for `load_scene`.
     identity : name, size of the first photo and numbers of views: what identifies the scene in runs.jsonl.
     differences : how this differs from the published protocol, in a few words each.
+    photos : training views that are used; None for all.
     """
 
     scene: SetScene
@@ -41,9 +43,10 @@ class BenchmarkScene:
     resolution: int
     identity: Mapping[str, Any]
     differences: Sequence[str]
+    photos: int | None = None
 
     def load(self, background: Color) -> Scene:
-        """Return the scene with its test views. Errors and warnings are those of `load_scene`."""
+        """Return the scene with its test views. Errors and warnings are those of `load_scene` and `few_photos`."""
         loaded = load_scene(
             _source(self.path, self.images),
             self.images,
@@ -52,7 +55,8 @@ class BenchmarkScene:
             background=background,
             masks=NO_MASKS,  # the protocols measure all pixels, even if there is a folder of masks
         )
-        return replace(loaded, name=self.scene.name)
+        loaded = replace(loaded, name=self.scene.name)
+        return loaded if self.photos is None else few_photos(loaded, self.photos)
 
 
 def find_scenes(
@@ -142,7 +146,7 @@ def _scene_at(
         "name": scene.name,
         "width": width,
         "height": height,
-        "train": sum(name not in test_names for name in posed.names),
+        "train": sum(name not in test_names for name in posed.names) if chosen.photos is None else chosen.photos,
         "test": sum(name in test_names for name in posed.names),
     }
     if max(abs(width - scene.size[0]), abs(height - scene.size[1])) > _SAME_SIZE:
@@ -151,7 +155,7 @@ def _scene_at(
         if identity[key] != number:
             kind = "training" if key == "train" else "test"
             differences.append(f"{identity[key]} {kind} views, not {number}")
-    return BenchmarkScene(scene, path, folder, resolution, identity, tuple(differences))
+    return BenchmarkScene(scene, path, folder, resolution, identity, tuple(differences), chosen.photos)
 
 
 def _missing_photos(scene: SetScene, path: Path, folder: str | None) -> InputError:

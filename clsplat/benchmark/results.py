@@ -55,7 +55,7 @@ def result_rows(chosen: BenchmarkSet, records: Sequence[Record]) -> list[Row]:
             *(row for row in rows if row["scene"] == scene),
             *(
                 _published_row(chosen, scene, published)
-                for published in chosen.published
+                for published in chosen.figures
                 if scene in published.values.get("psnr", {})
             ),
         ]
@@ -245,7 +245,7 @@ def _mean_table(chosen: BenchmarkSet, rows: Sequence[Row], scenes: Sequence[str]
                 *("" for _ in head[len(scenes) + 3 : -1]),
                 "; ".join(text for text in (each.source, each.note) if text),
             )
-            for each in chosen.published
+            for each in chosen.figures
             if each.mean is not None
         ]
     return ResultTable(f"PSNR of {len(scenes)} of {len(chosen.scenes)} scenes, and means", head, lines)

@@ -38,6 +38,7 @@ def run_benchmark(
     common: Mapping[str, Any] | None = None,
     images: str | None = None,
     resolution: int | None = None,
+    photos: int | None = None,
     lpips: bool = False,
     progress: Callable[[Progress], None] | None = None,
     on_run: Callable[[Run, Record | None], None] | None = None,
@@ -56,6 +57,7 @@ def run_benchmark(
     common : options of all methods, by the names of TrainConfig. By default iterations and background are those of the
         protocol. The tables name every difference.
     images, resolution : as for `find_scenes`.
+    photos : training views of each scene, at equal steps; None for all. The files are called NAME-PHOTOS then.
     lpips : whether to measure LPIPS too, which needs the extra of that name.
     progress : as of `train`. on_run : called with (run, None) before each run and (run, record) after it.
 
@@ -71,14 +73,16 @@ def run_benchmark(
     KeyboardInterrupt : Ctrl-C. The tables of the finished runs are written, and the same call continues.
     A run whose training fails raises nothing: its record has the message ("failed").
     """
-    chosen = benchmark_set(name)
+    chosen = benchmark_set(name) if photos is None else benchmark_set(name).with_photos(photos)
     methods = parse_methods(methods) if isinstance(methods, str) else methods
     options = {"iterations": chosen.iterations, "background": chosen.background, **(common or {})}
-    place = Path(f"benchmark-{name}" if output is None else output)
+    place = Path(f"benchmark-{chosen.name}" if output is None else output)
     scenes = find_scenes(chosen, folder, images, resolution)
     planned = [(scene, _runs(scene, methods, caps, seeds, options)) for scene in scenes]
     metric = Lpips(unit_range=True) if lpips else None  # 3DGS's script passes images in 0..1
-    refuse_foreign(place, files_of_results(name))  # models may be there already: a run that stopped has no line yet
+    refuse_foreign(
+        place, files_of_results(chosen.name)
+    )  # models may be there already: a run that stopped has no line yet
     runs = RunFile(place)
     with folder_lock(place):
         try:
@@ -110,7 +114,7 @@ def run_benchmark(
                         on_run(run, record)
         finally:
             write_results(place, chosen, runs.records)
-    return [record for record in runs.records if record["scene"].get("set") == name]
+    return [record for record in runs.records if record["scene"].get("set") == chosen.name]
 
 
 def _runs(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,12 @@ class SetScene:
         _, _, number = (self.images or "").partition("images_")
         return int(number) if number else 1
 
+    def with_images(self, images: str) -> SetScene:
+        """Return the scene with another folder of reduced photos, such as images_8."""
+        other = replace(self, images=images)
+        width, height = (round(side * self.factor / other.factor) for side in self.size)
+        return replace(other, size=(width, height))
+
 
 @dataclass(frozen=True)
 class Published:
@@ -56,6 +62,7 @@ class Published:
     values : figures by metric ("psnr" [dB], "ssim", "lpips") and scene.
     splats : numbers of splats by scene.
     mean : mean PSNR [dB] over all scenes of the set, for sources without figures by scene.
+    photos : training views of each scene; None for all.
     """
 
     system: str
@@ -65,6 +72,20 @@ class Published:
     values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     splats: Mapping[str, int] = field(default_factory=dict)
     mean: float | None = None
+    photos: int | None = None
+
+
+@dataclass(frozen=True)
+class FewPhotos:
+    """How a set is used with few training views.
+
+    Attributes
+    ----------
+    images : folder of photos inside the scenes. iterations : published length of a run.
+    """
+
+    images: str
+    iterations: int
 
 
 @dataclass(frozen=True)
@@ -96,6 +117,8 @@ class BenchmarkSet:
     other_images : folders of photos to use if the folder of the protocol is missing.
     counted : whether the scenes' default caps are published numbers of splats.
     start : the start of published runs; None if they start at the points of a scene.
+    few : the protocol with few training views; None if none is published.
+    photos : training views of each scene that are used; None for all.
     """
 
     name: str
@@ -109,6 +132,32 @@ class BenchmarkSet:
     other_images: Sequence[str] = ()
     counted: bool = True
     start: StartCube | None = None
+    few: FewPhotos | None = None
+    photos: int | None = None
+
+    @property
+    def figures(self) -> list[Published]:
+        """Published figures for the training views that are used."""
+        return [each for each in self.published if each.photos == self.photos]
+
+    def with_photos(self, count: int) -> BenchmarkSet:
+        """Return the set with `count` training views of each scene, and the figures that are published for them.
+
+        Without a published protocol, size and iterations are those with all views.
+        """
+        few = self.few
+        return replace(
+            self,
+            name=f"{self.name}-{count}",
+            title=f"{self.title} with {count} training views",
+            iterations=self.iterations if few is None else few.iterations,
+            scenes={
+                name: replace(scene if few is None else scene.with_images(few.images), train=count)
+                for name, scene in self.scenes.items()
+            },
+            counted=False,
+            photos=count,
+        )
 
 
 @cache
@@ -136,6 +185,7 @@ def benchmark_set(name: str) -> BenchmarkSet:
         tuple(values.get("other_images", ())),
         values.get("counted", True),
         StartCube(**values["start"]) if "start" in values else None,
+        FewPhotos(**values["few"]) if "few" in values else None,
     )
 
 
@@ -154,4 +204,5 @@ def _published(entry: Mapping[str, Any]) -> Published:
         {metric: entry[metric] for metric in METRICS if metric in entry},
         entry.get("splats", {}),
         entry.get("mean"),
+        entry.get("photos"),
     )

@@ -26,6 +26,7 @@ from ..splats.fields import Array, DoubleArray, sh_coefficients
 from ..splats.ply_compact import bands_in_use, in_use, layout_bytes, plan_layout
 from ..splats.splats import Splats
 from .importance import Importance, lower_bands, measure_importance
+from .rules import standard_error
 
 SHARES = {"splats": 0.5, "fields": 0.75, "bands": 1.0}  # of the tolerance, used after each kind
 _STEPS = 10  # of a bisection: it resolves a thousandth of the ranks
@@ -100,6 +101,8 @@ def prune(
 ) -> Pruned:
     """Remove as much as the tolerance on the validation views allows.
 
+    A loss counts with its standard error over the views: with few of them, a mean loss may be chance.
+
     Parameters
     ----------
     views : training views, on which the importance is measured.
@@ -116,7 +119,14 @@ def prune(
         raise InputError("prune: the model has no splats")
     if not tolerance >= 0:
         raise InputError(f"tolerance {tolerance}: must be at least 0 dB")
-    before = now = validation.psnr(splats)
+    views_before = validation.per_view(splats)
+
+    def surely(candidate: Splats) -> float:
+        """Return the PSNR less the standard error of the loss."""
+        found = validation.per_view(candidate)
+        return statistics.fmean(found) - standard_error(views_before, found)
+
+    before = now = statistics.fmean(views_before)
     thresholds, costs = Thresholds(), {}
     if "splats" in kinds:
         scores = splat_scores(
@@ -125,28 +135,30 @@ def prune(
                 measure_importance(validation.renderer, splats, views, validation.background, seed, parts=False), views
             ),
         )
-        threshold, splats, after = highest_threshold(
+        threshold, splats, _ = highest_threshold(
             scores,
             splats,
             now,
             before - SHARES["splats"] * tolerance,
             partial(without_splats, scores=scores),
-            validation.psnr,
+            surely,
         )
+        after = validation.psnr(splats)
         thresholds, costs["splats"], now = replace(thresholds, splats=threshold), now - after, after
     if "fields" not in kinds and "bands" not in kinds:
         return Pruned(splats, before, now, costs, thresholds)
     importance = per_pixel(measure_importance(validation.renderer, splats, views, validation.background, seed), views)
     for name, change in importance.fields.items() if "fields" in kinds else ():
         scores = field_scores(splats, name, change)
-        threshold, splats, after = highest_threshold(
+        threshold, splats, _ = highest_threshold(
             scores,
             splats,
             now,
             before - SHARES["fields"] * tolerance,
             partial(without_field, name=name, scores=scores),
-            validation.psnr,
+            surely,
         )
+        after = validation.psnr(splats)
         thresholds, costs[name], now = (
             replace(thresholds, fields=thresholds.fields | {name: threshold}),
             now - after,
@@ -155,14 +167,15 @@ def prune(
     if "bands" in kinds and splats.sh_degree:
         assert importance.colour is not None
         lower, lost = lower_bands(splats.sh, importance.colour)
-        threshold, splats, after = highest_threshold(
+        threshold, splats, _ = highest_threshold(
             band_slopes(lost),
             splats,
             now,
             before - SHARES["bands"] * tolerance,
             partial(without_bands, lower=lower, lost=lost),
-            validation.psnr,
+            surely,
         )
+        after = validation.psnr(splats)
         thresholds, costs["bands"], now = replace(thresholds, bands=threshold), now - after, after
     return Pruned(splats, before, now, costs, thresholds)
 

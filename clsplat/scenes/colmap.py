@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,6 +84,37 @@ def read_model(folder: Path) -> SparseReconstruction:
     ------
     InputError : a file is missing, truncated or damaged, or the model has no registered image.
     """
+    with _opened(folder) as (reconstruction, names):
+        photos, points = read_registered(reconstruction, names), read_points(reconstruction)
+    if not photos:
+        raise InputError(f"{folder}: the model registers no image; rebuild it with COLMAP's mapper")
+    bad = int((~np.isfinite(points.xyz)).any(axis=1).sum())
+    if bad:
+        raise InputError(
+            f"{folder}: {bad} points have a position that is not finite; the points3D file is damaged: rebuild it"
+        )
+    return SparseReconstruction(photos, points)
+
+
+def points_of_photos(folder: Path, photos: Collection[str], at_least: int) -> Points:
+    """Return the points of a model that at least so many of the named photos show, sorted by id.
+
+    Raises
+    ------
+    InputError : as `read_model`.
+    """
+    with _opened(folder) as (reconstruction, names):
+        images = {number for number, image in reconstruction.images.items() if names.get(number, image.name) in photos}
+        counts = {
+            number: len({element.image_id for element in point.track.elements} & images)
+            for number, point in reconstruction.points3D.items()
+        }
+        return read_points(reconstruction, {number: count for number, count in counts.items() if count >= at_least})
+
+
+@contextmanager
+def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str]]]:
+    """Yield a pycolmap.Reconstruction and names that replace its own. Raise InputError if it cannot be read."""
     suffix = _suffix(folder)
     if not suffix:
         raise InputError(f"{folder}: cameras or images file is missing (.bin or .txt)")
@@ -93,21 +124,12 @@ def read_model(folder: Path) -> SparseReconstruction:
     try:
         with _complete(folder, suffix) as whole:
             reconstruction = pycolmap.Reconstruction(str(whole))
-        names = _names_with_spaces(folder / "images.txt") if suffix == ".txt" else {}
-        photos, points = read_registered(reconstruction, names), read_points(reconstruction)
+        yield reconstruction, _names_with_spaces(folder / "images.txt") if suffix == ".txt" else {}
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
         raise InputError(
             f"{folder}: COLMAP cannot read the model ({reason_of(error)}); the files are "
             "damaged or do not belong together: copy or rebuild them"
         ) from None
-    if not photos:
-        raise InputError(f"{folder}: the model registers no image; rebuild it with COLMAP's mapper")
-    bad = int((~np.isfinite(points.xyz)).any(axis=1).sum())
-    if bad:
-        raise InputError(
-            f"{folder}: {bad} points have a position that is not finite; the points3D file is damaged: rebuild it"
-        )
-    return SparseReconstruction(photos, points)
 
 
 def _suffix(folder: Path) -> str:
@@ -186,11 +208,20 @@ def _rigid(name: str, pose: Any) -> NDArray[np.float64]:
     return matrix
 
 
-def read_points(reconstruction: Any) -> Points:
-    """Return the points of a pycolmap.Reconstruction, sorted by id."""
+def read_points(reconstruction: Any, counts: Mapping[int, int] | None = None) -> Points:
+    """Return the points of a pycolmap.Reconstruction, sorted by id.
+
+    Parameters
+    ----------
+    counts : ids of the points to return, with the number of images that stands for the length of their tracks. None:
+        all points.
+    """
     points = reconstruction.points3D
-    xyz, rgb = np.empty((len(points), 3)), np.empty((len(points), 3), np.uint8)
-    track_length = np.empty(len(points), np.int64)
-    for row, (_, point) in enumerate(sorted(points.items(), key=lambda item: item[0])):
-        xyz[row], rgb[row], track_length[row] = point.xyz, point.color, point.track.length()
+    ids = sorted(points if counts is None else counts)
+    xyz, rgb = np.empty((len(ids), 3)), np.empty((len(ids), 3), np.uint8)
+    track_length = np.empty(len(ids), np.int64)
+    for row, number in enumerate(ids):
+        point = points[number]
+        xyz[row], rgb[row] = point.xyz, point.color
+        track_length[row] = point.track.length() if counts is None else counts[number]
     return Points(xyz, rgb, track_length)

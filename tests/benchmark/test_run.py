@@ -316,3 +316,20 @@ def test_folders_of_others_are_refused(tanks: Path, tmp_path: Path) -> None:
     assert (tmp_path / "tanks.csv").read_text() == "mine"
     with pytest.raises(InputError, match="unknown benchmark"):
         run_benchmark("lego", tanks, output=tmp_path)
+
+
+def test_few_photos_of_each_scene(capture_folder: Path, tmp_path: Path) -> None:
+    as_colmap(capture_folder, tmp_path / "sets" / "fern", "images_8")
+    out = tmp_path / "out"
+    records = run_benchmark("llff", tmp_path / "sets", "gaussian", out, photos=3, caps=[CAP], common=SHORT)
+    (record,) = records
+    assert (record["scene"]["set"], record["scene"]["train"], record["scene"]["images"]) == ("llff-3", 3, "images_8")
+    config = json.loads(next(out.glob("models/*/config.json")).read_text())
+    assert len(json.loads(next(out.glob("models/*/cameras.json")).read_text())) == 3 + record["scene"]["test"]
+    assert config["scene"]["photos"].keys() >= {"view_001.png"}
+    text = (out / "llff-3.md").read_text()
+    assert text.startswith("# LLFF with 3 training views\n")
+    assert "not the published length (10000 iterations)" in text
+    assert "TensoRF" not in text, "figures with all views"
+    again = run_benchmark("llff", tmp_path / "sets", "gaussian", out, photos=3, caps=[CAP], common=SHORT)
+    assert [entry["seconds"] for entry in again] == [record["seconds"]]

@@ -42,6 +42,26 @@ def test_means_are_those_of_the_papers() -> None:
     assert sum(outdoor.values["psnr"].values()) / 9 == pytest.approx(27.20, abs=0.011)
 
 
+def test_sets_with_few_photos() -> None:
+    """Sizes are those of RegNeRF (LLFF), and half or a quarter of the photos that 3DGS uses (Mip-NeRF 360)."""
+    llff = benchmark_set("llff").with_photos(3)
+    assert (llff.name, llff.iterations, llff.scenes["fern"].size, llff.scenes["fern"].train) == (
+        "llff-3",
+        10_000,
+        (504, 378),
+        3,
+    )
+    assert {each.system: each.mean for each in llff.figures}["DropGaussian"] == 20.76
+    assert all(each.photos is None for each in benchmark_set("llff").figures)
+    assert not benchmark_set("llff").with_photos(4).figures
+    outdoor = benchmark_set("mipnerf360").with_photos(12)
+    assert outdoor.scenes["garden"].size == (round(1297 / 2), 420)
+    assert outdoor.scenes["garden"].factor == outdoor.scenes["room"].factor == 8
+    assert outdoor.scenes["room"].size == (389, 260)
+    tanks = benchmark_set("tanks").with_photos(5)
+    assert (tanks.iterations, tanks.scenes["truck"].images, tanks.figures) == (30_000, "images", [])
+
+
 def test_factors_of_photos() -> None:
     scenes = benchmark_set("mipnerf360").scenes
     assert (scenes["garden"].factor, scenes["kitchen"].factor) == (4, 2)

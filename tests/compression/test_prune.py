@@ -75,6 +75,25 @@ def test_prune_keeps_within_the_tolerance(splats: Splats, scene: Scene, validati
     np.testing.assert_array_equal(splats.log_scale[kept], pruned.splats.log_scale)
 
 
+class Disagreeing(Validation):
+    """Two views: one gains what the other loses with each removed splat, so the mean PSNR stays."""
+
+    def __init__(self, renderer: Renderer, n: int) -> None:
+        super().__init__(renderer, ())
+        self.n = n
+
+    def per_view(self, splats: Splats) -> list[float]:
+        change = 0.005 * (self.n - len(splats))
+        return [30.0 + change, 30.0 - change]
+
+
+def test_views_that_disagree_keep_the_parts(splats: Splats, scene: Scene, renderer: Renderer) -> None:
+    views = Disagreeing(renderer, len(splats))
+    pruned = prune(splats, scene.train, views, 0.5, ("splats",))
+    assert len(splats) - len(pruned.splats) == 50, "half of the tolerance is one standard error"
+    assert (pruned.before, pruned.after, pruned.costs) == (30.0, 30.0, {"splats": 0.0})
+
+
 def test_more_tolerance_leaves_less(splats: Splats, scene: Scene, validation: Validation, tmp_path: Path) -> None:
     sizes = []
     for tolerance in (0.0, 0.2, 2.0):
