@@ -9,8 +9,9 @@ from typing import Any
 import gpu_model
 import isa
 import pytest
+from device_schedules import as_kind
 
-from clsplat.device.device import Device, open_device
+from clsplat.device.device import Device
 from clsplat.device.schedule import SCHEDULES
 from clsplat.device.trace import recorded
 from clsplat.profiling.bench import bench_trainer
@@ -147,8 +148,7 @@ def test_shares_scale_the_raster_stages() -> None:
 def test_commands_are_those_of_a_step(devices: list[Device], monkeypatch: pytest.MonkeyPatch, shape: str) -> None:
     """The trace of a device that pretends to be a GPU."""
     monkeypatch.setenv("CLSPLAT_SCHEDULE", "gpu64")
-    device = open_device(devices[0].info.index)
-    device.info = replace(device.info, type="GPU")
+    device = as_kind(devices[0], "GPU")
     scene, splats = synthetic_scene(300, 64, 48, shape)
     trainer = bench_trainer(scene, device, shape, splats)
     for _ in range(3):

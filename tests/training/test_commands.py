@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from device_schedules import as_kind
 from small_scene import write_garden
 
-from clsplat.device.device import Device, open_device
+from clsplat.device.device import Device
 from clsplat.device.trace import recorded
 from clsplat.rendering.radix_sort import radix_passes
 from clsplat.scenes.scene import load_scene
@@ -30,8 +30,7 @@ def test_a_step_has_few_commands(
     Steps of visible splats need two more: the table of skipped steps, and the selection of splats.
     """
     monkeypatch.setenv("CLSPLAT_SCHEDULE", "gpu64")
-    gpu = open_device(device.info.index)
-    gpu.info = replace(gpu.info, type="GPU")
+    gpu = as_kind(device, "GPU")
     scene = load_scene(write_garden(tmp_path))
     config = TrainConfig(
         iterations=30, cap_max=200, shape=shape, densify_interval=50, opacity_reg=0.0, visible_adam=visible_adam
