@@ -3,7 +3,7 @@
     python benchmarks/budget.py --cases fox:4:12000:1000 kitchen:-1:20000:1000 --seeds 0 1 2
     python benchmarks/budget.py --cases fox:2:50000:1000 --views test      # once, after the choice
     python benchmarks/budget.py --table
-    python benchmarks/budget.py --page         # write the table of docs/small-models.md
+    python benchmarks/budget.py --page         # write the table and the chart of docs/small-models.md
 
 A case is scene:resolution:cap:iterations. The search stands beside runs of the default at the cap and at parts of it,
 with the same seed and photos. Both are measured on test views, or on validation views that neither has seen: the search
@@ -23,6 +23,7 @@ from typing import Any
 from common import RESULTS, ROOT, Runs, background_of, environment, groups, parser, real_scene, table, write_between
 
 from clsplat.comparison.measure import warm_up
+from clsplat.comparison.search_chart import rounds_chart
 from clsplat.compression.rules import TOLERANCE, BudgetOptions
 from clsplat.compression.search import train_budget
 from clsplat.compression.state import FILE
@@ -36,6 +37,7 @@ KEY = ("scene", "resolution", "cap", "iterations", "shape", "tolerance", "seed",
 SHARES = (1.0, 0.4, 0.1)  # of the cap: the runs beside a search
 PAGE = ROOT / "docs" / "small-models.md"
 MARKS = ("<!-- table of budget.py -->", "<!-- end of the table of budget.py -->")
+CHART, SHOWN = ROOT / "docs" / "images" / "rounds.png", "south_building_large"
 HEAD = ("scene", "kernel", "views", "seeds", "best cap: PSNR [dB]", "auto: PSNR [dB]", "splats", "bytes", "time")
 
 
@@ -92,7 +94,7 @@ def search(case: Case, seed: int, args: Any, runs: Runs) -> None:
         "splats": len(result.splats),
         "bytes": result.path.stat().st_size,
         "seconds": round(result.seconds, 1),
-        "search": {key: result.report[key] for key in ("rounds", "chosen", "held_out", "final")},
+        "search": {key: result.report[key] for key in ("rounds", "chosen", "held_out", "all_views", "final")},
     }
     runs.add(row | environment(renderer.device, renderer.schedule))
     print(
@@ -160,11 +162,15 @@ def main() -> None:
     flags.add_argument("--tolerance", type=float, default=TOLERANCE)
     flags.add_argument("--views", choices=("validation", "test"), default="validation")
     flags.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "clsplat-budget")
-    flags.add_argument("--page", action="store_true", help="write the table of docs/small-models.md, and run nothing")
+    flags.add_argument("--page", action="store_true", help="write docs/small-models.md, and run nothing")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
     if args.page:
         write_between(PAGE, *MARKS, page(runs.rows))
+        shown = next(row for row in runs.rows if row["scene"] == SHOWN)
+        for file in rounds_chart(shown["search"], CHART):
+            if file.suffix != CHART.suffix:
+                file.unlink()
         return
     if args.smoke:
         args.tolerance = 1.0

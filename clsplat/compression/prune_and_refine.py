@@ -42,11 +42,9 @@ class Part:
         return max(round(self.share * config.iterations), 1)
 
 
-Parts = tuple[Part, ...]
-_COOL = Part(0.1, 0.3)  # lower rates at the end, so that models of all stages can be compared
-ROUND: Parts = (Part(0.1, 1.0), _COOL)
+# The parts of a round. Lower rates at its end make its model comparable with that of a whole run.
+ROUND = (Part(0.1, 1.0), Part(0.1, 0.3))
 _RUN = 5  # iterations of a run over those of a round
-ALL_VIEWS: Parts = (Part(0.5, 1.0), _COOL)  # the last stage of a search, with the views that were held out
 
 
 def without_quarter(

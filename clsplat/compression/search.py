@@ -1,13 +1,13 @@
-"""Search for the smallest model of a scene: one run, then fewer splats, then fewer parameters of each splat.
+"""Search for the smallest model of a scene: how many rounds of pruning, and which parts, the images do not miss.
 
 All decisions are made on validation views, held out of the training set (scenes/split.py). Test views are never used.
 
-1. Whole run. A run with all splats, without the validation views.
+1. Trial. A run of half the length with all splats, without the validation views.
 2. Rounds. Each removes a quarter of the splats and fine-tunes the others (prune_and_refine.py). The rounds stop after
    two models that lost more than their share of the tolerance against the best one. The smallest model that surely did
    not is chosen (rules.py).
 3. Parts. The last quarter of the tolerance allows fields and bands of that model to be removed (prune.py).
-4. All views. The chosen model is trained on with all training views, and loses the same parts.
+4. All views. A whole run with all training views, the same number of rounds, and the same thresholds of parts.
 
 A target of PSNR or bytes replaces the tolerance as the condition that ends the rounds. state.py keeps finished stages.
 An interrupted stage goes on from its checkpoint.
@@ -37,11 +37,12 @@ from ..training.folder import ModelFolder, scene_record
 from ..training.log import Progress
 from ..training.run import train
 from .prune import Thresholds, Validation, apply_thresholds, prune, within_bytes
-from .prune_and_refine import ALL_VIEWS, ROUND, Parts, fine_tuning, without_messages, without_quarter
+from .prune_and_refine import ROUND, fine_tuning, without_messages, without_quarter
 from .rules import MIN_SPLATS, PARTS_SHARE, BudgetOptions, ModelRow, chosen_of, rounds_are_over
 from .state import BudgetState
 
-STEPS = 4  # whole run, rounds, parts, all views
+STEPS = 4  # trial, rounds, parts, all views
+TRIAL_PART = 2  # iterations of the run over those of the trial
 
 ProgressCallback = Callable[[Progress], None]
 
@@ -53,7 +54,7 @@ class Budgeted:
     Attributes
     ----------
     splats : the model. path : its file.
-    report : content of budget.json: the rounds (the first is the whole run), the removed parts and the result.
+    report : content of budget.json: the rounds (the first is the trial), the removed parts and the result.
     """
 
     splats: Splats
@@ -64,7 +65,8 @@ class Budgeted:
     def seconds(self) -> float:
         """Seconds of all stages. An interrupted stage counts from its last start."""
         report = self.report
-        return float(sum(stage["seconds"] for stage in (*report["rounds"], report["held_out"], report["final"])))
+        stages = (*report["rounds"], report["held_out"], *report["all_views"], report["final"])
+        return float(sum(stage["seconds"] for stage in stages))
 
 
 def train_budget(
@@ -121,52 +123,51 @@ class _Search:
         state: BudgetState,
         folder: ModelFolder,
     ) -> None:
-        self.scene, self.config, self.options, self.report = scene, config, options, progress
+        self.scene, self.options, self.report = scene, options, progress
         self.progress: ProgressCallback | None = progress and self._with_step
         self.step = 1
         self.state, self.folder = state, folder
         self.split = hold_out(scene)
         self.renderer = Renderer(config.device)
         self.validation = Validation(self.renderer, self.split.test, config.background)
+        self.config = config.replace(save_iterations=(), test_iterations=())
+        self.trial = self.config.replace(
+            iterations=max(config.iterations // TRIAL_PART, 1),
+            densify_interval=max(config.density.densify_interval // TRIAL_PART, 1),
+        )
 
     def run(self) -> Budgeted:
         """Run the missing stages."""
         values = self.state.values
-        stages = {"rounds": self.whole_run, "chosen": self.remove_splats, "thresholds": self.find_parts}
+        stages = {
+            "rounds": self.try_out,
+            "chosen": self.remove_splats,
+            "thresholds": self.find_parts,
+            "all_views": self.train_all,
+        }
         for key, stage in stages.items():
             if key not in values:
                 stage()
         return self.finish()
 
-    def whole_run(self) -> None:
-        """Make a run with all splats, without the validation views."""
+    def try_out(self) -> None:
+        """Make a run of half the length with all splats, without the validation views."""
+        start = time.perf_counter()
         self.tell(
             1,
-            f"a run with at most {self.config.cap_max} splats, {len(self.split.train)} training views and "
-            f"{len(self.split.test)} validation views",
+            f"a run of {self.trial.iterations} iterations with at most {self.trial.cap_max} splats, "
+            f"{len(self.split.train)} training views and {len(self.split.test)} validation views",
         )
-        start = time.perf_counter()
-        config = self.config.replace(save_iterations=(), test_iterations=())
-        splats = self.trained("whole", self.split, config)
-        self.state.save("round_0", splats)
+        splats = self.trained("trial", self.split, self.trial)
+        self.state.save("trial_0", splats)
         self.state.put("rounds", [self.row(splats, start)])
 
     def remove_splats(self) -> None:
         """Run rounds that remove splats."""
         rows: list[ModelRow] = self.state.values["rounds"]
         while not rounds_are_over(rows, self.options):
-            start, number = time.perf_counter(), len(rows)
-            fewer = without_quarter(
-                self.state.model(f"round_{number - 1}"),
-                self.split.train,
-                self.renderer,
-                self.config.background,
-                self.config.seed,
-                MIN_SPLATS,
-            )
-            self.tell(2, f"round {number}: {len(fewer)} splats")
-            splats = self.refined(f"round_{number}", self.split, fewer, ROUND)
-            self.state.save(f"round_{number}", splats)
+            start = time.perf_counter()
+            splats = self.round("trial", len(rows), self.split, self.trial)
             rows = [*rows, self.row(splats, start)]
             self.state.put("rounds", rows)
         self.state.put("chosen", chosen_of(rows, self.options))
@@ -179,7 +180,7 @@ class _Search:
         allowed = PARTS_SHARE * self.options.tolerance
         if self.options.target_psnr is not None:
             allowed = max(row["psnr"] - self.options.target_psnr, 0.0)
-        splats = self.state.model(f"round_{values['chosen']}")
+        splats = self.state.model(f"trial_{values['chosen']}")
         found = prune(splats, self.split.train, self.validation, allowed, ("fields", "bands"), self.config.seed)
         small = found.splats
         if self.options.max_bytes is not None:
@@ -196,13 +197,26 @@ class _Search:
         )
         self.state.put("thresholds", {"fields": found.thresholds.fields, "bands": found.thresholds.bands})
 
+    def train_all(self) -> None:
+        """Make a whole run with all training views."""
+        start = time.perf_counter()
+        self.tell(4, f"all {len(self.scene.train)} training views, at most {self.config.cap_max} splats")
+        splats = self.trained("whole", self.scene, self.config)
+        self.state.save("whole_0", splats)
+        seconds = round(time.perf_counter() - start, 2)
+        self.state.put("all_views", [{"splats": len(splats), "seconds": seconds}])
+
     def finish(self) -> Budgeted:
-        """Train the chosen model on with all views, remove the parts, and write its file."""
-        values, start = self.state.values, time.perf_counter()
-        splats = self.state.model(f"round_{values['chosen']}")
-        self.tell(4, f"all {len(self.scene.train)} training views: {len(splats)} splats")
-        splats = self.refined("all_views", self.scene, splats, ALL_VIEWS)
-        found = values["thresholds"]
+        """Repeat the rounds and the removal of parts on the model of all views, and write its file."""
+        values = self.state.values
+        rows: list[ModelRow] = values["all_views"]
+        while len(rows) <= values["chosen"] or self.is_too_large(rows):
+            start = time.perf_counter()
+            splats = self.round("whole", len(rows), self.scene, self.config)
+            rows = [*rows, {"splats": len(splats), "seconds": round(time.perf_counter() - start, 2)}]
+            self.state.put("all_views", rows)
+        start = time.perf_counter()
+        splats, found = self.state.model(f"whole_{len(rows) - 1}"), values["thresholds"]
         splats = apply_thresholds(
             splats,
             self.scene.train,
@@ -223,28 +237,48 @@ class _Search:
         self.state.end()
         return Budgeted(splats, path, values)
 
+    def is_too_large(self, rows: list[ModelRow]) -> bool:
+        """Whether the model of all views has more splats than the limit of bytes allows."""
+        if self.options.max_bytes is None or rows[-1]["splats"] <= MIN_SPLATS:
+            return False
+        return self.fitted(self.state.model(f"whole_{len(rows) - 1}"), self.scene) is None
+
     def write(self, splats: Splats) -> Path:
         """Write the files of the model's folder, and return the point cloud's."""
-        folder, last = self.folder, self.state.run_folder(f"all_views_{len(ALL_VIEWS) - 1}")
-        folder.write_run(self.config.to_json(), self.scene)
+        folder, rounds = self.folder, len(self.state.values["all_views"]) - 1
+        folder.write_run(self.state.values["config"], self.scene)
         views = [*self.scene.test, *self.scene.train]
         folder.write_cameras(named_cameras([view.name for view in views], [view.camera for view in views]))
-        for name, target in (("whole", folder.log_path), (last.path.name, folder.exposures_path)):
+        last = _run_name("whole", rounds, len(ROUND) - 1) if rounds else "whole"
+        for name, target in (("whole", folder.log_path), (last, folder.exposures_path)):
             source = self.state.run_folder(name).path / target.name
             if source.is_file():
                 source.replace(target)
-        rounds = self.state.values["chosen"]
-        iterations = sum(part.iterations(self.config) for part in (*ROUND * rounds, *ALL_VIEWS))
-        path = folder.ply_path(self.config.iterations + iterations)
+        path = folder.ply_path(self.config.iterations + rounds * sum(part.iterations(self.config) for part in ROUND))
         splats.save(path, compact=True)
         return path
 
-    def refined(self, name: str, scene: Scene, splats: Splats, parts: Parts) -> Splats:
-        """Train splats on without a change of their number, one part after the other."""
-        for number, part in enumerate(parts):
-            start = self.state.save(f"{name}_{number}_start", splats)
-            config = fine_tuning(self.config, splats, part.iterations(self.config), start, part.rate)
-            splats = self.trained(f"{name}_{number}", scene, config)
+    def round(self, run: str, number: int, scene: Scene, config: TrainConfig) -> Splats:
+        """Remove a quarter of the splats that the round before left, train the others on, and keep the model.
+
+        Parameters
+        ----------
+        run : "trial" or "whole". number : of the round, from 1. scene, config : as of the run.
+        """
+        splats = without_quarter(
+            self.state.model(f"{run}_{number - 1}"),
+            scene.train,
+            self.renderer,
+            config.background,
+            config.seed,
+            MIN_SPLATS,
+        )
+        self.tell(2 if run == "trial" else 4, f"round {number}: {len(splats)} splats")
+        for step, part in enumerate(ROUND):
+            name = _run_name(run, number, step)
+            start = self.state.save(f"{name}_start", splats)
+            splats = self.trained(name, scene, fine_tuning(config, splats, part.iterations(config), start, part.rate))
+        self.state.save(f"{run}_{number}", splats)
         return splats
 
     def trained(self, name: str, scene: Scene, config: TrainConfig) -> Splats:
@@ -297,3 +331,8 @@ class _Search:
         """Send a report of one run to the display, with the step of the search."""
         if self.report is not None:
             self.report(replace(report, phase=f"step {self.step} of {STEPS}"))
+
+
+def _run_name(run: str, number: int, step: int) -> str:
+    """Return the name of the folder of a part of a round."""
+    return f"{run}_{number}_{step}"

@@ -145,7 +145,8 @@ def test_a_search_finds_a_smaller_model(searched: clsplat.Budgeted) -> None:
     assert report["rounds"][0]["splats"] == 200
     assert rounds >= 1
     assert report["rounds"][1]["splats"] == 150, "a round removes a quarter"
-    assert len(searched.splats) == report["rounds"][rounds]["splats"] == report["final"]["splats"]
+    assert [row["splats"] for row in report["all_views"]] == [row["splats"] for row in report["rounds"][: rounds + 1]]
+    assert len(searched.splats) == report["all_views"][rounds]["splats"] == report["final"]["splats"]
     assert report["held_out"]["psnr_pruned"] >= report["held_out"]["psnr"] - 0.1
     assert report["final"]["bytes"] == searched.path.stat().st_size
     assert report["final"]["missed"] is None
@@ -162,7 +163,7 @@ def test_a_search_leaves_the_files_of_a_run(searched: clsplat.Budgeted, scene: S
     names = {camera.name for camera in read_cameras(folder.cameras_path)}
     assert names == {Path(view.name).stem for view in scene.views} or names == {view.name for view in scene.views}
     assert len(folder.log_path.read_text().splitlines()) >= 1
-    assert searched.path == folder.ply_path(30 + 6 * searched.report["chosen"] + 15 + 3), "all its iterations"
+    assert searched.path == folder.ply_path(30 + 6 * searched.report["chosen"]), "all its iterations"
 
 
 class Stop:
@@ -191,16 +192,16 @@ def test_an_interrupted_search_goes_on(scene: Scene, searched: clsplat.Budgeted,
     assert again.path.read_bytes() == searched.path.read_bytes()
 
 
-def test_ctrl_c_in_the_whole_run_keeps_its_iterations(
+def test_ctrl_c_in_a_run_keeps_its_iterations(
     scene: Scene, searched: clsplat.Budgeted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The whole run is the longest stage: it goes on from its checkpoint."""
+    """A run goes on from its checkpoint."""
     with monkeypatch.context() as patch:
-        trained_runs(patch, visit=press_ctrl_c_at_10)
+        trained_runs(patch, visit=press_ctrl_c_at_8)
         with pytest.raises(KeyboardInterrupt):
             train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path)
-    reached = Checkpoint.load(tmp_path / "budget" / "whole" / "checkpoint.npz").iteration
-    assert 0 < reached < CONFIG.iterations
+    reached = Checkpoint.load(tmp_path / "budget" / "trial" / "checkpoint.npz").iteration
+    assert 0 < reached < CONFIG.iterations / 2
     runs = trained_runs(monkeypatch)
     again = train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path, resume=True)
     assert [run["resume"] for run in runs] == [True] + [False] * (len(runs) - 1)
@@ -215,19 +216,19 @@ def test_a_moved_search_goes_on(
         trained_runs(patch, visit=press_ctrl_c_in_a_round)
         with pytest.raises(KeyboardInterrupt):
             train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path / "here")
-    assert (tmp_path / "here" / "budget" / "round_1_0" / "checkpoint.npz").is_file()
+    assert (tmp_path / "here" / "budget" / "trial_1_0" / "checkpoint.npz").is_file()
     (tmp_path / "here").rename(tmp_path / "there")
     again = train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path / "there", resume=True)
     assert again.path.read_bytes() == searched.path.read_bytes()
 
 
 def press_ctrl_c_in_a_round(trainer: Trainer, stop: threading.Event) -> None:
-    if trainer.config.iterations < CONFIG.iterations:
+    if trainer.config.iterations < CONFIG.iterations / 2:
         signal.raise_signal(signal.SIGINT)
 
 
-def press_ctrl_c_at_10(trainer: Trainer, stop: threading.Event) -> None:
-    if trainer.iteration == 10:
+def press_ctrl_c_at_8(trainer: Trainer, stop: threading.Event) -> None:
+    if trainer.iteration == 8:
         signal.raise_signal(signal.SIGINT)
 
 
@@ -252,11 +253,13 @@ def test_held_out_views_are_seen_in_the_last_stage_only(
     assert judges
     for run in runs:
         names = {view.name for view in run["scene"].train}
-        last = Path(run["output"]).name.startswith("all_views")
+        last = Path(run["output"]).name.startswith("whole")
         assert names
         assert not names & scene.test_names
         assert (judges <= names) if last else not names & judges
-    assert [Path(run["output"]).name for run in runs][-2:] == ["all_views_0", "all_views_1"]
+    lengths = {Path(run["output"]).name: run["config"].iterations for run in runs}
+    assert (lengths["trial"], lengths["whole"]) == (15, 30)
+    assert (lengths["trial_1_0"], lengths["trial_1_1"], lengths["whole_1_0"], lengths["whole_1_1"]) == (2, 2, 3, 3)
 
 
 def test_targets_out_of_reach_keep_the_best(scene: Scene, tmp_path: Path) -> None:
