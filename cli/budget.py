@@ -47,7 +47,7 @@ def budget_options(function: F) -> F:
             "--budget",
             type=click.Choice(["auto"]),
             help="Search for the smallest model that is as good as the one with --cap-max splats, on views held out of "
-            "training for it. Test views may lose more. The search takes the time of two to three runs.",
+            "training for it. Test views may lose more. The search takes the time of two to five runs.",
         ),
     ):
         function = option(function)
