@@ -49,9 +49,9 @@ def test_a_reconstructed_scene_is_left_out(photos: Path) -> None:
 
 @pytest.mark.parametrize("record", ["config.json", "budget.json"])
 def test_a_model_is_left_out(photos: Path, record: str) -> None:
-    write_png(photos / "day" / "m" / "growth.png", PIXELS)
+    write_png(photos / "day" / "m" / "rounds.png", PIXELS)
     write_record(photos / "day" / "m", record, {"config": {}, "scene": "no record of a scene"})
-    assert "day/m/growth.png" in list_images(photos, IMAGE_SUFFIXES).names
+    assert "day/m/rounds.png" in list_images(photos, IMAGE_SUFFIXES).names
     write_record(photos / "day" / "m", record, {"config": {}, "scene": {}})
     assert list_images(photos, IMAGE_SUFFIXES).outputs == ("day/m",)
     (photos / "day" / "m" / record).write_text("damaged")
