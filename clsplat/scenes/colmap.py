@@ -97,7 +97,7 @@ def read_model(folder: Path) -> SparseReconstruction:
 
 
 def points_of_photos(folder: Path, photos: Collection[str], at_least: int) -> Points:
-    """Return the points of a model that at least so many of the named photos show, sorted by id.
+    """Return the points of a model that `at_least` of the named photos show, sorted by id.
 
     Raises
     ------
