@@ -40,13 +40,15 @@ class BudgetState:
         write_json(self.path, self.values)
 
     def load(self) -> None:
-        """Read an earlier search; raises InputError if it is missing or damaged."""
+        """Read an earlier search; raises InputError if it is missing, damaged, or of a version with other stages."""
         if not self.path.is_file():
             raise InputError(f"{self.path}: no search to resume from: start without --resume")
         values = read_object(self.path)
         for key in ("config", "options", "scene"):
             if not isinstance(values.get(key), dict):
                 raise InputError(f"{self.path}: damaged (no {key!r}): start again with --overwrite")
+        if "growth" in values:
+            raise InputError(f"{self.path}: an earlier version began this search: start again with --overwrite")
         self.values = values
 
     def check(self, config: TrainConfig, options: BudgetOptions) -> None:

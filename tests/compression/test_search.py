@@ -284,6 +284,10 @@ def test_what_cannot_be_resumed_or_replaced(scene: Scene, searched: clsplat.Budg
         train_budget(scene, CONFIG, output=folder, resume=True)
     with pytest.raises(InputError, match="no search to resume from"):
         train_budget(scene, CONFIG, output=tmp_path, resume=True)
+    old = searched.report | {"growth": []}
+    (tmp_path / "budget.json").write_text(json.dumps(old))
+    with pytest.raises(InputError, match=r"budget\.json: an earlier version began this search: start again"):
+        train_budget(scene, CONFIG, output=tmp_path, resume=True)
     (tmp_path / "budget.json").write_text("{}")
     with pytest.raises(InputError, match=r"budget\.json: damaged \(no 'config'\)"):
         train_budget(scene, CONFIG, output=tmp_path, resume=True)
