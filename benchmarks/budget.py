@@ -16,11 +16,10 @@ from __future__ import annotations
 import statistics
 import sys
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common import RESULTS, ROOT, Runs, background_of, environment, groups, parser, real_scene, table, write_between
+from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, table, write_between
 
 from clsplat.comparison.measure import warm_up
 from clsplat.comparison.search_chart import rounds_chart
@@ -41,22 +40,6 @@ CHART, SHOWN = ROOT / "docs" / "images" / "rounds.png", "south_building_large"
 HEAD = ("scene", "kernel", "views", "seeds", "best cap: PSNR [dB]", "auto: PSNR [dB]", "splats", "bytes", "time")
 
 
-@dataclass(frozen=True)
-class Case:
-    """A scene at one size with the largest cap and the length of its runs."""
-
-    scene: str
-    resolution: int
-    cap: int
-    iterations: int
-
-    @classmethod
-    def parse(cls, text: str) -> Case:
-        """Return the case of scene:resolution:cap:iterations."""
-        name, *numbers = text.split(":")
-        return cls(name, *map(int, numbers))
-
-
 def search(case: Case, seed: int, args: Any, runs: Runs) -> None:
     """Run a search and the runs beside it, if they are not among `runs`."""
     row: dict[str, Any] = vars(case) | {
@@ -68,7 +51,7 @@ def search(case: Case, seed: int, args: Any, runs: Runs) -> None:
     if row in runs:
         return
     background = background_of(case.scene)
-    scene = real_scene(case.scene, case.resolution, validate=args.views == "validation", background=background)
+    scene = case.load(args.views)
     config = TrainConfig(
         shape=args.shape,
         iterations=case.iterations,

@@ -9,8 +9,9 @@ import platform
 import subprocess
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from blender_scenes import OBJECTS
 
@@ -74,6 +75,28 @@ def real_scene(name: str, resolution: int | None = None, *, validate: bool = Fal
     resolution = REDUCTION.get(name, -1) if resolution is None else resolution
     scene = load_scene(data_folder() / name, resolution=resolution, eval=True, background=background)
     return hold_out(scene) if validate else scene
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene at one size with one cap and one length of the run."""
+
+    scene: str
+    resolution: int
+    cap: int
+    iterations: int
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return the case of scene:resolution:cap:iterations, and of further numbers if there are more."""
+        name, *numbers = text.split(":")
+        return cls(name, *map(int, numbers))
+
+    def load(self, views: str) -> Scene:
+        """Return the scene with its test views, or for `views` "validation" with held-out training views instead."""
+        return real_scene(
+            self.scene, self.resolution, validate=views == "validation", background=background_of(self.scene)
+        )
 
 
 def commit() -> str:

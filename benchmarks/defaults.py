@@ -16,18 +16,16 @@ from __future__ import annotations
 import statistics
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from blender_scenes import NAMES
-from common import RESULTS, ROOT, Runs, background_of, data_folder, environment, groups, parser, table, write_between
+from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, table, write_between
 
 from clsplat.comparison.methods import Method, parse_methods
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import Scene, load_scene
-from clsplat.scenes.split import hold_out
+from clsplat.scenes.scene import Scene
 from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import decide
 from clsplat.training.run import train
@@ -41,28 +39,6 @@ TABLES = {  # scenes by the marks around their table on the page
     ("<!-- table of defaults.py -->", "<!-- end of the table -->"): FULL_SIZE,
     ("<!-- table of new scenes -->", "<!-- end of the table of new scenes -->"): NAMES,
 }
-
-
-@dataclass(frozen=True)
-class Case:
-    """A scene at one size with one cap and one length of the run."""
-
-    scene: str
-    resolution: int
-    cap: int
-    iterations: int
-
-    @classmethod
-    def parse(cls, text: str) -> Case:
-        """Return the case of scene:resolution:cap:iterations."""
-        name, *numbers = text.split(":")
-        return cls(name, *map(int, numbers))
-
-    def load(self, views: str) -> Scene:
-        """Return the scene with its test views, or with held-out training views in their place."""
-        background = background_of(self.scene)
-        loaded = load_scene(data_folder() / self.scene, resolution=self.resolution, eval=True, background=background)
-        return hold_out(loaded) if views == "validation" else loaded
 
 
 def measure(scene: Scene, config: TrainConfig, folder: Path | None) -> dict[str, Any]:

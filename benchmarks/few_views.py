@@ -17,13 +17,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from common import RESULTS, ROOT, Runs, background_of, data_folder, environment, groups, parser, table, write_between
+from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, table, write_between
 
 from clsplat.comparison.methods import Method, parse_methods
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.few_photos import few_photos
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.decisions import decide
 from clsplat.training.run import train
 
@@ -36,36 +36,25 @@ MARKS = ("<!-- table of few_views.py -->", "<!-- end of the table of few_views.p
 
 
 @dataclass(frozen=True)
-class Case:
-    """A scene at one size with some of its photos, one cap and one length of the run."""
+class FewPhotosCase(Case):
+    """A case of some photos of a scene: scene:resolution:cap:iterations:photos."""
 
-    scene: str
-    resolution: int
-    cap: int
-    iterations: int
     photos: int
 
-    @classmethod
-    def parse(cls, text: str) -> Case:
-        """Return the case of scene:resolution:cap:iterations:photos."""
-        name, *numbers = text.split(":")
-        return cls(name, *map(int, numbers))
-
-    def load(self) -> Scene:
-        """Return the scene with few training views; the other training views are validation views."""
-        background = background_of(self.scene)
-        whole = load_scene(data_folder() / self.scene, resolution=self.resolution, eval=True, background=background)
+    def load(self, views: str) -> Scene:
+        """Return the scene with few training views and its test views; the other training views validate."""
+        whole = super().load("test")
         few = few_photos(whole, self.photos)
         others = frozenset(view.name for view in whole.train) - frozenset(view.name for view in few.train)
         return replace(whole, points=few.points, validation_names=others)
 
 
-def run(case: Case, method: Method, seed: int, args: Any, runs: Runs) -> None:
+def run(case: FewPhotosCase, method: Method, seed: int, args: Any, runs: Runs) -> None:
     """Do one run, if it is not among `runs`."""
     row: dict[str, Any] = vars(case) | {"system": method.label, "seed": seed, "views": args.views}
     if row in runs:
         return
-    scene, background = case.load(), background_of(case.scene)
+    scene, background = case.load(args.views), background_of(case.scene)
     config = method.config(case.cap, seed, {"iterations": case.iterations, "background": background})
     decision = decide(scene, config.replace(device=args.device))
     model = train(scene, decision.config)
@@ -122,7 +111,7 @@ def main() -> None:
         write_between(PAGE, *MARKS, page(runs.rows))
         return
     if not args.table:
-        for case in map(Case.parse, args.cases):
+        for case in map(FewPhotosCase.parse, args.cases):
             for method in parse_methods(args.systems):
                 for seed in args.seeds:
                     run(case, method, seed, args, runs)

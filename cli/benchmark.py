@@ -122,7 +122,7 @@ def benchmark(
         )
     if quiet:
         return
-    chosen = benchmark_set(name) if photos is None else benchmark_set(name).with_photos(photos)
+    chosen = benchmark_set(name, photos)
     for each in result_tables(chosen, records):
         click.echo(f"{each.title}\n{table(each.head, each.rows, WORDS)}\n")
     for note in result_notes(chosen, records):

@@ -73,7 +73,7 @@ def run_benchmark(
     KeyboardInterrupt : Ctrl-C. The tables of the finished runs are written, and the same call continues.
     A run whose training fails raises nothing: its record has the message ("failed").
     """
-    chosen = benchmark_set(name) if photos is None else benchmark_set(name).with_photos(photos)
+    chosen = benchmark_set(name, photos)
     methods = parse_methods(methods) if isinstance(methods, str) else methods
     options = {"iterations": chosen.iterations, "background": chosen.background, **(common or {})}
     place = Path(f"benchmark-{chosen.name}" if output is None else output)

@@ -160,9 +160,8 @@ class BenchmarkSet:
         )
 
 
-@cache
-def benchmark_set(name: str) -> BenchmarkSet:
-    """Return the set of a name in SETS.
+def benchmark_set(name: str, photos: int | None = None) -> BenchmarkSet:
+    """Return the set of a name in SETS. photos : see `BenchmarkSet.with_photos`; None for all.
 
     Raises
     ------
@@ -170,6 +169,12 @@ def benchmark_set(name: str) -> BenchmarkSet:
     """
     if name not in SETS:
         raise InputError(f"unknown benchmark {name!r}: choose one of {', '.join(SETS)}")
+    chosen = _read(name)
+    return chosen if photos is None else chosen.with_photos(photos)
+
+
+@cache
+def _read(name: str) -> BenchmarkSet:
     values = tomllib.loads((Path(__file__).with_name("sets") / f"{name}.toml").read_text(encoding="utf-8"))
     layout = values["layout"]
     red, green, blue = values["background"]

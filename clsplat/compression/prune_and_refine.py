@@ -32,7 +32,12 @@ _WARM = 10.0  # first rate of positions over the last: removed splats leave gaps
 
 @dataclass(frozen=True)
 class Part:
-    """A part of fine-tuning. share : its iterations over those of the run. rate : factor on the run's last rates."""
+    """A part of fine-tuning.
+
+    Parameters
+    ----------
+    share : its iterations over those of the run. rate : factor on the run's last rates but that of the positions.
+    """
 
     share: float
     rate: float
@@ -111,7 +116,7 @@ def fine_tune(
     with tempfile.TemporaryDirectory() as folder:
         start = Path(folder) / "start.ply"
         splats.save(start)
-        options = fine_tuning(config, splats, part.iterations(config), start, part.rate)
+        options = fine_tuning(config, splats, part, start)
         trainer = Trainer(scene, options, device=device, progress=without_messages(progress))
     return trainer.run().splats
 
@@ -128,21 +133,21 @@ def without_messages(progress: Callable[[Progress], None] | None) -> Callable[[P
     return iterations_only
 
 
-def fine_tuning(config: TrainConfig, splats: Splats, iterations: int, start: Path, rate: float = 1.0) -> TrainConfig:
+def fine_tuning(config: TrainConfig, splats: Splats, part: Part, start: Path) -> TrainConfig:
     """Return options that train the splats in the file `start`: full images, all bands, no strategy, no noise.
 
     Parameters
     ----------
-    config : options of the run that made the splats. rate : factor on all its last rates but that of the positions.
+    config : options of the run that made the splats.
     """
-    short = config.replace(iterations=iterations)
+    short = config.replace(iterations=part.iterations(config))
     # Rates of short runs are larger: the short run gets options that lead to the rates of the long one.
     rates = {
-        rate_option(field): rate * run_rate(config, field) / short.rate_factor(field.name)
+        rate_option(field): part.rate * run_rate(config, field) / short.rate_factor(field.name)
         for field in splats.schema
         if field.name != "mean" and hasattr(config.optim, rate_option(field))
     }
-    rates["feature_rest_lr"] = rate * run_rest_rate(config) / short.length_factor(SH_REST_POWER)
+    rates["feature_rest_lr"] = part.rate * run_rest_rate(config) / short.length_factor(SH_REST_POWER)
     last = config.optim.position_lr_final * config.rate_factor("mean") / short.rate_factor("mean")
     return short.replace(
         shape=splats.shape,

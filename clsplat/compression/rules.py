@@ -25,7 +25,7 @@ class BudgetOptions:
 
     Parameters
     ----------
-    tolerance : allowed loss of PSNR to the model with all splats, on validation views [dB].
+    tolerance : allowed loss of PSNR to the best model, on validation views [dB].
     target_psnr : replaces the tolerance: find the smallest model with this PSNR on validation views [dB].
     max_bytes : size of the file: find the best model that fits.
 

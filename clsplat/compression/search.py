@@ -277,7 +277,7 @@ class _Search:
         for step, part in enumerate(ROUND):
             name = _run_name(run, number, step)
             start = self.state.save(f"{name}_start", splats)
-            splats = self.trained(name, scene, fine_tuning(config, splats, part.iterations(config), start, part.rate))
+            splats = self.trained(name, scene, fine_tuning(config, splats, part, start))
         self.state.save(f"{run}_{number}", splats)
         return splats
 

@@ -15,7 +15,7 @@ import pytest
 import clsplat
 from clsplat.cameras.cameras_json import read_cameras
 from clsplat.compression import search
-from clsplat.compression.prune_and_refine import fine_tuning
+from clsplat.compression.prune_and_refine import Part, fine_tuning
 from clsplat.compression.rules import BudgetOptions, chosen_of, loss_of, lost_too_much, rounds_are_over, standard_error
 from clsplat.compression.search import train_budget
 from clsplat.errors import InputError, OutputError
@@ -27,7 +27,7 @@ from clsplat.training.config import TrainConfig
 from clsplat.training.folder import ModelFolder
 from clsplat.training.log import Progress
 from clsplat.training.run import train
-from clsplat.training.trainer import Trainer
+from clsplat.training.trainer import Trainer, Visit
 
 AUTO = BudgetOptions()
 CONFIG = TrainConfig(iterations=30, cap_max=200, sh_degree=1, densify_interval=5)
@@ -105,7 +105,7 @@ def test_options_that_make_no_sense(values: dict[str, float]) -> None:
 def test_fine_tuning_goes_on_at_the_runs_last_rates() -> None:
     config = TrainConfig(iterations=2000, lr_factor=2.0)
     splats = Splats.from_points(np.eye(3), np.full((3, 3), 0.5), sh_degree=1)
-    short = fine_tuning(config, splats, 200, Path("start.ply"), rate=0.5)
+    short = fine_tuning(config, splats, Part(0.1, 0.5), Path("start.ply"))
     assert (short.iterations, short.cap_max, short.sh_degree, short.start.init) == (200, 3, 1, "start.ply")
     assert short.optim.position_lr_final * short.rate_factor("mean") == pytest.approx(
         config.optim.position_lr_final * config.rate_factor("mean")
@@ -196,10 +196,7 @@ def test_ctrl_c_in_a_run_keeps_its_iterations(
     scene: Scene, searched: clsplat.Budgeted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run goes on from its checkpoint."""
-    with monkeypatch.context() as patch:
-        trained_runs(patch, visit=press_ctrl_c_at_8)
-        with pytest.raises(KeyboardInterrupt):
-            train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path)
+    interrupt(scene, tmp_path, monkeypatch, press_ctrl_c_at_8)
     reached = Checkpoint.load(tmp_path / "budget" / "trial" / "checkpoint.npz").iteration
     assert 0 < reached < CONFIG.iterations / 2
     runs = trained_runs(monkeypatch)
@@ -212,14 +209,19 @@ def test_a_moved_search_goes_on(
     scene: Scene, searched: clsplat.Budgeted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A round has the path of its first splats among its options, so its checkpoint is of no use elsewhere."""
-    with monkeypatch.context() as patch:
-        trained_runs(patch, visit=press_ctrl_c_in_a_round)
-        with pytest.raises(KeyboardInterrupt):
-            train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path / "here")
+    interrupt(scene, tmp_path / "here", monkeypatch, press_ctrl_c_in_a_round)
     assert (tmp_path / "here" / "budget" / "trial_1_0" / "checkpoint.npz").is_file()
     (tmp_path / "here").rename(tmp_path / "there")
     again = train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path / "there", resume=True)
     assert again.path.read_bytes() == searched.path.read_bytes()
+
+
+def interrupt(scene: Scene, folder: Path, monkeypatch: pytest.MonkeyPatch, press: Visit) -> None:
+    """Begin a search and end it where `press` sends Ctrl-C."""
+    with monkeypatch.context() as patch:
+        trained_runs(patch, visit=press)
+        with pytest.raises(KeyboardInterrupt):
+            train_budget(scene, CONFIG, BudgetOptions(0.4), output=folder)
 
 
 def press_ctrl_c_in_a_round(trainer: Trainer, stop: threading.Event) -> None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import budget
 import defaults
 import few_views
 import pytest
@@ -301,6 +302,12 @@ def test_the_page_has_the_stored_runs_with_few_photos() -> None:
     assert few_views.page(rows) in few_views.PAGE.read_text(encoding="utf-8"), "run few_views.py --page"
 
 
+def test_the_page_has_the_stored_searches() -> None:
+    rows = budget.Runs(BENCHMARKS / "results" / "budget.jsonl", budget.KEY).rows
+    assert rows
+    assert budget.page(rows) in budget.PAGE.read_text(encoding="utf-8"), "run budget.py --page"
+
+
 @pytest.mark.slow
 def test_few_views(tmp_path: Path, capture_folder: Path) -> None:
     out = tmp_path / "few.jsonl"
@@ -324,7 +331,7 @@ def test_a_case_of_few_photos_has_the_points_of_two_of_them(
     capture_folder: Path, monkeypatch: pytest.MonkeyPatch, photos: int
 ) -> None:
     monkeypatch.setenv("CLSPLAT_DATA", str(capture_folder.parent))
-    scene = few_views.Case(capture_folder.name, -1, 9, 1, photos).load()
+    scene = few_views.FewPhotosCase(capture_folder.name, -1, 9, 1, photos).load("validation")
     whole = load_scene(capture_folder)
     assert len(scene.train) == photos
     assert [view.name for view in scene.test] == [view.name for view in whole.test]
