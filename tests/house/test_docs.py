@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 from cli_runner import ITERATIONS, run
 from clsplat_cli.main import COMMANDS, main
-from set_folders import as_blender
+from set_folders import as_blender, as_colmap
 
 import clsplat
 from clsplat.files.images import image_size, write_png
@@ -112,7 +112,9 @@ def stand_ins(folder: Path, words: list[str], capture: Path, model: Path) -> Non
     for name in ("SCENE", "MODEL", "OTHER", "SMALL"):
         if any(name in word.split("/") for word in words) and name != target:
             shutil.copytree(capture if name == "SCENE" else model, folder / name)
-    if "SETS" in words:
+    if "llff" in words:
+        as_colmap(capture, folder / "SETS" / "fern", "images_8")
+    elif "SETS" in words:
         as_blender(capture, folder / "SETS" / "lego")
     if "FILE.ply" in words:
         shutil.copy(max(model.glob("point_cloud/*/point_cloud.ply")), folder / "FILE.ply")
