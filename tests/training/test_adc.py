@@ -17,7 +17,7 @@ from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import Shape
 from clsplat.training.density.adc import MIN_OPACITY, RESET_OPACITY, WORLD_SIZE, plan_adc, with_reset
 from clsplat.training.density.edit import DensifyEdit
-from clsplat.training.density.halves import SPLIT_SHRINK, split_along_axis
+from clsplat.training.density.halves import SPLIT_SHRINK, split_along_axis, twice
 from clsplat.training.density.table import HostSplats
 from clsplat.training.options.density import SPLITS
 
@@ -133,8 +133,8 @@ def test_small_and_large_ones_are_split_along_their_longest_axis() -> None:
         edit = edited(arrays, shapes.GAUSSIAN, stats_of(np.array([0, 2, 0]) * THRESHOLD), split="long-axis")
         assert edit.source.tolist() == [0, 2, 1, 1]
         assert edit.fresh.tolist() == [False] * 2 + [True] * 2
-        moved, parents = edit.apply(arrays), {name: array[[1, 1]] for name, array in arrays.items()}
-        halves = parents | split_along_axis(parents, shapes.GAUSSIAN, MIN_OPACITY)
+        moved, parents = edit.apply(arrays), {name: array[[1]] for name, array in arrays.items()}
+        halves = twice(parents) | split_along_axis(parents, shapes.GAUSSIAN, MIN_OPACITY)
         for name, array in halves.items():
             np.testing.assert_array_equal(moved[name][2:], array.astype(np.float32), err_msg=name)
         assert not np.array_equal(moved["mean"][2], moved["mean"][3])

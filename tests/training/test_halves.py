@@ -22,8 +22,7 @@ MIN_OPACITY = 0.005
 
 def split(arrays: Arrays, shape: Shape, min_opacity: float = MIN_OPACITY) -> Arrays:
     """Return all fields of the halves, in float64."""
-    parents = twice(arrays)
-    changed = parents | split_along_axis(parents, shape, min_opacity)
+    changed = twice(arrays) | split_along_axis(arrays, shape, min_opacity)
     return {name: array.astype(np.float64) for name, array in changed.items()}
 
 
@@ -63,8 +62,9 @@ def test_the_distance_in_use_needs_no_more_than_opaque_halves() -> None:
 @given(seed=st.integers(0, 10_000), distance=st.floats(0.05, 0.95))
 def test_mean_and_covariance_of_the_pair_are_the_parents(seed: int, distance: float) -> None:
     arrays = random_model(shapes.GAUSSIAN, 5, seed, dead=0)
-    parents = {name: array.astype(np.float64) for name, array in twice(arrays).items()}
-    changed = parents | halves_along_axis(parents, shapes.GAUSSIAN, distance)
+    alone = {name: array.astype(np.float64) for name, array in arrays.items()}
+    parents = twice(alone)
+    changed = parents | halves_along_axis(alone, shapes.GAUSSIAN, distance)
     turn = rotations(parents["quat"])
     covariance = lambda of: np.einsum("nij,nj,nkj->nik", turn, np.exp(2 * of["log_scale"]), turn)  # noqa: E731
     first, second = changed["mean"][:5], changed["mean"][5:]
@@ -85,7 +85,7 @@ def test_opacities_of_every_shape(shape: Shape) -> None:
     """Each side has the root of its own equation after the sides were mixed. Signs stay, and rows do not mix."""
     arrays = random_model(shape, 40, 2, dead=0)
     names, halves = opacity_names(arrays), split(arrays, shape, 1e-30)
-    mixed = twice(arrays) | halves_along_axis(twice(arrays), shape, DISTANCE)
+    mixed = twice(arrays) | halves_along_axis(arrays, shape, DISTANCE)
     np.testing.assert_allclose(
         strengths(shape, halves), opacity_of_half(strengths(shape, mixed), DISTANCE), rtol=2e-6, atol=1e-12
     )

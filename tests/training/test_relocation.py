@@ -19,7 +19,7 @@ from clsplat.splats import shapes
 from clsplat.splats.optical_depth import opacity_names
 from clsplat.splats.shapes import BETA_BOUNDS, NU_BOUNDS, SKEW_MAX, SLANT_MAX, Shape
 from clsplat.training.density.edit import DensifyEdit
-from clsplat.training.density.halves import split_along_axis
+from clsplat.training.density.halves import split_along_axis, twice
 from clsplat.training.density.relocation import MIN_OPACITY, N_MAX, RULES, plan_relocation, relocation
 from clsplat.training.density.table import HostSplats
 
@@ -252,8 +252,8 @@ def test_with_long_axis_a_single_copy_makes_two_halves_and_more_make_a_stack(
     first, copies = np.flatnonzero((size == 2) & own), np.flatnonzero((size == 2) & ~own)
     copies = copies[np.argsort(piled.source[copies])]
     assert len(copies) == len(first)
-    parents = {name: array[np.concatenate([first, first])] for name, array in arrays.items()}
-    for name, array in (parents | split_along_axis(parents, shape, MIN_OPACITY)).items():
+    parents = {name: array[first] for name, array in arrays.items()}
+    for name, array in (twice(parents) | split_along_axis(parents, shape, MIN_OPACITY)).items():
         np.testing.assert_array_equal(after[name][np.concatenate([first, copies])], array.astype(np.float32))
 
 

@@ -29,7 +29,7 @@ from ...splats.fields import Array, DoubleArray
 from ...splats.optical_depth import opacity_names, raw_of_optical_depth
 from ...splats.shapes import Shape
 from .edit import DensifyEdit, Indices, NewValues
-from .halves import PUBLISHED_DISTANCE, SPLIT_SHRINK, drawn_halves, halves_along_axis, split_along_axis, twice
+from .halves import PUBLISHED_DISTANCE, SPLIT_SHRINK, drawn_halves, halves_along_axis, split_along_axis
 from .table import SplatTable, smallest
 
 # 3DGS's constants.
@@ -80,33 +80,34 @@ def plan_adc(
     """
     summary = splats.summary()
     sound = summary.some_finite()
-    log_size = summary.log_size.astype(np.float64)
     bright = summary.raw_opacity >= shape.raw_opacity(np.array(MIN_OPACITY))  # this is False for a NaN
     side_by_side = split == "long-axis"
     by_axis = side_by_side or depth_threshold > 0
     limit = _log(WORLD_SIZE * extent) if prune_large else math.inf
-    keep = bright & (log_size <= limit)
-    splittable = bright & (log_size - (0.0 if by_axis else math.log(SPLIT_SHRINK)) <= limit)
+    keep = bright & (summary.log_size <= limit) if prune_large else bright.copy()
     if not keep.any():
         keep = sound
 
-    score = _score(stats, grad_threshold, depth_threshold, extent)
-    splits = (score > 1.0) & splittable & (by_axis | (log_size > _log(dense_size * extent)))
-    clones = (score > 1.0) & keep & bright & ~splits
+    rows, score = _above_threshold(stats, grad_threshold, depth_threshold, extent)
+    size = summary.log_size[rows].astype(np.float64)
+    splits = bright[rows] & (size - (0.0 if by_axis else math.log(SPLIT_SHRINK)) <= limit)
+    splits &= by_axis | (size > _log(dense_size * extent))
+    clones = keep[rows] & bright[rows] & ~splits
     if turnover and len(keep) <= cap:
-        growth = np.count_nonzero(splits | clones) + np.count_nonzero(splits & ~keep)
+        growth = np.count_nonzero(splits | clones) + np.count_nonzero(splits & ~keep[rows])
         missing = int(np.count_nonzero(keep) + growth - cap)
         among = np.flatnonzero(keep)
         faint = among[smallest(summary.raw_opacity[among], min(missing, int(turnover * cap)))]
-        for rows in (keep, splits, clones):
-            rows[faint] = False
-    halved, cloned = _best(score, splits, clones, keep, cap)
+        keep[faint] = False
+        at = np.isin(rows, faint, kind="table")
+        splits[at] = clones[at] = False
+    halved, cloned = _best(rows, score, splits, clones, keep, cap)
     stays = keep.copy()
     stays[halved] = False
     stay = np.flatnonzero(stays)
     source = np.concatenate([stay, cloned, halved, halved])
 
-    parents = twice(splats.take(halved))
+    parents = splats.take(halved)
     if side_by_side:
         changed = split_along_axis(parents, shape, MIN_OPACITY)
     elif by_axis:
@@ -137,8 +138,13 @@ def with_reset(edit: DensifyEdit, splats: SplatTable, shape: Shape) -> DensifyEd
     return replace(edit, values=values, reset_fields=edit.reset_fields + names)
 
 
-def _score(stats: Array, grad_threshold: float, depth_threshold: float, extent: float) -> DoubleArray:
-    """Return the larger of both mean gradients over their thresholds, (N,); 0 if it is small or not finite."""
+def _above_threshold(
+    stats: Array, grad_threshold: float, depth_threshold: float, extent: float
+) -> tuple[Indices, DoubleArray]:
+    """Return the rows with a mean gradient above its threshold, and the larger of both ratios to the thresholds.
+
+    Gradients that are not finite do not count.
+    """
     times = np.maximum(stats[2], 1.0)
     loud = stats[0] > 0.5 * grad_threshold * times
     if depth_threshold > 0:
@@ -149,9 +155,8 @@ def _score(stats: Array, grad_threshold: float, depth_threshold: float, extent: 
     ratio: DoubleArray = screen / seen / max(grad_threshold, np.finfo(np.float64).tiny)
     if depth_threshold > 0:
         ratio = np.fmax(ratio, depth * extent / seen / depth_threshold)
-    score = np.zeros(len(loud))
-    score[rows] = np.where(np.isfinite(ratio), ratio, 0.0)
-    return score
+    above = np.isfinite(ratio) & (ratio > 1.0)
+    return rows[above], ratio[above]
 
 
 def _log(length: float) -> np.float64:
@@ -161,12 +166,20 @@ def _log(length: float) -> np.float64:
 
 
 def _best(
-    score: DoubleArray, splits: NDArray[np.bool_], clones: NDArray[np.bool_], keep: NDArray[np.bool_], cap: int
+    rows: Indices,
+    score: DoubleArray,
+    splits: NDArray[np.bool_],
+    clones: NDArray[np.bool_],
+    keep: NDArray[np.bool_],
+    cap: int,
 ) -> tuple[Indices, Indices]:
-    """Return the rows to split and the rows to clone that the cap has room for, in rising order."""
-    rows = np.flatnonzero(splits | clones)
-    cost, room = np.where(keep[rows], 1, 2), cap - np.count_nonzero(keep)  # a split saves a splat of a pruned size
+    """Return the rows to split and the rows to clone that the cap has room for, in rising order.
+
+    rows : rows above a threshold, in rising order. score, splits, clones : of these. keep : of all splats.
+    """
+    chosen = np.flatnonzero(splits | clones)
+    cost, room = np.where(keep[rows[chosen]], 1, 2), cap - np.count_nonzero(keep)  # a split saves one of a pruned size
     if cost.sum() > room:
-        order = np.argsort(-score[rows], kind="stable")
-        rows = np.sort(rows[order[np.cumsum(cost[order]) <= room]])
-    return rows[splits[rows]], rows[clones[rows]]
+        order = np.argsort(-score[chosen], kind="stable")
+        chosen = np.sort(chosen[order[np.cumsum(cost[order]) <= room]])
+    return rows[chosen[splits[chosen]]], rows[chosen[clones[chosen]]]

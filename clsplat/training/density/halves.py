@@ -42,37 +42,40 @@ def twice(arrays: Mapping[str, Array]) -> dict[str, Array]:
 def drawn_halves(parents: Mapping[str, Array], shape: Shape, rng: np.random.Generator) -> dict[str, Array]:
     """Return the changed fields of the halves of 3DGS: smaller scales, and places drawn from the parents' Gaussians.
 
-    parents : public arrays of the parents, `twice`, here and below.
+    parents : public arrays of N parents, without the colour, here and below.
+
+    The arrays that are returned have 2 N rows, here and below: the first halves of all parents, then the second ones.
     """
-    shift = rng.standard_normal(parents["mean"].shape)
-    return _placed(parents, shape, shift, {"log_scale": parents["log_scale"] - math.log(SPLIT_SHRINK)})
+    shift = rng.standard_normal((2, *parents["mean"].shape))
+    changed = {"log_scale": parents["log_scale"] - math.log(SPLIT_SHRINK)}
+    return twice(changed) | {"mean": _places(parents, shape, shift, changed)}
 
 
 def halves_along_axis(parents: Mapping[str, Array], shape: Shape, distance: float) -> dict[str, Array]:
     """Return the changed fields of the halves along the longest axis, without a change of the absorption.
 
-    The first half of the rows is at +d s, the second at -d s.
+    The first halves are at +d s, the second ones at -d s.
 
     distance : d, above 0 and below 1.
     """
-    n = len(parents["mean"])
-    row, axis = np.arange(n), parents["log_scale"].argmax(axis=1)
-    side = np.where(row < n // 2, 1.0, -1.0)
-    shift = np.zeros((n, 3))
-    shift[row, axis] = distance * side
+    row, axis = np.arange(len(parents["mean"])), parents["log_scale"].argmax(axis=1)
+    shift = np.zeros((2, len(row), 3))
+    shift[0, row, axis] = distance
+    shift[1, row, axis] = -distance
     changed = {"log_scale": parents["log_scale"].copy()}
     changed["log_scale"][row, axis] += 0.5 * math.log1p(-(distance**2))
     if "skew" in parents:
         changed["skew"] = parents["skew"].copy()
         changed["skew"][row, axis] *= 0.5
-    names = opacity_names(parents)
+    names, opacities = opacity_names(parents), {}
     if len(names) == 2:
         delta = _delta(parents)[row, axis]
         thick = [optical_depth(shape, parents[name]) for name in names]
-        beyond = np.where(side * delta > 0, thick[0], thick[1])
+        beyond = [np.where(side * delta > 0, thick[0], thick[1]) for side in (1.0, -1.0)]
         for name, depth in zip(names, thick, strict=True):
-            changed[name] = raw_of_optical_depth(shape, depth + delta**2 * (beyond - depth), parents[name])
-    return _placed(parents, shape, shift, changed)
+            mixed = [raw_of_optical_depth(shape, depth + delta**2 * (of - depth), parents[name]) for of in beyond]
+            opacities[name] = np.concatenate(mixed)
+    return twice(changed) | opacities | {"mean": _places(parents, shape, shift, changed)}
 
 
 def split_along_axis(parents: Mapping[str, Array], shape: Shape, min_opacity: float) -> dict[str, Array]:
@@ -82,14 +85,15 @@ def split_along_axis(parents: Mapping[str, Array], shape: Shape, min_opacity: fl
     """
     changed = halves_along_axis(parents, shape, DISTANCE)
     names = opacity_names(parents)
-    old = np.stack([optical_depth(shape, changed.get(name, parents[name])) for name in names], axis=1)
+    parted = len(names) == 2  # else both halves have the parent's opacity
+    before = {name: changed[name] if parted else parents[name] for name in names}
+    old = np.stack([optical_depth(shape, raw) for raw in before.values()], axis=1)
     opacity = opacity_of_half(-np.expm1(-old), DISTANCE)
     largest = opacity.max(axis=1, keepdims=True)
     opacity = np.where(largest < min_opacity, opacity * (min_opacity / np.maximum(largest, 1e-300)), opacity)
     depth = -np.log1p(-opacity)  # halves at this distance are never opaque
-    return changed | {
-        name: raw_of_optical_depth(shape, depth[:, side], parents[name]) for side, name in enumerate(names)
-    }
+    new = {name: raw_of_optical_depth(shape, depth[:, side], before[name]) for side, name in enumerate(names)}
+    return changed | (new if parted else twice(new))
 
 
 def opacity_of_half(opacity: DoubleArray, distance: float) -> DoubleArray:
@@ -105,15 +109,16 @@ def opacity_of_half(opacity: DoubleArray, distance: float) -> DoubleArray:
     return np.minimum(root, 1.0)
 
 
-def _placed(
-    parents: Mapping[str, Array], shape: Shape, shift: DoubleArray, changed: dict[str, Array]
-) -> dict[str, Array]:
-    """Return `changed` with the means. Centroids move by `shift`, in the parents' deviations along their axes."""
+def _places(parents: Mapping[str, Array], shape: Shape, shift: DoubleArray, changed: Mapping[str, Array]) -> Array:
+    """Return the means of the halves, (2 N, 3), whose centroids move by `shift`.
+
+    shift : (2, N, 3), in the parents' deviations along their axes. changed : the fields that both halves have.
+    """
     old, new = (np.exp(of["log_scale"].astype(np.float64)) for of in (parents, changed))
     step = old * (shift + _centroid(parents, shape)) - new * _centroid({**parents, **changed}, shape)
-    turn = rotations(parents["quat"][: len(step) // 2].astype(np.float64))
-    step = np.einsum("nij,hnj->hni", turn, step.reshape(2, -1, 3)).reshape(-1, 3)
-    return changed | {"mean": parents["mean"] + step}
+    turn = rotations(parents["quat"].astype(np.float64))
+    places: Array = parents["mean"] + np.einsum("nij,hnj->hni", turn, step)
+    return places.reshape(-1, 3)
 
 
 def _delta(arrays: Mapping[str, Array]) -> DoubleArray:

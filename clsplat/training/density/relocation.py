@@ -31,7 +31,7 @@ from ...splats.optical_depth import opacity_names, optical_depth, raw_of_optical
 from ...splats.shapes import Shape
 from ..methods import sss
 from .edit import DensifyEdit, Indices, NewValues
-from .halves import split_along_axis, twice
+from .halves import split_along_axis
 from .length_factor import length_factor
 from .table import SplatTable, smallest
 
@@ -129,7 +129,7 @@ def plan_relocation(
     if halved.any():
         beside = np.empty_like(targets)
         beside[stack] = places
-        parents = twice({name: array[halved] for name, array in old.items()})
+        parents = {name: array[halved] for name, array in old.items()}
         rows = np.concatenate([targets[halved], beside[halved]])
         values = _merged(values, rows, split_along_axis(parents, shape, min_opacity))
 

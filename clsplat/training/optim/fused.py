@@ -279,7 +279,10 @@ class FusedOptimizer:
         rows = [edit.values[name].rows for name in ("skew", "quat") if name in edit.values]
         if not rows:
             return None
-        changed = np.unique(np.concatenate(rows))
+        marked = np.zeros(self.splats.n, np.bool_)
+        for each in rows:
+            marked[each] = True
+        changed = np.flatnonzero(marked)
         target = self.columns.indices(changed)
         return target, self._skew_and_quat(target, len(changed))
 
