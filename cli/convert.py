@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from clsplat.splats.fields import MAX_SH_DEGREE
+from clsplat.splats.page_payload import PAGE_ENDING, PRECISIONS
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.spz import VERSIONS as SPZ_VERSIONS
 
@@ -46,8 +47,20 @@ if TYPE_CHECKING:
     "--cameras",
     type=PATH,
     metavar="FILE",
-    help="A cameras.json with the cameras of the measurement.  [default: that of the model folder]",
+    help="A cameras.json with the cameras of the measurement and of a page.  [default: that of the model folder]",
 )
+@click.option(
+    "--precision",
+    type=click.Choice(list(PRECISIONS)),
+    help="Of an .html page: compact rounds each value to one to three bytes, full keeps all digits.  [default: compact]",
+)
+@click.option(
+    "--camera-path",
+    type=PATH,
+    metavar="FILE",
+    help="Of an .html page: the camera path that it plays, as recorded in the viewer.  [default: around the scene]",
+)
+@click.option("--title", metavar="TEXT", help="Of an .html page: its heading.  [default: the model's name]")
 @iteration_option
 @overwrite_option()
 @device_option
@@ -60,20 +73,29 @@ def convert_model(
     sh_degree: int | None,
     spz_version: str | None,
     cameras: Path | None,
+    precision: str | None,
+    camera_path: Path | None,
+    title: str | None,
     iteration: int | None,
     overwrite: bool,
     device: str | None,
     quiet: bool,
 ) -> None:
-    """Write MODEL, a folder or a file of splats, into OUTPUT: a .ply with all columns, or a .splat or .spz file.
+    """Write MODEL, a folder or a file of splats, into OUTPUT: a .ply with all columns, a .splat or .spz file, or a page.
+
+    An .html page shows the splats in any browser with WebGL 2. It needs no server and no network: send it to anybody.
+    It draws Gaussians and skew-normals as they are.
 
     Without --approximate, nothing is written if a splat cannot be converted exactly. With --shape gaussian, a .ply has
     only 3DGS's columns. A .splat file has no SH bands above 0; .spz files round each value to about a byte. The loss
     of such files is measured on images.
     """
-    from clsplat.models.convert import conversion_cost
+    from clsplat.models.convert import PageOptions, conversion_cost
     from clsplat.models.convert import convert_model as convert
 
+    page = None
+    if output.suffix.lower() == PAGE_ENDING or precision or camera_path or title:
+        page = PageOptions(precision or PRECISIONS[0], cameras, camera_path, title)
     converted = convert(
         model,
         output,
@@ -81,6 +103,7 @@ def convert_model(
         approximate=approximate,
         sh_degree=sh_degree,
         spz_version=None if spz_version is None else int(spz_version),
+        page=page,
         iteration=iteration,
         overwrite=overwrite,
     )

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..cameras.cameras_json import read_cameras
+from ..cameras.cameras_json import NamedCamera, read_cameras
+from ..cameras.path import read_path
 from ..errors import InputError
 from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
@@ -18,9 +19,11 @@ from ..splats.any_file import GAUSSIAN_ENDINGS, PLY_ENDING, SPZ_ENDING, check_en
 from ..splats.approximate import nearest_gaussians
 from ..splats.convert import convert
 from ..splats.fields import sh_coefficients
+from ..splats.page_payload import PAGE_ENDING, PRECISIONS
 from ..splats.shapes import GAUSSIAN
 from ..splats.splats import Splats
 from ..splats.spz import VERSIONS as SPZ_VERSIONS
+from ..webpage.page import PageContent, as_drawn, write_web_page
 from .model import LoadedModel, model_at
 
 
@@ -53,6 +56,24 @@ class ConvertedModel:
 
 
 @dataclass(frozen=True)
+class PageOptions:
+    """What a web page has besides the splats.
+
+    Parameters
+    ----------
+    precision : "compact" rounds every value to one to three bytes; "full" keeps float32.
+    cameras : a cameras.json with the cameras to jump to; by default that of the model folder.
+    camera_path : a camera path that the page plays; by default an ellipse around the scene.
+    title : heading of the page; by default the name of the model.
+    """
+
+    precision: str = PRECISIONS[0]
+    cameras: Path | None = None
+    camera_path: Path | None = None
+    title: str | None = None
+
+
+@dataclass(frozen=True)
 class ConversionCost:
     """PSNR of the file's images against the model's images: mean and worst [dB] over a number of cameras."""
 
@@ -69,19 +90,22 @@ def convert_model(
     approximate: bool = False,
     sh_degree: int | None = None,
     spz_version: int | None = None,
+    page: PageOptions | None = None,
     iteration: int | None = None,
     overwrite: bool = False,
 ) -> ConvertedModel:
-    """Write a model as another shape or in another file format, and return the conversion.
+    """Write a model as another shape, in another file format or as a web page, and return the conversion.
 
     Parameters
     ----------
     model : a model folder or a file of splats, or what `load_model` returned.
-    output : a .ply file with all columns, or a .splat or .spz file.
-    shape : the shape to convert to; by default the model's, for .splat and .spz files Gaussian.
+    output : a .ply file with all columns, a .splat or .spz file, or an .html page that draws the splats.
+    shape : the shape to convert to; by default the model's, for .splat and .spz files Gaussian, and for pages one that
+        they draw.
     approximate : use the nearest Gaussian for splats without an equal one, instead of raising.
     sh_degree : remove the SH bands above, or add bands of zeros.
     spz_version : version of an .spz file, 3 or 4. Version 4 needs the extra `spz`.
+    page : what a page has besides the splats.
     iteration : as for `load_model`.
     overwrite : replace an existing file.
 
@@ -91,18 +115,26 @@ def convert_model(
     OutputError : the file exists, has an unknown ending or cannot be written.
     """
     output = Path(output)
-    suffix = check_ending(output)
+    suffix = check_ending(output, PAGE_ENDING)
     if spz_version is not None and suffix != SPZ_ENDING:
         raise InputError(f"{output}: the version is of .spz files: leave it out, or choose the ending .spz")
+    if page is not None and suffix != PAGE_ENDING:
+        raise InputError(f"{output}: precision, camera path and title are of pages: leave them out, or choose the ending .html")
     refuse_existing([output], overwrite)
     source = model_at(model, iteration)
     target = shape or (GAUSSIAN.name if suffix in GAUSSIAN_ENDINGS else source.splats.shape)
     if suffix in GAUSSIAN_ENDINGS and target != GAUSSIAN.name:
         raise InputError(f"{output}: {suffix} files hold Gaussians: leave --shape out, or write a .ply")
-    converted, is_nearest = _as_shape(source.splats, target, approximate)
+    if suffix == PAGE_ENDING and shape is None:
+        converted, is_nearest = _as_page_shape(source.splats, approximate)
+    else:
+        converted, is_nearest = _as_shape(source.splats, target, approximate)
     if sh_degree is not None:
         converted = _of_degree(converted, sh_degree)
-    converted.save(output, spz_version=spz_version or SPZ_VERSIONS[0])
+    if suffix == PAGE_ENDING:
+        _write_page(output, source, converted, page or PageOptions())
+    else:
+        converted.save(output, spz_version=spz_version or SPZ_VERSIONS[0])
     return ConvertedModel(source, output, converted, is_nearest)
 
 
@@ -121,7 +153,7 @@ def conversion_cost(
     The cost, or None if there are no cameras.
     """
     source = converted.source
-    named = source.read_cameras() if cameras is None else read_cameras(cameras)
+    named = _cameras(source, cameras)
     if not named:
         return None
     written, renderer = Splats.load(converted.output), Renderer(device)
@@ -132,6 +164,26 @@ def conversion_cost(
         )
         values.append(min(psnr(before, after), MAX_PSNR))
     return ConversionCost(sum(values) / len(values), min(values), len(values))
+
+
+def _cameras(source: LoadedModel, path: Path | None) -> list[NamedCamera]:
+    return source.read_cameras() if path is None else read_cameras(path)
+
+
+def _write_page(output: Path, source: LoadedModel, splats: Splats, page: PageOptions) -> None:
+    path = None if page.camera_path is None else read_path(page.camera_path)
+    content = PageContent(page.title or source.path.name, _cameras(source, page.cameras), path, source.background)
+    write_web_page(output, as_drawn(splats), content, page.precision)
+
+
+def _as_page_shape(splats: Splats, approximate: bool) -> tuple[Splats, bool]:
+    """Return the splats as a shape that pages draw, and whether they are only the nearest Gaussians."""
+    try:
+        return as_drawn(splats), False
+    except InputError as error:
+        if not approximate:
+            raise InputError(f"{error}; or --approximate") from None
+    return nearest_gaussians(splats), True
 
 
 def _as_shape(splats: Splats, target: str, approximate: bool) -> tuple[Splats, bool]:

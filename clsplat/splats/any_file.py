@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ..errors import InputError, OutputError
 from .dot_splat import read_splat, write_splat
+from .page_payload import PAGE_ENDING, read_page
 from .ply import read_ply, write_ply
 from .sog import META, is_sog, read_sog
 from .spz import VERSIONS as SPZ_VERSIONS
@@ -17,13 +18,13 @@ from .stored import StoredSplats
 PLY_ENDING = ".ply"
 SPZ_ENDING = ".spz"
 GAUSSIAN_ENDINGS = (".splat", SPZ_ENDING)  # formats that hold Gaussians only
-READ_ENDINGS = (PLY_ENDING, *GAUSSIAN_ENDINGS, ".sog")
+READ_ENDINGS = (PLY_ENDING, *GAUSSIAN_ENDINGS, ".sog", PAGE_ENDING)
 
 _ELSEWHERE = (".ksplat", ".lcc", ".lcc2")  # formats that splat-transform of PlayCanvas reads
 
 
 def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
-    """Read a PLY of splats (whole, compact or compressed), an .spz, .sog or .splat file, or the meta.json of a SOG.
+    """Read a PLY of splats (whole, compact or compressed), an .spz, .sog or .splat file, the meta.json of a SOG, or a page.
 
     Splats and columns that cannot be used are left out, with a warning.
 
@@ -40,6 +41,8 @@ def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
         )
     if suffix == ".splat":
         return read_splat(path)
+    if suffix == PAGE_ENDING:
+        return read_page(path)
     start = _start(path)
     if suffix == SPZ_ENDING or is_spz(start):
         return read_spz(path)
@@ -58,10 +61,12 @@ def write_splats(
 
     Raises
     ------
-    OutputError : the file cannot be written.
+    OutputError : the file cannot be written, or is a page, which needs cameras as well.
     InputError : the format does not support the shape of the splats.
     """
     suffix = Path(path).suffix.lower()
+    if suffix == PAGE_ENDING:
+        raise OutputError(f"{path}: pages are written by `clsplat convert` and clsplat.convert_model: use one of these")
     if suffix == ".splat":
         write_splat(path, splats)
     elif suffix == SPZ_ENDING:
@@ -78,11 +83,15 @@ def write_splats(
         )
 
 
-def check_ending(path: Path) -> str:
-    """Return the file's ending in lower case; raise OutputError if it is not that of a format that is written."""
+def check_ending(path: Path, *more: str) -> str:
+    """Return the file's ending in lower case; raise OutputError if it is not that of a format that is written.
+
+    more : further endings that the caller can write.
+    """
+    endings = (PLY_ENDING, *GAUSSIAN_ENDINGS, *more)
     suffix = path.suffix.lower()
-    if suffix not in (PLY_ENDING, *GAUSSIAN_ENDINGS):
-        raise OutputError(f"{path}: writes .ply, {' and '.join(GAUSSIAN_ENDINGS)} files: choose one of these endings")
+    if suffix not in endings:
+        raise OutputError(f"{path}: writes {', '.join(endings[:-1])} and {endings[-1]} files: choose one of these endings")
     return suffix
 
 

@@ -22,6 +22,7 @@ from .crop import CropBox
 from .crop_panel import CropPanel
 from .initial_view import UP, SceneCameras, vertical_fov
 from .legend import legend
+from .page_download import PageDownload
 from .path_panel import PathPanel
 from .settings import DEFAULT_SIZE, MAX_SIZE, MIN_SIZE
 from .status_line import StatusLine
@@ -183,6 +184,14 @@ class Page:
                 "Download picture", icon=viser.Icon.CAMERA, hint="This view as PNG, with the bytes of clsplat render"
             )
             save.on_click(lambda _: self._order_picture(longest.value))
+            PageDownload(
+                self.client,
+                lambda: viewer.source.splats,
+                self.known,
+                self._name,
+                lambda: viewer.settings_of(self.client.client_id).background,
+                self.set_status,
+            )
             if self._reload is not None:
                 button = gui.add_button("Read the file again", icon=viser.Icon.REFRESH)
                 button.on_click(lambda _: self._do_reload())

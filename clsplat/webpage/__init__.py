@@ -1,0 +1,1 @@
+"""A model as one self-contained web page: the splats, and a program that draws their kernels in any browser."""

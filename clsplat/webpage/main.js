@@ -1,0 +1,200 @@
+// main.js: the page. It reads the splats, draws them when something changes, and answers the buttons.
+
+// While the view moves, the image is smaller on slow devices. Sizes are shares of the screen's width and height.
+const SMALLEST = 0.35;
+const SLOW = 60, FAST = 25;  // time from one picture to the next [ms] above which the image shrinks, below which it grows
+const REST = 250;            // time without a change [ms] after which the image has its full size
+const find = (id) => document.getElementById(id);
+
+class Page {
+  constructor(settings) {
+    this.settings = settings;
+    this.canvas = find("view");
+    this.changed = true;
+    this.touring = null;
+    this.row = null;    // of the sort (sort.js) whose order the renderer has
+    this.drawn = null;  // the same for the last picture
+    this.share = 1;     // size of the image while the view moves
+    this.whole = true;  // whether the last picture had its full size
+    this.cameras = settings.cameras.length ? settings.cameras : settings.tour.cameras;
+    this.background = settings.background;
+  }
+
+  async open() {
+    const payload = await readPayload(find("payload").textContent, (share) => this.loaded(share));
+    find("payload").textContent = "";
+    this.renderer = new Renderer(this.canvas, payload, this.settings.shaders);
+    this.sorter = new Sorter(payload.columns.mean, (order, row) => this.sorted(order, row));
+    this.controls = new Controls(this.canvas, () => this.moved());
+    const tour = this.settings.tour.cameras;
+    this.middle = middleOf(tour.concat(this.settings.cameras), 3);
+    const ups = tour.map((camera) => scaled(poseOf(camera).axes[1], -1));
+    this.controls.up = unit(ups.reduce((sum, up) => add(sum, up), [0, 0, 0]));
+    this.buttons(payload.head);
+    this.jump(0);
+    find("loading").hidden = true;
+    this.last = performance.now();
+    requestAnimationFrame((now) => this.frame(now));
+  }
+
+  async loaded(share) {
+    find("loading-bar").value = share;
+    await new Promise((resolve) => setTimeout(resolve, 0));
+  }
+
+  buttons(head) {
+    const list = find("cameras");
+    this.cameras.forEach((camera, i) => list.add(new Option(camera.name || `view ${i + 1}`, i)));
+    list.onchange = () => this.jump(Number(list.value));
+    find("previous").onclick = () => this.jump(this.index - 1);
+    find("next").onclick = () => this.jump(this.index + 1);
+    find("reset").onclick = () => this.jump(0);
+    find("tour").onclick = () => this.tour(!this.touring);
+    const hex = (part) => Math.round(255 * part).toString(16).padStart(2, "0");
+    find("background").value = `#${this.background.map(hex).join("")}`;
+    find("background").oninput = (event) => {
+      this.background = [1, 3, 5].map((at) => parseInt(event.target.value.slice(at, at + 2), 16) / 255);
+      this.changed = true;
+    };
+    find("fullscreen").onclick = () =>
+      document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen();
+    find("help-button").onclick = () => find("help").showModal();
+    find("about").textContent = `${head.splats.toLocaleString("en")} splats, drawn with WebGL 2. Made by clsplat.`;
+    addEventListener("keydown", (event) => this.key(event));
+    addEventListener("resize", () => {
+      this.changed = true;
+    });
+    this.canvas.addEventListener("dblclick", (event) => this.aim(event));
+    this.canvas.addEventListener("webglcontextlost", () => this.fail(new Error("The graphics device was lost. Reload the page.")));
+  }
+
+  key(event) {
+    if (event.target !== this.canvas && event.target !== document.body) return;
+    const button = { ",": "previous", ".": "next", t: "tour", r: "reset", f: "fullscreen", h: "help-button" }[event.key];
+    if (button && !event.ctrlKey && !event.metaKey && !event.altKey) find(button).click();
+  }
+
+  // Goes to a camera of the list.
+  jump(index) {
+    this.tour(false);
+    this.index = (index + this.cameras.length) % this.cameras.length;
+    find("cameras").value = this.index;
+    this.camera = this.cameras[this.index];
+    this.controls.set(poseOf(this.camera), this.middle);
+    this.changed = true;
+  }
+
+  tour(on) {
+    this.touring = on ? { at: 0 } : null;
+    find("tour").setAttribute("aria-pressed", String(on));
+    this.changed = true;
+  }
+
+  moved() {
+    if (this.touring) this.tour(false);
+    this.changed = true;
+  }
+
+  // Turns around the splats under the pointer: the depth is that of the nearest centre beside the ray.
+  aim(event) {
+    const { mean } = this.renderer.payload.columns;
+    const { n } = this.renderer;
+    const box = this.canvas.getBoundingClientRect();
+    const scale = this.canvas.width / box.width;
+    const lens = lensFor(this.camera, this.canvas.width, this.canvas.height);
+    const { position, axes } = this.controls.pose;
+    const x = ((event.clientX - box.left) * scale - lens.cx) / lens.fx;
+    const y = ((event.clientY - box.top) * scale - lens.cy) / lens.fy;
+    let depth = Infinity;
+    const near = this.renderer.payload.head.near_plane;
+    for (let i = 0; i < n; ++i) {
+      const d = [mean[i] - position[0], mean[n + i] - position[1], mean[2 * n + i] - position[2]];
+      const z = dot(axes[2], d);
+      if (z <= near || z >= depth || this.renderer.payload.columns.opacity[i] < 0.3) continue;
+      const off = Math.hypot(dot(axes[0], d) / z - x, dot(axes[1], d) / z - y);
+      if (off < 8 / lens.fx) depth = z;
+    }
+    if (depth === Infinity) return;
+    const ray = add(add(scaled(axes[0], x), axes[1], y), axes[2]);
+    const place = add(position, ray, depth);
+    const z = unit(add(place, position, -1));
+    const x1 = unit(cross(axes[1], z));
+    this.controls.pose.axes = [x1, cross(z, x1), z];
+    this.controls.target = place;
+    this.moved();
+  }
+
+  sorted(order, row) {
+    this.renderer.setOrder(order);
+    this.row = row;
+    this.changed = true;
+  }
+
+  frame(now) {
+    const seconds = Math.min((now - this.last) / 1000, 0.1);
+    this.last = now;
+    if (this.touring) this.tourStep(seconds);
+    if (this.controls.advance(seconds)) this.changed = true;
+    if (this.changed) {
+      this.adapt(now);
+      this.draw(this.share, now);
+    } else if (!this.whole && now - this.lastDraw > REST) this.draw(1, now);
+    requestAnimationFrame((next) => this.frame(next));
+  }
+
+  tourStep(seconds) {
+    const { cameras, fps, closed } = this.settings.tour;
+    const steps = Math.max(closed ? cameras.length : cameras.length - 1, 1);
+    this.touring.at = (this.touring.at + seconds * fps) % steps;
+    const first = Math.floor(this.touring.at);
+    const pair = [cameras[first], cameras[(first + 1) % cameras.length]];
+    this.camera = pair[0];
+    this.controls.set(between(poseOf(pair[0]), poseOf(pair[1]), this.touring.at - first), this.middle);
+    this.changed = true;
+  }
+
+  // Chooses the size of the next image from the time since the last one.
+  adapt(now) {
+    const gap = now - (this.lastDraw || 0);
+    if (gap > 1000 || gap <= 0) return;  // the view was at rest
+    this.gap = 0.9 * (this.gap || gap) + 0.1 * gap;
+    if (gap > SLOW) this.share = Math.max(this.share * Math.sqrt(SLOW / gap), SMALLEST);
+    else if (gap < FAST) this.share = Math.min(this.share * 1.05, 1);
+  }
+
+  draw(share, now) {
+    this.changed = false;
+    this.whole = share === 1;
+    this.lastDraw = now;
+    const density = Math.min(devicePixelRatio || 1, 2);
+    const width = Math.max(Math.round(this.canvas.clientWidth * density), 1);
+    const height = Math.max(Math.round(this.canvas.clientHeight * density), 1);
+    this.renderer.resize(width, height, share);
+    const row = this.rowOfSort;
+    if (!this.row || row.some((value, i) => value !== this.row[i])) this.sorter.request(row);
+    this.renderer.draw(this.controls.pose, lensFor(this.camera, ...this.renderer.size), this.background);
+    this.drawn = this.row;
+    const count = this.renderer.n.toLocaleString("en");
+    find("info").textContent = this.gap ? `${count} splats, ${Math.round(1000 / this.gap)} a second` : `${count} splats`;
+  }
+
+  get rowOfSort() {
+    const { position, axes } = this.controls.pose;
+    return [...axes[2], -dot(axes[2], position)];
+  }
+
+  // True if the picture shows the present view at its full size, with its splats in order.
+  get settled() {
+    if (!this.controls || !this.drawn || this.changed || !this.whole) return false;
+    return this.rowOfSort.every((value, i) => value === this.drawn[i]);
+  }
+
+  fail(error) {
+    find("loading").hidden = false;
+    find("loading-bar").hidden = true;
+    find("loading-text").textContent = error.message;
+  }
+}
+
+const page = new Page(JSON.parse(find("settings").textContent));
+page.open().catch((error) => page.fail(error));

@@ -1,0 +1,22 @@
+#version 300 es
+// splat.frag: alpha of a pixel, cl/shape/skew_pixel.clh and cl/render/blend.clh. Row 0 of the image is at the bottom here.
+precision highp float;
+flat in vec4 vPlace, vForm, vLean;
+flat in vec3 vColour;
+out vec4 colour;
+
+float phi(float z) {
+  float t = 1.0 / (1.0 + 0.2316418838 * abs(z));
+  float p = ((((1.061405429 * t - 1.453152027) * t + 1.421413741) * t - 0.284496736) * t + 0.254829592) * t;
+  float tail = 0.5 * p * exp(-0.5 * z * z);
+  return z < 0.0 ? tail : 1.0 - tail;
+}
+
+void main() {
+  vec2 d = gl_FragCoord.xy - vPlace.xy;
+  float e = d.x * (d.x * vForm.x + d.y * vForm.y - vLean.x) + d.y * (d.y * vForm.z - vLean.y);
+  float u = dot(vLean.zw, d) + vPlace.w;
+  float alpha = min(vPlace.z * exp(e) * (u == 0.0 ? 0.5 : phi(u)), 0.99);
+  if (!(alpha >= 1.0 / 255.0)) discard;
+  colour = vec4(vColour * alpha, alpha);
+}

@@ -1,0 +1,29 @@
+#version 300 es
+// splat.vert: the rectangle of pixels that a splat reaches. Four vertices a splat, BATCH splats an instance (renderer.js).
+precision highp float;
+precision highp sampler2D;
+precision highp int;
+uniform sampler2D projected;  // five texels of a splat: the outputs of project.vert
+uniform int splats;
+uniform vec2 size;
+flat out vec4 vPlace, vForm, vLean;
+flat out vec3 vColour;
+
+const int PARTS = 5, ROW = 800, BATCH = 1024;
+
+void main() {
+  int splat = gl_InstanceID * BATCH + (gl_VertexID >> 2);
+  ivec2 at = ivec2(splat % ROW * PARTS, splat / ROW);
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside
+  if (splat >= splats) return;
+  vec4 box = texelFetch(projected, at, 0);
+  if (box.zw == vec2(0.0)) return;
+  vPlace = texelFetch(projected, at + ivec2(1, 0), 0);
+  vForm = texelFetch(projected, at + ivec2(2, 0), 0);
+  vLean = texelFetch(projected, at + ivec2(3, 0), 0);
+  vec4 rest = texelFetch(projected, at + ivec2(4, 0), 0);
+  vColour = vec3(vForm.w, rest.xy);
+  vec2 other = rest.z * normalize(vec2(-box.w, box.z));
+  vec2 px = box.xy + float(gl_VertexID & 1) * box.zw + float((gl_VertexID >> 1) & 1) * other;
+  gl_Position = vec4(2.0 * px / size - 1.0, 0.0, 1.0);
+}

@@ -1,0 +1,282 @@
+"""The web page in a real browser: headless Chromium draws what clsplat renders, and follows mouse, touch and keys."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install clsplat[test-view])")
+
+from playwright.sync_api import Browser, Page
+from viewer_browser import CHROMIUM, chromium
+
+from clsplat.cameras.camera import Camera
+from clsplat.cameras.cameras_json import NamedCamera
+from clsplat.evaluation.metrics import psnr
+from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.random_scene import synthetic_scene
+from clsplat.splats.splats import Splats
+from clsplat.webpage.page import PageContent, write_web_page
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
+
+WIDTH, HEIGHT = 320, 240
+BACKGROUND = (0.2, 0.4, 0.6)
+FULL, COMPACT = 45.0, 40.0  # lowest PSNR against the renderer [dB]
+SETTLED = "page.settled"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as running:
+        yield running
+
+
+def scene(shape: str, degree: int = 3, **options: Any) -> tuple[Splats, list[NamedCamera]]:
+    """Return 3000 random splats in a ball, and cameras around it with an off-centre principal point."""
+    made, splats = synthetic_scene(3000, WIDTH, HEIGHT, shape, degree)
+    moved = [
+        Camera(WIDTH, HEIGHT, c.fx, 1.1 * c.fy, c.cx + 9, c.cy - 7, c.cam_from_world)
+        for c in (view.camera for view in made.views)
+    ]
+    cameras = [NamedCamera(f"photo {i}", camera) for i, camera in enumerate(moved)]
+    return Splats(shape, splats.to_numpy(), **options), cameras
+
+
+def opened(browser: Browser, path: Path, content: tuple[Splats, list[NamedCamera]], precision: str = "full") -> Page:
+    """Write a page, open it in a window of the cameras' size, and wait for its picture."""
+    splats, cameras = content
+    write_web_page(path, splats, PageContent("ball", cameras, background=BACKGROUND), precision)
+    page = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, has_touch=True).new_page()
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(path.as_uri())
+    page.wait_for_function(f"window.errors || {SETTLED}")
+    assert not errors
+    return page
+
+
+def picture(page: Page) -> NDArray[np.float32]:
+    page.wait_for_function(SETTLED)
+    data = page.evaluate("page.canvas.toDataURL('image/png')").split(",")[1]
+    shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+    return shown.astype(np.float32) / 255
+
+
+def rendered(splats: Splats, camera: Camera) -> NDArray[np.float32]:
+    return np.clip(Renderer().render(splats, camera, BACKGROUND).color, 0, 1).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("shape", "degree", "options"),
+    [
+        ("gaussian", 3, {}),
+        ("gaussian", 0, {"antialiased": True}),
+        ("skew-normal", 3, {}),
+        ("skew-normal", 2, {"normalisation": "pdf", "near_plane": 2.0}),
+        ("skew-normal", 1, {"normalisation": "none"}),
+        ("skew-normal", 3, {"antialiased": True}),
+    ],
+    ids=str,
+)
+def test_the_page_draws_what_clsplat_renders(
+    browser: Browser, tmp_path: Path, shape: str, degree: int, options: dict[str, Any]
+) -> None:
+    content = scene(shape, degree, **options)
+    splats, cameras = content
+    with opened(browser, tmp_path / "ball.html", content) as page:
+        for number, named in enumerate(cameras[:3]):
+            page.evaluate(f"page.jump({number})")
+            expected = rendered(splats, named.camera)
+            assert expected.std() > 0.05
+            assert psnr(picture(page), expected) > FULL
+
+
+def test_compact_pages_are_close(browser: Browser, tmp_path: Path) -> None:
+    content = scene("skew-normal")
+    with opened(browser, tmp_path / "ball.html", content, "compact") as page:
+        assert psnr(picture(page), rendered(content[0], content[1][0].camera)) > COMPACT
+
+
+@pytest.fixture(scope="module")
+def ball(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with opened(browser, tmp_path_factory.mktemp("page") / "ball.html", scene("skew-normal")) as page:
+        yield page
+
+
+@pytest.fixture
+def page(ball: Page) -> Page:
+    """The page of the ball, at its first camera."""
+    ball.evaluate("page.jump(0)")
+    ball.wait_for_function(SETTLED)
+    return ball
+
+
+def pose(page: Page) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    found = page.evaluate("page.controls.pose")
+    position, axes = np.array(found["position"]), np.array(found["axes"])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(axes) > 0
+    return position, axes
+
+
+def target(page: Page) -> NDArray[np.float64]:
+    return np.array(page.evaluate("page.controls.target"))
+
+
+def test_the_page_begins_with_the_first_camera_and_names_all(page: Page) -> None:
+    assert page.title() == "ball"
+    assert page.locator("#loading").is_hidden()
+    assert page.locator("#cameras option").all_inner_texts() == [f"photo {i}" for i in range(6)]
+    assert "3,000 splats" in page.locator("#info").inner_text()
+
+
+def test_a_drag_turns_around_the_middle(page: Page) -> None:
+    (before, _), middle, first = pose(page), target(page), picture(page)
+    page.mouse.move(160, 120)
+    page.mouse.down()
+    page.mouse.move(220, 120, steps=3)
+    page.mouse.up()
+    after, axes = pose(page)
+    np.testing.assert_allclose(target(page), middle, atol=1e-6)
+    assert np.linalg.norm(after - middle) == pytest.approx(np.linalg.norm(before - middle), rel=1e-5)
+    assert np.linalg.norm(after - before) > 0.1
+    assert axes[2] @ (middle - after) > 0
+    assert psnr(picture(page), first) < 30
+
+
+def test_the_wheel_comes_closer_and_the_right_button_moves_sideways(page: Page) -> None:
+    (before, axes), middle = pose(page), target(page)
+    page.mouse.move(160, 120)
+    page.mouse.wheel(0, -300)
+    page.wait_for_timeout(100)
+    closer, _ = pose(page)
+    assert np.linalg.norm(closer - middle) < 0.9 * np.linalg.norm(before - middle)
+    page.mouse.down(button="right")
+    page.mouse.move(190, 120)
+    page.mouse.up(button="right")
+    aside, _ = pose(page)
+    assert (aside - closer) @ axes[0] < -0.01, "the scene follows the hand"
+    np.testing.assert_allclose(target(page) - middle, aside - closer, atol=1e-6)
+
+
+def test_keys_fly_and_look(page: Page) -> None:
+    before, axes = pose(page)
+    page.locator("#view").focus()
+    page.keyboard.down("w")
+    page.wait_for_timeout(300)
+    page.keyboard.up("w")
+    ahead, _ = pose(page)
+    assert (ahead - before) @ axes[2] > 0.05
+    page.keyboard.down("ArrowRight")
+    page.wait_for_timeout(300)
+    page.keyboard.up("ArrowRight")
+    still, turned = pose(page)
+    np.testing.assert_allclose(still, ahead, atol=1e-6)
+    assert turned[2] @ axes[0] > 0.05
+
+
+def test_one_finger_turns_and_two_come_closer(page: Page) -> None:
+    touch = """([fingers, moves]) => { const view = page.canvas;
+        view.setPointerCapture = () => {};
+        const send = (kind, id, x, y) => view.dispatchEvent(new PointerEvent(kind,
+            {pointerId: id, pointerType: "touch", clientX: x, clientY: y, bubbles: true}));
+        fingers.forEach(([x, y], id) => send("pointerdown", id + 5, x, y));
+        moves.forEach(([id, x, y]) => send("pointermove", id + 5, x, y));
+        fingers.forEach(([x, y], id) => send("pointerup", id + 5, x, y)); }"""
+    before, middle = pose(page)[0], target(page)
+    page.evaluate(touch, [[[160, 120]], [[0, 200, 120]]])
+    turned = pose(page)[0]
+    assert np.linalg.norm(turned - middle) == pytest.approx(np.linalg.norm(before - middle), rel=1e-5)
+    assert np.linalg.norm(turned - before) > 0.05
+    page.evaluate(touch, [[[140, 120], [180, 120]], [[0, 120, 120], [1, 200, 120]]])
+    assert page.evaluate("page.controls.distance") == pytest.approx(0.5 * np.linalg.norm(turned - middle), rel=1e-3)
+
+
+def test_buttons_go_to_cameras_and_tour(page: Page) -> None:
+    first = pose(page)[0]
+    page.locator("#next").click()
+    assert page.locator("#cameras").input_value() == "1"
+    second = pose(page)[0]
+    assert not np.allclose(first, second)
+    page.locator("#previous").click()
+    np.testing.assert_allclose(pose(page)[0], first)
+    page.locator("#cameras").select_option("3")
+    assert not np.allclose(pose(page)[0], first)
+    page.locator("#reset").click()
+    np.testing.assert_allclose(pose(page)[0], first)
+    page.locator("#tour").click()
+    page.wait_for_timeout(500)
+    assert page.locator("#tour").get_attribute("aria-pressed") == "true"
+    assert not np.allclose(pose(page)[0], first)
+    page.locator("#tour").click()
+    assert page.locator("#tour").get_attribute("aria-pressed") == "false"
+
+
+def test_the_background_shines_through_where_splats_do(page: Page) -> None:
+    before = picture(page)
+    page.locator("#background").fill("#ff0000")
+    change = picture(page) - before
+    page.locator("#background").fill("#336699")
+    assert change[..., 0].max() > 0.3
+    np.testing.assert_allclose(change, change[..., :1] * (np.array([0.8, -0.4, -0.6]) / 0.8), atol=0.01)
+
+
+def test_a_double_click_makes_a_place_the_middle(page: Page) -> None:
+    before = pose(page)[0]
+    page.mouse.dblclick(170, 110)
+    page.wait_for_timeout(100)
+    after, axes = pose(page)
+    np.testing.assert_allclose(after, before, atol=1e-6)
+    ahead = target(page) - after
+    np.testing.assert_allclose(ahead / np.linalg.norm(ahead), axes[2], atol=1e-6)
+
+
+def test_help_lists_the_keys(page: Page) -> None:
+    page.locator("#view").focus()
+    page.keyboard.press("h")
+    assert page.locator("#help").is_visible()
+    assert "3,000 splats" in page.locator("#about").inner_text()
+    page.keyboard.press("Escape")
+    assert page.locator("#help").is_hidden()
+
+
+def test_a_slow_device_gets_smaller_images_while_it_moves(page: Page) -> None:
+    page.evaluate("page.share = 1; page.changed = false; page.lastDraw = 0; page.adapt(200)")
+    assert page.evaluate("page.share") < 0.6
+    page.evaluate("for (let i = 1; i < 60; ++i) { page.lastDraw = 20 * i; page.adapt(20 * i + 20); }")
+    assert page.evaluate("page.share") == 1
+    page.evaluate("page.share = 0.5; page.changed = true")
+    page.wait_for_function(f"page.renderer.size[0] < {WIDTH}")
+    page.wait_for_function(SETTLED)
+    assert page.evaluate("page.renderer.size") == [WIDTH, HEIGHT], "a view at rest has its full size"
+
+
+def test_a_browser_without_webgl_is_told(browser: Browser, tmp_path: Path) -> None:
+    splats, cameras = scene("gaussian")
+    write_web_page(tmp_path / "ball.html", splats, PageContent("ball", cameras))
+    with browser.new_page() as page:
+        page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+        page.goto((tmp_path / "ball.html").as_uri())
+        page.wait_for_selector("#loading-text:has-text('This browser has no WebGL 2')")
+
+
+def test_a_damaged_page_says_so(browser: Browser, tmp_path: Path) -> None:
+    splats, cameras = scene("gaussian")
+    path = tmp_path / "ball.html"
+    write_web_page(path, splats, PageContent("ball", cameras))
+    text = path.read_text()
+    start = text.index('id="payload"') + 400
+    path.write_text(text[:start] + text[start + 400 :])
+    page = browser.new_page()
+    page.goto(path.as_uri())
+    page.wait_for_function("document.getElementById('loading-bar').hidden")
+    assert page.locator("#loading-text").inner_text()
