@@ -52,7 +52,8 @@ if TYPE_CHECKING:
 @click.option(
     "--precision",
     type=click.Choice(list(PRECISIONS)),
-    help="Of an .html page: compact rounds each value to one to three bytes, full keeps all digits.  [default: compact]",
+    help="Of an .html page: compact rounds each value to one to three bytes, full keeps all digits.  [default: "
+    "compact]",
 )
 @click.option(
     "--camera-path",
@@ -81,7 +82,7 @@ def convert_model(
     device: str | None,
     quiet: bool,
 ) -> None:
-    """Write MODEL, a folder or a file of splats, into OUTPUT: a .ply with all columns, a .splat or .spz file, or a page.
+    """Write MODEL, a folder or a file of splats, into OUTPUT: a .ply, .splat or .spz file, or an .html page.
 
     An .html page shows the splats in any browser with WebGL 2. It needs no server and no network: send it to anybody.
     It draws Gaussians and skew-normals as they are.

@@ -119,7 +119,9 @@ def convert_model(
     if spz_version is not None and suffix != SPZ_ENDING:
         raise InputError(f"{output}: the version is of .spz files: leave it out, or choose the ending .spz")
     if page is not None and suffix != PAGE_ENDING:
-        raise InputError(f"{output}: precision, camera path and title are of pages: leave them out, or choose the ending .html")
+        raise InputError(
+            f"{output}: precision, camera path and title are of pages: leave them out, or choose the ending .html"
+        )
     refuse_existing([output], overwrite)
     source = model_at(model, iteration)
     target = shape or (GAUSSIAN.name if suffix in GAUSSIAN_ENDINGS else source.splats.shape)

@@ -24,7 +24,7 @@ _ELSEWHERE = (".ksplat", ".lcc", ".lcc2")  # formats that splat-transform of Pla
 
 
 def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
-    """Read a PLY of splats (whole, compact or compressed), an .spz, .sog or .splat file, the meta.json of a SOG, or a page.
+    """Read a PLY of splats (whole, compact or compressed), an .spz, .sog or .splat file, a SOG's meta.json, or a page.
 
     Splats and columns that cannot be used are left out, with a warning.
 
@@ -91,7 +91,9 @@ def check_ending(path: Path, *more: str) -> str:
     endings = (PLY_ENDING, *GAUSSIAN_ENDINGS, *more)
     suffix = path.suffix.lower()
     if suffix not in endings:
-        raise OutputError(f"{path}: writes {', '.join(endings[:-1])} and {endings[-1]} files: choose one of these endings")
+        raise OutputError(
+            f"{path}: writes {', '.join(endings[:-1])} and {endings[-1]} files: choose one of these endings"
+        )
     return suffix
 
 

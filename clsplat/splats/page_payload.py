@@ -1,12 +1,12 @@
 """Splats inside a web page: columns of whole numbers, and back. `clsplat/webpage/` makes the page.
 
-The page has an element `<script id="payload" type="text/plain">` with a gzip stream in base64. The stream begins with the
-length of a JSON text as four bytes, the lowest first. Then come the text and the columns. The text has the number of splats,
-the kernel, and the columns in their order: name, width, bytes of a number, the largest number, and the map from numbers
-to values. Each component of a column is stored by itself: first the lowest bytes of all splats, then the next ones. So
-equal bytes lie side by side, which gzip needs.
+The page has an element `<script id="payload" type="text/plain">` with a gzip stream in base64. The stream begins with
+the length of a JSON text as four bytes, the lowest first. Then come the text and the columns. The text has the number
+of splats, the kernel, and the columns in their order: name, width, bytes of a number, the largest number, and the map
+from numbers to values. Each component of a column is stored alone: first the lowest bytes of all splats, then the next
+ones. So equal bytes lie side by side, which gzip needs.
 
-Maps from a whole number q to a value, with u = q / most and s = 2 u - 1:
+Maps from a whole number q to a value, with u = q / largest and s = 2 u - 1:
 
     linear    low + u (high - low)
     root      s |s| high: finer near zero, for values that are mostly small
@@ -57,7 +57,7 @@ class _Column:
     name: str
     map: str
     nbytes: int
-    most: int
+    largest: int
 
 
 # With an even largest number, the maps `root` and `log` have an exact zero. "full" keeps every value as float32.
@@ -70,7 +70,14 @@ _COMPACT = (
     _Column("harmonics", "root", 1, 30),
     _Column("skew", "linear", 1, 126),
 )
-_WIDTHS: dict[str, tuple[int, ...]] = {"mean": (3,), "log_scale": (3,), "rotation": (3,), "opacity": (1,), "color": (3,), "skew": (3,)}
+_WIDTHS: dict[str, tuple[int, ...]] = {
+    "mean": (3,),
+    "log_scale": (3,),
+    "rotation": (3,),
+    "opacity": (1,),
+    "color": (3,),
+    "skew": (3,),
+}
 _WIDTHS |= {"harmonics": tuple(3 * (sh_coefficients(degree) - 1) for degree in (1, 2, 3))}
 _OPTIONAL = ("harmonics", "skew")
 
@@ -90,7 +97,7 @@ def pack(splats: StoredSplats, precision: str = PRECISIONS[0]) -> bytes:
             entry: dict[str, Any] = {"map": "float", "bytes": 4}
             numbers = values.astype("<f4").view("<u4")
         else:
-            entry = {"map": column.map, "bytes": column.nbytes, "most": column.most} | _range(column, values)
+            entry = {"map": column.map, "bytes": column.nbytes, "largest": column.largest} | _range(column, values)
             numbers = _numbers(entry, values)
         columns.append({"name": column.name, "width": values.shape[1], **entry})
         parts += [_planes(component, entry["bytes"]) for component in numbers.T]
@@ -112,7 +119,7 @@ def read_page(path: str | os.PathLike[str]) -> StoredSplats:
 
     Raises
     ------
-    InputError : the file is missing, or it is no page of clsplat, or its payload is damaged.
+    InputError : the file is missing, or it is not a page of clsplat, or its payload is damaged.
     """
     path = Path(path)
     try:
@@ -138,7 +145,7 @@ def unpack(path: object, payload: bytes) -> StoredSplats:
         head = json.loads(start[4 : 4 + length])
         columns = _checked_columns(head)
         total = 4 + length + sum(column["width"] * column["bytes"] for column in columns) * head["splats"]
-        # A stream is at most 1032 times its file, so a false number of splats is found before memory is allocated.
+        # A stream is at largest 1032 times its file, so a false number of splats is found before memory is allocated.
         if total > _MAX_RATIO * len(payload) + 4 + _MAX_TEXT:
             raise ValueError
         stream = zlib.decompressobj(_GZIP)
@@ -185,14 +192,14 @@ def _checked_columns(head: Any) -> list[dict[str, Any]]:
         if column["map"] == "float":
             if column["bytes"] != 4:
                 raise ValueError
-        elif (column["map"], column["bytes"]) != (expected.map, expected.nbytes):
+            continue
+        if (column["map"], column["bytes"]) != (expected.map, expected.nbytes):
             raise ValueError
-        elif not 0 < column["most"] < 256 ** column["bytes"]:
+        bounds = np.array([column["low"], column["high"]], np.float64)
+        if not 0 < column["largest"] < 256 ** column["bytes"]:
             raise ValueError
-        else:
-            bounds = np.array([column["low"], column["high"]], np.float64)
-            if bounds.shape != (2, column["width"]) or not np.isfinite(bounds).all():
-                raise ValueError
+        if bounds.shape != (2, column["width"]) or not np.isfinite(bounds).all():
+            raise ValueError
     names = [column["name"] for column in columns]
     if names != [column.name for column in _COMPACT if column.name in names or column.name not in _OPTIONAL]:
         raise ValueError
@@ -258,7 +265,7 @@ def _numbers(entry: Mapping[str, Any], values: Array) -> NDArray[np.uint32]:
         else:
             share = 0.5 + 0.5 * np.sign(values - low) * np.log1p(np.abs(values - low)) / high
     share = np.where(high > low, share, 0.0) if entry["map"] == "linear" else np.where(high > 0.0, share, 0.5)
-    return np.rint(share * entry["most"]).astype(np.uint32)
+    return np.rint(share * entry["largest"]).astype(np.uint32)
 
 
 def _values(column: Mapping[str, Any], numbers: NDArray[np.uint32]) -> DoubleArray:
@@ -266,7 +273,7 @@ def _values(column: Mapping[str, Any], numbers: NDArray[np.uint32]) -> DoubleArr
     if column["map"] == "float":
         return np.ascontiguousarray(numbers).view(np.float32).astype(np.float64)
     low, high = np.array(column["low"]), np.array(column["high"])
-    share = numbers / float(column["most"])
+    share = numbers / float(column["largest"])
     if column["map"] == "linear":
         return np.asarray(low + share * (high - low))
     side = 2.0 * share - 1.0

@@ -45,11 +45,11 @@ function readComponent(whole, at, column, c, n, values) {
   }
   const low = column.low[c];
   const high = column.high[c];
-  const { most } = column;
+  const { largest } = column;
   for (let i = 0; i < n; ++i) {
     let number = 0;
     for (let b = column.bytes - 1; b >= 0; --b) number = number * 256 + whole[at + b * n + i];
-    const share = number / most;
+    const share = number / largest;
     const side = 2 * share - 1;
     if (column.map === "linear") values[i] = low + share * (high - low);
     else if (column.map === "root") values[i] = side * Math.abs(side) * high;

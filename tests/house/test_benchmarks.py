@@ -361,3 +361,21 @@ def test_defaults(tmp_path: Path, capture_folder: Path) -> None:
         assert row["splats"] <= 60
         assert f"| {row['system']} | {row['psnr']:.2f} |" in done.stdout
     assert rows[1]["options"]["strategy"] == "mcmc"
+
+
+@pytest.mark.slow
+def test_web_page(tmp_path: Path) -> None:
+    pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install clsplat[test-view])")
+    from viewer_browser import CHROMIUM
+
+    if CHROMIUM is None:
+        pytest.skip("no Chromium: apt install chromium")
+    out = tmp_path / "web_page.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "web_page.py"), "--smoke", "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    compact, full = (json.loads(line) for line in out.read_text().splitlines())
+    assert compact["bytes"] < full["bytes"]
+    assert min(compact["psnr"], compact["rounding_psnr"]) > 35
+    assert min(full["psnr"], full["rounding_psnr"]) > 45
+    assert min(compact["whole_ms"], compact["opened_s"]) > 0
+    assert "| `smoke` |" in done.stdout
