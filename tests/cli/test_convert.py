@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_runner import clsplat, error_of
+from model_arrays import random_model
 
 from clsplat.cameras.cameras_json import read_cameras
+from clsplat.cameras.path import CameraPath, write_path
 from clsplat.evaluation.metrics import psnr
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import GAUSSIAN, SHAPES, SKEW_NORMAL, SKEW_NORMAL_DIRECT
@@ -90,6 +92,49 @@ def test_files_for_viewers_are_measured_as_written(model: Path, tmp_path: Path) 
         np.testing.assert_array_equal(Splats.load(tmp_path / f"{name}.ply").mean, splats.mean)
 
 
+def test_a_page_is_measured_and_read_back(model: Path, tmp_path: Path) -> None:
+    page = tmp_path / "scene.html"
+    said = clsplat("convert", model, page, "--title", "My <scene>")
+    told = re.search(r"([\d.]+) dB, worst", said)
+    assert told is not None
+    assert float(told[1]) > 45
+    text = page.read_text()
+    assert "<title>My &lt;scene&gt;</title>" in text
+    assert text.count('"img_name"') == 0
+    assert all(f'"name": "{entry.name}"' in text for entry in read_cameras(model / "cameras.json"))
+    before = Splats.load(ModelFolder(model).latest_ply()[0])
+    assert len(Splats.load(page)) == len(before)
+    clsplat("convert", model, page, "--overwrite", "--precision", "full", "-q")
+    np.testing.assert_array_equal(Splats.load(page).mean, before.mean)
+    assert "splats" in clsplat("info", page)
+
+
+def test_a_page_plays_a_recorded_path(model: Path, tmp_path: Path) -> None:
+    cameras = [entry.camera for entry in read_cameras(model / "cameras.json")]
+    write_path(tmp_path / "path.json", CameraPath(tuple(cameras[:2]), 12.0))
+    clsplat("convert", model, tmp_path / "scene.html", "--camera-path", tmp_path / "path.json", "-q")
+    assert '"fps": 12.0, "closed": false' in (tmp_path / "scene.html").read_text()
+
+
+def test_options_of_pages_belong_to_pages(model: Path, tmp_path: Path) -> None:
+    said = "precision, camera path and title are of pages: leave them out, or choose the ending .html"
+    for option in (("--precision", "full"), ("--title", "x"), ("--camera-path", "x.json")):
+        assert said in error_of("convert", model, tmp_path / "out.ply", *option)
+    assert "'half' is not one of" in error_of("convert", model, tmp_path / "a.html", "--precision", "half", code=2)
+    assert "no.json" in error_of("convert", model, tmp_path / "a.html", "--camera-path", tmp_path / "no.json")
+    assert not list(tmp_path.glob("*.html"))
+
+
+def test_a_page_of_another_kernel_has_the_nearest_gaussians_if_asked(tmp_path: Path) -> None:
+    splats = Splats("student-t", random_model(SHAPES["student-t"], 9, 0, dead=0))
+    splats.save(tmp_path / "t.ply")
+    said = error_of("convert", tmp_path / "t.ply", tmp_path / "t.html")
+    assert "a page draws gaussian and skew-normal splats, not student-t" in said
+    assert said.endswith("; or --approximate")
+    clsplat("convert", tmp_path / "t.ply", tmp_path / "t.html", "--approximate", "-q")
+    assert Splats.load(tmp_path / "t.html").shape == "gaussian"
+
+
 def test_the_version_of_an_spz_file_is_chosen(model: Path, tmp_path: Path) -> None:
     pytest.importorskip("zstandard")
     for version, start in ((3, b"\x1f\x8b"), (4, b"NGSP\4")):
@@ -136,7 +181,7 @@ def test_a_ply_for_other_programs_has_3dgs_s_columns(model: Path, tmp_path: Path
 def test_bad_input(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     assert "'cube'" in error_of("convert", model, out, "--shape", "cube", code=2)
-    assert "writes .ply, .splat and .spz files" in error_of("convert", model, tmp_path / "out.obj")
+    assert "writes .ply, .splat, .spz and .html files" in error_of("convert", model, tmp_path / "out.obj")
     assert "leave --shape out" in error_of("convert", model, tmp_path / "out.splat", "--shape", "skew-normal")
     assert "no such model folder or file" in error_of("convert", tmp_path / "none", out, "--shape", "gaussian")
 

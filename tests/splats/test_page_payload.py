@@ -175,6 +175,28 @@ def test_lying_columns_are_refused(tmp_path: Path, name: str, value: Any) -> Non
         read_page(page_with(tmp_path / "lie.html", rewritten(payload, columns=columns)))
 
 
+def test_a_page_without_positions_is_refused(tmp_path: Path) -> None:
+    whole = gzip.decompress(pack(stored(5)))
+    (length,) = struct.unpack("<I", whole[:4])
+    head = json.loads(whole[4 : 4 + length])
+    first = head["columns"].pop(0)
+    assert first["name"] == "mean"
+    text = json.dumps(head).encode()
+    rest = whole[4 + length + 3 * first["bytes"] * 5 :]
+    with pytest.raises(InputError, match=r"lie.html: its payload cannot be read"):
+        read_page(page_with(tmp_path / "lie.html", gzip.compress(struct.pack("<I", len(text)) + text + rest)))
+
+
+def test_skews_at_their_limit_stay_within_it() -> None:
+    arrays = random_model(SKEW_NORMAL, 300, 5)
+    limit = SKEW_NORMAL.schema(0)["skew"].limit
+    assert limit is not None
+    arrays["skew"] *= (limit / np.linalg.norm(arrays["skew"], axis=1, keepdims=True)).astype(np.float32)
+    after = unpack("page", pack(StoredSplats("skew-normal", "peak", False, arrays))).arrays["skew"]
+    assert np.linalg.norm(after, axis=1).max() <= limit * (1 + 1e-6)
+    np.testing.assert_allclose(after, arrays["skew"], atol=0.02)
+
+
 def test_a_false_number_of_splats_allocates_nothing(tmp_path: Path) -> None:
     page = page_with(tmp_path / "lie.html", rewritten(pack(stored(5)), splats=10**9))
     tracemalloc.start()

@@ -30,6 +30,7 @@ from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
+from clsplat.webpage.page import PageContent, write_web_page
 
 
 @dataclass(frozen=True)
@@ -325,7 +326,12 @@ def read_facts(folder: Path) -> None:
     scene_info(folder)
 
 
+def make_page(folder: Path) -> None:
+    write_web_page(folder / "a.html", small_splats(), PageContent("page"))
+
+
 READERS = {
+    "page": Sample(make_page, lambda f: finite(Splats.load(f / "a.html").arrays)),
     "ply": Sample(lambda f: small_splats().save(f / "model.ply"), lambda f: finite(read_ply(f / "model.ply").arrays)),
     "ply-compact": Sample(make_compact, lambda f: finite(read_ply(f / "model.ply").arrays)),
     "point-cloud": Sample(make_ascii, lambda f: read_point_cloud(f / "points.ply")),

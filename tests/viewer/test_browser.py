@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from viser import CameraHandle, ClientHandle
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
+from clsplat.splats.splats import Splats
 from clsplat.viewer.initial_view import SceneCameras, initial_view
 from clsplat.viewer.page import HELP
 from clsplat.viewer.server import Server
@@ -163,3 +165,15 @@ def test_keys_do_what_the_help_says(server: Server, page: Page) -> None:
         moved = reports.position
         assert sign * moved[axis] > 0.05, (key, moved)
         assert abs(moved[axis]) > 5 * np.abs(np.delete(moved, axis)).max(), (key, moved)
+
+
+def test_the_model_is_downloaded_as_a_web_page(page: Page, tmp_path: Path) -> None:
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Download web page").click()
+    assert download.value.suggested_filename == "view.html"
+    download.value.save_as(tmp_path / "view.html")
+    np.testing.assert_allclose(Splats.load(tmp_path / "view.html").mean, wall().mean, atol=1e-4)
+    text = (tmp_path / "view.html").read_text()
+    assert '"name": "front"' in text
+    assert '"name": "aside"' in text
+    assert '"background": [0.0, 0.0, 1.0]' in text
