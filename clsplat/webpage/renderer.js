@@ -138,9 +138,9 @@ class Renderer {
     this.makeTexture(3);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, PARTS * ROW, rows);
 
-    // Two triangles for each splat of a batch.
+    // Two triangles for each splat of a batch. The last corner of both is the same: it alone has the flat values.
     const corners = new Uint16Array(6 * BATCH);
-    for (let i = 0; i < BATCH; ++i) corners.set([0, 1, 2, 2, 1, 3].map((corner) => 4 * i + corner), 6 * i);
+    for (let i = 0; i < BATCH; ++i) corners.set([0, 1, 3, 2, 0, 3].map((corner) => 4 * i + corner), 6 * i);
     this.splatArray = gl.createVertexArray();
     gl.bindVertexArray(this.splatArray);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());

@@ -18,11 +18,13 @@ void main() {
   if (splat >= splats) return;
   vec4 box = texelFetch(projected, at, 0);
   if (box.zw == vec2(0.0)) return;
-  vPlace = texelFetch(projected, at + ivec2(1, 0), 0);
-  vForm = texelFetch(projected, at + ivec2(2, 0), 0);
-  vLean = texelFetch(projected, at + ivec2(3, 0), 0);
   vec4 rest = texelFetch(projected, at + ivec2(4, 0), 0);
-  vColour = vec3(vForm.w, rest.xy);
+  if ((gl_VertexID & 3) == 3) {  // the corner whose flat values a triangle takes
+    vPlace = texelFetch(projected, at + ivec2(1, 0), 0);
+    vForm = texelFetch(projected, at + ivec2(2, 0), 0);
+    vLean = texelFetch(projected, at + ivec2(3, 0), 0);
+    vColour = vec3(vForm.w, rest.xy);
+  }
   vec2 other = rest.z * normalize(vec2(-box.w, box.z));
   vec2 px = box.xy + float(gl_VertexID & 1) * box.zw + float((gl_VertexID >> 1) & 1) * other;
   gl_Position = vec4(2.0 * px / size - 1.0, 0.0, 1.0);
