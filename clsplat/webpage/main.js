@@ -16,6 +16,7 @@ class Page {
     this.drawn = null;  // the same for the last picture
     this.share = 1;     // size of the image while the view moves
     this.whole = true;  // whether the last picture had its full size
+    this.gap = null;    // mean time between the pictures of a view that moves [ms]
     this.cameras = settings.cameras.length ? settings.cameras : settings.tour.cameras;
     this.background = settings.background;
   }
@@ -138,7 +139,11 @@ class Page {
     if (this.changed) {
       this.adapt(now);
       this.draw(this.share, now);
-    } else if (!this.whole && now - this.lastDraw > REST) this.draw(1, now);
+    } else if (now - this.lastDraw > REST && (!this.whole || this.gap !== null)) {
+      this.gap = null;
+      if (this.whole) this.describe();
+      else this.draw(1, now);
+    }
     requestAnimationFrame((next) => this.frame(next));
   }
 
@@ -156,8 +161,8 @@ class Page {
   // Chooses the size of the next image from the time since the last one.
   adapt(now) {
     const gap = now - (this.lastDraw || 0);
-    if (gap > 1000 || gap <= 0) return;  // the view was at rest
-    this.gap = 0.9 * (this.gap || gap) + 0.1 * gap;
+    this.gap = gap > 1000 ? null : 0.9 * (this.gap || gap) + 0.1 * gap;
+    if (this.gap === null || gap <= 0) return;  // the view was at rest
     if (gap > SLOW) this.share = Math.max(this.share * Math.sqrt(SLOW / gap), SMALLEST);
     else if (gap < FAST) this.share = Math.min(this.share * 1.05, 1);
   }
@@ -174,6 +179,10 @@ class Page {
     if (!this.row || row.some((value, i) => value !== this.row[i])) this.sorter.request(row);
     this.renderer.draw(this.controls.pose, lensFor(this.camera, ...this.renderer.size), this.background);
     this.drawn = this.row;
+    this.describe();
+  }
+
+  describe() {
     const count = this.renderer.n.toLocaleString("en");
     find("info").textContent = this.gap ? `${count} splats, ${Math.round(1000 / this.gap)} a second` : `${count} splats`;
   }
