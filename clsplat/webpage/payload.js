@@ -14,6 +14,7 @@ async function bytesOfBase64(text, progress) {
 }
 
 async function unzipped(bytes) {
+  if (typeof DecompressionStream === "undefined") throw new Error("This browser is too old for the page. Update it.");
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }

@@ -271,13 +271,29 @@ def test_a_slow_device_gets_smaller_images_while_it_moves(page: Page) -> None:
     assert page.evaluate("page.renderer.size") == [WIDTH, HEIGHT], "a view at rest has its full size"
 
 
-def test_a_browser_without_webgl_is_told(browser: Browser, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("without", "said"),
+    [
+        ("HTMLCanvasElement.prototype.getContext = () => null", "This browser has no WebGL 2"),
+        ("delete window.DecompressionStream", "This browser is too old for the page"),
+    ],
+)
+def test_old_browsers_are_told(browser: Browser, tmp_path: Path, without: str, said: str) -> None:
     splats, cameras = scene("gaussian")
     write_web_page(tmp_path / "ball.html", splats, PageContent("ball", cameras))
     with browser.new_page() as page:
-        page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+        page.add_init_script(without)
         page.goto((tmp_path / "ball.html").as_uri())
-        page.wait_for_selector("#loading-text:has-text('This browser has no WebGL 2')")
+        page.wait_for_selector(f"#loading-text:has-text('{said}')")
+
+
+def test_a_page_works_without_workers(browser: Browser, tmp_path: Path) -> None:
+    splats, cameras = scene("gaussian")
+    write_web_page(tmp_path / "ball.html", splats, PageContent("ball", cameras, background=BACKGROUND), "full")
+    with browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}) as page:
+        page.add_init_script("window.Worker = class { constructor() { throw new Error('no workers'); } }")
+        page.goto((tmp_path / "ball.html").as_uri())
+        assert psnr(picture(page), rendered(splats, cameras[0].camera)) > FULL
 
 
 def test_a_damaged_page_says_so(browser: Browser, tmp_path: Path) -> None:
