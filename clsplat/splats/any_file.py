@@ -20,6 +20,7 @@ SPZ_ENDING = ".spz"
 GAUSSIAN_ENDINGS = (".splat", SPZ_ENDING)  # formats that hold Gaussians only
 READ_ENDINGS = (PLY_ENDING, *GAUSSIAN_ENDINGS, ".sog", PAGE_ENDING)
 
+_PAGE_START = b"<!DOCTYP"
 _ELSEWHERE = (".ksplat", ".lcc", ".lcc2")  # formats that splat-transform of PlayCanvas reads
 
 
@@ -41,9 +42,9 @@ def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
         )
     if suffix == ".splat":
         return read_splat(path)
-    if suffix == PAGE_ENDING:
-        return read_page(path)
     start = _start(path)
+    if suffix == PAGE_ENDING or start == _PAGE_START:
+        return read_page(path)
     if suffix == SPZ_ENDING or is_spz(start):
         return read_spz(path)
     return read_sog(path) if suffix == ".sog" or path.name == META or is_sog(start) else read_ply(path)

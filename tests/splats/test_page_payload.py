@@ -107,12 +107,13 @@ def test_equal_models_give_equal_bytes_and_compact_is_smaller() -> None:
     assert len(pack(model)) < 0.35 * len(pack(model, "full"))
 
 
-def test_a_page_is_read_by_its_ending(tmp_path: Path) -> None:
+def test_a_page_is_read_by_its_ending_or_its_content(tmp_path: Path) -> None:
     model = stored(20)
     splats = Splats("skew-normal", model.arrays)
     write_web_page(tmp_path / "scene.html", splats, PageContent("scene"), "full")
-    again = Splats.load(tmp_path / "scene.html")
-    np.testing.assert_array_equal(again.mean, splats.mean)
+    (tmp_path / "renamed").write_bytes((tmp_path / "scene.html").read_bytes())
+    for name in ("scene.html", "renamed"):
+        np.testing.assert_array_equal(Splats.load(tmp_path / name).mean, splats.mean)
     with pytest.raises(OutputError, match=r"scene.html: pages are written by `clsplat convert`"):
         splats.save(tmp_path / "scene.html")
 
