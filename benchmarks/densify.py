@@ -12,6 +12,7 @@ what a GPU waits for. All are medians [ms]. `read` and `written` are MB that the
 from __future__ import annotations
 
 import argparse
+import re
 import statistics
 import time
 from typing import Any
@@ -33,7 +34,7 @@ from clsplat.training.options.density import Adc
 from clsplat.training.programs import kernel_build
 from clsplat.training.schedules import RunSchedule
 
-KEY = ("action", "shape", "splats", "platform", "commit")
+KEY = ("action", "shape", "splats", "platform", "device", "commit")
 EXTENT = 5.0
 LOUD = 0.05  # share of the splats with a gradient above the threshold
 ROOM = 1.1  # capacity over number of splats
@@ -154,9 +155,17 @@ def random_splats(shape: Shape, n: int, sh_degree: int) -> tuple[dict[str, np.nd
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the results as a Markdown table."""
     columns = {"action": "action", "shape": "shape", "splats": "splats"}
-    columns |= {"host_ms": "host ms", "read_mb": "read MB", "written_mb": "written MB", "commit": "commit"}
-    cells = ([f"{row[name]:.1f}" if isinstance(row[name], float) else row[name] for name in columns] for row in rows)
-    return common.table(list(columns.values()), cells, set(list(columns.values())[2:-1]))
+    columns |= {"host_ms": "host ms", "read_mb": "read MB", "written_mb": "written MB"}
+    columns |= {"device": "processor", "commit": "commit"}
+    cells = ([cell(row[name]) for name in columns] for row in rows)
+    return common.table(list(columns.values()), cells, set(list(columns.values())[2:-2]))
+
+
+def cell(value: Any) -> Any:
+    """Return a value of a row as it is printed; of a processor's name without PoCL's prefix."""
+    if isinstance(value, float):
+        return f"{value:.1f}"
+    return re.sub(r"^pthread-[\w-]+-(?=AMD|Intel)|\(R\)", "", value) if isinstance(value, str) else value
 
 
 if __name__ == "__main__":
