@@ -47,7 +47,7 @@ _OPEN, _CLOSE = b'<script id="payload" type="text/plain">', b"</script>"
 _MAX_TEXT = 1 << 16  # bytes of the JSON text
 _MAX_RATIO = 1100  # of a gzip stream; above its limit, 1032
 _GZIP = 31  # of zlib's window: with the header of gzip
-_LEVEL = 9
+_LEVEL = 6
 
 
 @dataclass(frozen=True)
