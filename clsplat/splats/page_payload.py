@@ -46,6 +46,7 @@ PRECISIONS = ("compact", "full")
 _OPEN, _CLOSE = b'<script id="payload" type="text/plain">', b"</script>"
 _MAX_TEXT = 1 << 16  # bytes of the JSON text
 _MAX_RATIO = 1100  # of a gzip stream; above its limit, 1032
+_FLAT = 20.0  # a scale that is e^20 times smaller than the largest one might as well be 0
 _GZIP = 31  # of zlib's window: with the header of gzip
 _LEVEL = 6
 
@@ -250,7 +251,11 @@ def _range(column: _Column, values: Array) -> dict[str, list[float]]:
     if column.map == "log":
         low = np.median(values, axis=0)
         return {"low": low.tolist(), "high": np.log1p(np.abs(values - low)).max(axis=0).tolist()}
-    return {"low": values.min(axis=0).tolist(), "high": values.max(axis=0).tolist()}
+    high = values.max(axis=0)
+    low = values.min(axis=0)
+    if column.name == "log_scale":
+        low = np.maximum(low, high - _FLAT)
+    return {"low": low.tolist(), "high": high.tolist()}
 
 
 def _numbers(entry: Mapping[str, Any], values: Array) -> NDArray[np.uint32]:
@@ -265,7 +270,7 @@ def _numbers(entry: Mapping[str, Any], values: Array) -> NDArray[np.uint32]:
         else:
             share = 0.5 + 0.5 * np.sign(values - low) * np.log1p(np.abs(values - low)) / high
     share = np.where(high > low, share, 0.0) if entry["map"] == "linear" else np.where(high > 0.0, share, 0.5)
-    return np.rint(share * entry["largest"]).astype(np.uint32)
+    return np.rint(np.clip(share, 0.0, 1.0) * entry["largest"]).astype(np.uint32)
 
 
 def _values(column: Mapping[str, Any], numbers: NDArray[np.uint32]) -> DoubleArray:

@@ -95,6 +95,15 @@ def test_zeros_stay_zeros_and_unused_bands_are_left_out() -> None:
     np.testing.assert_array_equal(without.arrays["sh"][7, 1:], 0)
 
 
+def test_a_flat_splat_does_not_make_the_scales_of_others_coarse() -> None:
+    arrays = random_model(GAUSSIAN, 50, 0)
+    arrays["log_scale"][3, 1] = -69  # scales of 0 are read as this
+    after = unpack("page", pack(StoredSplats("gaussian", "peak", False, arrays))).arrays["log_scale"]
+    assert after[3, 1] < arrays["log_scale"][:, 1].max() - 19
+    arrays["log_scale"][3, 1] = after[3, 1]
+    np.testing.assert_allclose(after, arrays["log_scale"], atol=0.011)
+
+
 def test_a_skew_normal_without_skew_is_a_gaussian() -> None:
     arrays = random_model(SKEW_NORMAL, 9, 0)
     arrays["skew"][:] = 0
