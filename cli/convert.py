@@ -85,7 +85,7 @@ def convert_model(
     """Write MODEL, a folder or a file of splats, into OUTPUT: a .ply, .splat or .spz file, or an .html page.
 
     An .html page shows the splats in any browser with WebGL 2. It needs no server and no network: send it to anybody.
-    It draws Gaussians and skew-normals as they are.
+    It draws Gaussians, skew-normals and generalised exponentials as they are.
 
     Without --approximate, nothing is written if a splat cannot be converted exactly. With --shape gaussian, a .ply has
     only 3DGS's columns. A .splat file has no SH bands above 0; .spz files round each value to about a byte. The loss

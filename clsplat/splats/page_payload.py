@@ -37,11 +37,11 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .fields import Array, DoubleArray, sh_coefficients
 from .near_plane import usable_near_plane
-from .shapes import GAUSSIAN, NORMALISATIONS, SKEW_NORMAL
+from .shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, NORMALISATIONS, SKEW_NORMAL
 from .stored import StoredSplats, usable_arrays
 
 PAGE_ENDING = ".html"
-PAGE_SHAPES = (GAUSSIAN.name, SKEW_NORMAL.name)  # kernels that a page draws
+PAGE_SHAPES = (GAUSSIAN.name, SKEW_NORMAL.name, GENERALISED_EXPONENTIAL.name)  # kernels that a page draws
 PRECISIONS = ("compact", "full")
 _OPEN, _CLOSE = b'<script id="payload" type="text/plain">', b"</script>"
 _MAX_TEXT = 1 << 16  # bytes of the JSON text
@@ -70,21 +70,16 @@ _COMPACT = (
     _Column("color", "root", 2, 510),
     _Column("harmonics", "root", 1, 30),
     _Column("skew", "linear", 1, 126),
+    _Column("beta", "linear", 1, 255),
 )
-_WIDTHS: dict[str, tuple[int, ...]] = {
-    "mean": (3,),
-    "log_scale": (3,),
-    "rotation": (3,),
-    "opacity": (1,),
-    "color": (3,),
-    "skew": (3,),
-}
+_WIDTHS: dict[str, tuple[int, ...]] = dict.fromkeys(("mean", "log_scale", "rotation", "color", "skew"), (3,))
+_WIDTHS |= {"opacity": (1,), "beta": (1,)}
 _WIDTHS |= {"harmonics": tuple(3 * (sh_coefficients(degree) - 1) for degree in (1, 2, 3))}
-_OPTIONAL = ("harmonics", "skew")
+_OPTIONAL = ("harmonics", "skew", "beta")
 
 
 def pack(splats: StoredSplats, precision: str = PRECISIONS[0]) -> bytes:
-    """Return the payload of Gaussians or skew-normals.
+    """Return the payload of splats of one of PAGE_SHAPES.
 
     precision : "full" keeps the bits of float32; "compact" rounds to one to three bytes.
     """
@@ -169,6 +164,8 @@ def unpack(path: object, payload: bytes) -> StoredSplats:
     shape, arrays = GAUSSIAN, _arrays(fields)
     if "skew" in fields:
         shape, arrays["skew"] = SKEW_NORMAL, _within(fields["skew"], SKEW_NORMAL.schema(0)["skew"].limit)
+    elif "beta" in fields:
+        shape, arrays["beta"] = GENERALISED_EXPONENTIAL, fields["beta"][:, 0]
     with np.errstate(over="ignore"):  # values that overflow are found below
         single: dict[str, Array] = {name: np.ascontiguousarray(each, np.float32) for name, each in arrays.items()}
     degree = round(single["sh"].shape[1] ** 0.5) - 1
@@ -235,6 +232,7 @@ def _fields(arrays: Mapping[str, Array]) -> dict[str, Array]:
         "color": sh[:, :3],
         "harmonics": sh[:, 3 : 3 * sh_coefficients(degree)],
         "skew": skew,
+        "beta": arrays["beta"][:, None] if "beta" in arrays else np.zeros((n, 0), np.float32),
     }
 
 

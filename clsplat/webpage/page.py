@@ -24,6 +24,7 @@ from ..splats.splats import Splats
 from ..splats.stored import StoredSplats
 
 _TOUR, _TOUR_FPS = 24, 0.8  # keys of the tour around the scene, and how many of them pass in a second
+_DRAWN = f"{', '.join(PAGE_SHAPES[:-1])} and {PAGE_SHAPES[-1]}"
 # In this order: later files use the earlier ones.
 _SCRIPTS = ("payload.js", "sort.js", "cameras.js", "renderer.js", "controls.js", "main.js")
 _SHADERS = ("project.vert", "splat.vert", "splat.frag", "screen.vert", "screen.frag")
@@ -62,13 +63,13 @@ def as_drawn(splats: Splats) -> Splats:
             return convert(splats, target)
         except InputError as error:
             reasons.append(str(error))
-    raise InputError(f"a page draws {' and '.join(PAGE_SHAPES)} splats, not {splats.shape}: {reasons[-1]}")
+    raise InputError(f"a page draws {_DRAWN} splats, not {splats.shape}: {reasons[1]}")
 
 
 def write_web_page(
     path: str | os.PathLike[str], splats: Splats, content: PageContent, precision: str = PRECISIONS[0]
 ) -> None:
-    """Write a page that draws Gaussians or skew-normals (`as_drawn`), atomically.
+    """Write a page that draws splats of PAGE_SHAPES (`as_drawn`), atomically.
 
     precision : "compact" or "full" (page_payload.py).
 
@@ -88,7 +89,7 @@ def page_text(splats: Splats, content: PageContent, precision: str = PRECISIONS[
     if not len(splats):
         raise InputError(f"{content.title}: the model has no splats to show; train it first")
     if splats.shape not in PAGE_SHAPES:
-        raise InputError(f"a page draws {' and '.join(PAGE_SHAPES)} splats, not {splats.shape}; see `as_drawn`")
+        raise InputError(f"a page draws {_DRAWN} splats, not {splats.shape}; see `as_drawn`")
     stored = StoredSplats(splats.shape, splats.normalisation, splats.antialiased, splats.arrays, splats.near_plane)
     payload = pack(stored, precision)
     cameras = [entry.camera for entry in content.cameras]

@@ -1,6 +1,6 @@
 #version 300 es
 // project.vert: a splat on the screen, as cl/render/project.cl and cl/shape/skew_normal.clh compute it. A Gaussian is a
-// skew-normal without skew. Transform feedback keeps the outputs, far splats first.
+// skew-normal without skew, and so is a generalised exponential, but for its height and reach. Transform feedback keeps the outputs, far splats first.
 precision highp float;
 precision highp sampler2D;
 precision highp int;
@@ -13,9 +13,10 @@ uniform vec4 lens, bounds;  // fx, fy, cx, cy [px]; limits of x/z and y/z in the
 uniform vec2 size;          // of the image [px]
 uniform float near;
 uniform int normalisation, antialiased, degree;
+uniform int exponential;  // 1: generalised exponentials, cl/shape/generalised_exponential.clh
 
 out vec4 box;    // a rectangle [px]: a corner, and the edge from it; no edge: nothing to draw
-out vec4 place;  // centre [px], amplitude, offset
+out vec4 place;  // centre [px], amplitude, offset or half of beta
 out vec4 form;   // -d'Pd/2 as three coefficients; red
 out vec4 lean;   // g, slope
 out vec4 rest;   // green, blue, the rectangle's other edge, unused
@@ -127,6 +128,10 @@ void main() {
   float amplitude = opacity * exp(logNorm), unused;
   float bound = amplitude * phi(radius(amplitude) * sqrt(steep), unused);
   float r1 = radius(bound), r2 = radius(0.5 * amplitude);
+  if (exponential == 1) {
+    amplitude = opacity;
+    r1 = r2 = sqrt(2.0 * pow(log(max(opacity / ALPHA_MIN, 1.0)), 2.0 / skew.w));
+  }
   vec4 reach = vec4(extent(-v.x, xx, t, r1, r2) + v.x, extent(v.x, xx, t, r1, r2) - v.x,
     extent(-v.y, yy, t, r1, r2) + v.y, extent(v.y, yy, t, r1, r2) - v.y);
   vec2 low = ceil(centre - reach.xz - 0.5), high = floor(centre + reach.yw - 0.5);
@@ -148,7 +153,7 @@ void main() {
     box = vec4(centre - v - halves.x * axis - halves.y * vec2(-axis.y, axis.x), 2.0 * halves.x * axis);
     rest.z = 2.0 * halves.y;
   }
-  place = vec4(centre, amplitude * exp(-0.5 * t * oneT), h * t);
+  place = vec4(centre, amplitude * exp(-0.5 * t * oneT), exponential == 1 ? 0.5 * skew.w : h * t);
   form = vec4(-0.5 * (conic.x - u.x * u.x * oneT), -(conic.y - u.x * u.y * oneT), -0.5 * (conic.z - u.y * u.y * oneT), rgb.r);
   lean = vec4(u * oneT, h * u);
   rest.xy = rgb.gb;

@@ -91,9 +91,9 @@ class Renderer {
     const { columns, head } = this.payload;
     const bands = columns.harmonics ? columns.harmonics.length / n / 3 : 0;
     this.degree = Math.round(Math.sqrt(bands + 1)) - 1;
-    // Four texels of a splat: mean and opacity, scale, rotation (w, x, y, z), skew.
+    // Four texels of a splat: mean and opacity, scale, rotation (w, x, y, z), skew and beta.
     this.texture(0, 4 * n, 4, true, (values) => {
-      const { mean, opacity, log_scale: logScale, rotation, skew } = columns;
+      const { mean, opacity, log_scale: logScale, rotation, skew, beta } = columns;
       for (let i = 0; i < n; ++i) {
         const at = 16 * i;
         let square = 0;
@@ -104,6 +104,7 @@ class Renderer {
           if (skew) values[at + 12 + c] = skew[c * n + i];
         }
         values[at + 3] = opacity[i];
+        if (beta) values[at + 15] = beta[i];
         values[at + 8] = (1 - square) / (1 + square);
         for (let c = 0; c < 3; ++c) values[at + 9 + c] = (2 * rotation[c * n + i]) / (1 + square);
       }
@@ -191,6 +192,7 @@ class Renderer {
       gl.uniform2f(this.splat.at.size, width, height);
       gl.uniform1i(this.splat.at.projected, 3);
       gl.uniform1i(this.splat.at.splats, this.n);
+      gl.uniform1i(this.splat.at.exponential, this.payload.columns.beta ? 1 : 0);
       gl.bindVertexArray(this.splatArray);
       gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.n / BATCH));
       gl.disable(gl.BLEND);
@@ -226,6 +228,7 @@ class Renderer {
     gl.uniform1i(at.normalisation, head.normalisation);
     gl.uniform1i(at.antialiased, head.antialiased ? 1 : 0);
     gl.uniform1i(at.degree, this.degree);
+    gl.uniform1i(at.exponential, this.payload.columns.beta ? 1 : 0);
     gl.bindVertexArray(this.orderArray);
     gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, this.feedback);
     gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, this.projected);

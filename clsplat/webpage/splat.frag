@@ -1,6 +1,7 @@
 #version 300 es
-// splat.frag: alpha of a pixel, cl/shape/skew_pixel.clh and cl/render/blend.clh. Row 0 of the image is at the bottom here.
+// splat.frag: alpha of a pixel, cl/shape/skew_pixel.clh, generalised_exponential.clh and cl/render/blend.clh. Row 0 of the image is at the bottom here.
 precision highp float;
+uniform int exponential;  // 1: generalised exponentials
 flat in vec4 vPlace, vForm, vLean;
 flat in vec3 vColour;
 out vec4 colour;
@@ -15,8 +16,14 @@ float phi(float z) {
 void main() {
   vec2 d = gl_FragCoord.xy - vPlace.xy;
   float e = d.x * (d.x * vForm.x + d.y * vForm.y - vLean.x) + d.y * (d.y * vForm.z - vLean.y);
-  float u = dot(vLean.zw, d) + vPlace.w;
-  float alpha = min(vPlace.z * exp(e) * (u == 0.0 ? 0.5 : phi(u)), 0.99);
+  float height;
+  if (exponential == 1) {
+    height = exp(-exp(min(vPlace.w * log(max(-e, 1e-30)), 10.0)));
+  } else {
+    float u = dot(vLean.zw, d) + vPlace.w;
+    height = exp(e) * (u == 0.0 ? 0.5 : phi(u));
+  }
+  float alpha = min(vPlace.z * height, 0.99);
   if (!(alpha >= 1.0 / 255.0)) discard;
   colour = vec4(vColour * alpha, alpha);
 }

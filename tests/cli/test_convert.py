@@ -129,7 +129,7 @@ def test_a_page_of_another_kernel_has_the_nearest_gaussians_if_asked(tmp_path: P
     splats = Splats("student-t", random_model(SHAPES["student-t"], 9, 0, dead=0))
     splats.save(tmp_path / "t.ply")
     said = error_of("convert", tmp_path / "t.ply", tmp_path / "t.html")
-    assert "a page draws gaussian and skew-normal splats, not student-t" in said
+    assert "a page draws gaussian, skew-normal and generalised-exponential splats, not student-t" in said
     assert said.endswith("; or --approximate")
     clsplat("convert", tmp_path / "t.ply", tmp_path / "t.html", "--approximate", "-q")
     assert Splats.load(tmp_path / "t.html").shape == "gaussian"

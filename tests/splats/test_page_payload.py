@@ -19,7 +19,7 @@ from model_arrays import random_model
 from clsplat.errors import InputError, OutputError
 from clsplat.splats.page_payload import pack, read_page, unpack
 from clsplat.splats.quaternions import rotations
-from clsplat.splats.shapes import GAUSSIAN, SKEW_NORMAL, STUDENT_T
+from clsplat.splats.shapes import GAUSSIAN, SHAPES, SKEW_NORMAL, STUDENT_T
 from clsplat.splats.splats import Splats
 from clsplat.splats.stored import StoredSplats
 from clsplat.webpage.page import PageContent, write_web_page
@@ -28,8 +28,7 @@ BAD_BOUNDS = [("low", [0.0]), ("low", "x"), ("high", [1.0, float("nan"), 1.0]), 
 
 
 def stored(n: int = 40, degree: int = 3, shape: str = "skew-normal", **options: Any) -> StoredSplats:
-    kernel = {"gaussian": GAUSSIAN, "skew-normal": SKEW_NORMAL}[shape]
-    arrays = random_model(kernel, n, 3, sh_degree=degree)
+    arrays = random_model(SHAPES[shape], n, 3, sh_degree=degree)
     return StoredSplats(
         shape, options.pop("normalisation", "peak"), options.pop("antialiased", False), arrays, **options
     )
@@ -51,13 +50,14 @@ def rewritten(payload: bytes, **changes: Any) -> bytes:
 
 
 @pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])
+@pytest.mark.parametrize("shape", ["gaussian", "skew-normal", "generalised-exponential"])
 def test_full_precision_keeps_what_an_image_depends_on(shape: str, degree: int) -> None:
     before = stored(degree=degree, shape=shape, antialiased=True, near_plane=0.07)
     after = unpack("page", pack(before, "full"))
     assert (after.shape, after.normalisation, after.antialiased) == (shape, "peak", True)
     assert after.near_plane == pytest.approx(0.07)
-    for name in ("mean", "log_scale", "sh", *(["skew"] if shape == "skew-normal" else [])):
+    further = {"skew-normal": ["skew"], "generalised-exponential": ["beta"]}.get(shape, [])
+    for name in ("mean", "log_scale", "sh", *further):
         np.testing.assert_array_equal(after.arrays[name], before.arrays[name], err_msg=name)
     turns = [rotations(each.arrays["quat"].astype(np.float64)) for each in (before, after)]
     np.testing.assert_allclose(*turns, atol=1e-6)
@@ -242,6 +242,6 @@ def test_other_pages_are_refused(tmp_path: Path, text: str, what: str) -> None:
 
 def test_other_kernels_are_not_written(tmp_path: Path) -> None:
     splats = Splats("student-t", random_model(STUDENT_T, 4, 0, dead=0))
-    with pytest.raises(InputError, match="a page draws gaussian and skew-normal splats, not student-t"):
+    with pytest.raises(InputError, match="a page draws .* generalised-exponential splats, not student-t"):
         write_web_page(tmp_path / "x.html", splats, PageContent("x"))
     assert not (tmp_path / "x.html").exists()

@@ -91,6 +91,8 @@ def rendered(splats: Splats, camera: Camera) -> NDArray[np.float32]:
         ("skew-normal", 3, {}),
         ("skew-normal", 2, {"normalisation": "pdf", "near_plane": 2.0}),
         ("skew-normal", 1, {"normalisation": "none"}),
+        ("generalised-exponential", 2, {}),
+        ("generalised-exponential", 0, {"antialiased": True, "shrink": 10.0}),
         ("skew-normal", 3, {"antialiased": True, "shrink": 10.0}),
     ],
     ids=str,
