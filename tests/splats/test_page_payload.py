@@ -242,6 +242,6 @@ def test_other_pages_are_refused(tmp_path: Path, text: str, what: str) -> None:
 
 def test_other_kernels_are_not_written(tmp_path: Path) -> None:
     splats = Splats("student-t", random_model(STUDENT_T, 4, 0, dead=0))
-    with pytest.raises(InputError, match="a page draws .* generalised-exponential splats, not student-t"):
+    with pytest.raises(InputError, match=r"a page draws .* generalised-exponential splats, not student-t"):
         write_web_page(tmp_path / "x.html", splats, PageContent("x"))
     assert not (tmp_path / "x.html").exists()
