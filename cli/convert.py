@@ -111,7 +111,8 @@ def convert_model(
     if quiet:
         return
     before, after = converted.source.splats, converted.splats
-    how = "each the nearest" if converted.approximate else "with the same images"
+    same = "with the same images" if converted.is_exact else "rounded"
+    how = "each the nearest" if converted.approximate else same
     click.echo(f"{output}: {len(after)} splats, {before.shape} to {after.shape}, {how}")
     if converted.removed:
         click.echo(f"{converted.removed} splats of negative opacity are left out, which {after.shape} does not support")
