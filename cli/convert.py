@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from clsplat.splats.any_file import PLY_ENDING
 from clsplat.splats.fields import MAX_SH_DEGREE
 from clsplat.splats.page_payload import PAGE_ENDING, PRECISIONS
 from clsplat.splats.shapes import SHAPES
@@ -111,8 +112,12 @@ def convert_model(
     if quiet:
         return
     before, after = converted.source.splats, converted.splats
-    same = "with the same images" if converted.is_exact else "rounded"
-    how = "each the nearest" if converted.approximate else same
+    if converted.approximate:
+        how = "each the nearest"
+    elif converted.is_exact:
+        how = "with the same images"
+    else:
+        how = "with fewer SH bands" if output.suffix.lower() == PLY_ENDING else "rounded"
     click.echo(f"{output}: {len(after)} splats, {before.shape} to {after.shape}, {how}")
     if converted.removed:
         click.echo(f"{converted.removed} splats of negative opacity are left out, which {after.shape} does not support")
