@@ -12,8 +12,6 @@ full size, and "a second" counts the pictures of the tour, whose size the page a
 from __future__ import annotations
 
 import argparse
-import base64
-import io
 import statistics
 import sys
 import tempfile
@@ -23,7 +21,6 @@ from typing import Any
 
 import common
 import numpy as np
-from PIL import Image
 
 from clsplat.evaluation.metrics import psnr
 from clsplat.models.convert import PageOptions, conversion_cost, convert_model
@@ -116,15 +113,15 @@ def open_page(browser: Any, path: Path, window: dict[str, int]) -> tuple[Any, fl
 
 def in_browser(browser: Any, path: Path, model: LoadedModel, renderer: Renderer) -> float:
     """Return the mean PSNR of the page's pictures against the model's renders, at the first cameras."""
+    from viewer_browser import canvas_picture
+
     values = []
     for number, named in enumerate(model.read_cameras()[:CAMERAS]):
         camera = named.camera
         page, _ = open_page(browser, path, {"width": camera.width, "height": camera.height})
         page.evaluate(f"page.jump({number})")
-        page.wait_for_function("page.settled", timeout=120_000)
-        data = page.evaluate("page.canvas.toDataURL('image/png')").split(",")[1]
+        shown = canvas_picture(page)
         page.context.close()
-        shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), np.float32) / 255
         expected = renderer.render(model.splats, camera, model.background).color
         values.append(psnr(shown, np.clip(expected, 0, 1).astype(np.float32)))
     return float(np.mean(values))

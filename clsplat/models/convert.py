@@ -124,13 +124,11 @@ def convert_model(
         )
     refuse_existing([output], overwrite)
     source = model_at(model, iteration)
-    target = shape or (GAUSSIAN.name if suffix in GAUSSIAN_ENDINGS else source.splats.shape)
+    by_default = {PAGE_ENDING: None, PLY_ENDING: source.splats.shape}
+    target = shape or by_default.get(suffix, GAUSSIAN.name)
     if suffix in GAUSSIAN_ENDINGS and target != GAUSSIAN.name:
         raise InputError(f"{output}: {suffix} files hold Gaussians: leave --shape out, or write a .ply")
-    if suffix == PAGE_ENDING and shape is None:
-        converted, is_nearest = _as_page_shape(source.splats, approximate)
-    else:
-        converted, is_nearest = _as_shape(source.splats, target, approximate)
+    converted, is_nearest = _as_shape(source.splats, target, approximate)
     if sh_degree is not None:
         converted = _of_degree(converted, sh_degree)
     if suffix == PAGE_ENDING:
@@ -178,22 +176,12 @@ def _write_page(output: Path, source: LoadedModel, splats: Splats, page: PageOpt
     write_web_page(output, as_drawn(splats), content, page.precision)
 
 
-def _as_page_shape(splats: Splats, approximate: bool) -> tuple[Splats, bool]:
-    """Return the splats as a shape that pages draw, and whether they are only the nearest Gaussians."""
+def _as_shape(splats: Splats, target: str | None, approximate: bool) -> tuple[Splats, bool]:
+    """Return the splats as `target`, and whether they are only the nearest Gaussians. None: a shape that pages draw."""
     try:
-        return as_drawn(splats), False
+        return (as_drawn(splats) if target is None else convert(splats, target)), False
     except InputError as error:
-        if not approximate:
-            raise InputError(f"{error}; or --approximate") from None
-    return nearest_gaussians(splats), True
-
-
-def _as_shape(splats: Splats, target: str, approximate: bool) -> tuple[Splats, bool]:
-    """Return the splats as `target`, and whether they are only the nearest Gaussians."""
-    try:
-        return convert(splats, target), False
-    except InputError as error:
-        if target != GAUSSIAN.name:
+        if target not in (None, GAUSSIAN.name):
             raise
         if not approximate:
             raise InputError(f"{error}; or --approximate") from None

@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .fields import Array, DoubleArray, sh_coefficients
 from .near_plane import usable_near_plane
+from .quaternions import from_rodrigues, to_rodrigues
 from .shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, NORMALISATIONS, SKEW_NORMAL
 from .stored import StoredSplats, usable_arrays
 
@@ -207,11 +208,13 @@ def _checked_columns(head: Any) -> list[dict[str, Any]]:
 def _arrays(fields: Mapping[str, DoubleArray]) -> dict[str, DoubleArray]:
     """Return the public arrays of the core fields."""
     n = len(fields["mean"])
+    with np.errstate(divide="ignore"):  # the logits of 0 and 1 are infinite, which `usable_arrays` replaces
+        logit = GAUSSIAN.raw_opacity(fields["opacity"][:, 0])
     return {
         "mean": fields["mean"],
         "log_scale": fields["log_scale"],
-        "quat": _quaternions(fields["rotation"]),
-        "opacity_logit": _logit(fields["opacity"][:, 0]),
+        "quat": from_rodrigues(fields["rotation"]),
+        "opacity_logit": logit,
         "sh": np.concatenate([fields["color"], fields.get("harmonics", np.zeros((n, 0)))], axis=1).reshape(n, -1, 3),
     }
 
@@ -227,8 +230,8 @@ def _fields(arrays: Mapping[str, Array]) -> dict[str, Array]:
     return {
         "mean": arrays["mean"],
         "log_scale": arrays["log_scale"],
-        "rotation": _rodrigues(arrays["quat"]),
-        "opacity": (1.0 / (1.0 + np.exp(-arrays["opacity_logit"].astype(np.float64))))[:, None],
+        "rotation": to_rodrigues(arrays["quat"].astype(np.float64)),
+        "opacity": GAUSSIAN.opacity(arrays["opacity_logit"].astype(np.float64))[:, None],
         "color": sh[:, :3],
         "harmonics": sh[:, 3 : 3 * sh_coefficients(degree)],
         "skew": skew,
@@ -296,20 +299,3 @@ def _within(vectors: DoubleArray, limit: float | None) -> DoubleArray:
     longest = np.inf if limit is None else limit
     norm = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(np.where(norm > longest, vectors * (longest / np.maximum(norm, 1e-300)), vectors))
-
-
-def _rodrigues(quat: Array) -> DoubleArray:
-    unit = quat.astype(np.float64) / np.linalg.norm(quat.astype(np.float64), axis=1, keepdims=True)
-    unit = np.where(unit[:, :1] < 0.0, -unit, unit)
-    return np.asarray(unit[:, 1:] / (1.0 + unit[:, :1]))
-
-
-def _quaternions(parameters: DoubleArray) -> DoubleArray:
-    square = np.sum(parameters**2, axis=1, keepdims=True)
-    return np.concatenate([1.0 - square, 2.0 * parameters], axis=1) / (1.0 + square)
-
-
-def _logit(opacity: DoubleArray) -> DoubleArray:
-    """Return logits, of finite size also for opacities of 0 and 1."""
-    inside = np.clip(opacity, 1e-7, 1.0 - 1e-7)
-    return np.asarray(np.log(inside) - np.log1p(-inside))

@@ -61,6 +61,21 @@ def rotations_vjp(quat: Array, v: Array) -> Array:
     return (v_unit - along * unit) / norm
 
 
+def to_rodrigues(quat: Array) -> Array:
+    """Return the modified Rodrigues parameters (N, 3) of quaternions: (x, y, z) / (1 + w) with |q| = 1 and w >= 0."""
+    unit = _unit(quat)[0]
+    unit = np.where(unit[:, :1] < 0.0, -unit, unit)
+    parameters: Array = unit[:, 1:] / (1.0 + unit[:, :1])
+    return parameters
+
+
+def from_rodrigues(parameters: Array) -> Array:
+    """Return the unit quaternions (N, 4) of modified Rodrigues parameters (N, 3)."""
+    square = np.sum(parameters**2, axis=1, keepdims=True)
+    quat: Array = np.concatenate([1.0 - square, 2.0 * parameters], axis=1) / (1.0 + square)
+    return quat
+
+
 def _unit(quat: Array) -> tuple[Array, Array]:
     """Return normalised quaternions (N, 4) and the norms (N, 1)."""
     norm = np.maximum(np.linalg.norm(quat, axis=1, keepdims=True), quat.dtype.type(NORM_FLOOR))

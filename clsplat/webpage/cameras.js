@@ -1,5 +1,5 @@
-// cameras.js: cameras, and paths between them. Axes of a camera: x right, y down, z forward. A pose is {position, axes}:
-// axes is a 3x3 matrix in rows, whose rows are the camera's axes in the world.
+// cameras.js: cameras, and paths between them. Axes of a camera: x right, y down, z forward. A pose is {position, axes},
+// where axes are the camera's three axes in the world.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const add = (a, b, factor = 1) => [a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]];

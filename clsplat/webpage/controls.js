@@ -35,7 +35,8 @@ class Controls {
     this.canvas.setPointerCapture(event.pointerId);
     this.canvas.classList.add("dragging");
     this.canvas.focus();
-    this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, pans: event.button === 2 || event.shiftKey });
+    const pans = event.button === 2 || event.shiftKey;
+    this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, pans });
   }
 
   release(event) {
@@ -58,7 +59,7 @@ class Controls {
     } else if (pointer.pans) this.pan(dx, dy);
     else this.orbit(dx, dy);
     Object.assign(pointer, { x: event.clientX, y: event.clientY });
-    this.onChange(true);
+    this.onChange();
   }
 
   wheel(event) {
@@ -66,7 +67,7 @@ class Controls {
     if (!this.pose) return;
     const lines = event.deltaMode === 1 ? 30 : 1;
     this.dolly(Math.exp(0.001 * Math.max(Math.min(event.deltaY * lines, 300), -300)));
-    this.onChange(true);
+    this.onChange();
   }
 
   key(event, down) {
@@ -77,7 +78,7 @@ class Controls {
     if (down) this.keys.add(name);
     else this.keys.delete(name);
     event.preventDefault();
-    this.onChange(true);
+    this.onChange();
   }
 
   // Does what the pressed keys say for some seconds. Returns whether there is a pressed key.
@@ -114,7 +115,8 @@ class Controls {
     const axis = this.up;
     let axes = this.pose.axes.map((each) => turned(each, axis, -right));
     const tipped = axes.map((each) => turned(each, axes[0], up));
-    if (Math.abs(dot(tipped[2], axis)) < STEEP || Math.abs(dot(tipped[2], axis)) < Math.abs(dot(axes[2], axis))) axes = tipped;
+    const steepness = Math.abs(dot(tipped[2], axis));
+    if (steepness < STEEP || steepness < Math.abs(dot(axes[2], axis))) axes = tipped;
     const x = unit(add(axes[0], axes[2], -dot(axes[0], axes[2])));
     this.pose.axes = [x, cross(axes[2], x), axes[2]];
   }

@@ -66,12 +66,14 @@ class Page {
       this.changed = true;
     });
     this.canvas.addEventListener("dblclick", (event) => this.aim(event));
-    this.canvas.addEventListener("webglcontextlost", () => this.fail(new Error("The graphics device was lost. Reload the page.")));
+    const lost = new Error("The graphics device was lost. Reload the page.");
+    this.canvas.addEventListener("webglcontextlost", () => this.fail(lost));
   }
 
   key(event) {
     if (event.target !== this.canvas && event.target !== document.body) return;
-    const button = { ",": "previous", ".": "next", t: "tour", r: "reset", f: "fullscreen", h: "help-button" }[event.key];
+    const buttons = { ",": "previous", ".": "next", t: "tour", r: "reset", f: "fullscreen", h: "help-button" };
+    const button = buttons[event.key];
     if (button && !event.ctrlKey && !event.metaKey && !event.altKey) find(button).click();
   }
 
@@ -175,8 +177,7 @@ class Page {
     const width = Math.max(Math.round(this.canvas.clientWidth * density), 1);
     const height = Math.max(Math.round(this.canvas.clientHeight * density), 1);
     this.renderer.resize(width, height, share);
-    const row = this.rowOfSort;
-    if (!this.row || row.some((value, i) => value !== this.row[i])) this.sorter.request(row);
+    if (!this.isSortedBy(this.row)) this.sorter.request(this.rowOfSort);
     this.renderer.draw(this.controls.pose, lensFor(this.camera, ...this.renderer.size), this.background);
     this.drawn = this.row;
     this.describe();
@@ -184,7 +185,8 @@ class Page {
 
   describe() {
     const count = this.renderer.n.toLocaleString("en");
-    find("info").textContent = this.gap ? `${count} splats, ${Math.round(1000 / this.gap)} a second` : `${count} splats`;
+    const rate = this.gap ? `, ${Math.round(1000 / this.gap)} a second` : "";
+    find("info").textContent = `${count} splats${rate}`;
   }
 
   get rowOfSort() {
@@ -192,10 +194,14 @@ class Page {
     return [...axes[2], -dot(axes[2], position)];
   }
 
+  // Whether the present view has the order that belongs to a row.
+  isSortedBy(row) {
+    return row !== null && this.rowOfSort.every((value, i) => value === row[i]);
+  }
+
   // True if the picture shows the present view at its full size, with its splats in order.
   get settled() {
-    if (!this.controls || !this.drawn || this.changed || !this.whole) return false;
-    return this.rowOfSort.every((value, i) => value === this.drawn[i]);
+    return Boolean(this.controls) && !this.changed && this.whole && this.isSortedBy(this.drawn);
   }
 
   fail(error) {

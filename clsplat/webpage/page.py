@@ -20,6 +20,7 @@ from ..files.html_page import escape, package_text
 from ..splats.color import BLACK, Color
 from ..splats.convert import convert
 from ..splats.page_payload import PAGE_SHAPES, PRECISIONS, pack
+from ..splats.shapes import GAUSSIAN, SKEW_NORMAL
 from ..splats.splats import Splats
 from ..splats.stored import StoredSplats
 
@@ -27,7 +28,13 @@ _TOUR, _TOUR_FPS = 24, 0.8  # keys of the tour around the scene, and how many of
 _DRAWN = f"{', '.join(PAGE_SHAPES[:-1])} and {PAGE_SHAPES[-1]}"
 # In this order: later files use the earlier ones.
 _SCRIPTS = ("payload.js", "sort.js", "cameras.js", "renderer.js", "controls.js", "main.js")
-_SHADERS = ("project.vert", "splat.vert", "splat.frag", "screen.vert", "screen.frag")
+_SHADERS = {
+    "project.vert": ("phi.glsl", "project.vert"),
+    "splat.vert": ("splat.vert",),
+    "splat.frag": ("phi.glsl", "splat.frag"),
+    "screen.vert": ("screen.vert",),
+    "screen.frag": ("screen.frag",),
+}
 
 
 @dataclass(frozen=True)
@@ -57,13 +64,13 @@ def as_drawn(splats: Splats) -> Splats:
     """
     if splats.shape in PAGE_SHAPES:
         return splats
-    reasons = []
-    for target in PAGE_SHAPES:
+    reason = ""
+    for target in (GAUSSIAN.name, SKEW_NORMAL.name):
         try:
             return convert(splats, target)
         except InputError as error:
-            reasons.append(str(error))
-    raise InputError(f"a page draws {_DRAWN} splats, not {splats.shape}: {reasons[1]}")
+            reason = str(error)
+    raise InputError(f"a page draws {_DRAWN} splats, not {splats.shape}: {reason}")
 
 
 def write_web_page(
@@ -99,7 +106,7 @@ def page_text(splats: Splats, content: PageContent, precision: str = PRECISIONS[
         "background": content.background,
         "cameras": [{"name": entry.name, **_camera(entry.camera)} for entry in content.cameras],
         "tour": {"cameras": [_camera(camera) for camera in tour.cameras], "fps": tour.fps, "closed": tour.closed},
-        "shaders": {name: _text(name) for name in _SHADERS},
+        "shaders": {name: "".join(map(_text, ("head.glsl", *parts))) for name, parts in _SHADERS.items()},
     }
     # "<" could end the script element.
     settings_text = json.dumps(settings).replace("<", "\\u003c")

@@ -1,15 +1,12 @@
-#version 300 es
 // project.vert: a splat on the screen, as cl/render/project.cl and cl/shape/skew_normal.clh compute it. A Gaussian is a
-// skew-normal without skew, and so is a generalised exponential, but for its height and reach. Transform feedback keeps the outputs, far splats first.
-precision highp float;
-precision highp sampler2D;
-precision highp int;
+// skew-normal without skew. So is a generalised exponential, but for its height and reach. Transform feedback keeps the
+// outputs, far splats first.
 
 layout(location = 0) in uint splat;
 uniform sampler2D geometry, colour;  // texels of a splat: see renderer.js
 uniform mat3 rotation;               // from the world to the camera
 uniform vec3 translation, eye;
-uniform vec4 lens, bounds;  // fx, fy, cx, cy [px]; limits of x/z and y/z in the Jacobian: least x, most x, least y, most y
+uniform vec4 lens, bounds;  // fx, fy, cx, cy [px]; lowest and highest x/z, then y/z, in the Jacobian
 uniform vec2 size;          // of the image [px]
 uniform float near;
 uniform int normalisation, antialiased, degree;
@@ -21,29 +18,18 @@ out vec4 form;   // -d'Pd/2 as three coefficients; red
 out vec4 lean;   // g, slope
 out vec4 rest;   // green, blue, the rectangle's other edge, unused
 
-const float LOW_PASS = 0.3, ALPHA_MIN = 1.0 / 255.0, SKEW_SQUARE = 1.69977443, KAPPA = 0.57079632679, HALF_PI = 1.57079632679;
-
-// Phi by Abramowitz & Stegun 7.1.26, and its density.
-float phi(float z, out float density) {
-  float e = exp(-0.5 * z * z);
-  density = 0.3989422804 * e;
-  float t = 1.0 / (1.0 + 0.2316418838 * abs(z));
-  float p = ((((1.061405429 * t - 1.453152027) * t + 1.421413741) * t - 0.284496736) * t + 0.254829592) * t;
-  float tail = 0.5 * p * e;
-  return z < 0.0 ? tail : 1.0 - tail;
-}
+const float LOW_PASS = 0.3, ALPHA_MIN = 1.0 / 255.0, SKEW_SQUARE = 1.69977443;
+const float KAPPA = 0.57079632679, HALF_PI = 1.57079632679;
+const float DENSITY_0 = 0.3989422804;  // of the normal distribution at 0
 
 // The logarithm of the kernel's peak: cl/shape/skew_pixel.clh, peak_ratio.
 float logPeak(float c) {
-  float r = 0.79788456 / (1.0 + 0.5 * c / (1.0 + 0.05 * sqrt(c))), density, cdf;
+  float r = 0.79788456 / (1.0 + 0.5 * c / (1.0 + 0.05 * sqrt(c)));
   for (int i = 0; i < 3; ++i) {
-    float s = c * r;
-    cdf = phi(s, density);
-    float ratio = density / cdf;
+    float s = c * r, ratio = DENSITY_0 * exp(-0.5 * s * s) / phi(s);
     r -= (r - ratio) / (1.0 + c * ratio * (s + ratio));
   }
-  cdf = phi(c * r, density);
-  return log(cdf) - 0.5 * c * r * r;
+  return log(phi(c * r)) - 0.5 * c * r * r;
 }
 
 float radius(float amplitude) { return sqrt(2.0 * log(max(amplitude / ALPHA_MIN, 1.0))); }
@@ -97,7 +83,8 @@ void main() {
   vec2 tangent = c.xy * rz, focal = lens.xy * rz;
   vec2 centre = lens.xy * tangent + lens.zw;
   vec2 clamped = clamp(tangent, bounds.xz, bounds.yw);
-  vec3 row0 = vec3(rotation[0].x, rotation[1].x, rotation[2].x), row1 = vec3(rotation[0].y, rotation[1].y, rotation[2].y);
+  vec3 row0 = vec3(rotation[0].x, rotation[1].x, rotation[2].x);
+  vec3 row1 = vec3(rotation[0].y, rotation[1].y, rotation[2].y);
   vec3 row2 = vec3(rotation[0].z, rotation[1].z, rotation[2].z);
   vec3 a0 = focal.x * (row0 - clamped.x * row2), a1 = focal.y * (row1 - clamped.y * row2);
   mat3 turn = mat3(  // columns: the axes of the splat
@@ -125,8 +112,8 @@ void main() {
     normSteep = HALF_PI * sharp / (1.0 - KAPPA * sharp);
   }
   float logNorm = normalisation == 0 ? -logPeak(normSteep) : normalisation == 1 ? 0.69314718056 : 0.0;
-  float amplitude = opacity * exp(logNorm), unused;
-  float bound = amplitude * phi(radius(amplitude) * sqrt(steep), unused);
+  float amplitude = opacity * exp(logNorm);
+  float bound = amplitude * phi(radius(amplitude) * sqrt(steep));
   float r1 = radius(bound), r2 = radius(0.5 * amplitude);
   if (exponential == 1) {
     amplitude = opacity;
@@ -143,10 +130,10 @@ void main() {
   // Every pixel is in the ellipse of C + vv' about the location as well. Its rectangle along the axes may be smaller.
   vec2 corner = max(low, 0.0), edges = min(high, size - 1.0) - corner + 1.0;
   vec3 grown = vec3(xx + v.x * v.x, xy + v.x * v.y, yy + v.y * v.y);
-  float middle = 0.5 * (grown.x + grown.z), gap = length(vec2(0.5 * (grown.x - grown.z), grown.y));
+  float middle = 0.5 * (grown.x + grown.z), tilt = 0.5 * (grown.x - grown.z), gap = length(vec2(tilt, grown.y));
   vec2 halves = 1.001 * r1 * sqrt(vec2(middle + gap, max(middle - gap, 0.0))) + 0.01;
   vec2 axis = gap < 1e-6 * middle ? vec2(1.0, 0.0)
-    : normalize(grown.x > grown.z ? vec2(0.5 * (grown.x - grown.z) + gap, grown.y) : vec2(grown.y, 0.5 * (grown.z - grown.x) + gap));
+    : normalize(tilt > 0.0 ? vec2(tilt + gap, grown.y) : vec2(grown.y, gap - tilt));
   box = vec4(corner, edges.x, 0.0);
   rest.z = edges.y;
   if (4.0 * halves.x * halves.y < edges.x * edges.y) {
@@ -154,7 +141,8 @@ void main() {
     rest.z = 2.0 * halves.y;
   }
   place = vec4(centre, amplitude * exp(-0.5 * t * oneT), exponential == 1 ? 0.5 * skew.w : h * t);
-  form = vec4(-0.5 * (conic.x - u.x * u.x * oneT), -(conic.y - u.x * u.y * oneT), -0.5 * (conic.z - u.y * u.y * oneT), rgb.r);
+  vec3 plain = conic - oneT * vec3(u.x * u.x, u.x * u.y, u.y * u.y);
+  form = vec4(-0.5 * plain.x, -plain.y, -0.5 * plain.z, rgb.r);
   lean = vec4(u * oneT, h * u);
   rest.xy = rgb.gb;
 }

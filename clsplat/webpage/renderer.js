@@ -1,7 +1,7 @@
 // renderer.js: draws the splats with WebGL 2. One pass projects each splat once, in the order of the sort (transform
-// feedback). The results go to a texture without leaving the device. A second pass blends a rectangle for each splat, from
-// far to near, into an image of 16-bit floats: 8 bits would round at every splat. A last pass puts the image over the
-// background.
+// feedback). The results go to a texture without leaving the device. A second pass blends a rectangle for each splat,
+// from far to near, into an image of 16-bit floats: 8 bits would round at every splat. A last pass puts the image over
+// the background.
 
 const TEXELS = 4096;  // width of the textures that hold the splats
 const PARTS = 5;      // texels of a projected splat
@@ -24,6 +24,7 @@ class Renderer {
     if (!gl) throw new Error("This browser has no WebGL 2. Update it, or switch hardware acceleration on.");
     Object.assign(this, { gl, canvas, payload, n: payload.head.splats });
     this.format = imageFormat(gl);
+    this.exponential = payload.columns.beta ? 1 : 0;
     this.project = this.program(shaders["project.vert"], null, ["box", "place", "form", "lean", "rest"]);
     this.splat = this.program(shaders["splat.vert"], shaders["splat.frag"]);
     this.screen = this.program(shaders["screen.vert"], shaders["screen.frag"]);
@@ -62,8 +63,7 @@ class Renderer {
   texture(unit, count, floats, exact, fill) {
     const gl = this.gl;
     const height = Math.max(Math.ceil(count / TEXELS), 1);
-    if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE))
-      throw new Error(this.tooMany());
+    if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(this.tooMany());
     const values = new Float32Array(TEXELS * height * floats);
     fill(values);
     this.makeTexture(unit);
@@ -78,7 +78,8 @@ class Renderer {
     const texture = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0 + unit);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     return texture;
   }
 
@@ -180,7 +181,7 @@ class Renderer {
   draw(pose, lens, background) {
     const gl = this.gl;
     const [width, height] = this.size;
-    this.projectSplats(pose, lens);
+    if (this.ordered) this.projectSplats(pose, lens);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
@@ -192,7 +193,8 @@ class Renderer {
       gl.uniform2f(this.splat.at.size, width, height);
       gl.uniform1i(this.splat.at.projected, 3);
       gl.uniform1i(this.splat.at.splats, this.n);
-      gl.uniform1i(this.splat.at.exponential, this.payload.columns.beta ? 1 : 0);
+      gl.uniform1i(this.splat.at.batch, BATCH);
+      gl.uniform1i(this.splat.at.exponential, this.exponential);
       gl.bindVertexArray(this.splatArray);
       gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.n / BATCH));
       gl.disable(gl.BLEND);
@@ -208,7 +210,6 @@ class Renderer {
   }
 
   projectSplats({ position, axes }, { fx, fy, cx, cy }) {
-    if (!this.ordered) return;
     const gl = this.gl;
     const [width, height] = this.size;
     const { program, at } = this.project;
@@ -220,15 +221,15 @@ class Renderer {
     gl.uniform3fv(at.translation, axes.map((axis) => -dot(axis, position)));
     gl.uniform3fv(at.eye, position);
     gl.uniform4f(at.lens, fx, fy, cx, cy);
-    const marginX = (TANGENT_MARGIN * 0.5 * width) / fx;
-    const marginY = (TANGENT_MARGIN * 0.5 * height) / fy;
-    gl.uniform4f(at.bounds, -cx / fx - marginX, (width - cx) / fx + marginX, -cy / fy - marginY, (height - cy) / fy + marginY);
+    const x = (TANGENT_MARGIN * 0.5 * width) / fx;
+    const y = (TANGENT_MARGIN * 0.5 * height) / fy;
+    gl.uniform4f(at.bounds, -cx / fx - x, (width - cx) / fx + x, -cy / fy - y, (height - cy) / fy + y);
     gl.uniform2f(at.size, width, height);
     gl.uniform1f(at.near, head.near_plane);
     gl.uniform1i(at.normalisation, head.normalisation);
     gl.uniform1i(at.antialiased, head.antialiased ? 1 : 0);
     gl.uniform1i(at.degree, this.degree);
-    gl.uniform1i(at.exponential, this.payload.columns.beta ? 1 : 0);
+    gl.uniform1i(at.exponential, this.exponential);
     gl.bindVertexArray(this.orderArray);
     gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, this.feedback);
     gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, this.projected);

@@ -1,6 +1,4 @@
-#version 300 es
 // screen.frag: the image over the background, with row 0 at the top. A smaller image is enlarged (bilinear).
-precision highp float;
 uniform sampler2D image;
 uniform vec3 background;
 uniform vec2 size;  // of the screen [px]

@@ -1,7 +1,7 @@
 // sort.js: the order of the splats from far to near, in a worker if the browser allows one.
 
 // Returns a function from a row (a, b, c, d) to the indices of the splats by falling depth a x + b y + c z + d. mean has
-// all x, then all y, then all z. The sort is by radix, 16 bits at a time, over the bits of a float: exact, and stable.
+// all x, then all y, then all z. The radix sort takes 16 bits of a float at a time. It is exact and stable.
 function makeSorter(mean) {
   const n = mean.length / 3;
   const keys = new Uint32Array(n);
@@ -37,22 +37,30 @@ function makeSorter(mean) {
 // Sorts for the latest camera. onOrder(order, row) is called with each result.
 class Sorter {
   constructor(mean, onOrder) {
-    this.onOrder = onOrder;
-    this.busy = false;
-    this.waiting = null;
+    Object.assign(this, { onOrder, busy: false, waiting: null, latest: null });
     try {
-      const source = `const sorter = (${makeSorter})(new Float32Array(0)); let sort = sorter;
+      const source = `const make = ${makeSorter};
+        let sort;
         onmessage = ({data}) => {
-          if (data.mean) sort = (${makeSorter})(data.mean);
+          if (data.mean) sort = make(data.mean);
           else { const order = sort(data.row); postMessage({order, row: data.row}, [order.buffer]); }
         };`;
       this.worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
       this.worker.onmessage = ({ data }) => this.finish(data.order, data.row);
+      this.worker.onerror = () => this.withoutWorker(mean);
       this.worker.postMessage({ mean });
     } catch {
-      this.worker = null;
-      this.sort = makeSorter(mean);
+      this.withoutWorker(mean);
     }
+  }
+
+  // Sorts in the page itself. Some browsers refuse a worker only after it was made.
+  withoutWorker(mean) {
+    this.worker = null;
+    this.sort = makeSorter(mean);
+    if (!this.busy) return;
+    this.busy = false;
+    this.request(this.waiting || this.latest);
   }
 
   request(row) {
@@ -61,6 +69,7 @@ class Sorter {
       return;
     }
     this.busy = true;
+    this.latest = row;
     if (this.worker) this.worker.postMessage({ row });
     else setTimeout(() => this.finish(this.sort(row), row), 0);
   }

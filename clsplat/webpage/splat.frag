@@ -1,17 +1,9 @@
-#version 300 es
-// splat.frag: alpha of a pixel, cl/shape/skew_pixel.clh, generalised_exponential.clh and cl/render/blend.clh. Row 0 of the image is at the bottom here.
-precision highp float;
+// splat.frag: alpha of a pixel, as cl/shape/skew_pixel.clh, cl/shape/generalised_exponential.clh and cl/render/blend.clh
+// compute it. Row 0 of the image is at the bottom here.
 uniform int exponential;  // 1: generalised exponentials
 flat in vec4 vPlace, vForm, vLean;
 flat in vec3 vColour;
 out vec4 colour;
-
-float phi(float z) {
-  float t = 1.0 / (1.0 + 0.2316418838 * abs(z));
-  float p = ((((1.061405429 * t - 1.453152027) * t + 1.421413741) * t - 0.284496736) * t + 0.254829592) * t;
-  float tail = 0.5 * p * exp(-0.5 * z * z);
-  return z < 0.0 ? tail : 1.0 - tail;
-}
 
 void main() {
   vec2 d = gl_FragCoord.xy - vPlace.xy;

@@ -1,19 +1,15 @@
-#version 300 es
-// splat.vert: the rectangle of pixels that a splat reaches. Four vertices a splat, BATCH splats an instance (renderer.js).
-precision highp float;
-precision highp sampler2D;
-precision highp int;
+// splat.vert: the rectangle of pixels that a splat reaches. It has four vertices.
 uniform sampler2D projected;  // five texels of a splat: the outputs of project.vert
-uniform int splats;
+uniform int splats, batch;    // all splats, and those of an instance
 uniform vec2 size;
 flat out vec4 vPlace, vForm, vLean;
 flat out vec3 vColour;
 
-const int PARTS = 5, ROW = 800, BATCH = 1024;
+const int PARTS = 5;  // texels of a splat
 
 void main() {
-  int splat = gl_InstanceID * BATCH + (gl_VertexID >> 2);
-  ivec2 at = ivec2(splat % ROW * PARTS, splat / ROW);
+  int splat = gl_InstanceID * batch + (gl_VertexID >> 2), row = textureSize(projected, 0).x / PARTS;
+  ivec2 at = ivec2(splat % row * PARTS, splat / row);
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside
   if (splat >= splats) return;
   vec4 box = texelFetch(projected, at, 0);

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from playwright.sync_api import Browser, sync_playwright
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from clsplat.splats.harmonics import SH_C0
 from clsplat.splats.splats import Splats
@@ -24,6 +28,14 @@ def chromium(*flags: str) -> Iterator[Browser]:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, *flags])
         yield browser
         browser.close()
+
+
+def canvas_picture(page: Page) -> NDArray[np.float32]:
+    """Return what the canvas of a web page shows as soon as its view is at rest, (H, W, 3), 0 to 1."""
+    page.wait_for_function("page.settled", timeout=120_000)
+    data = page.evaluate("page.canvas.toDataURL('image/png')").split(",")[1]
+    shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+    return shown.astype(np.float32) / 255
 
 
 def wall() -> Splats:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,12 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
 
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install clsplat[test-view])")
 
 from playwright.sync_api import Browser, Page
-from viewer_browser import CHROMIUM, chromium
+from viewer_browser import CHROMIUM, canvas_picture, chromium
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
@@ -66,16 +63,9 @@ def opened(browser: Browser, path: Path, content: tuple[Splats, list[NamedCamera
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto(path.as_uri())
-    page.wait_for_function(f"window.errors || {SETTLED}")
+    page.wait_for_function(SETTLED)
     assert not errors
     return page
-
-
-def picture(page: Page) -> NDArray[np.float32]:
-    page.wait_for_function(SETTLED)
-    data = page.evaluate("page.canvas.toDataURL('image/png')").split(",")[1]
-    shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
-    return shown.astype(np.float32) / 255
 
 
 def rendered(splats: Splats, camera: Camera) -> NDArray[np.float32]:
@@ -107,14 +97,14 @@ def test_the_page_draws_what_clsplat_renders(
             page.evaluate(f"page.jump({number})")
             expected = rendered(splats, named.camera)
             assert expected.std() > 0.04
-            assert psnr(picture(page), expected) > FULL
+            assert psnr(canvas_picture(page), expected) > FULL
 
 
 def test_compact_pages_are_close_and_python_reads_what_the_browser_reads(browser: Browser, tmp_path: Path) -> None:
     content = scene("skew-normal")
     camera = content[1][0].camera
     with opened(browser, tmp_path / "ball.html", content, "compact") as page:
-        shown = picture(page)
+        shown = canvas_picture(page)
     assert psnr(shown, rendered(content[0], camera)) > COMPACT
     assert psnr(shown, rendered(Splats.load(tmp_path / "ball.html"), camera)) > FULL
 
@@ -153,7 +143,7 @@ def test_the_page_begins_with_the_first_camera_and_names_all(page: Page) -> None
 
 
 def test_a_drag_turns_around_the_middle(page: Page) -> None:
-    (before, _), middle, first = pose(page), target(page), picture(page)
+    (before, _), middle, first = pose(page), target(page), canvas_picture(page)
     page.mouse.move(160, 120)
     page.mouse.down()
     page.mouse.move(220, 120, steps=3)
@@ -163,7 +153,7 @@ def test_a_drag_turns_around_the_middle(page: Page) -> None:
     assert np.linalg.norm(after - middle) == pytest.approx(np.linalg.norm(before - middle), rel=1e-5)
     assert np.linalg.norm(after - before) > 0.1
     assert axes[2] @ (middle - after) > 0
-    assert psnr(picture(page), first) < 30
+    assert psnr(canvas_picture(page), first) < 30
 
 
 def test_the_wheel_comes_closer_and_the_right_button_moves_sideways(page: Page) -> None:
@@ -235,9 +225,9 @@ def test_buttons_go_to_cameras_and_tour(page: Page) -> None:
 
 
 def test_the_background_shines_through_where_splats_do(page: Page) -> None:
-    before = picture(page)
+    before = canvas_picture(page)
     page.locator("#background").fill("#ff0000")
-    change = picture(page) - before
+    change = canvas_picture(page) - before
     page.locator("#background").fill("#336699")
     assert change[..., 0].max() > 0.3
     np.testing.assert_allclose(change, change[..., :1] * (np.array([0.8, -0.4, -0.6]) / 0.8), atol=0.01)
@@ -289,13 +279,17 @@ def test_old_browsers_are_told(browser: Browser, tmp_path: Path, without: str, s
         page.wait_for_selector(f"#loading-text:has-text('{said}')")
 
 
-def test_a_page_works_without_workers(browser: Browser, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "worker",
+    ["constructor() { throw new Error('no workers'); }", "postMessage() { setTimeout(() => this.onerror?.(), 50); }"],
+)
+def test_a_page_works_without_workers(browser: Browser, tmp_path: Path, worker: str) -> None:
     splats, cameras = scene("gaussian")
     write_web_page(tmp_path / "ball.html", splats, PageContent("ball", cameras, background=BACKGROUND), "full")
     with browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}) as page:
-        page.add_init_script("window.Worker = class { constructor() { throw new Error('no workers'); } }")
+        page.add_init_script(f"window.Worker = class {{ {worker} }}")
         page.goto((tmp_path / "ball.html").as_uri())
-        assert psnr(picture(page), rendered(splats, cameras[0].camera)) > FULL
+        assert psnr(canvas_picture(page), rendered(splats, cameras[0].camera)) > FULL
 
 
 def test_a_damaged_page_says_so(browser: Browser, tmp_path: Path) -> None:

@@ -279,7 +279,7 @@ class FusedOptimizer:
         rows = [edit.values[name].rows for name in ("skew", "quat") if name in edit.values]
         if not rows:
             return None
-        marked = np.zeros(self.splats.n, np.bool_)
+        marked = np.zeros(self.splats.n, np.bool_)  # np.unique hashes its values, which takes many times as long
         for each in rows:
             marked[each] = True
         changed = np.flatnonzero(marked)
