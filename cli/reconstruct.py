@@ -8,9 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from clsplat.scenes.reconstruct.options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, RANGES, ReconstructOptions
+from clsplat.scenes.reconstruct.options import (
+    CAMERA_MODELS,
+    CAMERA_MODES,
+    MATCHERS,
+    PANORAMAS,
+    RANGES,
+    ReconstructOptions,
+)
 from clsplat.training.live_line import PLAIN_INTERVAL, LiveLine
 
+from .command import DocumentedCommand
 from .options import PATH, overwrite_option, quiet_option
 from .progress import duration
 
@@ -21,7 +29,15 @@ if TYPE_CHECKING:
 _DEFAULTS = ReconstructOptions()
 
 
-@click.command("reconstruct")
+@click.command(
+    "reconstruct",
+    cls=DocumentedCommand,
+    examples=(
+        ("clsplat reconstruct PHOTOS -o SCENE", "Find the poses of a folder of photos."),
+        ("clsplat reconstruct VIDEO.mp4 -o SCENE --frames 200", "Take 200 sharp frames of a video."),
+    ),
+    see_also=("info", "train"),
+)
 @click.argument("photos", type=PATH)
 @click.option("-o", "--output", "scene", type=PATH, required=True, metavar="SCENE", help="Folder of the scene.")
 @click.option(
@@ -61,6 +77,13 @@ _DEFAULTS = ReconstructOptions()
     show_default=True,
     metavar="N",
     help="Number of frames to take from a video: the sharpest frame of each of N equal parts.",
+)
+@click.option(
+    "--panoramas",
+    type=click.Choice(PANORAMAS),
+    default=_DEFAULTS.panoramas,
+    show_default=True,
+    help="Cut equirectangular photos into pinhole photos. auto: if they say that they are panoramas; a video does not.",
 )
 @click.option(
     "--seed",

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 
-IMAGE_SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
+READS_HEIC = find_spec("pillow_heif") is not None  # the extra `heic`
+HEIC_SUFFIXES = (".heic", ".heif")  # of iPhones
+IMAGE_SUFFIXES = frozenset(
+    (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *(HEIC_SUFFIXES if READS_HEIC else ()))
+)
 JPEG_SUFFIXES = (".jpg", ".jpeg")
+HEIC_REMEDY = "pip install 'clsplat[heic]'"
 # Programs that convert formats of photos that are not supported to JPEG.
 CONVERTERS = {
-    **dict.fromkeys((".heic", ".heif"), "heif-convert"),
+    **dict.fromkeys(() if READS_HEIC else HEIC_SUFFIXES, "heif-convert"),
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "darktable-cli"),
     **dict.fromkeys((".jxl", ".exr"), "ImageMagick"),
 }

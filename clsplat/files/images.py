@@ -22,14 +22,14 @@ from PIL import ExifTags, Image, ImageOps, PngImagePlugin
 
 from ..errors import InputError, OutputError
 from .atomic import atomic_writer
-from .image_names import CONVERTERS, JPEG_SUFFIXES
+from .image_names import CONVERTERS, HEIC_REMEDY, JPEG_SUFFIXES, READS_HEIC
 
 ImageU8 = NDArray[np.uint8]
 
 _MARK = ("Software", "clsplat render")  # text in the PNG of a render
 _MARK_BYTES = 256  # the mark is before the pixels, within this number of bytes
 # Formats that photos have. Pillow starts other programs for some of the others, such as Ghostscript for EPS.
-_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "AVIF", "JPEG2000")
+_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "AVIF", "JPEG2000", "HEIF")
 MAX_PIXELS = 400_000_000  # larger than the photo of any camera; a file that claims more is damaged or an attack
 _HEIC = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1")  # brands of ISO/IEC 23008-12
 _PHOTO_QUALITY = 97  # of a JPEG made from another JPEG: the second compression adds little error to the first
@@ -326,6 +326,10 @@ def _open_unlimited(file: Path) -> Image.Image:
 def _known_formats() -> tuple[str, ...]:
     """Return the formats of photos that this Pillow can read."""
     Image.init()
+    if READS_HEIC:
+        from pillow_heif import register_heif_opener
+
+        register_heif_opener()
     return tuple(name for name in _FORMATS if name in Image.OPEN)
 
 
@@ -333,9 +337,9 @@ def _unreadable(path: str | os.PathLike[str], error: Exception) -> InputError:
     reason = (str(error).splitlines() or [type(error).__name__])[0]
     if "cannot identify" in reason:  # Pillow's message would repeat the path
         reason = "not an image of a supported format"
-        if _is_heic(Path(path)):
+        if not READS_HEIC and _is_heic(Path(path)):
             return InputError(
-                f"{path}: is a HEIC image, which is not supported; convert it to JPEG with {CONVERTERS['.heic']}"
+                f"{path}: is a HEIC image: {HEIC_REMEDY}, or convert it to JPEG with {CONVERTERS['.heic']}"
             )
     return InputError(f"{path}: cannot be read as an image ({reason}); replace or remove the file")
 

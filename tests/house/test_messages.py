@@ -33,6 +33,7 @@ NAMED_IN = {
     "models/render.py": ("render",),
     "scenes/changed_photos.py": ("train",),
     "scenes/reconstruct/model_scene.py": ("train",),
+    "scenes/reconstruct/panoramas.py": ("reconstruct",),
     "scenes/reconstruct/photo_files.py": ("reconstruct",),
     "scenes/reconstruct/reconstruct.py": ("reconstruct", "train"),
     "training/checkpoint.py": ("train",),

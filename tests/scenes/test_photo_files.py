@@ -13,6 +13,7 @@ from PIL import Image
 
 from clsplat.errors import InputError
 from clsplat.files.digest import file_digest
+from clsplat.files.image_names import READS_HEIC
 from clsplat.files.images import read_image, read_photo_header, write_photo
 from clsplat.scenes.reconstruct.photo_files import (
     PhotoFile,
@@ -84,13 +85,17 @@ def test_folders_without_photos(tmp_path: Path) -> None:
         find_photos(tmp_path / "absent")
     with pytest.raises(InputError, match=r"no photos in this folder or below; looked for \.bmp"):
         find_photos(tmp_path)
-    (tmp_path / "IMG_1.HEIC").write_bytes(b"heic")
     for name in ("b.cr2", "b.NEF"):
         (tmp_path / name).write_bytes(b"raw")
-    text = "3 files .cr2, .heic, .nef: convert them to JPEG, for example with darktable-cli or heif-convert"
+    text = "2 files .cr2, .nef: convert them to JPEG, for example with darktable-cli"
     with pytest.raises(InputError, match=f"no photos in this folder or below; {text}"):
         find_photos(tmp_path)
     assert unsupported_photos(tmp_path) == text
+    if READS_HEIC:
+        return
+    (tmp_path / "IMG_1.HEIC").write_bytes(b"heic")
+    text = "3 files .cr2, .heic, .nef: convert them to JPEG, for example with darktable-cli or heif-convert"
+    assert unsupported_photos(tmp_path) == f"{text}; or pip install 'clsplat[heic]'"
     assert not is_photographs(tmp_path)
 
 

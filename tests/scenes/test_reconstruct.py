@@ -23,6 +23,7 @@ from clsplat.scenes.colmap import find_model, read_model
 from clsplat.scenes.reconstruct import reconstruct as module
 from clsplat.scenes.reconstruct.model_scene import plan_scene
 from clsplat.scenes.reconstruct.options import CAMERA_MODELS, CAMERA_MODES, MATCHERS, ReconstructOptions
+from clsplat.scenes.reconstruct.pairs import pairs_of
 from clsplat.scenes.reconstruct.photo_files import PhotoFile, find_photos
 from clsplat.scenes.reconstruct.reconstruct import is_made_from, reconstruct
 from clsplat.scenes.reconstruct.sfm_process import Step
@@ -320,8 +321,8 @@ def test_estimate_grows_with_photos_and_their_size(tmp_path: Path) -> None:
 
 
 def test_pairs_of_a_sequence() -> None:
-    assert module._pairs(4, sequential=False) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
-    pairs = set(module._pairs(100, sequential=True))
+    assert pairs_of(4, sequential=False) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    pairs = set(pairs_of(100, sequential=True))
     assert {(0, 1), (0, 10), (5, 21), (5, 37), (0, 90), (30, 70)} <= pairs
     assert not {(0, 11), (1, 91), (5, 5)} & pairs
     assert len(pairs) < 0.4 * 99 * 50

@@ -21,6 +21,7 @@ CAMERA_MODELS = (
 )
 CAMERA_MODES = ("auto", "single", "per-image", "per-folder")
 MATCHERS = ("auto", "exhaustive", "sequential")
+PANORAMAS = ("auto", "yes", "no")
 N_FRAMES = 120  # default number of frames to take from a video
 RECORD = "reconstruct.json"  # file in the scene that records its photos, options and result
 MIN_PHOTOS = 3  # smallest number of photos for structure from motion
@@ -41,6 +42,8 @@ class ReconstructOptions:
         for videos and for more than 150 photos.
     max_size : photos are reduced to this longest side to find features [px]; the scene keeps the photos' size.
     frames : number of frames to take from a video.
+    panoramas : "yes": the photos are equirectangular, and are cut into pinhole photos. "auto" cuts photos that are
+        twice as wide as high and whose data say so; frames of a video have no such data.
     seed : seed of all random numbers.
 
     Raises
@@ -53,10 +56,17 @@ class ReconstructOptions:
     matcher: str = "auto"
     max_size: int = 1600
     frames: int = N_FRAMES
+    panoramas: str = "auto"
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, allowed in (("camera_model", CAMERA_MODELS), ("camera_mode", CAMERA_MODES), ("matcher", MATCHERS)):
+        allowed_values = {
+            "camera_model": CAMERA_MODELS,
+            "camera_mode": CAMERA_MODES,
+            "matcher": MATCHERS,
+            "panoramas": PANORAMAS,
+        }
+        for name, allowed in allowed_values.items():
             if getattr(self, name) not in allowed:
                 raise InputError(f"{name} {getattr(self, name)!r}: use one of {', '.join(allowed)}")
         for name, (minimum, maximum) in RANGES.items():

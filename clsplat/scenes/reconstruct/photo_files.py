@@ -14,7 +14,7 @@ import numpy as np
 from ...errors import InputError
 from ...files.digest import file_digest
 from ...files.file_names import name_key
-from ...files.image_names import CONVERTERS, IMAGE_SUFFIXES, JPEG_SUFFIXES
+from ...files.image_names import CONVERTERS, HEIC_REMEDY, HEIC_SUFFIXES, IMAGE_SUFFIXES, JPEG_SUFFIXES
 from ...files.images import (
     ImageU8,
     PhotoHeader,
@@ -35,11 +35,19 @@ _MIN_ALPHA = 128  # features are not searched for in pixels with a smaller alpha
 
 @dataclass(frozen=True, eq=False)
 class PhotoFile:
-    """A photo without a pose: its name in the new scene, its file, and its mask's file."""
+    """A photo without a pose.
+
+    Parameters
+    ----------
+    name : its name in the new scene.
+    file, mask : the files of the photo and of its mask.
+    place : its path in the working folder of a reconstruction, without an ending; by default its number.
+    """
 
     name: str
     file: Path
     mask: Path | None = None
+    place: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +167,8 @@ def stage_photo(photo: PhotoFile, number: int, photos: Path, masks: Path) -> Sta
     """
     try:
         header, pixels = read_photo_header(photo.file), read_image(photo.file, upright=True)
-        staged = f"{number:06}{'.png' if photo.file.suffix.lower() == '.png' and header.plain else '.jpg'}"
+        ending = ".png" if photo.file.suffix.lower() == ".png" and header.plain else ".jpg"
+        staged = f"{photo.place or f'{number:06}'}{ending}"
         result = StagedPhoto(photo, header, staged)
         mask = result.mask()
     except InputError as error:
@@ -171,6 +180,7 @@ def stage_photo(photo: PhotoFile, number: int, photos: Path, masks: Path) -> Sta
         return f"{photo.file}: " + (
             "every pixel is transparent" if photo.mask is None else f"its mask {photo.mask} hides every pixel"
         )
+    (photos / staged).parent.mkdir(parents=True, exist_ok=True)
     if header.plain and photo.file.suffix.lower() in (*JPEG_SUFFIXES, ".png"):
         _link(photo.file, photos / staged)
     else:
@@ -239,7 +249,8 @@ def _count_unsupported(home: Path) -> str:
     kinds = sorted({Path(name).suffix.lower() for name in names})
     tools = " or ".join(dict.fromkeys(CONVERTERS[kind] for kind in kinds))
     count = f"{len(names)} file{'s' if len(names) > 1 else ''} {', '.join(kinds)}"
-    return f"{count}: convert them to JPEG, for example with {tools}"
+    also = f"; or {HEIC_REMEDY}" if any(kind in HEIC_SUFFIXES for kind in kinds) else ""
+    return f"{count}: convert them to JPEG, for example with {tools}{also}"
 
 
 def _scene_names(names: Sequence[str]) -> list[str]:

@@ -20,6 +20,8 @@ from ...files.json_file import read_json, write_json
 from ...files.lock import folder_lock
 from ...files.real_path import real_path
 from .options import MIN_PHOTOS, RECORD, ReconstructOptions
+from .pairs import is_sequential, named_pairs, pairs_of
+from .panoramas import FACE_FOCAL, rig_of, with_faces
 from .photo_files import (
     PhotoFile,
     StagedPhoto,
@@ -40,10 +42,7 @@ from .video_frames import extract_frames
 T = TypeVar("T")
 R = TypeVar("R")
 
-MAX_EXHAUSTIVE = 150  # largest number of photos for which "auto" matches all pairs
 SMALL = 640  # photos with a shorter longest side [px] are also searched at twice their size, which takes longer
-_OVERLAP = 10  # number of following photos that each photo of a sequence is matched with
-_LOOP = 10  # every 10th photo of a sequence is matched with every other 10th photo, to close loops
 
 
 @dataclass(frozen=True)
@@ -113,15 +112,18 @@ def reconstruct(
         else:
             photo_files = find_photos(source)
         source_digest = fingerprint(source)
+        photo_files = with_faces(source, photo_files, options.panoramas, work / "faces", report)
         ready = _stage_all(photo_files, source, work, report)
-        groups = [[photo.staged for photo in group] for group in group_by_camera(ready, options.camera_mode)]
-        pairs = _pairs(len(ready), _sequential(options, source, len(ready)))
-        names = [photo.staged for photo in ready]
-        (work / "pairs.txt").write_bytes("".join(f"{names[a]} {names[b]}\n" for a, b in pairs).encode())
+        rig = rig_of(ready)
+        grouped = [faces for _, _, faces in rig] if rig else group_by_camera(ready, options.camera_mode)
+        pairs = named_pairs(ready, options.matcher, is_video(source))
+        (work / "pairs.txt").write_bytes("".join(f"{a} {b}\n" for a, b in pairs).encode())
         masks = complete_masks(ready, work / "masks")
         job = {
             "masks": masks and str(masks),
-            "groups": groups,
+            "groups": [[photo.staged for photo in group] for group in grouped],
+            "rig": [(face, rotation.ravel().tolist()) for face, rotation, _ in rig],
+            "focal": FACE_FOCAL,
             "n_pairs": len(pairs),
             "doubled": _longest_side(ready[len(ready) // 2].header, options) < SMALL,
             "camera_model": options.camera_model,
@@ -180,7 +182,7 @@ def estimate_seconds(photos: Sequence[PhotoFile], options: ReconstructOptions | 
     side = _longest_side(header, options)
     megapixels = header.width * header.height * (side / max(header.width, header.height)) ** 2 / 1e6
     features = min(1.0, 3.0 * megapixels)  # number of features over their limit
-    pairs = len(_pairs(len(photos), _sequential(options, photos[0].file, len(photos))))
+    pairs = len(pairs_of(len(photos), is_sequential(options.matcher, is_video(photos[0].file), len(photos))))
     search = len(photos) * megapixels * (4.9 if side < SMALL else 1.2)
     return (search + 0.2 * pairs * features**2 + 0.5 * len(photos)) / (os.cpu_count() or 1)
 
@@ -280,26 +282,6 @@ def _stage_all(photos: Sequence[PhotoFile], source: Path, work: Path, report: St
 def _longest_side(header: PhotoHeader, options: ReconstructOptions) -> int:
     """Return the longest side of the photo in which features are searched for [px]."""
     return min(max(header.width, header.height), options.max_size)
-
-
-def _sequential(options: ReconstructOptions, source: Path, photos: int) -> bool:
-    if options.matcher == "auto":
-        return is_video(source) or photos > MAX_EXHAUSTIVE
-    return options.matcher == "sequential"
-
-
-def _pairs(photos: int, sequential: bool) -> list[tuple[int, int]]:
-    """Return the pairs to match.
-
-    In a sequence, each photo is matched with its neighbours and with photos 16, 32, 64, ... later. A coarse grid of
-    photos is matched with itself.
-    """
-    if not sequential:
-        return [(a, b) for a in range(photos) for b in range(a + 1, photos)]
-    offsets = {*range(1, _OVERLAP + 1), *(1 << power for power in range(4, photos.bit_length()))}
-    near = {(a, a + offset) for a in range(photos) for offset in offsets if a + offset < photos}
-    grid = {(a, b) for a in range(0, photos, _LOOP) for b in range(a + _LOOP, photos, _LOOP)}
-    return sorted(near | grid)
 
 
 def _warn_of_unplaced(

@@ -4,10 +4,19 @@ pycolmap runs in a separate process for three reasons. It may abort the process,
 its SQLite database must not have another reader in the same process: closing one connection drops the locks of the
 other. The program prints its progress as JSON lines, and ends when its standard input ends, that is, with its parent.
 
-The job's paths are `database`, `photos`, `masks` (or null), `pairs` (a file of names) and `output`. Its other keys are
-`groups` (lists of photos that share a camera), `n_pairs`, `camera_model`, `max_size`, `doubled` and `seed`. If
-`doubled` is set, photos are also searched at twice their size. Each sparse model is written to a separate folder in
-`output`.
+Photos of a rig, such as the faces of panoramas, have exact pinhole lenses and exact places in the rig.
+
+The job's paths are `database`, `photos`, `masks` (or null), `pairs` (a file of names) and `output`. The other keys:
+
+    groups          lists of photos that share a camera
+    rig             for each group, the folder of its photos and the rotation from the frame of the first group, row by
+                    row; empty without a rig
+    focal           focal length of the photos of a rig, in their width
+    n_pairs         number of pairs
+    camera_model, max_size, seed    see ReconstructOptions
+    doubled         photos are also searched at twice their size
+
+Each sparse model is written to a separate folder in `output`.
 
 Photos are imported in order, and all random numbers are seeded. So the same photos give the same model.
 """
@@ -20,6 +29,8 @@ import sys
 import threading
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ...errors import reason_of
 from ..undistort import colmap_library
@@ -86,8 +97,12 @@ def _find_features(colmap: Any, job: dict[str, Any], photos: list[str]) -> None:
     if job["masks"]:
         reader.mask_path = job["masks"]
     colmap.Database.open(job["database"]).close()
+    if job["rig"]:
+        reader.camera_model = "SIMPLE_PINHOLE"
     for group in job["groups"]:  # extraction by several threads would number photos at random
         colmap.import_images(job["database"], job["photos"], colmap.CameraMode.SINGLE, group, reader)
+    if job["rig"]:
+        _define_rig(colmap, job)
     if fisheye:
         _trust_focal_lengths(colmap, job["database"])
     options = colmap.FeatureExtractionOptions()
@@ -99,6 +114,28 @@ def _find_features(colmap: Any, job: dict[str, Any], photos: list[str]) -> None:
     colmap.extract_features(
         job["database"], job["photos"], photos, colmap.CameraMode.AUTO, reader, options, colmap.Device.cpu
     )
+
+
+def _define_rig(colmap: Any, job: dict[str, Any]) -> None:
+    """Set the focal lengths of the cameras of the rig, and their places in it."""
+    database = colmap.Database.open(job["database"])
+    for camera in database.read_all_cameras():
+        camera.params = [job["focal"] * camera.width, 0.5 * camera.width, 0.5 * camera.height]
+        camera.has_prior_focal_length = True
+        database.update_camera(camera)
+    cameras = []
+    for index, (folder, rotation) in enumerate(job["rig"]):
+        camera = colmap.RigConfigCamera()
+        camera.ref_sensor = index == 0
+        camera.image_prefix = f"{folder}/"
+        if index:
+            turn = colmap.Rotation3d(np.array(rotation, np.float64).reshape(3, 3))
+            camera.cam_from_rig = colmap.Rigid3d(turn, np.zeros(3))
+        cameras.append(camera)
+    config = colmap.RigConfig()
+    config.cameras = cameras
+    colmap.apply_rig_config([config], database)
+    database.close()
 
 
 def _trust_focal_lengths(colmap: Any, path: str) -> None:
@@ -128,6 +165,9 @@ def _map(colmap: Any, job: dict[str, Any], output: Path, photos: int) -> dict[st
         part.random_seed = job["seed"]
     # Several threads would sum residuals in random order, and are hardly faster on few cores.
     options.num_threads = options.mapper.num_threads = 1
+    if job["rig"]:
+        options.ba_refine_sensor_from_rig = options.ba_refine_focal_length = False
+        options.ba_refine_extra_params = False
     output.mkdir(parents=True)
     placed = 0
 
