@@ -89,7 +89,7 @@ def camera_at(context: Any, item: Any, parent: Any = None) -> Camera:
     import numpy as np
 
     from clsplat.errors import InputError
-    from clsplat.splats.transform import similarity
+    from clsplat.splats.similarity import similarity
 
     from .lens import camera_of, moved
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from clsplat.cameras.camera import Camera
 from clsplat.errors import InputError
 from clsplat.rendering.renderer import Rendered, Renderer
+from clsplat.splats.similarity import similarity
 from clsplat.splats.splats import Splats
-from clsplat.splats.transform import joined, similarity, transformed
+from clsplat.splats.transform import joined, transformed
 
 from .lens import moved
 

@@ -7,25 +7,38 @@ from typing import TYPE_CHECKING
 
 import click
 
-from clsplat.splats.any_file import PLY_ENDING
 from clsplat.splats.fields import MAX_SH_DEGREE
 from clsplat.splats.page_payload import PAGE_ENDING, PRECISIONS
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.spz import VERSIONS as SPZ_VERSIONS
 
+from .command import DocumentedCommand
 from .options import PATH, device_option, iteration_option, overwrite_option, quiet_option
 
 if TYPE_CHECKING:
     from clsplat.models.convert import ConversionCost
 
 
-@click.command("convert")
+@click.command(
+    "convert",
+    cls=DocumentedCommand,
+    examples=(
+        ("clsplat convert MODEL scene.html", "A page that shows the splats, for anybody with a browser."),
+        (
+            "clsplat convert MODEL out.ply --shape gaussian --approximate",
+            "Gaussians for other programs, with the loss that this costs.",
+        ),
+        ("clsplat convert MODEL scene.glb", "A standard file with the skew in it."),
+        ("clsplat convert MODEL out.spz --approximate", "A small file for viewers on the web."),
+    ),
+    see_also=("view", "cameras"),
+)
 @click.argument("model", type=PATH)
 @click.argument("output", type=PATH)
 @click.option(
     "--shape",
     type=click.Choice(list(SHAPES)),
-    help="Kernel of the splats to convert to.  [default: the model's; for .splat and .spz files gaussian]",
+    help="Kernel of the splats to convert to.  [default: the model's, or an equal one that the format holds]",
 )
 @click.option(
     "--approximate",
@@ -83,14 +96,19 @@ def convert_model(
     device: str | None,
     quiet: bool,
 ) -> None:
-    """Write MODEL, a folder or a file of splats, into OUTPUT: a .ply, .splat or .spz file, or an .html page.
+    """Write MODEL, a folder or a file of splats, into OUTPUT, a file for other programs or a web page.
 
-    An .html page shows the splats in any browser with WebGL 2. It needs no server and no network: send it to anybody.
-    It draws Gaussians, skew-normals and generalised exponentials as they are.
+    The ending of OUTPUT is the format: .ply, .glb (glTF), .usd, .usda, .usdc, .usdz (OpenUSD), .spz, .splat or
+    .html. An .html page shows the splats in any browser with WebGL 2. It needs no server and no network: send it to
+    anybody.
+
+    A .ply holds every kernel. Pages, glTF and OpenUSD hold Gaussians, skew-normals and generalised exponentials. In
+    glTF and OpenUSD, programs that do not know a kernel show its ellipses. The other formats hold Gaussians. They
+    round each value to about a byte, and a .splat file has no SH bands above 0. The loss of such files is measured on
+    images.
 
     Without --approximate, nothing is written if a splat cannot be converted exactly. With --shape gaussian, a .ply has
-    only 3DGS's columns. A .splat file has no SH bands above 0; .spz files round each value to about a byte. The loss
-    of such files is measured on images.
+    only 3DGS's columns.
     """
     from clsplat.models.convert import PageOptions, conversion_cost
     from clsplat.models.convert import convert_model as convert
@@ -117,7 +135,7 @@ def convert_model(
     elif converted.is_exact:
         how = "with the same images"
     else:
-        how = "with fewer SH bands" if output.suffix.lower() == PLY_ENDING else "rounded"
+        how = "rounded" if converted.rounds else "with fewer SH bands"
     click.echo(f"{output}: {len(after)} splats, {before.shape} to {after.shape}, {how}")
     if converted.removed:
         click.echo(f"{converted.removed} splats of negative opacity are left out, which {after.shape} does not support")

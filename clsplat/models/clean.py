@@ -16,6 +16,7 @@ from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
 from ..splats.any_file import check_ending
 from ..splats.color import Color
+from ..splats.page_payload import PAGE_ENDING
 from ..splats.splats import Splats
 from ..training.folder import ModelFolder
 from .model import LoadedModel, SceneChoice, model_at
@@ -121,7 +122,7 @@ def _check_output(output: Path, model: LoadedModel, overwrite: bool) -> None:
     if output.suffix:
         if output.is_dir():
             raise OutputError(f"{output}: is a folder: name a file, or a folder without a dot in its name")
-        check_ending(output)
+        check_ending(output, PAGE_ENDING)
         refuse_existing([output], overwrite)
         return
     if model.folder is None or not model.folder.config_path.is_file():

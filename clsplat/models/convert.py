@@ -15,9 +15,9 @@ from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
 from ..files.existing import refuse_existing
 from ..rendering.renderer import Renderer
-from ..splats.any_file import GAUSSIAN_ENDINGS, PLY_ENDING, SPZ_ENDING, check_ending
+from ..splats.any_file import SPZ_ENDING, WRITTEN, check_ending
 from ..splats.approximate import nearest_gaussians
-from ..splats.convert import convert
+from ..splats.convert import as_one_of, convert
 from ..splats.fields import sh_coefficients
 from ..splats.page_payload import PAGE_ENDING, PRECISIONS
 from ..splats.shapes import GAUSSIAN
@@ -52,7 +52,12 @@ class ConvertedModel:
     def is_exact(self) -> bool:
         """Whether the file shows the same images as the model."""
         same_bands = self.splats.sh_degree >= self.source.splats.sh_degree
-        return not self.approximate and same_bands and self.output.suffix.lower() == PLY_ENDING
+        return not self.approximate and same_bands and not self.rounds
+
+    @property
+    def rounds(self) -> bool:
+        """Whether the file holds fewer digits than float32."""
+        return WRITTEN[self.output.suffix.lower()].rounds
 
 
 @dataclass(frozen=True)
@@ -99,9 +104,10 @@ def convert_model(
     Parameters
     ----------
     model : a model folder or a file of splats, or what `load_model` returned.
-    output : a .ply file with all columns, a .splat or .spz file, or an .html page that draws the splats.
-    shape : the shape to convert to; by default the model's, for .splat and .spz files Gaussian, and for pages one that
-        they draw.
+    output : a .ply file with all columns, a .splat, .spz, .glb or USD file (.usd, .usda, .usdc, .usdz), or an
+        .html page that draws the splats.
+    shape : the shape to convert to; by default the model's, or an equal one that the format holds: Gaussians, in .glb
+        and USD files and pages skew-normals and generalised exponentials too.
     approximate : use the nearest Gaussian for splats without an equal one, instead of raising.
     sh_degree : remove the SH bands above, or add bands of zeros.
     spz_version : version of an .spz file, 3 or 4. Version 4 needs the extra `spz`.
@@ -115,7 +121,7 @@ def convert_model(
     OutputError : the file exists, has an unknown ending or cannot be written.
     """
     output = Path(output)
-    suffix = check_ending(output, PAGE_ENDING)
+    suffix = check_ending(output)
     if spz_version is not None and suffix != SPZ_ENDING:
         raise InputError(f"{output}: the version is of .spz files: leave it out, or choose the ending .spz")
     if page is not None and suffix != PAGE_ENDING:
@@ -124,11 +130,12 @@ def convert_model(
         )
     refuse_existing([output], overwrite)
     source = model_at(model, iteration)
-    by_default = {PAGE_ENDING: None, PLY_ENDING: source.splats.shape}
-    target = shape or by_default.get(suffix, GAUSSIAN.name)
-    if suffix in GAUSSIAN_ENDINGS and target != GAUSSIAN.name:
-        raise InputError(f"{output}: {suffix} files hold Gaussians: leave --shape out, or write a .ply")
-    converted, is_nearest = _as_shape(source.splats, target, approximate)
+    shapes = WRITTEN[suffix].shapes
+    if shapes is not None and shape is not None and shape not in shapes:
+        raise InputError(
+            f"{output}: {suffix} files hold {', '.join(shapes)} splats: leave --shape out, or write a .ply"
+        )
+    converted, is_nearest = _as_shape(source.splats, shape, suffix, approximate)
     if sh_degree is not None:
         converted = _of_degree(converted, sh_degree)
     if suffix == PAGE_ENDING:
@@ -176,10 +183,17 @@ def _write_page(output: Path, source: LoadedModel, splats: Splats, page: PageOpt
     write_web_page(output, as_drawn(splats), content, page.precision)
 
 
-def _as_shape(splats: Splats, target: str | None, approximate: bool) -> tuple[Splats, bool]:
-    """Return the splats as `target`, and whether they are only the nearest Gaussians. None: a shape that pages draw."""
+def _as_shape(splats: Splats, target: str | None, suffix: str, approximate: bool) -> tuple[Splats, bool]:
+    """Return the splats as `target`, and whether they are only the nearest Gaussians.
+
+    Without a target, they get an equal shape that files of this ending hold.
+    """
+    shapes = WRITTEN[suffix].shapes
     try:
-        return (as_drawn(splats) if target is None else convert(splats, target)), False
+        if target is not None:
+            return convert(splats, target), False
+        holder = "a page draws" if suffix == PAGE_ENDING else f"a {suffix} file holds"
+        return (splats if shapes is None else as_one_of(splats, shapes, holder)), False
     except InputError as error:
         if target not in (None, GAUSSIAN.name):
             raise

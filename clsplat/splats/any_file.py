@@ -1,31 +1,62 @@
-"""Files of splats in any format that clsplat knows: the content decides, and for .splat files the ending."""
+"""Files of splats in any format that clsplat knows: the content decides, and for some formats the ending."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, OutputError
+from .activated import EXTRA_FIELDS
 from .dot_splat import read_splat, write_splat
-from .page_payload import PAGE_ENDING, read_page
+from .glb import is_glb
+from .gltf_splats import GLB_ENDING, GLTF_ENDING, read_gltf_splats, write_gltf_splats
+from .page_payload import PAGE_ENDING, PAGE_SHAPES, read_page
 from .ply import read_ply, write_ply
+from .shapes import GAUSSIAN
 from .sog import META, is_sog, read_sog
 from .spz import VERSIONS as SPZ_VERSIONS
 from .spz import read_spz, write_spz
 from .spz_streams import is_spz
 from .stored import StoredSplats
+from .usd import USD_ENDINGS, is_usd, read_usd, write_usd
 
-PLY_ENDING = ".ply"
-SPZ_ENDING = ".spz"
-GAUSSIAN_ENDINGS = (".splat", SPZ_ENDING)  # formats that hold Gaussians only
-READ_ENDINGS = (PLY_ENDING, *GAUSSIAN_ENDINGS, ".sog", PAGE_ENDING)
+PLY_ENDING, SPLAT_ENDING, SPZ_ENDING, SOG_ENDING = ".ply", ".splat", ".spz", ".sog"
 
 _PAGE_START = b"<!DOCTYP"
 _ELSEWHERE = (".ksplat", ".lcc", ".lcc2")  # formats that splat-transform of PlayCanvas reads
 
 
+@dataclass(frozen=True)
+class WrittenFormat:
+    """A format that is written.
+
+    Parameters
+    ----------
+    shapes : the kernels that it holds; None: all.
+    rounds : whether the file holds fewer digits than float32.
+    """
+
+    shapes: tuple[str, ...] | None
+    rounds: bool
+
+
+_GAUSSIAN_ONLY, _EXTENDED = (GAUSSIAN.name,), tuple(EXTRA_FIELDS)
+# By ending, in the order of messages. `clsplat convert` writes pages, because they have cameras as well.
+WRITTEN = {
+    PLY_ENDING: WrittenFormat(None, False),
+    SPLAT_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
+    SPZ_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
+    GLB_ENDING: WrittenFormat(_EXTENDED, False),
+    **{ending: WrittenFormat(_EXTENDED, False) for ending in USD_ENDINGS},
+    PAGE_ENDING: WrittenFormat(PAGE_SHAPES, True),
+}
+READ_ENDINGS = (*WRITTEN, SOG_ENDING, GLTF_ENDING)
+
+
 def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
-    """Read a PLY of splats (whole, compact or compressed), an .spz, .sog or .splat file, a SOG's meta.json, or a page.
+    """Read a file of splats: a PLY, .spz, .splat, .sog (or its meta.json), .glb, .gltf or USD file, or a page.
 
     Splats and columns that cannot be used are left out, with a warning.
 
@@ -40,20 +71,28 @@ def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
             f"{path}: {suffix} files are not read: convert it with `splat-transform {path.name} {path.stem}.ply` "
             "(npm install @playcanvas/splat-transform)"
         )
-    if suffix == ".splat":
-        return read_splat(path)
-    start = _start(path)
+    return _reader(path, suffix, _start(path))(path)
+
+
+def _reader(path: Path, suffix: str, start: bytes) -> Callable[[Path], StoredSplats]:
+    """Return the function that reads a file with this ending and this beginning."""
+    if suffix == SPLAT_ENDING:
+        return read_splat
     if suffix == PAGE_ENDING or start == _PAGE_START:
-        return read_page(path)
+        return read_page
+    if suffix in (GLB_ENDING, GLTF_ENDING) or is_glb(start):
+        return read_gltf_splats
+    if suffix in USD_ENDINGS or is_usd(start):
+        return read_usd
     if suffix == SPZ_ENDING or is_spz(start):
-        return read_spz(path)
-    return read_sog(path) if suffix == ".sog" or path.name == META or is_sog(start) else read_ply(path)
+        return read_spz
+    return read_sog if suffix == SOG_ENDING or path.name == META or is_sog(start) else read_ply
 
 
 def write_splats(
     path: str | os.PathLike[str], splats: StoredSplats, compact: bool = False, spz_version: int = SPZ_VERSIONS[0]
 ) -> None:
-    """Write a .splat or .spz file, or else a PLY.
+    """Write a .splat, .spz, .glb or USD file, or else a PLY.
 
     Parameters
     ----------
@@ -68,10 +107,14 @@ def write_splats(
     suffix = Path(path).suffix.lower()
     if suffix == PAGE_ENDING:
         raise OutputError(f"{path}: pages are written by `clsplat convert` and clsplat.convert_model: use one of these")
-    if suffix == ".splat":
+    if suffix == SPLAT_ENDING:
         write_splat(path, splats)
     elif suffix == SPZ_ENDING:
         write_spz(path, splats, spz_version)
+    elif suffix == GLB_ENDING:
+        write_gltf_splats(path, splats)
+    elif suffix in USD_ENDINGS:
+        write_usd(path, splats)
     else:
         write_ply(
             path,
@@ -84,12 +127,12 @@ def write_splats(
         )
 
 
-def check_ending(path: Path, *more: str) -> str:
+def check_ending(path: Path, *without: str) -> str:
     """Return the file's ending in lower case; raise OutputError if it is not that of a format that is written.
 
-    more : further endings that the caller can write.
+    without : endings that the caller cannot write.
     """
-    endings = (PLY_ENDING, *GAUSSIAN_ENDINGS, *more)
+    endings = [ending for ending in WRITTEN if ending not in without]
     suffix = path.suffix.lower()
     if suffix not in endings:
         raise OutputError(

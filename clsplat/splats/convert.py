@@ -8,7 +8,7 @@ contains it up to 4e-5 of alpha, at the largest nu.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from .checks import LIMIT_SLACK
 from .fields import Array, DoubleArray, scale_of
 from .optical_depth import optical_depth, raw_of_optical_depth
 from .quaternions import rotations
-from .shapes import SKEW_MAX, SLANT_MAX, Shape, shape_named
+from .shapes import GAUSSIAN, SKEW_MAX, SKEW_NORMAL, SLANT_MAX, Shape, shape_named
 from .splats import Splats
 
 ArraysByField = dict[str, DoubleArray]
@@ -46,6 +46,29 @@ def convert(splats: Splats, shape: str) -> Splats:
     dtype = splats.mean.dtype
     arrays = {name: values.astype(dtype) for name, values in model.items()}
     return Splats(shape, arrays, normalisation, splats.antialiased, splats.near_plane)
+
+
+def as_one_of(splats: Splats, shapes: Sequence[str], holder: str) -> Splats:
+    """Return splats with equal images and one of the shapes: theirs, or the Gaussian, or the skew-normal.
+
+    holder : what holds only these shapes, with its verb, for the message.
+
+    Raises
+    ------
+    InputError : some splats have no equal of these shapes.
+    """
+    if splats.shape in shapes:
+        return splats
+    reason = ""
+    for target in (GAUSSIAN.name, SKEW_NORMAL.name):
+        try:
+            if target in shapes:
+                return convert(splats, target)
+        except InputError as error:
+            reason = str(error)
+    if len(shapes) == 1:
+        raise InputError(reason)
+    raise InputError(f"{holder} {', '.join(shapes[:-1])} and {shapes[-1]} splats, not {splats.shape}: {reason}")
 
 
 def _refuse(bad: NDArray[np.bool_], target: Shape, why: str, remedy: str) -> None:

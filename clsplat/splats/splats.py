@@ -88,7 +88,9 @@ class Splats:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Splats:
-        """Read a file of splats: a PLY (also of 3DGS, or compressed), .spz or .splat. The content decides.
+        """Read a file of splats: a PLY (also of 3DGS, or compressed), glTF, OpenUSD, .sog, .spz, .splat or a page.
+
+        The content decides which format it is.
 
         Splats and columns that cannot be used are left out, with a warning. `load_model` reads model folders.
 
@@ -100,7 +102,7 @@ class Splats:
         return cls(found.shape, found.arrays, found.normalisation, found.antialiased, found.near_plane)
 
     def save(self, path: str | os.PathLike[str], compact: bool = False, *, spz_version: int = SPZ_VERSIONS[0]) -> None:
-        """Write a .splat or .spz file, or else a PLY file in float32, atomically.
+        """Write a .splat, .spz, .glb or OpenUSD file, or else a PLY file in float32, atomically.
 
         Parameters
         ----------
@@ -110,7 +112,7 @@ class Splats:
 
         Raises
         ------
-        InputError : the file holds Gaussians only, and these splats have another shape.
+        InputError : the format does not hold splats of this shape.
         OutputError : the file cannot be written.
         """
         stored = StoredSplats(self._shape, self._normalisation, self._antialiased, self._arrays, self._near_plane)

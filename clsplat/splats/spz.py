@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
+from .axes import flipped
 from .fields import MAX_SH_DEGREE, Array, sh_coefficients
-from .harmonics import axis_flip_signs
 from .quaternions import OTHER_PLACES, from_smallest_three
 from .shapes import GAUSSIAN
 from .spz_streams import (
@@ -124,16 +124,8 @@ def read_spz(path: str | os.PathLike[str]) -> StoredSplats:
 def _other_axes(arrays: Mapping[str, Array], system: int) -> dict[str, Array]:
     """Return the arrays with the axes of a PLY exchanged for those of another coordinate system, or the other way."""
     differing = (system - 1) ^ (_RDF - 1)
-    signs = np.array([-1.0 if differing >> axis & 1 else 1.0 for axis in range(3)])
-    turned = dict(arrays)
-    dtype = arrays["mean"].dtype
-    # The rotation R becomes F R F with the flips F. The covariance F R F S² F Rᵀ F is the flipped one, because S is
-    # diagonal. A component of the axis of rotation changes its sign with the two other axes.
-    turned["mean"] = arrays["mean"] * signs.astype(dtype)
-    turned["quat"] = arrays["quat"] * np.array([1.0, *signs.prod() * signs]).astype(dtype)
-    degree = round(arrays["sh"].shape[1] ** 0.5) - 1
-    turned["sh"] = arrays["sh"] * axis_flip_signs(signs, degree)[:, None].astype(dtype)
-    return turned
+    x, y, z = (-1 if differing >> axis & 1 else 1 for axis in range(3))
+    return flipped(arrays, (x, y, z))
 
 
 def _places(stored: Bytes, header: SpzHeader) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ leave a few splats that are not finite. Readers keep the rest of the file.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,6 +84,31 @@ def usable_arrays(
     for what in _faults(schema, arrays, place, kept):
         raise InputError(f"{path}: {what}; remove that splat or export again")
     return arrays
+
+
+def joined_parts(path: object, parts: Sequence[StoredSplats]) -> StoredSplats:
+    """Return the splats of the parts of a file as one, in float32, without unusable ones (see `usable_arrays`).
+
+    SH bands that some parts lack are 0. The near plane is the smallest.
+
+    Raises
+    ------
+    InputError : the parts have several kernels.
+    """
+    first = parts[0]
+    kinds = {(part.shape, part.normalisation, part.antialiased) for part in parts}
+    if len(kinds) > 1:
+        raise InputError(f"{path}: has splats of several kernels; export each of them as a file")
+    width = max(part.arrays["sh"].shape[1] for part in parts)
+    arrays = {}
+    for name in first.arrays:
+        several = [part.arrays[name] for part in parts]
+        if name == "sh":
+            several = [np.pad(sh, ((0, 0), (0, width - sh.shape[1]), (0, 0))) for sh in several]
+        with np.errstate(over="ignore"):  # values that overflow are found below
+            arrays[name] = np.concatenate(several).astype(np.float32)
+    schema = shape_named(first.shape).schema(round(width**0.5) - 1)
+    return replace(first, arrays=usable_arrays(path, schema, arrays), near_plane=min(part.near_plane for part in parts))
 
 
 def check_gaussian(path: object, shape: str, ending: str) -> None:

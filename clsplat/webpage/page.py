@@ -18,9 +18,8 @@ from ..errors import InputError
 from ..files.atomic import atomic_writer
 from ..files.html_page import escape, package_text
 from ..splats.color import BLACK, Color
-from ..splats.convert import convert
+from ..splats.convert import as_one_of
 from ..splats.page_payload import PAGE_SHAPES, PRECISIONS, pack
-from ..splats.shapes import GAUSSIAN, SKEW_NORMAL
 from ..splats.splats import Splats
 from ..splats.stored import StoredSplats
 
@@ -62,15 +61,7 @@ def as_drawn(splats: Splats) -> Splats:
     ------
     InputError : a splat has no equal of these kernels.
     """
-    if splats.shape in PAGE_SHAPES:
-        return splats
-    reason = ""
-    for target in (GAUSSIAN.name, SKEW_NORMAL.name):
-        try:
-            return convert(splats, target)
-        except InputError as error:
-            reason = str(error)
-    raise InputError(f"a page draws {_DRAWN} splats, not {splats.shape}: {reason}")
+    return as_one_of(splats, PAGE_SHAPES, "a page draws")
 
 
 def write_web_page(

@@ -13,6 +13,7 @@ from model_arrays import random_model
 from clsplat.cameras.cameras_json import read_cameras
 from clsplat.cameras.path import CameraPath, write_path
 from clsplat.evaluation.metrics import psnr
+from clsplat.models.model import load_model
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.shapes import GAUSSIAN, SHAPES, SKEW_NORMAL, SKEW_NORMAL_DIRECT
 from clsplat.splats.splats import Splats
@@ -135,6 +136,28 @@ def test_a_page_of_another_kernel_has_the_nearest_gaussians_if_asked(tmp_path: P
     assert Splats.load(tmp_path / "t.html").shape == "gaussian"
 
 
+@pytest.mark.parametrize("ending", [".glb", ".usda", ".usdc", ".usdz"])
+def test_interchange_files_keep_the_skew(model: Path, tmp_path: Path, ending: str) -> None:
+    """They are models: the next command reads them, and their images are those of the model."""
+    if ending != ".glb":
+        pytest.importorskip("pxr")
+    out = tmp_path / f"out{ending}"
+    said = clsplat("convert", model, out)
+    assert said.strip().endswith("skew-normal to skew-normal, with the same images")
+    camera = load_model(model).read_cameras()[0].camera
+    renders = [Renderer().render(splats, camera).color for splats in (load_model(model).splats, Splats.load(out))]
+    assert psnr(*renders) > 90
+    assert "skew-normal" in clsplat("info", out)
+    student = Splats("student-t", random_model(SHAPES["student-t"], 9, 0, dead=0))
+    student.save(tmp_path / "t.ply")
+    said = error_of("convert", tmp_path / "t.ply", tmp_path / f"t{ending}")
+    assert f"a {ending} file holds gaussian, skew-normal and generalised-exponential splats, not student-t" in said
+    clsplat("convert", tmp_path / "t.ply", tmp_path / f"t{ending}", "--approximate", "-q")
+    assert Splats.load(tmp_path / f"t{ending}").shape == "gaussian"
+    said = error_of("convert", model, tmp_path / f"u{ending}", "--shape", "student-t")
+    assert f"{ending} files hold gaussian, skew-normal, generalised-exponential splats: leave --shape out" in said
+
+
 def test_the_version_of_an_spz_file_is_chosen(model: Path, tmp_path: Path) -> None:
     pytest.importorskip("zstandard")
     for version, start in ((3, b"\x1f\x8b"), (4, b"NGSP\4")):
@@ -181,7 +204,9 @@ def test_a_ply_for_other_programs_has_3dgs_s_columns(model: Path, tmp_path: Path
 def test_bad_input(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     assert "'cube'" in error_of("convert", model, out, "--shape", "cube", code=2)
-    assert "writes .ply, .splat, .spz and .html files" in error_of("convert", model, tmp_path / "out.obj")
+    assert "writes .ply, .splat, .spz, .glb, .usd, .usda, .usdc, .usdz and .html files" in error_of(
+        "convert", model, tmp_path / "out.obj"
+    )
     assert "leave --shape out" in error_of("convert", model, tmp_path / "out.splat", "--shape", "skew-normal")
     assert "no such model folder or file" in error_of("convert", tmp_path / "none", out, "--shape", "gaussian")
 

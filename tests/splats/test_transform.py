@@ -15,8 +15,9 @@ from clsplat.errors import InputError
 from clsplat.splats.approximate import nearest_gaussians
 from clsplat.splats.convert import convert
 from clsplat.splats.harmonics import sh_basis
+from clsplat.splats.similarity import similarity, turned_harmonics
 from clsplat.splats.splats import Splats
-from clsplat.splats.transform import joined, similarity, transformed, turned_harmonics
+from clsplat.splats.transform import joined, transformed
 
 
 def matrix(scale: float = 1.7, seed: int = 0) -> np.ndarray:

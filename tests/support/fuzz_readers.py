@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import glb_files
 import numpy as np
 import packed_ply
 import sog_files
@@ -336,6 +337,16 @@ def make_page(folder: Path) -> None:
     (folder / "a.html").write_text(payload, encoding="utf-8")
 
 
+def make_gltf(folder: Path) -> None:
+    small_splats().save(folder / "a.glb")
+    document, binary = glb_files.parts((folder / "a.glb").read_bytes())
+    (folder / "a.glb").unlink()
+    document["buffers"][0]["uri"] = "a.bin"
+    document["nodes"][0] |= {"translation": [1, 2, 3], "rotation": [0, 0, 0, 1], "scale": [2, 2, 2]}
+    (folder / "a.bin").write_bytes(binary)
+    (folder / "a.gltf").write_text(json.dumps(document), encoding="utf-8")
+
+
 READERS = {
     "page": Sample(make_page, lambda f: finite(Splats.load(f / "a.html").arrays)),
     "ply": Sample(lambda f: small_splats().save(f / "model.ply"), lambda f: finite(read_ply(f / "model.ply").arrays)),
@@ -359,6 +370,8 @@ READERS = {
         lambda f: sog_files.write(f / "meta.json", *sog_files.some(6, 1)),
         lambda f: finite(Splats.load(f / "meta.json").arrays),
     ),
+    "glb": Sample(lambda f: small_splats().save(f / "a.glb"), lambda f: finite(Splats.load(f / "a.glb").arrays)),
+    "gltf": Sample(make_gltf, lambda f: finite(Splats.load(f / "a.gltf").arrays), "a.gltf"),
     "cfg-args": Sample(make_cfg_args, lambda f: read_cfg_args(f / "cfg_args")),
     "colmap-bin": Sample(make_scene, lambda f: read_model(find_model(f)), "sparse"),
     "colmap-txt": Sample(lambda f: make_scene(f, ".txt"), lambda f: read_model(find_model(f)), "sparse"),
@@ -381,3 +394,9 @@ if find_spec("zstandard"):
         lambda f: small_splats("gaussian", 2).save(f / "a.spz", spz_version=4),
         lambda f: finite(Splats.load(f / "a.spz").arrays),
     )
+if find_spec("pxr"):
+    for ending in ("usda", "usdc"):
+        READERS[ending] = Sample(
+            lambda f, ending=ending: small_splats().save(f / f"a.{ending}"),
+            lambda f, ending=ending: finite(Splats.load(f / f"a.{ending}").arrays),
+        )
