@@ -11,6 +11,7 @@ from clsplat.errors import InputError
 from clsplat.files.existing import refuse_existing
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
+from .command import DocumentedCommand
 from .options import PATH, device_option, is_given, overwrite_option, scene_options
 from .progress import table
 
@@ -28,7 +29,17 @@ _DOMINANT = 0.1  # smallest share of an iteration for which a stage gets a sente
 _NEAR = 0.5  # smallest fraction of a limit that counts as the limit of a stage
 
 
-@click.command()
+@click.command(
+    cls=DocumentedCommand,
+    examples=(
+        ("clsplat bench", "Random splats on the default device."),
+        (
+            "clsplat bench -s SCENE -m MODEL --json speed.json",
+            "A trained model and its photos, with all numbers in a file.",
+        ),
+    ),
+    see_also=("devices",),
+)
 @scene_options
 @click.option(
     "-m",

@@ -38,7 +38,19 @@ _COMMON = (
 )
 
 
-@click.command("benchmark", cls=TrainingCommand, sections={"Common options": _COMMON})
+@click.command(
+    "benchmark",
+    cls=TrainingCommand,
+    sections={"Common options": _COMMON},
+    examples=(
+        (
+            "clsplat benchmark nerf-synthetic SETS -o results",
+            "All scenes of a set in the folder SETS, as published.",
+        ),
+        ("clsplat benchmark llff SETS -o results --photos 3", "Train on three photos of each scene."),
+    ),
+    see_also=("compare",),
+)
 @click.argument("name", metavar="SET", type=click.Choice(SETS))
 @click.argument("folder", type=PATH)
 @grid_options(

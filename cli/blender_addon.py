@@ -17,6 +17,7 @@ from clsplat.errors import InputError
 from clsplat.files.atomic import atomic_writer
 from clsplat.files.existing import refuse_existing
 
+from .command import DocumentedCommand
 from .options import PATH, overwrite_option
 
 _MANIFEST = "blender_manifest.toml"
@@ -31,7 +32,11 @@ _PLATFORMS = {
 }
 
 
-@click.command()
+@click.command(
+    cls=DocumentedCommand,
+    examples=(("clsplat blender-addon -o clsplat-addon.zip", "Then install the zip in Blender."),),
+    see_also=("render",),
+)
 @click.option(
     "-o",
     "--output",
@@ -90,11 +95,10 @@ def addon_zip(wheels: list[Path]) -> bytes:
 def manifest(wheels: list[Path]) -> str:
     """Return the add-on's manifest with clsplat's version, the wheels and their platforms."""
     text = (files("clsplat_blender") / _MANIFEST).read_text("utf-8")
-    text = re.sub(r'^version = ".*"$', f'version = "{__version__}"', text, count=1, flags=re.M)
-    lines = ""
+    lines = f'version = "{__version__}"\n'
     if wheels:
         named = json.dumps([f"./wheels/{wheel.name}" for wheel in wheels], indent=2)
-        lines = f"wheels = {named}\n"
+        lines += f"wheels = {named}\n"
         platforms = sorted(
             {
                 place
@@ -104,9 +108,9 @@ def manifest(wheels: list[Path]) -> str:
             }
         )
         if platforms:
-            lines = f"platforms = {json.dumps(platforms)}\n{lines}"
+            lines += f"platforms = {json.dumps(platforms)}\n"
     head, section, rest = text.partition("[permissions]")
-    return head + lines + ("\n" if lines else "") + section + rest
+    return head.rstrip() + "\n" + lines + "\n" + section + rest
 
 
 def wheels_in(folder: Path) -> list[Path]:

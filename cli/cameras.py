@@ -8,10 +8,19 @@ import click
 
 from clsplat.scenes.options import CAMERA_FORMATS
 
+from .command import DocumentedCommand
 from .options import PATH, iteration_option, overwrite_option, quiet_option
 
 
-@click.command("cameras")
+@click.command(
+    "cameras",
+    cls=DocumentedCommand,
+    examples=(
+        ("clsplat cameras SCENE transforms.json", "For nerfstudio and instant-ngp."),
+        ("clsplat cameras MODEL colmap --format colmap-text", "A COLMAP model as text files."),
+    ),
+    see_also=("convert",),
+)
 @click.argument("source", type=PATH)
 @click.argument("output", type=PATH)
 @click.option(

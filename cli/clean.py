@@ -45,7 +45,16 @@ SECTIONS = {
 }
 
 
-@click.command("clean", cls=SectionedCommand, sections=SECTIONS)
+@click.command(
+    "clean",
+    cls=SectionedCommand,
+    sections=SECTIONS,
+    examples=(
+        ("clsplat clean MODEL --dry-run", "What would be removed, and what it would cost."),
+        ("clsplat clean MODEL -s SCENE -o cleaned.ply", "Remove it, and write a file of splats."),
+    ),
+    see_also=("prune", "view"),
+)
 @click.argument("model", type=PATH)
 @scene_options
 @changed_photos_option

@@ -1,4 +1,4 @@
-"""Commands whose `--help` is one screen: the common options first, all others under `--help-all`, in sections."""
+"""Commands whose `--help` is one screen with examples. Options that few need are under `--help-all`, in sections."""
 
 from __future__ import annotations
 
@@ -8,9 +8,43 @@ from typing import Any
 
 import click
 
+from .help_layout import TerminalContext, write_examples, write_see_also
+
 _ALL = "clsplat.help_all"  # key in `Context.meta`
 _SHORT_TEXT = 2  # paragraphs of the description that the short help shows
 OTHER = "Other options"
+
+
+class DocumentedCommand(click.Command):
+    """A command whose help fits the terminal and ends with examples.
+
+    Parameters
+    ----------
+    examples : command lines, each with a sentence on what it does.
+    see_also : names of commands that come before or after this one.
+    environment : variables that the command reads, each with what it does.
+    """
+
+    context_class = TerminalContext
+
+    def __init__(
+        self,
+        *args: Any,
+        examples: Sequence[tuple[str, str]],
+        see_also: Sequence[str] = (),
+        environment: Sequence[tuple[str, str]] = (),
+        **extra: Any,
+    ) -> None:
+        super().__init__(*args, **extra)
+        self.examples, self.see_also, self.environment = examples, see_also, environment
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write what follows the options."""
+        if self.environment:
+            with formatter.section("Environment"):
+                formatter.write_dl(self.environment)
+        write_examples(formatter, self.examples)
+        write_see_also(formatter, self.see_also)
 
 
 class SectionOption(click.Option):
@@ -21,7 +55,7 @@ class SectionOption(click.Option):
         self.section = section
 
 
-class SectionedCommand(click.Command):
+class SectionedCommand(DocumentedCommand):
     """A command with a short `--help` and a long `--help-all`.
 
     The short help has the first two paragraphs of the description and the first section of options.

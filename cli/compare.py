@@ -42,7 +42,22 @@ CAPS = (5000,)
 SYSTEMS = (DEFAULT, *PRESETS)
 
 
-@click.command("compare", cls=TrainingCommand, sections=comparison_sections("save_models"))
+@click.command(
+    "compare",
+    cls=TrainingCommand,
+    sections=comparison_sections("save_models"),
+    examples=(
+        (
+            "clsplat compare SCENE -o table --systems 3dgs,default --iterations 1000",
+            "Two systems, each trained once.",
+        ),
+        (
+            "clsplat compare SCENE -o table --cap-max 5000,20000 --seeds 0,1,2",
+            "All systems at two sizes, with three seeds each.",
+        ),
+    ),
+    see_also=("frontier", "benchmark"),
+)
 @click.argument("scenes", nargs=-1, required=True, type=PATH)
 @grid_options(
     output="Folder of the runs and the table.",

@@ -11,6 +11,7 @@ from clsplat.errors import OutputError
 from clsplat.training.config import TrainConfig
 from clsplat.training.folder import ModelFolder
 
+from .command import DocumentedCommand
 from .evaluate import describe
 from .options import PATH, device_option, overwrite_option, quiet_option
 from .progress import ViewCount, duration
@@ -20,7 +21,14 @@ from .train import report_interruption, run_training
 ITERATIONS, CAP = 1500, 6000
 
 
-@click.command()
+@click.command(
+    cls=DocumentedCommand,
+    examples=(
+        ("clsplat demo out", "Minutes on two processor cores."),
+        ("clsplat demo out --iterations 300 --cap-max 1000", "A shorter run and a coarser model."),
+    ),
+    see_also=("train", "view"),
+)
 @click.argument("out", type=PATH)
 @click.option(
     "--iterations",

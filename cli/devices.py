@@ -10,11 +10,28 @@ import click
 
 from clsplat.errors import DeviceError
 
+from .command import DocumentedCommand
+
 if TYPE_CHECKING:
     from clsplat.device.device import DeviceInfo
 
 
-@click.command()
+@click.command(
+    cls=DocumentedCommand,
+    examples=(
+        ("clsplat devices", "Which devices are there, and does each compute right?"),
+        (
+            "clsplat train SCENE -m MODEL --device cpu",
+            "Use the processor, even beside a GPU. All commands that compute have this option.",
+        ),
+    ),
+    see_also=("bench",),
+    environment=(
+        ("PYOPENCL_CTX", "The default device, as pyopencl names it: 0:1, or part of a platform's name."),
+        ("CLSPLAT_SCHEDULE", "A schedule to use instead of the fastest one, such as cpu8 or scalar."),
+        ("XDG_CACHE_HOME", "Folder for the caches of kernels and schedules.  [default: ~/.cache]"),
+    ),
+)
 @click.pass_context
 def devices(ctx: click.Context) -> None:
     """List the OpenCL devices, test each on a small scene, and suggest fixes for known faults.

@@ -56,7 +56,17 @@ SECTIONS = {
 }
 
 
-@click.command("eval", cls=SectionedCommand, sections=SECTIONS)
+@click.command(
+    "eval",
+    cls=SectionedCommand,
+    sections=SECTIONS,
+    examples=(
+        ("clsplat eval MODEL", "Measure the test views and write a page with the images."),
+        ("clsplat eval MODEL OTHER --report both.html", "Compare two models on one page."),
+        ("clsplat eval FILE.ply -s SCENE", "Measure splats of another program."),
+    ),
+    see_also=("train", "compare"),
+)
 @click.argument("models", nargs=-1, type=PATH)
 @click.option("-m", "--model-path", "more_models", type=PATH, multiple=True, help="The same as an argument.")
 @scene_options

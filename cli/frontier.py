@@ -30,7 +30,22 @@ CAPS = (1000, 2500, 5000, 10_000)
 SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 
 
-@click.command("frontier", cls=TrainingCommand, sections=comparison_sections("curve", "repeat", "add", "charts_only"))
+@click.command(
+    "frontier",
+    cls=TrainingCommand,
+    sections=comparison_sections("curve", "repeat", "add", "charts_only"),
+    examples=(
+        (
+            "clsplat frontier SCENE -o out --systems 3dgs,default --iterations 500,1000",
+            "Quality against the time of training.",
+        ),
+        (
+            "clsplat frontier SCENE -o out --cap-max 1000,5000,20000",
+            "Quality against the number of splats and bytes.",
+        ),
+    ),
+    see_also=("compare",),
+)
 @click.argument("scenes", nargs=-1, type=PATH)
 @grid_options(
     output="Folder of the runs, charts and page.",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .command import DocumentedCommand
 from .options import PATH, iteration_option
 from .progress import table
 
@@ -19,7 +20,15 @@ if TYPE_CHECKING:
 _MAX_LISTED = 5  # longest list of names that is printed in full
 
 
-@click.command("info")
+@click.command(
+    "info",
+    cls=DocumentedCommand,
+    examples=(
+        ("clsplat info MODEL", "What a model is made of."),
+        ("clsplat info SCENE", "What there is to train on."),
+    ),
+    see_also=("train", "convert"),
+)
 @click.argument("paths", nargs=-1, required=True, type=PATH)
 @iteration_option
 @click.option("-i", "--images", metavar="NAME", help="Folder of the photos inside a scene, such as images_4.")

@@ -16,6 +16,7 @@ from clsplat.errors import FEWER_SPLATS, OTHER_DEVICE, SMALLER_IMAGES, ClsplatEr
 from clsplat.files import stop_signals
 
 from .command import nearest_command
+from .help_layout import write_examples
 
 # Each command: (module:attribute, line of --help). The table lets --help work without importing the modules.
 COMMANDS = {
@@ -46,6 +47,18 @@ COMMANDS = {
     ),
     "cameras": ("clsplat_cli.cameras:write_cameras_of", "Write the cameras of a scene or a model for other programs."),
 }
+EXAMPLES = (
+    ("clsplat demo out", "A first trial, with a scene that it makes itself."),
+    ("clsplat train PHOTOS -m MODEL", "A model of your photos, or of a video."),
+    ("clsplat view MODEL", "Look at it in the browser."),
+)
+# The codes of error and stop_signals.exit_code, and click's for a wrong command line.
+EXIT_CODES = (
+    ("0", "Success."),
+    ("1", "An error, in one line on standard error."),
+    ("2", "A wrong command line."),
+    ("130", "Stopped by Ctrl-C. Another signal: 128 plus its number."),
+)
 _LONGEST_WORD = 400  # characters of a word that a message shows in full; a path may be that long
 
 
@@ -65,6 +78,12 @@ class Commands(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write what follows the list of commands."""
+        write_examples(formatter, EXAMPLES)
+        with formatter.section("Exit codes"):
+            formatter.write_dl(EXIT_CODES)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if not args:  # click 8.2 and later would make an error of the help, and `main` would print it as one line
@@ -142,7 +161,7 @@ class Commands(click.Group):
 def main() -> None:
     """Gaussian and skew-normal splatting on any OpenCL device.
 
-    For a first trial: clsplat demo out. With your photos: clsplat train PHOTOS -m MODEL, then clsplat view MODEL.
+    `clsplat COMMAND --help` describes a command.
     """
 
 

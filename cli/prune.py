@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .command import DocumentedCommand
 from .models import scene_choice
 from .options import (
     PATH,
@@ -24,7 +25,18 @@ if TYPE_CHECKING:
     from clsplat.models.prune import PrunedModel
 
 
-@click.command("prune")
+@click.command(
+    "prune",
+    cls=DocumentedCommand,
+    examples=(
+        ("clsplat prune MODEL -o small.ply", "As small as a loss of 0.1 dB allows."),
+        (
+            "clsplat prune MODEL -o small.ply --tolerance 0.5 --iterations 200",
+            "Smaller, with some training between the rounds.",
+        ),
+    ),
+    see_also=("clean", "convert"),
+)
 @click.argument("model", type=PATH)
 @scene_options
 @changed_photos_option

@@ -49,7 +49,15 @@ SECTIONS = {
 }
 
 
-@click.command(cls=SectionedCommand, sections=SECTIONS)
+@click.command(
+    cls=SectionedCommand,
+    sections=SECTIONS,
+    examples=(
+        ("clsplat render MODEL -o renders", "The test views as images."),
+        ("clsplat render MODEL --path orbit --video turn.mp4", "A flight around the scene."),
+    ),
+    see_also=("view", "eval"),
+)
 @click.argument("model", required=False, type=PATH, metavar="MODEL_OR_PLY")
 @click.option("-m", "--model-path", type=PATH, help="The same as MODEL_OR_PLY.")
 @click.option("-o", "--output", type=PATH, metavar="DIR", help="Folder of the images.")

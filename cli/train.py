@@ -88,7 +88,22 @@ def _qualities() -> str:
     )
 
 
-@click.command(cls=TrainingCommand, sections=SECTIONS)
+@click.command(
+    cls=TrainingCommand,
+    sections=SECTIONS,
+    examples=(
+        (
+            "clsplat train PHOTOS -m MODEL --eval --quality draft",
+            "A quick model of photos without known cameras, measured on test views.",
+        ),
+        (
+            "clsplat train SCENE -m MODEL --cap-max 20000 -r 4",
+            "A small model from photos at a quarter of their size.",
+        ),
+        ("clsplat train --resume -m MODEL", "Continue a run that was stopped."),
+    ),
+    see_also=("reconstruct", "eval", "view"),
+)
 @click.argument("scene", required=False, type=PATH)
 @click.option(
     "-m",

@@ -12,6 +12,7 @@ import click
 from clsplat.files.stop_signals import exit_code
 from clsplat.splats.color import Color
 
+from .command import DocumentedCommand
 from .models import one_model, scene_choice
 from .options import (
     PATH,
@@ -76,7 +77,14 @@ def addresses(urls: Sequence[str]) -> str:
     return f"{urls[0]}, from other machines at {urls[1]}" if len(urls) > 1 else urls[0]
 
 
-@click.command()
+@click.command(
+    cls=DocumentedCommand,
+    examples=(
+        ("clsplat view MODEL", "Then open the printed address in a browser."),
+        ("clsplat view FILE.ply --port 0", "Any splat file, at any free port."),
+    ),
+    see_also=("render", "convert"),
+)
 @click.argument("model", required=False, type=PATH, metavar="MODEL_OR_PLY")
 @click.option("-m", "--model-path", type=PATH, help="The same as MODEL_OR_PLY.")
 @scene_options

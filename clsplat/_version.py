@@ -1,3 +1,3 @@
-"""The version, for modules that must not import the package."""
+"""The version, in its only place: setuptools reads this text, and modules read it without importing the package."""
 
 __version__ = "0.1.0"

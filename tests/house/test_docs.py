@@ -1,14 +1,14 @@
 """Documents are correct: commands and Python run, links work, and quoted messages are in the source.
 
-Each `clsplat` command of a code block runs alone, in a folder with stand-ins for the names in it (SCENE, MODEL, ...).
-`shortened` gives it few iterations and splats. Other commands are checked for the files and options that they name.
+Each `clsplat` command of a code block, and each example of `--help`, runs alone. Its folder has stand-ins for the names
+in it (SCENE, MODEL, ...), and `shortened` gives it few iterations and splats. Other commands are checked for the files
+and options that they name.
 `NOT_RUN` contains the reason why a command is not run. A command that is neither run nor in `NOT_RUN` fails.
 """
 
 from __future__ import annotations
 
 import ast
-import importlib.util
 import os
 import re
 import shlex
@@ -24,10 +24,10 @@ import draw_imports
 import numpy as np
 import pytest
 from cli_runner import ITERATIONS, run
+from clsplat_cli.command import DocumentedCommand
 from clsplat_cli.main import COMMANDS, main
 from set_folders import as_blender, as_colmap
 
-import clsplat
 from clsplat.files.images import image_size, write_png
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,9 +42,10 @@ NOT_RUN = (
     (r"(\.venv/bin/)?pytest|\.venv/bin/(ruff|clang-format|mypy)|\.ci/run", "the checks; files they name are checked"),
     (r"python tests/support/english\.py", "a check of every text"),
     (r"python benchmarks/", "hours; test_benchmarks.py runs small ones; script and options are checked"),
-    (r"python docs/api\.py", "test_docstrings_are_rendered runs it"),
+    (r"python docs/api\.py", "test_reference.py runs it"),
     (r"python docs/draw_imports\.py", "test_the_drawing_is_up_to_date makes the drawing"),
-    (r"\.venv/bin/clsplat devices", "measures schedules; tests/device/test_device.py and tests/cli/test_cli.py run it"),
+    (r"(\.venv/bin/)?clsplat devices", "measures schedules; test_device.py and test_cli.py run it"),
+    (r"clsplat reconstruct VIDEO", "no video is here; tests/scenes/test_video_frames.py makes one"),
     (r"clsplat view |clsplat train .*--view", "serves until it is stopped; tests/cli/test_view.py runs it"),
 )
 # Commands that take minutes, or that resemble a command that is run.
@@ -63,7 +64,7 @@ def blocks(text: str, language: str) -> list[str]:
 
 
 def commands() -> dict[str, str]:
-    """Return all commands of code blocks with their pages, without comments."""
+    """Return all commands of code blocks and of examples in `--help` with their pages, without comments."""
     found: dict[str, str] = {}
     for page, text in TEXTS.items():
         lines = [line for body in blocks(text, "sh") for line in body.splitlines()]
@@ -72,6 +73,11 @@ def commands() -> dict[str, str]:
             for command in re.sub(r"\s+#.*", "", line).split(" && "):
                 if command.strip():
                     found.setdefault(command.strip(), page)
+    for name in COMMANDS:
+        shown = main.get_command(click.Context(main), name)
+        assert isinstance(shown, DocumentedCommand)
+        for command, _ in shown.examples:
+            found.setdefault(command, f"clsplat {name} --help")
     return found
 
 
@@ -288,25 +294,3 @@ def test_messages_are_those_of_the_source() -> None:
                         words = part.strip(" ',:;")
                         assert len(words) < 3 or any(words in known for known in texts), f"{page}: {words!r}"
     assert quoted > 50
-
-
-def test_docstrings_are_rendered(tmp_path: Path) -> None:
-    pytest.importorskip("pdoc", reason="pdoc is not installed (pip install clsplat[docs])")
-    command = [sys.executable, "-W", "error", str(ROOT / "docs" / "api.py"), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    text = (tmp_path / "clsplat.html").read_text()
-    for name in clsplat.__all__:
-        assert f'id="{name}"' in text
-    assert "<li><strong>target_psnr</strong>: replaces the tolerance" in text
-    assert "-----" not in text, "a section that docs/api.py did not parse"
-
-
-def test_docstrings_without_pdoc(tmp_path: Path) -> None:
-    if importlib.util.find_spec("pdoc"):
-        pytest.skip("pdoc is installed")
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "docs" / "api.py"), str(tmp_path)], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 1
-    assert done.stderr == 'error: pdoc is not installed: pip install "clsplat[docs]"\n'
