@@ -21,11 +21,18 @@ OTHER_EXTRAS = (
     "pillow_heif",
 )
 COLLECT = """
+import importlib.util
 import sys
 
-for name in sys.argv[1].split(","):
-    sys.modules[name] = None  # importing it fails, and find_spec does not find it
+missing, found = sys.argv[1].split(","), importlib.util.find_spec
 
+class Missing:
+    def find_spec(name, path=None, target=None):
+        if name.split(".")[0] in missing:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing)
+importlib.util.find_spec = lambda name, package=None: None if name in missing else found(name, package)
 import pytest
 sys.exit(pytest.main(["--collect-only", "-q", "-n0", "-p", "no:cacheprovider", sys.argv[2]]))
 """
