@@ -22,7 +22,8 @@ from .source import Source, ViewPicture, depth_view
 from .viewer import FRAME_TIME, Viewer
 
 SHARE = 0.015  # share of the run time for frames; messages of browsers take one or two hundredths more
-TRAINING_FRAME_TIME = 0.025  # seconds for a frame of a moving camera, short so that frames still arrive
+MOVING_SHARE = 0.2  # the same while somebody moves a camera and waits for frames
+TRAINING_FRAME_TIME = 0.025  # seconds for a frame of a moving camera: with this share, 8 a second
 _MAX_CREDIT = 0.2  # seconds of frames that are saved up for a moving camera
 _REFRESH = 2.0  # seconds between frames of a still camera
 _PAUSE_STEP = 0.1  # seconds between checks for Ctrl-C during a pause
@@ -88,7 +89,7 @@ class TrainingView:
 
     Parameters
     ----------
-    share : share of the run time that frames may take.
+    share, moving_share : share of the run time that frames may take: usually, and while a camera moves.
     on_pause : called in the trainer's thread with a message when the run is paused (True) or goes on (False).
     """
 
@@ -96,13 +97,14 @@ class TrainingView:
         self,
         config: TrainConfig,
         share: float = SHARE,
+        moving_share: float = MOVING_SHARE,
         clock: Callable[[], float] = time.monotonic,
         on_pause: Callable[[bool, str], None] = lambda paused, message: None,
     ) -> None:
         self.source: Source = TrainingSource(config)
         self.viewer = Viewer(self.source, Settings(background=config.background), TRAINING_FRAME_TIME, clock)
         self.on_pause = on_pause
-        self._share, self._clock = share, clock
+        self._share, self._moving_share, self._clock = share, moving_share, clock
         self._paused = threading.Event()
         self._credit, self._left, self._refreshed, self._cost = 0.0, math.inf, -math.inf, 0.0
 
@@ -117,7 +119,8 @@ class TrainingView:
         """Serve a frame between two iterations if one is due and there is time; during a pause serve all of them."""
         self._attach(trainer)
         now = self._clock()
-        self._credit = min(self._credit + self._share * max(now - self._left, 0.0), _MAX_CREDIT)
+        share = max(self._share, self._moving_share) if self.viewer.moving else self._share
+        self._credit = min(self._credit + share * max(now - self._left, 0.0), _MAX_CREDIT)
         if self._credit > 0.0:
             due = now - self._refreshed > _REFRESH and self._credit >= self._cost
             fresh = due and self.viewer.count > 0

@@ -128,6 +128,12 @@ class Viewer:
         """Number of clients."""
         return len(self._clients)
 
+    @property
+    def moving(self) -> int:
+        """Number of clients whose cameras move."""
+        now = self._clock()
+        return sum(now - client.moved < REST for client in list(self._clients.values()))
+
     def serve(self, timeout: float = 0.0) -> bool:
         """Render and send one frame; return False if no request came within `timeout` seconds."""
         client_id = self.queue.next_client(timeout)
@@ -150,7 +156,7 @@ class Viewer:
             self.leave(client_id)
             return True
         if not still:
-            client.resolution.update((self._clock() - start) * self._moving(start))
+            client.resolution.update((self._clock() - start) * max(self.moving, 1))
             self.queue.request(client_id, max(client.moved + REST + _ROUNDING - self._clock(), 0.0))
         return True
 
@@ -173,10 +179,6 @@ class Viewer:
                 setattr(client, name, value)
             client.moved = self._clock()
         self.queue.request(client_id)
-
-    def _moving(self, now: float) -> int:
-        """Return the number of moving cameras, which share the time, but at least 1."""
-        return max(sum(now - client.moved < REST for client in list(self._clients.values())), 1)
 
     def _render(
         self, pose: Pose, settings: Settings, size: int, still: bool, start: float, enlarge: bool = False

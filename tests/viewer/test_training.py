@@ -30,7 +30,7 @@ from clsplat.viewer import training
 from clsplat.viewer.camera import Pose, camera_of
 from clsplat.viewer.settings import Settings
 from clsplat.viewer.source import ModelSource, ViewPicture
-from clsplat.viewer.training import SHARE, TrainingSource, TrainingView, run_line
+from clsplat.viewer.training import MOVING_SHARE, SHARE, TrainingSource, TrainingView, run_line
 from clsplat.viewer.viewer import ViewerImage
 
 CONFIG = TrainConfig(iterations=40, cap_max=2400, sh_degree=1, densify_interval=10, strategy="mcmc")
@@ -102,7 +102,8 @@ def test_no_band_is_shown_before_it_is_trained(scene: Scene, monkeypatch: pytest
         shown.clear()
 
 
-def test_pictures_take_no_more_than_their_share() -> None:
+@pytest.mark.parametrize(("moving", "share"), [(True, MOVING_SHARE), (False, SHARE)])
+def test_pictures_take_no_more_than_their_share(moving: bool, share: float) -> None:
     """The clock of the test advances 10 ms for an iteration and 30 ms for a frame."""
     now = [0.0]
     spent = [0.0]
@@ -127,11 +128,14 @@ def test_pictures_take_no_more_than_their_share() -> None:
 
     view.source = view.viewer.source = Source()  # type: ignore[assignment]
     view.viewer.join(1, lambda shot: None)
-    for _ in range(3000):
-        view.viewer.move(1, Pose((1, 0, 0, 0), (0, 0, -3), 1.0, 64, 48))
+    for number in range(3000):
+        if moving or number == 0:
+            view.viewer.move(1, Pose((1, 0, 0, 0), (0, 0, -3), 1.0, 64, 48))
         view.visit(Run(), threading.Event())  # type: ignore[arg-type]
         now[0] += 0.01
-    assert 0.5 * SHARE * 30.0 < spent[0] <= SHARE * 30.0 + 0.03
+    assert 0.5 * share * 30.0 < spent[0] <= share * 30.0 + 0.06
+    if moving:
+        assert spent[0] / 0.03 > 5.0 * 30.0, "a moving camera gets five frames a second"
 
 
 def test_a_paused_run_waits_and_still_shows(scene: Scene) -> None:
