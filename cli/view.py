@@ -82,11 +82,18 @@ def addresses(urls: Sequence[str]) -> str:
     examples=(
         ("clsplat view MODEL", "Then open the printed address in a browser."),
         ("clsplat view FILE.ply --port 0", "Any splat file, at any free port."),
+        ("clsplat view MODEL --against OTHER", "Two models in one picture, with a divider."),
     ),
     see_also=("render", "convert"),
 )
 @click.argument("model", required=False, type=PATH, metavar="MODEL_OR_PLY")
 @click.option("-m", "--model-path", type=PATH, help="The same as MODEL_OR_PLY.")
+@click.option(
+    "--against",
+    type=PATH,
+    metavar="MODEL",
+    help="Another model of the same scene, to the right of a divider that the panel moves.",
+)
 @scene_options
 @server_options
 @click.option(
@@ -103,6 +110,7 @@ def addresses(urls: Sequence[str]) -> str:
 def view(
     model: Path | None,
     model_path: Path | None,
+    against: Path | None,
     port: int,
     host: str,
     names: tuple[str, ...],
@@ -129,7 +137,8 @@ def view(
     require_viser()
     loaded = load_model(source, iteration)
     options = ServerOptions(host, port, names, token, folder)
-    session = ViewingSession(loaded, known_cameras(loaded, scene), colour, options, iteration, device)
+    other = None if against is None else load_model(against)
+    session = ViewingSession(loaded, known_cameras(loaded, scene), colour, options, iteration, device, other)
     if not quiet:
         click.echo(f"{source}: {len(loaded.splats)} splats at {addresses(session.server.urls)} (Ctrl-C ends)")
     try:

@@ -22,10 +22,11 @@ from .crop import CropBox
 from .crop_panel import CropPanel
 from .initial_view import UP, SceneCameras, vertical_fov
 from .legend import legend
+from .measure_panel import MeasurePanel
 from .page_download import PageDownload
 from .path_panel import PathPanel
 from .settings import DEFAULT_SIZE, MAX_SIZE, MIN_SIZE
-from .status_line import StatusLine
+from .status_line import StatusLine, plain
 from .viewer import Viewer, ViewerImage
 
 QUALITY, MOVING_QUALITY = 95, 80  # JPEG quality of still and of moving frames
@@ -92,6 +93,7 @@ class Page:
             self._crop = CropPanel(
                 client, lambda: viewer.source.splats, up, self._choose_box, self._try, self.set_status, folder
             )
+            self._measure = MeasurePanel(client, lambda: viewer.source, self.set_status)
             with client.gui.add_folder("Help", expand_by_default=False):
                 client.gui.add_markdown(HELP)
             viewer.join(client.client_id, self.send)
@@ -136,6 +138,7 @@ class Page:
         if everything or self._cap.value > n:
             self._cap.value = max(n, 1)
         self._crop.model_changed()
+        self._measure.model_changed()
 
     def _add_settings(self) -> None:
         gui, viewer, source = self.client.gui, self.viewer, self.viewer.source
@@ -145,6 +148,10 @@ class Page:
             mode = gui.add_dropdown("Show", tuple(labels), hint="The property of the splats that is shown")
             mode.on_update(lambda _: self._choose("mode", labels.get(mode.value)))
             self._legend = gui.add_html("", visible=False)
+            if source.sides is not None:
+                gui.add_markdown(plain(" | ".join(source.sides)))
+                divider = gui.add_slider("Divider", 0.0, 1.0, 0.005, chosen.divider, hint="Between the two models")
+                divider.on_update(lambda _: self._choose("divider", divider.value))
             r, g, b = (round(255 * part) for part in chosen.background)
             ground = gui.add_rgb("Background", (r, g, b))
             ground.on_update(lambda _: self._choose("background", ground.value))

@@ -18,6 +18,7 @@ from ..files.real_path import real_path
 from ..models.model import LoadedModel, SceneChoice, in_both_forms
 from ..splats.color import Color
 from ..training.folder import ModelFolder
+from .compared import ComparedSource
 from .initial_view import SceneCameras, initial_view
 from .options import ServerOptions
 from .settings import Settings
@@ -42,6 +43,7 @@ class ViewingSession:
     background : colour 0..1; None takes the model's.
     iteration : of a model folder, the point cloud to watch; None watches for the last.
     device : OpenCL device, as for `Renderer`.
+    against : another model, which is shown to the right of a divider.
 
     Raises
     ------
@@ -57,18 +59,22 @@ class ViewingSession:
         options: ServerOptions | None = None,
         iteration: int | None = None,
         device: str | None = None,
+        against: LoadedModel | None = None,
     ) -> None:
         require_viser()
         from .server import Server
 
         known, options = known or known_cameras(model), options or ServerOptions()
         cameras = [item.camera for item in (*known.train, *known.test)]
-        self.source = ModelSource(model.splats, device)
+        self.source: ModelSource | ComparedSource = ModelSource(model.splats, device)
+        if against is not None:
+            names = real_path(model.path).stem, real_path(against.path).stem
+            self.source = ComparedSource(self.source, ModelSource(against.splats, device), names)
         self.watch = ModelWatcher(_finder(model.path, iteration))
         settings = Settings(background=model.background if background is None else background)
         self.viewer = Viewer(self.source, settings)
         # This picture builds the kernels before a client waits for them, and raises the device's errors here.
-        self.source.picture(Camera(64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4)), settings)
+        self.source.view(Camera(64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4)), settings)
         self.server: Server = Server(
             self.viewer,
             initial_view(model.splats.mean, cameras),

@@ -26,6 +26,7 @@ class Settings:
     sh_degree : highest SH band that is shown, or None for all.
     cap : number of splats that are shown, or None for all. Those that cover most are shown first.
     crop : box that hides the splats outside of it, or None.
+    divider : share of the width that shows the first of two models.
     """
 
     mode: str = "colour"
@@ -34,6 +35,7 @@ class Settings:
     sh_degree: int | None = None
     cap: int | None = None
     crop: CropBox | None = None
+    divider: float = 0.5
 
     def changed(self, name: str, value: Any, modes: tuple[str, ...]) -> Settings:
         """Return the settings with one value of a browser; the same settings if the value is unusable.
@@ -48,6 +50,7 @@ class Settings:
             "size": lambda size: _whole(size, MIN_SIZE, MAX_SIZE),
             "sh_degree": lambda degree: _whole(degree, 0, 3),
             "cap": lambda cap: _whole(cap, 0, 1 << 31),
+            "divider": _share,
             "crop": lambda box: box if box is None or isinstance(box, CropBox) else _unusable(),
         }
         try:
@@ -61,6 +64,12 @@ def _rgb(value: Any) -> Color:
     if not all(0.0 <= part <= 1.0 for part in (r, g, b)):
         _unusable()
     return r, g, b
+
+
+def _share(value: Any) -> float:
+    if isinstance(value, (str, bytes)) or not math.isfinite(value):
+        _unusable()
+    return float(min(max(value, 0.0), 1.0))
 
 
 def _whole(value: Any, low: int, high: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Callable
@@ -16,11 +17,14 @@ from ..cameras.camera import Camera
 from ..errors import ClsplatError, InputError
 from ..rendering.colormaps import MODES, Picture, depth_picture, depth_range, model_for, picture
 from ..rendering.renderer import Rendered, Renderer
+from ..splats.fields import DoubleArray
 from ..splats.shapes import shape_named
 from ..splats.splats import Splats
 from .crop import CropBox
 from .settings import Settings
 
+_PROBE, _PROBE_FOCAL = 5, 1000.0  # size and focal length of the image that finds a surface [px]
+_SOLID = 0.5  # alpha from which a pixel belongs to a surface
 KEPT = 4  # models on the device at once: parts for clients with another cap or mode
 
 
@@ -57,8 +61,16 @@ class Source(Protocol):
     @property
     def partial(self) -> bool: ...
 
+    @property
+    def sides(self) -> tuple[str, str] | None:
+        """Names of two models that share the picture; None for one model."""
+        ...
+
     def view(self, camera: Camera, settings: Settings) -> ViewPicture:
         """Return the view of a camera, in the size of its image."""
+
+    def surface(self, origin: DoubleArray, direction: DoubleArray) -> DoubleArray | None:
+        """Return the point (3,) where a ray meets the model; None if it meets nothing, or during a run."""
 
 
 class ModelSource:
@@ -71,6 +83,7 @@ class ModelSource:
 
     modes = MODES
     partial = True
+    sides = None
 
     def __init__(self, splats: Splats, device: str | None = None, keep: int = KEPT) -> None:
         self.renderer = Renderer(device, keep=keep)
@@ -102,17 +115,48 @@ class ModelSource:
     def view(self, camera: Camera, settings: Settings) -> ViewPicture:
         """Return the view of a camera."""
         mode, background, degree = settings.mode, settings.background, settings.sh_degree
+        if mode == "depth":
+            return depth_view(self.rendered(camera, settings), settings)
         with self._rendering:
             splats = self._shown.part(settings.cap, mode, settings.crop)
-            if mode == "depth":
-                return depth_view(self.renderer.render(splats, camera, background, degree), settings)
             return ViewPicture(picture(self.renderer, splats, camera, mode, background, sh_degree=degree))
+
+    def rendered(self, camera: Camera, settings: Settings) -> Rendered:
+        """Return the image of a camera with its depths."""
+        with self._rendering:
+            splats = self._shown.part(settings.cap, settings.mode, settings.crop)
+            return self.renderer.render(splats, camera, settings.background, settings.sh_degree)
+
+    def surface(self, origin: DoubleArray, direction: DoubleArray) -> DoubleArray | None:
+        """Return the point (3,) where a ray meets the model, by the mean depth of a tiny image; None beside it."""
+        camera = _camera_along(origin, direction)
+        if camera is None:
+            return None
+        image = self.rendered(camera, Settings())
+        solid = image.alpha > _SOLID
+        if not solid.any():
+            return None
+        depth = float(np.median(image.depth[solid].astype(np.float64) / image.alpha[solid]))
+        return camera.position + depth * camera.rotation[2]
 
 
 def depth_view(image: Rendered, settings: Settings) -> ViewPicture:
     """Return the depth of a rendered image in colours, with the range of its depths."""
     near_far = depth_range(image)
     return ViewPicture(depth_picture(image, near_far, settings.background), near_far)
+
+
+def _camera_along(origin: DoubleArray, direction: DoubleArray) -> Camera | None:
+    """Return a camera that looks along a ray, with a very small angle of view; None for an unusable ray."""
+    length = float(np.linalg.norm(direction))
+    if not (np.isfinite(origin).all() and 0.0 < length < math.inf):
+        return None
+    ahead = direction / length
+    aside = np.cross(np.eye(3)[np.abs(ahead).argmin()], ahead)
+    aside /= np.linalg.norm(aside)
+    rotation = np.stack([aside, np.cross(ahead, aside), ahead])
+    pose = np.concatenate([rotation, -rotation @ origin[:, None]], axis=1)
+    return Camera(_PROBE, _PROBE, _PROBE_FOCAL, _PROBE_FOCAL, 0.5 * _PROBE, 0.5 * _PROBE, pose)
 
 
 class _Shown:

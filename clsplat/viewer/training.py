@@ -14,6 +14,7 @@ from ..rendering.overdraw import splats_per_pixel
 from ..rendering.pipeline import Pipeline
 from ..rendering.renderer import read_frame
 from ..rendering.splat_buffers import SplatBuffers
+from ..splats.fields import DoubleArray
 from ..training.config import TrainConfig
 from ..training.log import Progress
 from ..training.trainer import Trainer
@@ -36,6 +37,7 @@ class TrainingSource:
     modes = MODES
     partial = False  # a part would need a copy of the splats
     splats = None
+    sides = None
 
     def __init__(self, config: TrainConfig) -> None:
         self._config = config
@@ -74,6 +76,10 @@ class TrainingSource:
             return depth_view(image, settings)
         counts = splats_per_pixel(pipeline, frame) if settings.mode == "splats" else None
         return ViewPicture(picture_of(image, settings.mode, settings.background, counts=counts))
+
+    def surface(self, origin: DoubleArray, direction: DoubleArray) -> DoubleArray | None:
+        """Return None: only the trainer's thread may render."""
+        return None
 
     def _splats(self, trainer: Trainer) -> SplatBuffers:
         """Return the splats to show: those of the run, or at its end those of the model, which may be a mean."""

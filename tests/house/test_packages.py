@@ -49,6 +49,7 @@ OWNERS = {
     "viser": {
         "viewer.crop_panel",
         "viewer.listen",
+        "viewer.measure_panel",
         "viewer.page",
         "viewer.page_download",
         "viewer.path_panel",

@@ -154,9 +154,7 @@ def test_which_photos_are_panoramas(tmp_path: Path) -> None:
     assert cut(tmp_path / "a.jpg", panoramas="no") == ["a.jpg"]
     assert cut(tmp_path / "a.jpg", panoramas="yes") == faces
     assert cut(tmp_path / "c.jpg") == ["c.jpg"]
-    with pytest.warns(
-        UserWarning, match="twice as wide as high: if they are panoramas, use `clsplat reco"
-    ):
+    with pytest.warns(UserWarning, match="twice as wide as high: if they are panoramas, use `clsplat reco"):
         assert cut(tmp_path / "b.jpg") == ["b.jpg"]
     with pytest.raises(InputError, match=r"1 of 2 photos are panoramas: put them into a folder of their own"):
         cut(tmp_path / "a.jpg", tmp_path / "c.jpg")

@@ -22,6 +22,7 @@ from viser import CameraHandle, ClientHandle
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
 from clsplat.splats.splats import Splats
+from clsplat.viewer.compared import ComparedSource
 from clsplat.viewer.initial_view import SceneCameras, initial_view
 from clsplat.viewer.page import HELP
 from clsplat.viewer.server import Server
@@ -177,3 +178,47 @@ def test_the_model_is_downloaded_as_a_web_page(page: Page, tmp_path: Path) -> No
     assert '"name": "front"' in text
     assert '"name": "aside"' in text
     assert '"background": [0.0, 0.0, 1.0]' in text
+
+
+def test_a_distance_is_measured_by_two_clicks(server: Server, page: Page) -> None:
+    """The wall is 4 units ahead of a camera with 500 px for a unit at the distance of one."""
+    (client,) = server.server.get_clients().values()
+    stand_at_the_origin(page, client, Reports(client.camera))
+    page.get_by_text("Measure", exact=True).click()
+    page.get_by_role("button", name="Measure a distance").click()
+    page.wait_for_timeout(500)
+    focal = 0.5 * HEIGHT / np.tan(0.5 * client.camera.fov)
+    for x in (60, 260):
+        page.mouse.click(x, 300)
+        page.wait_for_timeout(1500)
+    wanted = 200 / focal * 4
+    found = page.get_by_text("units of the model").first.text_content()
+    assert found is not None
+    assert float(found.split()[-5] if found.startswith("distance") else found.split()[0]) == pytest.approx(
+        wanted, rel=0.03
+    )
+    length = page.get_by_label("Real length")
+    length.fill("2.5")
+    length.press("Enter")
+    page.get_by_text("2.5 in real").first.wait_for()
+
+
+@pytest.mark.slow
+def test_a_divider_moves_between_two_models(page: Page) -> None:
+    dark = wall().with_arrays(wall().to_numpy() | {"sh": np.full_like(wall().sh, -1.0)})
+    source = ComparedSource(ModelSource(wall()), ModelSource(dark), ("bright", "dark_one"))
+    viewer = Viewer(source, Settings(background=(0.0, 0.0, 1.0)))
+    running = Server(
+        viewer, initial_view(wall().mean, [FRONT]), SceneCameras((NamedCamera("front", FRONT),), ()), port=0
+    )
+    assert page.context.browser is not None
+    with serving(viewer, running):
+        page = page.context.browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        page.goto(running.url)
+        page.get_by_text("bright | dark_one").wait_for()
+        wait_for(page, source.view(FRONT, Settings(background=(0.0, 0.0, 1.0))).picture)
+        number = page.locator("input[value='0.5']")  # beside the slider, whose keys would also move the camera
+        number.fill("0.25")
+        number.press("Enter")
+        wait_for(page, source.view(FRONT, Settings(background=(0.0, 0.0, 1.0), divider=0.25)).picture)
+        page.close()

@@ -196,6 +196,9 @@ def test_moving_pictures_get_smaller_until_they_come_in_time() -> None:
         ("sh_degree", -4, 0),
         ("cap", 10, 10),
         ("cap", -1, 0),
+        ("divider", 0.25, 0.25),
+        ("divider", -3, 0.0),
+        ("divider", 7, 1.0),
     ],
 )
 def test_usable_values_are_taken(name: str, value: object, expected: object) -> None:
@@ -218,6 +221,9 @@ def test_usable_values_are_taken(name: str, value: object, expected: object) -> 
         ("size", math.inf),
         ("sh_degree", None),
         ("cap", {}),
+        ("divider", "0.5"),
+        ("divider", math.nan),
+        ("divider", None),
     ],
 )
 def test_unusable_values_change_nothing(name: str, value: object) -> None:
