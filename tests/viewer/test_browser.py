@@ -219,6 +219,6 @@ def test_a_divider_moves_between_two_models(page: Page) -> None:
         wait_for(page, source.view(FRONT, Settings(background=(0.0, 0.0, 1.0))).picture)
         number = page.locator("input[type=text][value='0.5']")  # beside the slider, whose keys would also move the camera
         number.fill("0.25")
-        number.press("Enter")
+        page.keyboard.press("Enter")
         wait_for(page, source.view(FRONT, Settings(background=(0.0, 0.0, 1.0), divider=0.25)).picture)
         page.close()
