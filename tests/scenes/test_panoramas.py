@@ -63,6 +63,15 @@ def test_a_pixel_of_a_face_has_the_colour_of_its_direction(face: str) -> None:
     np.testing.assert_allclose((found - wanted).mean(axis=(0, 1)), 0, atol=0.1)
 
 
+def test_there_is_no_seam() -> None:
+    """Where the panorama begins does not matter: a panorama of noise that begins elsewhere has the same top, turned."""
+    panorama = np.random.default_rng(0).integers(0, 256, (64, 128, 3)).astype(np.uint8)
+    found, rolled = face_pixels(panorama, "top"), face_pixels(np.roll(panorama, 64, axis=1), "top")
+    assert np.abs(found.astype(int) - np.rot90(rolled, 2)).max() <= 1
+    turned = face_pixels(np.roll(panorama, 32, axis=1), "right")
+    assert np.abs(face_pixels(panorama, "front").astype(int) - turned).max() <= 1
+
+
 def test_the_faces_are_rotations_to_the_named_sides() -> None:
     looks = {name: rotation.T @ [0, 0, 1] for name, rotation in face_rotations().items()}
     wanted = {"front": (0, 0, 1), "right": (1, 0, 0), "back": (0, 0, -1), "left": (-1, 0, 0), "top": (0, -1, 0)}
