@@ -217,7 +217,9 @@ def test_a_divider_moves_between_two_models(page: Page) -> None:
         page.goto(running.url)
         page.get_by_text("bright | dark_one").wait_for()
         wait_for(page, source.view(FRONT, Settings(background=(0.0, 0.0, 1.0))).picture)
-        number = page.locator("input[type=text][value='0.5']")  # beside the slider, whose keys would also move the camera
+        number = page.locator(
+            "input[type=text][value='0.5']"
+        )  # beside the slider, whose keys would also move the camera
         number.fill("0.25")
         page.keyboard.press("Enter")
         wait_for(page, source.view(FRONT, Settings(background=(0.0, 0.0, 1.0), divider=0.25)).picture)
