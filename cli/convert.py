@@ -29,7 +29,7 @@ if TYPE_CHECKING:
             "Gaussians for other programs, with the loss that this costs.",
         ),
         ("clsplat convert MODEL scene.glb", "A standard file with the skew in it."),
-        ("clsplat convert MODEL out.spz --approximate", "A small file for viewers on the web."),
+        ("clsplat convert MODEL out.sog --approximate", "A small file for viewers on the web."),
     ),
     see_also=("view", "cameras"),
 )
@@ -98,7 +98,7 @@ def convert_model(
 ) -> None:
     """Write MODEL, a folder or a file of splats, into OUTPUT, a file for other programs or a web page.
 
-    The ending of OUTPUT is the format: .ply, .glb (glTF), .usd, .usda, .usdc, .usdz (OpenUSD), .spz, .splat or
+    The ending of OUTPUT is the format: .ply, .glb (glTF), .usd, .usda, .usdc, .usdz (OpenUSD), .sog, .spz, .splat or
     .html. An .html page shows the splats in any browser with WebGL 2. It needs no server and no network: send it to
     anybody.
 

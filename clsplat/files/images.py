@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Pillow must be loaded before pycolmap, or writing PNG corrupts the heap. So this import stays at the top.
-from PIL import ExifTags, Image, ImageOps, PngImagePlugin
+from PIL import ExifTags, Image, ImageOps, PngImagePlugin, features
 
 from ..errors import InputError, OutputError
 from .atomic import atomic_writer
@@ -33,6 +33,7 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "AVIF", "
 MAX_PIXELS = 400_000_000  # larger than the photo of any camera; a file that claims more is damaged or an attack
 _HEIC = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1")  # brands of ISO/IEC 23008-12
 _PHOTO_QUALITY = 97  # of a JPEG made from another JPEG: the second compression adds little error to the first
+_WEBP_METHOD, _WEBP_EFFORT = 2, 80  # of lossless WebP: more effort takes many times longer and saves less than 1 %
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk: its length, its name and its checksum
 _ALPHA_MODES = ("RGBA", "RGBa", "LA", "La", "PA")
@@ -110,6 +111,21 @@ def decode_pixels(data: bytes, name: str) -> ImageU8:
             return np.array(image.convert("RGBA"), dtype=np.uint8)
     except Exception:  # decoders of damaged files raise nearly anything
         raise InputError(f"{name}: cannot be read as an image; export it again") from None
+
+
+def encode_pixels(pixels: ImageU8) -> bytes:
+    """Return (H, W, 4) as the bytes of a lossless WebP file, which keeps the colours of transparent pixels as well.
+
+    Raises
+    ------
+    OutputError : this Pillow cannot write WebP.
+    """
+    if not features.check("webp"):
+        raise OutputError("this Pillow cannot write WebP images: install it anew with `pip install pillow`")
+    stream = io.BytesIO()
+    image = Image.fromarray(np.ascontiguousarray(pixels))
+    image.save(stream, format="WEBP", lossless=True, exact=True, method=_WEBP_METHOD, quality=_WEBP_EFFORT)
+    return stream.getvalue()
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:

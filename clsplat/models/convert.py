@@ -104,7 +104,7 @@ def convert_model(
     Parameters
     ----------
     model : a model folder or a file of splats, or what `load_model` returned.
-    output : a .ply file with all columns, a .splat, .spz, .glb or USD file (.usd, .usda, .usdc, .usdz), or an
+    output : a .ply file with all columns, a .splat, .spz, .sog, .glb or USD file (.usd, .usda, .usdc, .usdz), or an
         .html page that draws the splats.
     shape : the shape to convert to; by default the model's, or an equal one that the format holds: Gaussians, in .glb
         and USD files and pages skew-normals and generalised exponentials too.

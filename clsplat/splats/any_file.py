@@ -16,6 +16,7 @@ from .page_payload import PAGE_ENDING, PAGE_SHAPES, read_page
 from .ply import read_ply, write_ply
 from .shapes import GAUSSIAN
 from .sog import META, is_sog, read_sog
+from .sog_writer import write_sog
 from .spz import VERSIONS as SPZ_VERSIONS
 from .spz import read_spz, write_spz
 from .spz_streams import is_spz
@@ -48,11 +49,12 @@ WRITTEN = {
     PLY_ENDING: WrittenFormat(None, False),
     SPLAT_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
     SPZ_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
+    SOG_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
     GLB_ENDING: WrittenFormat(_EXTENDED, False),
     **{ending: WrittenFormat(_EXTENDED, False) for ending in USD_ENDINGS},
     PAGE_ENDING: WrittenFormat(PAGE_SHAPES, True),
 }
-READ_ENDINGS = (*WRITTEN, SOG_ENDING, GLTF_ENDING)
+READ_ENDINGS = (*WRITTEN, GLTF_ENDING)
 
 
 def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
@@ -92,7 +94,7 @@ def _reader(path: Path, suffix: str, start: bytes) -> Callable[[Path], StoredSpl
 def write_splats(
     path: str | os.PathLike[str], splats: StoredSplats, compact: bool = False, spz_version: int = SPZ_VERSIONS[0]
 ) -> None:
-    """Write a .splat, .spz, .glb or USD file, or else a PLY.
+    """Write a .splat, .spz, .sog, .glb or USD file, or else a PLY.
 
     Parameters
     ----------
@@ -111,6 +113,8 @@ def write_splats(
         write_splat(path, splats)
     elif suffix == SPZ_ENDING:
         write_spz(path, splats, spz_version)
+    elif suffix == SOG_ENDING:
+        write_sog(path, splats)
     elif suffix == GLB_ENDING:
         write_gltf_splats(path, splats)
     elif suffix in USD_ENDINGS:

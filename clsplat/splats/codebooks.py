@@ -27,7 +27,7 @@ MAX_ENTRIES = 1 << 16
 _LEVEL_STEPS = 200  # limit of Lloyd's steps for numbers, which take microseconds
 _PIECE = 1024  # rows that are compared pair by pair; twice as many gain 0.2 dB and take twice the time
 _AXIS_ROWS = 4096  # rows that the direction of a cut is computed from
-_NEIGHBOURS = 16  # pieces whose entries a row may take
+_NEIGHBOURS = 32  # pieces whose entries a row may take
 _ENTRY_STEPS = 2  # Lloyd's steps for entries
 _CHUNK = 1 << 22  # distances that are in memory at a time
 
@@ -50,24 +50,19 @@ def best_levels(
     if values.size == 0:
         return np.zeros(n)
     points, mass = _points(values, weights, finest)
-    middle = np.average(points, weights=mass)
-    points -= middle
-    moments = np.zeros((3, len(points) + 1))  # sums over the points before each one; those of a cell are differences
-    np.cumsum([mass, mass * points, mass * points**2], axis=1, out=moments[:, 1:])
-    edges = _halved(points, moments, n)
+    edges = _halved(points, mass, n)
     for _ in range(_LEVEL_STEPS):
-        total, first, _ = np.diff(moments[:, edges], axis=1)
-        levels = first / total
+        levels = np.add.reduceat(mass * points, edges[:-1]) / np.add.reduceat(mass, edges[:-1])
         inner = np.searchsorted(points, 0.5 * (levels[1:] + levels[:-1]))
         moved = np.unique([0, *inner, len(points)])  # a cell without points vanishes
         if np.array_equal(moved, edges):
             break
         edges = moved
-    return np.pad(levels + middle, (0, n - len(levels)), mode="edge")
+    return np.pad(levels, (0, n - len(levels)), mode="edge")
 
 
 def nearest_level(levels: DoubleArray, values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return the place of the nearest of at most 256 ascending levels, for each value. Of equal ones the first counts."""
+    """Return the place of the nearest of at most 256 ascending levels for each value, the first of equal ones."""
     distinct = np.unique(levels)
     return np.searchsorted(0.5 * (distinct[1:] + distinct[:-1]), values).astype(np.uint8)
 
@@ -112,19 +107,121 @@ def _points(
     return np.add.reduceat(mass * flat, starts) / total, total
 
 
-def _halved(points: DoubleArray, moments: DoubleArray, n: int) -> Indices:
+def _halved(points: DoubleArray, mass: DoubleArray, n: int) -> Indices:
     """Return the edges of at most n cells of points: the cell with the largest error is cut at its mean, repeatedly.
 
     The cells of the best levels have nearly equal errors (Panter and Dite 1951), so this is a good start.
     """
-    cells = [(-np.inf, 0, len(points))]
-    while len(cells) < n and cells[0][0] < 0.0:
-        _, start, end = heapq.heappop(cells)
-        total, first, _ = moments[:, end] - moments[:, start]
-        cut = start + np.searchsorted(points[start:end], first / total)
-        cut = int(np.clip(cut, start + 1, max(end - 1, start + 1)))
-        for low, high in ((start, cut), (cut, end)):
-            total, first, second = moments[:, high] - moments[:, low]
-            error = second - first**2 / total if high - low > 1 else 0.0
-            heapq.heappush(cells, (-error, low, high))
-    return np.array([*sorted(start for _, start, _ in cells), len(points)])
+
+    def cell(start: int, end: int) -> tuple[float, int, int, float]:
+        mean = np.average(points[start:end], weights=mass[start:end])
+        return -float(np.sum(mass[start:end] * (points[start:end] - mean) ** 2)), start, end, mean
+
+    cells = [cell(0, len(points))]
+    while len(cells) < min(n, len(points)):
+        _, start, end, mean = heapq.heappop(cells)
+        cut = min(max(int(np.searchsorted(points[start:end], mean)), 1), end - start - 1) + start
+        heapq.heappush(cells, cell(start, cut))
+        heapq.heappush(cells, cell(cut, end))
+    return np.array([*sorted(start for _, start, _, _ in cells), len(points)])
+
+
+def _distinct(rows: Rows) -> tuple[Indices, Indices]:
+    """Return the place of the first of equal rows, for each different row, and the number (N,) of the row it equals."""
+    if rows.size == 0:
+        return np.arange(min(len(rows), 1)), np.zeros(len(rows), np.int64)
+    keys = rows.view(np.dtype((np.void, rows.strides[0])))[:, 0]
+    _, first, labels = np.unique(keys, return_index=True, return_inverse=True)
+    return first, labels
+
+
+def _clustered(rows: Rows, weights: Rows, n: int) -> tuple[Rows, Indices]:
+    """Return n entries for more than n different rows, and the place of the entry of each row."""
+    pieces = _pieces(rows)
+    merges = [_merges(piece, rows[piece], weights[piece]) for piece in pieces]
+    kept, gone, added = (np.concatenate(parts) for parts in zip(*merges, strict=True))
+    cheapest = np.argsort(added, kind="stable")[: len(rows) - n]
+    root = np.arange(len(rows))
+    root[gone[cheapest]] = kept[cheapest]
+    while not np.array_equal(root, higher := root[root]):
+        root = higher
+    roots, labels = np.unique(root, return_inverse=True)
+    entries = _averages(rows, weights, labels, rows[roots])
+
+    piece_of = np.empty(len(rows), np.int64)
+    for i, piece in enumerate(pieces):
+        piece_of[piece] = i
+    of_piece = [np.flatnonzero(piece_of[roots] == i) for i in range(len(pieces))]
+    centres = np.stack([rows[piece].mean(axis=0) for piece in pieces])
+    for _ in range(_ENTRY_STEPS):
+        for piece, centre in zip(pieces, centres, strict=True):
+            near = np.argsort(np.sum((centres - centre) ** 2, axis=1), kind="stable")[:_NEIGHBOURS]
+            choice = np.concatenate([of_piece[i] for i in near])
+            labels[piece] = choice[_nearest(rows[piece], entries[choice])]
+        entries = _averages(rows, weights, labels, entries)
+    return entries, labels
+
+
+def _pieces(rows: Rows) -> list[Indices]:
+    """Return the rows in pieces of at most `_PIECE`: each is cut in two halves along its longest axis."""
+    whole, pieces = [np.arange(len(rows))], []
+    while whole:
+        piece = whole.pop()
+        if len(piece) <= _PIECE:
+            pieces.append(piece)
+            continue
+        some = rows[piece[:: -(-len(piece) // _AXIS_ROWS)]]
+        some = some - some.mean(axis=0)
+        axis = np.linalg.eigh(some.T @ some)[1][:, -1]
+        half = len(piece) // 2
+        order = np.argpartition(rows[piece] @ axis, half)
+        whole += [np.sort(piece[order[:half]]), np.sort(piece[order[half:]])]
+    return pieces
+
+
+def _merges(names: Indices, means: Rows, weights: Rows) -> tuple[Indices, Indices, Rows]:
+    """Return the merges of rows into one: the name of the row that stays, that of the other one, and the added error.
+
+    Two clusters that are nearest to each other merge at once. The tree is that of merging the nearest pair of all,
+    because a merge does not bring clusters nearer (Murtagh 1983).
+    """
+    light = 1.0 / weights
+    found = []
+    while len(names) > 1:
+        half = 0.5 * np.einsum("nd,nd->n", means, means)
+        added = means @ means.T
+        np.subtract(half, added, out=added)
+        added += half[:, None]
+        added /= light + light[:, None]
+        np.fill_diagonal(added, np.inf)
+        nearest = added.argmin(axis=1)
+        places = np.arange(len(names))
+        one = np.flatnonzero((nearest[nearest] == places) & (places < nearest))
+        if len(one) == 0:  # rounding can make a circle of nearest ones
+            one = added[places, nearest].argmin(keepdims=True)
+        other = nearest[one]
+        found.append((names[one], names[other], added[one, other]))
+        share = (light[one] / (light[one] + light[other]))[:, None]  # the lighter one has the smaller share
+        means = means.copy()
+        means[one] += share * (means[other] - means[one])
+        light[one] = 1.0 / (1.0 / light[one] + 1.0 / light[other])
+        names, means, light = (np.delete(values, other, axis=0) for values in (names, means, light))
+    kept, gone, cost = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return kept, gone, cost
+
+
+def _nearest(rows: Rows, entries: Rows) -> Indices:
+    """Return the place of the nearest entry of each row."""
+    half = 0.5 * np.einsum("nd,nd->n", entries, entries)
+    step = max(1, _CHUNK // len(entries))
+    parts = [(rows[i : i + step] @ entries.T - half).argmax(axis=1) for i in range(0, len(rows), step)]
+    return np.concatenate(parts)
+
+
+def _averages(rows: Rows, weights: Rows, labels: Indices, entries: Rows) -> Rows:
+    """Return the weighted average of the rows of each entry; entries without rows stay."""
+    mass = np.bincount(labels, weights, len(entries))
+    sums = np.stack([np.bincount(labels, weights * column, len(entries)) for column in rows.T], axis=1)
+    averages = entries.copy()
+    averages[mass > 0.0] = sums[mass > 0.0] / mass[mass > 0.0, None]
+    return averages

@@ -102,7 +102,7 @@ class Splats:
         return cls(found.shape, found.arrays, found.normalisation, found.antialiased, found.near_plane)
 
     def save(self, path: str | os.PathLike[str], compact: bool = False, *, spz_version: int = SPZ_VERSIONS[0]) -> None:
-        """Write a .splat, .spz, .glb or OpenUSD file, or else a PLY file in float32, atomically.
+        """Write a .splat, .spz, .sog, .glb or OpenUSD file, or else a PLY file in float32, atomically.
 
         Parameters
         ----------

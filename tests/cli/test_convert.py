@@ -204,7 +204,7 @@ def test_a_ply_for_other_programs_has_3dgs_s_columns(model: Path, tmp_path: Path
 def test_bad_input(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     assert "'cube'" in error_of("convert", model, out, "--shape", "cube", code=2)
-    assert "writes .ply, .splat, .spz, .glb, .usd, .usda, .usdc, .usdz and .html files" in error_of(
+    assert "writes .ply, .splat, .spz, .sog, .glb, .usd, .usda, .usdc, .usdz and .html files" in error_of(
         "convert", model, tmp_path / "out.obj"
     )
     assert "leave --shape out" in error_of("convert", model, tmp_path / "out.splat", "--shape", "skew-normal")
