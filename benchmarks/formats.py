@@ -7,7 +7,8 @@
 
 "dB" is the PSNR of the written file's pictures against those of the model, at the first cameras. Formats that hold
 Gaussians only get the nearest Gaussian of each splat. "rounding" is then the PSNR against the pictures of these
-Gaussians. Seconds are medians of three writings and readings, or of one of many splats, without the search for the nearest Gaussians.
+Gaussians. Seconds are medians of three writings and readings, or of one of many splats. They are without the search for
+the nearest Gaussians.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,9 @@ CAMERAS = 8
 REPEATS, MANY = 3, 200_000  # readings and writings; above this number of splats there is one
 DOCS = common.ROOT / "docs"
 PAGE, CHART = DOCS / "formats.md", DOCS / "images" / "formats"
+ZSTD = "compression" if sys.version_info >= (3, 14) else "zstandard"
+_SKEWED, _GAUSSIAN = "#0072b2", "#d55e00"  # files with the kernel of the model, and with the nearest Gaussians
+_TICKS = (25, 50, 100, 200)
 MARKS = ("<!-- table of formats.py -->", "<!-- end of the table of formats.py -->")
 TIMES = ("<!-- times of formats.py -->", "<!-- end of the times of formats.py -->")
 
@@ -54,12 +59,13 @@ TIMES = ("<!-- times of formats.py -->", "<!-- end of the times of formats.py --
 class Format:
     """A format, or a format with an option.
 
-    name : of the rows. ending : of the file. write : writes splats.
+    name : of the rows. ending : of the file. write : writes splats. library : what it needs besides clsplat.
     """
 
     name: str
     ending: str
     write: Callable[[Path, Splats], None]
+    library: str = "numpy"
 
 
 def _save(**options: Any) -> Callable[[Path, Splats], None]:
@@ -74,11 +80,11 @@ FORMATS = (
     Format(".ply", ".ply", _save()),
     Format(".ply, compact", ".ply", _save(compact=True)),
     Format(".glb", ".glb", _save()),
-    Format(".usdc", ".usdc", _save()),
+    Format(".usdc", ".usdc", _save(), "pxr"),
     Format(".html, full", ".html", _page("full")),
     Format(".html", ".html", _page("compact")),
     Format(".spz, version 3", ".spz", _save(spz_version=3)),
-    Format(".spz, version 4", ".spz", _save(spz_version=4)),
+    Format(".spz, version 4", ".spz", _save(spz_version=4), ZSTD),
     Format(".sog", ".sog", _save()),
     Format(".splat", ".splat", _save()),
 )
@@ -136,8 +142,9 @@ def measure(
         values = [min(psnr(a, b), MAX_PSNR) for a, b in zip(before, after, strict=True)]
         return round(statistics.mean(values), 2) if values else None
 
-    cases = [{"model": name, "shape": splats.shape, "splats": len(splats), "format": f.name, **where} for f in FORMATS]
-    todo = [(case, one) for case, one in zip(cases, FORMATS, strict=True) if case not in runs]
+    formats = [one for one in FORMATS if find_spec(one.library)]
+    cases = [{"model": name, "shape": splats.shape, "splats": len(splats), "format": f.name, **where} for f in formats]
+    todo = [(case, one) for case, one in zip(cases, formats, strict=True) if case not in runs]
     if not todo:
         return
     gaussians = nearest_gaussians(splats)
@@ -210,7 +217,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     for row in latest(rows):
         if row["psnr"] is None:
             continue
-        held = GAUSSIAN.name if WRITTEN[ending_of(row)].shapes == (GAUSSIAN.name,) else row["shape"]
+        held = row["shape"] if holds_skew(row) else GAUSSIAN.name
         lines.append(
             f"| `{row['model']}` | {row['format']} | {held} | {row['bytes'] / 1e6:.2f} | "
             f"{row['bytes'] / row['splats']:.1f} | {row['rounding_psnr']:.1f} | {row['psnr']:.1f} |"
@@ -234,20 +241,32 @@ def ending_of(row: dict[str, Any]) -> str:
 
 
 def draw(rows: list[dict[str, Any]], out: Path) -> None:
-    """Draw PSNR against bytes of a splat, a panel for each model."""
+    """Draw PSNR against bytes of a splat, a panel for each model, with one marker for each format."""
     rows = [row for row in latest(rows) if row["psnr"] is not None]
-    models = list(dict.fromkeys(row["model"] for row in rows))
-    with chart_style.drawing(out, height=3.4) as figure:
+    models, formats = (list(dict.fromkeys(row[name] for row in rows)) for name in ("model", "format"))
+    markers = dict(zip(formats, "os^vDP*Xhd", strict=False))
+    with chart_style.drawing(out, height=3.9) as figure:
         panels = figure.subplots(1, len(models), sharey=True, squeeze=False)[0]
         for panel, model in zip(panels, models, strict=True):
             for row in (row for row in rows if row["model"] == model):
-                x, y = row["bytes"] / row["splats"], row["psnr"]
-                panel.plot(x, y, "o", color=chart_style.INK)
-                panel.annotate(row["format"], (x, y), xytext=(4, 3), textcoords="offset points", fontsize=7)
+                x, colour = row["bytes"] / row["splats"], _SKEWED if holds_skew(row) else _GAUSSIAN
+                style = {"color": colour, "marker": markers[row["format"]], "linestyle": "none"}
+                panel.plot(x, row["psnr"], label=row["format"], **style)
+                if row["rounding_psnr"] - row["psnr"] > 0.5:
+                    panel.plot(x, row["rounding_psnr"], markerfacecolor="none", **style)
             panel.set_xscale("log")
+            panel.set_xlim(20, 350)
+            panel.set_xticks(_TICKS, [str(tick) for tick in _TICKS])
+            panel.minorticks_off()
             panel.set_title(model)
             panel.set_xlabel("bytes a splat")
-        panels[0].set_ylabel("PSNR against the model's own images, dB")
+        panels[0].set_ylabel("PSNR of the file's pictures, dB")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=5)
+
+
+def holds_skew(row: dict[str, Any]) -> bool:
+    return WRITTEN[ending_of(row)].shapes != (GAUSSIAN.name,)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,8 +12,9 @@ from clsplat.splats.fields import MAX_SH_DEGREE
 from clsplat.splats.page_payload import PAGE_ENDING, PRECISIONS
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.spz import VERSIONS as SPZ_VERSIONS
+from clsplat.splats.streamed_sog import MAX_LEVELS
 
-from .command import DocumentedCommand
+from .command import SectionedCommand
 from .options import PATH, device_option, iteration_option, overwrite_option, quiet_option
 
 if TYPE_CHECKING:
@@ -21,7 +23,12 @@ if TYPE_CHECKING:
 
 @click.command(
     "convert",
-    cls=DocumentedCommand,
+    cls=SectionedCommand,
+    sections={
+        "Options": ("shape", "approximate", "sh_degree", "cameras", "iteration", "overwrite", "device", "quiet"),
+        "Web pages": ("precision", "camera_path", "title"),
+        "Other formats": ("spz_version", "levels"),
+    },
     examples=(
         ("clsplat convert MODEL scene.html", "A page that shows the splats, for anybody with a browser."),
         (
@@ -58,6 +65,13 @@ if TYPE_CHECKING:
     help="Version of an .spz file. Some programs read only one of them.  [default: 3]",
 )
 @click.option(
+    "--levels",
+    type=click.IntRange(1, MAX_LEVELS),
+    metavar="N",
+    help="Number of levels of detail of a lod-meta.json. Each has about half of the splats of the one before.  "
+    "[default: 4]",
+)
+@click.option(
     "--cameras",
     type=PATH,
     metavar="FILE",
@@ -66,16 +80,15 @@ if TYPE_CHECKING:
 @click.option(
     "--precision",
     type=click.Choice(list(PRECISIONS)),
-    help="Of an .html page: compact rounds each value to one to three bytes, full keeps all digits.  [default: "
-    "compact]",
+    help="Compact rounds each value to one to three bytes, full keeps all digits.  [default: compact]",
 )
 @click.option(
     "--camera-path",
     type=PATH,
     metavar="FILE",
-    help="Of an .html page: the camera path that it plays, as recorded in the viewer.  [default: around the scene]",
+    help="The camera path that the page plays, as recorded in the viewer.  [default: around the scene]",
 )
-@click.option("--title", metavar="TEXT", help="Of an .html page: its heading.  [default: the model's name]")
+@click.option("--title", metavar="TEXT", help="Heading of the page.  [default: the model's name]")
 @iteration_option
 @overwrite_option()
 @device_option
@@ -87,6 +100,7 @@ def convert_model(
     approximate: bool,
     sh_degree: int | None,
     spz_version: str | None,
+    levels: int | None,
     cameras: Path | None,
     precision: str | None,
     camera_path: Path | None,
@@ -107,10 +121,13 @@ def convert_model(
     round each value to about a byte, and a .splat file has no SH bands above 0. The loss of such files is measured on
     images.
 
+    If OUTPUT is a file with the name lod-meta.json, the model is written as streamed SOG, in parts and levels of detail
+    for viewers on the web.
+
     Without --approximate, nothing is written if a splat cannot be converted exactly. With --shape gaussian, a .ply has
     only 3DGS's columns.
     """
-    from clsplat.models.convert import PageOptions, conversion_cost
+    from clsplat.models.convert import PageOptions, conversion_cost, level_costs
     from clsplat.models.convert import convert_model as convert
 
     page = None
@@ -123,6 +140,7 @@ def convert_model(
         approximate=approximate,
         sh_degree=sh_degree,
         spz_version=None if spz_version is None else int(spz_version),
+        levels=levels,
         page=page,
         iteration=iteration,
         overwrite=overwrite,
@@ -141,6 +159,10 @@ def convert_model(
         click.echo(f"{converted.removed} splats of negative opacity are left out, which {after.shape} does not support")
     if not converted.is_exact:
         click.echo(_cost_line(conversion_cost(converted, cameras, device)))
+    for number, (level, cost) in enumerate(
+        zip_longest(converted.levels, level_costs(converted, cameras, device)), start=1
+    ):
+        click.echo(f"level {number}: {len(level)} splats" + ("" if cost is None else f", {cost.mean:.2f} dB"))
 
 
 def _cost_line(cost: ConversionCost | None) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
 from ..files.existing import refuse_existing
 from ..rendering.renderer import Renderer
-from ..splats.any_file import SPZ_ENDING, WRITTEN, check_ending
+from ..splats.any_file import SPZ_ENDING, WRITTEN, check_ending, format_of
 from ..splats.approximate import nearest_gaussians
 from ..splats.convert import as_one_of, convert
 from ..splats.fields import sh_coefficients
@@ -23,6 +24,8 @@ from ..splats.page_payload import PAGE_ENDING, PRECISIONS
 from ..splats.shapes import GAUSSIAN
 from ..splats.splats import Splats
 from ..splats.spz import VERSIONS as SPZ_VERSIONS
+from ..splats.stored import StoredSplats
+from ..splats.streamed_sog import LEVELS, LOD_META, write_streamed_sog
 from ..webpage.page import PageContent, as_drawn, write_web_page
 from .model import LoadedModel, model_at
 
@@ -36,12 +39,14 @@ class ConvertedModel:
     source : the model before. output : the file that was written.
     splats : the model after, before the file rounded it.
     approximate : True if the splats are only the nearest Gaussians.
+    levels : the coarser levels of detail of a streamed SOG, the finest first.
     """
 
     source: LoadedModel
     output: Path
     splats: Splats
     approximate: bool
+    levels: tuple[Splats, ...] = ()
 
     @property
     def removed(self) -> int:
@@ -57,7 +62,7 @@ class ConvertedModel:
     @property
     def rounds(self) -> bool:
         """Whether the file holds fewer digits than float32."""
-        return WRITTEN[self.output.suffix.lower()].rounds
+        return WRITTEN[format_of(self.output)].rounds
 
 
 @dataclass(frozen=True)
@@ -95,6 +100,7 @@ def convert_model(
     approximate: bool = False,
     sh_degree: int | None = None,
     spz_version: int | None = None,
+    levels: int | None = None,
     page: PageOptions | None = None,
     iteration: int | None = None,
     overwrite: bool = False,
@@ -105,12 +111,13 @@ def convert_model(
     ----------
     model : a model folder or a file of splats, or what `load_model` returned.
     output : a .ply file with all columns, a .splat, .spz, .sog, .glb or USD file (.usd, .usda, .usdc, .usdz), or an
-        .html page that draws the splats.
+        .html page that draws the splats; or a file lod-meta.json, which gets the chunks of a streamed SOG beside it.
     shape : the shape to convert to; by default the model's, or an equal one that the format holds: Gaussians, in .glb
         and USD files and pages skew-normals and generalised exponentials too.
     approximate : use the nearest Gaussian for splats without an equal one, instead of raising.
     sh_degree : remove the SH bands above, or add bands of zeros.
     spz_version : version of an .spz file, 3 or 4. Version 4 needs the extra `spz`.
+    levels : number of levels of detail of a streamed SOG, 1 to 8; by default 4.
     page : what a page has besides the splats.
     iteration : as for `load_model`.
     overwrite : replace an existing file.
@@ -124,6 +131,8 @@ def convert_model(
     suffix = check_ending(output)
     if spz_version is not None and suffix != SPZ_ENDING:
         raise InputError(f"{output}: the version is of .spz files: leave it out, or choose the ending .spz")
+    if levels is not None and suffix != LOD_META:
+        raise InputError(f"{output}: levels are of streamed SOG: leave them out, or name the file {LOD_META}")
     if page is not None and suffix != PAGE_ENDING:
         raise InputError(
             f"{output}: precision, camera path and title are of pages: leave them out, or choose the ending .html"
@@ -138,11 +147,14 @@ def convert_model(
     converted, is_nearest = _as_shape(source.splats, shape, suffix, approximate)
     if sh_degree is not None:
         converted = _of_degree(converted, sh_degree)
+    coarser: list[Splats] = []
     if suffix == PAGE_ENDING:
         _write_page(output, source, converted, page or PageOptions())
+    elif suffix == LOD_META:
+        coarser = _write_levels(output, converted, levels or LEVELS)
     else:
         converted.save(output, spz_version=spz_version or SPZ_VERSIONS[0])
-    return ConvertedModel(source, output, converted, is_nearest)
+    return ConvertedModel(source, output, converted, is_nearest, tuple(coarser))
 
 
 def conversion_cost(
@@ -159,18 +171,35 @@ def conversion_cost(
     -------
     The cost, or None if there are no cameras.
     """
+    costs = _costs(converted, [Splats.load(converted.output)], cameras, device)
+    return costs[0] if costs else None
+
+
+def level_costs(
+    converted: ConvertedModel, cameras: Path | None = None, device: str | None = None
+) -> list[ConversionCost]:
+    """Return the PSNR of the images of each coarser level; parameters as for `conversion_cost`.
+
+    The rounding of the files is not in it. Without cameras, the list is empty.
+    """
+    return _costs(converted, converted.levels, cameras, device)
+
+
+def _costs(
+    converted: ConvertedModel, written: Sequence[Splats], cameras: Path | None, device: str | None
+) -> list[ConversionCost]:
     source = converted.source
     named = _cameras(source, cameras)
-    if not named:
-        return None
-    written, renderer = Splats.load(converted.output), Renderer(device)
-    values = []
-    for entry in named:
-        before, after = (
-            renderer.render(splats, entry.camera, source.background).color for splats in (source.splats, written)
-        )
-        values.append(min(psnr(before, after), MAX_PSNR))
-    return ConversionCost(sum(values) / len(values), min(values), len(values))
+    if not named or not written:
+        return []
+    renderer = Renderer(device)
+    before = [renderer.render(source.splats, entry.camera, source.background).color for entry in named]
+    found = []
+    for splats in written:
+        after = (renderer.render(splats, entry.camera, source.background).color for entry in named)
+        values = [min(psnr(a, b), MAX_PSNR) for a, b in zip(before, after, strict=True)]
+        found.append(ConversionCost(sum(values) / len(values), min(values), len(values)))
+    return found
 
 
 def _cameras(source: LoadedModel, path: Path | None) -> list[NamedCamera]:
@@ -181,6 +210,12 @@ def _write_page(output: Path, source: LoadedModel, splats: Splats, page: PageOpt
     path = None if page.camera_path is None else read_path(page.camera_path)
     content = PageContent(page.title or source.path.name, _cameras(source, page.cameras), path, source.background)
     write_web_page(output, as_drawn(splats), content, page.precision)
+
+
+def _write_levels(output: Path, splats: Splats, levels: int) -> list[Splats]:
+    """Write a streamed SOG and return its coarser levels."""
+    stored = StoredSplats(splats.shape, splats.normalisation, splats.antialiased, splats.arrays, splats.near_plane)
+    return [splats.with_arrays(level.arrays) for level in write_streamed_sog(output, stored, levels)[1:]]
 
 
 def _as_shape(splats: Splats, target: str | None, suffix: str, approximate: bool) -> tuple[Splats, bool]:

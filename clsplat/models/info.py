@@ -11,6 +11,7 @@ from ..errors import InputError
 from ..scenes.info import SceneInfo, is_scene, scene_info
 from ..scenes.reconstruct.photo_files import is_photographs
 from ..scenes.wrong_folder import scene_hint
+from ..splats.any_file import READ_NAMES
 from ..splats.stats import Complexity, complexity
 from ..training.folder import ModelFolder
 from .model import LoadedModel, load_model
@@ -64,7 +65,7 @@ def inspect(
 
 def _is_scene(path: Path) -> bool:
     if path.is_file() or not path.is_dir() or ModelFolder(path).iterations():
-        return path.is_file() and path.suffix == ".json"
+        return path.is_file() and path.suffix == ".json" and path.name not in READ_NAMES
     if is_scene(path):
         return True
     if ModelFolder(path).is_used:

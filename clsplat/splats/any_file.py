@@ -21,6 +21,7 @@ from .spz import VERSIONS as SPZ_VERSIONS
 from .spz import read_spz, write_spz
 from .spz_streams import is_spz
 from .stored import StoredSplats
+from .streamed_sog import LEVELS, LOD_META, read_streamed_sog, write_streamed_sog
 from .usd import USD_ENDINGS, is_usd, read_usd, write_usd
 
 PLY_ENDING, SPLAT_ENDING, SPZ_ENDING, SOG_ENDING = ".ply", ".splat", ".spz", ".sog"
@@ -44,17 +45,19 @@ class WrittenFormat:
 
 
 _GAUSSIAN_ONLY, _EXTENDED = (GAUSSIAN.name,), tuple(EXTRA_FIELDS)
-# By ending, in the order of messages. `clsplat convert` writes pages, because they have cameras as well.
+# By ending or whole name, in the order of messages. `clsplat convert` writes pages, because they have cameras as well.
 WRITTEN = {
     PLY_ENDING: WrittenFormat(None, False),
     SPLAT_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
     SPZ_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
     SOG_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
+    LOD_META: WrittenFormat(_GAUSSIAN_ONLY, True),
     GLB_ENDING: WrittenFormat(_EXTENDED, False),
     **{ending: WrittenFormat(_EXTENDED, False) for ending in USD_ENDINGS},
     PAGE_ENDING: WrittenFormat(PAGE_SHAPES, True),
 }
-READ_ENDINGS = (*WRITTEN, GLTF_ENDING)
+READ_ENDINGS = (*WRITTEN, GLTF_ENDING)  # lod-meta.json ends a path too
+READ_NAMES = (META, LOD_META)  # JSON files that are models; all other ones are not
 
 
 def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
@@ -73,7 +76,7 @@ def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
             f"{path}: {suffix} files are not read: convert it with `splat-transform {path.name} {path.stem}.ply` "
             "(npm install @playcanvas/splat-transform)"
         )
-    return _reader(path, suffix, _start(path))(path)
+    return read_streamed_sog(path) if path.name == LOD_META else _reader(path, suffix, _start(path))(path)
 
 
 def _reader(path: Path, suffix: str, start: bytes) -> Callable[[Path], StoredSplats]:
@@ -106,7 +109,7 @@ def write_splats(
     OutputError : the file cannot be written, or is a page, which needs cameras as well.
     InputError : the format does not support the shape of the splats.
     """
-    suffix = Path(path).suffix.lower()
+    suffix = format_of(Path(path))
     if suffix == PAGE_ENDING:
         raise OutputError(f"{path}: pages are written by `clsplat convert` and clsplat.convert_model: use one of these")
     if suffix == SPLAT_ENDING:
@@ -115,6 +118,8 @@ def write_splats(
         write_spz(path, splats, spz_version)
     elif suffix == SOG_ENDING:
         write_sog(path, splats)
+    elif suffix == LOD_META:
+        write_streamed_sog(path, splats, LEVELS)
     elif suffix == GLB_ENDING:
         write_gltf_splats(path, splats)
     elif suffix in USD_ENDINGS:
@@ -131,13 +136,18 @@ def write_splats(
         )
 
 
+def format_of(path: Path) -> str:
+    """Return the key of a file in WRITTEN: its ending in lower case, or its whole name."""
+    return LOD_META if path.name == LOD_META else path.suffix.lower()
+
+
 def check_ending(path: Path, *without: str) -> str:
-    """Return the file's ending in lower case; raise OutputError if it is not that of a format that is written.
+    """Return `format_of` a file; raise OutputError if that format is not written.
 
     without : endings that the caller cannot write.
     """
     endings = [ending for ending in WRITTEN if ending not in without]
-    suffix = path.suffix.lower()
+    suffix = format_of(path)
     if suffix not in endings:
         raise OutputError(
             f"{path}: writes {', '.join(endings[:-1])} and {endings[-1]} files: choose one of these endings"

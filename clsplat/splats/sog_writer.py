@@ -56,13 +56,32 @@ def write_sog(path: str | os.PathLike[str], splats: StoredSplats) -> None:
     InputError : the shape is not Gaussian, or there are more than 268 million splats.
     OutputError : the file cannot be written, or Pillow cannot write WebP.
     """
+    files = sog_files(path, splats, morton_order(splats.arrays["mean"]))
+    with atomic_writer(path) as stream, zipfile.ZipFile(stream, "w") as archive:
+        for name, data in files.items():
+            entry = zipfile.ZipInfo(name)  # with the year 1980 as its time
+            entry.create_system, entry.external_attr = 3, 0o644 << 16  # the same bytes on every system
+            archive.writestr(entry, data)
+
+
+def sog_files(path: object, splats: StoredSplats, order: NDArray[np.int64]) -> dict[str, bytes]:
+    """Return the files of a SOG by their names, meta.json first.
+
+    Parameters
+    ----------
+    path : named in errors.
+    order : (N,) places of the splats to write, in the order of the images.
+
+    Raises
+    ------
+    InputError, OutputError : as for `write_sog`.
+    """
     from ..files.images import encode_pixels  # lazy: a slow import
 
     check_gaussian(path, splats.shape, ".sog")
-    count = len(splats.arrays["mean"])
+    count = len(order)
     if count > _MAX_SIDE**2:
         raise InputError(f"{path}: .sog files hold at most {_MAX_SIDE**2} splats, not {count}: write a .ply")
-    order = morton_order(splats.arrays["mean"])
     arrays = {name: values[order].astype(np.float64) for name, values in splats.arrays.items() if name != "sh"}
     meta: dict[str, Any] = {
         "version": 2,
@@ -78,14 +97,10 @@ def write_sog(path: str | os.PathLike[str], splats: StoredSplats) -> None:
     if splats.arrays["sh"].shape[1] > 1:
         _add_bands(meta, images, splats.arrays["sh"][order, 1:], arrays)
     try:
-        files = {f"{name}.webp": encode_pixels(pixels) for name, pixels in images.items()}
+        encoded = {f"{name}.webp": encode_pixels(pixels) for name, pixels in images.items()}
     except OutputError as error:
         raise OutputError(f"{path}: {error}") from None
-    with atomic_writer(path) as stream, zipfile.ZipFile(stream, "w") as archive:
-        for name, data in {META: json.dumps(meta, separators=(",", ":")).encode(), **files}.items():
-            entry = zipfile.ZipInfo(name)  # with the year 1980 as its time
-            entry.create_system, entry.external_attr = 3, 0o644 << 16  # the same bytes on every system
-            archive.writestr(entry, data)
+    return {META: json.dumps(meta, separators=(",", ":")).encode(), **encoded}
 
 
 def _add_places(meta: dict[str, Any], images: dict[str, Bytes], mean: DoubleArray) -> None:

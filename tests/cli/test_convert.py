@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -158,6 +159,21 @@ def test_interchange_files_keep_the_skew(model: Path, tmp_path: Path, ending: st
     assert f"{ending} files hold gaussian, skew-normal, generalised-exponential splats: leave --shape out" in said
 
 
+def test_levels_of_detail_are_written_and_measured(model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "scene" / "lod-meta.json"
+    said = clsplat("convert", model, out, "--approximate", "--levels", 3).splitlines()
+    counts = json.loads(out.read_text())["counts"]
+    assert len(counts) == 3
+    assert said[0].endswith("skew-normal to gaussian, each the nearest")
+    costs = [float(line.split()[-2]) for line in said[-2:]]
+    assert [line.split(",")[0] for line in said[-2:]] == [f"level {n}: {counts[n]} splats" for n in (1, 2)]
+    assert costs[0] > costs[1] > 10
+    assert f"{counts[0]} splats, shape gaussian" in clsplat("info", out)
+    assert "exists" in error_of("convert", model, out, "--approximate")
+    said = "levels are of streamed SOG: leave them out, or name the file lod-meta.json"
+    assert said in error_of("convert", model, tmp_path / "a.sog", "--approximate", "--levels", 3)
+
+
 def test_the_version_of_an_spz_file_is_chosen(model: Path, tmp_path: Path) -> None:
     pytest.importorskip("zstandard")
     for version, start in ((3, b"\x1f\x8b"), (4, b"NGSP\4")):
@@ -204,8 +220,9 @@ def test_a_ply_for_other_programs_has_3dgs_s_columns(model: Path, tmp_path: Path
 def test_bad_input(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     assert "'cube'" in error_of("convert", model, out, "--shape", "cube", code=2)
-    assert "writes .ply, .splat, .spz, .sog, .glb, .usd, .usda, .usdc, .usdz and .html files" in error_of(
-        "convert", model, tmp_path / "out.obj"
+    assert (
+        "writes .ply, .splat, .spz, .sog, lod-meta.json, .glb, .usd, .usda, .usdc, .usdz and .html files"
+        in error_of("convert", model, tmp_path / "out.obj")
     )
     assert "leave --shape out" in error_of("convert", model, tmp_path / "out.splat", "--shape", "skew-normal")
     assert "no such model folder or file" in error_of("convert", tmp_path / "none", out, "--shape", "gaussian")

@@ -11,6 +11,7 @@ from pathlib import Path
 import budget
 import defaults
 import few_views
+import formats
 import pytest
 
 from clsplat.scenes.scene import load_scene
@@ -379,3 +380,28 @@ def test_web_page(tmp_path: Path) -> None:
     assert min(full["psnr"], full["rounding_psnr"]) > 45
     assert min(compact["whole_ms"], compact["opened_s"]) > 0
     assert "| `smoke` |" in done.stdout
+
+
+@pytest.mark.slow
+def test_formats(tmp_path: Path) -> None:
+    out = tmp_path / "formats.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "formats.py"), "--smoke", "--random", "50", "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    rows = {(row["model"], row["format"]): row for row in map(json.loads, out.read_text().splitlines())}
+    for name in {".ply", ".glb", ".usdc", ".html, full"} & {name for _, name in rows}:
+        assert rows["smoke", name]["psnr"] > 80, name
+    for name in (".html", ".sog", ".spz, version 3"):
+        assert 25 < rows["smoke", name]["rounding_psnr"] < 80, name
+        assert rows["smoke", name]["bytes"] < rows["smoke", ".ply"]["bytes"]
+    assert rows["smoke", ".sog"]["psnr"] < rows["smoke", ".sog"]["rounding_psnr"], "the skew is lost"
+    assert rows["random", ".sog"]["psnr"] is None
+    assert min(row["write_s"] for row in rows.values()) > 0
+    assert "| `smoke` | .sog | gaussian |" in done.stdout
+    assert "| 50 | .sog |" in done.stdout
+
+
+def test_the_table_of_formats_is_that_of_the_results() -> None:
+    rows = [json.loads(line) for line in (BENCHMARKS / "results" / "formats.jsonl").read_text().splitlines()]
+    page = (BENCHMARKS.parent / "docs" / "formats.md").read_text()
+    assert formats.table(rows) in page
+    assert formats.times_table(rows) in page

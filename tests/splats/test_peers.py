@@ -28,7 +28,10 @@ from reference.scenes import for_shape, random_splats
 
 from clsplat.splats.axes import RUB, flipped
 from clsplat.splats.harmonics import SH_C0, axis_flip_signs
+from clsplat.splats.quaternions import rotations
 from clsplat.splats.splats import Splats
+from clsplat.splats.stored import StoredSplats
+from clsplat.splats.streamed_sog import LOD_META, write_streamed_sog
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 N = 40
@@ -230,6 +233,7 @@ READERS: list[tuple[Callable[[Path, Path], Found], str, dict[str, float]]] = [
     (by_splat_transform, "skewed.ply", EXACT),
     (by_splat_transform, "gaussian.spz", EXACT),
     (by_splat_transform, "version4.spz", EXACT),
+    (by_splat_transform, "gaussian.sog", EXACT),
     (by_spz_library, "gaussian.spz", EXACT),
     (by_spz_library, "version4.spz", EXACT),
     (by_splat_transform, "gaussian.splat", EXACT | {"quat": 0.01}),
@@ -258,6 +262,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     gaussians.save(folder / "gaussian.ply")
     gaussians.save(folder / "gaussian.splat")
     gaussians.save(folder / "gaussian.spz")
+    gaussians.save(folder / "gaussian.sog")
     if find_spec("zstandard") or sys.version_info >= (3, 14):
         gaussians.save(folder / "version4.spz", spz_version=4)
     return folder
@@ -350,3 +355,25 @@ def test_we_read_what_the_library_of_spz_writes(files: Path, tmp_path: Path, ver
     node(tmp_path, SPZ_LIBRARY, files / "gaussian.spz", tmp_path / "back.spz", version)
     rounding = NOTHING | {"mean": 2e-4, "quat": 1e-3 if version == 2 else 1e-6}
     agree(Splats.load(tmp_path / "back.spz"), Splats.load(files / "gaussian.spz"), rounding)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_splat_transform_reads_our_levels(files: Path, tmp_path: Path, level: int) -> None:
+    """The levels of a streamed SOG have the splats that we have merged, up to the rounding of a palette."""
+    stored = StoredSplats("gaussian", "peak", False, Splats.load(files / "gaussian.ply").arrays)
+    levels = write_streamed_sog(tmp_path / "scene" / LOD_META, stored, 3)
+    back = transform(tmp_path / "scene" / LOD_META, tmp_path / "back.ply", "-L", str(level))
+    found, wanted = Splats.load(back), Splats("gaussian", levels[level].arrays)
+    order = [int(np.abs(wanted.mean - mean).sum(axis=1).argmin()) for mean in found.mean]
+    assert sorted(order) == list(range(len(wanted)))
+    np.testing.assert_allclose(found.mean, wanted.mean[order], atol=2e-3)
+    np.testing.assert_allclose(found.sh, wanted.sh[order], atol=0.1)
+    # The writer gives rotations a half turn, which no Gaussian shows.
+    sizes = np.trace(covariances(wanted), axis1=1, axis2=2)[order]
+    different = np.abs(covariances(found) - covariances(wanted)[order]).max(axis=(1, 2))
+    assert (different < 0.05 * sizes).all()
+
+
+def covariances(splats: Splats) -> np.ndarray:
+    frame = rotations(splats.quat.astype(np.float64)) * np.exp(splats.log_scale.astype(np.float64))[:, None]
+    return frame @ frame.transpose(0, 2, 1)

@@ -1,0 +1,169 @@
+"""Levels of detail: models with ever fewer Gaussians, in which neighbours are merged in pairs.
+
+A merged Gaussian has the mean and the covariance of its pair, each weighted by opacity times area, and their mean
+colour. Its opacity keeps the sum of opacity times area, as far as that is below 1. These are the rules of Hierarchical
+3DGS (Kerbl et al. 2024). The area is that of the two longer axes.
+
+Pairs are chosen among near neighbours. The cheapest go first: those that are faint or small, close to each other in
+their deviations, and alike in colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .fields import Array, DoubleArray
+from .harmonics import SH_C0
+from .quaternions import rotations
+from .shapes import GAUSSIAN
+
+Indices = NDArray[np.int64]
+
+_NEIGHBOURS = 8
+_CLOSENESS = 0.02  # cost of a squared distance in deviations, against that of a squared difference in colour
+_ROUNDS = 40  # limit of the rounds in which pairs choose each other
+_OPACITIES = (1e-6, 1.0 - 1e-6)
+_FLATTEST = 1e-12  # smallest variance, relative to the largest of a splat
+
+
+@dataclass(frozen=True)
+class Level:
+    """Gaussians of one level.
+
+    Parameters
+    ----------
+    mean, covariance : (N, 3) and (N, 3, 3). opacity : (N,) 0..1. sh : (N, K, 3).
+    group : (N,) number of the part of the scene; only splats of one part are merged.
+    error : (N,) sum of the costs of the merges below each splat.
+    """
+
+    mean: DoubleArray
+    covariance: DoubleArray
+    opacity: DoubleArray
+    sh: DoubleArray
+    group: Indices
+    error: DoubleArray
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the public arrays in float32."""
+        from scipy.spatial.transform import Rotation  # lazy: a slow import
+
+        variances, axes = np.linalg.eigh(self.covariance)
+        variances = np.maximum(variances, _FLATTEST * variances[:, -1:])
+        axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0
+        quat = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]] if len(self) else np.empty((0, 4))
+        values = {
+            "mean": self.mean,
+            "quat": quat,
+            "log_scale": 0.5 * np.log(np.maximum(variances, 1e-60)),
+            "opacity_logit": GAUSSIAN.raw_opacity(np.clip(self.opacity, *_OPACITIES)),
+            "sh": self.sh,
+        }
+        return {name: value.astype(np.float32) for name, value in values.items()}
+
+
+def level_of(arrays: Mapping[str, Array], group: Indices) -> Level:
+    """Return the Gaussians of public arrays as the first level."""
+    frame = rotations(arrays["quat"].astype(np.float64)) * np.exp(arrays["log_scale"].astype(np.float64))[:, None]
+    return Level(
+        arrays["mean"].astype(np.float64),
+        frame @ frame.transpose(0, 2, 1),
+        np.asarray(GAUSSIAN.opacity(arrays["opacity_logit"].astype(np.float64)), np.float64),
+        arrays["sh"].astype(np.float64),
+        group,
+        np.zeros(len(group)),
+    )
+
+
+def merged(level: Level) -> Level:
+    """Return a level with about half as many Gaussians: as many pairs as have a near neighbour of their part."""
+    one, other, cost = _pairs(level)
+    if len(one) == 0:
+        return level
+    area = _areas(level.covariance)
+    mass = level.opacity * area
+    share = mass[one] / np.maximum(mass[one] + mass[other], 1e-300)
+    first, second = share[:, None], 1.0 - share[:, None]
+    mean = first * level.mean[one] + second * level.mean[other]
+    covariance = np.zeros((len(one), 3, 3))
+    for part, weight in ((one, first), (other, second)):
+        offset = level.mean[part] - mean
+        covariance += weight[:, :, None] * (level.covariance[part] + offset[:, :, None] * offset[:, None, :])
+    pair = Level(
+        mean,
+        covariance,
+        np.minimum((mass[one] + mass[other]) / np.maximum(_areas(covariance), 1e-300), 1.0),
+        first[:, :, None] * level.sh[one] + second[:, :, None] * level.sh[other],
+        level.group[one],
+        level.error[one] + level.error[other] + cost,
+    )
+    alone = np.ones(len(level), np.bool_)
+    alone[one] = alone[other] = False
+    names = ("mean", "covariance", "opacity", "sh", "group", "error")
+    joined = {name: np.concatenate([getattr(level, name)[alone], getattr(pair, name)]) for name in names}
+    return replace(level, **joined)
+
+
+def _areas(covariance: DoubleArray) -> DoubleArray:
+    """Return the product of the two longer axes of each splat."""
+    variances = np.linalg.eigvalsh(covariance)
+    return np.sqrt(np.maximum(variances[:, 1] * variances[:, 2], 0.0))
+
+
+def _pairs(level: Level) -> tuple[Indices, Indices, DoubleArray]:
+    """Return both members of at most half as many pairs as there are splats, and the cost of each merge."""
+    from scipy.spatial import cKDTree  # lazy: a slow import
+
+    n = len(level)
+    none = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+    if n < 2:
+        return none
+    # Parts of the scene lie far from each other along a fourth axis, so that all neighbours are of one part.
+    far = 4.0 * max(float(np.ptp(level.mean, axis=0).max()), 1e-30)
+    places = np.column_stack([level.mean, far * level.group])
+    near = np.asarray(cKDTree(places).query(places, min(_NEIGHBOURS + 1, n), workers=-1)[1])[:, 1:]
+    one = np.repeat(np.arange(n), near.shape[1])
+    other = near.ravel()
+    kept = (level.group[one] == level.group[other]) & (one != other)
+    if not kept.any():
+        return none
+    one, other = np.minimum(one, other)[kept], np.maximum(one, other)[kept]
+    one, other = np.unique(np.stack([one, other]), axis=1)
+    cost = _costs(level, one, other)
+    taken = np.zeros(n, np.bool_)
+    chosen: list[Indices] = []
+    left = np.argsort(cost, kind="stable")
+    for _ in range(_ROUNDS):
+        if len(left) == 0:
+            break
+        # A pair is taken if it is the cheapest one of both its members.
+        first = np.full(n, len(left))
+        np.minimum.at(first, one[left], np.arange(len(left)))
+        np.minimum.at(first, other[left], np.arange(len(left)))
+        places_of = np.arange(len(left))
+        mutual = left[(first[one[left]] == places_of) & (first[other[left]] == places_of)]
+        chosen.append(mutual)
+        taken[one[mutual]] = taken[other[mutual]] = True
+        left = left[~(taken[one[left]] | taken[other[left]])]
+    best = np.concatenate(chosen)
+    return one[best], other[best], cost[best]
+
+
+def _costs(level: Level, one: Indices, other: Indices) -> DoubleArray:
+    """Return the cost of each pair's merge."""
+    mass = level.opacity * _areas(level.covariance)
+    weight = mass[one] * mass[other] / np.maximum(mass[one] + mass[other], 1e-300)
+    difference = SH_C0 * (level.sh[one, 0] - level.sh[other, 0])
+    offset = level.mean[one] - level.mean[other]
+    both = level.covariance[one] + level.covariance[other]
+    both += 1e-9 * np.trace(both, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    distance = np.einsum("ni,ni->n", offset, np.linalg.solve(both, offset[:, :, None])[:, :, 0])
+    cost: DoubleArray = weight * (np.sum(difference**2, axis=1) + _CLOSENESS * distance)
+    return cost
