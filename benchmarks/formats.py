@@ -106,6 +106,7 @@ def main() -> None:
         common.write_between(PAGE, *MARKS, text)
         common.write_between(PAGE, *TIMES, times)
         draw(runs.rows, CHART)
+        CHART.with_suffix(".svg").unlink()  # pages show the PNG
 
 
 def measure_all(args: argparse.Namespace, runs: common.Runs, scratch: Path) -> None:
