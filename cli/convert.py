@@ -121,8 +121,7 @@ def convert_model(
     round each value to about a byte, and a .splat file has no SH bands above 0. The loss of such files is measured on
     images.
 
-    If OUTPUT is a file with the name lod-meta.json, the model is written as streamed SOG, in parts and levels of detail
-    for viewers on the web.
+    An OUTPUT with the name lod-meta.json is written as streamed SOG: parts and levels of detail for viewers on the web.
 
     Without --approximate, nothing is written if a splat cannot be converted exactly. With --shape gaussian, a .ply has
     only 3DGS's columns.

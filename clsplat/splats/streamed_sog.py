@@ -1,8 +1,8 @@
 """Streamed SOG of PlayCanvas, version 1: a scene in parts and levels of detail, which a viewer loads as it needs them.
 
 Format: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog. A folder has lod-meta.json
-and a folder with a SOG for each chunk. lod-meta.json has a binary tree of boxes. A leaf says, for each level, which run
-of splats of which chunk belongs to it. Level 0 is the model; each further level has about half as many Gaussians
+and a folder with a SOG for each chunk. lod-meta.json has a binary tree of boxes. For each level, a leaf names a chunk
+and the run of its splats there. Level 0 is the model. Each further level has about half as many Gaussians
 (merging.py).
 """
 
