@@ -87,13 +87,13 @@ def test_only_splats_of_one_part_are_merged() -> None:
 
 
 def test_alike_and_near_splats_are_merged_first() -> None:
-    """Four splats in a row: the two red ones are as near to each other as a red one is to a blue one."""
+    """Four splats in a row: the two red ones in the middle are farther from each other than from their neighbours."""
     arrays = model(4)
-    arrays["mean"] = np.float32([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
+    arrays["mean"] = np.float32([[0, 0, 0], [1, 0, 0], [2.2, 0, 0], [3.2, 0, 0]])
     arrays["log_scale"][:], arrays["opacity_logit"][:], arrays["sh"][:] = -1.0, 0.0, 0.0
     arrays["sh"][1:3, 0, 0] = 3.0  # the two in the middle
     found = merged(level_of(arrays, np.zeros(4, np.int64)))
-    assert sorted(found.mean[:, 0].round(6)) in ([0.0, 1.5, 3.0], [1.5, 1.5])
+    assert sorted(found.mean[:, 0].round(6)) in ([0.0, 1.6, 3.2], [1.6, 1.6])
 
 
 def test_equal_inputs_give_equal_levels_and_odd_values_no_faults() -> None:
