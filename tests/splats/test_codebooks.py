@@ -33,6 +33,14 @@ def optimum(values: np.ndarray, n: int) -> float:
     return float(best[-1] / len(x))
 
 
+def lloyd_error(values: np.ndarray, levels: np.ndarray) -> float:
+    """Mean squared error after Lloyd's method in its plainest form."""
+    for _ in range(100):
+        place = np.abs(values[:, None] - levels).argmin(axis=1)
+        levels = np.array([values[place == i].mean() if (place == i).any() else levels[i] for i in range(len(levels))])
+    return level_error(values, levels)
+
+
 SAMPLES = {
     "normal": lambda rng: rng.normal(size=400),
     "laplace": lambda rng: rng.laplace(size=400),
@@ -43,13 +51,16 @@ SAMPLES = {
 
 
 @pytest.mark.parametrize("name", SAMPLES)
-@pytest.mark.parametrize("n", [4, 16, 60])
-def test_levels_are_near_the_best_ones(name: str, n: int) -> None:
-    values = SAMPLES[name](np.random.default_rng(n))
+@pytest.mark.parametrize(("n", "factor"), [(4, 1.05), (16, 1.1), (60, 1.35)])
+def test_levels_are_near_the_best_ones(name: str, n: int, factor: float) -> None:
+    rng = np.random.default_rng(n)
+    values = SAMPLES[name](rng)
     levels = best_levels(values, n=n)
     assert levels.shape == (n,)
     assert (np.diff(levels) >= 0).all()
-    assert optimum(values, n) * (1 - 1e-9) <= level_error(values, levels) <= 1.1 * optimum(values, n)
+    error = level_error(values, levels)
+    assert optimum(values, n) * (1 - 1e-9) <= error <= factor * optimum(values, n)
+    assert error <= 1.03 * min(lloyd_error(values, rng.choice(values, n, replace=False)) for _ in range(5))
 
 
 def test_levels_of_many_numbers_are_better_than_equal_steps_and_nearly_as_good_as_the_limit() -> None:
@@ -62,7 +73,7 @@ def test_levels_of_many_numbers_are_better_than_equal_steps_and_nearly_as_good_a
     error = np.mean((levels[codes] - values) ** 2)
     steps = np.linspace(values.min(), values.max(), 256)
     assert error < 0.6 * np.mean((steps[nearest_level(steps, values)] - values) ** 2)
-    assert error < 1.03 * np.pi * 3**0.5 / 2 / 256**2
+    assert error < 1.01 * np.pi * 3**0.5 / 2 / 256**2
 
 
 def test_each_level_is_the_average_of_its_values() -> None:
@@ -128,10 +139,10 @@ def some_rows(n: int, width: int, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("n", [40, 41, 1000])
 def test_a_palette_of_few_different_rows_is_exact(n: int) -> None:
-    rows = some_rows(40, 9)[np.random.default_rng(1).integers(0, 40, 300)]
-    rows = np.concatenate([some_rows(40, 9), rows])
+    rows = some_rows(40, 9)
     rows[3] = 0.0
-    rows[50] = -0.0
+    rows = np.concatenate([rows, rows[np.random.default_rng(1).integers(0, 40, 300)], np.full((1, 9), -0.0)])
+    rows = rows.astype(np.float32)
     entries, labels = palette(rows, np.ones(len(rows)), n)
     np.testing.assert_array_equal(entries[labels], rows)
     assert len(entries) == 40
@@ -140,7 +151,7 @@ def test_a_palette_of_few_different_rows_is_exact(n: int) -> None:
 
 
 def test_a_palette_is_better_than_lloyds_from_random_rows() -> None:
-    rows, n = some_rows(3000, 12), 400
+    rows, n = some_rows(2000, 12), 300
     weights = np.random.default_rng(2).uniform(0.1, 3.0, len(rows))
     entries, labels = palette(rows, weights, n)
     assert entries.dtype == np.float32
