@@ -156,6 +156,8 @@ def convert_model(
     click.echo(f"{output}: {len(after)} splats, {before.shape} to {after.shape}, {how}")
     if converted.removed:
         click.echo(f"{converted.removed} splats of negative opacity are left out, which {after.shape} does not support")
+    if converted.lacks_near_plane:
+        click.echo(f"the near plane is not in the file: splats nearer than {after.near_plane:.4g} units are drawn")
     if not converted.is_exact:
         click.echo(_cost_line(conversion_cost(converted, cameras, device)))
     for number, (level, cost) in enumerate(

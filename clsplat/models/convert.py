@@ -20,6 +20,7 @@ from ..splats.any_file import SPZ_ENDING, WRITTEN, check_ending, format_of
 from ..splats.approximate import nearest_gaussians
 from ..splats.convert import as_one_of, convert
 from ..splats.fields import sh_coefficients
+from ..splats.near_plane import NEAR_PLANE
 from ..splats.page_payload import PAGE_ENDING, PRECISIONS
 from ..splats.shapes import GAUSSIAN
 from ..splats.splats import Splats
@@ -58,6 +59,11 @@ class ConvertedModel:
         """Whether the file shows the same images as the model."""
         same_bands = self.splats.sh_degree >= self.source.splats.sh_degree
         return not self.approximate and same_bands and not self.rounds
+
+    @property
+    def lacks_near_plane(self) -> bool:
+        """Whether the model has a near plane that the file does not hold."""
+        return self.splats.near_plane != NEAR_PLANE and not WRITTEN[format_of(self.output)].near_plane
 
     @property
     def rounds(self) -> bool:

@@ -38,18 +38,20 @@ class WrittenFormat:
     ----------
     shapes : the kernels that it holds; None: all.
     rounds : whether the file holds fewer digits than float32.
+    near_plane : whether the file holds the near plane of the model.
     """
 
     shapes: tuple[str, ...] | None
     rounds: bool
+    near_plane: bool = True
 
 
 _GAUSSIAN_ONLY, _EXTENDED = (GAUSSIAN.name,), tuple(EXTRA_FIELDS)
 # By ending or whole name, in the order of messages. `clsplat convert` writes pages, because they have cameras as well.
 WRITTEN = {
     PLY_ENDING: WrittenFormat(None, False),
-    SPLAT_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
-    SPZ_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
+    SPLAT_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True, False),
+    SPZ_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True, False),
     SOG_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
     LOD_META: WrittenFormat(_GAUSSIAN_ONLY, True),
     GLB_ENDING: WrittenFormat(_EXTENDED, False),

@@ -19,6 +19,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +28,13 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .fields import MAX_SH_DEGREE, sh_coefficients
+from .near_plane import NEAR_PLANE, usable_near_plane
 from .quaternions import from_smallest_three
 from .shapes import GAUSSIAN
 from .stored import StoredSplats, gaussians
 
 META = "meta.json"
+EXTRA = "clsplat"  # object in meta.json for what the format has no place for; other programs ignore it
 _MAX_FILE = 1 << 28  # bytes of one file in the archive
 _TAG = 252  # alpha of a rotation whose largest component is w
 _PALETTE_ROW = 64
@@ -98,7 +101,14 @@ class _Reader:
                     [self._reals("sh0", "codebook", _LEVELS)[color[:, None, :3]], self._bands()], axis=1
                 ),
             }
-        return gaussians(self.path, arrays, self._value("antialias", default=False) is True)
+        found = gaussians(self.path, arrays, self._value("antialias", default=False) is True)
+        return replace(found, near_plane=self._near_plane())
+
+    def _near_plane(self) -> float:
+        found = self._value(EXTRA, "nearPlane", default=NEAR_PLANE)
+        if type(found) not in (int, float) or not 0.0 < found < math.inf:
+            raise InputError(f"{self.path}: {EXTRA}.nearPlane in {META} is {str(found)[:40]!r}; give a depth above 0")
+        return usable_near_plane(found)
 
     def _quaternions(self) -> NDArray[np.float64]:
         """Return quaternions (N, 4) as w, x, y, z; zeros, which are unusable, for wrong tags."""

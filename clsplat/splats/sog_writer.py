@@ -30,7 +30,7 @@ from .codebooks import best_levels, nearest_level, palette
 from .fields import Array, DoubleArray, sh_degree_of
 from .morton import morton_order
 from .shapes import GAUSSIAN
-from .sog import META
+from .sog import EXTRA, META
 from .stored import StoredSplats, check_gaussian
 
 Bytes = NDArray[np.uint8]
@@ -88,6 +88,7 @@ def sog_files(path: object, splats: StoredSplats, order: NDArray[np.int64]) -> d
         "asset": {"generator": f"clsplat {__version__}"},
         "count": count,
         "antialias": splats.antialiased,
+        EXTRA: {"nearPlane": splats.near_plane},
     }
     images: dict[str, Bytes] = {}
     _add_places(meta, images, arrays["mean"])

@@ -159,6 +159,16 @@ def test_interchange_files_keep_the_skew(model: Path, tmp_path: Path, ending: st
     assert f"{ending} files hold gaussian, skew-normal, generalised-exponential splats: leave --shape out" in said
 
 
+@pytest.mark.parametrize(("ending", "kept"), [(".spz", False), (".splat", False), (".sog", True), (".glb", True)])
+def test_a_lost_near_plane_is_named(tmp_path: Path, ending: str, kept: bool) -> None:
+    splats = Splats("gaussian", random_model(GAUSSIAN, 9, 0, dead=0), near_plane=0.25)
+    splats.save(tmp_path / "a.ply")
+    said = clsplat("convert", tmp_path / "a.ply", tmp_path / f"a{ending}")
+    line = "the near plane is not in the file: splats nearer than 0.25 units are drawn"
+    assert (line in said) is not kept
+    assert Splats.load(tmp_path / f"a{ending}").near_plane == (0.25 if kept else 0.01)
+
+
 def test_levels_of_detail_are_written_and_measured(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "scene" / "lod-meta.json"
     said = clsplat("convert", model, out, "--approximate", "--levels", 3).splitlines()

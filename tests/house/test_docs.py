@@ -147,6 +147,8 @@ def test_commands_run(
     words = shortened(command)
     if "--video" in words:
         pytest.importorskip("imageio_ffmpeg", reason="imageio[ffmpeg] is not installed (pip install clsplat[video])")
+    if ".usd" in command:
+        pytest.importorskip("pxr", reason="usd-core is not installed (pip install clsplat[usd])")
     stand_ins(tmp_path, words, capture_folder, model_folder)
     monkeypatch.chdir(tmp_path)
     before = set(tmp_path.rglob("*"))

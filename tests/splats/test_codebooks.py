@@ -9,6 +9,8 @@ from scipy.cluster.hierarchy import linkage
 from clsplat.splats import codebooks
 from clsplat.splats.codebooks import best_levels, nearest_level, palette
 
+pytestmark = pytest.mark.filterwarnings("error")
+
 
 def level_error(values: np.ndarray, levels: np.ndarray, weights: np.ndarray | None = None) -> float:
     """Weighted mean square of the distance to the nearest level, by comparing all of them."""
@@ -201,6 +203,14 @@ def test_merges_are_those_of_ward() -> None:
     np.testing.assert_allclose(np.sort(2.0 * np.sqrt(added)), linkage(rows, "ward")[:, 2], rtol=1e-3)
     assert sorted(gone) == sorted(set(gone))
     assert set(range(150)) - set(gone) == {kept[-1]}
+
+
+def test_pieces_are_cut_across_their_longest_axis() -> None:
+    rows = np.random.default_rng(7).normal(size=(1200, 4)).astype(np.float32)
+    far = np.random.default_rng(8).permutation(1200) < 600
+    rows[far, 2] += 100.0
+    pieces = codebooks._pieces(rows, 1000)
+    assert sorted(map(tuple, pieces)) == sorted([tuple(np.flatnonzero(far)), tuple(np.flatnonzero(~far))])
 
 
 def test_rows_of_a_lattice_have_many_equal_distances() -> None:

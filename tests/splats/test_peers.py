@@ -246,6 +246,7 @@ READERS: list[tuple[Callable[[Path, Path], Found], str, dict[str, float]]] = [
     (by_spark, "gaussian.ply", SPARK_ROUNDING),
     (by_spark, "skewed.ply", SPARK_ROUNDING),
     (by_spark, "gaussian.spz", SPARK_ROUNDING),
+    (by_spark, "gaussian.sog", SPARK_ROUNDING),
     (by_spark, "gaussian.splat", SPARK_ROUNDING),
     (by_plyfile, "gaussian.ply", EXACT),
     (by_plyfile, "skewed.ply", EXACT),
