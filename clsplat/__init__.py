@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
     from .models.cameras import export_cameras
     from .models.clean import clean_model
-    from .models.convert import PageOptions, conversion_cost, convert_model
+    from .models.convert import PageOptions, conversion_cost, convert_model, level_costs
     from .models.evaluation import EvaluationOptions, evaluate, evaluate_models
     from .models.info import inspect
     from .models.model import LoadedModel, SceneChoice, load_model
@@ -71,6 +71,7 @@ _HOME = {
     "resume": "models.resume",
     "convert_model": "models.convert",
     "conversion_cost": "models.convert",
+    "level_costs": "models.convert",
     "PageOptions": "models.convert",
     "clean_model": "models.clean",
     "prune_model": "models.prune",
@@ -111,6 +112,7 @@ __all__ = [
     "evaluate_models",
     "export_cameras",
     "inspect",
+    "level_costs",
     "load_model",
     "load_scene",
     "make_demo_scene",
