@@ -60,12 +60,14 @@ class Format:
     """A format, or a format with an option.
 
     name : of the rows. ending : of the file. write : writes splats. library : what it needs besides clsplat.
+    gaussians : whether the file gets the nearest Gaussians, although it can hold the skew.
     """
 
     name: str
     ending: str
     write: Callable[[Path, Splats], None]
     library: str = "numpy"
+    gaussians: bool = False
 
 
 def _save(**options: Any) -> Callable[[Path, Splats], None]:
@@ -86,6 +88,7 @@ FORMATS = (
     Format(".spz, version 3", ".spz", _save(spz_version=3)),
     Format(".spz, version 4", ".spz", _save(spz_version=4), ZSTD),
     Format(".sog", ".sog", _save()),
+    Format(".sog, Gaussians", ".sog", _save(), gaussians=True),
     Format(".splat", ".splat", _save()),
 )
 
@@ -152,7 +155,7 @@ def measure(
     model_pictures, of_gaussians = pictures(splats), pictures(gaussians)
     for case, one in todo:
         shapes = WRITTEN[one.ending].shapes
-        skewed = shapes is None or splats.shape in shapes
+        skewed = (shapes is None or splats.shape in shapes) and not one.gaussians
         held = splats if skewed else gaussians
         path = scratch / f"file{one.ending}"
         written, read = [], []
@@ -245,7 +248,7 @@ def draw(rows: list[dict[str, Any]], out: Path) -> None:
     """Draw PSNR against bytes of a splat, a panel for each model, with one marker for each format."""
     rows = [row for row in latest(rows) if row["psnr"] is not None]
     models, formats = (list(dict.fromkeys(row[name] for row in rows)) for name in ("model", "format"))
-    markers = dict(zip(formats, "os^vDP*Xhd", strict=False))
+    markers = dict(zip(formats, "os^vDP*XhHd", strict=False))
     with chart_style.drawing(out, height=3.9) as figure:
         panels = figure.subplots(1, len(models), sharey=True, squeeze=False)[0]
         for panel, model in zip(panels, models, strict=True):
@@ -267,7 +270,7 @@ def draw(rows: list[dict[str, Any]], out: Path) -> None:
 
 
 def holds_skew(row: dict[str, Any]) -> bool:
-    return WRITTEN[ending_of(row)].shapes != (GAUSSIAN.name,)
+    return WRITTEN[ending_of(row)].shapes != (GAUSSIAN.name,) and "Gaussians" not in row["format"]
 
 
 if __name__ == "__main__":

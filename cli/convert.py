@@ -36,7 +36,7 @@ if TYPE_CHECKING:
             "Gaussians for other programs, with the loss that this costs.",
         ),
         ("clsplat convert MODEL scene.glb", "A standard file with the skew in it."),
-        ("clsplat convert MODEL out.sog --approximate", "A small file for viewers on the web."),
+        ("clsplat convert MODEL out.sog", "A small file for viewers on the web."),
     ),
     see_also=("view", "cameras"),
 )
@@ -116,9 +116,9 @@ def convert_model(
     .html. An .html page shows the splats in any browser with WebGL 2. It needs no server and no network: send it to
     anybody.
 
-    A .ply holds every kernel. Pages, glTF and OpenUSD hold Gaussians, skew-normals and generalised exponentials. In
-    glTF and OpenUSD, programs that do not know a kernel show its ellipses. The other formats hold Gaussians. They
-    round each value to about a byte, and a .splat file has no SH bands above 0. The loss of such files is measured on
+    A .ply holds every kernel. Pages, glTF and OpenUSD hold Gaussians, skew-normals and generalised exponentials, .sog
+    files the first two. Programs that do not know a kernel show its ellipses. The other formats hold Gaussians. The
+    last three round each value to about a byte, and a .splat file has no SH bands above 0. The loss is measured on
     images.
 
     An OUTPUT with the name lod-meta.json is written as streamed SOG: parts and levels of detail for viewers on the web.

@@ -14,7 +14,7 @@ from .glb import is_glb
 from .gltf_splats import GLB_ENDING, GLTF_ENDING, read_gltf_splats, write_gltf_splats
 from .page_payload import PAGE_ENDING, PAGE_SHAPES, read_page
 from .ply import read_ply, write_ply
-from .shapes import GAUSSIAN
+from .shapes import GAUSSIAN, SKEW_NORMAL
 from .sog import META, is_sog, read_sog
 from .sog_writer import write_sog
 from .spz import VERSIONS as SPZ_VERSIONS
@@ -52,7 +52,7 @@ WRITTEN = {
     PLY_ENDING: WrittenFormat(None, False),
     SPLAT_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True, False),
     SPZ_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True, False),
-    SOG_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True),
+    SOG_ENDING: WrittenFormat((GAUSSIAN.name, SKEW_NORMAL.name), True),
     LOD_META: WrittenFormat(_GAUSSIAN_ONLY, True),
     GLB_ENDING: WrittenFormat(_EXTENDED, False),
     **{ending: WrittenFormat(_EXTENDED, False) for ending in USD_ENDINGS},

@@ -9,6 +9,11 @@ from the top, belongs to splat i:
     sh0                 a byte for each channel: f_dc in the codebook; alpha is the opacity
     shN_labels          red and green: low and high byte of the splat's entry in the palette
     shN_centroids       the palette, 64 entries in a row: a pixel for each coefficient, its channels in the codebook
+
+The object `clsplat` in meta.json is not of the format, and other programs ignore it. It has the near plane, and for
+skew-normals the normalisation and one more image:
+
+    skew                a byte for each component: 127 is zero, 0 and 254 are the limits
 """
 
 from __future__ import annotations
@@ -19,7 +24,6 @@ import math
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +34,12 @@ from ..errors import InputError
 from .fields import MAX_SH_DEGREE, sh_coefficients
 from .near_plane import NEAR_PLANE, usable_near_plane
 from .quaternions import from_smallest_three
-from .shapes import GAUSSIAN
-from .stored import StoredSplats, gaussians
+from .shapes import GAUSSIAN, NORMALISATIONS, SKEW_LIMIT, SKEW_NORMAL
+from .stored import StoredSplats, joined_parts
 
 META = "meta.json"
-EXTRA = "clsplat"  # object in meta.json for what the format has no place for; other programs ignore it
+EXTRA = "clsplat"
+SKEW_ZERO = 127  # byte of a component of the skew that is zero
 _MAX_FILE = 1 << 28  # bytes of one file in the archive
 _TAG = 252  # alpha of a rotation whose largest component is w
 _PALETTE_ROW = 64
@@ -90,7 +95,7 @@ class _Reader:
         lower, upper = self._reals("means", "mins", 3), self._reals("means", "maxs", 3)
         share = (low[:, :3] + 256.0 * high[:, :3]) / 65535.0
         color = self._pixels("sh0", 0)
-        with np.errstate(all="ignore"):  # `gaussians` treats values that are not finite
+        with np.errstate(all="ignore"):  # `joined_parts` treats values that are not finite
             place = lower + share * (upper - lower)
             arrays = {
                 "mean": np.sign(place) * np.expm1(np.abs(place)),
@@ -101,8 +106,26 @@ class _Reader:
                     [self._reals("sh0", "codebook", _LEVELS)[color[:, None, :3]], self._bands()], axis=1
                 ),
             }
-        found = gaussians(self.path, arrays, self._value("antialias", default=False) is True)
-        return replace(found, near_plane=self._near_plane())
+        shape = GAUSSIAN.name
+        if self._value(EXTRA, "skew") is not None:
+            shape, arrays["skew"] = SKEW_NORMAL.name, self._skew()
+        antialiased = self._value("antialias", default=False) is True
+        found = StoredSplats(shape, self._normalisation(), antialiased, arrays, self._near_plane())
+        return joined_parts(self.path, [found])
+
+    def _skew(self) -> NDArray[np.float64]:
+        """Return skews (N, 3)."""
+        limit = self._value(EXTRA, "skew", "limit")
+        if type(limit) not in (int, float) or not 0.0 <= limit <= SKEW_LIMIT:
+            raise InputError(f"{self.path}: skew.limit in {META} is {str(limit)[:40]!r}; export it again")
+        stored = self._pixels(EXTRA, 0, "skew")[:, :3].astype(np.float64)
+        return np.clip((stored - SKEW_ZERO) / SKEW_ZERO, -1.0, 1.0) * limit
+
+    def _normalisation(self) -> str:
+        found = self._value(EXTRA, "normalisation", default=NORMALISATIONS[0])
+        if found not in NORMALISATIONS:
+            raise InputError(f"{self.path}: normalisation {str(found)[:40]!r} in {META} is unknown; export it again")
+        return str(found)
 
     def _near_plane(self) -> float:
         found = self._value(EXTRA, "nearPlane", default=NEAR_PLANE)
@@ -135,17 +158,17 @@ class _Reader:
         coefficients: NDArray[np.float64] = self._reals("shN", "codebook", _LEVELS)[palette[:rows]]
         return coefficients.reshape(-1, width, 3)[label]
 
-    def _pixels(self, group: str, place: int) -> NDArray[np.uint8]:
-        """Return the values (N, 4) of the splats in an image."""
-        flat = self._image(group, place).reshape(-1, 4)
+    def _pixels(self, group: str, place: int, *inner: str) -> NDArray[np.uint8]:
+        """Return the values (N, 4) of the splats in an image. inner : keys of a group inside the group."""
+        flat = self._image(group, place, *inner).reshape(-1, 4)
         if len(flat) < self.count:
             raise InputError(f"{self.path}: image {place} of {group} has {len(flat)} pixels for {self.count} splats")
         return flat[: self.count]
 
-    def _image(self, group: str, place: int) -> NDArray[np.uint8]:
+    def _image(self, group: str, place: int, *inner: str) -> NDArray[np.uint8]:
         from ..files.images import decode_pixels  # lazy: a slow import
 
-        names = self._value(group, "files")
+        names = self._value(group, *inner, "files")
         if not isinstance(names, list) or len(names) <= place or not isinstance(names[place], str):
             raise InputError(f"{self.path}: {group}.files in {META} has no file {place}; export it again")
         return decode_pixels(self.read(names[place]), f"{self.path}: {names[place][:80]!r}")

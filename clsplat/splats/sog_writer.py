@@ -29,9 +29,9 @@ from ..files.atomic import atomic_writer
 from .codebooks import best_levels, nearest_level, palette
 from .fields import Array, DoubleArray, sh_degree_of
 from .morton import morton_order
-from .shapes import GAUSSIAN
-from .sog import EXTRA, META
-from .stored import StoredSplats, check_gaussian
+from .shapes import GAUSSIAN, SKEW_MAX, SKEW_NORMAL
+from .sog import EXTRA, META, SKEW_ZERO
+from .stored import StoredSplats
 
 Bytes = NDArray[np.uint8]
 
@@ -47,13 +47,15 @@ _WEIGHTS = 1e3  # the largest weight of a splat and the inverse of the smallest 
 _TURNED = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
 _SIGNS = np.array([[1.0, 1.0, 1.0, 1.0], [-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, -1.0, 1.0]])
 
+_AXES = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])  # after these turns
+
 
 def write_sog(path: str | os.PathLike[str], splats: StoredSplats) -> None:
-    """Write Gaussians as a .sog archive, in Morton order. Equal splats give equal bytes.
+    """Write Gaussians or skew-normals as a .sog archive, in Morton order. Equal splats give equal bytes.
 
     Raises
     ------
-    InputError : the shape is not Gaussian, or there are more than 268 million splats.
+    InputError : the shape is another one, or there are more than 268 million splats.
     OutputError : the file cannot be written, or Pillow cannot write WebP.
     """
     files = sog_files(path, splats, morton_order(splats.arrays["mean"]))
@@ -78,7 +80,10 @@ def sog_files(path: object, splats: StoredSplats, order: NDArray[np.int64]) -> d
     """
     from ..files.images import encode_pixels  # lazy: a slow import
 
-    check_gaussian(path, splats.shape, ".sog")
+    if splats.shape not in (GAUSSIAN.name, SKEW_NORMAL.name):
+        raise InputError(
+            f"{path}: .sog files hold Gaussians and skew-normals, not {splats.shape} splats; convert them first"
+        )
     count = len(order)
     if count > _MAX_SIDE**2:
         raise InputError(f"{path}: .sog files hold at most {_MAX_SIDE**2} splats, not {count}: write a .ply")
@@ -90,9 +95,11 @@ def sog_files(path: object, splats: StoredSplats, order: NDArray[np.int64]) -> d
         "antialias": splats.antialiased,
         EXTRA: {"nearPlane": splats.near_plane},
     }
+    if "skew" in arrays:
+        meta[EXTRA]["normalisation"] = splats.normalisation
     images: dict[str, Bytes] = {}
     _add_places(meta, images, arrays["mean"])
-    _add_rotations(meta, images, arrays["quat"])
+    _add_rotations(meta, images, arrays)
     _add_scales(meta, images, arrays)
     _add_color(meta, images, splats.arrays["sh"][order, 0], arrays)
     if splats.arrays["sh"].shape[1] > 1:
@@ -114,13 +121,28 @@ def _add_places(meta: dict[str, Any], images: dict[str, Bytes], mean: DoubleArra
     meta["means"] = {"mins": lower.tolist(), "maxs": upper.tolist(), "files": ["means_l.webp", "means_u.webp"]}
 
 
-def _add_rotations(meta: dict[str, Any], images: dict[str, Bytes], quat: DoubleArray) -> None:
-    """Add x, y and z of the quaternions that have the largest component in front, with a positive sign."""
+def _add_rotations(meta: dict[str, Any], images: dict[str, Bytes], arrays: dict[str, DoubleArray]) -> None:
+    """Add x, y and z of the quaternions that have the largest component in front, with a positive sign; and the skew.
+
+    A half turn changes the signs of the skew in the frame of the splat.
+    """
+    quat = arrays["quat"]
     largest = np.abs(quat).argmax(axis=1)
     turned = np.take_along_axis(quat, _TURNED[largest], axis=1) * _SIGNS[largest]
     turned *= np.copysign(1.0, turned[:, :1]) / np.linalg.norm(turned, axis=1, keepdims=True)
     images["quats"] = _image(np.rint(255.0 * (turned[:, 1:] * math.sqrt(0.5) + 0.5)), _TAG)
     meta["quats"] = {"files": ["quats.webp"]}
+    if "skew" in arrays:
+        _add_skew(meta, images, arrays["skew"] * _AXES[largest])
+
+
+def _add_skew(meta: dict[str, Any], images: dict[str, Bytes], skew: DoubleArray) -> None:
+    """Add skews (N, 3), shortened as the kernels shorten them."""
+    length = np.linalg.norm(skew, axis=1, keepdims=True)
+    skew = skew * np.minimum(SKEW_MAX / np.maximum(length, 1e-300), 1.0)
+    limit = float(np.abs(skew).max(initial=0.0))
+    images["skew"] = _image(np.rint(SKEW_ZERO * (skew / max(limit, 1e-300) + 1.0)))
+    meta[EXTRA]["skew"] = {"limit": limit, "files": ["skew.webp"]}
 
 
 def _add_scales(meta: dict[str, Any], images: dict[str, Bytes], arrays: dict[str, DoubleArray]) -> None:

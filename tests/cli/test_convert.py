@@ -159,6 +159,15 @@ def test_interchange_files_keep_the_skew(model: Path, tmp_path: Path, ending: st
     assert f"{ending} files hold gaussian, skew-normal, generalised-exponential splats: leave --shape out" in said
 
 
+def test_sog_keeps_the_skew_rounded(model: Path, tmp_path: Path) -> None:
+    said = clsplat("convert", model, tmp_path / "a.sog").splitlines()
+    assert said[0].endswith("skew-normal to skew-normal, rounded")
+    skewed = float(said[-1].split(" dB")[0].split()[-1])
+    said = clsplat("convert", model, tmp_path / "b.sog", "--shape", "gaussian", "--approximate").splitlines()
+    assert skewed > float(said[-1].split(" dB")[0].split()[-1])
+    assert [Splats.load(tmp_path / name).shape for name in ("a.sog", "b.sog")] == ["skew-normal", "gaussian"]
+
+
 @pytest.mark.parametrize(("ending", "kept"), [(".spz", False), (".splat", False), (".sog", True), (".glb", True)])
 def test_a_lost_near_plane_is_named(tmp_path: Path, ending: str, kept: bool) -> None:
     splats = Splats("gaussian", random_model(GAUSSIAN, 9, 0, dead=0), near_plane=0.25)

@@ -393,10 +393,10 @@ def test_formats(tmp_path: Path) -> None:
     for name in (".html", ".sog", ".spz, version 3"):
         assert 25 < rows["smoke", name]["rounding_psnr"] < 80, name
     assert rows["smoke", ".sog"]["bytes"] < rows["smoke", ".ply"]["bytes"]
-    assert rows["smoke", ".sog"]["psnr"] < rows["smoke", ".sog"]["rounding_psnr"], "the skew is lost"
+    assert rows["smoke", ".sog, Gaussians"]["psnr"] < rows["smoke", ".sog"]["psnr"], "the skew is lost"
     assert rows["random", ".sog"]["psnr"] is None
     assert min(row["write_s"] for row in rows.values()) >= 0
-    assert "| `smoke` | .sog | gaussian |" in done.stdout
+    assert "| `smoke` | .sog, Gaussians | gaussian |" in done.stdout
     assert "| 50 | .sog |" in done.stdout
 
 

@@ -22,6 +22,7 @@ from clsplat.splats import sog_writer
 from clsplat.splats.codebooks import palette
 from clsplat.splats.morton import morton_order
 from clsplat.splats.quaternions import rotations
+from clsplat.splats.shapes import SKEW_MAX
 from clsplat.splats.sog_writer import write_sog
 from clsplat.splats.splats import Splats
 from clsplat.splats.stored import StoredSplats
@@ -271,8 +272,8 @@ def test_extreme_values_spoil_no_others(
 
 def test_other_shapes_and_too_many_splats_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "a.sog"
-    with pytest.raises(InputError, match="hold Gaussians, not skew-normal") as caught:
-        write_sog(file, StoredSplats("skew-normal", "peak", False, random_splats(0, 3, 0)))
+    with pytest.raises(InputError, match="hold Gaussians and skew-normals, not student-t") as caught:
+        write_sog(file, StoredSplats("student-t", "peak", False, random_splats(0, 3, 0)))
     assert str(caught.value).startswith(str(file))
     monkeypatch.setattr(sog_writer, "_MAX_SIDE", 4)
     write_sog(tmp_path / "full.sog", gaussians(16, 0))
@@ -302,3 +303,63 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"cannot be written .*; choose another place"):
         write_sog(tmp_path / "file" / "a.sog", gaussians(3, 0))
+
+
+def test_the_skew_comes_back_in_an_image_of_its_own(tmp_path: Path) -> None:
+    """Rotations get half turns; what the splats show in space stays."""
+    arrays = {name: values.astype(np.float32) for name, values in random_splats(3, 200, 1).items()}
+    arrays["skew"][:20] = 0
+    arrays["skew"][20] = [0, 0, 1.32]  # above the limit of the kernels
+    before = Splats("skew-normal", arrays, "pdf", near_plane=0.3).select(morton_order(arrays["mean"]))
+    before.save(tmp_path / "a.sog")
+    after = Splats.load(tmp_path / "a.sog")
+    assert (after.shape, after.normalisation, after.near_plane) == ("skew-normal", "pdf", 0.3)
+
+    def in_world(splats: Splats) -> np.ndarray:
+        """Skews in space, in deviations, so that the rounding of scales does not count."""
+        return np.einsum("nij,nj->ni", rotations(splats.quat.astype(np.float64)), splats.skew)
+
+    length = np.linalg.norm(before.skew, axis=1, keepdims=True)
+    bounded = before.with_arrays(
+        before.to_numpy() | {"skew": before.skew * np.minimum(SKEW_MAX / np.maximum(length, 1e-9), 1)}
+    )
+    np.testing.assert_allclose(in_world(after), in_world(bounded), atol=0.04)
+    assert (np.linalg.norm(after.skew, axis=1) == 0).sum() == 20
+    # Other programs see Gaussians with the mean and the covariance of the skew-normals.
+    meta, images = content(tmp_path / "a.sog")
+    assert meta["clsplat"]["skew"]["files"] == ["skew.webp"]
+    limit = meta["clsplat"]["skew"]["limit"]
+    stored = (pixels(images, "skew", 200)[:, :3] - 127) / 127 * limit
+    np.testing.assert_allclose(np.linalg.norm(stored, axis=1), np.minimum(length[:, 0], SKEW_MAX), atol=0.02)
+    assert np.abs(stored).max() == pytest.approx(limit)
+
+
+def test_gaussians_have_no_image_of_skews(tmp_path: Path) -> None:
+    write_sog(tmp_path / "a.sog", gaussians())
+    meta, images = content(tmp_path / "a.sog")
+    assert set(meta["clsplat"]) == {"nearPlane"}
+    assert "skew" not in images
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"skew": {"limit": 2.0, "files": ["skew.webp"]}}, "skew.limit in meta.json is '2.0'"),
+        ({"skew": {"files": ["skew.webp"]}}, "skew.limit in meta.json is 'None'"),
+        ({"skew": {"limit": 1.0}}, "files in meta.json has no file 0"),
+        ({"skew": {"limit": 1.0, "files": ["no.webp"]}}, "has no file 'no.webp'"),
+        ({"normalisation": "sum"}, "normalisation 'sum' in meta.json is unknown"),
+    ],
+)
+def test_damaged_skews_are_named(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    arrays = {name: values.astype(np.float32) for name, values in random_splats(3, 20, 1).items()}
+    Splats("skew-normal", arrays).save(tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(files["meta.json"])
+    meta["clsplat"] |= change
+    with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
+        for name, data in (files | {"meta.json": json.dumps(meta).encode()}).items():
+            archive.writestr(name, data)
+    with pytest.raises(InputError, match=message):
+        Splats.load(tmp_path / "b.sog")
