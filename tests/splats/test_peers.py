@@ -234,6 +234,7 @@ READERS: list[tuple[Callable[[Path, Path], Found], str, dict[str, float]]] = [
     (by_splat_transform, "gaussian.spz", EXACT),
     (by_splat_transform, "version4.spz", EXACT),
     (by_splat_transform, "gaussian.sog", EXACT),
+    (by_splat_transform, "skewed.sog", EXACT),
     (by_spz_library, "gaussian.spz", EXACT),
     (by_spz_library, "version4.spz", EXACT),
     (by_splat_transform, "gaussian.splat", EXACT | {"quat": 0.01}),
@@ -258,7 +259,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("files")
     arrays = {name: values.astype(np.float32) for name, values in random_splats(7, N, 3).items()}
     arrays["sh"] *= 0.3
-    Splats("skew-normal", arrays).save(folder / "skewed.ply")
+    for name in ("skewed.ply", "skewed.sog"):
+        Splats("skew-normal", arrays).save(folder / name)
     gaussians = Splats("gaussian", for_shape(arrays, "gaussian"))
     gaussians.save(folder / "gaussian.ply")
     gaussians.save(folder / "gaussian.splat")
