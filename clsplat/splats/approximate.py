@@ -4,7 +4,8 @@
 opacity times exp(-z'z / 2) (r + (1 - r) Phi(lambda u'z)). Here r is the ratio of the two opacities, or 0 for
 skew-normals, and lambda is infinite for a cut by a plane. The profile across u is already Gaussian. The profile along u
 is replaced by the Gaussian with the least squared difference on that line. Its centre, width and height depend only on
-lambda and r. It is nearer to the profile than the Gaussian of equal moments. Two or three Gaussians for a splat are
+lambda and r. It is nearer to the profile than the Gaussian of equal moments. But it absorbs less than the splat, which
+shows where splats hide each other. Skew-normals get the Gaussian halfway between both. Two or three Gaussians for a splat are
 nearer on the line but not in images: the low-pass filter widens each of them, and along u they hide each other.
 
 *Round profiles* (with an exponent or degrees of freedom) get the Gaussian with the least squared difference on the
@@ -84,7 +85,7 @@ def _lopsided(model: dict[str, DoubleArray], source: Shape) -> dict[str, DoubleA
         towards = np.where((lesser > greater)[:, None], -towards, towards)
         opacity = np.maximum(greater, lesser)
         ratio = np.minimum(greater, lesser) / np.maximum(opacity, 1e-300)
-    centre, width, height = _between(line_fits(), slant, ratio).T
+    centre, width, height = _between(_halfway() if source.normalised else line_fits(), slant, ratio).T
     if source.normalised:  # the opacity is that of the peak
         height = height / _between(_line_peaks()[..., None], slant, ratio)[:, 0]
     frame, _ = restretched(direct, towards, width[:, None])
@@ -136,6 +137,24 @@ def line_fits() -> NDArray[np.float64]:
     lines = _lines()
     flat = lines.reshape(-1, len(_LINE))
     return _fits(_LINE, flat, np.ones_like(flat), True).reshape(*lines.shape[:2], 3)
+
+
+@cache
+def _halfway() -> NDArray[np.float64]:
+    """Return centre, width and height halfway between the nearest Gaussian and the one of equal moments and peak."""
+    lines = _lines()
+    mass = lines.sum(axis=2)
+    centre = np.sum(lines * _LINE, axis=2) / mass
+    variance = np.sum(lines * (_LINE - centre[..., None]) ** 2, axis=2) / mass
+    near = line_fits()
+    return np.stack(
+        [
+            0.5 * (near[..., 0] + centre),
+            np.sqrt(0.5 * (near[..., 1] ** 2 + variance)),
+            0.5 * (near[..., 2] + lines.max(axis=2)),
+        ],
+        axis=2,
+    )
 
 
 @cache
