@@ -5,8 +5,9 @@ opacity times exp(-z'z / 2) (r + (1 - r) Phi(lambda u'z)). Here r is the ratio o
 skew-normals, and lambda is infinite for a cut by a plane. The profile across u is already Gaussian. The profile along u
 is replaced by the Gaussian with the least squared difference on that line. Its centre, width and height depend only on
 lambda and r. It is nearer to the profile than the Gaussian of equal moments. But it absorbs less than the splat, which
-shows where splats hide each other. Skew-normals get the Gaussian halfway between both. Two or three Gaussians for a splat
-are nearer on the line but not in images: the low-pass filter widens each of them, and along u they hide each other.
+shows where splats hide each other. Skew-normals get the Gaussian halfway between both. Two or three Gaussians for a
+splat are nearer on the line but not in images: the low-pass filter widens each of them, and along u they hide each
+other.
 
 *Round profiles* (with an exponent or degrees of freedom) get the Gaussian with the least squared difference on the
 plane. Only the part counts where alpha of an opaque splat is at least 1/255. No Gaussian has a negative opacity, so
