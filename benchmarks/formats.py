@@ -210,9 +210,10 @@ def smoke_model(folder: Path) -> Path:
 
 
 def latest(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the last row of each model, number of splats and format."""
+    """Return the last row of each model, number of splats and format, in the order of FORMATS."""
     found = {(row["model"], row["splats"], row["format"]): row for row in rows}
-    return list(found.values())
+    models = list(dict.fromkeys((model, splats) for model, splats, _ in found))
+    return [found[*model, one.name] for model in models for one in FORMATS if (*model, one.name) in found]
 
 
 def table(rows: list[dict[str, Any]]) -> str:
