@@ -25,9 +25,8 @@ from ..splats.page_payload import PAGE_ENDING, PRECISIONS
 from ..splats.shapes import GAUSSIAN
 from ..splats.splats import Splats
 from ..splats.spz import VERSIONS as SPZ_VERSIONS
-from ..splats.stored import StoredSplats
 from ..splats.streamed_sog import LEVELS, LOD_META, write_streamed_sog
-from ..webpage.page import PageContent, as_drawn, write_web_page
+from ..webpage.page import PageContent, write_web_page
 from .model import LoadedModel, model_at
 
 
@@ -215,13 +214,12 @@ def _cameras(source: LoadedModel, path: Path | None) -> list[NamedCamera]:
 def _write_page(output: Path, source: LoadedModel, splats: Splats, page: PageOptions) -> None:
     path = None if page.camera_path is None else read_path(page.camera_path)
     content = PageContent(page.title or source.path.name, _cameras(source, page.cameras), path, source.background)
-    write_web_page(output, as_drawn(splats), content, page.precision)
+    write_web_page(output, splats, content, page.precision)
 
 
 def _write_levels(output: Path, splats: Splats, levels: int) -> list[Splats]:
     """Write a streamed SOG and return its coarser levels."""
-    stored = StoredSplats(splats.shape, splats.normalisation, splats.antialiased, splats.arrays, splats.near_plane)
-    return [splats.with_arrays(level.arrays) for level in write_streamed_sog(output, stored, levels)[1:]]
+    return [splats.with_arrays(level.arrays) for level in write_streamed_sog(output, splats.stored(), levels)[1:]]
 
 
 def _as_shape(splats: Splats, target: str | None, suffix: str, approximate: bool) -> tuple[Splats, bool]:

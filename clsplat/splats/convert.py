@@ -17,7 +17,7 @@ from ..errors import InputError
 from .checks import LIMIT_SLACK
 from .fields import Array, DoubleArray, scale_of
 from .optical_depth import optical_depth, raw_of_optical_depth
-from .quaternions import rotations
+from .quaternions import of_rotations, rotations
 from .shapes import GAUSSIAN, SKEW_MAX, SKEW_NORMAL, SLANT_MAX, Shape, shape_named
 from .splats import Splats
 
@@ -150,17 +150,10 @@ def restretched(model: ArraysByField, along: DoubleArray, factor: DoubleArray) -
     mirrored = np.linalg.det(u) < 0.0
     u[mirrored, :, 2] *= -1.0
     w[mirrored, 2, :] *= -1.0
-    frame["quat"][stretched] = _quaternions(rotations(model["quat"][stretched]) @ u)
+    frame["quat"][stretched] = of_rotations(rotations(model["quat"][stretched]) @ u)
     frame["log_scale"][stretched] = np.log(np.maximum(singular, 1e-300)) + largest
     turned[stretched] = np.einsum("nij,nj->ni", w, along[stretched])
     return frame, turned
-
-
-def _quaternions(matrices: DoubleArray) -> DoubleArray:
-    """Return quaternions w, x, y, z (N, 4) of rotation matrices (N, 3, 3)."""
-    from scipy.spatial.transform import Rotation  # lazy: a slow import
-
-    return Rotation.from_matrix(matrices).as_quat()[:, [3, 0, 1, 2]]
 
 
 # ---- through the Gaussian --------------------------------------------------------------------------------------

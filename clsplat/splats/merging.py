@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from .fields import Array, DoubleArray
 from .harmonics import SH_C0
-from .quaternions import rotations
+from .quaternions import of_rotations, rotations
 from .shapes import GAUSSIAN
 
 Indices = NDArray[np.int64]
@@ -53,15 +53,12 @@ class Level:
 
     def arrays(self) -> dict[str, Array]:
         """Return the public arrays in float32."""
-        from scipy.spatial.transform import Rotation  # lazy: a slow import
-
         variances, axes = np.linalg.eigh(self.covariance)
         variances = np.maximum(variances, _FLATTEST * variances[:, -1:])
         axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0
-        quat = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]] if len(self) else np.empty((0, 4))
         values = {
             "mean": self.mean,
-            "quat": quat,
+            "quat": of_rotations(axes),
             "log_scale": 0.5 * np.log(np.maximum(variances, 1e-60)),
             "opacity_logit": GAUSSIAN.raw_opacity(np.clip(self.opacity, *_OPACITIES)),
             "sh": self.sh,
@@ -84,11 +81,10 @@ def level_of(arrays: Mapping[str, Array], group: Indices) -> Level:
 
 def merged(level: Level) -> Level:
     """Return a level with about half as many Gaussians: as many pairs as have a near neighbour of their part."""
-    one, other, cost = _pairs(level)
+    mass = level.opacity * _areas(level.covariance)
+    one, other, cost = _pairs(level, mass)
     if len(one) == 0:
         return level
-    area = _areas(level.covariance)
-    mass = level.opacity * area
     share = mass[one] / np.maximum(mass[one] + mass[other], 1e-300)
     first, second = share[:, None], 1.0 - share[:, None]
     mean = first * level.mean[one] + second * level.mean[other]
@@ -117,7 +113,7 @@ def _areas(covariance: DoubleArray) -> DoubleArray:
     return np.sqrt(np.maximum(variances[:, 1] * variances[:, 2], 0.0))
 
 
-def _pairs(level: Level) -> tuple[Indices, Indices, DoubleArray]:
+def _pairs(level: Level, mass: DoubleArray) -> tuple[Indices, Indices, DoubleArray]:
     """Return both members of at most half as many pairs as there are splats, and the cost of each merge."""
     from scipy.spatial import cKDTree  # lazy: a slow import
 
@@ -136,7 +132,7 @@ def _pairs(level: Level) -> tuple[Indices, Indices, DoubleArray]:
         return none
     one, other = np.minimum(one, other)[kept], np.maximum(one, other)[kept]
     one, other = np.unique(np.stack([one, other]), axis=1)
-    cost = _costs(level, one, other)
+    cost = _costs(level, mass, one, other)
     taken = np.zeros(n, np.bool_)
     chosen: list[Indices] = []
     left = np.argsort(cost, kind="stable")
@@ -156,9 +152,8 @@ def _pairs(level: Level) -> tuple[Indices, Indices, DoubleArray]:
     return one[best], other[best], cost[best]
 
 
-def _costs(level: Level, one: Indices, other: Indices) -> DoubleArray:
-    """Return the cost of each pair's merge."""
-    mass = level.opacity * _areas(level.covariance)
+def _costs(level: Level, mass: DoubleArray, one: Indices, other: Indices) -> DoubleArray:
+    """Return the cost of each pair's merge; mass (N,) is opacity times area."""
     weight = mass[one] * mass[other] / np.maximum(mass[one] + mass[other], 1e-300)
     difference = SH_C0 * (level.sh[one, 0] - level.sh[other, 0])
     offset = level.mean[one] - level.mean[other]

@@ -1,4 +1,4 @@
-"""Rotation matrices of quaternions w, x, y, z with any norm above 0, and their gradient."""
+"""Quaternions w, x, y, z with any norm above 0: their rotation matrices, their gradient and other forms of them."""
 
 from __future__ import annotations
 
@@ -24,6 +24,15 @@ def rotations(quat: Array) -> Array:
         for j, column in enumerate(row):
             matrices[:, i, j] = column
     return matrices
+
+
+def of_rotations(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit quaternions (N, 4) of rotation matrices (N, 3, 3)."""
+    from scipy.spatial.transform import Rotation  # lazy: a slow import
+
+    if len(matrices) == 0:
+        return np.empty((0, 4))
+    return Rotation.from_matrix(matrices).as_quat()[:, [3, 0, 1, 2]]
 
 
 def from_smallest_three(others: NDArray[np.float64], largest: NDArray[np.integer]) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from ..errors import InputError
 from .fields import Array, DoubleArray, sh_coefficients
 from .harmonics import sh_basis
+from .quaternions import of_rotations
 
 _DIRECTIONS = 64  # directions in which a band of harmonics is sampled; a band has at most 7 functions
 _TOLERANCE = 1e-4  # deviation of a matrix from a rotation times a scale; float32 transforms deviate by 1e-6
@@ -47,9 +48,7 @@ def moved(
 
     The fields of the shape do not change, as they are relative to the frame and the size of each splat.
     """
-    from scipy.spatial.transform import Rotation  # lazy: a slow import
-
-    w, x, y, z = Rotation.from_matrix(rotation).as_quat()[[3, 0, 1, 2]]
+    w, x, y, z = of_rotations(rotation[None])[0]
     # The product from the left with (w, x, y, z); the other quaternion may have any norm.
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     changed = {

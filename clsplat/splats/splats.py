@@ -115,8 +115,11 @@ class Splats:
         InputError : the format does not hold splats of this shape.
         OutputError : the file cannot be written.
         """
-        stored = StoredSplats(self._shape, self._normalisation, self._antialiased, self._arrays, self._near_plane)
-        write_splats(path, stored, compact, spz_version)
+        write_splats(path, self.stored(), compact, spz_version)
+
+    def stored(self) -> StoredSplats:
+        """Return the content of a file of these splats, which shares the arrays."""
+        return StoredSplats(self._shape, self._normalisation, self._antialiased, self._arrays, self._near_plane)
 
     @classmethod
     def from_points(

@@ -21,7 +21,6 @@ from ..splats.color import BLACK, Color
 from ..splats.convert import as_one_of
 from ..splats.page_payload import PAGE_SHAPES, PRECISIONS, pack
 from ..splats.splats import Splats
-from ..splats.stored import StoredSplats
 
 _TOUR, _TOUR_FPS = 24, 0.8  # keys of the tour around the scene, and how many of them pass in a second
 _DRAWN = f"{', '.join(PAGE_SHAPES[:-1])} and {PAGE_SHAPES[-1]}"
@@ -88,8 +87,7 @@ def page_text(splats: Splats, content: PageContent, precision: str = PRECISIONS[
         raise InputError(f"{content.title}: the model has no splats to show; train it first")
     if splats.shape not in PAGE_SHAPES:
         raise InputError(f"a page draws {_DRAWN} splats, not {splats.shape}; see `as_drawn`")
-    stored = StoredSplats(splats.shape, splats.normalisation, splats.antialiased, splats.arrays, splats.near_plane)
-    payload = pack(stored, precision)
+    payload = pack(splats.stored(), precision)
     cameras = [entry.camera for entry in content.cameras]
     tour = content.path or CameraPath(tuple(ellipse(splats, cameras, _TOUR)), _TOUR_FPS, closed=True)
     settings = {

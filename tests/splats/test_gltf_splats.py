@@ -11,13 +11,12 @@ from typing import Any
 import glb_files
 import numpy as np
 import pytest
-from model_arrays import random_model
+from same_splats import model, same
 
 from clsplat.errors import InputError
 from clsplat.splats.axes import LUF, flipped
 from clsplat.splats.harmonics import SH_C0
 from clsplat.splats.quaternions import rotations
-from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 from clsplat.splats.transform import joined, transformed
 
@@ -26,28 +25,9 @@ SKEWED = "CLSPLAT_gaussian_splatting_kernel_skew_normal"
 EXPONENTIAL = "CLSPLAT_gaussian_splatting_kernel_generalised_exponential"
 
 
-def model(shape: str = "skew-normal", degree: int = 2, n: int = 30, **options: Any) -> Splats:
-    return Splats(shape, random_model(SHAPES[shape], n, 5, sh_degree=degree, dead=0), **options)
-
-
 def primitive(document: dict[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = document["meshes"][0]["primitives"][0]
     return found
-
-
-def same(found: Splats, wanted: Splats, tolerance: float = 1e-6) -> None:
-    assert (found.shape, found.normalisation, found.antialiased) == (
-        wanted.shape,
-        wanted.normalisation,
-        wanted.antialiased,
-    )
-    assert found.near_plane == pytest.approx(wanted.near_plane)
-    for name in set(wanted.arrays) - {"quat"}:
-        np.testing.assert_allclose(
-            found.arrays[name], wanted.arrays[name], rtol=tolerance, atol=tolerance, err_msg=name
-        )
-    turns = [rotations(splats.quat.astype(np.float64)) for splats in (found, wanted)]
-    np.testing.assert_allclose(*turns, atol=tolerance)
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -98,15 +97,7 @@ window.ready = true;
 
 
 def by_splat_transform(tmp_path: Path, file: Path) -> Found:
-    package("@playcanvas/splat-transform")
-    table = tmp_path / "read.csv"
-    subprocess.run(
-        ["node", MODULES / "@playcanvas/splat-transform" / "bin" / "cli.mjs", "-q", file, table],
-        check=True,
-        capture_output=True,
-        timeout=60,
-    )
-    rows = np.genfromtxt(table, delimiter=",", names=True)
+    rows = np.genfromtxt(transform(file, tmp_path / "read.csv"), delimiter=",", names=True)
 
     def columns(*names: str) -> np.ndarray:
         return np.stack([rows[name] for name in names], axis=1)

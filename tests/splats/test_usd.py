@@ -4,41 +4,19 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from model_arrays import random_model
+from same_splats import model, same
 
 from clsplat.errors import InputError, OutputError
 from clsplat.splats import usd
 from clsplat.splats.axes import RUB, flipped
-from clsplat.splats.quaternions import rotations
-from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 from clsplat.splats.transform import joined, transformed
 
 pxr = pytest.importorskip("pxr")
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol  # noqa: E402
-
-
-def model(shape: str = "skew-normal", degree: int = 2, n: int = 30, **options: Any) -> Splats:
-    return Splats(shape, random_model(SHAPES[shape], n, 5, sh_degree=degree, dead=0), **options)
-
-
-def same(found: Splats, wanted: Splats, tolerance: float = 1e-6) -> None:
-    assert (found.shape, found.normalisation, found.antialiased) == (
-        wanted.shape,
-        wanted.normalisation,
-        wanted.antialiased,
-    )
-    assert found.near_plane == pytest.approx(wanted.near_plane)
-    for name in set(wanted.arrays) - {"quat"}:
-        np.testing.assert_allclose(
-            found.arrays[name], wanted.arrays[name], rtol=tolerance, atol=tolerance, err_msg=name
-        )
-    turns = [rotations(splats.quat.astype(np.float64)) for splats in (found, wanted)]
-    np.testing.assert_allclose(*turns, atol=tolerance)
 
 
 @pytest.fixture
