@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .fields import Array
+from .fields import Array, sh_degree_of
 from .harmonics import axis_flip_signs
 
 Signs = tuple[int, int, int]  # 1 or -1 for x, y and z
@@ -26,7 +26,7 @@ def flipped(arrays: Mapping[str, Array], signs: Signs) -> dict[str, Array]:
     arrays : public arrays by field name, all of one real type.
     """
     factors = np.array(signs, arrays["mean"].dtype)
-    degree = round(arrays["sh"].shape[1] ** 0.5) - 1
+    degree = sh_degree_of(arrays["sh"].shape[1])
     # The rotation R becomes F R F with the flips F. The covariance F R F S² F Rᵀ F is the flipped one, because S is
     # diagonal. A component of the axis of rotation changes its sign with the two other axes.
     changed = {

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .fields import Array, DoubleArray, sh_coefficients
+from .fields import Array, DoubleArray, sh_coefficients, sh_degree_of
 from .near_plane import usable_near_plane
 from .quaternions import from_rodrigues, to_rodrigues
 from .shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, NORMALISATIONS, SKEW_NORMAL
@@ -169,7 +169,7 @@ def unpack(path: object, payload: bytes) -> StoredSplats:
         shape, arrays["beta"] = GENERALISED_EXPONENTIAL, fields["beta"][:, 0]
     with np.errstate(over="ignore"):  # values that overflow are found below
         single: dict[str, Array] = {name: np.ascontiguousarray(each, np.float32) for name, each in arrays.items()}
-    degree = round(single["sh"].shape[1] ** 0.5) - 1
+    degree = sh_degree_of(single["sh"].shape[1])
     usable = usable_arrays(path, shape.schema(degree), single)
     return StoredSplats(shape.name, normalisation, head["antialiased"], usable, near_plane)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from .fields import Array, DoubleArray, sh_coefficients
+from .fields import Array, DoubleArray, sh_coefficients, sh_degree_of
 from .harmonics import sh_basis
 from .quaternions import of_rotations
 
@@ -66,7 +66,7 @@ def turned_harmonics(sh: Array, rotation: DoubleArray) -> Array:
     Bands do not mix. The matrix of a band maps its values in sampled directions to its values in the directions turned
     back, exact up to rounding.
     """
-    degree = round(sh.shape[1] ** 0.5) - 1
+    degree = sh_degree_of(sh.shape[1])
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     here, back = sh_basis(directions, degree), sh_basis(directions @ rotation, degree)

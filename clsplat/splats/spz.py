@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..files.atomic import atomic_writer
 from .axes import flipped
-from .fields import MAX_SH_DEGREE, Array, sh_coefficients
+from .fields import MAX_SH_DEGREE, Array, sh_coefficients, sh_degree_of
 from .quaternions import OTHER_PLACES, from_smallest_three
 from .shapes import GAUSSIAN
 from .spz_streams import (
@@ -76,7 +76,7 @@ def write_spz(path: str | os.PathLike[str], splats: StoredSplats, version: int =
             f"{path}: a splat lies {farthest:.3g} units away, .spz files reach {_MAX_FIXED}: remove it, or write a .ply"
         )
     bits = min(_FRACTION_BITS, math.floor(math.log2(_MAX_FIXED / max(farthest, 1e-30))))
-    degree = round(arrays["sh"].shape[1] ** 0.5) - 1
+    degree = sh_degree_of(arrays["sh"].shape[1])
     header = SpzHeader(version, len(arrays["mean"]), degree, bits, ANTIALIASED * splats.antialiased)
     parts: list[NDArray[Any]] = [
         _positions(arrays["mean"], bits),

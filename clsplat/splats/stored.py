@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .checks import Fault, first_fault, unusable
-from .fields import Array, Field, Schema
+from .fields import Array, Field, Schema, sh_degree_of
 from .near_plane import NEAR_PLANE
 from .shapes import GAUSSIAN, shape_named
 
@@ -47,7 +47,7 @@ def gaussians(path: object, arrays: Mapping[str, NDArray[np.floating]], antialia
     """Return the content of a file that holds Gaussians only, without unusable splats (see `usable_arrays`)."""
     with np.errstate(over="ignore"):  # values that overflow are found below
         single: dict[str, Array] = {name: values.astype(np.float32) for name, values in arrays.items()}
-    degree = round(single["sh"].shape[1] ** 0.5) - 1
+    degree = sh_degree_of(single["sh"].shape[1])
     return StoredSplats(GAUSSIAN.name, "peak", antialiased, usable_arrays(path, GAUSSIAN.schema(degree), single))
 
 
@@ -107,7 +107,7 @@ def joined_parts(path: object, parts: Sequence[StoredSplats]) -> StoredSplats:
             several = [np.pad(sh, ((0, 0), (0, width - sh.shape[1]), (0, 0))) for sh in several]
         with np.errstate(over="ignore"):  # values that overflow are found below
             arrays[name] = np.concatenate(several).astype(np.float32)
-    schema = shape_named(first.shape).schema(round(width**0.5) - 1)
+    schema = shape_named(first.shape).schema(sh_degree_of(width))
     return replace(first, arrays=usable_arrays(path, schema, arrays), near_plane=min(part.near_plane for part in parts))
 
 

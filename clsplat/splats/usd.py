@@ -30,7 +30,7 @@ from ..files.atomic import atomic_path
 from ..files.host_memory import limit_address_space
 from .activated import EXTRA_FIELDS, OPACITY, SCALE, activated, placed, raw_arrays
 from .axes import RUB
-from .fields import MAX_SH_DEGREE, DoubleArray, sh_coefficients
+from .fields import MAX_SH_DEGREE, DoubleArray, sh_coefficients, sh_degree_of
 from .near_plane import NEAR_PLANE, usable_near_plane
 from .shapes import GAUSSIAN, NORMALISATIONS, shape_named
 from .stored import StoredSplats, joined_parts
@@ -113,7 +113,7 @@ def _define(stage: Any, splats: StoredSplats) -> None:
     put(_NAMES[OPACITY], kinds.FloatArray, Vt.FloatArray.FromNumpy(values[OPACITY].astype(np.float32)))
     sh = np.ascontiguousarray(values["sh"].reshape(-1, 3), np.float32)
     put(_HARMONICS, kinds.Float3Array, Vt.Vec3fArray.FromNumpy(sh)).SetMetadata("elementSize", values["sh"].shape[1])
-    put(_DEGREE, kinds.Int, round(values["sh"].shape[1] ** 0.5) - 1)
+    put(_DEGREE, kinds.Int, sh_degree_of(values["sh"].shape[1]))
     put("projectionModeHint", kinds.Token, "perspective")
     put("sortingModeHint", kinds.Token, "zDepth")
     if len(mean):
