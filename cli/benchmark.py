@@ -11,7 +11,7 @@ from clsplat.benchmark.sets import SETS
 from clsplat.comparison.methods import DEFAULT, parse_methods
 
 from .compare import distinct_numbers, report_run
-from .comparison_options import grid_options
+from .comparison_options import check_device, cluster_option, grid_options
 from .options import (
     PATH,
     TrainingCommand,
@@ -33,6 +33,7 @@ _COMMON = (
     "resolution",
     "photos",
     "lpips",
+    "cluster",
     "device",
     "quiet",
 )
@@ -78,6 +79,7 @@ _COMMON = (
     "[default: all]",
 )
 @click.option("--lpips", is_flag=True, help="Measure LPIPS too; needs the extra lpips.")
+@cluster_option
 @quiet_option
 @config_options("shape", "cap_max", "seed", "iterations", "save_iterations", "test_iterations")
 @click.pass_context
@@ -95,6 +97,7 @@ def benchmark(
     resolution: int | None,
     photos: int | None,
     lpips: bool,
+    cluster: str | None,
     quiet: bool,
     **values: Any,
 ) -> None:
@@ -111,6 +114,7 @@ def benchmark(
     from clsplat.benchmark.run import run_benchmark
     from clsplat.benchmark.sets import benchmark_set
 
+    check_device(values.get("device"), cluster)
     methods = parse_methods(systems)
     common = config_values(ctx, values)
     if iterations is not None:
@@ -129,6 +133,7 @@ def benchmark(
             resolution=resolution,
             photos=photos,
             lpips=lpips,
+            cluster=cluster,
             progress=display,
             on_run=None if quiet else report_run,
         )

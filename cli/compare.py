@@ -15,7 +15,7 @@ from clsplat.splats.color import BLACK
 from clsplat.training.presets import PRESETS
 from clsplat.training.stored_run import load_recorded_scene
 
-from .comparison_options import comparison_sections, grid_options
+from .comparison_options import check_device, cluster_option, comparison_sections, grid_options
 from .options import (
     PATH,
     TrainingCommand,
@@ -55,8 +55,12 @@ SYSTEMS = (DEFAULT, *PRESETS)
             "clsplat compare SCENE -o table --cap-max 5000,20000 --seeds 0,1,2",
             "All systems at two sizes, with three seeds each.",
         ),
+        (
+            "clsplat compare SCENE -o table --cluster local:2",
+            "Two runs at a time, each with half of the cores.",
+        ),
     ),
-    see_also=("frontier", "benchmark"),
+    see_also=("frontier", "benchmark", "worker"),
 )
 @click.argument("scenes", nargs=-1, required=True, type=PATH)
 @grid_options(
@@ -71,6 +75,7 @@ SYSTEMS = (DEFAULT, *PRESETS)
 @hiding_options
 @split_options
 @click.option("--save-models", is_flag=True, help="Keep the splats of each run, in DIR/models.")
+@cluster_option
 @quiet_option
 @config_options(
     *("shape", "cap_max", "seed", "iterations", "save_iterations", "test_iterations"),
@@ -87,6 +92,7 @@ def compare_systems(
     lengths: tuple[tuple[int, ...], ...],
     seeds: tuple[tuple[int, ...], ...],
     save_models: bool,
+    cluster: str | None,
     quiet: bool,
     **values: Any,
 ) -> None:
@@ -99,6 +105,7 @@ def compare_systems(
     from clsplat.comparison.compare import compare
     from clsplat.comparison.table import HEAD, cells, notes, summarise
 
+    check_device(values.get("device"), cluster)
     methods = parse_methods(systems)
     common, loaded = options_and_scenes(ctx, scenes, methods, values)
     with TrainingDisplay(quiet) as display:
@@ -111,6 +118,7 @@ def compare_systems(
             common,
             lengths=distinct_numbers(lengths),
             save_models=save_models,
+            cluster=cluster,
             progress=display,
             on_run=None if quiet else report_run,
         )

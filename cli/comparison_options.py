@@ -13,12 +13,24 @@ from .options import PATH, Numbers
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+cluster_option = click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Let workers do the runs: those of a scheduler (tcp://HOST:8786 or its file), or local:N on this machine.",
+)
+
+
+def check_device(device: str | None, cluster: str | None) -> None:
+    """Refuse `--device` beside workers of other programs, which have devices of their own."""
+    if device is not None and cluster is not None and not cluster.startswith("local"):
+        raise click.UsageError("--device has no effect here: each worker has its own (clsplat worker --device)")
+
 
 def comparison_sections(*others: str) -> dict[str, tuple[str, ...]]:
     """Return the sections of a command's help. others : names of the common options that only this command has."""
     grid = ("output", "systems", "caps", "seeds", "lengths", "resolution")
     return {
-        "Common options": (*grid, *others, "device", "quiet"),
+        "Common options": (*grid, *others, "cluster", "device", "quiet"),
         "Photos and test views": ("images", "masks", "alpha", "test_every", "test_list"),
     }
 

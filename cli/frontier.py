@@ -11,7 +11,7 @@ from clsplat.comparison.methods import parse_methods
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
 from .compare import distinct_numbers, options_and_scenes, report_run
-from .comparison_options import comparison_sections, grid_options
+from .comparison_options import check_device, cluster_option, comparison_sections, grid_options
 from .options import (
     PATH,
     TrainingCommand,
@@ -81,6 +81,7 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 @photo_options
 @hiding_options
 @split_options
+@cluster_option
 @quiet_option
 @config_options(
     *("shape", "cap_max", "seed", "iterations", "save_iterations", "test_iterations"),
@@ -100,6 +101,7 @@ def draw_frontier(
     curve: int,
     add: tuple[Path, ...],
     charts_only: bool,
+    cluster: str | None,
     quiet: bool,
     **values: Any,
 ) -> None:
@@ -123,6 +125,7 @@ def draw_frontier(
         records = read_runs(output)
         write_report(output, [*records, *more], reference=methods[0].label)
     else:
+        check_device(values.get("device"), cluster)
         common, loaded = options_and_scenes(ctx, scenes, methods, values)
         with TrainingDisplay(quiet) as display:
             records = sweep(
@@ -136,6 +139,7 @@ def draw_frontier(
                 curve=curve,
                 repeat=repeat,
                 more=more,
+                cluster=cluster,
                 progress=display,
                 on_run=None if quiet else report_run,
             )

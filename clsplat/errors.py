@@ -63,6 +63,10 @@ class TrainingError(ClsplatError):
     """Training cannot go on. The model trained so far is saved."""
 
 
+class ClusterError(ClsplatError):
+    """The scheduler of a cluster or its workers cannot be used."""
+
+
 FEWER_SPLATS = Remedy("use fewer splats", "--cap-max", "--splats")
 SMALLER_IMAGES = Remedy("use smaller images", "-r 2, 4, 8", "--size WxH", "--width N", "--max-size PX")
 OTHER_DEVICE = Remedy("choose another device", "--device")

@@ -6,26 +6,22 @@ import statistics
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
-from threading import Event
 
 from .. import activity
-from ..comparison.measure import empty_record, measure_model, warm_up
+from ..comparison.measure import FailedRun, empty_record, measure_model, train_in
 from ..comparison.table import Record
 from ..device.device import Device
-from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import evaluate
 from ..evaluation.metrics import PROTOCOLS
 from ..evaluation.perceptual import Lpips
 from ..models.measurements import ViewRecorder
 from ..rendering.renderer import Rendered, Renderer
 from ..scenes.scene import Scene, View
-from ..training.checkpoint import Checkpoint
 from ..training.config import TrainConfig
 from ..training.decisions import decide
 from ..training.folder import ModelFolder
 from ..training.log import Progress
-from ..training.run import train
-from ..training.trainer import Trainer
+from ..training.trainer import Visit
 
 PROTOCOL = PROTOCOLS["3dgs"]  # papers report the metrics of 3DGS's script
 
@@ -37,6 +33,7 @@ def train_and_measure_in(
     device: Device,
     lpips: Lpips | None = None,
     progress: Callable[[Progress], None] | None = None,
+    visit: Visit | None = None,
 ) -> Record:
     """Train in a model folder, or resume the run there, and return the record as `comparison.train_and_measure` does.
 
@@ -48,30 +45,10 @@ def train_and_measure_in(
     Other exceptions are those of `train`. A run whose training fails raises nothing: its record has the message.
     """
     config = decide(scene, config).config  # the record has the options of the run
-    model_folder = ModelFolder(folder)
-    resume = model_folder.checkpoint_path.is_file()
-    if not resume:
-        warm_up(scene, config, device)
-    schedules: list[str] = []
-
-    def remember(trainer: Trainer, stop: Event) -> None:
-        if not schedules:
-            schedules.append(str(trainer.kernels.schedule))
-
     try:
-        # A folder without a checkpoint holds a run that was killed before it saved anything.
-        model = train(scene, config, progress, output=folder, resume=resume, overwrite=not resume, visit=remember)
-    except InputError as error:
-        if not resume:
-            raise
-        reason = "its checkpoint or its scene has changed"
-        raise InputError(f"{folder}: the run cannot be resumed ({reason}): delete this folder to repeat it") from error
-    except TrainingError as error:
-        return _described(empty_record(device, schedules[0] if schedules else ""), None) | {"failed": str(error)}
-    if not model.finished:
-        raise KeyboardInterrupt
-    # A run that was finished already has visited no iteration.
-    schedule = schedules[0] if schedules else Checkpoint.load(model_folder.checkpoint_path).schedule
+        model, schedule = train_in(folder, scene, config, device, progress, visit)
+    except FailedRun as failed:
+        return _described(empty_record(device, failed.schedule), None) | {"failed": str(failed)}
     renderer, recorder, numbers = Renderer(device), ViewRecorder(lpips, report=False), count(1)
 
     def on_view(view: View, image: Rendered) -> None:
@@ -79,7 +56,7 @@ def train_and_measure_in(
         recorder(view, image)
 
     evaluation = evaluate(renderer, model.splats, scene.test, config.background, PROTOCOL, on_view)
-    file = model_folder.ply_path(model.iteration)
+    file = ModelFolder(folder).ply_path(model.iteration)
     record = _described(empty_record(device, schedule), lpips)
     record |= measure_model(renderer, model.splats, file, scene, config, evaluation, repeat_renders=False)
     return record | {

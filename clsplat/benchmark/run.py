@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ..cluster.job import Job
 from ..comparison.methods import Method, parse_methods
-from ..comparison.runs import Run, RunFile, refuse_foreign, run_key
+from ..comparison.planned import PlannedRun, do_runs
+from ..comparison.runs import Run, RunFile, key_digest, refuse_foreign
 from ..comparison.table import Record
 from ..device.device import open_device
 from ..evaluation.perceptual import Lpips
 from ..files.lock import folder_lock
-from ..scenes.scene import Scene
+from ..files.real_path import real_path
 from ..training.config import TrainConfig
 from ..training.log import Progress
 from ..training.presets import PRESETS
+from .job import BenchmarkJob, do_benchmark_run, metric_of
 from .measure import train_and_measure_in
 from .protocol import BenchmarkScene, find_scenes
 from .results import files_of_results, write_results
 from .sets import BenchmarkSet, benchmark_set
-from .start import with_start
 
 MODELS = "models"
 
@@ -40,6 +42,7 @@ def run_benchmark(
     resolution: int | None = None,
     photos: int | None = None,
     lpips: bool = False,
+    cluster: str | None = None,
     progress: Callable[[Progress], None] | None = None,
     on_run: Callable[[Run, Record | None], None] | None = None,
 ) -> list[Record]:
@@ -59,6 +62,8 @@ def run_benchmark(
     images, resolution : as for `find_scenes`.
     photos : training views of each scene, at equal steps; None for all. The files are called NAME-PHOTOS then.
     lpips : whether to measure LPIPS too, which needs the extra of that name.
+    cluster : address of workers (`cluster.address`), which must see `folder` and `output`; None for runs in this
+        process.
     progress : as of `train`. on_run : called with (run, None) before each run and (run, record) after it.
 
     Returns
@@ -70,6 +75,8 @@ def run_benchmark(
     InputError : an unknown set, no scene of it, missing photos, options that do not fit, or LPIPS is not installed.
     OutputError : `output` cannot be written, holds files of others, or another benchmark writes there.
     DeviceError : no device, or not enough memory.
+    ClusterError : with `cluster`: no scheduler answers, or it is gone.
+    ClsplatError : with `cluster`: of a run that no worker can do, once all others are finished.
     KeyboardInterrupt : Ctrl-C. The tables of the finished runs are written, and the same call continues.
     A run whose training fails raises nothing: its record has the message ("failed").
     """
@@ -78,43 +85,62 @@ def run_benchmark(
     options = {"iterations": chosen.iterations, "background": chosen.background, **(common or {})}
     place = Path(f"benchmark-{chosen.name}" if output is None else output)
     scenes = find_scenes(chosen, folder, images, resolution)
-    planned = [(scene, _runs(scene, methods, caps, seeds, options)) for scene in scenes]
-    metric = Lpips(unit_range=True) if lpips else None  # 3DGS's script passes images in 0..1
+    planned_runs = [(scene, _runs(scene, methods, caps, seeds, options)) for scene in scenes]
+    metric = metric_of(lpips)
     refuse_foreign(
         place, files_of_results(chosen.name)
     )  # models may be there already: a run that stopped has no line yet
     runs = RunFile(place)
     with folder_lock(place):
         try:
-            for scene, configs in planned:
-                loaded: Scene | None = None
-                for number, (method, config) in enumerate(configs, 1):
-                    label = method.label
-                    done = runs.find(_identity(chosen, scene), label, config)
-                    if done is not None and (metric is None or done["failed"] or done.get("lpips") is not None):
-                        continue
-                    run = Run(scene.scene.name, label, config, number, len(configs))
-                    if on_run is not None:
-                        on_run(run, None)
-                    loaded = loaded or scene.load(config.background)
-                    record: Record = {
-                        "scene": _identity(chosen, scene),
-                        "system": label,
-                        "config": config.to_json(),
-                        "repeat": 0,
-                        "differences": [*scene.differences, *_differences(chosen, scene, method, config)],
-                    }
-                    model = place / MODELS / f"{scene.scene.name}-{run.stem}-{_key_digest(record)}"
-                    started = loaded
-                    if chosen.start is not None and method.base in PRESETS:
-                        started = with_start(loaded, chosen.start, config.seed)
-                    record |= train_and_measure_in(model, started, config, open_device(config.device), metric, progress)
-                    runs.add(record)
-                    if on_run is not None:
-                        on_run(run, record)
+            plan = [
+                planned
+                for scene, configs in planned_runs
+                for planned in _missing(chosen, scene, configs, runs, place, metric, progress)
+            ]
+            do_runs(plan, runs, place / MODELS, cluster, on_run)
         finally:
             write_results(place, chosen, runs.records)
     return [record for record in runs.records if record["scene"].get("set") == chosen.name]
+
+
+def _missing(
+    chosen: BenchmarkSet,
+    scene: BenchmarkScene,
+    configs: Sequence[tuple[Method, TrainConfig]],
+    runs: RunFile,
+    place: Path,
+    metric: Lpips | None,
+    progress: Callable[[Progress], None] | None,
+) -> Iterator[PlannedRun]:
+    """Yield the runs on a scene that are not finished. configs : of all runs. place : folder of the benchmark."""
+    for number, (method, config) in enumerate(configs, 1):
+        label = method.label
+        done = runs.find(_identity(chosen, scene), label, config)
+        if done is not None and (metric is None or done["failed"] or done.get("lpips") is not None):
+            continue
+        run = Run(scene.scene.name, label, config, number, len(configs))
+        record: Record = {
+            "scene": _identity(chosen, scene),
+            "system": label,
+            "config": config.to_json(),
+            "repeat": 0,
+            "differences": [*scene.differences, *_differences(chosen, scene, method, config)],
+        }
+        model = place / MODELS / f"{scene.scene.name}-{run.stem}-{key_digest(record)}"
+        start = chosen.start if method.base in PRESETS else None
+        job = BenchmarkJob(scene, config, real_path(model), start, metric is not None)
+        yield PlannedRun(
+            run,
+            record,
+            partial(_alone, job, model, metric, progress),
+            partial(Job, f"{run.scene} {run.stem}", do_benchmark_run, (job,)),
+        )
+
+
+def _alone(job: BenchmarkJob, model: Path, metric: Lpips | None, progress: Callable[[Progress], None] | None) -> Record:
+    """Do a run in this process. model : its folder as messages name it."""
+    return train_and_measure_in(model, job.load(), job.config, open_device(job.config.device), metric, progress)
 
 
 def _runs(
@@ -153,8 +179,3 @@ def _differences(chosen: BenchmarkSet, scene: BenchmarkScene, method: Method, co
     if chosen.counted and config.cap_max < scene.scene.splats:
         found.append(f"at most {config.cap_max} splats, not {scene.scene.splats}")
     return found
-
-
-def _key_digest(record: Mapping[str, Any]) -> str:
-    """Return eight digits that differ between runs with different options, so that no run replaces another."""
-    return hashlib.sha256(run_key(record).encode()).hexdigest()[:8]

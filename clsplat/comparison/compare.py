@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from ..device.device import Device, open_device
+from ..cluster.job import Job
+from ..device.device import open_device
 from ..errors import InputError
 from ..files.atomic import atomic_writer
 from ..files.json_file import write_json
 from ..files.lock import folder_lock
+from ..files.real_path import real_path
 from ..scenes.scene import Scene
+from ..scenes.source import SceneSource
+from ..training.config import TrainConfig
 from ..training.decisions import decide
 from ..training.log import Progress
+from .jobs import UNFINISHED, RunJob, do_run
 from .measure import train_and_measure, warm_up
 from .methods import Method
-from .runs import Run, RunFile, refuse_foreign, scene_identity
+from .planned import PlannedRun, do_runs
+from .runs import Run, RunFile, key_digest, refuse_foreign, scene_identity
 from .table import Record, markdown, notes, summarise
 
 TABLE, RESULTS, MODELS = "table.md", "results.json", "models"
@@ -35,6 +42,7 @@ def compare(
     curve: int = 0,
     repeat: int = 1,
     extra: Mapping[str, Any] | None = None,
+    cluster: str | None = None,
     progress: Callable[[Progress], None] | None = None,
     on_run: Callable[[Run, Record | None], None] | None = None,
 ) -> list[Record]:
@@ -52,6 +60,8 @@ def compare(
     curve : number of measurements of the test views along each run; a run without a curve is repeated.
     repeat : how often to train the first seed: on one device the splats have the same bits each time.
     extra : more keys of each record.
+    cluster : address of workers (`cluster.address`); None for runs in this process, one after the other. Runs that are
+        cut short go on from their checkpoints in `output`/unfinished, if all workers see that folder.
     progress : as of `train`. on_run : called with (run, None) before each run and (run, record) after it.
 
     Returns
@@ -63,6 +73,8 @@ def compare(
     InputError : a scene has no test views, or options do not fit a method.
     OutputError : `output` cannot be written, holds files that no comparison wrote, or another comparison writes there.
     DeviceError : no device, or not enough memory.
+    ClusterError : with `cluster`: no scheduler answers, or it is gone.
+    ClsplatError : with `cluster`: of a run that no worker can do, once all others are finished.
     A run whose training fails raises nothing: its record has the message ("failed").
     """
     folder = Path(output)
@@ -77,41 +89,69 @@ def compare(
     ]
     refuse_foreign(folder, (TABLE, RESULTS, MODELS))
     runs = RunFile(folder)
-    device: Device | None = None
-    warm: set[str] = set()
     with folder_lock(folder):
         try:
-            for scene in scenes:
-                if not scene.test:
-                    raise InputError(f"{scene.path}: no test views to measure on: load it with eval")
-                identity = scene_identity(scene)
-                for number, (label, undecided, again) in enumerate(configs, 1):
-                    config = decide(scene, undecided).config
-                    done = runs.find(identity, label, config, again)
-                    if done is not None and (not curve or done.get("curve") is not None):
-                        continue
-                    run = Run(scene.name, label, config, number, len(configs), again)
-                    if on_run is not None:
-                        on_run(run, None)
-                    device = device or open_device(config.device)
-                    if label not in warm:
-                        warm_up(scene, config, device)
-                        warm.add(label)
-                    ply = folder / MODELS / f"{scene.name}-{run.stem}.ply" if save_models else None
-                    record = {
-                        "scene": identity,
-                        "system": label,
-                        "config": config.to_json(),
-                        "repeat": again,
-                        **train_and_measure(scene, config, device, progress, ply, curve),
-                        **(extra or {}),
-                    }
-                    runs.add(record)
-                    if on_run is not None:
-                        on_run(run, record)
+            plan = _missing(scenes, configs, runs, folder, save_models, curve, progress)
+            do_runs(plan, runs, folder / UNFINISHED, cluster, on_run, extra)
         finally:
             write_table(folder, runs.records)
     return runs.records
+
+
+def _missing(
+    scenes: Iterable[Scene],
+    configs: Sequence[tuple[str, TrainConfig, int]],
+    runs: RunFile,
+    folder: Path,
+    save_models: bool,
+    curve: int,
+    progress: Callable[[Progress], None] | None,
+) -> Iterator[PlannedRun]:
+    """Yield the runs that are not finished, in their order. configs : label, undecided options and number of repeat."""
+    warm: set[str] = set()
+    for scene in scenes:
+        if not scene.test:
+            raise InputError(f"{scene.path}: no test views to measure on: load it with eval")
+        identity = scene_identity(scene)
+        source = cache(partial(SceneSource.of, scene))
+        for number, (label, undecided, again) in enumerate(configs, 1):
+            config = decide(scene, undecided).config
+            done = runs.find(identity, label, config, again)
+            if done is not None and (not curve or done.get("curve") is not None):
+                continue
+            run = Run(scene.name, label, config, number, len(configs), again)
+            record: Record = {"scene": identity, "system": label, "config": config.to_json(), "repeat": again}
+            ply = folder / MODELS / f"{scene.name}-{run.stem}.ply" if save_models else None
+            scratch = real_path(folder) / UNFINISHED / f"{scene.name}-{run.stem}-{key_digest(record)}"
+            yield PlannedRun(
+                run,
+                record,
+                partial(_alone, scene, run, warm, progress, ply, curve),
+                partial(_job, source, run, scratch, ply, curve),
+                scratch,
+            )
+
+
+def _alone(
+    scene: Scene,
+    run: Run,
+    warm: set[str],
+    progress: Callable[[Progress], None] | None,
+    ply: Path | None,
+    curve: int,
+) -> Record:
+    """Do a run in this process. warm : systems whose kernels are compiled; the run's is added."""
+    device = open_device(run.config.device)
+    if run.system not in warm:
+        warm_up(scene, run.config, device)
+        warm.add(run.system)
+    return train_and_measure(scene, run.config, device, progress, ply, curve)
+
+
+def _job(source: Callable[[], SceneSource], run: Run, folder: Path, ply: Path | None, curve: int) -> Job:
+    """Return the job that has a worker do a run."""
+    work = RunJob(source(), run.config, folder, None if ply is None else real_path(ply), curve)
+    return Job(f"{run.scene} {run.stem}", do_run, (work,))
 
 
 def _with_lengths(common: Mapping[str, Any] | None, lengths: Sequence[int]) -> list[dict[str, Any]]:

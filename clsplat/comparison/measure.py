@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import statistics
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,16 +17,20 @@ from numpy.typing import NDArray
 
 from .._version import __version__
 from ..device.device import Device
-from ..errors import TrainingError
+from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.metrics import DEFAULT_PROTOCOL
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene, View
 from ..splats.color import Color
 from ..splats.splats import Splats
+from ..training.checkpoint import Checkpoint
 from ..training.config import TrainConfig
+from ..training.folder import ModelFolder
 from ..training.log import Progress
-from ..training.trainer import Trainer
+from ..training.model import Model
+from ..training.run import train
+from ..training.trainer import Trainer, Visit
 from .table import MEASURED, Record
 
 WARM_UP = 3  # iterations
@@ -65,19 +71,7 @@ def train_and_measure(
         model = trainer.run()
     except TrainingError as error:
         return record | {"failed": str(error)}
-    cpu_seconds = time.process_time() - started
-    with tempfile.TemporaryDirectory() as folder:
-        file = ply or Path(folder) / "splats.ply"
-        model.splats.save(file)
-        measured = measure_model(
-            trainer.renderer, model.splats, file, scene, config, model.evaluations.get(config.iterations)
-        )
-    record |= measured | {
-        "seconds": model.seconds,
-        "cpu_seconds": cpu_seconds,
-        "device_bytes": model.device_bytes,
-        "peak_bytes": model.peak_bytes,
-    }
+    record |= {"cpu_seconds": time.process_time() - started}
     if curve:
         record["curve"] = [
             {
@@ -88,7 +82,118 @@ def train_and_measure(
             }
             for iteration in along
         ]
-    return record
+    return record | _measured(trainer.renderer, model, scene, config, ply)
+
+
+def train_and_measure_resumable(
+    folder: Path,
+    scene: Scene,
+    config: TrainConfig,
+    device: Device,
+    progress: Callable[[Progress], None] | None = None,
+    ply: Path | None = None,
+    curve: int = 0,
+    visit: Visit | None = None,
+) -> Record:
+    """Do as `train_and_measure` in a model folder, so that an interrupted run goes on from its checkpoint there.
+
+    Parameters
+    ----------
+    config : complete options (`decide`). visit : as of `train`.
+
+    Raises
+    ------
+    KeyboardInterrupt : the run was stopped; its checkpoint is saved. Others: as `train_in`.
+    """
+    started = time.process_time()
+    along = curve_iterations(config.iterations, curve)
+    try:
+        model, schedule = train_in(folder, scene, config.replace(test_iterations=along), device, progress, visit)
+    except FailedRun as failed:
+        return empty_record(device, failed.schedule) | {"curve": [] if curve else None, "failed": str(failed)}
+    record = empty_record(device, schedule) | {"cpu_seconds": time.process_time() - started}
+    if curve:
+        record["curve"] = curve_of_log(ModelFolder(folder).log_path)
+    return record | _measured(Renderer(device), model, scene, config, ply)
+
+
+class FailedRun(Exception):
+    """The training of a run failed. Its schedule is empty if it failed before the first iteration."""
+
+    def __init__(self, error: TrainingError, schedule: str) -> None:
+        super().__init__(str(error))
+        self.schedule = schedule
+
+
+def train_in(
+    folder: Path,
+    scene: Scene,
+    config: TrainConfig,
+    device: Device,
+    progress: Callable[[Progress], None] | None = None,
+    visit: Visit | None = None,
+) -> tuple[Model, str]:
+    """Train in a model folder, or go on with the run there, and return the model and its schedule.
+
+    Raises
+    ------
+    FailedRun : the training failed. KeyboardInterrupt : the run was stopped; its checkpoint is saved.
+    Other exceptions are those of `train`.
+    """
+    model_folder = ModelFolder(folder)
+    resume = model_folder.checkpoint_path.is_file()
+    if not resume:
+        warm_up(scene, config, device)
+    schedules: list[str] = []
+
+    def remember(trainer: Trainer, stop: threading.Event) -> None:
+        if not schedules:
+            schedules.append(str(trainer.kernels.schedule))
+        if visit is not None:
+            visit(trainer, stop)
+
+    try:
+        # A folder without a checkpoint holds a run that was killed before it saved anything.
+        model = train(scene, config, progress, output=folder, resume=resume, overwrite=not resume, visit=remember)
+    except InputError as error:
+        if not resume:
+            raise
+        reason = "its checkpoint or its scene has changed"
+        raise InputError(f"{folder}: the run cannot be resumed ({reason}): delete this folder to repeat it") from error
+    except TrainingError as error:
+        raise FailedRun(error, schedules[0] if schedules else "") from error
+    if not model.finished:
+        raise KeyboardInterrupt
+    # A run that was finished already has visited no iteration.
+    return model, schedules[0] if schedules else str(Checkpoint.load(model_folder.checkpoint_path).schedule)
+
+
+def curve_of_log(path: Path) -> list[dict[str, Any]]:
+    """Return the measurements of the test views in a run's log, in the form of a record's "curve"."""
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return [
+        {
+            "iteration": line["iteration"],
+            "seconds": line["seconds"],
+            "psnr": line["test_psnr"],
+            "ssim": line["test_ssim"],
+        }
+        for line in lines
+        if "test_psnr" in line
+    ]
+
+
+def _measured(renderer: Renderer, model: Model, scene: Scene, config: TrainConfig, ply: Path | None) -> Record:
+    """Return what a record holds of a finished run, except its curve and its time on the processor."""
+    with tempfile.TemporaryDirectory() as place:
+        file = ply or Path(place) / "splats.ply"
+        model.splats.save(file)
+        measured = measure_model(renderer, model.splats, file, scene, config, model.evaluations.get(config.iterations))
+    return measured | {
+        "seconds": model.seconds,
+        "device_bytes": model.device_bytes,
+        "peak_bytes": model.peak_bytes,
+    }
 
 
 def empty_record(device: Device, schedule: object) -> Record:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -88,9 +89,7 @@ class RunFile:
         for place, other in enumerate(self.records):
             if run_key(other) == run_key(record):
                 self.records[place] = record
-                with atomic_writer(self.path) as whole:
-                    whole.write("".join(json.dumps(line) + "\n" for line in self.records).encode())
-                self._separator = ""
+                self._write()
                 return
         try:
             with self.path.open("a", encoding="utf-8") as stream:
@@ -99,6 +98,19 @@ class RunFile:
             raise OutputError(f"{self.path}: cannot be written ({error.strerror or error}): free some space") from None
         self._separator = ""
         self.records.append(record)
+
+    def arrange(self, order: Sequence[Mapping[str, Any]]) -> None:
+        """Put the lines of some runs into an order, behind all others. order : the start of their records."""
+        places = {run_key(record): place for place, record in enumerate(order)}
+        arranged = sorted(self.records, key=lambda record: places.get(run_key(record), -1))
+        if arranged != self.records:
+            self.records = arranged
+            self._write()
+
+    def _write(self) -> None:
+        with atomic_writer(self.path) as whole:
+            whole.write("".join(json.dumps(line) + "\n" for line in self.records).encode())
+        self._separator = ""
 
 
 def refuse_foreign(folder: Path, names: Sequence[str]) -> None:
@@ -156,6 +168,11 @@ def run_key(record: Mapping[str, Any]) -> str:
     """Return what identifies a run: scene, system, the options that change the result, and the number of the repeat."""
     options = {key: value for key, value in record["config"].items() if key not in FREE_OPTIONS}
     return json.dumps([record["scene"], record["system"], options, record.get("repeat", 0)], sort_keys=True)
+
+
+def key_digest(record: Mapping[str, Any]) -> str:
+    """Return eight digits that differ between runs with different options, so that no run replaces another."""
+    return hashlib.sha256(run_key(record).encode()).hexdigest()[:8]
 
 
 def scene_identity(scene: Scene) -> dict[str, Any]:

@@ -87,6 +87,7 @@ def sweep(
     repeat: int = 1,
     more: Sequence[Record] = (),
     extra: Mapping[str, Any] | None = None,
+    cluster: str | None = None,
     progress: Callable[[Progress], None] | None = None,
     on_run: Callable[[Run, Record | None], None] | None = None,
 ) -> list[Record]:
@@ -94,7 +95,8 @@ def sweep(
 
     Parameters
     ----------
-    scenes, methods, output, caps, seeds, common, lengths, curve, repeat, extra, progress, on_run : as of `compare`.
+    scenes, methods, output, caps, seeds, common, lengths, curve, repeat, extra, cluster, progress, on_run : as of
+        `compare`.
     more : records of other comparisons, which are drawn too; see `read_runs`.
 
     Returns
@@ -121,6 +123,7 @@ def sweep(
             curve=curve,
             repeat=repeat,
             extra=extra,
+            cluster=cluster,
             progress=progress,
             on_run=on_run,
         )

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from set_folders import as_blender, as_colmap
 
-from clsplat.benchmark import measure
 from clsplat.benchmark.results import result_notes, result_rows, result_tables
 from clsplat.benchmark.run import run_benchmark
 from clsplat.benchmark.sets import StartCube, benchmark_set
 from clsplat.benchmark.start import with_start
+from clsplat.comparison import measure
 from clsplat.comparison.runs import Run
 from clsplat.comparison.table import Record
 from clsplat.errors import InputError, OutputError, TrainingError
@@ -169,6 +169,16 @@ def test_an_interrupted_run_is_resumed(tanks: Path, tmp_path: Path, monkeypatch:
     forget()
 
 
+def test_workers_write_the_files_of_a_benchmark_without_them(tanks: Path, finished: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    run_benchmark("tanks", tanks, "gaussian,default", tmp_path, caps=[CAP], common=SHORT, cluster="local:1")
+    kept = ("scene", "system", "config", "digest", "psnr", "ssim", "splats", "differences", "protocol")
+    for row, other in zip(done(tmp_path), done(finished), strict=True):
+        assert {key: row[key] for key in kept} == {key: other[key] for key in kept}
+    files = {path.relative_to(finished) for path in finished.rglob("*")}
+    assert {path.relative_to(tmp_path) for path in tmp_path.rglob("*")} == files
+
+
 def test_other_options_are_another_run(tanks: Path, tmp_path: Path) -> None:
     arguments: tuple[Any, ...] = ("tanks", tanks / "truck", "gaussian", tmp_path)
     run_benchmark(*arguments, caps=[CAP], common=SHORT)
@@ -299,7 +309,7 @@ def test_lpips_is_measured_later_without_training(tanks: Path, tmp_path: Path, m
     arguments: tuple[Any, ...] = ("tanks", tanks / "truck", "gaussian", tmp_path)
     (first,) = run_benchmark(*arguments, caps=[CAP], common=SHORT)
     assert first["lpips"] is None
-    monkeypatch.setattr("clsplat.benchmark.run.Lpips", Fake)
+    monkeypatch.setattr("clsplat.benchmark.job.Lpips", Fake)
     (second,) = run_benchmark(*arguments, caps=[CAP], common=SHORT, lpips=True)
     assert (second["lpips"], second["digest"], second["seconds"]) == (0.25, first["digest"], first["seconds"])
     assert result_tables(TANKS, [second])[0].rows[0][3] == "0.2500"

@@ -45,6 +45,10 @@ NOT_RUN = (
     (r"python docs/api\.py", "test_reference.py runs it"),
     (r"python docs/draw_imports\.py", "test_the_drawing_is_up_to_date makes the drawing"),
     (r"(\.venv/bin/)?clsplat devices", "measures schedules; test_device.py and test_cli.py run it"),
+    (
+        r"dask scheduler|sbatch|srun|clsplat worker|.*--cluster",
+        "needs a scheduler; tests/cluster runs them",
+    ),
     (r"clsplat reconstruct VIDEO", "no video is here; tests/scenes/test_video_frames.py makes one"),
     (r"clsplat view |clsplat train .*--view", "serves until it is stopped; tests/cli/test_view.py runs it"),
 )

@@ -19,6 +19,7 @@ OTHER_EXTRAS = (
     "bpy",
     "pxr",
     "pillow_heif",
+    "distributed",
 )
 COLLECT = """
 import importlib.util

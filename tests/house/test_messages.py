@@ -49,6 +49,7 @@ NAMED_IN = {
 # Files of the command line that several commands share. The others belong to the commands that they define.
 SHARED = {
     "options.py": ("train", "compare", "frontier", "benchmark", "render", "eval", "view"),
+    "comparison_options.py": ("compare", "frontier", "benchmark"),
     "path_options.py": ("render",),
     "models.py": ("render", "view"),
     "budget.py": ("train",),

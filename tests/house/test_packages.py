@@ -29,6 +29,7 @@ PACKAGES = (
     "rendering",
     "evaluation",
     "training",
+    "cluster",
     "compression",
     "cleaning",
     "models",
@@ -62,6 +63,8 @@ OWNERS = {
     "torch": {"evaluation.perceptual"},
     "flip_evaluator": {"evaluation.perceptual"},
     "zstandard": {"files.zstd"},
+    "distributed": {"cluster.dask"},
+    "dask": {"cluster.dask"},
     "click": set(),  # only the command line imports it
 }
 

@@ -73,7 +73,7 @@ def foreign_flags(message: str, command: str) -> list[str]:
 
     What is quoted may come from the user. "(see: ...)" is click's.
     """
-    text = re.sub(r"'[^']*'|`pip [^`]*`|\(see: .*?\)|clsplat devices", "", message)
+    text = re.sub(r"'[^']*'|`(?:pip|dask) [^`]*`|\(see: .*?\)|clsplat devices", "", message)
     foreign = []
     for part in re.split(r"(?=clsplat [a-z-]+ )", text):
         named = re.match(r"clsplat ([a-z-]+) ", part)

@@ -42,6 +42,7 @@ BASES: dict[str, tuple[str, ...]] = {
     "demo": ("{out}", "--iterations", "1", "--cap-max", "9", "--width", "32", "--views", "4", "-q"),
     "reconstruct": ("{scene}/images", "-o", "{out}"),
     "train": ("{scene}", "-m", "{out}", "--iterations", "2", "--cap-max", "9", "--sh-degree", "0"),
+    "worker": ("127.0.0.1:9", "--device", "cpu"),
     "view": ("{model}", "--port", "0"),
     "render": ("{model}", "-o", "{out}", "--path", "orbit", "--frames", "2", "--size", "16x16"),
     "eval": ("{model}", "--save-renders", "{out}"),

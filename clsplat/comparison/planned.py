@@ -1,0 +1,97 @@
+"""Runs that are not finished yet: done in this process one after the other, or by workers."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .. import activity
+from ..cluster.job import Job
+from ..cluster.pool import WorkerPool
+from ..errors import ClsplatError
+from .jobs import marked, unmark
+from .runs import Run, RunFile
+from .table import Record
+
+OnRun = Callable[[Run, Record | None], None]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedRun:
+    """One run.
+
+    Attributes
+    ----------
+    run : for displays. record : the start of its line in runs.jsonl.
+    alone : does the run in this process, and returns the rest of its line.
+    job : returns the job that has a worker do the same.
+    scratch : folder of a worker's run that is not kept; None if its folder is kept.
+    """
+
+    run: Run
+    record: Record
+    alone: Callable[[], Record]
+    job: Callable[[], Job]
+    scratch: Path | None = None
+
+
+def do_runs(
+    plan: Iterable[PlannedRun],
+    runs: RunFile,
+    place: Path,
+    cluster: str | None,
+    on_run: OnRun | None,
+    extra: Mapping[str, Any] | None = None,
+) -> None:
+    """Do runs and write their lines, each as soon as it is finished.
+
+    Parameters
+    ----------
+    place : folder of the runs of workers.
+    cluster : address of workers (`cluster.address`); None for this process, one run after the other.
+    on_run : called with (run, None) before each run and (run, record) after it. extra : more keys of each record.
+
+    Raises
+    ------
+    ClsplatError : with `cluster`: of the first run that no worker can do, once all others are finished.
+    ClusterError : as `WorkerPool`. Others are those of the runs.
+    """
+
+    def tell(planned: PlannedRun, record: Record | None = None) -> None:
+        if on_run is not None:
+            on_run(planned.run, record)
+
+    def add(planned: PlannedRun, measured: Record) -> None:
+        record = planned.record | measured | dict(extra or {})
+        runs.add(record)
+        tell(planned, record)
+
+    if cluster is None:
+        for planned in plan:
+            tell(planned)
+            add(planned, planned.alone())
+        return
+    plan = list(plan)
+    if not plan:
+        return
+    failed: ClsplatError | None = None
+    place = marked(place)
+    try:
+        with WorkerPool(cluster, plan[0].run.config.device) as pool:
+            if pool.dashboard is not None:
+                activity.report(f"Dask's page about these runs: {pool.dashboard}")
+            for number, result in pool.results([planned.job() for planned in plan], lambda at: tell(plan[at])):
+                if isinstance(result, ClsplatError):
+                    failed = failed or result
+                    continue
+                add(plan[number], result)
+                if (scratch := plan[number].scratch) is not None:
+                    shutil.rmtree(scratch, ignore_errors=True)
+        if failed is not None:
+            raise failed
+    finally:
+        unmark(place)
+        runs.arrange([planned.record for planned in plan])  # workers end in any order
