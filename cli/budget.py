@@ -72,6 +72,7 @@ def run_search(
     resume: bool,
     overwrite: bool,
     quiet: bool,
+    cluster: str | None = None,
 ) -> None:
     """Run the search with a live display, and print its result."""
     from clsplat.comparison.search_chart import draw_search
@@ -81,7 +82,14 @@ def run_search(
     try:
         with TrainingDisplay(quiet) as display:
             result = train_budget(
-                scene, config, options, display, output=model_path, resume=resume, overwrite=overwrite
+                scene,
+                config,
+                options,
+                display,
+                output=model_path,
+                resume=resume,
+                overwrite=overwrite,
+                cluster=cluster,
             )
     except KeyboardInterrupt:
         _report_interruption(ctx, model_path)

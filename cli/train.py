@@ -24,6 +24,7 @@ from clsplat.training.stored_run import load_recorded_scene, read_options_file
 from clsplat.viewer.options import ServerOptions
 
 from .budget import budget_options, run_search, search_options
+from .comparison_options import check_device, cluster_option
 from .options import (
     PATH,
     TrainingCommand,
@@ -74,7 +75,7 @@ SECTIONS = {
         "test_list",
         "allow_changed_photos",
     ),
-    "Search for a small model": ("budget_tolerance", "target_psnr", "max_bytes"),
+    "Search for a small model": ("budget_tolerance", "target_psnr", "max_bytes", "cluster"),
     "Viewer": ("port", "host", "names", "token", "stay"),
     "Published systems and files of options": ("preset", "config_file"),
 }
@@ -147,6 +148,7 @@ def _qualities() -> str:
     help="Keep the page of --view open after training, until Ctrl-C.  [default: at a terminal without --quiet]",
 )
 @budget_options
+@cluster_option
 @config_options()
 @click.pass_context
 def train(
@@ -168,6 +170,7 @@ def train(
     names: tuple[str, ...],
     token: bool,
     stay: bool | None,
+    cluster: str | None,
     **values: Any,
 ) -> None:
     """Learn a splat model of SCENE.
@@ -200,6 +203,7 @@ def train(
     if path is None and not (resume and model_path):
         raise click.UsageError("give the scene's folder")
     search = search_options(values)
+    check_device(values.get("device"), cluster)
     if view and search is not None:
         raise click.UsageError("--view shows one run: remove --budget, or show the result with clsplat view")
     flags = config_values(ctx, values)
@@ -228,10 +232,12 @@ def train(
         loaded = load_recorded_scene(path, reading, config.background)
     warn_without_effect([decide(loaded, config).config], flags)
     check_photos(loaded, photos, model_path, allow=allow_changed_photos, all_views=True)
+    if cluster is not None and search is None:
+        raise click.UsageError("--cluster is for searches of several runs: give --budget auto too")
     if search is not None:
         if view:
             raise click.UsageError(f"{model_path} is a search of many runs: resume it without --view")
-        run_search(ctx, loaded, config, search, model_path, resume, overwrite, quiet)
+        run_search(ctx, loaded, config, search, model_path, resume, overwrite, quiet, cluster)
         return
     serving = ServerOptions(host, port, names, token)
     with _viewer(loaded, config, model_path, serving, quiet) if view else nullcontext() as live:

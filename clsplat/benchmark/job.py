@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..cluster.job import JobContext
-from ..comparison.jobs import in_folder, progress_of, scene_of
+from ..cluster.training import in_folder, progress_of, scene_of
 from ..comparison.table import Record
 from ..device.device import open_device
 from ..evaluation.perceptual import Lpips

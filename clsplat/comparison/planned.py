@@ -11,8 +11,8 @@ from typing import Any
 from .. import activity
 from ..cluster.job import Job
 from ..cluster.pool import WorkerPool
+from ..cluster.training import marked, unmark
 from ..errors import ClsplatError
-from .jobs import marked, unmark
 from .runs import Run, RunFile
 from .table import Record
 

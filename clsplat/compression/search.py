@@ -24,10 +24,14 @@ from pathlib import Path
 from typing import Any
 
 from ..cameras.cameras_json import named_cameras
-from ..errors import OutputError
+from ..cluster.job import Job
+from ..cluster.pool import WorkerPool
+from ..cluster.training import TrainJob, marked, train_in_place, unmark
+from ..errors import ClsplatError, OutputError
 from ..files.lock import folder_lock
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
+from ..scenes.source import SceneSource
 from ..scenes.split import hold_out
 from ..splats.splats import Splats
 from ..splats.stats import complexity
@@ -78,6 +82,7 @@ def train_budget(
     output: str | Path,
     resume: bool = False,
     overwrite: bool = False,
+    cluster: str | None = None,
 ) -> Budgeted:
     """Learn the smallest model that a scene needs.
 
@@ -86,10 +91,13 @@ def train_budget(
     config : options of a whole run; its `cap_max` is the largest cap that is tried. progress : as of `train`.
     output : model folder. It gets the files of `train`, budget.json, and the small model as its last point cloud.
     resume : continue an interrupted search, with the same options. overwrite : as of `train`.
+    cluster : address of workers (`cluster.address`) that make the trial and the run of all views at the same time. They
+        must see `output`. The rest of the search is done by this process.
 
     Raises
     ------
     InputError : too few training views, other options than before, or a target that no model can meet.
+    ClusterError : as `WorkerPool`.
     OutputError, DeviceError, TrainingError : as `train`. KeyboardInterrupt : Ctrl-C; `resume` goes on from there.
     """
     config, options = config or TrainConfig(), options or BudgetOptions()
@@ -108,7 +116,7 @@ def train_budget(
         if not resume:
             folder.clear()
             state.begin(config, options, scene_record(scene, folder.path))
-        return _Search(scene, config, options, progress, state, folder).run()
+        return _Search(scene, config, options, progress, state, folder, cluster).run()
 
 
 class _Search:
@@ -122,7 +130,9 @@ class _Search:
         progress: ProgressCallback | None,
         state: BudgetState,
         folder: ModelFolder,
+        cluster: str | None = None,
     ) -> None:
+        self.cluster = cluster
         self.scene, self.options, self.report = scene, options, progress
         self.progress: ProgressCallback | None = progress and self._with_step
         self.step = 1
@@ -139,6 +149,8 @@ class _Search:
     def run(self) -> Budgeted:
         """Run the missing stages."""
         values = self.state.values
+        if self.cluster is not None:
+            self.train_on_workers(self.cluster)
         stages = {
             "rounds": self.try_out,
             "chosen": self.remove_splats,
@@ -149,6 +161,26 @@ class _Search:
             if key not in values:
                 stage()
         return self.finish()
+
+    def train_on_workers(self, cluster: str) -> None:
+        """Have workers make the runs of the trial and of all views at the same time, if they are not made yet."""
+        runs = {"rounds": ("trial", self.split, self.trial), "all_views": ("whole", self.scene, self.config)}
+        missing = [run for stage, run in runs.items() if stage not in self.state.values]
+        place = marked(self.state.folder)
+        jobs = [
+            Job(name, train_in_place, (TrainJob(SceneSource.of(scene), config, place / name),))
+            for name, scene, config in missing
+        ]
+        if not jobs:
+            return
+        self.tell(1, f"{' and '.join(job.name for job in jobs)}: on workers")
+        try:
+            with WorkerPool(cluster, self.config.device) as pool:
+                for _, result in pool.results(jobs):
+                    if isinstance(result, ClsplatError):
+                        raise result
+        finally:
+            unmark(place)
 
     def try_out(self) -> None:
         """Make a run of half the length with all splats, without the validation views."""

@@ -13,6 +13,7 @@ from ..files.json_file import read_object, write_json
 from ..files.lock import folder_lock
 from ..splats.splats import Splats
 from ..training.config import FREE_OPTIONS, TrainConfig
+from ..training.extension import holds_run
 from ..training.folder import ModelFolder
 from ..training.stored_run import DAMAGE, StoredRun
 from .rules import BudgetOptions
@@ -82,10 +83,7 @@ class BudgetState:
 
     def can_resume(self, folder: ModelFolder, config: TrainConfig) -> bool:
         """Whether a stage's run has a checkpoint of the same options. If the model's folder was moved, it has not."""
-        if not folder.checkpoint_path.is_file():
-            return False
-        stored = TrainConfig.from_json(folder.read_config()["config"]).to_json()
-        return all(stored[key] == value for key, value in config.to_json().items() if key not in FREE_OPTIONS)
+        return holds_run(folder, config)
 
     def remove(self) -> None:
         """Delete budget.json and the models of the stages."""

@@ -12,12 +12,13 @@ from typing import Any
 
 import pytest
 
+from clsplat.cluster import training as module
 from clsplat.cluster.job import Abandoned, Job, MissingFiles
+from clsplat.cluster.training import MARK, in_folder, marked, scene_of, unmark
 from clsplat.comparison import compare as compare_module
-from clsplat.comparison import jobs as module
 from clsplat.comparison import planned
 from clsplat.comparison.compare import compare
-from clsplat.comparison.jobs import MARK, UNFINISHED, in_folder, marked, scene_of, unmark
+from clsplat.comparison.jobs import UNFINISHED
 from clsplat.comparison.methods import parse_methods
 from clsplat.comparison.runs import Run
 from clsplat.comparison.table import Record

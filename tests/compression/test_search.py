@@ -205,6 +205,28 @@ def test_ctrl_c_in_a_run_keeps_its_iterations(
     assert again.path.read_bytes() == searched.path.read_bytes()
 
 
+def test_workers_find_the_same_model(scene: Scene, searched: clsplat.Budgeted, tmp_path: Path) -> None:
+    """They train the trial and the run of all views. The search itself trains neither of them."""
+    pytest.importorskip("distributed")
+    trained: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        original = search.train
+
+        def noted(*arguments: Any, **named: Any) -> Any:
+            model = original(*arguments, **named)
+            trained.append(f"{Path(named['output']).name} {'resumed' if named['resume'] else 'trained'}")
+            return model
+
+        patch.setattr(search, "train", noted)
+        found = train_budget(scene, CONFIG, BudgetOptions(0.4), output=tmp_path / "out", cluster="local:1")
+    assert trained[0] == "trial resumed"
+    assert "whole resumed" in trained
+    assert found.path.read_bytes() == searched.path.read_bytes()
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        path.name for path in searched.path.parents[2].iterdir()
+    }
+
+
 def test_a_moved_search_goes_on(
     scene: Scene, searched: clsplat.Budgeted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
