@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from clsplat.compression.rules import TOLERANCE, BudgetOptions
-from clsplat.files.stop_signals import exit_code
 from clsplat.training.config import TrainConfig
 
+from .blocks import report_interruption
 from .options import Decibels, F
 from .progress import TrainingDisplay
 
@@ -92,7 +92,7 @@ def run_search(
                 cluster=cluster,
             )
     except KeyboardInterrupt:
-        _report_interruption(ctx, model_path)
+        report_interruption(ctx, model_path)
     charts = draw_search(result.report, model_path)
     if quiet:
         return
@@ -117,8 +117,3 @@ def result_lines(result: Budgeted) -> list[str]:
         f"{final['parameters_in_use']} parameters, {final['bytes'] / 1e6:.2f} MB; {result.seconds:.0f} s in total",
     ]
     return lines + [f"warning: {final['missed']}"] * (final["missed"] is not None)
-
-
-def _report_interruption(ctx: click.Context, model_path: Path) -> NoReturn:
-    click.echo(f"interrupted, finished steps are kept; to continue: clsplat train --resume -m {model_path}", err=True)
-    ctx.exit(exit_code())

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
+from clsplat.blocks.state import is_in_blocks, remove_blocks
 from clsplat.compression.state import is_search, remove_search
 from clsplat.errors import InputError, OutputError
 from clsplat.files.real_path import real_path
@@ -23,6 +24,7 @@ from clsplat.training.quality import NORMAL, QUALITIES, quality
 from clsplat.training.stored_run import load_recorded_scene, read_options_file
 from clsplat.viewer.options import ServerOptions
 
+from .blocks import blocks_options, given_blocks, run_blocks
 from .budget import budget_options, run_search, search_options
 from .comparison_options import check_device, cluster_option
 from .options import (
@@ -75,7 +77,8 @@ SECTIONS = {
         "test_list",
         "allow_changed_photos",
     ),
-    "Search for a small model": ("budget_tolerance", "target_psnr", "max_bytes", "cluster"),
+    "Search for a small model": ("budget_tolerance", "target_psnr", "max_bytes"),
+    "Large scenes, and workers": ("blocks", "polish", "cluster"),
     "Viewer": ("port", "host", "names", "token", "stay"),
     "Published systems and files of options": ("preset", "config_file"),
 }
@@ -100,6 +103,10 @@ def _qualities() -> str:
         (
             "clsplat train SCENE -m MODEL --cap-max 20000 -r 4",
             "A small model from photos at a quarter of their size.",
+        ),
+        (
+            "clsplat train SCENE -m MODEL --blocks 2x2 --cluster local:2",
+            "A large scene in four blocks, two at a time.",
         ),
         ("clsplat train --resume -m MODEL", "Continue a run that was stopped."),
     ),
@@ -148,6 +155,7 @@ def _qualities() -> str:
     help="Keep the page of --view open after training, until Ctrl-C.  [default: at a terminal without --quiet]",
 )
 @budget_options
+@blocks_options
 @cluster_option
 @config_options()
 @click.pass_context
@@ -202,7 +210,9 @@ def train(
     path = scene or source_path
     if path is None and not (resume and model_path):
         raise click.UsageError("give the scene's folder")
-    search = search_options(values)
+    search, blocks = search_options(values), given_blocks(values)
+    if blocks is not None and (view or search is not None):
+        raise click.UsageError("--blocks is for one model of a large scene: remove --view and --budget")
     check_device(values.get("device"), cluster)
     if view and search is not None:
         raise click.UsageError("--view shows one run: remove --budget, or show the result with clsplat view")
@@ -220,8 +230,8 @@ def train(
             raise InputError(f"{model_path}: no search to resume from: start without --resume")
         options, reading = stored.run.options | options, stored.run.scene | reading
         recorded, photos = stored.run.scene_path, stored.run.scene["photos"]
-        path, search = path or recorded, search or stored.search
-    elif (ModelFolder(model_path).is_used or is_search(model_path)) and not overwrite:
+        path, search, blocks = path or recorded, search or stored.search, blocks or stored.blocks
+    elif any((ModelFolder(model_path).is_used, is_search(model_path), is_in_blocks(model_path))) and not overwrite:
         # The function train checks this too, but only after the scene is read.
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
     assert path is not None
@@ -232,8 +242,12 @@ def train(
         loaded = load_recorded_scene(path, reading, config.background)
     warn_without_effect([decide(loaded, config).config], flags)
     check_photos(loaded, photos, model_path, allow=allow_changed_photos, all_views=True)
-    if cluster is not None and search is None:
-        raise click.UsageError("--cluster is for searches of several runs: give --budget auto too")
+    if cluster is not None and search is None and blocks is None:
+        raise click.UsageError("--cluster is for several runs: give --blocks or --budget auto too")
+    if blocks is not None:
+        remove_search(model_path)
+        run_blocks(ctx, loaded, config, blocks, model_path, resume, overwrite, quiet, cluster)
+        return
     if search is not None:
         if view:
             raise click.UsageError(f"{model_path} is a search of many runs: resume it without --view")
@@ -242,6 +256,7 @@ def train(
     serving = ServerOptions(host, port, names, token)
     with _viewer(loaded, config, model_path, serving, quiet) if view else nullcontext() as live:
         remove_search(model_path)
+        remove_blocks(model_path)
         model = run_training(loaded, config, model_path, resume, overwrite, quiet, live)
         if not model.finished:
             report_interruption(ctx, model)

@@ -14,11 +14,13 @@ from ..files.lock import folder_lock
 from ..files.real_path import real_path
 from ..scenes.scene import Scene
 from ..scenes.source import SceneSource
+from ..splats.splats import Splats
 from ..training.config import TrainConfig
 from ..training.extension import holds_run
 from ..training.folder import ModelFolder
 from ..training.log import Progress
 from ..training.run import train
+from ..training.trainer import Visit
 from .job import Abandoned, JobContext, MissingFiles
 
 T = TypeVar("T")
@@ -34,7 +36,7 @@ class TrainJob:
 
     Attributes
     ----------
-    source : of the scene. config : complete options. folder : absolute path of the model, in a marked folder.
+    source : of the scene. config : complete options. folder : of the model; workers need its absolute path.
     """
 
     source: SceneSource
@@ -42,19 +44,59 @@ class TrainJob:
     folder: Path
 
 
-def train_in_place(context: JobContext, job: TrainJob) -> None:
-    """Train a model in its folder, or go on from the checkpoint of another worker there (`Job.function`)."""
-    scene = scene_of(job.source, SceneSource.load)
+def train_in_folder(
+    config: TrainConfig,
+    scene: Scene,
+    folder: Path,
+    context: Splats | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    visit: Visit | None = None,
+) -> dict[str, Any] | None:
+    """Train a model in its folder, or go on from the checkpoint there.
 
-    def run(folder: Path) -> None:
-        resume = holds_run(ModelFolder(folder), job.config)
-        config = job.config.replace(device=context.device)
-        progress, visit = progress_of(context), context.stop_if_unwanted
-        model = train(scene, config, progress, output=folder, resume=resume, overwrite=not resume, visit=visit)
-        if not model.finished:
+    Parameters
+    ----------
+    config : complete options. context, progress, visit : as of `train`.
+
+    Returns
+    -------
+    What the run took: "splats" (without the context), "context" (their number), "seconds", "peak_bytes" of this process
+    and "device_bytes". None if it was stopped; its checkpoint is saved.
+    """
+    resume = holds_run(ModelFolder(folder), config)
+    n_context = 0 if context is None else len(context)
+    model = train(
+        scene,
+        config,
+        progress,
+        output=folder,
+        resume=resume,
+        overwrite=not resume,
+        visit=visit,
+        context=context if n_context else None,
+    )
+    if not model.finished:
+        return None
+    return {
+        "splats": len(model.splats) - n_context,
+        "context": n_context,
+        "seconds": round(model.seconds, 2),
+        "peak_bytes": model.peak_bytes,
+        "device_bytes": model.device_bytes,
+    }
+
+
+def train_in_place(work: JobContext, job: TrainJob) -> dict[str, Any]:
+    """Do `train_in_folder` on a worker (`Job.function`)."""
+    scene, config = scene_of(job.source, SceneSource.load), job.config.replace(device=work.device)
+
+    def run(folder: Path) -> dict[str, Any]:
+        row = train_in_folder(config, scene, folder, None, progress_of(work), work.stop_if_unwanted)
+        if row is None:
             raise Abandoned
+        return row
 
-    in_folder(job.folder, run, keep=True)
+    return in_folder(job.folder, run, keep=True)
 
 
 def progress_of(context: JobContext) -> Callable[[Progress], None]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..blocks.state import BlocksOptions, stored_blocks
 from ..compression.rules import BudgetOptions
 from ..compression.state import stored_search
 from ..training.config import TrainConfig
@@ -15,27 +16,32 @@ from ..training.log import Progress
 from ..training.stored_run import StoredRun, load_recorded_scene, stored_run
 
 if TYPE_CHECKING:
+    from ..blocks.train import BlocksModel
     from ..compression.search import Budgeted
     from ..training.model import Model
 
 
 @dataclass(frozen=True)
 class Unfinished:
-    """A run or a search that can be resumed. `search` is None for a run."""
+    """What can be resumed: a run, a search (`search`), or a training in blocks (`blocks`)."""
 
     run: StoredRun
     search: BudgetOptions | None = None
+    blocks: BlocksOptions | None = None
 
 
 def find_unfinished(path: str | os.PathLike[str]) -> Unfinished:
-    """Return the run or the search that can be resumed in a model folder.
+    """Return what can be resumed in a model folder.
 
     Raises
     ------
-    InputError : there is neither a checkpoint nor an unfinished search, or a file is damaged.
+    InputError : there is neither a checkpoint nor an unfinished search or training in blocks, or a file is damaged.
     """
-    search = stored_search(Path(path))
-    return Unfinished(stored_run(path)) if search is None else Unfinished(*search)
+    if (search := stored_search(Path(path))) is not None:
+        return Unfinished(*search)
+    if (blocks := stored_blocks(Path(path))) is not None:
+        return Unfinished(blocks[0], blocks=blocks[1])
+    return Unfinished(stored_run(path))
 
 
 def resume(
@@ -45,8 +51,8 @@ def resume(
     progress: Callable[[Progress], None] | None = None,
     allow_changed_photos: bool = False,
     **options: Any,
-) -> Model | Budgeted:
-    """Continue the run or the search in a model folder with its options and scene, and return the result.
+) -> Model | Budgeted | BlocksModel:
+    """Continue what is unfinished in a model folder, with its options and scene, and return the result.
 
     Parameters
     ----------
@@ -62,6 +68,7 @@ def resume(
     InputError : there is nothing to resume, an option must not change, or photos have changed.
     Other exceptions : see `train`.
     """
+    from ..blocks.train import train_in_blocks
     from ..compression.search import train_budget
     from ..scenes.changed_photos import check_photos
     from ..training.run import train
@@ -70,6 +77,8 @@ def resume(
     config = TrainConfig(**(stored.run.options | options))
     loaded = load_recorded_scene(scene or stored.run.scene_path, stored.run.scene, config.background)
     check_photos(loaded, stored.run.scene["photos"], Path(path), allow=allow_changed_photos, all_views=True)
+    if stored.blocks is not None:
+        return train_in_blocks(loaded, stored.blocks, config, progress, output=Path(path), resume=True)
     if stored.search is not None:
         return train_budget(loaded, config, stored.search, progress, output=Path(path), resume=True)
     return train(loaded, config, progress, output=Path(path), resume=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -72,8 +72,21 @@ class SceneSource:
                 f"{self.path}: the points are others here than in the program that asks: copy the scene's files again, "
                 "and do not change a scene between reading and training"
             )
+        return self.part_of(loaded)
+
+    def of_views(self, names: Sequence[str]) -> SceneSource:
+        """Return the source of a scene with some of the views, all for training."""
+        digests = {name: self.photo_digests[name] for name in names if name in self.photo_digests}
+        nothing: frozenset[str] = frozenset()
         return replace(
-            loaded,
+            self, names=tuple(sorted(names)), test_names=nothing, validation_names=nothing, photo_digests=digests
+        )
+
+    def part_of(self, scene: Scene) -> Scene:
+        """Return this scene as a part of one from the same files."""
+        views = {view.name: view for view in scene.views}
+        return replace(
+            scene,
             name=self.name,
             views=[views[name] for name in self.names],
             test_names=self.test_names,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,9 +22,40 @@ from .random_points import random_points
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
+    from .config import TrainConfig
 
 RANDOM_POINTS = 100_000  # 3DGS
 MIN_POINTS = 4  # the first scale needs a point and its three neighbours
+
+
+def first_arrays(
+    scene: Scene, config: TrainConfig, near_plane: float, context: Splats | None = None
+) -> tuple[Mapping[str, Array], str]:
+    """Return the public arrays of a run's first splats, with its context behind them, and a message on their source.
+
+    Parameters
+    ----------
+    config : complete options. near_plane : of the kernels. context : splats that do not change (context.py).
+    """
+    splats, message = initial_splats(
+        scene,
+        config.shape,
+        config.cap_max,
+        config.sh_degree,
+        config.start.init,
+        config.seed,
+        normalisation=config.normalisation,
+        antialiased=config.antialiased,
+        near_plane=near_plane,
+        random_share=config.start.random_points,
+        opacity=config.density.init_opacity,
+        scale_factor=config.density.init_scale,
+    )
+    arrays: Mapping[str, Array] = splats.to_numpy()
+    if context is not None:
+        around = context.to_numpy()
+        arrays = {name: np.concatenate([array, around[name]]) for name, array in arrays.items()}
+    return arrays, message
 
 
 def initial_splats(

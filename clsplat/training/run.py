@@ -32,6 +32,7 @@ def train(
     resume: bool = False,
     overwrite: bool = False,
     visit: Visit | None = None,
+    context: Splats | None = None,
 ) -> Model:
     """Train a splat model on a scene's training views and return it.
 
@@ -43,7 +44,7 @@ def train(
     resume : continue from the folder's checkpoint. The config must be the same, except for options without an effect
         on the result, such as `device`, and for more `iterations`.
     overwrite : replace a model in `output`.
-    visit : see `Trainer.run`.
+    visit : see `Trainer.run`. context : see `Trainer`; a resumed run needs the same one.
 
     Returns
     -------
@@ -69,7 +70,7 @@ def train(
     if checkpoint is None:
         config = decide(scene, config).tell(progress)
     with folder_lock(None if folder is None else folder.path):
-        trainer = Trainer(scene, config, checkpoint, progress)
+        trainer = Trainer(scene, config, checkpoint, progress, context=context)
         if folder is not None:
             if checkpoint is None:
                 folder.clear()

@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -30,12 +31,13 @@ from .average import ParameterAverage
 from .checkpoint import Checkpoint
 from .checkpoint_times import CheckpointTimes
 from .config import TrainConfig
+from .context import FrozenSplats, check_context
 from .density.control import DensityControl, ExplorationNoise
 from .dropout import SplatDropout
 from .exposure import ExposureLoss, exposures_json
 from .extension import reached_by
 from .folder import ModelFolder
-from .initialise import initial_splats
+from .initialise import first_arrays
 from .interrupt import stoppable
 from .log import Progress, RunLog
 from .loss import ImageLoss, LossValue
@@ -67,6 +69,7 @@ class Trainer:
     scene : with the option `validate`, some of its training views become validation views.
     checkpoint : state to continue from.
     progress : called with messages and with the progress of the run.
+    context : splats that are shown and do not change (context.py). They are the last ones of the result.
 
     Raises
     ------
@@ -81,7 +84,10 @@ class Trainer:
         checkpoint: Checkpoint | None = None,
         progress: Callable[[Progress], None] | None = None,
         device: Device | None = None,
+        context: Splats | None = None,
     ) -> None:
+        check_context(context, config)
+        self.context = context
         if config.validation.validate and not scene.validation_names:
             scene = with_validation(scene)
         if not scene.train:
@@ -99,10 +105,11 @@ class Trainer:
         self.memory = run_memory(self.device, self.kernels, config, scene.train)
         self.rng = np.random.default_rng(config.seed)
         self.iteration, self.seconds = 0, 0.0
-        first, message = self._first_splats() if checkpoint is None else self._stored_splats(checkpoint)
+        new = partial(first_arrays, scene, config, self.kernels.near_plane, context)
+        first, message = new() if checkpoint is None else self._stored_splats(checkpoint)
         self._send(f"{message}; about {self.memory}")
         self.reached = reached_by(checkpoint, config, scene.train) if checkpoint else None
-        self.n_first = checkpoint.n_first if checkpoint else len(first["mean"])
+        self.n_first = checkpoint.n_first if checkpoint else len(first["mean"]) - (len(context) if context else 0)
         self._create_device_state(first)
         if checkpoint is not None:
             self._load_state(checkpoint)
@@ -120,7 +127,15 @@ class Trainer:
             self.average.load_state(checkpoint.average)
         statistics = self.pipeline.statistics
         self.density = DensityControl(
-            config, self.kernels, self.schedule, self.splats, self.optimizer, statistics, self.rng, scene.extent
+            config,
+            self.kernels,
+            self.schedule,
+            self.splats,
+            self.optimizer,
+            statistics,
+            self.rng,
+            scene.extent,
+            self.frozen,
         )
         self.clock = RunClock(config, self.schedule, self.views, self.pipeline, self.splats, self.iteration)
         self.running = RunningLoss(len(scene.train))
@@ -133,25 +148,6 @@ class Trainer:
         self.evaluations: dict[int, Evaluation] = {}
         self.evaluation_seconds: dict[int, float] = {}
 
-    def _first_splats(self) -> tuple[Mapping[str, Array], str]:
-        """Return the public arrays of the first splats, and a message that names their source."""
-        config = self.config
-        splats, message = initial_splats(
-            self.scene,
-            config.shape,
-            config.cap_max,
-            config.sh_degree,
-            config.start.init,
-            config.seed,
-            normalisation=config.normalisation,
-            antialiased=config.antialiased,
-            near_plane=self.kernels.near_plane,
-            random_share=config.start.random_points,
-            opacity=config.density.init_opacity,
-            scale_factor=config.density.init_scale,
-        )
-        return splats.to_numpy(), message
-
     def _stored_splats(self, checkpoint: Checkpoint) -> tuple[Mapping[str, Array], str]:
         """Return the arrays of the checkpoint. They may hold non-finite values until the next densification."""
         self.iteration, self.seconds = checkpoint.iteration, checkpoint.seconds
@@ -161,11 +157,13 @@ class Trainer:
     def _create_device_state(self, first: Mapping[str, Array]) -> None:
         """Create the pipeline, the splats, the optimizer and the losses."""
         config, kernels, dtype = self.config, self.kernels, self.kernels.dtype
-        capacity = max(config.cap_max, len(first["mean"]))
+        n_frozen = 0 if self.context is None else len(self.context)
+        capacity = max(config.cap_max + n_frozen, len(first["mean"]))
         max_isects = min(isect_limit(self.device, kernels), room_for_isects(self.memory, self.device.info))
         self.pipeline = Pipeline(self.device, kernels, max_isects)
         self.splats = SplatBuffers(self.device, kernels.schema, capacity, dtype)
         self.splats.set(first)
+        self.frozen = FrozenSplats(kernels, self.splats, n_frozen) if n_frozen else None
         self.grads = CompactGradients(self.device, self.splats.schema, capacity, dtype)
         self.optimizer = make_optimizer(self.device, kernels, self.splats, config, self.scene.extent)
         self.loss = ImageLoss(self.pipeline.pool, kernels, config.loss.lambda_dssim, config.loss.smooth_l1)
@@ -303,6 +301,8 @@ class Trainer:
         frame = self.pipeline.forward(self.splats, target.camera, background, degree, self.dropout.of(it))
         self.loss_result = self.exposure.evaluate(target, frame.images.color.buffer, background)
         self.pipeline.backward(frame, self.loss_result.v_color, self.grads)
+        if self.frozen is not None:
+            self.frozen.clear(self.grads)
         mean_lr = self.scene.extent * self.schedule.mean_rate(it)
         self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it, frame.projected.depth_key)
         if self.density.is_due(it):

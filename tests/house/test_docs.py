@@ -103,7 +103,7 @@ def shortened(command: str) -> list[str]:
     if "--resume" in words and "--iterations" in words:  # more than those of the model
         words[words.index("--iterations") + 1] = str(ITERATIONS + 1)
     name = words[0]
-    if name in ("train", "demo", "compare", "frontier", "benchmark") and "--resume" not in words:
+    if name in ("train", "partition", "demo", "compare", "frontier", "benchmark") and "--resume" not in words:
         options = {"--iterations", "--cap-max"} - set(words)
         words += [part for option in sorted(options) for part in (option, FEW[option])]
     if name == "demo":
@@ -117,7 +117,7 @@ def shortened(command: str) -> list[str]:
 
 def stand_ins(folder: Path, words: list[str], capture: Path, model: Path) -> None:
     """Make the scene, photos and models that a command names."""
-    makes = {"train": "-m", "reconstruct": "-o"}.get(words[0]) if "--resume" not in words else None
+    makes = {"train": "-m", "partition": "-m", "reconstruct": "-o"}.get(words[0]) if "--resume" not in words else None
     target = next((after for word, after in pairwise(words) if word == makes), None)
     for name in ("SCENE", "MODEL", "OTHER", "SMALL"):
         if any(name in word.split("/") for word in words) and name != target:

@@ -22,6 +22,8 @@ ALL_WITH_MODELS = ("render", "eval", "view", "prune", "clean")
 # name options as `Remedy`; each command shows its own.
 NAMED_IN = {
     "cameras/make_path.py": ("render",),
+    "blocks/state.py": ("train",),
+    "blocks/train.py": ("train", "partition"),
     "compression/search.py": ("train",),
     "compression/state.py": ("train",),
     "files/existing.py": tuple(name for name in COMMANDS if "--overwrite" in flags_of(name)),
@@ -53,6 +55,7 @@ SHARED = {
     "path_options.py": ("render",),
     "models.py": ("render", "view"),
     "budget.py": ("train",),
+    "blocks.py": ("train", "partition"),
     "main.py": (),
 }
 

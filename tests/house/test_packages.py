@@ -31,6 +31,7 @@ PACKAGES = (
     "training",
     "cluster",
     "compression",
+    "blocks",
     "cleaning",
     "models",
     "comparison",

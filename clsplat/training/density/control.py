@@ -9,6 +9,7 @@ from ...errors import TrainingError
 from ...rendering.build import KernelBuild
 from ...rendering.splat_buffers import SplatBuffers, SplatStatistics
 from ..config import TrainConfig
+from ..context import FrozenSplats, LiveSplats
 from ..methods.sns import learning_groups
 from ..optim.noise import noise_amount, noise_reach
 from ..optim.optimizer import Optimizer
@@ -16,6 +17,7 @@ from ..programs import columns_program, optim_program
 from ..schedules import RunSchedule
 from .on_device import DeviceSplats
 from .strategy import StepInfo, next_edit
+from .table import SplatTable
 
 
 class DensityControl:
@@ -26,6 +28,7 @@ class DensityControl:
     statistics : gradient statistics of the splats since the last densification.
     rng : generator of the run.
     extent : extent of the scene [world units].
+    frozen : the splats that do not change (training/context.py); None without any.
     """
 
     def __init__(
@@ -38,7 +41,9 @@ class DensityControl:
         statistics: SplatStatistics,
         rng: np.random.Generator,
         extent: float,
+        frozen: FrozenSplats | None = None,
     ) -> None:
+        self.frozen = frozen
         self.config, self.schedule, self.splats, self.optimizer = config, schedule, splats, optimizer
         self.statistics, self.rng, self.extent = statistics, rng, extent
         self.kernels = kernels
@@ -63,8 +68,12 @@ class DensityControl:
                 f"iteration {iteration}: no image shows any splat (transparent, or outside of all images): "
                 "check the start (init) and the learning rates"
             )
-        table = DeviceSplats(self.splats, columns_program(self.splats.device, self.kernels))
+        table: SplatTable = DeviceSplats(self.splats, columns_program(self.splats.device, self.kernels))
+        if self.frozen is not None:
+            table, statistics = LiveSplats(table, self.frozen.n_live), statistics[:, : self.frozen.n_live]
         edit = next_edit(self.config, table, statistics, self.rng, info)
+        if self.frozen is not None:
+            edit = self.frozen.with_frozen(edit)
         self.optimizer.apply(self.optimizer.arranged(edit))
         self.statistics.reset()
 

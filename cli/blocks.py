@@ -1,0 +1,123 @@
+"""`clsplat train --blocks` and `clsplat partition`: large scenes in parts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import click
+
+from clsplat.blocks.cells import parse_blocks
+from clsplat.blocks.state import BlocksOptions
+from clsplat.files.stop_signals import exit_code
+from clsplat.training.config import TrainConfig
+
+from .options import F
+from .progress import TrainingDisplay, table
+
+if TYPE_CHECKING:
+    from clsplat.blocks.partition import Partition
+    from clsplat.scenes.scene import Scene
+
+
+def blocks_options(function: F) -> F:
+    """Add `--blocks` and `--polish`."""
+    for option in (
+        click.option(
+            "--polish",
+            type=click.IntRange(min=0),
+            metavar="N",
+            help="Iterations that train all blocks together at the end.  [default: half of --iterations]",
+        ),
+        click.option(
+            "--blocks",
+            metavar="NxM",
+            help="Train a large scene in N x M blocks, one after the other or on workers (--cluster). --cap-max is "
+            "that of the whole model, and --iterations are those of each block.",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def given_blocks(values: dict[str, Any]) -> BlocksOptions | None:
+    """Remove the options of blocks from `values` and return them; None if no blocks were requested."""
+    blocks, polish = values.pop("blocks"), values.pop("polish")
+    if blocks is None:
+        if polish is not None:
+            raise click.UsageError("--polish is for trainings in blocks: give --blocks too")
+        return None
+    return BlocksOptions(*parse_blocks(blocks), polish)
+
+
+def run_blocks(
+    ctx: click.Context,
+    scene: Scene,
+    config: TrainConfig,
+    options: BlocksOptions,
+    model_path: Path,
+    resume: bool,
+    overwrite: bool,
+    quiet: bool,
+    cluster: str | None,
+) -> None:
+    """Train in blocks with a live display, and print the result."""
+    from clsplat.blocks.train import train_in_blocks
+    from clsplat.training.run import evaluate_test_views
+
+    try:
+        with TrainingDisplay(quiet) as display:
+            result = train_in_blocks(
+                scene,
+                options,
+                config,
+                display,
+                output=model_path,
+                resume=resume,
+                overwrite=overwrite,
+                cluster=cluster,
+            )
+    except KeyboardInterrupt:
+        report_interruption(ctx, model_path)
+    if quiet:
+        return
+    head = ("block", "photos", "splats", "kept", "around it", "seconds", "MB of device")
+    rows = [
+        (
+            str(row["number"]),
+            str(row["views"]),
+            str(row["splats"]),
+            str(row["kept"]),
+            str(row["context"]),
+            f"{row['seconds']:.0f}",
+            f"{row['device_bytes'] / 1e6:.0f}",
+        )
+        for row in result.report["blocks"]
+    ]
+    click.echo(table(head, rows))
+    click.echo(f"{result.path}: {len(result.splats)} splats, {result.path.stat().st_size / 1e6:.2f} MB")
+    metrics = evaluate_test_views(result.splats, scene, config)
+    if metrics is not None:
+        click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
+
+
+def report_interruption(ctx: click.Context, model_path: Path) -> NoReturn:
+    """Print how to continue after Ctrl-C or another signal, and exit."""
+    click.echo(f"interrupted, finished steps are kept; to continue: clsplat train --resume -m {model_path}", err=True)
+    ctx.exit(exit_code())
+
+
+def partition_table(partition: Partition) -> str:
+    """Return a line for each block: its splats, points and photos."""
+    head = ("block", "splats", "points", "photos", "most of a photo")
+    rows = [
+        (
+            str(block.number),
+            str(block.splats),
+            str(block.points),
+            str(len(block.views)),
+            f"{max(block.shares, default=0):.0%}",
+        )
+        for block in partition.blocks
+    ]
+    return table(head, rows)

@@ -1,0 +1,69 @@
+"""The run of a block, in this process or on a worker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..cluster.job import Abandoned, JobContext
+from ..cluster.training import in_folder, progress_of, scene_of, train_in_folder
+from ..rendering.renderer import Renderer
+from ..scenes.scene import Scene
+from ..scenes.source import SceneSource
+from ..splats.splats import Splats
+from ..training.config import TrainConfig
+from ..training.log import Progress
+from ..training.trainer import Visit
+from .targets import with_block_targets
+
+START, CONTEXT, RUN = "start.ply", "context.ply", "run"  # in the folder of a block
+
+
+@dataclass(frozen=True, eq=False)
+class BlockJob:
+    """What is needed to train a block.
+
+    Attributes
+    ----------
+    source : of its photos. config : complete options. folder : of the block, with its splats and those around it.
+    uncovered : its part of what no splat covers (targets.py).
+    """
+
+    source: SceneSource
+    config: TrainConfig
+    folder: Path
+    uncovered: float
+
+
+def train_block(
+    job: BlockJob,
+    scene: Scene,
+    folder: Path,
+    device: str | None,
+    progress: Callable[[Progress], None] | None = None,
+    visit: Visit | None = None,
+) -> dict[str, Any] | None:
+    """Train a block and return what that took, as `train_in_folder` does; None if it was stopped.
+
+    Parameters
+    ----------
+    scene : with the photos of the block. folder : of the run. device : as for `open_device`.
+    """
+    inside, context = Splats.load(job.folder / START), Splats.load(job.folder / CONTEXT)
+    prepared = with_block_targets(scene, inside, context, Renderer(device), job.uncovered)
+    return train_in_folder(job.config.replace(device=device), prepared, folder, context, progress, visit)
+
+
+def train_block_on_worker(work: JobContext, job: BlockJob) -> dict[str, Any]:
+    """Do `train_block` on a worker (`Job.function`)."""
+    scene = scene_of(job.source, SceneSource.load)
+
+    def run(folder: Path) -> dict[str, Any]:
+        row = train_block(job, scene, folder, work.device, progress_of(work), work.stop_if_unwanted)
+        if row is None:
+            raise Abandoned
+        return row
+
+    return in_folder(job.folder / RUN, run, keep=True)

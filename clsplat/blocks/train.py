@@ -1,0 +1,331 @@
+"""Training in blocks: a coarse model, a partition, a run for each block, and a last run of all together.
+
+1. Coarse. A run of the whole scene with a quarter of the splats.
+2. Partition. Cells that fill equal parts of the photos, and the photos that show each of them (partition.py).
+3. Blocks. Each block goes on from its splats of the coarse model, with its share of the cap. It learns its own part
+   of the photos (targets.py). The coarse splats around it are shown and do not change. In the end it keeps the
+   splats in its cell, so nothing stands twice.
+4. Polish. A short run of all blocks together, without new splats.
+
+state.py keeps finished stages. An interrupted stage goes on from its checkpoint.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..cameras.cameras_json import named_cameras
+from ..cluster.job import Job
+from ..cluster.pool import WorkerPool
+from ..cluster.training import marked, train_in_folder
+from ..compression.prune_and_refine import Part, fine_tuning
+from ..errors import ClsplatError, InputError, OutputError, Remedy
+from ..files.lock import folder_lock
+from ..files.real_path import real_path
+from ..rendering.renderer import Renderer
+from ..scenes.scene import Scene
+from ..scenes.source import SceneSource
+from ..splats.splats import Splats
+from ..splats.transform import joined
+from ..training.config import TrainConfig
+from ..training.decisions import as_decided, decide
+from ..training.folder import ModelFolder, scene_record
+from ..training.log import Progress
+from ..training.options.density import Adc
+from .job import CONTEXT, RUN, START, BlockJob, train_block, train_block_on_worker
+from .partition import Partition, make_partition, surroundings
+from .picture import write_picture
+from .state import BlocksOptions, BlocksState
+
+STEPS = 4  # coarse, partition, blocks, polish
+COARSE_CAP, POLISH = 0.25, 0.5  # of the cap, and of the iterations of a block
+POLISH_RATES = (1.0, 0.3)  # factors on the last rates of a block in the two halves of the polish
+PICTURE, MERGED = "partition.svg", "merged.ply"
+
+ProgressCallback = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class BlocksModel:
+    """The result of a training in blocks.
+
+    Attributes
+    ----------
+    splats : the model. path : its file. report : content of blocks.json.
+    """
+
+    splats: Splats
+    path: Path
+    report: dict[str, Any]
+
+
+def train_in_blocks(
+    scene: Scene,
+    options: BlocksOptions,
+    config: TrainConfig | None = None,
+    progress: ProgressCallback | None = None,
+    *,
+    output: str | Path,
+    resume: bool = False,
+    overwrite: bool = False,
+    cluster: str | None = None,
+) -> BlocksModel:
+    """Train a model of a large scene in blocks.
+
+    Parameters
+    ----------
+    options : the blocks.
+    config : options; `cap_max` is that of the whole model, and `iterations` those of each block.
+    progress, overwrite : as of `train`. resume : go on with an interrupted training, with the same options.
+    output : model folder. It gets the files of `train`, blocks.json and partition.svg.
+    cluster : address of workers (`cluster.address`) that train the blocks and see `output`; None for this process.
+
+    Raises
+    ------
+    InputError : no training views, other options than before, or options that blocks cannot have.
+    OutputError, DeviceError, TrainingError : as `train`. ClusterError : as `WorkerPool`.
+    KeyboardInterrupt : Ctrl-C; `resume` goes on from there.
+    """
+    state, stages = _begin(scene, options, config, progress, output, resume, overwrite)
+    with folder_lock(state.path.parent):
+        return stages(cluster).run()
+
+
+def partition_scene(
+    scene: Scene,
+    options: BlocksOptions,
+    config: TrainConfig | None = None,
+    progress: ProgressCallback | None = None,
+    *,
+    output: str | Path,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> Partition:
+    """Do the first two stages of `train_in_blocks`, which goes on from there with `resume`."""
+    state, stages = _begin(scene, options, config, progress, output, resume, overwrite)
+    with folder_lock(state.path.parent):
+        return stages(None).divided()
+
+
+def _begin(
+    scene: Scene,
+    options: BlocksOptions,
+    config: TrainConfig | None,
+    progress: ProgressCallback | None,
+    output: str | Path,
+    resume: bool,
+    overwrite: bool,
+) -> tuple[BlocksState, Callable[[str | None], _Stages]]:
+    """Return the state of a training, new or resumed, and a function that makes its stages."""
+    config = config or TrainConfig()
+    folder, state = ModelFolder(output), BlocksState(Path(output))
+    check_options(config)
+    if resume:
+        state.load()
+        config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
+        state.check(config, options)
+    elif (folder.is_used or state.path.exists()) and not overwrite:
+        raise OutputError(
+            f"{folder.path}: already holds a model",
+            Remedy("replace it", "--overwrite"),
+            Remedy("continue it", "--resume"),
+            Remedy("choose another folder"),
+        )
+    folder.prepare()
+    if not resume:
+        config = decide(scene, config).tell(progress)
+        with folder_lock(folder.path):
+            folder.clear()
+            state.begin(config, options, scene_record(scene, folder.path))
+    return state, lambda cluster: _Stages(scene, config, options, progress, state, folder, cluster)
+
+
+def check_options(config: TrainConfig) -> None:
+    """Raise InputError for options that a training in blocks cannot have."""
+    if config.appearance.exposure:
+        raise InputError("exposure: each block would learn exposures of its own: leave --exposure out")
+    if config.validation.validate:
+        raise InputError("validate: each block has other photos: leave --validate out")
+    if config.start.init not in ("sfm", "random"):
+        raise InputError(f"init {config.start.init}: blocks start from a coarse model of their own: leave --init out")
+
+
+class _Stages:
+    """The stages of a training, each done once."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        options: BlocksOptions,
+        progress: ProgressCallback | None,
+        state: BlocksState,
+        folder: ModelFolder,
+        cluster: str | None,
+    ) -> None:
+        self.scene, self.options, self.report, self.cluster = scene, options, progress, cluster
+        self.config = config.replace(save_iterations=(), test_iterations=())
+        self.progress: ProgressCallback | None = progress and self._with_step
+        self.state, self.folder, self.step = state, folder, 1
+
+    def run(self) -> BlocksModel:
+        """Run the missing stages."""
+        partition = self.divided()
+        if "blocks" not in self.state.values:
+            self.train_blocks(partition)
+        return self.finish()
+
+    def divided(self) -> Partition:
+        """Return the partition, with the coarse run and the division if they are missing."""
+        if "coarse" not in self.state.values:
+            self.train_coarse()
+        if "partition" not in self.state.values:
+            self.divide()
+        return Partition.from_json(self.state.values["partition"])
+
+    def coarse(self) -> Splats:
+        """Return the coarse model."""
+        return Splats.load(self.state.run_folder("coarse").latest_ply()[0])
+
+    def train_coarse(self) -> None:
+        """Make the coarse model."""
+        config = self.config.replace(cap_max=max(math.ceil(COARSE_CAP * self.config.cap_max), 1))
+        self.tell(1, f"a coarse model of {config.iterations} iterations with at most {config.cap_max} splats")
+        self.state.put("coarse", self.train_whole("coarse", config))
+
+    def divide(self) -> None:
+        """Divide the scene, and draw the cells."""
+        coarse, columns, rows = self.coarse(), self.options.columns, self.options.rows
+        self.tell(2, f"{columns} x {rows} blocks of {len(coarse)} splats and {len(self.scene.train)} training views")
+        partition = make_partition(self.scene, coarse, Renderer(self.config.device), columns, rows)
+        write_picture(self.folder.path / PICTURE, self.scene, partition)
+        self.state.put("partition", partition.to_json())
+
+    def train_blocks(self, partition: Partition) -> None:
+        """Train each block that a photo shows, and merge the splats that are in its cell."""
+        coarse = self.coarse()
+        blocks = [block for block in partition.blocks if block.views]
+        cap = self.config.cap_max // self.options.count
+        self.tell(3, f"{len(blocks)} blocks with at most {cap} splats, {self.config.iterations} iterations each")
+        cell = partition.cells.of(coarse.mean)
+        around = surroundings(self.scene, coarse, Renderer(self.config.device), partition)
+        jobs = []
+        for block in blocks:
+            folder = real_path(self.state.folder) / f"block_{block.number}"
+            folder.mkdir(parents=True, exist_ok=True)
+            inside = coarse.select(np.flatnonzero(cell == block.number))
+            inside.save(folder / START)
+            coarse.select(around[block.number]).save(folder / CONTEXT)
+            config = block_config(self.config, folder / START, max(cap, len(inside)))
+            source = SceneSource.of(self.scene).of_views(block.views)
+            jobs.append(BlockJob(source, config, folder, 1.0 / len(blocks)))
+        rows = self.train_all(jobs, [f"block {block.number}" for block in blocks])
+        parts = [coarse.select(np.flatnonzero(~np.isin(cell, [block.number for block in blocks])))]
+        for block, job, row in zip(blocks, jobs, rows, strict=True):
+            trained = Splats.load(ModelFolder(job.folder / RUN).latest_ply()[0])
+            learned = trained.select(np.arange(len(trained) - row["context"]))
+            parts.append(learned.select(partition.cells.of(learned.mean) == block.number))
+            row |= {"number": block.number, "views": len(block.views), "kept": len(parts[-1])}
+        joined([part for part in parts if len(part)]).save(self.state.folder / MERGED)
+        self.state.put("blocks", rows)
+
+    def finish(self) -> BlocksModel:
+        """Train all blocks together for a short time, and write the model."""
+        polish, start = self.options.polish, time.perf_counter()
+        iterations = math.ceil(POLISH * self.config.iterations) if polish is None else polish
+        whole = Splats.load(self.state.folder / MERGED)
+        if iterations:
+            self.tell(4, f"{len(whole)} splats together, {iterations} iterations")
+        run = block_config(self.config, self.folder.path, self.config.cap_max)  # its last rates are those of the polish
+        for number, rate in enumerate(POLISH_RATES if iterations else ()):
+            name, part = f"polish_{number}", Part(iterations / len(POLISH_RATES) / run.iterations, rate)
+            file = real_path(self.state.folder) / f"{name}.ply"
+            whole.save(file)
+            self.train_whole(name, fine_tuning(run, whole, part, file))
+            whole = Splats.load(self.state.run_folder(name).latest_ply()[0])
+        self.folder.write_run(self.state.values["config"], self.scene)
+        views = [*self.scene.test, *self.scene.train]
+        self.folder.write_cameras(named_cameras([view.name for view in views], [view.camera for view in views]))
+        path = self.folder.ply_path(self.config.iterations + iterations)
+        whole.save(path)
+        seconds = round(time.perf_counter() - start, 2)
+        self.state.put("final", {"splats": len(whole), "bytes": path.stat().st_size, "polish_seconds": seconds})
+        self.state.end()
+        return BlocksModel(whole, path, self.state.values)
+
+    def train_whole(self, name: str, config: TrainConfig) -> dict[str, Any]:
+        """Make a run of the whole scene in this process, and return what it took."""
+        row = train_in_folder(config, self.scene, self.state.run_folder(name).path, None, self.progress)
+        if row is None:
+            raise KeyboardInterrupt
+        return row
+
+    def train_all(self, jobs: Sequence[BlockJob], names: Sequence[str]) -> list[dict[str, Any]]:
+        """Train blocks here or on workers, and return what each took."""
+        rows = dict(self._here(jobs) if self.cluster is None else self._on_workers(jobs, names))
+        return [rows[number] for number in range(len(jobs))]
+
+    def _here(self, jobs: Sequence[BlockJob]) -> Iterator[tuple[int, dict[str, Any]]]:
+        for number, job in enumerate(jobs):
+            scene = job.source.part_of(self.scene)
+            row = train_block(job, scene, job.folder / RUN, self.config.device, self.progress)
+            if row is None:
+                raise KeyboardInterrupt
+            yield number, row
+
+    def _on_workers(self, jobs: Sequence[BlockJob], names: Sequence[str]) -> Iterator[tuple[int, dict[str, Any]]]:
+        assert self.cluster is not None
+        failed: ClsplatError | None = None
+        for job in jobs:
+            marked(job.folder)
+        with WorkerPool(self.cluster, self.config.device) as pool:
+            work = [Job(name, train_block_on_worker, (job,)) for name, job in zip(names, jobs, strict=True)]
+            for number, result in pool.results(work):
+                if isinstance(result, ClsplatError):
+                    failed = failed or result
+                else:
+                    yield number, result
+        if failed is not None:
+            raise failed
+
+    def tell(self, step: int, message: str) -> None:
+        """Send a message to the display, and name the step (from 1) in all that follows."""
+        self.step = step
+        if self.report is not None:
+            text = f"step {step} of {STEPS}, {message}"
+            self.report(Progress(0, self.config.iterations, math.nan, math.nan, 0, 0.0, 0.0, text))
+
+    def _with_step(self, report: Progress) -> None:
+        """Send a report of one run to the display, with the step."""
+        if self.report is not None:
+            self.report(replace(report, phase=f"step {self.step} of {STEPS}"))
+
+
+def block_config(config: TrainConfig, start: Path, cap: int) -> TrainConfig:
+    """Return the options of a run that goes on from a model: no random points, no penalties, images at full size.
+
+    Parameters
+    ----------
+    config : complete options of the whole training. start : file of the model.
+    """
+    changed = {
+        "strategy": Adc.strategy,
+        "init": str(start),
+        "cap_max": cap,
+        "lr_factor": 1.0,
+        "random_points": 0.0,
+        "opacity_reg": 0.0,
+        "scale_reg": 0.0,
+        "noise_lr": 0.0,
+        "visible_adam": False,
+        "coarse_to_fine": False,
+        "sh_interval": 1,  # the coarse model has all bands
+    }
+    return TrainConfig(**config.to_json() | changed)

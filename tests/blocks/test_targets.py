@@ -1,0 +1,50 @@
+"""What blocks learn: their corrections sum to that of the photo."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clsplat.blocks.cells import make_cells
+from clsplat.blocks.targets import block_part, with_block_targets
+from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.scene import Scene
+from clsplat.splats.splats import Splats
+from clsplat.splats.transform import joined
+from clsplat.training.config import TrainConfig
+from clsplat.training.run import train
+
+
+@pytest.fixture(scope="module")
+def model(scene: Scene) -> Splats:
+    return train(scene, TrainConfig(iterations=40, cap_max=150, sh_degree=1)).splats
+
+
+def halves(model: Splats, scene: Scene) -> list[tuple[Splats, Splats]]:
+    """Return for each of two blocks its splats and the others."""
+    cells = make_cells(model.mean, np.ones(len(model)), [v.camera.position for v in scene.train], 2, 1)
+    inside = [np.flatnonzero(cells.of(model.mean) == number) for number in range(2)]
+    return [(model.select(inside[i]), model.select(inside[1 - i])) for i in range(2)]
+
+
+def test_parts_of_all_blocks_sum_to_the_opacity(scene: Scene, model: Splats) -> None:
+    renderer, view = Renderer(), scene.train[0]
+    parts = [block_part(view, joined(list(pair)), len(pair[0]), renderer) for pair in halves(model, scene)]
+    alpha = 1.0 - renderer.render(model, view.camera).alpha
+    assert parts[0][0] + parts[1][0] == pytest.approx(1.0 - alpha, abs=1e-5)
+    assert parts[0][1] == pytest.approx(parts[1][1], abs=1e-6)
+
+
+def test_corrections_sum_to_that_of_the_photo(scene: Scene, model: Splats) -> None:
+    renderer = Renderer()
+    learned = [with_block_targets(scene, *pair, renderer, 0.5) for pair in halves(model, scene)]
+    for number, view in enumerate(scene.views):
+        shown = 255 * np.clip(renderer.render(model, view.camera, scene.background).color, 0, 1)
+        corrections = sum(part.views[number].image.astype(float) - shown for part in learned)
+        assert corrections == pytest.approx(view.image - shown, abs=1.01), "rounding of two images"
+    assert [view.name for view in learned[0].views] == scene.names
+
+
+def test_a_block_of_everything_learns_the_photos(scene: Scene, model: Splats) -> None:
+    (only,) = [with_block_targets(scene, model, model.select([]), Renderer(), 1.0)]
+    assert all((a.image == b.image).all() for a, b in zip(only.views, scene.views, strict=True))

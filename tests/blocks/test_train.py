@@ -1,0 +1,168 @@
+"""Trainings in blocks: nothing twice, the same bits on workers and after an interruption, one line for mistakes."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clsplat.blocks import train as module
+from clsplat.blocks.partition import Partition, make_partition, surroundings
+from clsplat.blocks.state import BlocksOptions, remove_blocks, stored_blocks
+from clsplat.blocks.train import PICTURE, BlocksModel, partition_scene, train_in_blocks
+from clsplat.errors import InputError, OutputError
+from clsplat.models.resume import resume
+from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.scene import Scene
+from clsplat.splats.splats import Splats
+from clsplat.training.config import TrainConfig
+from clsplat.training.folder import ModelFolder
+from clsplat.training.run import train
+
+CONFIG = TrainConfig(iterations=20, cap_max=120, sh_degree=1, densify_interval=5)
+TWO = BlocksOptions(2, 1, polish=8)
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> BlocksModel:
+    """A finished training in two blocks. Tests must not write into its folder."""
+    return train_in_blocks(scene, TWO, CONFIG, output=tmp_path_factory.mktemp("blocks") / "model")
+
+
+@pytest.fixture(scope="module")
+def coarse(scene: Scene) -> Splats:
+    return train(scene, TrainConfig(iterations=40, cap_max=100, sh_degree=1)).splats
+
+
+def test_a_partition_says_what_the_photos_show(scene: Scene, coarse: Splats) -> None:
+    renderer = Renderer()
+    found = make_partition(scene, coarse, renderer, 2, 2)
+    assert sum(block.splats for block in found.blocks) == len(coarse)
+    assert sum(block.points for block in found.blocks) == len(scene.points.xyz)
+    names = {view.name for view in scene.train}
+    cell = found.cells.of(coarse.mean)
+    for block, around in zip(found.blocks, surroundings(scene, coarse, renderer, found), strict=True):
+        assert set(block.views) <= names
+        assert list(block.shares) == sorted(block.shares, reverse=True)
+        assert (cell[around] != block.number).all()
+    again = Partition.from_json(json.loads(json.dumps(found.to_json())))
+    assert again.blocks == found.blocks
+    assert (again.cells.of(coarse.mean) == cell).all()
+
+
+def test_a_photo_that_shows_a_block_is_among_its_views(scene: Scene, coarse: Splats) -> None:
+    """A photo belongs to the block if its pixels change without it."""
+    renderer = Renderer()
+    found = make_partition(scene, coarse, renderer, 2, 1)
+    for block in found.blocks:
+        others = coarse.select(np.flatnonzero(found.cells.of(coarse.mean) != block.number))
+        for view in scene.train:
+            alpha = [renderer.render(splats, view.camera).alpha.mean() for splats in (coarse, others)]
+            assert alpha[0] - alpha[1] < 0.02 or view.name in block.views
+
+
+def test_the_model_has_each_place_once(finished: BlocksModel, scene: Scene) -> None:
+    report = finished.report
+    assert len(finished.splats) == sum(row["kept"] for row in report["blocks"]) <= CONFIG.cap_max
+    assert [row["number"] for row in report["blocks"]] == [0, 1]
+    assert all(row["kept"] <= row["splats"] <= CONFIG.cap_max // 2 for row in report["blocks"])
+    assert report["final"]["splats"] == len(finished.splats)
+
+
+def test_the_folder_is_that_of_a_run(finished: BlocksModel, scene: Scene) -> None:
+    folder = ModelFolder(finished.path.parents[2])
+    assert {path.name for path in folder.path.iterdir()} == {
+        *("config.json", "cameras.json", "blocks.json", PICTURE, "point_cloud"),
+    }
+    assert folder.latest_ply() == (finished.path, CONFIG.iterations + 8)
+    assert (Splats.load(finished.path).mean == finished.splats.mean).all()
+    assert folder.read_config()["scene"]["test_names"] == sorted(scene.test_names)
+    assert "<svg" in (folder.path / PICTURE).read_text()
+
+
+def test_workers_make_the_same_model(finished: BlocksModel, scene: Scene, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    found = train_in_blocks(scene, TWO, CONFIG, output=tmp_path, cluster="local:1")
+    assert found.path.read_bytes() == finished.path.read_bytes()
+
+
+@pytest.mark.parametrize("moment", ["coarse", "block", "polish"])
+def test_an_interrupted_training_goes_on(
+    finished: BlocksModel, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    """With the same bits, and without doing finished stages again."""
+    calls = {"coarse": 0, "block": 2, "polish": 3}
+    original, number = module.train_in_folder, iter(range(100))
+
+    def interrupted(*arguments: Any, **named: Any) -> Any:
+        def stop(trainer: Any, event: threading.Event) -> None:
+            if trainer.iteration == 2:
+                event.set()
+
+        if next(number) == calls[moment]:
+            return original(*arguments, **named, visit=stop)
+        return original(*arguments, **named)
+
+    monkeypatch.setattr(module, "train_in_folder", interrupted)
+    monkeypatch.setattr("clsplat.blocks.job.train_in_folder", lambda *a: interrupted(*a[:5]))
+    with pytest.raises(KeyboardInterrupt):
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path)
+    monkeypatch.undo()
+    found = resume(tmp_path)
+    assert isinstance(found, BlocksModel)
+    assert found.path.read_bytes() == finished.path.read_bytes()
+
+
+def test_a_partition_is_where_a_training_goes_on(finished: BlocksModel, scene: Scene, tmp_path: Path) -> None:
+    found = partition_scene(scene, TWO, CONFIG, output=tmp_path)
+    assert found.to_json() == finished.report["partition"]
+    stored = stored_blocks(tmp_path)
+    assert stored is not None
+    assert stored[1] == TWO
+    whole = train_in_blocks(scene, TWO, CONFIG, output=tmp_path, resume=True)
+    assert whole.path.read_bytes() == finished.path.read_bytes()
+
+
+def test_a_block_that_no_photo_shows_stays_as_it_is(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_views(*arguments: Any) -> Partition:
+        found = make_partition(*arguments)
+        first, *others = found.to_json()["blocks"]
+        return Partition.from_json(found.to_json() | {"blocks": [first | {"views": [], "shares": []}, *others]})
+
+    monkeypatch.setattr(module, "make_partition", without_views)
+    found = train_in_blocks(scene, BlocksOptions(2, 1, polish=0), CONFIG, output=tmp_path)
+    assert [row["number"] for row in found.report["blocks"]] == [1]
+    cells = Partition.from_json(found.report["partition"]).cells
+    first = found.report["partition"]["blocks"][0]
+    assert np.count_nonzero(cells.of(found.splats.mean) == 0) == first["splats"]
+
+
+def test_what_cannot_be_resumed_or_replaced(finished: BlocksModel, scene: Scene, tmp_path: Path) -> None:
+    folder = finished.path.parents[2]
+    with pytest.raises(OutputError, match="already holds a model: replace it, continue it or choose another folder"):
+        train_in_blocks(scene, TWO, CONFIG, output=folder)
+    with pytest.raises(InputError, match="finished: nothing to resume"):
+        stored_blocks(folder)
+    with pytest.raises(InputError, match="blocks\\.json"):
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path / "new", resume=True)
+    partition_scene(scene, TWO, CONFIG, output=tmp_path)
+    with pytest.raises(InputError, match="--resume with columns=3, but the training was started with columns=2"):
+        train_in_blocks(scene, BlocksOptions(3, 1, 8), CONFIG, output=tmp_path, resume=True)
+    (tmp_path / "blocks.json").write_text('{"config": {}, "options": {}, "scene": {}}')
+    with pytest.raises(InputError, match=r"blocks\.json: damaged"):
+        stored_blocks(tmp_path)
+    remove_blocks(tmp_path)
+    assert not (tmp_path / "blocks").exists()
+    assert stored_blocks(tmp_path) is None
+
+
+@pytest.mark.parametrize("options", [{"exposure": True}, {"validate": True}, {"init": "model.ply"}])
+def test_options_that_blocks_cannot_have(scene: Scene, tmp_path: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=f"^{next(iter(options))}.*leave --"):
+        train_in_blocks(scene, TWO, TrainConfig(**options), output=tmp_path)

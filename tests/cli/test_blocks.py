@@ -1,0 +1,42 @@
+"""`clsplat partition` and `clsplat train --blocks`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cli_runner import clsplat, error_of, run
+
+TINY = ["--iterations", "12", "--sh-degree", "1", "--densify-interval", "5", "--cap-max", "80"]
+
+
+def test_a_partition_is_shown_and_then_trained(scene: Path, tmp_path: Path) -> None:
+    said = run("partition", scene, "-m", tmp_path / "m", "--blocks", "2x1", "--polish", "2", "--eval", *TINY)
+    assert said.exit_code == 0, said.output
+    lines = said.stdout.splitlines()
+    assert lines[0].split() == ["block", "splats", "points", "photos", "most", "of", "a", "photo"]
+    assert [line.split()[0] for line in lines[1:3]] == ["0", "1"]
+    assert "partition.svg" in lines[3]
+    trained = run("train", "--resume", "-m", tmp_path / "m")
+    assert trained.exit_code == 0, trained.output
+    lines = trained.stdout.splitlines()
+    assert lines[0].split()[:4] == ["block", "photos", "splats", "kept"]
+    assert "test views (2): PSNR" in lines[-1]
+    assert "step 3 of 4, 2 blocks with at most 40 splats" in trained.stderr
+    assert clsplat("eval", tmp_path / "m") != ""
+
+
+def test_train_in_blocks_at_once(scene: Path, tmp_path: Path) -> None:
+    assert clsplat("train", scene, "-m", tmp_path / "m", "--blocks", "2x1", "--polish", "0", "-q", *TINY) == ""
+    assert "already holds a model" in error_of("train", scene, "-m", tmp_path / "m", *TINY)
+    clsplat("train", scene, "-m", tmp_path / "m", "--overwrite", "-q", *TINY)
+    assert not (tmp_path / "m" / "blocks.json").exists()
+
+
+def test_mistakes_are_one_line(scene: Path, tmp_path: Path) -> None:
+    arguments = ("train", scene, "-m", tmp_path / "m")
+    assert "such as 2x2" in error_of(*arguments, "--blocks", "4")
+    assert "give --blocks too" in error_of(*arguments, "--polish", "4", code=2)
+    assert "remove --view and --budget" in error_of(*arguments, "--blocks", "2x2", "--budget", "auto", code=2)
+    assert "leave --exposure out" in error_of(*arguments, "--blocks", "2x2", "--exposure")
+    assert "name the blocks" in error_of("partition", scene, "-m", tmp_path / "m")
+    assert not (tmp_path / "m").exists()

@@ -1,0 +1,96 @@
+"""Splats that a run shows and does not change."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clsplat.errors import InputError
+from clsplat.scenes.scene import Scene
+from clsplat.splats.splats import Splats
+from clsplat.training.config import TrainConfig
+from clsplat.training.run import train
+from clsplat.training.trainer import Trainer
+
+RUN: dict[str, Any] = {
+    "iterations": 30,
+    "cap_max": 60,
+    "sh_degree": 1,
+    "densify_interval": 5,
+    "near_plane": 0.01,
+    "random_points": 0.0,
+    "dropout": 0.0,
+    "coarse_to_fine": False,
+    "grad_threshold": 0.0,
+}
+
+
+@pytest.fixture(scope="module")
+def parts(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Splats]:
+    """The file of half of a model, and its other half."""
+    model = train(scene, TrainConfig(**{**RUN, "cap_max": 80})).splats
+    order = np.argsort(model.mean[:, 0])
+    file = tmp_path_factory.mktemp("context") / "half.ply"
+    model.select(order[:40]).save(file)
+    return file, model.select(order[40:])
+
+
+def options(file: Path, **more: Any) -> TrainConfig:
+    return TrainConfig(**{**RUN, "init": str(file), "strategy": "adc", "opacity_reg": 0.0, **more})
+
+
+def test_the_context_stays_as_it_is(scene: Scene, parts: tuple[Path, Splats]) -> None:
+    """To the bit, but for the skew: the kernel's value follows from the trainable one, with rounding."""
+    file, context = parts
+    splats = train(scene, options(file), context=context).splats
+    n = len(splats) - len(context)
+    assert 40 < n <= RUN["cap_max"], "the other splats grow to the cap"
+    for name, array in context.arrays.items():
+        found = splats.arrays[name][n:]
+        if name == "skew":
+            assert found == pytest.approx(array, abs=1e-6)
+        else:
+            assert (found == array).all(), name
+    start = Splats.load(file)
+    assert not np.isin(start.mean, splats.mean[:n]).all(), "they move"
+
+
+def test_the_context_is_shown(scene: Scene, parts: tuple[Path, Splats]) -> None:
+    file, context = parts
+    with_context, without = (Trainer(scene, options(file), context=given) for given in (context, None))
+    assert with_context.evaluate(scene.train).psnr > without.evaluate(scene.train).psnr + 0.5
+    assert len(with_context.snapshot()) == len(without.snapshot()) + len(context)
+
+
+def test_strategies_see_the_other_splats_only(scene: Scene, parts: tuple[Path, Splats]) -> None:
+    """A context of nearly transparent splats is not pruned."""
+    file, context = parts
+    faint = context.with_arrays(context.to_numpy() | {"opacity_logit": np.full(len(context), -6, np.float32)})
+    splats = train(scene, options(file), context=faint).splats
+    assert (splats.opacity_logit[-len(faint) :] == -6).all()
+
+
+def test_a_resumed_run_has_the_same_bits(scene: Scene, parts: tuple[Path, Splats], tmp_path: Path) -> None:
+    file, context = parts
+    whole = train(scene, options(file), context=context).splats
+
+    def stop(trainer: Trainer, event: Any) -> None:
+        if trainer.iteration == 17:
+            event.set()
+
+    train(scene, options(file), output=tmp_path / "run", visit=stop, context=context)
+    splats = train(scene, options(file), output=tmp_path / "run", resume=True, context=context).splats
+    assert all((splats.arrays[name] == array).all() for name, array in whole.arrays.items())
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{"strategy": "mcmc"}, {"opacity_reg": 0.1}, {"noise_lr": 1.0}, {"optimizer": "numpy"}, {"sh_degree": 2}],
+)
+def test_runs_that_would_change_it_are_refused(scene: Scene, parts: tuple[Path, Splats], more: dict[str, Any]) -> None:
+    file, context = parts
+    with pytest.raises(InputError, match="context"):
+        train(scene, options(file, **more), context=context)
