@@ -52,7 +52,7 @@ def seeds_chart(rows: Sequence[Mapping[str, Any]], out: str | Path) -> list[Path
                 names.append(_strip(panel, place, system, [row for row in shown if row["system"] == system]))
             panel.set_xticks(range(len(names)), names, fontsize=7.5)
             panel.set(ylabel="test PSNR [dB]", xlim=(-0.6, len(names) - 0.4))
-            panel.set_title(f"{scene}, cap {short_count(shown[0]['cap'])}, {shown[0]['iterations']} iterations")
+            panel.set_title(f"{scene},\ncap {short_count(shown[0]['cap'])}, {shown[0]['iterations']} iterations")
             panel.grid(False, axis="x")
     return chart_paths(out)
 

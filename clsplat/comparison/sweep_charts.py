@@ -54,7 +54,7 @@ def time_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
                 runs.setdefault((row["system"], row["seed"]), []).append(row)
             lines = [(system, run) for (system, _), run in runs.items()]
             _quality_panels(panels[:, column], lines, styles, column == 0)
-            panels[0][column].set_title(f"{scene}, cap {short_count(shown[0]['cap'])}")
+            panels[0][column].set_title(f"{scene},\ncap {short_count(shown[0]['cap'])}")
             panels[1][column].set_xlabel("training time [s]")
         system_legend(figure, styles)
     return chart_paths(out)
@@ -81,7 +81,7 @@ def length_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
                 [row["seconds"] for row in front], [row["psnr"] for row in front], color=FRONT, linewidth=5, zorder=1
             )
             _quality_panels(panels[:, column], list(runs.items()), styles, column == 0)
-            panels[0][column].set_title(f"{scene}, cap {short_count(shown[0]['cap'])}")
+            panels[0][column].set_title(f"{scene},\ncap {short_count(shown[0]['cap'])}")
             panels[1][column].set_xlabel("training time [s]")
         system_legend(figure, styles)
     return chart_paths(out)

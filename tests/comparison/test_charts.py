@@ -126,7 +126,7 @@ def test_length_chart(tmp_path: Path, drawn: list[Any]) -> None:
     assert (list(gaussian.get_xdata()), list(gaussian.get_ydata())) == ([1.0, 2.0, 4.0], [20.0, 21.0, 22.0])
     assert list(default.get_ydata()) == [21.5, 22.5, 23.5]
     assert len(ssim.lines) == 2, "the front is that of PSNR"
-    assert psnr.get_title() == "yard 8x6, cap 1k"
+    assert psnr.get_title() == "yard 8x6,\ncap 1k"
 
 
 def test_equal_chart(tmp_path: Path, drawn: list[Any]) -> None:
