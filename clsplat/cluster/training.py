@@ -16,10 +16,10 @@ from ..scenes.scene import Scene
 from ..scenes.source import SceneSource
 from ..splats.splats import Splats
 from ..training.config import TrainConfig
-from ..training.extension import holds_run
 from ..training.folder import ModelFolder
 from ..training.log import Progress
 from ..training.run import train
+from ..training.stored_run import holds_run
 from ..training.trainer import Visit
 from .job import Abandoned, JobContext, MissingFiles
 

@@ -13,9 +13,8 @@ from ..files.json_file import read_object, write_json
 from ..files.lock import folder_lock
 from ..splats.splats import Splats
 from ..training.config import FREE_OPTIONS, TrainConfig
-from ..training.extension import holds_run
 from ..training.folder import ModelFolder
-from ..training.stored_run import DAMAGE, StoredRun
+from ..training.stored_run import DAMAGE, StoredRun, holds_run
 from .rules import BudgetOptions
 
 FILE, FOLDER = "budget.json", "budget"

@@ -39,14 +39,6 @@ def fitting_checkpoint(folder: ModelFolder, config: TrainConfig) -> Checkpoint:
     return checkpoint
 
 
-def holds_run(folder: ModelFolder, config: TrainConfig) -> bool:
-    """Return whether a folder has the checkpoint of a run with these options, which are complete."""
-    if not folder.checkpoint_path.is_file():
-        return False
-    stored = TrainConfig.from_json(folder.read_config()["config"]).to_json()
-    return all(stored[key] == value for key, value in config.to_json().items() if key not in FREE_OPTIONS)
-
-
 def reached_by(checkpoint: Checkpoint, config: TrainConfig, views: list[View]) -> Reached | None:
     """Return the limits of the rest of a run. None if the run never became longer.
 

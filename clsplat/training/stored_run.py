@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..files.json_file import describe, read_object, to_real
 from ..scenes.options import ALPHA_USES, READING_OPTIONS
 from ..splats.color import BLACK, Color
-from .config import TrainConfig, read_options
+from .config import FREE_OPTIONS, TrainConfig, read_options
 from .folder import ModelFolder
 
 if TYPE_CHECKING:
@@ -133,6 +133,14 @@ def stored_run(path: str | os.PathLike[str]) -> StoredRun:
         return StoredRun.from_json(stored, folder.path)
     except DAMAGE as error:
         raise InputError(f"{folder.config_path}: damaged ({error}): start again with --overwrite") from None
+
+
+def holds_run(folder: ModelFolder, config: TrainConfig) -> bool:
+    """Return whether a folder has the checkpoint of a run with these options, which are complete."""
+    if not folder.checkpoint_path.is_file():
+        return False
+    stored = TrainConfig.from_json(folder.read_config()["config"]).to_json()
+    return all(stored[key] == value for key, value in config.to_json().items() if key not in FREE_OPTIONS)
 
 
 def read_options_file(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -123,6 +123,39 @@ def test_a_run_that_was_cut_short_goes_on(
     assert {path.name for path in out.iterdir()} == {"runs.jsonl", "table.md", "results.json"}
 
 
+def test_runs_end_in_any_order_and_one_may_fail(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lines are in the order of the plan. A failed run ends no other, and the next call does it."""
+    systems, out = parse_methods("gaussian,default"), tmp_path / "out"
+    compare([scene], systems, tmp_path / "whole", [CAP], [0, 1], SHORT)
+    fails = [1]
+
+    class Pool:
+        """Does the jobs in this process, the last one first."""
+
+        dashboard = None
+
+        def __init__(self, *_: object) -> None: ...
+        def __enter__(self) -> Pool:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def results(self, jobs: list[Job], begin: object) -> Iterator[tuple[int, Any]]:
+            for number in reversed(range(len(jobs))):
+                if number in fails:
+                    yield number, OutputError("disk full")
+                else:
+                    yield number, jobs[number].function(CountedWork(1000), *jobs[number].arguments)
+
+    monkeypatch.setattr(planned, "WorkerPool", Pool)
+    with pytest.raises(OutputError, match="disk full"):
+        compare([scene], systems, out, [CAP], [0, 1], SHORT, cluster="local")
+    assert lines(out) == [line for place, line in enumerate(lines(tmp_path / "whole")) if place != 1]
+    fails.clear()
+    compare([scene], systems, out, [CAP], [0, 1], SHORT, cluster="local")
+    assert sorted(map(str, lines(out))) == sorted(map(str, lines(tmp_path / "whole")))
+
+
 def test_a_scene_that_workers_do_not_have(
     capture_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

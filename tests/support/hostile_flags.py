@@ -201,7 +201,7 @@ def bounded(patch: pytest.MonkeyPatch, plan_only: bool = False) -> Iterator[None
     if plan_only:
         for place in ("training.run.Trainer", "models.prune._pruned"):
             patch.setattr(f"clsplat.{place}", interrupt)
-        for place in ("comparison.compare.warm_up", "benchmark.measure.warm_up"):
+        for place in ("comparison.compare.warm_up", "comparison.measure.warm_up"):
             patch.setattr(f"clsplat.{place}", interrupt)
         for place in ("rendering.renderer.Renderer.render", "profiling.bench.bench_trainer"):
             patch.setattr(f"clsplat.{place}", interrupt)
