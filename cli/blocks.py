@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -31,23 +32,28 @@ def blocks_options(function: F) -> F:
         ),
         click.option(
             "--blocks",
-            metavar="NxM",
-            help="Train a large scene in N x M blocks, one after the other or on workers (--cluster). --cap-max is "
-            "that of the whole model, and --iterations are those of each block.",
+            metavar="NxM|auto",
+            help="Divide a large scene into N x M blocks, which are trained one by one or on workers. --cap-max is "
+            "that of the whole model, and --iterations are those of each block. auto: blocks of 200000 splats at most.",
         ),
     ):
         function = option(function)
     return function
 
 
-def given_blocks(values: dict[str, Any]) -> BlocksOptions | None:
-    """Remove the options of blocks from `values` and return them; None if no blocks were requested."""
+def given_blocks(values: dict[str, Any]) -> Callable[[TrainConfig], BlocksOptions] | None:
+    """Remove the options of blocks from `values`.
+
+    Returns
+    -------
+    A function that returns them for the options of the training; None if no blocks were requested.
+    """
     blocks, polish = values.pop("blocks"), values.pop("polish")
     if blocks is None:
         if polish is not None:
             raise click.UsageError("--polish is for trainings in blocks: give --blocks too")
         return None
-    return BlocksOptions(*parse_blocks(blocks), polish)
+    return lambda config: BlocksOptions(*parse_blocks(blocks, config.cap_max), polish)
 
 
 def run_blocks(

@@ -40,7 +40,7 @@ COMMANDS = {
         "Repeat a published benchmark by its protocol.",
     ),
     "partition": ("clsplat_cli.partition:partition", "Divide a large scene into blocks, and show them."),
-    "worker": ("clsplat_cli.worker:start_workers", "Do the runs of comparisons on this machine's devices."),
+    "worker": ("clsplat_cli.worker:start_workers", "Do training runs of other commands on this machine's devices."),
     "bench": ("clsplat_cli.bench:bench", "Time the stages of training and rendering on this device."),
     "blender-addon": ("clsplat_cli.blender_addon:build_addon", "Build the Blender add-on as a zip."),
     "convert": (

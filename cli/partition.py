@@ -74,10 +74,11 @@ def partition(
     """
     from clsplat.blocks.train import PICTURE, partition_scene
 
-    options = given_blocks(values)
-    if options is None:
+    blocks = given_blocks(values)
+    if blocks is None:
         raise InputError("name the blocks: --blocks 2x2")
     config = TrainConfig(**config_values(ctx, values))
+    options = blocks(config)
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
     loaded = load_recorded_scene(scene, reading, config.background)
     try:

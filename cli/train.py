@@ -210,8 +210,8 @@ def train(
     path = scene or source_path
     if path is None and not (resume and model_path):
         raise click.UsageError("give the scene's folder")
-    search, blocks = search_options(values), given_blocks(values)
-    if blocks is not None and (view or search is not None):
+    search, given = search_options(values), given_blocks(values)
+    if given is not None and (view or search is not None):
         raise click.UsageError("--blocks is for one model of a large scene: remove --view and --budget")
     check_device(values.get("device"), cluster)
     if view and search is not None:
@@ -223,19 +223,20 @@ def train(
         options = with_preset(preset, options)
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
     model_path = model_path or _default_folder(path)
-    recorded, photos = None, {}
+    recorded, photos, blocks = None, {}, None
     if resume:
         stored = find_unfinished(model_path)
         if search is not None and stored.search is None:
             raise InputError(f"{model_path}: no search to resume from: start without --resume")
         options, reading = stored.run.options | options, stored.run.scene | reading
         recorded, photos = stored.run.scene_path, stored.run.scene["photos"]
-        path, search, blocks = path or recorded, search or stored.search, blocks or stored.blocks
+        path, search, blocks = path or recorded, search or stored.search, stored.blocks
     elif any((ModelFolder(model_path).is_used, is_search(model_path), is_in_blocks(model_path))) and not overwrite:
         # The function train checks this too, but only after the scene is read.
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
     assert path is not None
     config = TrainConfig(**options)
+    blocks = given(config) if given is not None else blocks
     if is_photographs(path):
         path = scene_of_photos(path, model_path, overwrite, quiet, recorded)
     with activity_line(quiet):

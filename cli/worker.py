@@ -1,4 +1,4 @@
-"""`clsplat worker`: do the runs of comparisons that a scheduler hands out."""
+"""`clsplat worker`: do the runs that a scheduler hands out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .options import quiet_option
         ("clsplat worker tcp://HOST:8786 --device 0:0 --device 0:1", "A worker on each of two devices."),
         ("clsplat compare SCENE -o table --cluster tcp://HOST:8786", "A comparison that the workers do."),
     ),
-    see_also=("compare", "frontier", "benchmark", "devices"),
+    see_also=("compare", "frontier", "benchmark", "train"),
 )
 @click.argument("address")
 @click.option(
@@ -34,7 +34,7 @@ from .options import quiet_option
 )
 @quiet_option
 def start_workers(address: str, devices: tuple[str, ...], workers: int | None, quiet: bool) -> None:
-    """Do the runs of comparisons on this machine's devices, as the scheduler at ADDRESS hands them out.
+    """Do training runs of other commands on this machine's devices, as the scheduler at ADDRESS hands them out.
 
     ADDRESS is that of a scheduler of dask.distributed, such as tcp://HOST:8786, or its scheduler file. The command
     `dask scheduler` starts one on any machine. Scenes and results must be at the same paths on all machines, for

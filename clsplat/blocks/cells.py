@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,16 +14,33 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..splats.fields import DoubleArray
 
+AUTO = "auto"
 MOST_BLOCKS = 64  # in each direction
+SPLATS_OF_A_BLOCK = 200_000  # at most, with "auto"
 _FAR = 4.0  # distances of the cameras from their middle; farther places count as if they were there
 
 
-def parse_blocks(text: str) -> tuple[int, int]:
-    """Return columns and rows of a text such as 2x3. Raise InputError if it has another form."""
+def parse_blocks(text: str, cap: int) -> tuple[int, int]:
+    """Return columns and rows of a text such as 2x3.
+
+    With "auto", each block has at most SPLATS_OF_A_BLOCK splats, and there are about as many columns as rows.
+
+    Parameters
+    ----------
+    cap : largest number of splats of the whole model.
+
+    Raises
+    ------
+    InputError : the text has another form.
+    """
+    if text == AUTO:
+        count = max(-(-cap // SPLATS_OF_A_BLOCK), 2)
+        columns = min(math.ceil(math.sqrt(count)), MOST_BLOCKS)
+        return columns, min(-(-count // columns), MOST_BLOCKS)
     found = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
     columns, rows = (int(found[1]), int(found[2])) if found else (0, 0)
     if not (1 <= columns <= MOST_BLOCKS and 1 <= rows <= MOST_BLOCKS) or columns * rows < 2:
-        raise InputError(f"blocks {text!r}: give columns x rows with at least two blocks, such as 2x2")
+        raise InputError(f"blocks {text!r}: give columns x rows with at least two blocks, such as 2x2, or {AUTO}")
     return columns, rows
 
 

@@ -22,6 +22,7 @@ from .job import DEVICE_VARIABLE, RESOURCE
 CORES_OF_A_WORKER = 2  # on a CPU, unless the number of workers is given
 CONNECT_SECONDS = 10.0
 POLL = 0.5  # seconds
+MOST_STARTS = 20  # of a process that dies each time
 # These run first in a worker's process. Ctrl-C reaches all processes of a terminal, and the program that started this
 # one ends it. Threads inherit the cores of the thread that starts them, so all later ones have them.
 _IGNORE_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
@@ -90,10 +91,8 @@ def plan_workers(devices: Sequence[str | None], count: int | None = None, *, loc
     plans, part = [], 0
     for number, info in enumerate(chosen):
         part_of_cores = None
-        if info.type == "CPU":
-            part_of_cores = (
-                tuple(cores[part * len(cores) // on_cpu : (part + 1) * len(cores) // on_cpu]) if on_cpu > 1 else None
-            )
+        if info.type == "CPU" and on_cpu > 1:
+            part_of_cores = tuple(cores[part * len(cores) // on_cpu : (part + 1) * len(cores) // on_cpu])
             part += 1
         schedule = str(schedule_for(open_device(info.index))) if local else None
         plans.append(WorkerPlan(f"{_host()}-{number}" if count > 1 else _host(), info.index, part_of_cores, schedule))
@@ -131,6 +130,7 @@ def local_cluster(plans: Sequence[WorkerPlan]) -> Iterator[Any]:
             for worker, event in zip(workers, ready, strict=True):
                 while not event.wait(POLL):
                     if worker.done():
+                        worker.result()  # its error
                         raise no_scheduler(cluster.scheduler_address)
             yield cluster
         finally:
@@ -152,16 +152,29 @@ async def _keep(address: str, plan: WorkerPlan, on_ready: Callable[[], None]) ->
     """Keep a worker alive until the scheduler ends.
 
     A nanny starts its process again if that dies, but gives up if it dies while it starts.
+
+    Raises
+    ------
+    ClusterError : the process has died MOST_STARTS times in a row while it started.
     """
-    package = distributed()
+    package, in_vain = distributed(), 0
+
+    def started() -> None:
+        nonlocal in_vain
+        in_vain = 0
+        on_ready()
+
     for attempt in count():
+        if in_vain == MOST_STARTS:
+            raise ClusterError(f"worker {plan.name}: its process dies again and again while it starts: look at its log")
+        in_vain += 1
         name = f"{plan.name}.{attempt}" if attempt else plan.name  # the scheduler may still know the other one
         nanny = package.Nanny(address, **plan.options() | {"name": name})
         _open.add(nanny)
         try:
             with suppress(OSError, RuntimeError, TimeoutError):
                 await nanny
-                on_ready()
+                started()
                 await nanny.finished()
         finally:
             with suppress(Exception):  # the scheduler may be gone

@@ -70,10 +70,17 @@ def test_places_that_are_all_equal_are_in_one_cell() -> None:
 
 @pytest.mark.parametrize(("text", "blocks"), [("2x2", (2, 2)), ("1X8", (1, 8)), ("64x64", (64, 64))])
 def test_numbers_of_blocks(text: str, blocks: tuple[int, int]) -> None:
-    assert parse_blocks(text) == blocks
+    assert parse_blocks(text, 1000) == blocks
 
 
 @pytest.mark.parametrize("text", ["", "2", "2x", "0x3", "1x1", "65x2", "2x2x2", "-1x2", "axb", "2 x 2"])
 def test_other_texts_are_one_line(text: str) -> None:
     with pytest.raises(InputError, match=r"^blocks .*such as 2x2"):
-        parse_blocks(text)
+        parse_blocks(text, 1000)
+
+
+@pytest.mark.parametrize(
+    ("cap", "blocks"), [(100, (2, 1)), (400_000, (2, 1)), (400_001, (2, 2)), (1_000_000, (3, 2)), (10**12, (64, 64))]
+)
+def test_auto_leaves_each_block_a_number_of_splats(cap: int, blocks: tuple[int, int]) -> None:
+    assert parse_blocks("auto", cap) == blocks

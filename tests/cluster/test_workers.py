@@ -10,7 +10,7 @@ from clsplat.cluster import workers as module
 from clsplat.cluster.job import DEVICE_VARIABLE, RESOURCE
 from clsplat.cluster.workers import WorkerPlan, plan_workers
 from clsplat.device.device import DeviceInfo, open_device
-from clsplat.errors import DeviceError, InputError
+from clsplat.errors import ClusterError, DeviceError, InputError
 from clsplat.rendering.tuning import SCHEDULE_VARIABLE, schedule_for
 
 
@@ -80,3 +80,13 @@ def test_options_of_the_process() -> None:
     assert options["env"] == {DEVICE_VARIABLE: "0:1", SCHEDULE_VARIABLE: "1x16x16"}
     assert "{2, 3}" in options["preload"][-1]
     assert len(WorkerPlan("w", "0:1").options()["preload"]) == 1
+
+
+def test_a_process_that_never_starts_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(module, "MOST_STARTS", 2)
+    monkeypatch.setattr(module, "_IGNORE_CTRL_C", "import os; os._exit(3)")
+    plans = [WorkerPlan("w", open_device().info.index)]
+    dies = pytest.raises(ClusterError, match=r"^worker w: its process dies again and again while it starts")
+    with dies, module.local_cluster(plans):
+        pass
