@@ -210,8 +210,8 @@ def train(
     path = scene or source_path
     if path is None and not (resume and model_path):
         raise click.UsageError("give the scene's folder")
-    search, given = search_options(values), given_blocks(values)
-    if given is not None and (view or search is not None):
+    search, blocks_for = search_options(values), given_blocks(values)
+    if blocks_for is not None and (view or search is not None):
         raise click.UsageError("--blocks is for one model of a large scene: remove --view and --budget")
     check_device(values.get("device"), cluster)
     if view and search is not None:
@@ -236,7 +236,7 @@ def train(
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
     assert path is not None
     config = TrainConfig(**options)
-    blocks = given(config) if given is not None else blocks
+    blocks = blocks_for(config) if blocks_for is not None else blocks
     if is_photographs(path):
         path = scene_of_photos(path, model_path, overwrite, quiet, recorded)
     with activity_line(quiet):

@@ -12,11 +12,13 @@ from ._version import __version__ as __version__
 
 if TYPE_CHECKING:
     from .benchmark.run import run_benchmark
+    from .blocks.state import BlocksOptions
+    from .blocks.train import BlocksModel, partition_scene, train_in_blocks
     from .cameras.camera import Camera
     from .cameras.make_path import PathRequest
     from .compression.rules import BudgetOptions
     from .compression.search import Budgeted, train_budget
-    from .errors import ClsplatError, DeviceError, InputError, OutputError, TrainingError
+    from .errors import ClsplatError, ClusterError, DeviceError, InputError, OutputError, TrainingError
     from .models.cameras import export_cameras
     from .models.clean import clean_model
     from .models.convert import PageOptions, conversion_cost, convert_model, level_costs
@@ -44,6 +46,7 @@ _HOME = {
     "DeviceError": "errors",
     "InputError": "errors",
     "OutputError": "errors",
+    "ClusterError": "errors",
     "TrainingError": "errors",
     "Rendered": "rendering.renderer",
     "Renderer": "rendering.renderer",
@@ -53,9 +56,13 @@ _HOME = {
     "TrainConfig": "training.config",
     "train": "training.run",
     "Model": "training.run",
+    "BlocksModel": "blocks.train",
+    "BlocksOptions": "blocks.state",
     "BudgetOptions": "compression.rules",
     "Budgeted": "compression.search",
+    "partition_scene": "blocks.train",
     "train_budget": "compression.search",
+    "train_in_blocks": "blocks.train",
     "TrainingDisplay": "training.progress",
     "quality": "training.quality",
     "LoadedModel": "models.model",
@@ -83,10 +90,13 @@ _HOME = {
 }
 
 __all__ = [
+    "BlocksModel",
+    "BlocksOptions",
     "BudgetOptions",
     "Budgeted",
     "Camera",
     "ClsplatError",
+    "ClusterError",
     "DeviceError",
     "EvaluationOptions",
     "InputError",
@@ -116,6 +126,7 @@ __all__ = [
     "load_model",
     "load_scene",
     "make_demo_scene",
+    "partition_scene",
     "prune_model",
     "quality",
     "reconstruct",
@@ -124,6 +135,7 @@ __all__ = [
     "run_benchmark",
     "train",
     "train_budget",
+    "train_in_blocks",
 ]
 
 
