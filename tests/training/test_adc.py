@@ -307,6 +307,15 @@ def test_the_depth_threshold_does_not_depend_on_the_scenes_units() -> None:
         assert len(edit.source) == count
 
 
+@pytest.mark.parametrize("options", [{"depth_threshold": 1e300}, {"grad_threshold": 1e300}])
+def test_nothing_exceeds_a_threshold_beyond_single_precision(options: dict[str, float]) -> None:
+    """And no warning of an overflow is printed."""
+    stats = stats_of(np.ones(1), np.ones(1)).astype(np.float32)
+    with np.errstate(over="raise"):
+        edit = edited(plain(1, 1e-3), shapes.GAUSSIAN, stats, **{"grad_threshold": 1e30, **options})
+    assert len(edit.source) == 1
+
+
 def opacities(shape: Shape, arrays: Arrays) -> np.ndarray:
     return np.array([shape.opacity(arrays[name].astype(np.float64)) for name in opacity_names(arrays)]).T
 
