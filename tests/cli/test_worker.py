@@ -51,7 +51,7 @@ def test_workers_that_cannot_be_used(command: str, scene: Path, tmp_path: Path) 
 
 def test_a_single_run_needs_no_workers(scene: Path, tmp_path: Path) -> None:
     arguments = ("train", scene, "-m", tmp_path / "out", *TINY, "--cluster", "local:1")
-    assert "give --budget auto too" in error_of(*arguments, code=2)
+    assert "give --blocks or --budget auto too" in error_of(*arguments, code=2)
 
 
 def test_frontier_and_benchmark_with_workers(scene: Path, tmp_path: Path) -> None:
