@@ -14,7 +14,7 @@ from clsplat.files.stop_signals import exit_code
 from clsplat.training.config import TrainConfig
 
 from .options import F
-from .progress import TrainingDisplay, table
+from .progress import TrainingDisplay, report_test_views, table
 
 if TYPE_CHECKING:
     from clsplat.blocks.partition import Partition
@@ -102,9 +102,7 @@ def run_blocks(
     ]
     click.echo(table(head, rows))
     click.echo(f"{result.path}: {len(result.splats)} splats, {result.path.stat().st_size / 1e6:.2f} MB")
-    metrics = evaluate_test_views(result.splats, scene, config)
-    if metrics is not None:
-        click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
+    report_test_views(evaluate_test_views(result.splats, scene, config))
 
 
 def report_interruption(ctx: click.Context, model_path: Path) -> NoReturn:

@@ -12,7 +12,7 @@ from clsplat.training.config import TrainConfig
 
 from .blocks import report_interruption
 from .options import Decibels, F
-from .progress import TrainingDisplay
+from .progress import TrainingDisplay, report_test_views
 
 if TYPE_CHECKING:
     from clsplat.compression.search import Budgeted
@@ -100,9 +100,7 @@ def run_search(
         click.echo(line)
     if charts:
         click.echo(f"chart of the rounds: {', '.join(str(file) for file in charts)}")
-    metrics = evaluate_test_views(result.splats, scene, config)
-    if metrics is not None:
-        click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
+    report_test_views(evaluate_test_views(result.splats, scene, config))
 
 
 def result_lines(result: Budgeted) -> list[str]:

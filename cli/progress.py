@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from types import TracebackType
+from typing import TYPE_CHECKING
+
+import click
 
 from clsplat.training.live_line import PLAIN_INTERVAL, LiveLine, activity_line, duration
 from clsplat.training.progress import TrainingDisplay
 
-__all__ = ["TrainingDisplay", "ViewCount", "activity_line", "duration", "table"]
+if TYPE_CHECKING:
+    from clsplat.evaluation.evaluate import Evaluation
+
+__all__ = ["TrainingDisplay", "ViewCount", "activity_line", "duration", "report_test_views", "table"]
 
 
 class ViewCount:
@@ -52,6 +58,12 @@ class ViewCount:
     def clear(self) -> None:
         """Remove the line."""
         self._line.clear()
+
+
+def report_test_views(metrics: Evaluation | None) -> None:
+    """Print how good a model is on its test views; nothing without them."""
+    if metrics is not None:
+        click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str] = ()) -> str:

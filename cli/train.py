@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from clsplat.blocks.state import is_in_blocks, remove_blocks
-from clsplat.compression.state import is_search, remove_search
+from clsplat.blocks.state import BlocksState
+from clsplat.compression.state import BudgetState
 from clsplat.errors import InputError, OutputError
 from clsplat.files.real_path import real_path
 from clsplat.files.stop_signals import exit_code
@@ -41,7 +41,7 @@ from .options import (
     split_options,
     warn_without_effect,
 )
-from .progress import TrainingDisplay, activity_line, duration
+from .progress import TrainingDisplay, activity_line, duration, report_test_views
 from .reconstruct import scene_of_photos
 from .view import addresses, server_options
 
@@ -224,6 +224,7 @@ def train(
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
     model_path = model_path or _default_folder(path)
     recorded, photos, blocks = None, {}, None
+    is_used = ModelFolder(model_path).is_used or BudgetState.is_in(model_path) or BlocksState.is_in(model_path)
     if resume:
         stored = find_unfinished(model_path)
         if search is not None and stored.search is None:
@@ -231,33 +232,34 @@ def train(
         options, reading = stored.run.options | options, stored.run.scene | reading
         recorded, photos = stored.run.scene_path, stored.run.scene["photos"]
         path, search, blocks = path or recorded, search or stored.search, stored.blocks
-    elif any((ModelFolder(model_path).is_used, is_search(model_path), is_in_blocks(model_path))) and not overwrite:
+    elif is_used and not overwrite:
         # The function train checks this too, but only after the scene is read.
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
     assert path is not None
     config = TrainConfig(**options)
     blocks = blocks_for(config) if blocks_for is not None else blocks
+    if cluster is not None and search is None and blocks is None:
+        raise click.UsageError("--cluster is for several runs: give --blocks or --budget auto too")
     if is_photographs(path):
         path = scene_of_photos(path, model_path, overwrite, quiet, recorded)
     with activity_line(quiet):
         loaded = load_recorded_scene(path, reading, config.background)
     warn_without_effect([decide(loaded, config).config], flags)
     check_photos(loaded, photos, model_path, allow=allow_changed_photos, all_views=True)
-    if cluster is not None and search is None and blocks is None:
-        raise click.UsageError("--cluster is for several runs: give --blocks or --budget auto too")
     if blocks is not None:
-        remove_search(model_path)
+        BudgetState.remove_from(model_path)
         run_blocks(ctx, loaded, config, blocks, model_path, resume, overwrite, quiet, cluster)
         return
     if search is not None:
         if view:
             raise click.UsageError(f"{model_path} is a search of many runs: resume it without --view")
+        BlocksState.remove_from(model_path)
         run_search(ctx, loaded, config, search, model_path, resume, overwrite, quiet, cluster)
         return
     serving = ServerOptions(host, port, names, token)
     with _viewer(loaded, config, model_path, serving, quiet) if view else nullcontext() as live:
-        remove_search(model_path)
-        remove_blocks(model_path)
+        BudgetState.remove_from(model_path)
+        BlocksState.remove_from(model_path)
         model = run_training(loaded, config, model_path, resume, overwrite, quiet, live)
         if not model.finished:
             report_interruption(ctx, model)
@@ -337,5 +339,4 @@ def report(model: Model, metrics: Evaluation | None) -> None:
         f"trained {model.iteration} iterations in {duration(model.seconds)}, "
         f"peak memory {model.peak_bytes / 1e6:.0f} MB"
     )
-    if metrics is not None:
-        click.echo(f"test views ({len(metrics.per_view)}): PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
+    report_test_views(metrics)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..cluster.job import Abandoned, JobContext
+from ..cluster.job import JobContext
 from ..cluster.training import in_folder, progress_of, scene_of, train_in_folder
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
@@ -44,8 +44,8 @@ def train_block(
     device: str | None,
     progress: Callable[[Progress], None] | None = None,
     visit: Visit | None = None,
-) -> dict[str, Any] | None:
-    """Train a block and return what that took, as `train_in_folder` does; None if it was stopped.
+) -> dict[str, Any]:
+    """Train a block and return what that took, as `train_in_folder` does.
 
     Parameters
     ----------
@@ -61,9 +61,6 @@ def train_block_on_worker(work: JobContext, job: BlockJob) -> dict[str, Any]:
     scene = scene_of(job.source, SceneSource.load)
 
     def run(folder: Path) -> dict[str, Any]:
-        row = train_block(job, scene, folder, work.device, progress_of(work), work.stop_if_unwanted)
-        if row is None:
-            raise Abandoned
-        return row
+        return train_block(job, scene, folder, work.device, progress_of(work), work.stop_if_unwanted)
 
     return in_folder(job.folder / RUN, run, keep=True)

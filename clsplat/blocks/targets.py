@@ -49,9 +49,8 @@ def _target(view: View, whole: Splats, n_inside: int, scene: Scene, renderer: Re
 
 def block_part(view: View, whole: Splats, n_inside: int, renderer: Renderer) -> tuple[DoubleArray, DoubleArray]:
     """Return the part of each pixel that the first splats make up, and the opacity of all of them, (H, W), 0 to 1."""
-    colors = np.zeros((len(whole), 1, 3), whole.sh.dtype)
-    colors[:n_inside] = 0.5 / SH_C0  # white, and black for the others
-    colors[n_inside:] = -0.5 / SH_C0
+    colors = np.full((len(whole), 1, 3), -0.5 / SH_C0, whole.sh.dtype)  # black, and white for the first ones
+    colors[:n_inside] = 0.5 / SH_C0
     marked = whole.with_arrays(whole.to_numpy() | {"sh": colors})
     shown = renderer.render(marked, view.camera)
     return shown.color[..., 0].astype(np.float64), shown.alpha.astype(np.float64)

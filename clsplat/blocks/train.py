@@ -15,18 +15,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..cameras.cameras_json import named_cameras
 from ..cluster.job import Job
 from ..cluster.pool import WorkerPool
 from ..cluster.training import marked, train_in_folder
 from ..compression.prune_and_refine import Part, fine_tuning
-from ..errors import ClsplatError, InputError, OutputError, Remedy
+from ..errors import InputError, OutputError, Remedy
 from ..files.lock import folder_lock
 from ..files.real_path import real_path
 from ..rendering.renderer import Renderer
@@ -39,6 +38,7 @@ from ..training.decisions import as_decided, decide
 from ..training.folder import ModelFolder, scene_record
 from ..training.log import Progress
 from ..training.options.density import Adc
+from ..training.stages import StepReports
 from .job import CONTEXT, RUN, START, BlockJob, train_block, train_block_on_worker
 from .partition import Partition, make_partition, surroundings
 from .picture import write_picture
@@ -170,10 +170,10 @@ class _Stages:
         folder: ModelFolder,
         cluster: str | None,
     ) -> None:
-        self.scene, self.options, self.report, self.cluster = scene, options, progress, cluster
+        self.scene, self.options, self.cluster = scene, options, cluster
         self.config = config.replace(save_iterations=(), test_iterations=())
-        self.progress: ProgressCallback | None = progress and self._with_step
-        self.state, self.folder, self.step = state, folder, 1
+        self.state, self.folder = state, folder
+        self.steps = StepReports(progress, STEPS, config.iterations)
 
     def run(self) -> BlocksModel:
         """Run the missing stages."""
@@ -197,13 +197,15 @@ class _Stages:
     def train_coarse(self) -> None:
         """Make the coarse model."""
         config = self.config.replace(cap_max=max(math.ceil(COARSE_CAP * self.config.cap_max), 1))
-        self.tell(1, f"a coarse model of {config.iterations} iterations with at most {config.cap_max} splats")
+        self.steps.tell(1, f"a coarse model of {config.iterations} iterations with at most {config.cap_max} splats")
         self.state.put("coarse", self.train_whole("coarse", config))
 
     def divide(self) -> None:
         """Divide the scene, and draw the cells."""
         coarse, columns, rows = self.coarse(), self.options.columns, self.options.rows
-        self.tell(2, f"{columns} x {rows} blocks of {len(coarse)} splats and {len(self.scene.train)} training views")
+        self.steps.tell(
+            2, f"{columns} x {rows} blocks of {len(coarse)} splats and {len(self.scene.train)} training views"
+        )
         partition = make_partition(self.scene, coarse, Renderer(self.config.device), columns, rows)
         write_picture(self.folder.path / PICTURE, self.scene, partition)
         self.state.put("partition", partition.to_json())
@@ -213,10 +215,10 @@ class _Stages:
         coarse = self.coarse()
         blocks = [block for block in partition.blocks if block.views]
         cap = self.config.cap_max // self.options.count
-        self.tell(3, f"{len(blocks)} blocks with at most {cap} splats, {self.config.iterations} iterations each")
+        self.steps.tell(3, f"{len(blocks)} blocks with at most {cap} splats, {self.config.iterations} iterations each")
         cell = partition.cells.of(coarse.mean)
         around = surroundings(self.scene, coarse, Renderer(self.config.device), partition)
-        jobs = []
+        source, jobs = SceneSource.of(self.scene), []
         for block in blocks:
             folder = real_path(self.state.folder) / f"block_{block.number}"
             folder.mkdir(parents=True, exist_ok=True)
@@ -224,8 +226,7 @@ class _Stages:
             inside.save(folder / START)
             coarse.select(around[block.number]).save(folder / CONTEXT)
             config = block_config(self.config, folder / START, max(cap, len(inside)))
-            source = SceneSource.of(self.scene).of_views(block.views)
-            jobs.append(BlockJob(source, config, folder, 1.0 / len(blocks)))
+            jobs.append(BlockJob(source.of_views(block.views), config, folder, 1.0 / len(blocks)))
         rows = self.train_all(jobs, [f"block {block.number}" for block in blocks])
         parts = [coarse.select(np.flatnonzero(~np.isin(cell, [block.number for block in blocks])))]
         for block, job, row in zip(blocks, jobs, rows, strict=True):
@@ -242,7 +243,7 @@ class _Stages:
         iterations = math.ceil(POLISH * self.config.iterations) if polish is None else polish
         whole = Splats.load(self.state.folder / MERGED)
         if iterations:
-            self.tell(4, f"{len(whole)} splats together, {iterations} iterations")
+            self.steps.tell(4, f"{len(whole)} splats together, {iterations} iterations")
         run = block_config(self.config, self.folder.path, self.config.cap_max)  # its last rates are those of the polish
         for number, rate in enumerate(POLISH_RATES if iterations else ()):
             name, part = f"polish_{number}", Part(iterations / len(POLISH_RATES) / run.iterations, rate)
@@ -251,8 +252,7 @@ class _Stages:
             self.train_whole(name, fine_tuning(run, whole, part, file))
             whole = Splats.load(self.state.run_folder(name).latest_ply()[0])
         self.folder.write_run(self.state.values["config"], self.scene)
-        views = [*self.scene.test, *self.scene.train]
-        self.folder.write_cameras(named_cameras([view.name for view in views], [view.camera for view in views]))
+        self.folder.write_views([*self.scene.test, *self.scene.train])
         path = self.folder.ply_path(self.config.iterations + iterations)
         whole.save(path)
         seconds = round(time.perf_counter() - start, 2)
@@ -262,10 +262,7 @@ class _Stages:
 
     def train_whole(self, name: str, config: TrainConfig) -> dict[str, Any]:
         """Make a run of the whole scene in this process, and return what it took."""
-        row = train_in_folder(config, self.scene, self.state.run_folder(name).path, None, self.progress)
-        if row is None:
-            raise KeyboardInterrupt
-        return row
+        return train_in_folder(config, self.scene, self.state.run_folder(name).path, None, self.steps.progress)
 
     def train_all(self, jobs: Sequence[BlockJob], names: Sequence[str]) -> list[dict[str, Any]]:
         """Train blocks here or on workers, and return what each took."""
@@ -275,37 +272,15 @@ class _Stages:
     def _here(self, jobs: Sequence[BlockJob]) -> Iterator[tuple[int, dict[str, Any]]]:
         for number, job in enumerate(jobs):
             scene = job.source.part_of(self.scene)
-            row = train_block(job, scene, job.folder / RUN, self.config.device, self.progress)
-            if row is None:
-                raise KeyboardInterrupt
-            yield number, row
+            yield number, train_block(job, scene, job.folder / RUN, self.config.device, self.steps.progress)
 
     def _on_workers(self, jobs: Sequence[BlockJob], names: Sequence[str]) -> Iterator[tuple[int, dict[str, Any]]]:
         assert self.cluster is not None
-        failed: ClsplatError | None = None
         for job in jobs:
             marked(job.folder)
         with WorkerPool(self.cluster, self.config.device) as pool:
             work = [Job(name, train_block_on_worker, (job,)) for name, job in zip(names, jobs, strict=True)]
-            for number, result in pool.results(work):
-                if isinstance(result, ClsplatError):
-                    failed = failed or result
-                else:
-                    yield number, result
-        if failed is not None:
-            raise failed
-
-    def tell(self, step: int, message: str) -> None:
-        """Send a message to the display, and name the step (from 1) in all that follows."""
-        self.step = step
-        if self.report is not None:
-            text = f"step {step} of {STEPS}, {message}"
-            self.report(Progress(0, self.config.iterations, math.nan, math.nan, 0, 0.0, 0.0, text))
-
-    def _with_step(self, report: Progress) -> None:
-        """Send a report of one run to the display, with the step."""
-        if self.report is not None:
-            self.report(replace(report, phase=f"step {self.step} of {STEPS}"))
+            yield from pool.successes(work)
 
 
 def block_config(config: TrainConfig, start: Path, cap: int) -> TrainConfig:

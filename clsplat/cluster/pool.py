@@ -14,7 +14,7 @@ from typing import Any
 
 from .. import activity
 from .._version import __version__
-from ..errors import ClusterError
+from ..errors import ClsplatError, ClusterError
 from .address import ClusterAddress
 from .dask import distributed, scheduler_address
 from .job import RESOURCE, Job, Outcome, perform
@@ -61,6 +61,8 @@ class WorkerPool:
             except (OSError, ValueError):
                 raise no_scheduler(str(place)) from None
             self._open = opened.pop_all()
+        if self.dashboard is not None:
+            activity.report(f"Dask's page about these runs: {self.dashboard}")
         return self
 
     def __exit__(
@@ -104,6 +106,19 @@ class WorkerPool:
             yield from round_.results()
         finally:
             round_.end()
+
+    def successes(
+        self, jobs: Sequence[Job], on_begin: Callable[[int], None] | None = None
+    ) -> Iterator[tuple[int, Any]]:
+        """Do as `results`, but raise the first error of a job once all others have ended."""
+        failed: ClsplatError | None = None
+        for number, result in self.results(jobs, on_begin):
+            if isinstance(result, ClsplatError):
+                failed = failed or result
+            else:
+                yield number, result
+        if failed is not None:
+            raise failed
 
 
 class _Round:

@@ -51,7 +51,7 @@ def train_in_folder(
     context: Splats | None = None,
     progress: Callable[[Progress], None] | None = None,
     visit: Visit | None = None,
-) -> dict[str, Any] | None:
+) -> dict[str, Any]:
     """Train a model in its folder, or go on from the checkpoint there.
 
     Parameters
@@ -61,7 +61,11 @@ def train_in_folder(
     Returns
     -------
     What the run took: "splats" (without the context), "context" (their number), "seconds", "peak_bytes" of this process
-    and "device_bytes". None if it was stopped; its checkpoint is saved.
+    and "device_bytes".
+
+    Raises
+    ------
+    KeyboardInterrupt : the run was stopped; its checkpoint is saved. Others are those of `train`.
     """
     resume = holds_run(ModelFolder(folder), config)
     n_context = 0 if context is None else len(context)
@@ -76,7 +80,7 @@ def train_in_folder(
         context=context if n_context else None,
     )
     if not model.finished:
-        return None
+        raise KeyboardInterrupt
     return {
         "splats": len(model.splats) - n_context,
         "context": n_context,
@@ -91,10 +95,7 @@ def train_in_place(work: JobContext, job: TrainJob) -> dict[str, Any]:
     scene, config = scene_of(job.source, SceneSource.load), job.config.replace(device=work.device)
 
     def run(folder: Path) -> dict[str, Any]:
-        row = train_in_folder(config, scene, folder, None, progress_of(work), work.stop_if_unwanted)
-        if row is None:
-            raise Abandoned
-        return row
+        return train_in_folder(config, scene, folder, None, progress_of(work), work.stop_if_unwanted)
 
     return in_folder(job.folder, run, keep=True)
 

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .. import activity
 from ..cluster.job import Job
 from ..cluster.pool import WorkerPool
 from ..cluster.training import marked, unmark
-from ..errors import ClsplatError
 from .runs import Run, RunFile
 from .table import Record
 
@@ -77,21 +75,13 @@ def do_runs(
     plan = list(plan)
     if not plan:
         return
-    failed: ClsplatError | None = None
     place = marked(place)
     try:
         with WorkerPool(cluster, plan[0].run.config.device) as pool:
-            if pool.dashboard is not None:
-                activity.report(f"Dask's page about these runs: {pool.dashboard}")
-            for number, result in pool.results([planned.job() for planned in plan], lambda at: tell(plan[at])):
-                if isinstance(result, ClsplatError):
-                    failed = failed or result
-                    continue
-                add(plan[number], result)
+            for number, measured in pool.successes([each.job() for each in plan], lambda at: tell(plan[at])):
+                add(plan[number], measured)
                 if (scratch := plan[number].scratch) is not None:
                     shutil.rmtree(scratch, ignore_errors=True)
-        if failed is not None:
-            raise failed
     finally:
         unmark(place)
         runs.arrange([planned.record for planned in plan])  # workers end in any order

@@ -15,19 +15,17 @@ An interrupted stage goes on from its checkpoint.
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..cameras.cameras_json import named_cameras
 from ..cluster.job import Job
 from ..cluster.pool import WorkerPool
 from ..cluster.training import TrainJob, marked, train_in_place, unmark
-from ..errors import ClsplatError, OutputError
+from ..errors import OutputError
 from ..files.lock import folder_lock
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
@@ -40,6 +38,8 @@ from ..training.decisions import as_decided, decide
 from ..training.folder import ModelFolder, scene_record
 from ..training.log import Progress
 from ..training.run import train
+from ..training.stages import StepReports
+from ..training.stored_run import holds_run
 from .prune import Thresholds, Validation, apply_thresholds, prune, within_bytes
 from .prune_and_refine import ROUND, fine_tuning, without_messages, without_quarter
 from .rules import MIN_SPLATS, PARTS_SHARE, BudgetOptions, ModelRow, chosen_of, rounds_are_over
@@ -133,14 +133,13 @@ class _Search:
         cluster: str | None = None,
     ) -> None:
         self.cluster = cluster
-        self.scene, self.options, self.report = scene, options, progress
-        self.progress: ProgressCallback | None = progress and self._with_step
-        self.step = 1
+        self.scene, self.options = scene, options
         self.state, self.folder = state, folder
         self.split = hold_out(scene)
         self.renderer = Renderer(config.device)
         self.validation = Validation(self.renderer, self.split.test, config.background)
         self.config = config.replace(save_iterations=(), test_iterations=())
+        self.steps = StepReports(progress, STEPS, config.iterations)
         self.trial = self.config.replace(
             iterations=max(config.iterations // TRIAL_PART, 1),
             densify_interval=max(config.density.densify_interval // TRIAL_PART, 1),
@@ -166,26 +165,25 @@ class _Search:
         """Have workers make the runs of the trial and of all views at the same time, if they are not made yet."""
         runs = {"rounds": ("trial", self.split, self.trial), "all_views": ("whole", self.scene, self.config)}
         missing = [run for stage, run in runs.items() if stage not in self.state.values]
+        if not missing:
+            return
         place = marked(self.state.folder)
         jobs = [
             Job(name, train_in_place, (TrainJob(SceneSource.of(scene), config, place / name),))
             for name, scene, config in missing
         ]
-        if not jobs:
-            return
-        self.tell(1, f"{' and '.join(job.name for job in jobs)}: on workers")
+        self.steps.tell(1, f"{' and '.join(job.name for job in jobs)}: on workers")
         try:
             with WorkerPool(cluster, self.config.device) as pool:
-                for _, result in pool.results(jobs):
-                    if isinstance(result, ClsplatError):
-                        raise result
+                for _ in pool.successes(jobs):
+                    pass
         finally:
             unmark(place)
 
     def try_out(self) -> None:
         """Make a run of half the length with all splats, without the validation views."""
         start = time.perf_counter()
-        self.tell(
+        self.steps.tell(
             1,
             f"a run of {self.trial.iterations} iterations with at most {self.trial.cap_max} splats, "
             f"{len(self.split.train)} training views and {len(self.split.test)} validation views",
@@ -208,7 +206,7 @@ class _Search:
         """Find the fields and bands that the validation views do not need."""
         values, start = self.state.values, time.perf_counter()
         row = values["rounds"][values["chosen"]]
-        self.tell(3, f"parts of {row['splats']} splats that no view needs")
+        self.steps.tell(3, f"parts of {row['splats']} splats that no view needs")
         allowed = PARTS_SHARE * self.options.tolerance
         if self.options.target_psnr is not None:
             allowed = max(row["psnr"] - self.options.target_psnr, 0.0)
@@ -232,7 +230,7 @@ class _Search:
     def train_all(self) -> None:
         """Make a whole run with all training views."""
         start = time.perf_counter()
-        self.tell(4, f"all {len(self.scene.train)} training views, at most {self.config.cap_max} splats")
+        self.steps.tell(4, f"all {len(self.scene.train)} training views, at most {self.config.cap_max} splats")
         splats = self.trained("whole", self.scene, self.config)
         self.state.save("whole_0", splats)
         seconds = round(time.perf_counter() - start, 2)
@@ -279,8 +277,7 @@ class _Search:
         """Write the files of the model's folder, and return the point cloud's."""
         folder, rounds = self.folder, len(self.state.values["all_views"]) - 1
         folder.write_run(self.state.values["config"], self.scene)
-        views = [*self.scene.test, *self.scene.train]
-        folder.write_cameras(named_cameras([view.name for view in views], [view.camera for view in views]))
+        folder.write_views([*self.scene.test, *self.scene.train])
         last = _run_name("whole", rounds, len(ROUND) - 1) if rounds else "whole"
         for name, target in (("whole", folder.log_path), (last, folder.exposures_path)):
             source = self.state.run_folder(name).path / target.name
@@ -305,7 +302,7 @@ class _Search:
             config.seed,
             MIN_SPLATS,
         )
-        self.tell(2 if run == "trial" else 4, f"round {number}: {len(splats)} splats")
+        self.steps.tell(2 if run == "trial" else 4, f"round {number}: {len(splats)} splats")
         for step, part in enumerate(ROUND):
             name = _run_name(run, number, step)
             start = self.state.save(f"{name}_start", splats)
@@ -316,8 +313,8 @@ class _Search:
     def trained(self, name: str, scene: Scene, config: TrainConfig) -> Splats:
         """Train in a folder of the search, from the stage's checkpoint if there is one."""
         folder = self.state.run_folder(name)
-        resume = self.state.can_resume(folder, config)
-        report = without_messages(self.progress)
+        resume = holds_run(folder, config)
+        report = without_messages(self.steps.progress)
         model = train(scene, config, report, output=folder.path, resume=resume, overwrite=not resume)
         if not model.finished:
             raise KeyboardInterrupt
@@ -351,18 +348,6 @@ class _Search:
         if options.max_bytes is not None and nbytes > options.max_bytes:
             sentences.append(f"{nbytes} bytes are more than {options.max_bytes}: the smallest model tried is kept")
         return "; ".join(sentences) or None
-
-    def tell(self, step: int, message: str) -> None:
-        """Send a message to the display, and name the step of the search (from 1) in all that follows."""
-        self.step = step
-        if self.report is not None:
-            text = f"step {step} of {STEPS}, {message}"
-            self.report(Progress(0, self.config.iterations, math.nan, math.nan, 0, 0.0, 0.0, text))
-
-    def _with_step(self, report: Progress) -> None:
-        """Send a report of one run to the display, with the step of the search."""
-        if self.report is not None:
-            self.report(replace(report, phase=f"step {self.step} of {STEPS}"))
 
 
 def _run_name(run: str, number: int, step: int) -> str:

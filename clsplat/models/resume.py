@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..blocks.state import BlocksOptions, stored_blocks
+from ..blocks.state import BlocksOptions, BlocksState
 from ..compression.rules import BudgetOptions
-from ..compression.state import stored_search
+from ..compression.state import BudgetState
 from ..training.config import TrainConfig
 from ..training.log import Progress
 from ..training.stored_run import StoredRun, load_recorded_scene, stored_run
@@ -37,9 +37,9 @@ def find_unfinished(path: str | os.PathLike[str]) -> Unfinished:
     ------
     InputError : there is neither a checkpoint nor an unfinished search or training in blocks, or a file is damaged.
     """
-    if (search := stored_search(Path(path))) is not None:
+    if (search := BudgetState.stored(Path(path))) is not None:
         return Unfinished(*search)
-    if (blocks := stored_blocks(Path(path))) is not None:
+    if (blocks := BlocksState.stored(Path(path))) is not None:
         return Unfinished(blocks[0], blocks=blocks[1])
     return Unfinished(stored_run(path))
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..cameras.cameras_json import NamedCamera, write_cameras
+from ..cameras.cameras_json import NamedCamera, named_cameras, write_cameras
 from ..errors import InputError, OutputError
 from ..files.json_file import read_object, write_json
 from ..files.real_path import real_path
 from ..splats.splats import Splats
 
 if TYPE_CHECKING:
-    from ..scenes.scene import Scene
+    from ..scenes.scene import Scene, View
 
 _ITERATION = re.compile(r"iteration_(\d+)")
 
@@ -133,6 +134,10 @@ class ModelFolder:
     def write_cameras(self, named: list[NamedCamera]) -> None:
         """Write 3DGS's cameras.json."""
         write_cameras(self.cameras_path, named)
+
+    def write_views(self, views: Sequence[View]) -> None:
+        """Write the cameras of views to 3DGS's cameras.json."""
+        self.write_cameras(named_cameras([view.name for view in views], [view.camera for view in views]))
 
     def write_exposures(self, by_photo: dict[str, list[list[float]]]) -> None:
         """Write 3DGS's exposure.json."""

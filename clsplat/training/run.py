@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from ..cameras.cameras_json import named_cameras
 from ..errors import OutputError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..files.lock import folder_lock
@@ -75,8 +74,7 @@ def train(
             if checkpoint is None:
                 folder.clear()
             folder.write_run(config.to_json(), trainer.scene)
-            views = [*scene.test, *trainer.scene.validation, *trainer.scene.train]
-            folder.write_cameras(named_cameras([view.name for view in views], [view.camera for view in views]))
+            folder.write_views([*scene.test, *trainer.scene.validation, *trainer.scene.train])
         return trainer.run(folder, visit)
 
 

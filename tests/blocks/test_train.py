@@ -12,7 +12,7 @@ import pytest
 
 from clsplat.blocks import train as module
 from clsplat.blocks.partition import Partition, make_partition, surroundings
-from clsplat.blocks.state import BlocksOptions, remove_blocks, stored_blocks
+from clsplat.blocks.state import BlocksOptions, BlocksState
 from clsplat.blocks.train import PICTURE, BlocksModel, partition_scene, train_in_blocks
 from clsplat.errors import InputError, OutputError
 from clsplat.models.resume import resume
@@ -120,7 +120,7 @@ def test_an_interrupted_training_goes_on(
 def test_a_partition_is_where_a_training_goes_on(finished: BlocksModel, scene: Scene, tmp_path: Path) -> None:
     found = partition_scene(scene, TWO, CONFIG, output=tmp_path)
     assert found.to_json() == finished.report["partition"]
-    stored = stored_blocks(tmp_path)
+    stored = BlocksState.stored(tmp_path)
     assert stored is not None
     assert stored[1] == TWO
     whole = train_in_blocks(scene, TWO, CONFIG, output=tmp_path, resume=True)
@@ -148,7 +148,7 @@ def test_what_cannot_be_resumed_or_replaced(finished: BlocksModel, scene: Scene,
     with pytest.raises(OutputError, match="already holds a model: replace it, continue it or choose another folder"):
         train_in_blocks(scene, TWO, CONFIG, output=folder)
     with pytest.raises(InputError, match="finished: nothing to resume"):
-        stored_blocks(folder)
+        BlocksState.stored(folder)
     with pytest.raises(InputError, match="blocks\\.json"):
         train_in_blocks(scene, TWO, CONFIG, output=tmp_path / "new", resume=True)
     partition_scene(scene, TWO, CONFIG, output=tmp_path)
@@ -156,10 +156,10 @@ def test_what_cannot_be_resumed_or_replaced(finished: BlocksModel, scene: Scene,
         train_in_blocks(scene, BlocksOptions(3, 1, 8), CONFIG, output=tmp_path, resume=True)
     (tmp_path / "blocks.json").write_text('{"config": {}, "options": {}, "scene": {}}')
     with pytest.raises(InputError, match=r"blocks\.json: damaged"):
-        stored_blocks(tmp_path)
-    remove_blocks(tmp_path)
+        BlocksState.stored(tmp_path)
+    BlocksState.remove_from(tmp_path)
     assert not (tmp_path / "blocks").exists()
-    assert stored_blocks(tmp_path) is None
+    assert BlocksState.stored(tmp_path) is None
 
 
 @pytest.mark.parametrize("options", [{"exposure": True}, {"validate": True}, {"init": "model.ply"}])

@@ -6,7 +6,8 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 
 from clsplat.cluster import training as module
 from clsplat.cluster.job import Abandoned, Job, MissingFiles
+from clsplat.cluster.pool import WorkerPool
 from clsplat.cluster.training import MARK, in_folder, marked, scene_of, unmark
 from clsplat.comparison import compare as compare_module
 from clsplat.comparison import planned
@@ -87,6 +89,30 @@ class CountedWork:
             stop.set()
 
 
+class PoolHere(WorkerPool):
+    """Does the jobs in this process, the last one first.
+
+    Parameters
+    ----------
+    works : what each job gets from its worker. fails : numbers of jobs that fail.
+    """
+
+    def __init__(self, works: Iterator[CountedWork], fails: Collection[int] = ()) -> None:
+        self.works, self.fails = works, fails
+
+    def __enter__(self) -> PoolHere:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def results(self, jobs: Sequence[Job], on_begin: object = None) -> Iterator[tuple[int, Any]]:
+        for number in reversed(range(len(jobs))):
+            if number in self.fails:
+                yield number, OutputError("disk full")
+            else:
+                yield number, jobs[number].function(next(self.works), *jobs[number].arguments)
+
+
 @pytest.mark.parametrize("curve", [0, 3])
 def test_a_run_that_was_cut_short_goes_on(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, curve: int
@@ -97,21 +123,7 @@ def test_a_run_that_was_cut_short_goes_on(
     works = [CountedWork(8), CountedWork(1000)]
     left = iter(works)
 
-    class Pool:
-        """Does the jobs in this process."""
-
-        dashboard = None
-
-        def __init__(self, *_: object) -> None: ...
-        def __enter__(self) -> Pool:
-            return self
-
-        def __exit__(self, *_: object) -> None: ...
-
-        def results(self, jobs: list[Job], begin: object) -> Iterator[tuple[int, Any]]:
-            yield 0, jobs[0].function(next(left), *jobs[0].arguments)
-
-    monkeypatch.setattr(planned, "WorkerPool", Pool)
+    monkeypatch.setattr(planned, "WorkerPool", lambda *_: PoolHere(left))
     with pytest.raises(Abandoned):
         compare([scene], systems, out, [CAP], [0], SHORT, curve=curve, cluster="local")
     assert [path.is_dir() for path in (out / UNFINISHED).iterdir()] == [True]
@@ -129,25 +141,8 @@ def test_runs_end_in_any_order_and_one_may_fail(scene: Scene, tmp_path: Path, mo
     compare([scene], systems, tmp_path / "whole", [CAP], [0, 1], SHORT)
     fails = [1]
 
-    class Pool:
-        """Does the jobs in this process, the last one first."""
-
-        dashboard = None
-
-        def __init__(self, *_: object) -> None: ...
-        def __enter__(self) -> Pool:
-            return self
-
-        def __exit__(self, *_: object) -> None: ...
-
-        def results(self, jobs: list[Job], begin: object) -> Iterator[tuple[int, Any]]:
-            for number in reversed(range(len(jobs))):
-                if number in fails:
-                    yield number, OutputError("disk full")
-                else:
-                    yield number, jobs[number].function(CountedWork(1000), *jobs[number].arguments)
-
-    monkeypatch.setattr(planned, "WorkerPool", Pool)
+    works = (CountedWork(1000) for _ in count())
+    monkeypatch.setattr(planned, "WorkerPool", lambda *_: PoolHere(works, fails))
     with pytest.raises(OutputError, match="disk full"):
         compare([scene], systems, out, [CAP], [0, 1], SHORT, cluster="local")
     assert lines(out) == [line for place, line in enumerate(lines(tmp_path / "whole")) if place != 1]

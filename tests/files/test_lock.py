@@ -15,7 +15,7 @@ from pathlib import Path
 import pretended_windows
 import pytest
 
-from clsplat.compression.state import FILE, remove_search
+from clsplat.compression.state import BudgetState
 from clsplat.errors import OutputError
 from clsplat.files import lock
 from clsplat.files.lock import folder_lock
@@ -95,17 +95,17 @@ def refused(folder: Path, start: str) -> bool:
 
 def test_a_running_search_keeps_its_results(folder: Path, start: str) -> None:
     """A second run with --overwrite is refused before it removes anything."""
-    (folder / FILE).write_text("{}")
+    (folder / BudgetState.FILE).write_text("{}")
     process = holder(folder, start)
     try:
         with pytest.raises(OutputError, match="another run writes into it"):
-            remove_search(folder)
-        assert (folder / FILE).exists()
+            BudgetState.remove_from(folder)
+        assert (folder / BudgetState.FILE).exists()
     finally:
         process.kill()
         process.wait(10)
-    remove_search(folder)
-    assert not (folder / FILE).exists()
+    BudgetState.remove_from(folder)
+    assert not (folder / BudgetState.FILE).exists()
 
 
 @pytest.mark.parametrize("start", ["windows"], indirect=True)
