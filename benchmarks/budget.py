@@ -25,7 +25,7 @@ from clsplat.comparison.measure import warm_up
 from clsplat.comparison.search_chart import rounds_chart
 from clsplat.compression.rules import TOLERANCE, BudgetOptions
 from clsplat.compression.search import train_budget
-from clsplat.compression.state import FILE
+from clsplat.compression.state import BudgetState
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
@@ -64,7 +64,7 @@ def search(case: Case, seed: int, args: Any, runs: Runs) -> None:
     warm_up(scene, config, renderer.device)
     plain = [plain_run(scene, config.replace(cap_max=max(round(share * case.cap), 1)), renderer) for share in SHARES]
     work = args.work / "-".join(str(row[name]) for name in KEY)
-    resume = (work / FILE).is_file()
+    resume = (work / BudgetState.FILE).is_file()
     result = train_budget(
         scene, config, BudgetOptions(args.tolerance), output=work, resume=resume, overwrite=not resume
     )

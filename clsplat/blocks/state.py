@@ -31,3 +31,4 @@ class BlocksState(StagesState):
     """blocks.json in a model's folder, written after every stage."""
 
     FILE, FOLDER, NAME, OPTIONS = "blocks.json", "blocks", "training", BlocksOptions
+    FINISHED = "the training in blocks is finished: nothing to resume"

@@ -14,6 +14,7 @@ class BudgetState(StagesState):
     """budget.json in a model's folder, written after every stage, and the models and runs of the stages."""
 
     FILE, FOLDER, NAME, OPTIONS = "budget.json", "budget", "search", BudgetOptions
+    FINISHED = "the search is finished: nothing to resume"
 
     def load(self) -> None:
         """Read an earlier search; raises InputError if it is missing, damaged, or of a version with other stages."""

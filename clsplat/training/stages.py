@@ -24,13 +24,14 @@ class StagesState:
 
     Attributes
     ----------
-    FILE, FOLDER : their names. NAME : what messages call the training. OPTIONS : the class of its own options.
+    FILE, FOLDER : their names. NAME, FINISHED : what messages say of it. OPTIONS : the class of its own options.
     values : "config", "options", "scene" (how it was read), and a key for each finished stage.
     """
 
     FILE: ClassVar[str]
     FOLDER: ClassVar[str]
     NAME: ClassVar[str]
+    FINISHED: ClassVar[str]
     OPTIONS: ClassVar[type[Any]]
 
     def __init__(self, output: Path) -> None:
@@ -99,7 +100,7 @@ class StagesState:
         except DAMAGE as error:
             raise InputError(f"{state.path}: damaged ({error}): start again with --overwrite") from None
         if "final" in state.values:
-            raise InputError(f"{output}: the {cls.NAME} is finished: nothing to resume")
+            raise InputError(f"{output}: {cls.FINISHED}")
         return stored, options
 
     @classmethod

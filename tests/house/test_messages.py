@@ -22,7 +22,6 @@ ALL_WITH_MODELS = ("render", "eval", "view", "prune", "clean")
 # name options as `Remedy`; each command shows its own.
 NAMED_IN = {
     "cameras/make_path.py": ("render",),
-    "blocks/state.py": ("train",),
     "blocks/train.py": ("train", "partition"),
     "compression/search.py": ("train",),
     "compression/state.py": ("train",),
@@ -43,6 +42,7 @@ NAMED_IN = {
     "training/initialise.py": TRAINING,
     "training/optim/rules.py": ("train",),
     "training/run.py": ("train",),
+    "training/stages.py": ("train",),
     "training/stored_run.py": ("train",),
     "training/extension.py": ("train",),
     "viewer/access.py": ("train", "view"),

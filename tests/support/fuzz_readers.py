@@ -228,9 +228,9 @@ def make_search(folder: Path) -> None:
 
 
 def read_search(folder: Path) -> None:
-    from clsplat.compression.state import stored_search
+    from clsplat.compression.state import BudgetState
 
-    found = stored_search(folder)
+    found = BudgetState.stored(folder)
     if found is not None:
         TrainConfig(**found[0].options)
 
