@@ -11,6 +11,7 @@ import click
 
 from clsplat.blocks.state import BlocksState
 from clsplat.compression.state import BudgetState
+from clsplat.device.specs import count_devices
 from clsplat.errors import InputError, OutputError
 from clsplat.files.real_path import real_path
 from clsplat.files.stop_signals import exit_code
@@ -213,12 +214,17 @@ def train(
     search, blocks_for = search_options(values), given_blocks(values)
     if blocks_for is not None and (view or search is not None):
         raise click.UsageError("--blocks is for one model of a large scene: remove --view and --budget")
+    if count_devices(values.get("device")) > 1 and (blocks_for is not None or search is not None):
+        raise click.UsageError("--blocks and --budget share runs, not photos, among devices: give --cluster local:N")
     check_device(values.get("device"), cluster)
     if view and search is not None:
         raise click.UsageError("--view shows one run: remove --budget, or show the result with clsplat view")
     flags = config_values(ctx, values)
     options = {} if config_file is None else read_options_file(config_file)
-    options |= ({} if quality_name is None else quality(quality_name)) | flags
+    batch = flags.get("batch", count_devices(flags.get("device")))
+    if batch > 1 and preset is None and not resume:
+        quality_name = quality_name or NORMAL  # its iterations count photos
+    options |= ({} if quality_name is None else quality(quality_name, batch)) | flags
     if preset is not None:
         options = with_preset(preset, options)
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}

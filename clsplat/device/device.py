@@ -17,6 +17,7 @@ from .caches import ensure_caches
 from .context import shared_context
 from .opencl import Buffer, Event, first_line, is_out_of_memory
 from .pip_runtime import register_pip_runtime
+from .specs import count_devices
 
 if TYPE_CHECKING:
     import pyopencl
@@ -222,8 +223,10 @@ def open_device(spec: str | None = None) -> Device:
 
     Raises
     ------
-    DeviceError : no platform, no such device, or only devices known not to work.
+    DeviceError : no platform, no such device, several devices, or only devices known not to work.
     """
+    if count_devices(spec) > 1:
+        raise DeviceError(f"device {spec!r} names several devices: only the training of one model uses them, name one")
     pairs = _all_devices()
     if not pairs:
         raise DeviceError(NO_PLATFORM)

@@ -129,7 +129,7 @@ def measure_training(trainer: Trainer, limits: Roofline, iterations: int) -> Rep
     start = time.perf_counter()
     trainer.density.densify(trainer.iteration)
     trainer.device.finish()
-    action_ms = 1e3 * (time.perf_counter() - start) / trainer.config.density.densify_interval
+    action_ms = 1e3 * (time.perf_counter() - start) / trainer.config.densify_every
     wall_ms = measured.wall_ms + action_ms
     stages = [dataclasses.replace(stage, share=stage.ms / wall_ms) for stage in measured.stages]
     stages.insert(-1, StageTime("strategy", action_ms, action_ms / wall_ms))

@@ -34,6 +34,7 @@ STAGES = {
         "settle_color",
         "settle_geometry",
         "settle_skew",
+        "add_columns",
     ),
     "strategy": ("summarise_splats", "gather_columns", "scatter_columns", "zero_columns"),
     "transfers": TRANSFERS,

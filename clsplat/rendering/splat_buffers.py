@@ -111,21 +111,30 @@ class SplatBuffers(ParameterBuffers):
 class CompactGradients(ParameterBuffers):
     """Gradients of all parameters. The gradients of the SH coefficients are kept as the two factors of a product.
 
-    `sh` is [6, capacity], or (N, 2, 3) on the host: the gradient of the colour, and the unit direction from the camera,
-    at which the SH basis is evaluated. Their product would have 3 K numbers for each splat and would be the largest
-    output of the backward pass.
+    `sh` is [6 photos, capacity], or (N, 2 photos, 3) on the host: for each photo the gradient of the colour, and the
+    unit direction from the camera, at which the SH basis is evaluated. Their product would have 3 K numbers for each
+    splat and would be the largest output of the backward pass.
+
+    Parameters
+    ----------
+    photos : photos whose gradients are summed; the backward pass writes those of one.
     """
 
-    def __init__(self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating]) -> None:
-        self.sh_degree = schema.sh_degree
-        fields = (replace(field, width=COMPACT_ROWS) if field.name == "sh" else field for field in schema)
+    def __init__(
+        self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating], photos: int = 1
+    ) -> None:
+        self.sh_degree, self.photos = schema.sh_degree, photos
+        fields = (replace(field, width=COMPACT_ROWS * photos) if field.name == "sh" else field for field in schema)
         super().__init__(device, Schema(tuple(fields)), capacity, dtype)
 
     def written_out(self, n: int) -> dict[str, Array]:
         """Return the gradients of the first n splats by field, with `sh` multiplied out to (N, K, 3)."""
         arrays = self.download(n)
-        v_rgb, direction = arrays["sh"][:, :1], arrays["sh"][:, 1]
-        return arrays | {"sh": sh_basis(direction, self.sh_degree)[:, :, None] * v_rgb}
+        sh = sum(
+            sh_basis(direction, self.sh_degree)[:, :, None] * v_rgb[:, None]
+            for v_rgb, direction in zip(*(arrays["sh"][:, part::2].swapaxes(0, 1) for part in (0, 1)), strict=True)
+        )
+        return arrays | {"sh": np.asarray(sh, self.dtype)}
 
 
 class SplatStatistics:

@@ -1,4 +1,4 @@
-"""Moves of splats between the columns of buffers [rows, capacity] on the device (cl/train/columns.cl)."""
+"""Moves and sums of columns of buffers [rows, capacity] on the device (cl/train/columns.cl)."""
 
 from __future__ import annotations
 
@@ -57,6 +57,34 @@ class Columns:
     def zero(self, values: Buffer, fresh: Buffer, n: int, rows: int) -> None:
         """Set those of the first n columns to zero for which `fresh` (n bytes) is not 0."""
         self.program.zero_columns.over(n, GROUP_ITEMS, rows, values=values, fresh=fresh, capacity=self.capacity, n=n)
+
+    def add(
+        self,
+        total: Buffer,
+        addend: Buffer,
+        n: int,
+        target: slice,
+        source: slice,
+        factor: float = 1.0,
+        adds: bool = True,
+    ) -> None:
+        """Add rows of the first n columns, times a factor, to rows of `total`, or replace those rows.
+
+        Parameters
+        ----------
+        target, source : rows of `total` and of `addend`, equally many.
+        adds : False to replace the rows.
+        """
+        self.program.add_columns.over(
+            n,
+            GROUP_ITEMS,
+            target.stop - target.start,
+            sum=total,
+            addend=addend,
+            **{"capacity": self.capacity, "first": target.start, "from": source.start, "n": n},
+            factor=factor,
+            adds=int(adds),
+        )
 
     def _gather(self, values: Buffer, source: Buffer, moved: Buffer, width: int, first: int, n: int, rows: int) -> None:
         self.program.gather_columns.over(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field
 from typing import Any
@@ -117,7 +118,10 @@ class TrainConfig:
         below=2**64,
     )
     device: str | None = option(
-        None, help='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name.', metavar="SPEC"
+        None,
+        help='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name. For train also several '
+        "with commas between, as 0:0,0:1, or the equal parts of one, as cpu/2.",
+        metavar="SPEC",
     )
     density: Adc | Mcmc
     start: StartConfig
@@ -159,22 +163,28 @@ class TrainConfig:
         return self.density.strategy
 
     @property
+    def densify_every(self) -> int:
+        """Iterations from one densification to the next: those that have `densify_interval` photos, rounded down."""
+        return max(self.density.densify_interval // self.schedule.batch, 1)
+
+    @property
     def skew_map(self) -> str:
         """Name of the skew map in use: never "auto", and "" for shapes without a skew."""
         return map_named(self.optim.skew_map, shape_named(self.shape).skew_form)
 
     def rate_factor(self, field: str) -> float:
-        """Return the factor on a field's learning rate for the length of the run: max(1, 30 000 / iterations)^p.
+        """Return the factor on a field's learning rate for the length of the run: max(1, 30 000 / photos)^p √batch.
 
-        3DGS's rates were published for 30 000 iterations; shorter runs need larger steps. p is the field's
+        3DGS's rates were published for 30 000 iterations of one photo; shorter runs need larger steps. p is the field's
         `lr_power`: 3/4 for positions, 1/2 for rotation and the parameters of shapes, 1/4 for scale, 0 for the others.
         View-dependent colours have 1/4 (`optim.rules.SH_REST_POWER`).
         """
         return self.length_factor(next((known.lr_power for known in known_fields() if known.name == field), 0.0))
 
     def length_factor(self, power: float) -> float:
-        """Return max(1, 30 000 / iterations)^power."""
-        return float(max(1.0, PUBLISHED_ITERATIONS / self.iterations) ** power)
+        """Return max(1, 30 000 / photos)^power √batch, with the photos of all iterations of the run."""
+        batch = self.schedule.batch
+        return float(max(1.0, PUBLISHED_ITERATIONS / (self.iterations * batch)) ** power * math.sqrt(batch))
 
     def replace(self, **options: Any) -> TrainConfig:
         """Return a copy with other values of some options. The names are those of the constructor."""

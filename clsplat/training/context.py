@@ -13,7 +13,7 @@ import numpy as np
 from ..device.memory import to_device
 from ..errors import InputError
 from ..rendering.build import KernelBuild
-from ..rendering.splat_buffers import COMPACT_ROWS, CompactGradients, SplatBuffers
+from ..rendering.splat_buffers import CompactGradients, SplatBuffers
 from ..splats.fields import Array, Group
 from ..splats.splats import Splats
 from .columns import Columns
@@ -68,7 +68,7 @@ class FrozenSplats:
             to_device(self.splats.device, self._marks, marks)
             self._marked = n
         self._columns.zero(grads.geom, self._marks, n, self.splats.schema.rows(Group.GEOM))
-        self._columns.zero(grads.sh, self._marks, n, COMPACT_ROWS)
+        self._columns.zero(grads.sh, self._marks, n, grads.schema.rows(Group.SH))
 
     def with_frozen(self, edit: DensifyEdit) -> DensifyEdit:
         """Return an edit of the splats that change as one of all splats."""

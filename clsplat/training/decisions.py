@@ -9,6 +9,7 @@
 - With few photos, splats that fit a single photo are cheap, and other views see them. A part of the splats is not drawn
   in each iteration (dropout.py). With very few photos, no splat starts at a random place beside the scene's points.
 - Splats that start at random places have a longer way, so their learning rates are twice as high.
+- On several devices, an iteration has a photo for each of them.
 - A step of Adam reads and writes every parameter, also of splats that the image does not show. On a GPU it takes a
   large part of an iteration. If photos show a part of a large scene, only visible splats step (optim/lazy.py).
 - Splats very close to a camera are not drawn (`near_plane.py`): one of them can hide a whole scene from views between
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..cameras.seen import mean_share_seen, sampled
 from ..device.device import open_device
+from ..device.specs import count_devices, first_device
 from .config import OPTIONS, TrainConfig
 from .initialise import MIN_POINTS
 from .log import Progress
@@ -109,7 +111,11 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if why and config.iterations >= FEWEST_ITERATIONS and not {"lr_factor", *_RATES} & config.named_options.keys():
         chosen["lr_factor"] = RANDOM_START_RATES
         reasons.append(f"learning rates times {RANDOM_START_RATES:g}, because {why}")
-    if "visible_adam" not in config.named_options and (seen_by_photo := waits_for_sight(scene, config)):
+    if (devices := count_devices(config.device)) > 1 and "batch" not in config.named_options:
+        chosen["batch"] = devices
+        reasons.append(f"{devices} photos in an iteration, because there are {devices} devices")
+    one_photo = chosen.get("batch", config.schedule.batch) == 1
+    if one_photo and "visible_adam" not in config.named_options and (seen_by_photo := waits_for_sight(scene, config)):
         chosen["visible_adam"] = True
         reasons.append(f"steps of visible splats only, because a photo shows {seen_by_photo:.0%} of the points")
     if config.near_plane is None:
@@ -164,4 +170,4 @@ def waits_for_sight(scene: Scene, config: TrainConfig) -> float:
     share = mean_share_seen([view.camera for view in scene.train], sampled(scene.points.xyz))
     if share >= SEEN_SHARE or (1.0 - share) * config.cap_max < UNSEEN_SPLATS:
         return 0.0
-    return share if open_device(config.device).info.type == "GPU" else 0.0
+    return share if open_device(first_device(config.device)).info.type == "GPU" else 0.0

@@ -53,9 +53,10 @@ class ExposureLoss:
         self._photo = DeviceImage(loss.pool, self.kernels.dtype, 3)
         self._laid_over = DeviceImage(loss.pool, np.dtype(np.uint8), 3)
         self._partial = loss.pool.buffer(self.kernels.dtype, EXPOSURE_SUMS)
+        self._parts = 0  # of the latest evaluation, in `_partial`
 
     def evaluate(self, target: Target, rendered: Buffer, background: Color) -> LossResult:
-        """Compute the loss of an image, rendered over `background`, and step the photo's exposure."""
+        """Compute the loss of an image, rendered over `background`, and what the step of the exposure needs."""
         planes = self.targets.planes(target)
         if not self.in_use:
             return self.loss.evaluate(target.layout, rendered, planes)
@@ -89,24 +90,51 @@ class ExposureLoss:
             **common,
         )
         result = self.loss.evaluate(layout, photo, laid_over, target.unmasked)
-        parts = items * layout.height
-        partial = self._partial.reserve(parts)
+        self._parts = items * layout.height
+        partial = self._partial.reserve(self._parts)
         self.program.photo_of_render_vjp.over(
             items, group, layout.height, v=result.v_color, target=laid_over, partial=partial, **common
         )
-        if self.learns:
-            self.program.step_exposure(
-                (self._step_group,),
-                (self._step_group,),
-                exposures=self._exposures,
-                partial=partial,
-                parts=parts,
-                view=target.index,
-                views=len(self.targets.views),
-                rate=self.config.appearance.exposure_rate,
-                pull=self.config.appearance.exposure_pull,
-            )
         return result
+
+    def step(self, view: int, sums: NDArray[np.floating] | None = None) -> None:
+        """Step the exposure of a photo.
+
+        Parameters
+        ----------
+        view : index of the photo.
+        sums : what `sums` returned after the evaluation of the photo; None if it was the latest evaluation here.
+        """
+        if not self.learns:
+            return
+        partial, parts = self._partial.buffer, self._parts
+        if sums is not None:
+            parts = sums.size // EXPOSURE_SUMS
+            partial = self._partial.reserve(parts)
+            to_device(self.device, partial, sums)
+        self.program.step_exposure(
+            (self._step_group,),
+            (self._step_group,),
+            exposures=self._exposures,
+            partial=partial,
+            parts=parts,
+            view=view,
+            views=len(self.targets.views),
+            rate=self.config.appearance.exposure_rate,
+            pull=self.config.appearance.exposure_pull,
+        )
+
+    def sums(self) -> NDArray[np.floating] | None:
+        """Return what `step` needs of the latest evaluation, after waiting for the device; None without exposures."""
+        if not self.learns:
+            return None
+        sums: NDArray[np.floating] = np.empty(EXPOSURE_SUMS * self._parts, self.kernels.dtype)
+        return to_host(self.device, self._partial.buffer, sums)
+
+    def follow(self, other: ExposureLoss) -> None:
+        """Take the exposures of all photos from another device."""
+        if self.learns:
+            to_device(self.device, self._exposures, other._download())
 
     def exposures(self) -> NDArray[np.floating]:
         """Return the exposures E of all views, (views, 3, 4); the identity if exposures are not learned.

@@ -7,6 +7,8 @@ beta, and |e| - beta / 2 from there on (Girshick 2015, arXiv 1504.08083).
 from __future__ import annotations
 
 import math
+import statistics
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +46,16 @@ class LossValue:
     def psnr(self) -> float:
         """Peak signal-to-noise ratio of the unrounded image [dB]."""
         return -10 * math.log10(max(self.mse, 1e-12))
+
+    def to_json(self) -> dict[str, float]:
+        """Return the values by name, as in log.jsonl."""
+        return {"loss": self.total, "l1": self.l1, "ssim": self.ssim, "psnr": self.psnr}
+
+
+def mean_loss(values: Sequence[LossValue]) -> LossValue:
+    """Return the mean of the losses of several images."""
+    means = (statistics.fmean(getattr(value, name) for value in values) for name in ("total", "l1", "ssim", "mse"))
+    return LossValue(*means)
 
 
 @dataclass(frozen=True)

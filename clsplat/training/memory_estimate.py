@@ -10,7 +10,7 @@ from ..errors import FEWER_SPLATS, OTHER_DEVICE, SMALLER_IMAGES, DeviceError, Re
 from ..rendering.build import KernelBuild
 from ..rendering.frame import ImageLayout
 from ..rendering.pipeline import isect_bytes
-from ..rendering.splat_buffers import CAPACITY_STEP, COMPACT_ROWS, capacity_for
+from ..rendering.splat_buffers import CAPACITY_STEP, COMPACT_ROWS, SplatStatistics, capacity_for
 from ..scenes.scene import View
 from ..splats.fields import Group
 from .config import TrainConfig
@@ -91,6 +91,9 @@ def estimate(
     n_isects = _ISECTS_PER_TILE * layout.tiles_x * layout.tiles_y + _ISECTS_PER_SPLAT * n
     extra = 6 * SkewMap(config.skew_map).width if config.skew_map else 0  # s and two moments, with spare copies
     extra += 0 if config.sghmc.position_optimizer == "adam" else 6  # momentum
+    batch = config.schedule.batch
+    if batch > 1:  # the mean gradients, and rows that come from another device
+        extra += 2 * rows[Group.GEOM] + (batch + 1) * COMPACT_ROWS + SplatStatistics.ROWS
     widest = max(*rows.values(), kernels.record, kernels.v_record)  # of the buffers with a column for each splat
     color_roles = _ROLES - 1 - config.optim.half_moments  # two moments of 16 bits are one word
     splat = _ROLES * rows[Group.GEOM] + color_roles * rows[Group.SH] + COMPACT_ROWS + extra

@@ -87,18 +87,20 @@ _BELOW_STEPS = (
 _STEPS = ("train/optim.cl", "train/positions.cl")
 
 
-def optim_program(device: Device, kernels: KernelBuild, half_moments: bool = False) -> Program:
+def optim_program(device: Device, kernels: KernelBuild, half_moments: bool = False, photos: int = 1) -> Program:
     """Return the program of the optimizer: steps of colour, geometry and skew, SGHMC and noise.
 
-    half_moments : whether the moments of colours have 16 bits.
+    half_moments : whether the moments of colours have 16 bits. photos : those of an iteration.
     """
-    return build(device, (*_BELOW_STEPS, *_STEPS), _optim_defines(kernels, half_moments) | {"LAZY": 0}, kernels.real)
+    defines = _optim_defines(kernels, half_moments) | {"LAZY": 0, "PHOTOS": photos}
+    return build(device, (*_BELOW_STEPS, *_STEPS), defines, kernels.real)
 
 
 def lazy_program(device: Device, kernels: KernelBuild, half_moments: bool = False) -> Program:
     """Return the program of the optimizer with the kernels for visible splats (optim/lazy.py)."""
     defines = _optim_defines(kernels, half_moments) | {
         "LAZY": 1,
+        "PHOTOS": 1,
         "ADAM_WAITS": adam.WAITS,
         "CULLED_KEY": f"{CULLED_KEY:#x}u",
         "DRIFT": adam.DECAY_ROWS + adam.DRIFT,

@@ -21,12 +21,13 @@ QUALITIES: dict[str, Values] = {
 }
 
 
-def quality(name: str) -> Values:
+def quality(name: str, batch: int = 1) -> Values:
     """Return the options of a quality by their names in `TrainConfig`.
 
     Parameters
     ----------
     name : "draft", "normal" or "best".
+    batch : photos in an iteration. All qualities have the same photos in fewer iterations.
 
     Raises
     ------
@@ -34,4 +35,5 @@ def quality(name: str) -> Values:
     """
     if name not in QUALITIES:
         raise InputError(f"unknown quality {name!r}: choose one of {', '.join(QUALITIES)}")
-    return dict(QUALITIES[name])
+    values = QUALITIES[name]
+    return values | {"iterations": -(-values["iterations"] // batch)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from ..device.specs import first_device
 from ..errors import OutputError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..files.lock import folder_lock
@@ -85,4 +86,6 @@ def evaluate_test_views(splats: Splats, scene: Scene, config: TrainConfig) -> Ev
     -------
     The metrics, or None if the scene has no test views.
     """
-    return evaluate(Renderer(config.device), splats, scene.test, config.background) if scene.test else None
+    return (
+        evaluate(Renderer(first_device(config.device)), splats, scene.test, config.background) if scene.test else None
+    )

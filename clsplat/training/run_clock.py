@@ -54,7 +54,7 @@ class RunClock:
             config.cap_max,
             config.sh_degree,
             schedule,
-            config.density.densify_interval,
+            config.densify_every,
         )
         self.forecast = Forecast(run, splats.n, iteration)
         self.clock: Callable[[], float] = time.perf_counter

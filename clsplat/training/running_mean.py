@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from .loss import ImageLoss, LossResult, PendingValue
+from collections.abc import Iterable
+
+from .loss import PendingValue
 
 WINDOW = 100  # views of a running mean, if a scene has as many
 
@@ -24,9 +26,9 @@ class RunningLoss:
         self._weight = self._loss = self._psnr = 0.0
         self._pending: list[PendingValue] = []
 
-    def observe(self, loss: ImageLoss, result: LossResult) -> None:
-        """Take the latest evaluation of a loss, without waiting for the device."""
-        self._pending.append(loss.value_later(result))
+    def observe(self, values: Iterable[PendingValue]) -> None:
+        """Take the losses of an iteration, without waiting for the device."""
+        self._pending.extend(values)
 
     def means(self) -> tuple[float, float]:
         """Return the means of the loss and of the PSNR [dB], after waiting for the device; NaN without a value."""

@@ -62,7 +62,7 @@ def growth_factor(config: TrainConfig, n_first: int, window: int) -> float:
     """
     if not isinstance(config.density, Mcmc):
         return 1.0
-    actions = max(window // config.density.densify_interval // 2, 1)
+    actions = max(window // config.densify_every // 2, 1)
     return float(max(config.density.growth, (config.cap_max / n_first) ** (1 / actions)))
 
 

@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
-from ..device.device import Device, open_device
+from ..device.device import Device
+from ..device.several import open_devices
 from ..errors import InputError, TrainingError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..evaluation.floaters import measure_floaters
 from ..evaluation.metrics import check_sizes
 from ..files.host_memory import peak_bytes
 from ..rendering.frame import Frame
-from ..rendering.pipeline import Pipeline, isect_limit
 from ..rendering.renderer import Renderer
-from ..rendering.splat_buffers import CompactGradients, SplatBuffers
 from ..rendering.tuning import schedule_for
 from ..scenes.read_view import keep_photos
 from ..scenes.scene import Scene, View
@@ -28,30 +27,28 @@ from ..splats.fields import Array
 from ..splats.optical_depth import finite_rows
 from ..splats.splats import Splats
 from .average import ParameterAverage
+from .batch import Batch, Photo, check_batch
 from .checkpoint import Checkpoint
 from .checkpoint_times import CheckpointTimes
 from .config import TrainConfig
 from .context import FrozenSplats, check_context
 from .density.control import DensityControl, ExplorationNoise
-from .dropout import SplatDropout
-from .exposure import ExposureLoss, exposures_json
+from .exposure import exposures_json
 from .extension import reached_by
 from .folder import ModelFolder
 from .initialise import first_arrays
 from .interrupt import stoppable
 from .log import Progress, RunLog
-from .loss import ImageLoss, LossValue
-from .loss_check import check_loss
-from .memory_estimate import room_for_isects, run_memory
+from .loss import LossValue, PendingValue, mean_loss
+from .memory_estimate import run_memory
 from .model import Model
 from .optim.optimizer import make_optimizer
 from .programs import kernel_build
 from .rate_limits import check_rates
+from .replica import Replica
 from .run_clock import RunClock
 from .running_mean import RunningLoss
 from .schedules import RunSchedule, sh_degree_at
-from .step_check import check_step
-from .targets import Targets, target_budget, target_channels
 from .validation import RunValidation
 from .view_sampler import ViewSampler
 
@@ -99,7 +96,8 @@ class Trainer:
         check_rates(config)
         keep_photos(scene.train)
         self.scene, self.config, self.progress = scene, config, progress
-        self.device = device or open_device(config.device)
+        self.device, *others = [device] if device is not None else open_devices(config.device)
+        check_batch(config, 1 + len(others))
         schedule = schedule_for(self.device, checkpoint.schedule if checkpoint else None)
         self.kernels = kernel_build(config, schedule)
         self.memory = run_memory(self.device, self.kernels, config, scene.train)
@@ -110,7 +108,7 @@ class Trainer:
         self._send(f"{message}; about {self.memory}")
         self.reached = reached_by(checkpoint, config, scene.train) if checkpoint else None
         self.n_first = checkpoint.n_first if checkpoint else len(first["mean"]) - (len(context) if context else 0)
-        self._create_device_state(first)
+        self._create_device_state(first, others)
         if checkpoint is not None:
             self._load_state(checkpoint)
         self.views = ViewSampler(
@@ -140,7 +138,6 @@ class Trainer:
         self.clock = RunClock(config, self.schedule, self.views, self.pipeline, self.splats, self.iteration)
         self.running = RunningLoss(len(scene.train))
         self.noise = ExplorationNoise(config, self.kernels, self.splats, scene.extent)
-        self.dropout = SplatDropout(config, self.splats)
         self.renderer = Renderer(self.device)
         self.validation = RunValidation(
             self.renderer, scene.validation, config.background, config.iterations, config.output.save_iterations
@@ -154,24 +151,19 @@ class Trainer:
         self.rng.bit_generator.state = checkpoint.rng
         return checkpoint.splats, f"resumed at iteration {checkpoint.iteration} of {self.config.iterations}"
 
-    def _create_device_state(self, first: Mapping[str, Array]) -> None:
-        """Create the pipeline, the splats, the optimizer and the losses."""
-        config, kernels, dtype = self.config, self.kernels, self.kernels.dtype
+    def _create_device_state(self, first: Mapping[str, Array], others: Sequence[Device]) -> None:
+        """Create the splats of each device with what makes their gradients, and the optimizer of the first one."""
+        config = self.config
         n_frozen = 0 if self.context is None else len(self.context)
         capacity = max(config.cap_max + n_frozen, len(first["mean"]))
-        max_isects = min(isect_limit(self.device, kernels), room_for_isects(self.memory, self.device.info))
-        self.pipeline = Pipeline(self.device, kernels, max_isects)
-        self.splats = SplatBuffers(self.device, kernels.schema, capacity, dtype)
-        self.splats.set(first)
-        self.frozen = FrozenSplats(kernels, self.splats, n_frozen) if n_frozen else None
-        self.grads = CompactGradients(self.device, self.splats.schema, capacity, dtype)
-        self.optimizer = make_optimizer(self.device, kernels, self.splats, config, self.scene.extent)
-        self.loss = ImageLoss(self.pipeline.pool, kernels, config.loss.lambda_dssim, config.loss.smooth_l1)
-        check_loss(self.device, kernels, config.loss.lambda_dssim, config.loss.smooth_l1)
-        check_step(self.device, kernels, config.sghmc.position_optimizer)
-        channels = target_channels(self.scene.train, config.random_background)
-        self.targets = Targets(self.device, kernels, self.scene.train, target_budget(self.device), channels)
-        self.exposure = ExposureLoss(self.loss, self.targets, config, self.scene.background)
+        main = Replica(self.device, self.kernels, self.memory, self.scene, config, first, capacity)
+        self.pipeline, self.splats, self.grads, self.dropout = main.pipeline, main.splats, main.grads, main.dropout
+        self.loss, self.targets, self.exposure = main.loss, main.targets, main.exposure
+        self.main, self.batch = main, None
+        if config.schedule.batch > 1:
+            self.batch = Batch([main, *(main.copy_on(device, first) for device in others)], config)
+        self.frozen = FrozenSplats(self.kernels, self.splats, n_frozen) if n_frozen else None
+        self.optimizer = make_optimizer(self.device, self.kernels, self.splats, config, self.scene.extent)
 
     def _load_state(self, checkpoint: Checkpoint) -> None:
         state = dict(checkpoint.optimizer)
@@ -206,14 +198,14 @@ class Trainer:
                 it = self.iteration
                 if self.progress is not None:
                     self.clock.end(it)
-                    self.running.observe(self.loss, self.loss_result)
+                    self.running.observe(self.losses)
                 ends = it == config.iterations
                 measured = it in config.output.test_iterations and bool(self.scene.test)
                 validated = self.validation.is_due(it)
                 if measured or validated:
                     self.device.finish()  # pending commands count as training time
                 if it % LOG_INTERVAL == 0 or ends:
-                    value = self.loss.value(self.loss_result)
+                    value = mean_loss([loss.wait() for loss in self.losses])
                     self.seconds += time.perf_counter() - start
                     self._log(value, log)
                     self._show(since, started)
@@ -288,29 +280,44 @@ class Trainer:
         return max(scheduled, self.reached.sh_degree) if self.reached else scheduled
 
     def step(self) -> Frame:
-        """Do one iteration and return its frame: one image, one optimizer step, and a densification if it is due."""
+        """Do one iteration, and return its last frame: gradients, a step, and a densification if it is due."""
         config = self.config
         self.iteration += 1
-        it = self.iteration
-        target = self.targets.get(*self.views.next(it, self.splats.n))
-        degree = self.sh_degree
-        background = config.background
-        if config.random_background and it <= config.random_background_until * config.iterations:
-            r, g, b = self.rng.random(3).tolist()
-            background = r, g, b
-        frame = self.pipeline.forward(self.splats, target.camera, background, degree, self.dropout.of(it))
-        self.loss_result = self.exposure.evaluate(target, frame.images.color.buffer, background)
-        self.pipeline.backward(frame, self.loss_result.v_color, self.grads)
+        it, degree = self.iteration, self.sh_degree
+        photos = [self._next_photo() for _ in range(config.schedule.batch)]
+        grads, depth_key = self.grads, None
+        if self.batch is None:
+            (photo,) = photos
+            target = self.targets.get(photo.view, photo.downscale)
+            frame, self.loss_result = self.main.learn(target, photo.background, degree, it)
+            self.exposure.step(photo.view)
+            depth_key = frame.projected.depth_key
+        else:
+            frame, self._losses = self.batch.learn(photos, degree, it)
+            grads = self.batch.grads
         if self.frozen is not None:
-            self.frozen.clear(self.grads)
+            self.frozen.clear(grads)
         mean_lr = self.scene.extent * self.schedule.mean_rate(it)
-        self.optimizer.step(self.grads, mean_lr * config.rate_factor("mean"), degree, it, frame.projected.depth_key)
+        self.optimizer.step(grads, mean_lr * config.rate_factor("mean"), degree, it, depth_key)
         if self.density.is_due(it):
             self.density.densify(it)
         self.noise.add(it, mean_lr)
         if self.average.is_due(it):
             self.average.add(self.optimizer.read())
         return frame
+
+    def _next_photo(self) -> Photo:
+        config, it, background = self.config, self.iteration, self.config.background
+        view, downscale = self.views.next(it, self.splats.n)
+        if config.random_background and it <= config.random_background_until * config.iterations:
+            r, g, b = self.rng.random(3).tolist()
+            background = r, g, b
+        return Photo(view, downscale, background)
+
+    @property
+    def losses(self) -> list[PendingValue]:
+        """The losses of the photos of the last iteration, on their way from the devices."""
+        return [self.loss.value_later(self.loss_result)] if self.batch is None else self._losses
 
     @property
     def has_mean(self) -> bool:
@@ -364,17 +371,8 @@ class Trainer:
                 f"iteration {self.iteration}: the loss is not finite: lower the learning rates; "
                 "the last checkpoint is kept"
             )
-        log.write(
-            {
-                "iteration": self.iteration,
-                "loss": value.total,
-                "l1": value.l1,
-                "ssim": value.ssim,
-                "psnr": value.psnr,
-                "splats": self.splats.n,
-                "seconds": self.seconds,
-            }
-        )
+        counts = {"splats": self.splats.n, "seconds": self.seconds}
+        log.write({"iteration": self.iteration, **value.to_json(), **counts})
 
     def _show(self, since: int, started: float) -> None:
         if self.progress is not None:

@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from ..cameras.cameras_json import NamedCamera
+from ..device.specs import first_device
 from ..scenes.scene import Scene
 from ..training.config import TrainConfig
 from ..training.log import Progress
@@ -83,7 +84,7 @@ class TrainingSession:
 
     def stay(self, model: Model) -> None:
         """Show a finished model, until interrupted or until `stop`."""
-        self._training.finish(ModelSource(model.splats, self._config.device))
+        self._training.finish(ModelSource(model.splats, first_device(self._config.device)))
         self._server.end_training()
         self._server.set_training_status(f"iteration {model.iteration}: the run has finished")
         self._server.model_changed()

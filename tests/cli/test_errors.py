@@ -157,10 +157,10 @@ def test_unknown_command() -> None:
 
 
 def test_a_loss_that_is_not_finite(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from clsplat.training.loss import ImageLoss, LossValue
+    from clsplat.training.loss import LossValue, PendingValue
 
-    monkeypatch.setattr("clsplat.training.trainer.check_loss", lambda *_: None)  # it would find the fault first
-    monkeypatch.setattr(ImageLoss, "value", lambda *_: LossValue(float("nan"), 0, 0, 0))
+    monkeypatch.setattr("clsplat.training.replica.check_loss", lambda *_: None)  # it would find the fault first
+    monkeypatch.setattr(PendingValue, "wait", lambda _: LossValue(float("nan"), 0, 0, 0))
     assert "learning rates" in error_of("train", scene, "-m", scene / "m", *SHORT)
 
 

@@ -44,7 +44,14 @@ LAST = ("benchmark", "profiling", "viewer")
 
 # Libraries that only these modules import.
 OWNERS = {
-    "pyopencl": {"device.context", "device.device", "device.memory", "device.opencl", "device.program"},
+    "pyopencl": {
+        "device.context",
+        "device.device",
+        "device.memory",
+        "device.opencl",
+        "device.program",
+        "device.several",
+    },
     "pycolmap": {"scenes.undistort"},
     "PIL": {"files.images"},
     "matplotlib": {"evaluation.chart_style"},

@@ -66,6 +66,7 @@ DEFAULTS = {
     "random_points": None,
     "sh_interval": 0,
     "coarse_to_fine": True,
+    "batch": 1,
     "lambda_dssim": 0.2,
     "smooth_l1": 0.05,
     "bisect_reg": 0.0,

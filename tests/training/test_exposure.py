@@ -142,6 +142,7 @@ def test_gradients_and_step_equal_the_reference(
         color = np.random.default_rng(iteration).random((*view.image.shape[:2], 3)).astype(np.float32)
         rendered = DeviceImage(exposure.loss.pool, dtype, 3).write(layout, color)
         result = exposure.evaluate(target, rendered, NEW)
+        exposure.step(i)
         planes = to_host(device, result.v_color, np.empty((3, layout.rows, layout.stride), dtype))
         v = gradient_of(color.astype(np.float64), exposures[i], view)
         found = layout.unpack(planes)

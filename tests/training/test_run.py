@@ -22,7 +22,7 @@ from clsplat.splats.splats import Splats
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 from clsplat.training.log import Progress
-from clsplat.training.loss import ImageLoss, LossValue
+from clsplat.training.loss import LossValue, PendingValue
 from clsplat.training.optim.noise import noise_reach
 from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
@@ -118,8 +118,8 @@ def test_models_are_not_overwritten_and_resume_wants_the_same_config(scene: Scen
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("clsplat.training.trainer.check_loss", lambda *_: None)  # it would find the fault first
-    monkeypatch.setattr(ImageLoss, "value", lambda self, result: LossValue(float("nan"), 0, 0, 0))
+    monkeypatch.setattr("clsplat.training.replica.check_loss", lambda *_: None)  # it would find the fault first
+    monkeypatch.setattr(PendingValue, "wait", lambda self: LossValue(float("nan"), 0, 0, 0))
     with pytest.raises(TrainingError, match=r"iteration 50: .* learning rates"):
         train(scene, CONFIG, output=tmp_path / "m")
     assert (tmp_path / "m" / "checkpoint.npz").is_file()

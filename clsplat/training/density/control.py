@@ -51,7 +51,7 @@ class DensityControl:
     def is_due(self, iteration: int) -> bool:
         """Whether the strategy densifies after this iteration."""
         first, last = self.schedule.densify_first, self.schedule.densify_last
-        return first <= iteration <= last and iteration % self.config.density.densify_interval == 0
+        return first <= iteration <= last and iteration % self.config.densify_every == 0
 
     def densify(self, iteration: int) -> None:
         """Add, move and remove splats, and set the statistics to zero.

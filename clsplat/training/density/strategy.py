@@ -70,7 +70,7 @@ def next_edit(
             growth=info.growth,
             limit=density.relocation_limit,
             rule=density.relocation if scaled else "opacity-only",
-            turnover=turnover(density, config.iterations),
+            turnover=turnover(config),
             split=density.split,
             gradient=stats[SplatStatistics.SCREEN_GRADIENT] / np.maximum(stats[SplatStatistics.TIMES_SEEN], 1.0),
         )
@@ -85,21 +85,21 @@ def next_edit(
         grad_threshold=density.grad_threshold,
         depth_threshold=density.depth_threshold,
         dense_size=density.dense_size,
-        turnover=turnover(density, config.iterations),
+        turnover=turnover(config),
         split=density.split,
         prune_large=0 < every < info.iteration,
     )
-    return with_reset(grown, splats, shape) if resets(density, config.iterations, info) else grown
+    return with_reset(grown, splats, shape) if resets(config, density, info) else grown
 
 
-def turnover(density: Adc | Mcmc, iterations: int) -> float:
+def turnover(config: TrainConfig) -> float:
     """Return the part of the cap that a densification may replace: the option, or a default by the length of the run.
 
     By default, all densifications of a run together may replace about the same number of splats.
     """
-    if density.turnover is not None:
-        return density.turnover
-    return min(TURNOVER * density.densify_interval / iterations, LARGEST_TURNOVER)
+    if config.density.turnover is not None:
+        return config.density.turnover
+    return min(TURNOVER * config.densify_every / config.iterations, LARGEST_TURNOVER)
 
 
 def reset_interval(density: Adc, iterations: int) -> int:
@@ -107,13 +107,13 @@ def reset_interval(density: Adc, iterations: int) -> int:
     return density.opacity_reset and max(iterations // density.opacity_reset, RESET_INTERVAL_MIN)
 
 
-def resets(density: Adc, iterations: int, info: StepInfo) -> bool:
+def resets(config: TrainConfig, density: Adc, info: StepInfo) -> bool:
     """Return whether this densification resets opacities: the first one at or after a multiple of the interval does.
 
     The last densification never resets. 3DGS resets at 3000, 6000, 9000 and 12 000 of 30 000 iterations, and densifies
     until 15 000.
     """
-    every = reset_interval(density, iterations)
+    every = reset_interval(density, config.iterations)
     if not every or info.iteration >= info.last:
         return False
-    return info.iteration // every > (info.iteration - density.densify_interval) // every
+    return info.iteration // every > (info.iteration - config.densify_every) // every

@@ -64,7 +64,7 @@ class FusedOptimizer:
     def __init__(self, device: Device, kernels: KernelBuild, splats: SplatBuffers, rules: Rules) -> None:
         self.device, self.kernels, self.splats, self.rules = device, kernels, splats, rules
         half = rules.config.optim.half_moments
-        self.program: Program = optim_program(device, kernels, half)
+        self.program: Program = optim_program(device, kernels, half, rules.config.schedule.batch)
         self._group = lane_group(device)
         self.columns = Columns(device, columns_program(device, kernels), splats.capacity, splats.dtype)
         self.steps = 0

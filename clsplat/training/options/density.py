@@ -23,7 +23,9 @@ class DensityConfig(OptionGroup):
 
     densify_from: float = option(0.05, help="Start of densification, as a fraction of the run.")
     densify_until: float = option(help="End of densification, as a fraction of the run.")
-    densify_interval: int = option(100, help="Iterations between two densification steps.", at_least=1)
+    densify_interval: int = option(
+        100, help="Iterations between two densification steps; of a larger batch, photos.", at_least=1
+    )
     init_opacity: float = option(0.2, help="Opacity of splats that are created from points.", above=0, below=1)
     init_scale: float = option(
         help="Scale of splats that are created from points, as a factor of the mean distance to three neighbours.",

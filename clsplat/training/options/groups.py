@@ -47,6 +47,13 @@ class ScheduleConfig(OptionGroup):
         at_least=0,
     )
     coarse_to_fine: bool = option(True, help="Train on images at 1/4 size, then 1/2, then full size.")
+    batch: int = option(
+        1,
+        help="Photos in one iteration. Its step has the mean of their gradients, and rates times the root of their "
+        "number. By default the number of devices.",
+        at_least=1,
+        by_scene=True,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
