@@ -1,7 +1,7 @@
 """Iterations of several photos, on one device and on its equal parts: quality, time of a photo, and bits.
 
     python benchmarks/batch.py --cases fox:4:8000:2000 --batches 1,2,4 --devices cpu,cpu/2
-    python benchmarks/batch.py --table
+    python benchmarks/batch.py --page      # write the table of docs/devices.md
 
 A case is scene:resolution:cap:photos. All runs of a case learn as many photos: those of a batch of 4 have a quarter of
 the iterations. PSNR is that of validation views. `bits` is a digest of the splats: runs that differ only in the number
@@ -15,7 +15,7 @@ import statistics
 import sys
 from typing import Any
 
-from common import RESULTS, Case, Runs, background_of, environment, groups, parser, table
+from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, table, write_between
 
 from clsplat.device.several import open_devices
 from clsplat.device.specs import count_devices
@@ -26,6 +26,8 @@ from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
 from clsplat.training.run import train
 
+PAGE = ROOT / "docs" / "devices.md"
+MARKS = ("<!-- table of batch.py -->", "<!-- end of the table of batch.py -->")
 KEY = ("scene", "resolution", "cap", "iterations", "batch", "devices", "seed")
 
 
@@ -74,9 +76,8 @@ def page(rows: list[dict[str, Any]]) -> str:
         equal = all(whole.get(row["seed"]) == row["bits"] for row in same)
         time = statistics.median(row["photo_ms"] for row in same)
         bits = "yes" if equal else "no"
-        lines.append(
-            (scene, cap, photos, batch, devices, len(psnr), f"{statistics.fmean(psnr):.2f}{spread}", time, bits)
-        )
+        mean = f"{statistics.fmean(psnr):.2f}{spread}"
+        lines.append((f"`{scene}`", cap, photos, batch, f"`{devices}`", len(psnr), mean, time, bits))
     head = ("scene", "splats", "photos", "batch", "devices", "seeds", "PSNR [dB]", "ms a photo", "bits of one device")
     return table(head, lines, right=(*head[1:4], *head[5:8]))
 
@@ -93,8 +94,12 @@ def main() -> None:
     flags.add_argument("--batches", default="1,2,4")
     flags.add_argument("--devices", default="cpu,cpu/2")
     flags.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    flags.add_argument("--page", action="store_true", help="write the table of docs/devices.md, and run nothing")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
+    if args.page:
+        write_between(PAGE, *MARKS, page(runs.rows))
+        return
     if not args.table:
         for case in map(Case.parse, args.cases):
             for seed in args.seeds:
