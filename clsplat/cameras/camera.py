@@ -81,6 +81,11 @@ class Camera:
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.cam_from_world)
 
+    def at_most(self, longest: int) -> Camera:
+        """Return the same camera for an image whose longest side is at most `longest` px."""
+        factor = min(1.0, longest / max(self.width, self.height))
+        return self.resized(max(round(factor * self.width), 1), max(round(factor * self.height), 1))
+
     def posed(self, cam_from_world: ArrayLike) -> Camera:
         """Return a camera with the same intrinsics at another pose."""
         return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, cam_from_world)

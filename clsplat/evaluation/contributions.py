@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.camera import Camera
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
 from ..splats.fields import DoubleArray
@@ -57,16 +58,32 @@ def contributions(
     ------
     InputError : no photo can be decoded.
     """
-    grey = splats.with_arrays(splats.to_numpy() | {"sh": np.zeros((len(splats), 1, 3), splats.sh.dtype)})
+    grey = _grey(splats)
     for whole in decoded(views, "looked at"):
         view = whole if longest is None else _at_most(whole, longest)
-        renderer.render(grey, view.camera)
         weights = np.zeros((view.camera.height, view.camera.width, 3))
         weights[..., _ALL] = 1.0 if view.mask is None else view.mask
         if view.alpha is not None:
             weights[..., _CLEAR] = weights[..., _ALL] * (1.0 - view.alpha / 255.0)
-        sums = np.abs(renderer.backward(weights)["sh"][:, 0].astype(np.float64)) / SH_C0
+        sums = _weights(renderer, grey, view.camera, weights)
         yield Contribution(sums[:, _ALL], sums[:, _CLEAR], depths(splats, view))
+
+
+def share_of_image(renderer: Renderer, splats: Splats, camera: Camera) -> DoubleArray:
+    """Return the mean blending weight |alpha * transmittance| of each splat over the pixels of a camera, (N,)."""
+    pixels = np.zeros((camera.height, camera.width, 3))
+    pixels[..., _ALL] = 1.0 / (camera.width * camera.height)
+    return _weights(renderer, _grey(splats), camera, pixels)[:, _ALL]
+
+
+def _grey(splats: Splats) -> Splats:
+    return splats.with_arrays(splats.to_numpy() | {"sh": np.zeros((len(splats), 1, 3), splats.sh.dtype)})
+
+
+def _weights(renderer: Renderer, grey: Splats, camera: Camera, pixels: DoubleArray) -> DoubleArray:
+    """Return the sums (N, 3) of the blending weights over the pixels, each pixel times its value in `pixels`."""
+    renderer.render(grey, camera)
+    return np.abs(renderer.backward(pixels)["sh"][:, 0].astype(np.float64)) / SH_C0
 
 
 def depths(splats: Splats, view: View) -> DoubleArray:
@@ -78,6 +95,5 @@ def depths(splats: Splats, view: View) -> DoubleArray:
 
 def _at_most(view: View, longest: int) -> View:
     """Return the view with its longest side reduced to `longest` px."""
-    width, height = view.camera.width, view.camera.height
-    factor = min(1.0, longest / max(width, height))
-    return view.resized(max(round(factor * width), 1), max(round(factor * height), 1))
+    camera = view.camera.at_most(longest)
+    return view.resized(camera.width, camera.height)

@@ -28,19 +28,20 @@ class ParameterAverage:
     Attributes
     ----------
     count : number of samples so far.
+    begin : the iteration after which samples may come. From then on the splats must stay the same ones.
     """
 
     def __init__(self, config: TrainConfig, densify_last: int) -> None:
         self._last = config.iterations
         window = min(round(config.optim.average_last * self._last), self._last - densify_last)
-        self._begin = self._last - window
+        self.begin = self._last - window
         self._every = max(window // SAMPLES, 1)
         self._mean: dict[str, Array] = {}
         self.count = 0
 
     def is_due(self, iteration: int) -> bool:
         """Return whether the parameters after an iteration (from 1) are a sample. Those of the last iteration are."""
-        return self._begin < iteration <= self._last and (self._last - iteration) % self._every == 0
+        return self.begin < iteration <= self._last and (self._last - iteration) % self._every == 0
 
     def add(self, arrays: Mapping[str, Array]) -> None:
         """Add a sample. It has the splats of the samples before."""

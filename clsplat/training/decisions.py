@@ -7,7 +7,8 @@
 - Beside the points of a scene, some splats start at random places too: a plain wall has no points, and would else get
   no splats. They also need the penalty.
 - With few photos, splats that fit a single photo are cheap, and other views see them. A part of the splats is not drawn
-  in each iteration (dropout.py). With very few photos, no splat starts at a random place beside the scene's points.
+  in each iteration (dropout.py). Splats that only views between the photos show large are removed (occluders.py). With
+  very few photos, no splat starts at a random place beside the scene's points.
 - Splats that start at random places have a longer way, so their learning rates are twice as high.
 - On several devices, an iteration has a photo for each of them.
 - A step of Adam reads and writes every parameter, also of splats that the image does not show. On a GPU it takes a
@@ -98,6 +99,9 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if len(scene.train) <= FEW_VIEWS and "dropout" not in config.named_options:
         chosen["dropout"] = DROPOUT
         reasons.append(f"a dropout of {DROPOUT:.0%} of the splats, because there are only {len(scene.train)} photos")
+    if len(scene.train) <= FEW_VIEWS and "occluder_check" not in config.named_options:
+        chosen["occluder_check"] = True
+        reasons.append("no splats that would cover the view between the photos")
     if transparent and "random_background" not in config.named_options:
         chosen["random_background"] = True
         part = "" if config.random_background_until == 1 else f" for {config.random_background_until:.0%} of the run"

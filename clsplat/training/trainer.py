@@ -42,6 +42,7 @@ from .log import Progress, RunLog
 from .loss import LossValue, PendingValue, mean_loss
 from .memory_estimate import run_memory
 from .model import Model
+from .occluders import OccluderCheck
 from .optim.optimizer import make_optimizer
 from .programs import kernel_build
 from .rate_limits import check_rates
@@ -139,6 +140,7 @@ class Trainer:
         self.running = RunningLoss(len(scene.train))
         self.noise = ExplorationNoise(config, self.kernels, self.splats, scene.extent)
         self.renderer = Renderer(self.device)
+        self.occluders = OccluderCheck(config, scene.train, self.renderer, self.density, self.average.begin)
         self.validation = RunValidation(
             self.renderer, scene.validation, config.background, config.iterations, config.output.save_iterations
         )
@@ -281,9 +283,8 @@ class Trainer:
 
     def step(self) -> Frame:
         """Do one iteration, and return its last frame: gradients, a step, and a densification if it is due."""
-        config = self.config
         self.iteration += 1
-        it, degree = self.iteration, self.sh_degree
+        config, it, degree = self.config, self.iteration, self.sh_degree
         photos = [self._next_photo() for _ in range(config.schedule.batch)]
         grads, depth_key = self.grads, None
         if self.batch is None:
@@ -301,18 +302,19 @@ class Trainer:
         self.optimizer.step(grads, mean_lr * config.rate_factor("mean"), degree, it, depth_key)
         if self.density.is_due(it):
             self.density.densify(it)
+        if self.occluders.is_due(it):
+            self.occluders.remove(self.snapshot())
         self.noise.add(it, mean_lr)
         if self.average.is_due(it):
             self.average.add(self.optimizer.read())
         return frame
 
     def _next_photo(self) -> Photo:
-        config, it, background = self.config, self.iteration, self.config.background
+        config, it = self.config, self.iteration
         view, downscale = self.views.next(it, self.splats.n)
-        if config.random_background and it <= config.random_background_until * config.iterations:
-            r, g, b = self.rng.random(3).tolist()
-            background = r, g, b
-        return Photo(view, downscale, background)
+        is_random = config.random_background and it <= config.random_background_until * config.iterations
+        r, g, b = self.rng.random(3).tolist() if is_random else config.background
+        return Photo(view, downscale, (r, g, b))
 
     @property
     def losses(self) -> list[PendingValue]:

@@ -51,7 +51,7 @@ NOT_RUN = (
     ),
     (
         r"clsplat train .*--device (0:0,0:1|cpu/2)",
-        "not every machine has such devices; training/test_batch.py has parts",
+        "not every machine has such devices; training/test_batch.py",
     ),
     (r"clsplat reconstruct VIDEO", "no video is here; tests/scenes/test_video_frames.py makes one"),
     (r"clsplat view |clsplat train .*--view", "serves until it is stopped; tests/cli/test_view.py runs it"),

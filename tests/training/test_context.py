@@ -94,3 +94,15 @@ def test_runs_that_would_change_it_are_refused(scene: Scene, parts: tuple[Path, 
     file, context = parts
     with pytest.raises(InputError, match="context"):
         train(scene, options(file, **more), context=context)
+
+
+def test_the_context_is_never_removed(scene: Scene, parts: tuple[Path, Splats]) -> None:
+    file, context = parts
+    trainer = Trainer(scene, options(file), context=context)
+    n = trainer.splats.n
+    gone = np.zeros(n, np.bool_)
+    gone[[3, n - 1, n - len(context)]] = True
+    trainer.density.remove(gone)
+    assert trainer.splats.n == n - 1
+    for name, array in context.arrays.items():
+        assert trainer.snapshot().arrays[name][-len(context) :] == pytest.approx(array, abs=1e-6), name

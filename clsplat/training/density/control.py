@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...device.program import lane_group
 from ...errors import TrainingError
@@ -15,6 +16,7 @@ from ..optim.noise import noise_amount, noise_reach
 from ..optim.optimizer import Optimizer
 from ..programs import columns_program, optim_program
 from ..schedules import RunSchedule
+from .edit import DensifyEdit
 from .on_device import DeviceSplats
 from .strategy import StepInfo, next_edit
 from .table import SplatTable
@@ -76,6 +78,20 @@ class DensityControl:
             edit = self.frozen.with_frozen(edit)
         self.optimizer.apply(self.optimizer.arranged(edit))
         self.statistics.reset()
+
+    def remove(self, gone: NDArray[np.bool_]) -> None:
+        """Remove splats. gone : (N,). The statistics of the others stay. Frozen splats are never removed."""
+        gone = gone.copy()
+        if self.frozen is not None:
+            gone[self.frozen.n_live :] = False
+        if not gone.any() or gone.all():
+            return
+        self.optimizer.settle()
+        kept, statistics = np.flatnonzero(~gone), self.statistics.read(self.splats.n)
+        fresh = np.zeros(len(kept), np.bool_)
+        edit = self.optimizer.arranged(DensifyEdit(kept, {}, fresh, state_source=kept, removed=int(gone.sum())))
+        self.optimizer.apply(edit)
+        self.statistics.write(statistics[:, edit.source], self.splats.capacity)
 
 
 class ExplorationNoise:

@@ -98,6 +98,12 @@ class ViewsConfig(OptionGroup):
         below=1,
         by_scene=True,
     )
+    occluder_check: bool = option(
+        False,
+        help="Remove splats that cameras between the photos show much larger than any photo does, after each tenth of "
+        "the run.",
+        by_scene=True,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
