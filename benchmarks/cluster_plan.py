@@ -19,7 +19,7 @@ import statistics
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from common import RESULTS, ROOT, Runs, parser, table, write_between
@@ -70,7 +70,6 @@ class Outcome:
     restarts: int = 0
     lost: float = 0.0
     read: float = 0.0
-    waiting: list[float] = field(default_factory=list)  # idle time of each worker at the end
 
 
 def simulate(
@@ -214,23 +213,19 @@ def check(runs: Runs) -> None:
     measured = Runs(RESULTS / "cluster.jsonl", ("case", "runs", "workers")).rows
     alone = next(row for row in measured if row["case"] == "sweep" and row["workers"] == 1)
     n, job = alone["runs"], alone["seconds"] / alone["runs"]
-    for row in measured:
-        # A job there is a whole run. Imports and the start of a worker took about three seconds.
-        kills = row.get("kills", 0)
-        failure = row["seconds"] * row["workers"] / kills if kills else math.inf
-        machines = Machines(row["workers"], failure=failure, back=3.0, start=0.0, slow=(0.0, 1.0))
+    for measurement in measured:
+        kills, workers, seconds = measurement.get("kills", 0), measurement["workers"], measurement["seconds"]
+        row: dict[str, Any] = {"case": "check", "name": f"{n} runs" + (f", {kills} kills" if kills else "")}
+        row |= {"workers": workers, "seed": 0}
+        if row in runs:
+            continue
+        # A job there is a whole run. A worker that was killed is back after the imports.
+        failure = seconds * workers / kills if kills else math.inf
+        machines = Machines(workers, failure=failure, back=3.0, start=0.0, slow=(0.0, 1.0))
         outcomes = [simulate([Work(job)] * n, machines, math.inf, seed) for seed in range(200)]
-        runs.add(
-            {
-                "case": "check",
-                "name": f"{n} runs" + (f", {kills} kills" if kills else ""),
-                "workers": row["workers"],
-                "seed": 0,
-                "measured": round(row["seconds"], 1),
-                "simulated": round(statistics.fmean(outcome.makespan for outcome in outcomes), 1),
-                "spread": round(statistics.pstdev(outcome.makespan for outcome in outcomes), 1),
-            }
-        )
+        found = [outcome.makespan for outcome in outcomes]
+        row |= {"measured": round(seconds, 1), "simulated": round(statistics.fmean(found), 1)}
+        runs.add(row | {"spread": round(statistics.pstdev(found), 1)})
 
 
 def sizes(runs: Runs, dispatch: float, seeds: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -121,6 +121,7 @@ def load_scene(
     masks: str | None = None,
     alpha: str = ALPHA_USES[0],
     read_photos: bool = True,
+    only: Collection[str] | None = None,
 ) -> Scene:
     """Read a scene: a folder with photos and a COLMAP model in `sparse`, or with transforms.json.
 
@@ -143,6 +144,8 @@ def load_scene(
         pixels that are less than half opaque.
     read_photos : whether to decode the training photos now and keep them. Photos of test views, or all of them, are
         decoded at each use instead (`View.loaded`).
+    only : names of the photos to read, for a part of a large scene. The files of the others are not opened, except for
+        their sizes. Test views are chosen among all photos.
 
     Warns
     -----
@@ -163,8 +166,9 @@ def load_scene(
     check_lenses(root, posed)
     test_names = select_test_names(posed, test_every, test_list) if eval else frozenset()
     mask_of = find_masks(root, posed, masks)
-    decoded = [read_photos and photo.name not in test_names for photo in posed.photos]
-    sizes = [posed.sizes[photo.name] for photo, now in zip(posed.photos, decoded, strict=True) if now]
+    photos = [photo for photo in posed.photos if only is None or photo.name in only]
+    decoded = [read_photos and photo.name not in test_names for photo in photos]
+    sizes = [posed.sizes[photo.name] for photo, now in zip(photos, decoded, strict=True) if now]
     check_memory(root, sizes, resolution)
     readers = [
         PhotoReader(
@@ -176,18 +180,18 @@ def load_scene(
             mask_of.get(photo.name),
             alpha == "mask",
         )
-        for photo in posed.photos
+        for photo in photos
     ]
     results = read_views(readers, decoded)
     names = [result.name for result in results if isinstance(result, View)]
     with ThreadPoolExecutor() as pool:
         digests = list(pool.map(lambda name: file_digest(*_files_of(name, posed, mask_of)), names))
     views = [view for view in results if isinstance(view, View)]
-    unusable = {photo.name: view for photo, view in zip(posed.photos, results, strict=True) if isinstance(view, str)}
+    unusable = {photo.name: view for photo, view in zip(photos, results, strict=True) if isinstance(view, str)}
     left_out, n = dict(sorted((posed.left_out | unusable).items())), len(posed.listed)
     check_left_out(root, left_out, n)
     warn_of_left_out(root, left_out, n)
-    if all(view.name in test_names for view in views):
+    if only is None and all(view.name in test_names for view in views):
         raise InputError(
             f"{root}: no training view is left: all {len(views)} photos that can be used are test views; "
             "add photos, or turn eval off"

@@ -60,11 +60,11 @@ class SceneSource:
         ------
         InputError : the files are missing, or they are not those that the scene was read from.
         """
-        loaded = load_scene(self.path, background=self.background, **self.reading)
+        loaded = load_scene(self.path, background=self.background, only=frozenset(self.names), **self.reading)
         views = {view.name: view for view in loaded.views}
         if missing := [name for name in self.names if name not in views]:
             raise InputError(f"{self.path}: the photo {missing[0]} is missing here: copy the scene's files again")
-        changed = [name for name, digest in self.photo_digests.items() if loaded.photo_digests.get(name) != digest]
+        changed = [name for name in self.names if loaded.photo_digests.get(name) != self.photo_digests.get(name)]
         if changed:
             raise InputError(f"{self.path}: the photo {changed[0]} is another one here: copy the scene's files again")
         if _points_digest(loaded) != self.points_digest:

@@ -1,8 +1,8 @@
 """Splats that stand before the scene in views between the photos, and that no photo shows as large.
 
-With few photos, a splat near the cameras can be at the edge of each photo, or in its sky. It can cover the whole picture
-of a camera between them. No photo corrects it. So cameras between those of neighbouring photos look at the splats now
-and then. A splat goes if one of them shows it much larger than any photo does.
+With few photos, a splat near the cameras can be at the edge of each photo, or in its sky. It can cover the whole
+picture of a camera between them. No photo corrects it. So cameras between those of neighbouring photos look at the
+splats now and then. A splat goes if one of them shows it much larger than any photo does.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ import pytest
 
 from clsplat.errors import InputError
 from clsplat.files.images import write_png
+from clsplat.scenes.read_view import PhotoReader
 from clsplat.scenes.scene import Points, Scene, load_scene
 from clsplat.scenes.source import SceneSource
 from clsplat.scenes.split import hold_out, with_validation
@@ -73,3 +74,34 @@ def test_a_scene_that_was_changed_in_memory_is_refused(folder: Path) -> None:
     moved = replace(scene, points=Points(points.xyz + 1, points.rgb, points.track_length))
     with pytest.raises(InputError, match="the points are others here"):
         again(moved)
+
+
+def test_a_part_opens_only_its_own_photos(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photos of other parts may be damaged, and cost neither reading nor memory."""
+    scene = load_scene(folder)
+    names = [view.name for view in scene.train[1:4]]
+    source = SceneSource.of(scene).of_views(names)
+    for name in scene.names:
+        if name not in names:
+            file = folder / "images" / name
+            file.write_bytes(file.read_bytes()[:200])  # the size is still there
+    opened: list[str] = []
+    read = PhotoReader.read
+    monkeypatch.setattr(PhotoReader, "read", lambda self: opened.append(self.photo.name) or read(self))
+    part = source.load()
+    assert sorted(opened) == sorted(part.names) == sorted(names)
+    assert set(part.photo_digests) == set(names)
+    assert [view.name for view in part.train] == sorted(names)
+    for view in part.train:
+        assert (view.image == next(other.image for other in scene.views if other.name == view.name)).all()
+
+
+def test_a_part_whose_photos_are_missing(folder: Path) -> None:
+    scene = load_scene(folder)
+    source = SceneSource.of(scene).of_views([scene.train[0].name])
+    (folder / "images" / scene.train[0].name).unlink()
+    with (
+        pytest.raises(InputError, match=f"the photo {scene.train[0].name} is missing here"),
+        pytest.warns(UserWarning, match="left out"),
+    ):
+        source.load()
