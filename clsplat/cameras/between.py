@@ -12,14 +12,14 @@ from .camera import Camera
 
 _NEIGHBOURS = 2  # of each camera, by position
 _PLACES = (1 / 3, 2 / 3)  # of the way from one camera to the other
-_LARGEST_TURN = np.pi / 3  # between two cameras; what lies between wider ones may be in neither image
+_LARGEST_TURN = 2 * np.pi / 3  # between two cameras; others look at different things
 
 
 def between(cameras: Sequence[Camera]) -> list[Camera]:
     """Return cameras on the ways from each camera to its two nearest ones.
 
     Positions are on the straight line, and rotations on the shortest arc. Intrinsics and size are those of one of the
-    two. Pairs whose rotations differ by more than 60 degrees are left out.
+    two. Pairs whose rotations differ by more than 120 degrees are left out.
     """
     if len(cameras) < 2:
         return []

@@ -44,7 +44,7 @@ def test_two_cameras_have_two_between() -> None:
 
 
 def test_cameras_that_look_elsewhere_are_no_neighbours() -> None:
-    assert between(looking(ring(4), MIDDLE)) == []  # a quarter of a turn between each pair
+    assert between(looking(ring(2), MIDDLE)) == []  # from opposite sides
 
 
 def test_the_order_of_the_cameras_does_not_matter() -> None:
