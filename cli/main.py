@@ -32,6 +32,7 @@ COMMANDS = {
     "eval": ("clsplat_cli.evaluate:evaluate_models", "Measure models on views that were held out of training."),
     "info": ("clsplat_cli.info:show_info", "Show what a model or a scene contains."),
     "clean": ("clsplat_cli.clean:clean_model", "Remove floaters and what no training view sees."),
+    "lod": ("clsplat_cli.lod:lod", "Merge splats in levels of detail, and measure them."),
     "prune": ("clsplat_cli.prune:prune_model", "Remove the splats that a model's images do not need."),
     "compare": ("clsplat_cli.compare:compare_systems", "Train published systems side by side and print a table."),
     "frontier": ("clsplat_cli.frontier:draw_frontier", "Train systems at several caps and chart quality against cost."),

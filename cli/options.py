@@ -119,6 +119,21 @@ class TrainingCommand(SectionedCommand):
 device_option = click.option(
     "--device", metavar="SPEC", help='OpenCL device: "cpu", "gpu", an index such as 0:1, or part of a name.'
 )
+
+
+def detail_option(default: float) -> Callable[[F], F]:
+    """Add `--detail`, with 0 for the model itself."""
+    return click.option(
+        "--detail",
+        type=click.FloatRange(0, 100),
+        default=default,
+        show_default=True,
+        metavar="PIXELS",
+        help="Draw parts that are far away as fewer and larger splats, whose merged centres are at most this far apart "
+        "in the image. 0.25 is hardly visible. 0: all splats.",
+    )
+
+
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print warnings and errors only.")
 iteration_option = click.option(
     "--iteration",

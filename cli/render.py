@@ -13,6 +13,7 @@ from .options import (
     PATH,
     background_of,
     background_options,
+    detail_option,
     device_option,
     iteration_option,
     overwrite_option,
@@ -45,7 +46,7 @@ SECTIONS = {
     ),
     "Views": ("model_path", "iteration", "cameras", "source_path", "images", "resolution"),
     "Camera path": ("keys", "closed", "seconds", "save_path"),
-    "Images": ("format", "alpha", "depth_colours", "depth_range", "background"),
+    "Images": ("format", "alpha", "depth_colours", "depth_range", "background", "detail"),
 }
 
 
@@ -85,6 +86,7 @@ SECTIONS = {
 )
 @click.option("--depth-range", type=Range(), help="Depths at the ends of the colours.  [default: from the images]")
 @background_options
+@detail_option(0.0)
 @iteration_option
 @overwrite_option("files that are there")
 @device_option
@@ -142,6 +144,7 @@ def render(
                 iteration=iteration,
                 overwrite=overwrite,
                 device=device,
+                detail=values["detail"],
                 progress=progress,
             )
         except KeyboardInterrupt:

@@ -18,6 +18,7 @@ from .options import (
     PATH,
     background_of,
     background_options,
+    detail_option,
     device_option,
     iteration_option,
     quiet_option,
@@ -104,6 +105,7 @@ def addresses(urls: Sequence[str]) -> str:
     help="Folder for recorded camera paths and cropped models. Without it they can only be downloaded.",
 )
 @background_options
+@detail_option(0.0)
 @iteration_option
 @device_option
 @quiet_option
@@ -118,6 +120,7 @@ def view(
     folder: Path | None,
     background: Color | None,
     white_background: bool,
+    detail: float,
     iteration: int | None,
     device: str | None,
     quiet: bool,
@@ -138,7 +141,7 @@ def view(
     loaded = load_model(source, iteration)
     options = ServerOptions(host, port, names, token, folder)
     other = None if against is None else load_model(against)
-    session = ViewingSession(loaded, known_cameras(loaded, scene), colour, options, iteration, device, other)
+    session = ViewingSession(loaded, known_cameras(loaded, scene), colour, options, iteration, device, other, detail)
     if not quiet:
         click.echo(f"{source}: {len(loaded.splats)} splats at {addresses(session.server.urls)} (Ctrl-C ends)")
     try:

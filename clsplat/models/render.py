@@ -15,9 +15,10 @@ from ..cameras.path import DEFAULT_FPS, CameraPath, write_path
 from ..errors import InputError
 from ..files.existing import refuse_existing
 from ..files.video import VideoWriter
-from ..rendering.renderer import Renderer
+from ..rendering.renderer import Renderer, RendersSplats
 from ..rendering.views import RenderOutput, ViewProgress, files_of, render_to_files
 from ..splats.color import Color
+from .detail import DetailLevels, DetailRenderer
 from .model import LoadedModel, SceneChoice, in_both_forms, model_at
 
 VIEW_SETS = ("test", "train", "validation", "all")
@@ -71,6 +72,7 @@ def render_views(
     iteration: int | None = None,
     overwrite: bool = False,
     device: str | None = None,
+    detail: float = 0.0,
     progress: ViewProgress | None = None,
 ) -> ModelRenders:
     """Render views of a model into images, a video, or both, and return their description.
@@ -85,6 +87,7 @@ def render_views(
     iteration : as for `load_model`.
     overwrite : replace existing files.
     device : OpenCL device, as for `Renderer`.
+    detail : levels of detail, as `pixels` of `DetailLevels.choose`; 0 draws all splats.
     progress : called before each view.
 
     Raises
@@ -103,8 +106,11 @@ def render_views(
     refuse_existing([*files_of(output, [view.name for view in views]), *named], overwrite)
     if path is not None and save_path is not None:
         write_path(save_path, path)
+    renderer: RendersSplats = Renderer(device)
+    if detail:
+        renderer = DetailRenderer(Renderer(device), DetailLevels(loaded.splats), detail)
     rendered = render_to_files(
-        Renderer(device),
+        renderer,
         loaded.splats,
         views,
         replace(output, fps=fps),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,6 +41,16 @@ class Rendered:
     color: Array
     alpha: Array
     depth: Array
+
+
+class RendersSplats(Protocol):
+    """What draws splats from a camera: a `Renderer`, or one with levels of detail."""
+
+    def render(
+        self, splats: Splats, camera: Camera, background: ArrayLike = BLACK, sh_degree: int | None = None
+    ) -> Rendered:
+        """Return the image. background : R, G, B. sh_degree : highest band of spherical harmonics in use."""
+        ...
 
 
 class Renderer:

@@ -17,7 +17,7 @@ from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from .colormaps import depth_range
 from .outputs import ImageWriter, VideoFiles, extra_video, image_file, output_stems
-from .renderer import Renderer
+from .renderer import RendersSplats
 
 _QUARTILES = (0.25, 0.75)  # quantiles over the frames of the near and of the far end
 _SAMPLES = 12  # frames that the range of depths is taken from, at a quarter of the size
@@ -77,7 +77,7 @@ def files_of(output: RenderOutput, names: Sequence[str]) -> list[Path]:
 
 
 def render_to_files(
-    renderer: Renderer,
+    renderer: RendersSplats,
     splats: Splats,
     views: Sequence[NamedCamera],
     output: RenderOutput,
@@ -123,7 +123,7 @@ def render_to_files(
     return RenderedViews(1e3 * statistics.median(times[1:] or times), scales)
 
 
-def depths_seen(renderer: Renderer, splats: Splats, views: Sequence[NamedCamera]) -> tuple[float, float]:
+def depths_seen(renderer: RendersSplats, splats: Splats, views: Sequence[NamedCamera]) -> tuple[float, float]:
     """Depths at the two ends of the colours, from a few small frames.
 
     All views get one range, so that the colours of a video do not flicker.

@@ -10,7 +10,7 @@ their deviations, and alike in colour.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,9 @@ _CLOSENESS = 0.02  # cost of a squared distance in deviations, against that of a
 _ROUNDS = 40  # limit of the rounds in which pairs choose each other
 _OPACITIES = (1e-6, 1.0 - 1e-6)
 _FLATTEST = 1e-12  # smallest variance, relative to the largest of a splat
+_REACH = 3.0  # standard deviations: the extent of a Gaussian in a box
+
+Box = tuple[DoubleArray, DoubleArray]  # its lowest and its highest corner, (3,) each
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,7 @@ class Level:
     mean, covariance : (N, 3) and (N, 3, 3). opacity : (N,) 0..1. sh : (N, K, 3).
     group : (N,) number of the part of the scene; only splats of one part are merged.
     error : (N,) sum of the costs of the merges below each splat.
+    spread : (N,) variance of the centres that were merged into each splat, along all axes together [world units²].
     """
 
     mean: DoubleArray
@@ -47,6 +51,7 @@ class Level:
     sh: DoubleArray
     group: Indices
     error: DoubleArray
+    spread: DoubleArray
 
     def __len__(self) -> int:
         return len(self.mean)
@@ -76,7 +81,50 @@ def level_of(arrays: Mapping[str, Array], group: Indices) -> Level:
         arrays["sh"].astype(np.float64),
         group,
         np.zeros(len(group)),
+        np.zeros(len(group)),
     )
+
+
+def leaves_of(mean: Array, most: int) -> list[Indices]:
+    """Return the rows of the parts of a scene with at most `most` splats each.
+
+    Splats are halved along the longest side of their box, repeatedly. mean : (N, 3).
+    """
+    waiting, found = [np.arange(len(mean))], []
+    while waiting:
+        rows = waiting.pop()
+        if len(rows) <= most:
+            found.append(rows)
+            continue
+        places = mean[rows]
+        order = np.argsort(places[:, np.ptp(places, axis=0).argmax()], kind="stable")
+        half = len(rows) // 2
+        waiting += [rows[order[half:]], rows[order[:half]]]
+    return found
+
+
+def levels_of(arrays: Mapping[str, Array], leaves: Sequence[Indices], most: int) -> list[Level]:
+    """Return at most `most` levels of Gaussians, the finest first. Splats of one leaf alone are merged.
+
+    arrays : public arrays. leaves : the rows of each leaf.
+    """
+    group = np.empty(len(arrays["mean"]), np.int64)
+    for number, rows in enumerate(leaves):
+        group[rows] = number
+    found = [level_of(arrays, group)]
+    while len(found) < most and len(coarser := merged(found[-1])) < len(found[-1]):
+        found.append(coarser)
+    return found
+
+
+def boxes_of(levels: Sequence[Level], leaves: int) -> list[Box]:
+    """Return the box of each leaf around the Gaussians of all levels."""
+    low, high = np.full((leaves, 3), np.inf), np.full((leaves, 3), -np.inf)
+    for level in levels:
+        reach = _REACH * np.sqrt(np.diagonal(level.covariance, axis1=1, axis2=2))
+        np.minimum.at(low, level.group, level.mean - reach)
+        np.maximum.at(high, level.group, level.mean + reach)
+    return list(zip(low, high, strict=True))
 
 
 def merged(level: Level) -> Level:
@@ -88,9 +136,10 @@ def merged(level: Level) -> Level:
     share = mass[one] / np.maximum(mass[one] + mass[other], 1e-300)
     first, second = share[:, None], 1.0 - share[:, None]
     mean = first * level.mean[one] + second * level.mean[other]
-    covariance = np.zeros((len(one), 3, 3))
+    covariance, spread = np.zeros((len(one), 3, 3)), np.zeros(len(one))
     for part, weight in ((one, first), (other, second)):
         offset = level.mean[part] - mean
+        spread += weight[:, 0] * (level.spread[part] + np.sum(offset * offset, axis=1))
         covariance += weight[:, :, None] * (level.covariance[part] + offset[:, :, None] * offset[:, None, :])
     pair = Level(
         mean,
@@ -99,10 +148,11 @@ def merged(level: Level) -> Level:
         first[:, :, None] * level.sh[one] + second[:, :, None] * level.sh[other],
         level.group[one],
         level.error[one] + level.error[other] + cost,
+        spread,
     )
     alone = np.ones(len(level), np.bool_)
     alone[one] = alone[other] = False
-    names = ("mean", "covariance", "opacity", "sh", "group", "error")
+    names = ("mean", "covariance", "opacity", "sh", "group", "error", "spread")
     joined = {name: np.concatenate([getattr(level, name)[alone], getattr(pair, name)]) for name in names}
     return replace(level, **joined)
 

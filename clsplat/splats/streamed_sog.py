@@ -23,7 +23,7 @@ from .._version import __version__
 from ..errors import InputError, OutputError
 from ..files.atomic import atomic_writer
 from .fields import Array, DoubleArray
-from .merging import Level, level_of, merged
+from .merging import Box, Level, boxes_of, leaves_of, levels_of
 from .morton import morton_order
 from .sog import META, read_sog
 from .sog_writer import sog_files
@@ -34,10 +34,7 @@ LEVELS, MAX_LEVELS = 4, 8  # by default, and at most
 _VERSION = 1
 _LEAF = 8192  # largest number of splats of a leaf at level 0
 _CHUNK = 1 << 18  # splats of a chunk, from which the next one begins
-_REACH = 3.0  # standard deviations: the extent of a Gaussian in a box
 _MAX_DEPTH = 64  # of a tree that is read
-
-Box = tuple[DoubleArray, DoubleArray]
 
 
 def write_streamed_sog(path: str | os.PathLike[str], splats: StoredSplats, levels: int) -> list[StoredSplats]:
@@ -61,13 +58,8 @@ def write_streamed_sog(path: str | os.PathLike[str], splats: StoredSplats, level
         raise InputError(f"{path}: {levels} levels: choose 1 to {MAX_LEVELS}")
     if not len(splats.arrays["mean"]):
         raise InputError(f"{path}: the model has no splats; train it first")
-    leaves = list(_leaves(splats.arrays["mean"], np.arange(len(splats.arrays["mean"]))))
-    group = np.empty(len(splats.arrays["mean"]), np.int64)
-    for number, rows in enumerate(leaves):
-        group[rows] = number
-    found = [level_of(splats.arrays, group)]
-    while len(found) < levels and len(coarser := merged(found[-1])) < len(found[-1]):
-        found.append(coarser)
+    leaves = leaves_of(splats.arrays["mean"], _LEAF)
+    found = levels_of(splats.arrays, leaves, levels)
     stored = [splats, *(replace(splats, arrays=level.arrays()) for level in found[1:])]
     _remove_chunks(path)
     filenames: list[str] = []
@@ -75,7 +67,7 @@ def write_streamed_sog(path: str | os.PathLike[str], splats: StoredSplats, level
     for number, (level, part) in enumerate(zip(found, stored, strict=True)):
         filenames += list(_write_level(path, number, level, part, runs, len(filenames)))
     errors = np.stack([np.bincount(level.group, level.error, len(leaves)) for level in found], axis=1)
-    boxes = _boxes(found, len(leaves))
+    boxes = boxes_of(found, len(leaves))
     tree = _tree(splats.arrays["mean"], leaves, runs, np.maximum.accumulate(errors, axis=1), boxes)
     document = {
         "version": _VERSION,
@@ -90,23 +82,6 @@ def write_streamed_sog(path: str | os.PathLike[str], splats: StoredSplats, level
     with atomic_writer(path) as stream:
         stream.write(json.dumps(document, separators=(",", ":")).encode())
     return stored
-
-
-def _leaves(mean: Array, rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Yield the rows of each leaf: the splats are halved along the longest side of their box, repeatedly."""
-    if len(rows) <= _LEAF:
-        yield rows
-        return
-    first, second = _halves(mean, rows)
-    yield from _leaves(mean, first)
-    yield from _leaves(mean, second)
-
-
-def _halves(mean: Array, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    places = mean[rows]
-    order = np.argsort(places[:, np.ptp(places, axis=0).argmax()], kind="stable")
-    half = len(rows) // 2
-    return rows[order[:half]], rows[order[half:]]
 
 
 def _tree(
@@ -132,16 +107,6 @@ def _tree(
         return {"bound": bound, **entry}, (low, high)
 
     return node(len(mean))[0]
-
-
-def _boxes(levels: Sequence[Level], leaves: int) -> list[Box]:
-    """Return the box of each leaf around the Gaussians of all levels."""
-    low, high = np.full((leaves, 3), np.inf), np.full((leaves, 3), -np.inf)
-    for level in levels:
-        reach = _REACH * np.sqrt(np.diagonal(level.covariance, axis1=1, axis2=2))
-        np.minimum.at(low, level.group, level.mean - reach)
-        np.maximum.at(high, level.group, level.mean + reach)
-    return list(zip(low, high, strict=True))
 
 
 def _write_level(

@@ -44,6 +44,7 @@ class ViewingSession:
     iteration : of a model folder, the point cloud to watch; None watches for the last.
     device : OpenCL device, as for `Renderer`.
     against : another model, which is shown to the right of a divider.
+    detail : levels of detail, as `pixels` of `DetailLevels.choose`; 0 draws all splats.
 
     Raises
     ------
@@ -60,16 +61,17 @@ class ViewingSession:
         iteration: int | None = None,
         device: str | None = None,
         against: LoadedModel | None = None,
+        detail: float = 0.0,
     ) -> None:
         require_viser()
         from .server import Server
 
         known, options = known or known_cameras(model), options or ServerOptions()
         cameras = [item.camera for item in (*known.train, *known.test)]
-        self.source: ModelSource | ComparedSource = ModelSource(model.splats, device)
+        self.source: ModelSource | ComparedSource = ModelSource(model.splats, device, detail=detail)
         if against is not None:
             names = real_path(model.path).stem, real_path(against.path).stem
-            self.source = ComparedSource(self.source, ModelSource(against.splats, device), names)
+            self.source = ComparedSource(self.source, ModelSource(against.splats, device, detail=detail), names)
         self.watch = ModelWatcher(_finder(model.path, iteration))
         settings = Settings(background=model.background if background is None else background)
         self.viewer = Viewer(self.source, settings)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..errors import ClsplatError, InputError
+from ..models.detail import DetailLevels
 from ..rendering.colormaps import MODES, Picture, depth_picture, depth_range, model_for, picture
 from ..rendering.renderer import Rendered, Renderer
 from ..splats.fields import DoubleArray
@@ -79,14 +80,16 @@ class ModelSource:
     Parameters
     ----------
     splats : the first model. keep : number of models that stay on the device.
+    detail : levels of detail, as `pixels` of `DetailLevels.choose`; 0 draws all splats.
     """
 
     modes = MODES
     partial = True
     sides = None
 
-    def __init__(self, splats: Splats, device: str | None = None, keep: int = KEPT) -> None:
+    def __init__(self, splats: Splats, device: str | None = None, keep: int = KEPT, detail: float = 0.0) -> None:
         self.renderer = Renderer(device, keep=keep)
+        self._detail = detail
         self._rendering = threading.Lock()  # only one thread at a time may use a renderer
         self._keep = keep
         self.show(splats)
@@ -94,7 +97,7 @@ class ModelSource:
     def show(self, splats: Splats) -> None:
         """Show another model from the next frame on; any thread may call this."""
         # One assignment: a frame in progress sees either the old model or the new one.
-        self._shown = _Shown(splats, self._keep)
+        self._shown = _Shown(splats, self._keep, DetailLevels(splats) if self._detail else None, self._detail)
 
     @property
     def splats(self) -> Splats:
@@ -118,13 +121,13 @@ class ModelSource:
         if mode == "depth":
             return depth_view(self.rendered(camera, settings), settings)
         with self._rendering:
-            splats = self._shown.part(settings.cap, mode, settings.crop)
+            splats = self._shown.seen(camera, settings)
             return ViewPicture(picture(self.renderer, splats, camera, mode, background, sh_degree=degree))
 
     def rendered(self, camera: Camera, settings: Settings) -> Rendered:
         """Return the image of a camera with its depths."""
         with self._rendering:
-            splats = self._shown.part(settings.cap, settings.mode, settings.crop)
+            splats = self._shown.seen(camera, settings)
             return self.renderer.render(splats, camera, settings.background, settings.sh_degree)
 
     def surface(self, origin: DoubleArray, direction: DoubleArray) -> DoubleArray | None:
@@ -160,12 +163,19 @@ def _camera_along(origin: DoubleArray, direction: DoubleArray) -> Camera | None:
 
 
 class _Shown:
-    """A model and its most recently requested parts."""
+    """A model and its most recently requested parts. With `levels`, the whole model is drawn in levels of detail."""
 
-    def __init__(self, splats: Splats, keep: int) -> None:
-        self.splats, self._keep = splats, keep
+    def __init__(self, splats: Splats, keep: int, levels: DetailLevels | None = None, pixels: float = 0.0) -> None:
+        self.splats, self._keep, self._levels, self._pixels = splats, keep, levels, pixels
         self._order: NDArray[np.intp] | None = None
         self._parts: dict[tuple[int, bool, CropBox | None], Splats] = {}
+
+    def seen(self, camera: Camera, settings: Settings) -> Splats:
+        """Return the splats to draw for a camera."""
+        splats = self.part(settings.cap, settings.mode, settings.crop)
+        if self._levels is None or splats is not self.splats:
+            return splats
+        return self._levels.seen(camera, self._pixels)
 
     def part(self, cap: int | None, mode: str, crop: CropBox | None = None) -> Splats:
         """Return the `cap` splats of the box that cover most, in the order of the file, coloured for the mode."""

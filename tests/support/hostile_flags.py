@@ -61,6 +61,7 @@ BASES: dict[str, tuple[str, ...]] = {
     "eval": ("{model}", "--save-renders", "{out}"),
     "info": ("{scene}",),
     "clean": ("{model}", "-o", "{out}.ply"),
+    "lod": ("{model}", "-o", "{out}", "--levels", "2"),
     "prune": ("{model}", "-o", "{out}.ply"),
     "compare": ("{scene}", "-o", "{out}", "--systems", "gaussian", "--cap-max", "9", "--iterations", "2"),
     "frontier": (

@@ -117,7 +117,7 @@ def test_checks_come_after_each_tenth_but_the_last(
     scene: Scene, strategy: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[int] = []
-    trainer = Trainer(scene, config_of(strategy=strategy))
+    trainer = Trainer(scene, config_of(strategy=strategy, average_last=0))
     monkeypatch.setattr(OccluderCheck, "remove", lambda self, splats: seen.append(trainer.iteration))
     while trainer.iteration < 40:
         trainer.step()

@@ -1,0 +1,93 @@
+"""`clsplat lod`: levels of detail of a model, what they cost and what they save."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from .command import DocumentedCommand
+from .models import one_model
+from .options import PATH, detail_option, device_option, iteration_option, overwrite_option, quiet_option
+from .progress import table
+
+_VIEWS = 4  # cameras that are measured, at most
+
+
+@click.command(
+    "lod",
+    cls=DocumentedCommand,
+    examples=(
+        ("clsplat lod MODEL", "What each level costs, and what they save from far away."),
+        ("clsplat lod MODEL -o levels", "Each level as a file, too."),
+        ("clsplat render MODEL -o renders --detail 0.25", "Images with levels of detail."),
+    ),
+    see_also=("render", "view", "convert"),
+)
+@click.argument("model", type=PATH, metavar="MODEL_OR_PLY")
+@click.option("-o", "--output", type=PATH, metavar="DIR", help="Folder for the levels: level_1.ply and so on.")
+@click.option(
+    "--levels",
+    type=click.IntRange(2, 12),
+    default=8,
+    show_default=True,
+    metavar="N",
+    help="Number of levels. Each one has about half of the splats of the one before.",
+)
+@detail_option(0.25)
+@iteration_option
+@overwrite_option("the levels that are there")
+@device_option
+@quiet_option
+def lod(
+    model: Path,
+    output: Path | None,
+    levels: int,
+    detail: float,
+    iteration: int | None,
+    overwrite: bool,
+    device: str | None,
+    quiet: bool,
+) -> None:
+    """Merge the splats of MODEL_OR_PLY in levels of detail, and measure them.
+
+    The first table has each level as a whole, against the model. The second one has images from farther away, where
+    each part of the scene is as coarse as --detail allows. `render` and `view` have --detail, too.
+    """
+    from clsplat.cameras.make_path import PathRequest
+    from clsplat.files.existing import refuse_existing
+    from clsplat.models.detail import DetailLevels
+    from clsplat.models.measure_detail import measure_distances, measure_levels
+    from clsplat.models.model import load_model
+    from clsplat.models.render import ViewChoice, choose_views
+    from clsplat.rendering.renderer import Renderer
+
+    loaded = load_model(one_model(model, None), iteration)
+    files = [] if output is None else [output / f"level_{number}.ply" for number in range(1, levels)]
+    refuse_existing(files, overwrite)
+    around = None if loaded.read_cameras() else PathRequest("orbit", frames=_VIEWS)
+    views, _ = choose_views(loaded, ViewChoice(path=around))
+    cameras = [view.camera for view in views[:: -(-len(views) // _VIEWS)]]
+    found, renderer = DetailLevels(loaded.splats, levels), Renderer(device)
+    for number, file in zip(range(1, len(found)), files, strict=False):
+        found.whole(number).save(file)
+    if quiet:
+        return
+    rows = [
+        (str(one.level), str(one.splats), f"{one.psnr:.1f}")
+        for one in measure_levels(found, cameras, renderer, loaded.background)
+    ]
+    click.echo(table(("level", "splats", "PSNR [dB]"), rows))
+    click.echo()
+    lines = [
+        (
+            f"{one.factor}x",
+            f"{one.splats:.0f}",
+            f"{one.splats / one.whole:.0%}",
+            *(f"{value:.1f}" for value in (one.ms, one.whole_ms, one.psnr)),
+        )
+        for one in measure_distances(found, detail, cameras, renderer, loaded.background)
+    ]
+    click.echo(table(("distance", "splats", "of all", "ms", "ms, whole", "PSNR [dB]"), lines))
+    for file in files[: len(found) - 1]:
+        click.echo(str(file))
