@@ -7,11 +7,8 @@ from pathlib import Path
 import click
 
 from .command import DocumentedCommand
-from .models import one_model
 from .options import PATH, detail_option, device_option, iteration_option, overwrite_option, quiet_option
 from .progress import table
-
-_VIEWS = 4  # cameras that are measured, at most
 
 
 @click.command(
@@ -25,7 +22,9 @@ _VIEWS = 4  # cameras that are measured, at most
     see_also=("render", "view", "convert"),
 )
 @click.argument("model", type=PATH, metavar="MODEL_OR_PLY")
-@click.option("-o", "--output", type=PATH, metavar="DIR", help="Folder for the levels: level_1.ply and so on.")
+@click.option(
+    "-o", "--output", type=PATH, metavar="DIR", help="Folder for the levels after the first one, a PLY file each."
+)
 @click.option(
     "--levels",
     type=click.IntRange(2, 12),
@@ -54,29 +53,13 @@ def lod(
     The first table has each level as a whole, against the model. The second one has images from farther away, where
     each part of the scene is as coarse as --detail allows. `render` and `view` have --detail, too.
     """
-    from clsplat.cameras.make_path import PathRequest
-    from clsplat.files.existing import refuse_existing
-    from clsplat.models.detail import DetailLevels
-    from clsplat.models.measure_detail import measure_distances, measure_levels
-    from clsplat.models.model import load_model
-    from clsplat.models.render import ViewChoice, choose_views
-    from clsplat.rendering.renderer import Renderer
+    from clsplat.models.lod import model_levels
 
-    loaded = load_model(one_model(model, None), iteration)
-    files = [] if output is None else [output / f"level_{number}.ply" for number in range(1, levels)]
-    refuse_existing(files, overwrite)
-    around = None if loaded.read_cameras() else PathRequest("orbit", frames=_VIEWS)
-    views, _ = choose_views(loaded, ViewChoice(path=around))
-    cameras = [view.camera for view in views[:: -(-len(views) // _VIEWS)]]
-    found, renderer = DetailLevels(loaded.splats, levels), Renderer(device)
-    for number, file in zip(range(1, len(found)), files, strict=False):
-        found.whole(number).save(file)
+    found = model_levels(model, levels, output=output, iteration=iteration, overwrite=overwrite)
     if quiet:
         return
-    rows = [
-        (str(one.level), str(one.splats), f"{one.psnr:.1f}")
-        for one in measure_levels(found, cameras, renderer, loaded.background)
-    ]
+    whole, distances = found.measure(detail, device)
+    rows = [(str(one.level), str(one.splats), f"{one.psnr:.1f}") for one in whole]
     click.echo(table(("level", "splats", "PSNR [dB]"), rows))
     click.echo()
     lines = [
@@ -86,8 +69,8 @@ def lod(
             f"{one.splats / one.whole:.0%}",
             *(f"{value:.1f}" for value in (one.ms, one.whole_ms, one.psnr)),
         )
-        for one in measure_distances(found, detail, cameras, renderer, loaded.background)
+        for one in distances
     ]
     click.echo(table(("distance", "splats", "of all", "ms", "ms, whole", "PSNR [dB]"), lines))
-    for file in files[: len(found) - 1]:
+    for file in found.files:
         click.echo(str(file))

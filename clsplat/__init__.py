@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from .models.cameras import export_cameras
     from .models.clean import clean_model
     from .models.convert import PageOptions, conversion_cost, convert_model, level_costs
+    from .models.detail import DetailLevels
     from .models.evaluation import EvaluationOptions, evaluate, evaluate_models
     from .models.info import inspect
+    from .models.lod import ModelLevels, model_levels
     from .models.model import LoadedModel, SceneChoice, load_model
     from .models.prune import prune_model
     from .models.render import ViewChoice, render_views
@@ -78,6 +80,9 @@ _HOME = {
     "resume": "models.resume",
     "convert_model": "models.convert",
     "conversion_cost": "models.convert",
+    "DetailLevels": "models.detail",
+    "ModelLevels": "models.lod",
+    "model_levels": "models.lod",
     "level_costs": "models.convert",
     "PageOptions": "models.convert",
     "clean_model": "models.clean",
@@ -97,11 +102,13 @@ __all__ = [
     "Camera",
     "ClsplatError",
     "ClusterError",
+    "DetailLevels",
     "DeviceError",
     "EvaluationOptions",
     "InputError",
     "LoadedModel",
     "Model",
+    "ModelLevels",
     "OutputError",
     "PageOptions",
     "PathRequest",
@@ -126,6 +133,7 @@ __all__ = [
     "load_model",
     "load_scene",
     "make_demo_scene",
+    "model_levels",
     "partition_scene",
     "prune_model",
     "quality",

@@ -58,11 +58,11 @@ def measure_levels(
     levels: DetailLevels, cameras: Sequence[Camera], renderer: Renderer, background: Color
 ) -> Iterator[LevelMeasure]:
     """Yield the measures of each level, the finest first."""
-    wanted = [renderer.render(levels.splats, camera, background).color for camera in cameras]
+    expected = [renderer.render(levels.splats, camera, background).color for camera in cameras]
     for level in range(len(levels)):
         splats = levels.whole(level)
         found = [renderer.render(splats, camera, background).color for camera in cameras]
-        yield LevelMeasure(level, len(splats), _mean_psnr(found, wanted))
+        yield LevelMeasure(level, len(splats), _mean_psnr(found, expected))
 
 
 def measure_distances(
@@ -77,10 +77,10 @@ def measure_distances(
         drawn = []
         for camera, depth in zip(cameras, depths, strict=True):
             far = farther(camera, factor, depth)
-            wanted, whole_ms = _timed(renderer, levels.splats, background, far)
+            expected, whole_ms = _timed(renderer, levels.splats, background, far)
             found, ms = _timed(detailed, levels.splats, background, far)
             drawn.append(len(levels.seen(far, pixels)))
-            images.append((found, wanted))
+            images.append((found, expected))
             times.append((ms, whole_ms))
         ms, whole_ms = (statistics.median(column) for column in zip(*times, strict=True))
         quality = _mean_psnr(*zip(*images, strict=True))
@@ -101,6 +101,6 @@ def _depth(image: Rendered) -> float:
     return float(np.median(image.depth[solid] / image.alpha[solid])) if solid.any() else 1.0
 
 
-def _mean_psnr(found: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> float:
-    values = (psnr(np.clip(a, 0, 1), np.clip(b, 0, 1), rounded=False) for a, b in zip(found, wanted, strict=True))
+def _mean_psnr(found: Sequence[np.ndarray], expected: Sequence[np.ndarray]) -> float:
+    values = (psnr(np.clip(a, 0, 1), np.clip(b, 0, 1), rounded=False) for a, b in zip(found, expected, strict=True))
     return statistics.fmean(min(value, MAX_PSNR) for value in values)

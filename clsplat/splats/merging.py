@@ -85,15 +85,15 @@ def level_of(arrays: Mapping[str, Array], group: Indices) -> Level:
     )
 
 
-def leaves_of(mean: Array, most: int) -> list[Indices]:
-    """Return the rows of the parts of a scene with at most `most` splats each.
+def leaves_of(mean: Array, size: int) -> list[Indices]:
+    """Return the rows of the parts of a scene with at most `size` splats each.
 
     Splats are halved along the longest side of their box, repeatedly. mean : (N, 3).
     """
     waiting, found = [np.arange(len(mean))], []
     while waiting:
         rows = waiting.pop()
-        if len(rows) <= most:
+        if len(rows) <= size:
             found.append(rows)
             continue
         places = mean[rows]
@@ -103,8 +103,8 @@ def leaves_of(mean: Array, most: int) -> list[Indices]:
     return found
 
 
-def levels_of(arrays: Mapping[str, Array], leaves: Sequence[Indices], most: int) -> list[Level]:
-    """Return at most `most` levels of Gaussians, the finest first. Splats of one leaf alone are merged.
+def levels_of(arrays: Mapping[str, Array], leaves: Sequence[Indices], count: int) -> list[Level]:
+    """Return at most `count` levels of Gaussians, the finest first. Splats of one leaf alone are merged.
 
     arrays : public arrays. leaves : the rows of each leaf.
     """
@@ -112,7 +112,7 @@ def levels_of(arrays: Mapping[str, Array], leaves: Sequence[Indices], most: int)
     for number, rows in enumerate(leaves):
         group[rows] = number
     found = [level_of(arrays, group)]
-    while len(found) < most and len(coarser := merged(found[-1])) < len(found[-1]):
+    while len(found) < count and len(coarser := merged(found[-1])) < len(found[-1]):
         found.append(coarser)
     return found
 

@@ -101,8 +101,9 @@ def test_near_parts_are_finer_than_far_ones() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_parts_outside_the_image_are_left_out_without_a_trace(seed: int) -> None:
+def test_parts_outside_the_image_are_left_out_without_a_trace(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """With 0 pixels only leaves outside the image are left out."""
+    monkeypatch.setattr(detail, "_LEAF", 8)
     rng, arrays = np.random.default_rng(seed), random_model(SHAPES["skew-normal"], 400, seed, dead=0)
     places, sizes = rng.uniform(-2, 2, (400, 3)), rng.uniform(0.02, 0.15, (400, 3))
     splats = Splats("skew-normal", {**arrays, "mean": places, "log_scale": np.log(sizes)})
