@@ -88,6 +88,16 @@ def test_pictures_from_afar_hardly_change(shape: str) -> None:
     assert psnr(*pictures, rounded=False) > 40
 
 
+def test_each_part_is_as_coarse_as_the_pixels_allow() -> None:
+    camera, pixels = before_wall(8.0), 0.5
+    levels = DetailLevels(wall())
+    outside = np.maximum(np.maximum(levels._low - camera.position, camera.position - levels._high), 0.0)
+    apart = levels.distances * camera.fx / np.linalg.norm(outside, axis=1)
+    for leaf, level in enumerate(levels.choose(camera, pixels)):
+        assert 0 < level < len(levels) - 1
+        assert apart[level, leaf] <= pixels < apart[level + 1, leaf]
+
+
 def test_near_parts_are_finer_than_far_ones() -> None:
     places = np.array([[0.0, -0.3, -0.95]])  # in front of the lower edge, along the wall
     (camera,) = looking(places, np.array([0.05, 0.0, 1.0]), field=1.2)
