@@ -22,7 +22,7 @@ from .density.control import DensityControl
 
 CHECKS = 10  # the run has a check after each tenth, except the last one
 LONGEST = 200  # longest side of the images [px]
-LARGER = 3.0  # times what any photo shows of a splat
+LARGER = 5.0  # times what any photo shows of a splat
 LEAST = 0.002  # part of an image; smaller splats stay
 
 
