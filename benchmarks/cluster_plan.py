@@ -149,7 +149,7 @@ class Size:
 
     Attributes
     ----------
-    photos : number of photos. pixels : of a photo [millions]. megabytes : of its file.
+    photos : number of photos. megabytes : of the file of one.
     splats_per_photo : splats of the model over photos.
     shown : blocks that a photo belongs to, on average.
     """
@@ -157,7 +157,6 @@ class Size:
     name: str
     photos: int
     workers: tuple[int, ...]
-    pixels: float = 2.0
     megabytes: float = 1.5
     splats_per_photo: int = 5000
     shown: float = 3.0
@@ -191,7 +190,7 @@ SIZES = (
 )
 ITERATION = 0.010  # seconds of an iteration of a block on a GPU: 200 000 splats and a photo of 2 million pixels
 FAILURE = 24 * HOUR  # of a worker, as machines that are lent cheaply
-CHECKPOINT = 7.5  # seconds of work: every 1000 iterations are 10 s, and one is half done on average
+CHECKPOINT = 1000 * ITERATION  # seconds of work
 
 
 def dask_overhead(jobs: int) -> float:
