@@ -15,7 +15,7 @@ import statistics
 import sys
 from typing import Any
 
-from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, table, write_between
+from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, spread, table, write_between
 
 from clsplat.device.several import open_devices
 from clsplat.device.specs import count_devices
@@ -71,12 +71,11 @@ def page(rows: list[dict[str, Any]]) -> str:
         rows, "scene", "cap", "iterations", "batch", "devices"
     ).items():
         psnr = [row["psnr"] for row in same]
-        spread = f" ± {statistics.stdev(psnr):.2f}" if len(psnr) > 1 else ""
         whole = {row["seed"]: row["bits"] for row in rows if _is_whole(row, same[0])}
         equal = all(whole.get(row["seed"]) == row["bits"] for row in same)
         time = statistics.median(row["photo_ms"] for row in same)
         bits = "yes" if equal else "no"
-        mean = f"{statistics.fmean(psnr):.2f}{spread}"
+        mean = f"{statistics.fmean(psnr):.2f}{spread(psnr)}"
         lines.append((f"`{scene}`", cap, photos, batch, f"`{devices}`", len(psnr), mean, time, bits))
     head = ("scene", "splats", "photos", "batch", "devices", "seeds", "PSNR [dB]", "ms a photo", "bits of one device")
     return table(head, lines, right=(*head[1:4], *head[5:8]))

@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import platform
+import statistics
 import subprocess
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -176,6 +177,11 @@ def groups(rows: Iterable[dict[str, Any]], *names: str) -> dict[tuple[Any, ...],
     for row in rows:
         found.setdefault(tuple(row[name] for name in names), []).append(row)
     return found
+
+
+def spread(values: Sequence[float]) -> str:
+    """Return the standard deviation of several values, as the end of a cell; nothing for one value."""
+    return f" ± {statistics.stdev(values):.2f}" if len(values) > 1 else ""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], right: Collection[str] = ()) -> str:

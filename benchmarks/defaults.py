@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from blender_scenes import NAMES
-from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, table, write_between
+from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, spread, table, write_between
 
 from clsplat.comparison.methods import Method, parse_methods
 from clsplat.evaluation.evaluate import evaluate
@@ -101,7 +101,6 @@ def page(rows: list[dict[str, Any]]) -> str:
         lines = []
         for (system,), same in groups(chosen, "system").items():
             psnr = [row["psnr"] for row in same]
-            spread = f" ± {statistics.stdev(psnr):.2f}" if len(psnr) > 1 else ""
             mean = {
                 name: statistics.fmean(row[name] for row in same)
                 for name in ("psnr", "ssim", "train_psnr", "splats", "seconds")
@@ -109,7 +108,7 @@ def page(rows: list[dict[str, Any]]) -> str:
             lines.append(
                 (
                     system,
-                    f"{mean['psnr']:.2f}{spread}",
+                    f"{mean['psnr']:.2f}{spread(psnr)}",
                     f"{mean['train_psnr']:.2f}",
                     f"{mean['ssim']:.4f}",
                     f"{mean['splats']:.0f}",
@@ -146,7 +145,7 @@ def test_table(rows: list[dict[str, Any]], scenes: Sequence[str]) -> str:
                     f"{cap:,}".replace(",", " "),
                     f"{iterations:,}".replace(",", " "),
                     system,
-                    shown + (f" ± {statistics.stdev(psnr):.2f}" if len(psnr) > 1 else ""),
+                    shown + spread(psnr),
                     f"{statistics.fmean(r['ssim'] for r in same):.4f}",
                     f"{statistics.fmean(r['train_psnr'] for r in same):.2f}",
                     f"{statistics.fmean(r['seconds'] for r in same) / 60:.1f}",

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, table, write_between
+from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, spread, table, write_between
 
 from clsplat.comparison.methods import Method, parse_methods
 from clsplat.evaluation.evaluate import evaluate
@@ -91,8 +91,7 @@ def page(rows: list[dict[str, Any]], systems: Sequence[str] = ON_PAGE) -> str:
         for system in systems:
             same = [row for row in case if row["system"] == system]
             psnr, ssim = [row["psnr"] for row in same], [row["ssim"] for row in same]
-            spread = f" ± {statistics.stdev(psnr):.2f}" if len(psnr) > 1 else ""
-            cells.append(f"{statistics.fmean(psnr):.2f}{spread}, {statistics.fmean(ssim):.3f}" if same else "")
+            cells.append(f"{statistics.fmean(psnr):.2f}{spread(psnr)}, {statistics.fmean(ssim):.3f}" if same else "")
         size = "" if resolution == -1 else f" `-r {resolution}`"
         lines.append((f"`{scene}`{size}", photos, cap, iterations, views, *cells))
     head = ("scene", "photos", "splats", "iterations", "views", *systems)

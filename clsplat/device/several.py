@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import DeviceError
 from .device import Device, open_device
 from .opencl import first_line
-from .specs import PARTS, device_specs
+from .specs import device_specs
 
 if TYPE_CHECKING:
     import pyopencl
@@ -28,9 +28,7 @@ def open_devices(spec: str | None) -> list[Device]:
     """
     devices: list[Device] = []
     for one in device_specs(spec):
-        parts = None if one is None else PARTS.fullmatch(one)
-        opened = [open_device(one)] if parts is None else _parted(open_device(parts["device"]), int(parts["count"]))
-        for device in opened:
+        for device in _parted(open_device(one.device), one.parts):
             if device.info.index in {other.info.index for other in devices}:
                 raise DeviceError(f"device {spec!r} lists {device.info} twice: name each device once")
             devices.append(device)

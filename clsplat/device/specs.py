@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import re
+from typing import NamedTuple
 
-PARTS = re.compile(r"(?P<device>.*)/(?P<count>\d+)")
+_PARTS = re.compile(r"(?P<device>.*)/(?P<count>\d+)")
 
 
-def device_specs(spec: str | None) -> list[str | None]:
-    """Return the specs of single devices that `spec` lists. A device with parts, such as "cpu/2", stays one spec."""
-    return [None] if spec is None else [part.strip() for part in spec.split(",")]
+class DeviceSpec(NamedTuple):
+    """A device, by a spec of `open_device`, and the number of equal parts that are used as devices."""
+
+    device: str | None
+    parts: int
+
+
+def device_specs(spec: str | None) -> list[DeviceSpec]:
+    """Return the devices that `spec` lists, without a look at them."""
+    found = []
+    for one in [None] if spec is None else [part.strip() for part in spec.split(",")]:
+        parted = None if one is None else _PARTS.fullmatch(one)
+        found.append(DeviceSpec(parted["device"], int(parted["count"])) if parted else DeviceSpec(one, 1))
+    return found
 
 
 def first_device(spec: str | None) -> str | None:
     """Return the spec of the first device that `spec` lists, as a whole."""
-    first = device_specs(spec)[0]
-    found = None if first is None else PARTS.fullmatch(first)
-    return found["device"] if found else first
+    return device_specs(spec)[0].device
 
 
 def count_devices(spec: str | None) -> int:
-    """Return the number of devices that `spec` lists, without a look at the devices."""
-    found = (None if one is None else PARTS.fullmatch(one) for one in device_specs(spec))
-    return sum(int(parts["count"]) if parts else 1 for parts in found)
+    """Return the number of devices that `spec` lists."""
+    return sum(one.parts for one in device_specs(spec))

@@ -69,11 +69,13 @@ def contributions(
         yield Contribution(sums[:, _ALL], sums[:, _CLEAR], depths(splats, view))
 
 
-def share_of_image(renderer: Renderer, splats: Splats, camera: Camera) -> DoubleArray:
-    """Return the mean blending weight |alpha * transmittance| of each splat over the pixels of a camera, (N,)."""
-    pixels = np.zeros((camera.height, camera.width, 3))
-    pixels[..., _ALL] = 1.0 / (camera.width * camera.height)
-    return _weights(renderer, _grey(splats), camera, pixels)[:, _ALL]
+def shares_of_images(renderer: Renderer, splats: Splats, cameras: Sequence[Camera]) -> Iterator[DoubleArray]:
+    """Yield for each camera the mean blending weight |alpha * transmittance| of each splat over its pixels, (N,)."""
+    grey = _grey(splats)
+    for camera in cameras:
+        pixels = np.zeros((camera.height, camera.width, 3))
+        pixels[..., _ALL] = 1.0 / (camera.width * camera.height)
+        yield _weights(renderer, grey, camera, pixels)[:, _ALL]
 
 
 def _grey(splats: Splats) -> Splats:

@@ -12,13 +12,12 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
-from ..rendering.renderer import Rendered, Renderer, RendersSplats
+from ..rendering.renderer import Renderer, RendersSplats
 from ..splats.color import Color
 from ..splats.splats import Splats
 from .detail import DetailLevels, DetailRenderer, farther
 
 DISTANCES = (1, 2, 4, 8, 16)
-_SOLID = 0.5  # alpha from which a pixel belongs to a surface
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ def measure_distances(
 ) -> Iterator[DistanceMeasure]:
     """Yield the measures of each of DISTANCES. pixels : as of `DetailLevels.choose`."""
     detailed = DetailRenderer(renderer, levels, pixels)
-    depths = [_depth(renderer.render(levels.splats, camera)) for camera in cameras]
+    depths = [renderer.render(levels.splats, camera).median_depth or 1.0 for camera in cameras]
     for factor in DISTANCES:
         images: list[tuple[np.ndarray, np.ndarray]] = []
         times: list[tuple[float, float]] = []
@@ -93,12 +92,6 @@ def _timed(renderer: RendersSplats, splats: Splats, background: Color, camera: C
     start = time.perf_counter()
     image = renderer.render(splats, camera, background)
     return image.color, 1e3 * (time.perf_counter() - start)
-
-
-def _depth(image: Rendered) -> float:
-    """Return the median depth of an image [world units], or 1 if it is empty."""
-    solid = image.alpha > _SOLID
-    return float(np.median(image.depth[solid] / image.alpha[solid])) if solid.any() else 1.0
 
 
 def _mean_psnr(found: Sequence[np.ndarray], expected: Sequence[np.ndarray]) -> float:

@@ -24,6 +24,7 @@ from .pipeline import Pipeline
 from .splat_buffers import ParameterBuffers, SplatBuffers
 from .tuning import schedule_for
 
+_SOLID = 0.5  # alpha from which a pixel belongs to a surface
 PRECISIONS: dict[str, Real] = {"float32": "float", "float64": "double"}
 
 
@@ -41,6 +42,12 @@ class Rendered:
     color: Array
     alpha: Array
     depth: Array
+
+    @property
+    def median_depth(self) -> float | None:
+        """Median of the mean depth of the pixels that are more than half opaque [world units]; None without any."""
+        solid = self.alpha > _SOLID
+        return float(np.median(self.depth[solid].astype(np.float64) / self.alpha[solid])) if solid.any() else None
 
 
 class RendersSplats(Protocol):

@@ -123,7 +123,7 @@ class CompactGradients(ParameterBuffers):
     def __init__(
         self, device: Device, schema: Schema, capacity: int, dtype: np.dtype[np.floating], photos: int = 1
     ) -> None:
-        self.sh_degree, self.photos = schema.sh_degree, photos
+        self.sh_degree = schema.sh_degree
         fields = (replace(field, width=COMPACT_ROWS * photos) if field.name == "sh" else field for field in schema)
         super().__init__(device, Schema(tuple(fields)), capacity, dtype)
 

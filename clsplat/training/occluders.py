@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.between import between
-from ..evaluation.contributions import share_of_image
+from ..evaluation.contributions import shares_of_images
 from ..rendering.renderer import Renderer
 from ..scenes.scene import View
 from ..splats.splats import Splats
@@ -57,9 +57,7 @@ class OccluderCheck:
 
     def occluders(self, splats: Splats) -> NDArray[np.bool_]:
         """Return which splats cover much of a view between the photos, (N,)."""
-        shown, covering = (
-            np.max([share_of_image(self.renderer, splats, camera) for camera in cameras], axis=0)
-            for cameras in (self.photos, self.between)
-        )
+        shares = np.stack(list(shares_of_images(self.renderer, splats, [*self.photos, *self.between])))
+        shown, covering = shares[: len(self.photos)].max(axis=0), shares[len(self.photos) :].max(axis=0)
         found: NDArray[np.bool_] = (covering > LEAST) & (covering > LARGER * shown)
         return found

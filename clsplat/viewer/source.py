@@ -25,7 +25,6 @@ from .crop import CropBox
 from .settings import Settings
 
 _PROBE, _PROBE_FOCAL = 5, 1000.0  # size and focal length of the image that finds a surface [px]
-_SOLID = 0.5  # alpha from which a pixel belongs to a surface
 KEPT = 4  # models on the device at once: parts for clients with another cap or mode
 
 
@@ -136,11 +135,8 @@ class ModelSource:
         if camera is None:
             return None
         image = self.rendered(camera, Settings())
-        solid = image.alpha > _SOLID
-        if not solid.any():
-            return None
-        depth = float(np.median(image.depth[solid].astype(np.float64) / image.alpha[solid]))
-        return camera.position + depth * camera.rotation[2]
+        depth = image.median_depth
+        return None if depth is None else camera.position + depth * camera.rotation[2]
 
 
 def depth_view(image: Rendered, settings: Settings) -> ViewPicture:

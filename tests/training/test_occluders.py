@@ -11,7 +11,7 @@ from looking_cameras import looking
 
 from clsplat.cameras.between import between
 from clsplat.cameras.camera import Camera
-from clsplat.evaluation.contributions import share_of_image
+from clsplat.evaluation.contributions import shares_of_images
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
 from clsplat.splats.splats import Splats
@@ -71,7 +71,8 @@ def test_the_weight_of_a_splat_is_its_share_of_the_image() -> None:
             "sh": np.zeros((2, 1, 3)),
         },
     )
-    np.testing.assert_allclose(share_of_image(Renderer(), front, camera), [0.6, 0.4 * 0.5], rtol=0.02)
+    (shares,) = shares_of_images(Renderer(), front, [camera])
+    np.testing.assert_allclose(shares, [0.6, 0.4 * 0.5], rtol=0.02)
 
 
 def test_a_splat_between_the_photos_goes(scene: Scene) -> None:
