@@ -21,6 +21,12 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 
+BLOCKS_HELP = (
+    "Divide a large scene into N x M blocks, which are trained one by one or on workers. auto: blocks of 200000 splats "
+    "at most."
+)
+
+
 def blocks_options(function: F) -> F:
     """Add `--blocks` and `--polish`."""
     for option in (
@@ -33,8 +39,7 @@ def blocks_options(function: F) -> F:
         click.option(
             "--blocks",
             metavar="NxM|auto",
-            help="Divide a large scene into N x M blocks, which are trained one by one or on workers. --cap-max is "
-            "that of the whole model, and --iterations are those of each block. auto: blocks of 200000 splats at most.",
+            help=f"{BLOCKS_HELP} --cap-max is that of the whole model, and --iterations are those of each block.",
         ),
     ):
         function = option(function)
@@ -87,7 +92,7 @@ def run_blocks(
         report_interruption(ctx, model_path)
     if quiet:
         return
-    head = ("block", "photos", "splats", "kept", "around it", "seconds", "MB of device")
+    head = ("block", "photos", "splats", "kept", "around it", "seconds", "MB of device", "MB in all")
     rows = [
         (
             str(row["number"]),
@@ -97,6 +102,7 @@ def run_blocks(
             str(row["context"]),
             f"{row['seconds']:.0f}",
             f"{row['device_bytes'] / 1e6:.0f}",
+            f"{row['peak_bytes'] / 1e6:.0f}",
         )
         for row in result.report["blocks"]
     ]

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .models.resume import resume
     from .rendering.renderer import Rendered, Renderer
     from .rendering.views import RenderOutput
-    from .scenes.demo.make import make_demo_scene
+    from .scenes.demo.make import make_demo_scene, make_large_demo_scene
     from .scenes.reconstruct.reconstruct import reconstruct
     from .scenes.scene import Scene, load_scene
     from .splats.splats import Splats
@@ -90,6 +90,7 @@ _HOME = {
     "inspect": "models.info",
     "export_cameras": "models.cameras",
     "make_demo_scene": "scenes.demo.make",
+    "make_large_demo_scene": "scenes.demo.make",
     "reconstruct": "scenes.reconstruct.reconstruct",
     "run_benchmark": "benchmark.run",
 }
@@ -133,6 +134,7 @@ __all__ = [
     "load_model",
     "load_scene",
     "make_demo_scene",
+    "make_large_demo_scene",
     "model_levels",
     "partition_scene",
     "prune_model",

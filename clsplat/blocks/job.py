@@ -14,6 +14,7 @@ from ..scenes.scene import Scene
 from ..scenes.source import SceneSource
 from ..splats.splats import Splats
 from ..training.config import TrainConfig
+from ..training.exposure_file import exposures_of_start
 from ..training.log import Progress
 from ..training.trainer import Visit
 from .targets import with_block_targets
@@ -52,7 +53,8 @@ def train_block(
     scene : with the photos of the block. folder : of the run. device : as for `open_device`.
     """
     inside, context = Splats.load(job.folder / START), Splats.load(job.folder / CONTEXT)
-    prepared = with_block_targets(scene, inside, context, Renderer(device), job.uncovered)
+    exposures = exposures_of_start(str(job.folder / START)) if job.config.appearance.exposure else {}
+    prepared = with_block_targets(scene, inside, context, Renderer(device), job.uncovered, exposures)
     return train_in_folder(job.config.replace(device=device), prepared, folder, context, progress, visit)
 
 

@@ -35,6 +35,7 @@ from ..splats.splats import Splats
 from ..splats.transform import joined
 from ..training.config import TrainConfig
 from ..training.decisions import as_decided, decide
+from ..training.exposure_file import copy_exposures, exposures_beside
 from ..training.folder import ModelFolder, scene_record
 from ..training.log import Progress
 from ..training.options.density import Adc
@@ -149,8 +150,6 @@ def _begin(
 
 def check_options(config: TrainConfig) -> None:
     """Raise InputError for options that a training in blocks cannot have."""
-    if config.appearance.exposure:
-        raise InputError("exposure: each block would learn exposures of its own: leave --exposure out")
     if config.validation.validate:
         raise InputError("validate: each block has other photos: leave --validate out")
     if config.start.init not in ("sfm", "random"):
@@ -224,6 +223,7 @@ class _Stages:
             folder.mkdir(parents=True, exist_ok=True)
             inside = coarse.select(np.flatnonzero(cell == block.number))
             inside.save(folder / START)
+            copy_exposures(self.state.run_folder("coarse"), exposures_beside(folder / START))
             coarse.select(around[block.number]).save(folder / CONTEXT)
             config = block_config(self.config, folder / START, max(cap, len(inside)))
             jobs.append(BlockJob(source.of_views(block.views), config, folder, 1.0 / len(blocks)))
@@ -244,15 +244,19 @@ class _Stages:
         whole = Splats.load(self.state.folder / MERGED)
         if iterations:
             self.steps.tell(4, f"{len(whole)} splats together, {iterations} iterations")
+        before = "coarse"
         run = block_config(self.config, self.folder.path, self.config.cap_max)  # its last rates are those of the polish
+        run = run.replace(exposure_rate=self.config.appearance.exposure_rate)
         for number, rate in enumerate(POLISH_RATES if iterations else ()):
             name, part = f"polish_{number}", Part(iterations / len(POLISH_RATES) / run.iterations, rate)
             file = real_path(self.state.folder) / f"{name}.ply"
             whole.save(file)
+            copy_exposures(self.state.run_folder(before), exposures_beside(file))
             self.train_whole(name, fine_tuning(run, whole, part, file))
-            whole = Splats.load(self.state.run_folder(name).latest_ply()[0])
+            whole, before = Splats.load(self.state.run_folder(name).latest_ply()[0]), name
         self.folder.write_run(self.state.values["config"], self.scene)
         self.folder.write_views([*self.scene.test, *self.scene.train])
+        copy_exposures(self.state.run_folder(before), self.folder.exposures_path)
         path = self.folder.ply_path(self.config.iterations + iterations)
         whole.save(path)
         seconds = round(time.perf_counter() - start, 2)
@@ -286,6 +290,8 @@ class _Stages:
 def block_config(config: TrainConfig, start: Path, cap: int) -> TrainConfig:
     """Return the options of a run that goes on from a model: no random points, no penalties, images at full size.
 
+    Exposures stay those of the model, so that they are common to all blocks.
+
     Parameters
     ----------
     config : complete options of the whole training. start : file of the model.
@@ -301,6 +307,7 @@ def block_config(config: TrainConfig, start: Path, cap: int) -> TrainConfig:
         "noise_lr": 0.0,
         "visible_adam": False,
         "coarse_to_fine": False,
+        "exposure_rate": 0.0,
         "sh_interval": 1,  # the coarse model has all bands
     }
     return TrainConfig(**config.to_json() | changed)

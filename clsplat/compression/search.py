@@ -35,6 +35,7 @@ from ..splats.splats import Splats
 from ..splats.stats import complexity
 from ..training.config import TrainConfig
 from ..training.decisions import as_decided, decide
+from ..training.exposure_file import copy_exposures, exposures_beside
 from ..training.folder import ModelFolder, scene_record
 from ..training.log import Progress
 from ..training.run import train
@@ -279,10 +280,10 @@ class _Search:
         folder.write_run(self.state.values["config"], self.scene)
         folder.write_views([*self.scene.test, *self.scene.train])
         last = _run_name("whole", rounds, len(ROUND) - 1) if rounds else "whole"
-        for name, target in (("whole", folder.log_path), (last, folder.exposures_path)):
-            source = self.state.run_folder(name).path / target.name
-            if source.is_file():
-                source.replace(target)
+        log = self.state.run_folder("whole").log_path
+        if log.is_file():
+            log.replace(folder.log_path)
+        copy_exposures(self.state.run_folder(last), folder.exposures_path)
         path = folder.ply_path(self.config.iterations + rounds * sum(part.iterations(self.config) for part in ROUND))
         splats.save(path, compact=True)
         return path
@@ -303,9 +304,12 @@ class _Search:
             MIN_SPLATS,
         )
         self.steps.tell(2 if run == "trial" else 4, f"round {number}: {len(splats)} splats")
+        before = _run_name(run, number - 1, len(ROUND) - 1) if number > 1 else run
         for step, part in enumerate(ROUND):
             name = _run_name(run, number, step)
             start = self.state.save(f"{name}_start", splats)
+            copy_exposures(self.state.run_folder(before), exposures_beside(start))
+            before = name
             splats = self.trained(name, scene, fine_tuning(config, splats, part, start))
         self.state.save(f"{run}_{number}", splats)
         return splats

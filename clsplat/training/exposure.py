@@ -3,12 +3,12 @@
 The exposure of a photo is an affine map from the colours of the render to the colours of the photo, as in 3DGS. Each
 time a view is trained, its exposure moves a fixed fraction towards the least-squares fit of the current render. The
 mean over all views is kept at the identity, which is also used for novel views. 3DGS learns exposures by Adam instead;
-the comparison is in docs/decisions.md. Runs without exposures, masks and transparency launch none of these kernels.
+the comparison is in docs/decisions.md. A run that begins with a model begins with the exposures of that model. Runs
+without exposures, masks and transparency launch none of these kernels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from ..errors import InputError
 from ..rendering.frame import DeviceImage, ImageLayout
 from ..splats.color import Color
 from .config import TrainConfig
+from .exposure_file import exposures_of_start
 from .loss import ImageLoss, LossResult
 from .programs import EXPOSURE_GROUP, EXPOSURE_SUMS, EXPOSURE_VECS, exposure_program
 from .targets import Target, Targets
@@ -47,7 +48,9 @@ class ExposureLoss:
         self.program, self._step_group = exposure_program(self.device, self.kernels), EXPOSURE_GROUP
         if self.program.step_exposure.max_group < EXPOSURE_GROUP:
             self.program, self._step_group = exposure_program(self.device, self.kernels, 1), 1
-        self._rows = np.tile(_IDENTITY.ravel(), (len(targets.views), 1)).astype(self.kernels.dtype)
+        start = exposures_of_start(config.start.init) if self.learns else {}
+        first = np.array([start.get(view.name, _IDENTITY) for view in targets.views])
+        self._rows = first.reshape(len(targets.views), -1).astype(self.kernels.dtype)
         self._exposures = self.device.alloc(self._rows.nbytes)
         to_device(self.device, self._exposures, self._rows)
         self._photo = DeviceImage(loss.pool, self.kernels.dtype, 3)
@@ -105,7 +108,7 @@ class ExposureLoss:
         view : index of the photo.
         sums : what `sums` returned after the evaluation of the photo; None if it was the latest evaluation here.
         """
-        if not self.learns:
+        if not self.learns or not self.config.appearance.exposure_rate:
             return
         partial, parts = self._partial.buffer, self._parts
         if sums is not None:
@@ -177,12 +180,3 @@ def needs_exposure(config: TrainConfig, channels: int) -> bool:
 def exposure_bytes(layout: ImageLayout, itemsize: int, config: TrainConfig, channels: int) -> int:
     """Return the device memory of `ExposureLoss` for images of the layout."""
     return (3 * itemsize + 3) * layout.plane if needs_exposure(config, channels) else 0
-
-
-def exposures_json(names: Sequence[str], exposures: NDArray[np.floating]) -> dict[str, list[list[float]]]:
-    """Return the content of 3DGS's exposure.json by photo name.
-
-    The file holds the matrices E[:, :3] transposed, because 3DGS multiplies colours from the left.
-    """
-    written = np.concatenate([exposures[:, :, :3].transpose(0, 2, 1), exposures[:, :, 3:]], axis=2)
-    return dict(zip(names, written.tolist(), strict=True))

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from .config import TrainConfig
 
 RANDOM_POINTS = 100_000  # 3DGS
+_MOST_CELLS = 4096  # of the grid of `best_observed`, per unit of length; contracted space has 4 units
+_KEY = 4 * _MOST_CELLS + 1  # more than the number of cells in a direction
 MIN_POINTS = 4  # the first scale needs a point and its three neighbours
 
 
@@ -132,7 +134,8 @@ def _points(
             message = f"{len(apart)} splats from the scene's points"
         else:
             keep = best_observed(xyz, tracks, cap - n_random, scene)
-            message = f"{cap - n_random} splats from the scene's points: the best observed of {len(apart)}"
+            which = "spread among" if all_equal(tracks) else "the best observed of"
+            message = f"{cap - n_random} splats from the scene's points: {which} {len(apart)}"
             xyz, rgb = xyz[keep], rgb[keep]
         if not n_random:
             return xyz, rgb, message
@@ -174,8 +177,9 @@ def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene
 
     Half of them are the points with the longest tracks in the cells of a grid. The others have the longest of the
     remaining tracks. By track length alone, all points could come from a textured surface, and none from the
-    background. Space is contracted around the cameras (Barron et al. 2022, Mip-NeRF 360, eq. 10), so that far points
-    share larger cells.
+    background. If all tracks are equal, as in files of points without tracks, all come from the grid: the order of
+    a file may be that of a scanner. Space is contracted around the cameras (Barron et al. 2022, Mip-NeRF 360, eq. 10),
+    so that far points share larger cells.
     """
     centres = np.array([view.camera.position for view in scene.train])
     from_centre = (xyz - centres.mean(axis=0)) / scene.extent
@@ -183,18 +187,24 @@ def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene
     contracted = np.where(norm > 1, from_centre / norm * (2 - 1 / norm), from_centre)
     # The sort is stable: equal tracks stay in the order of their indices.
     order = np.argsort(-track_length.astype(np.int64), kind="stable")
-    low, high = 1.0, 4096.0  # cells per unit of length
+    n_spread = cap if all_equal(track_length) else max(cap // 2, 1)
+    low, high = 1.0, float(_MOST_CELLS)  # cells per unit of length
     first = order[:0]
     for _ in range(24):
         cells = 0.5 * (low + high)
-        cell = np.floor(contracted[order] * cells).astype(np.int64)
-        _, position = np.unique(cell, axis=0, return_index=True)
-        if len(position) > max(cap // 2, 1):
+        x, y, z = (np.floor(contracted[order] * cells).astype(np.int64) + 2 * _MOST_CELLS).T
+        _, position = np.unique((x * _KEY + y) * _KEY + z, return_index=True)
+        if len(position) > n_spread:
             high = cells
         else:
             low, first = cells, order[np.sort(position)]
     rest = order[~np.isin(order, first)]
     return np.sort(np.concatenate([first, rest])[:cap])
+
+
+def all_equal(track_length: NDArray[np.integer]) -> bool:
+    """Return whether all tracks have one length: then they say nothing about the points."""
+    return bool((track_length == track_length[:1]).all())
 
 
 def _from_model(

@@ -33,7 +33,7 @@ from .checkpoint_times import CheckpointTimes
 from .config import TrainConfig
 from .context import FrozenSplats, check_context
 from .density.control import DensityControl, ExplorationNoise
-from .exposure import exposures_json
+from .exposure_file import exposures_json
 from .extension import reached_by
 from .folder import ModelFolder
 from .initialise import first_arrays

@@ -20,6 +20,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
+from clsplat.training.exposure_file import read_exposures
 from clsplat.training.folder import ModelFolder
 from clsplat.training.run import train
 
@@ -162,7 +163,35 @@ def test_what_cannot_be_resumed_or_replaced(finished: BlocksModel, scene: Scene,
     assert BlocksState.stored(tmp_path) is None
 
 
-@pytest.mark.parametrize("options", [{"exposure": True}, {"validate": True}, {"init": "model.ply"}])
+@pytest.mark.parametrize("polish", [0, 8])
+def test_exposures_are_those_of_all_blocks(scene: Scene, tmp_path: Path, polish: int) -> None:
+    """Blocks take them from the coarse run and leave them as they are. The polish learns on."""
+    seen: dict[str, dict[str, Any]] = {}
+
+    def keep(folder: Path) -> None:
+        for stage in ("coarse", "block_0/run", "block_1/run"):
+            seen[stage] = read_exposures(folder / "blocks" / stage / "exposure.json")
+
+    original = BlocksState.end
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(BlocksState, "end", lambda state: (keep(state.path.parent), original(state)))
+        found = train_in_blocks(
+            scene, BlocksOptions(2, 1, polish), CONFIG.replace(exposure=True, iterations=40), output=tmp_path
+        )
+    coarse = seen["coarse"]
+    assert any(not np.allclose(one, np.eye(3, 4), atol=1e-3) for one in coarse.values())
+    for stage in ("block_0/run", "block_1/run"):
+        assert seen[stage]
+        for name, one in seen[stage].items():
+            np.testing.assert_array_equal(one, coarse[name])
+    last = read_exposures(found.path.parents[2] / "exposure.json")
+    assert set(last) == {view.name for view in scene.train}
+    assert polish == 0 or any(not np.array_equal(last[name], coarse[name]) for name in coarse)
+    assert all(polish or np.array_equal(last[name], coarse[name]) for name in coarse)
+    assert all(np.abs(last[name] - coarse[name]).max() < 0.1 for name in coarse), "the polish does not begin anew"
+
+
+@pytest.mark.parametrize("options", [{"validate": True}, {"init": "model.ply"}])
 def test_options_that_blocks_cannot_have(scene: Scene, tmp_path: Path, options: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=f"^{next(iter(options))}.*leave --"):
         train_in_blocks(scene, TWO, TrainConfig(**options), output=tmp_path)

@@ -37,6 +37,5 @@ def test_mistakes_are_one_line(scene: Path, tmp_path: Path) -> None:
     assert "such as 2x2" in error_of(*arguments, "--blocks", "4")
     assert "give --blocks too" in error_of(*arguments, "--polish", "4", code=2)
     assert "remove --view and --budget" in error_of(*arguments, "--blocks", "2x2", "--budget", "auto", code=2)
-    assert "leave --exposure out" in error_of(*arguments, "--blocks", "2x2", "--exposure")
     assert "name the blocks" in error_of("partition", scene, "-m", tmp_path / "m")
     assert not (tmp_path / "m").exists()

@@ -6,6 +6,7 @@ import json
 import signal
 import threading
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from clsplat.scenes.split import hold_out
 from clsplat.splats.splats import Splats
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
+from clsplat.training.exposure_file import exposures_of_start, read_exposures
 from clsplat.training.folder import ModelFolder
 from clsplat.training.log import Progress
 from clsplat.training.run import train
@@ -164,6 +166,30 @@ def test_a_search_leaves_the_files_of_a_run(searched: clsplat.Budgeted, scene: S
     assert names == {Path(view.name).stem for view in scene.views} or names == {view.name for view in scene.views}
     assert len(folder.log_path.read_text().splitlines()) >= 1
     assert searched.path == folder.ply_path(30 + 6 * searched.report["chosen"]), "all its iterations"
+
+
+def test_rounds_begin_with_the_exposures_of_the_run_before(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned, begun = {}, {}
+
+    def recorded(scene: Scene, config: TrainConfig, *arguments: Any, output: Path, **named: Any) -> Any:
+        begun[output.name] = exposures_of_start(config.start.init)
+        result = train(scene, config, *arguments, output=output, **named)
+        learned[output.name] = read_exposures(output / "exposure.json")
+        return result
+
+    monkeypatch.setattr(search, "train", recorded)
+    found = train_budget(scene, CONFIG.replace(exposure=True), BudgetOptions(0.4), output=tmp_path / "m")
+    assert found.report["chosen"] >= 1
+    runs = [name for name in learned if name.startswith("whole")]
+    assert begun["whole"] == begun["trial"] == {}
+    for before, after in pairwise(runs):
+        assert set(begun[after]) == {view.name for view in scene.train}
+        for name, exposure in begun[after].items():
+            np.testing.assert_array_equal(exposure, learned[before][name])
+    last = read_exposures(tmp_path / "m" / "exposure.json")
+    assert all(np.array_equal(last[name], learned[runs[-1]][name]) for name in last)
 
 
 class Stop:

@@ -19,6 +19,7 @@ from clsplat.device.device import Device
 from clsplat.device.memory import Pool, to_host
 from clsplat.device.program import Real
 from clsplat.device.schedule import Schedule, default_schedule
+from clsplat.errors import InputError
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.frame import DeviceImage
 from clsplat.rendering.renderer import Renderer
@@ -26,7 +27,9 @@ from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import decide
-from clsplat.training.exposure import ExposureLoss, exposures_json
+from clsplat.training.exposure import ExposureLoss
+from clsplat.training.exposure_file import exposures_json, read_exposures
+from clsplat.training.folder import ModelFolder
 from clsplat.training.loss import ImageLoss
 from clsplat.training.run import train
 from clsplat.training.targets import Targets, target_channels
@@ -309,6 +312,37 @@ def test_exposure_json_multiplies_from_the_left() -> None:
     exposure, colour = some_exposures(1), np.array([0.2, 0.5, 0.7])
     stored = np.array(exposures_json(["a"], exposure)["a"])
     np.testing.assert_allclose(colour @ stored[:, :3] + stored[:, 3], exposure[0, :, :3] @ colour + exposure[0, :, 3])
+
+
+def test_a_run_begins_with_the_exposures_of_its_model(scene: Scene, tmp_path: Path) -> None:
+    n = len(scene.train)
+    changed = exposed(scene, np.linspace(0.8, 1.2, n))
+    train(changed, replace(CONFIG, iterations=60, exposure=True), output=tmp_path / "first")
+    folder = ModelFolder(tmp_path / "first")
+    start = replace(CONFIG, iterations=10, exposure=True, init=str(folder.latest_ply()[0]))
+    first = read_exposures(folder.exposures_path)
+    assert {view.name for view in scene.train} == set(first)
+    trainer = Trainer(changed, start)
+    of_start = trainer.exposure.exposures()
+    np.testing.assert_allclose(of_start, [first[view.name] for view in changed.train], atol=1e-6)
+    trainer.run()
+    assert not np.array_equal(trainer.exposure.exposures(), of_start)
+    frozen = Trainer(changed, replace(start, exposure_rate=0.0))
+    frozen.run()
+    np.testing.assert_array_equal(frozen.exposure.exposures(), of_start)
+    lost = {
+        name: rows for name, rows in json.loads(folder.exposures_path.read_text()).items() if name != "view_003.png"
+    }
+    folder.exposures_path.write_text(json.dumps(lost))
+    missing = Trainer(changed, start).exposure.exposures()
+    np.testing.assert_array_equal(missing[[view.name == "view_003.png" for view in changed.train]], np.eye(3, 4)[None])
+
+
+@pytest.mark.parametrize("rows", [[[1, 2], [3, 4]], "much", [[1.0, 0, 0, float("nan")]] * 3, [[10**400] * 4] * 3, None])
+def test_a_damaged_file_of_exposures_is_refused(tmp_path: Path, rows: Any) -> None:
+    (tmp_path / "exposure.json").write_text(json.dumps({"a.png": rows}))
+    with pytest.raises(InputError, match=r"exposure\.json.*"):
+        read_exposures(tmp_path / "exposure.json")
 
 
 def test_on_the_command_line(tmp_path: Path, capture_folder: Path) -> None:

@@ -80,6 +80,18 @@ def test_a_cap_leaves_no_part_of_the_scene_empty() -> None:
     assert (np.abs(splats.mean).max(axis=1) > 39).sum() == 3
 
 
+def test_points_without_tracks_are_spread_over_the_scene() -> None:
+    """The order of a file may be that of a scanner, which begins at one end."""
+    source = scene(400)
+    source.points.xyz[:] = source.points.xyz[np.argsort(source.points.xyz[:, 0])]
+    source.points.track_length[:] = 1
+    splats, message = initial_splats(source, cap=100)
+    assert len(splats) == 100
+    assert "100 splats from the scene's points: spread among 400" in message
+    edges = np.quantile(source.points.xyz[:, 0], [0.25, 0.5, 0.75])
+    assert np.bincount(np.searchsorted(edges, splats.mean[:, 0]), minlength=4).min() >= 15
+
+
 @pytest.mark.parametrize(("init", "n_points"), [("random", 50), ("sfm", 0), ("sfm", 3)])
 def test_scenes_without_points_start_at_random(init: str, n_points: int) -> None:
     splats, message = initial_splats(scene(n_points), cap=3000, init=init)

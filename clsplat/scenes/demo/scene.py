@@ -11,25 +11,24 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...cameras.camera import Camera
 from ...errors import InputError, OutputError
 from ...files.images import write_png
 from ..colmap_binary import ModelView, write_binary_model
-from .world import SURFACES, Hits, World
+from .capture import cast, photograph, pixels, project, rays_through, upright_camera, visible
+from .rays import Hits
+from .world import SURFACES, World
 
 RING_RADIUS = 3.6  # radius of the rings of cameras [world units]
 _HEIGHTS = (0.75, 1.9)  # heights of the lower and the upper ring
 RING_TARGET = np.array([0.0, 0.0, 0.5])
 _FOCAL = 0.9  # focal length over the image width: 58 degrees wide
-_SUBPIXELS = (0.25, 0.75)  # positions of 2x2 samples inside a pixel
 
 _N_POINTS = 3000
 _MIN_OBSERVATIONS = 3  # smallest number of views that see a point
 # Share of the point cloud on each surface; thin and small surfaces get more than their share of the area.
 _SHARES = {"ground": 0.36, "dome": 0.16, "box": 0.16, "ball": 0.08, "panel": 0.12, "poles": 0.12}
-_DEPTH_TOLERANCE = 2e-3  # [world units]; float32 rays have an error of about 1e-5
 
 
 def write_capture(
@@ -72,7 +71,7 @@ def write_capture(
             (width, height),
             (camera.fx, camera.fy, camera.cx, camera.cy),
             camera.cam_from_world,
-            _project(camera, xyz[of_view])[0],
+            project(camera, xyz[of_view])[0],
             np.flatnonzero(of_view),
         )
         for index, (camera, of_view) in enumerate(zip(cameras, seen, strict=True))
@@ -90,39 +89,8 @@ def ring_cameras(width: int, height: int, n_views: int) -> list[Camera]:
         angle = 2 * np.pi * place / count
         position = np.array([RING_RADIUS * np.cos(angle), RING_RADIUS * np.sin(angle), _HEIGHTS[ring]])
         forward = (RING_TARGET - position) / np.linalg.norm(RING_TARGET - position)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ position
-        cameras.append(Camera(width, height, _FOCAL * width, _FOCAL * width, width / 2, height / 2, pose))
+        cameras.append(upright_camera(width, height, _FOCAL * width, position, forward))
     return cameras
-
-
-def photograph(world: World, camera: Camera) -> NDArray[np.float32]:
-    """Return a photo, (H, W, 3), colours 0..1, as the mean of 2x2 rays per pixel."""
-    rays = [_cast(world, camera, _pixels(camera) + np.array([dx, dy])).color for dy in _SUBPIXELS for dx in _SUBPIXELS]
-    return np.mean(rays, axis=0).reshape(camera.height, camera.width, 3)
-
-
-def visible(world: World, camera: Camera, xyz: NDArray[np.floating], normal: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Return whether the camera sees each surface point, (P,).
-
-    A visible point projects into the image, its surface faces the camera, and no other surface is in front of it.
-
-    Parameters
-    ----------
-    xyz, normal : (P, 3) positions and normals of the points.
-    """
-    pixels, depth = _project(camera, xyz)
-    inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
-    facing = ((xyz - camera.position) * normal).sum(axis=1) < 0
-    seen = np.zeros(len(xyz), np.bool_)
-    candidates = np.flatnonzero(inside & facing)
-    distance = np.linalg.norm(xyz[candidates] - camera.position, axis=1)
-    nearest = world.distances(*_rays(camera, pixels[candidates])).min(axis=0)
-    seen[candidates] = np.abs(nearest - distance) < _DEPTH_TOLERANCE
-    return seen
 
 
 def _name(index: int) -> str:
@@ -133,37 +101,9 @@ def _surface_points(world: World, cameras: list[Camera], rng: np.random.Generato
     """Return surface points at random pixels of every view, with the share of each surface."""
     chosen: list[Hits] = []
     for camera in cameras:
-        pixels = _pixels(camera) + rng.random((camera.width * camera.height, 2))
-        surface = world.distances(*_rays(camera, pixels)).argmin(axis=0)
+        places = pixels(camera) + rng.random((camera.width * camera.height, 2))
+        surface = world.distances(*rays_through(camera, places)).argmin(axis=0)
         counts = [max(1, round(_N_POINTS * _SHARES[name] / len(cameras))) for name in SURFACES]
         picks = [rng.permutation(np.flatnonzero(surface == index))[:count] for index, count in enumerate(counts)]
-        chosen.append(_cast(world, camera, pixels[np.concatenate(picks)]))
+        chosen.append(cast(world, camera, places[np.concatenate(picks)]))
     return Hits(*(np.concatenate([getattr(hits, part.name) for hits in chosen]) for part in fields(Hits)))
-
-
-def _pixels(camera: Camera) -> NDArray[np.float64]:
-    """Return the corners x, y of all pixels, (H * W, 2), row by row."""
-    y, x = np.mgrid[: camera.height, : camera.width]
-    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
-
-
-def _rays(camera: Camera, pixels: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return origins and unit directions, (R, 3) each, of the rays through pixel positions (R, 2)."""
-    local = np.concatenate(
-        [(pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones((len(pixels), 1))], axis=1
-    )
-    direction = local @ camera.rotation / np.linalg.norm(local, axis=1, keepdims=True)
-    origin = np.broadcast_to(camera.position.astype(np.float32), direction.shape)
-    return origin, direction.astype(np.float32)
-
-
-def _cast(world: World, camera: Camera, pixels: NDArray[np.float64]) -> Hits:
-    return world.cast(*_rays(camera, pixels))
-
-
-def _project(camera: Camera, xyz: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return pixel positions (P, 2) and depths (P,) of world points."""
-    local = xyz @ camera.rotation.T + camera.translation
-    depth = local[:, 2]
-    safe = np.where(depth > 0, depth, 1.0)[:, None]
-    return local[:, :2] / safe * (camera.fx, camera.fy) + (camera.cx, camera.cy), depth

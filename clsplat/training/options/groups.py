@@ -229,7 +229,8 @@ class AppearanceConfig(OptionGroup):
     )
     exposure_rate: float = option(
         0.2,
-        help="Fraction of the way to the best fit that a photo's map moves each time the photo is trained.",
+        help="Fraction of the way to the best fit that a photo's map moves each time the photo is trained. 0: the maps "
+        "are those of the model that the run begins with.",
         at_least=0,
         at_most=1,
     )
