@@ -96,6 +96,7 @@ def demo(
     OUT/model` goes on.
     """
     from clsplat.blocks.train import PICTURE
+    from clsplat.cluster.pool import check_cluster
     from clsplat.evaluation.metrics import DEFAULT_PROTOCOL
     from clsplat.models.evaluation import EvaluationOptions, evaluate
     from clsplat.rendering.outputs import output_stems
@@ -106,6 +107,9 @@ def demo(
     if not large and (blocks or cluster):
         raise click.UsageError("--blocks and --cluster are for --large")
     check_device(device, cluster)
+    config = TrainConfig(iterations=iterations or size.iterations, cap_max=cap or size.cap, device=device)
+    divided = BlocksOptions(*parse_blocks(blocks or BLOCKS, config.cap_max)) if large else None
+    check_cluster(cluster, device)
     folder, renders, views = ModelFolder(out / "model"), out / "renders", views or size.views
     for made, used in ((folder.path, folder.is_used), (renders, renders.exists())):
         if used and not overwrite:
@@ -114,13 +118,11 @@ def demo(
         exists = (out / "scene").exists()
         message = f"{out / 'scene'}: exists and is used" if exists else f"making {views} photos in {out / 'scene'}"
         click.echo(message, err=True)
-    config = TrainConfig(iterations=iterations or size.iterations, cap_max=cap or size.cap, device=device)
     make = make_large_demo_scene if large else make_demo_scene
     with activity_line(quiet):
         scene = load_scene(make(out / "scene", width or size.width, views), background=config.background)
-    if large:
-        options = BlocksOptions(*parse_blocks(blocks or BLOCKS, config.cap_max))
-        run_blocks(ctx, scene, config, options, folder.path, False, overwrite, quiet, cluster)
+    if divided is not None:
+        run_blocks(ctx, scene, config, divided, folder.path, False, overwrite, quiet, cluster)
     else:
         model = run_training(scene, config, folder.path, overwrite=overwrite, quiet=quiet)
         if not model.finished:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from ..cluster.job import Job
-from ..cluster.pool import WorkerPool
+from ..cluster.pool import WorkerPool, check_cluster
 from ..cluster.training import marked, train_in_folder
 from ..compression.prune_and_refine import Part, fine_tuning
 from ..errors import InputError, OutputError, Remedy
@@ -94,6 +94,7 @@ def train_in_blocks(
     OutputError, DeviceError, TrainingError : as `train`. ClusterError : as `WorkerPool`.
     KeyboardInterrupt : Ctrl-C; `resume` goes on from there.
     """
+    check_cluster(cluster, None if config is None else config.device)
     state, stages = _begin(scene, options, config, progress, output, resume, overwrite)
     with folder_lock(state.path.parent):
         return stages(cluster).run()

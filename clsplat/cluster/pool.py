@@ -25,6 +25,17 @@ SAVING_SECONDS = 60.0  # that jobs get to save their work after Ctrl-C
 SHOWN = 4  # running jobs in a line
 
 
+def check_cluster(address: str | None, device: str | None) -> None:
+    """Raise what `WorkerPool` raises, before a long stage that needs no workers yet. None stands for no cluster."""
+    if address is None:
+        return
+    if ClusterAddress.parse(address).is_local:
+        distributed()  # its workers start later
+        return
+    with WorkerPool(address, device):
+        pass
+
+
 class WorkerPool:
     """A context manager that reaches workers, and has jobs done by them.
 

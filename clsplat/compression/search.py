@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from ..cluster.job import Job
-from ..cluster.pool import WorkerPool
+from ..cluster.pool import WorkerPool, check_cluster
 from ..cluster.training import TrainJob, marked, train_in_place, unmark
 from ..errors import OutputError
 from ..files.lock import folder_lock
@@ -102,6 +102,7 @@ def train_budget(
     OutputError, DeviceError, TrainingError : as `train`. KeyboardInterrupt : Ctrl-C; `resume` goes on from there.
     """
     config, options = config or TrainConfig(), options or BudgetOptions()
+    check_cluster(cluster, config.device)
     state = BudgetState(Path(output))
     folder = ModelFolder(output)
     if resume:

@@ -14,7 +14,8 @@ from clsplat.blocks import train as module
 from clsplat.blocks.partition import Partition, make_partition, surroundings
 from clsplat.blocks.state import BlocksOptions, BlocksState
 from clsplat.blocks.train import PICTURE, BlocksModel, partition_scene, train_in_blocks
-from clsplat.errors import InputError, OutputError
+from clsplat.compression.search import train_budget
+from clsplat.errors import ClsplatError, InputError, OutputError
 from clsplat.models.resume import resume
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
@@ -189,6 +190,22 @@ def test_exposures_are_those_of_all_blocks(scene: Scene, tmp_path: Path, polish:
     assert polish == 0 or any(not np.array_equal(last[name], coarse[name]) for name in coarse)
     assert all(polish or np.array_equal(last[name], coarse[name]) for name in coarse)
     assert all(np.abs(last[name] - coarse[name]).max() < 0.1 for name in coarse), "the polish does not begin anew"
+
+
+@pytest.mark.parametrize("cluster", ["tcp://127.0.0.1:9", "local:2"])
+def test_a_missing_cluster_is_said_at_once(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cluster: str
+) -> None:
+    def missing() -> None:
+        raise InputError("a cluster needs dask.distributed")
+
+    if cluster == "local:2":
+        monkeypatch.setattr("clsplat.cluster.pool.distributed", missing)
+    with pytest.raises(ClsplatError, match=r"no scheduler answers|dask\.distributed"):
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path / "m", cluster=cluster)
+    with pytest.raises(ClsplatError, match=r"no scheduler answers|dask\.distributed"):
+        train_budget(scene, CONFIG, output=tmp_path / "m", cluster=cluster)
+    assert not (tmp_path / "m").exists()
 
 
 @pytest.mark.parametrize("options", [{"validate": True}, {"init": "model.ply"}])

@@ -275,3 +275,21 @@ def test_demo_runs_all_steps_and_runs_again(tmp_path: Path) -> None:
     made = (tmp_path / "d" / "scene" / "sparse" / "0" / "points3D.bin").stat().st_mtime_ns
     clsplat("demo", tmp_path / "d", *small, "--overwrite", "--quiet")
     assert (tmp_path / "d" / "scene" / "sparse" / "0" / "points3D.bin").stat().st_mtime_ns == made
+
+
+def test_a_large_demo_is_trained_in_blocks(tmp_path: Path) -> None:
+    out = tmp_path / "street"
+    small = ["--large", "--iterations", "8", "--cap-max", "80", "--width", "32", "--views", "12", "--blocks", "2x1"]
+    printed = clsplat("demo", out, *small)
+    assert printed.count("test views (2): PSNR") == 2
+    listed = [Path(line.split()[0]) for line in printed.splitlines() if line.startswith("  ")]
+    assert all(path.is_file() for path in listed)
+    assert out / "model" / "partition.svg" in listed
+    assert "MB in all" in printed
+    assert len(json.loads((out / "model" / "blocks.json").read_text())["blocks"]) == 2
+    assert "--overwrite" in error_of("demo", out, *small)
+    assert "are for --large" in error_of("demo", tmp_path / "x", "--blocks", "2x1", code=2)
+    assert "are for --large" in error_of("demo", tmp_path / "x", "--cluster", "local:2", code=2)
+    assert "such as 2x2" in error_of("demo", tmp_path / "x", "--large", "--blocks", "7")
+    assert "at least" in error_of("demo", tmp_path / "x", "--large", "--views", "5")
+    assert not (tmp_path / "x").exists()

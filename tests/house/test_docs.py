@@ -111,7 +111,7 @@ def shortened(command: str) -> list[str]:
         options = {"--iterations", "--cap-max"} - set(words)
         words += [part for option in sorted(options) for part in (option, FEW[option])]
     if name == "demo":
-        words += ["--views", "10", "--width", "48"]
+        words += ["--views", "12", "--width", "48"]
     if name == "render" and "--path" in words and "--frames" not in words:
         words += ["--frames", "3"]
     if name == "bench":
