@@ -19,7 +19,8 @@ from ..training.log import Progress
 from ..training.trainer import Visit
 from .targets import with_block_targets
 
-START, CONTEXT, RUN = "start.ply", "context.ply", "run"  # in the folder of a block
+# In the folder of a block: its splats of the coarse model and those around it, its first splats, and its run.
+INSIDE, CONTEXT, START, RUN = "inside.ply", "context.ply", "start.ply", "run"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,7 @@ def train_block(
     ----------
     scene : with the photos of the block. folder : of the run. device : as for `open_device`.
     """
-    inside, context = Splats.load(job.folder / START), Splats.load(job.folder / CONTEXT)
+    inside, context = Splats.load(job.folder / INSIDE), Splats.load(job.folder / CONTEXT)
     exposures = exposures_of_start(str(job.folder / START)) if job.config.appearance.exposure else {}
     prepared = with_block_targets(scene, inside, context, Renderer(device), job.uncovered, exposures)
     return train_in_folder(job.config.replace(device=device), prepared, folder, context, progress, visit)

@@ -2,9 +2,9 @@
 
 1. Coarse. A run of the whole scene with a quarter of the splats.
 2. Partition. Cells that fill equal parts of the photos, and the photos that show each of them (partition.py).
-3. Blocks. Each block goes on from its splats of the coarse model, with its share of the cap. It learns its own part
-   of the photos (targets.py). The coarse splats around it are shown and do not change. In the end it keeps the
-   splats in its cell, so nothing stands twice.
+3. Blocks. Each block goes on from its splats of the coarse model and points of its cell (start.py), with its share of
+   the cap. It learns its own part of the photos (targets.py). The coarse splats around it are shown and do not change.
+   In the end it keeps the splats in its cell, so nothing stands twice.
 4. Polish. A short run of all blocks together, without new splats.
 
 state.py keeps finished stages. An interrupted stage goes on from its checkpoint.
@@ -40,9 +40,10 @@ from ..training.folder import ModelFolder, scene_record
 from ..training.log import Progress
 from ..training.options.density import Adc
 from ..training.stages import StepReports
-from .job import CONTEXT, RUN, START, BlockJob, train_block, train_block_on_worker
+from .job import CONTEXT, INSIDE, RUN, START, BlockJob, train_block, train_block_on_worker
 from .partition import Partition, make_partition, surroundings
 from .picture import write_picture
+from .start import with_points
 from .state import BlocksOptions, BlocksState
 
 STEPS = 4  # coarse, partition, blocks, polish
@@ -223,7 +224,8 @@ class _Stages:
             folder = real_path(self.state.folder) / f"block_{block.number}"
             folder.mkdir(parents=True, exist_ok=True)
             inside = coarse.select(np.flatnonzero(cell == block.number))
-            inside.save(folder / START)
+            inside.save(folder / INSIDE)
+            with_points(inside, self.scene, partition.cells, block.number, cap, self.config).save(folder / START)
             copy_exposures(self.state.run_folder("coarse"), exposures_beside(folder / START))
             coarse.select(around[block.number]).save(folder / CONTEXT)
             config = block_config(self.config, folder / START, max(cap, len(inside)))

@@ -117,7 +117,7 @@ def initial_splats(
         splats, message = _from_model(init, shape, cap, sh_degree, normalisation, antialiased)
     else:
         raise InputError(f"init {init!r}: choose sfm, random, or the path of a file of splats")
-    return _started(splats, rng).with_near_plane(near_plane), message
+    return started(splats, rng).with_near_plane(near_plane), message
 
 
 def _points(
@@ -243,7 +243,7 @@ def _fit_bands(sh: Array, coefficients: int) -> Array:
     return fitted
 
 
-def _started(splats: Splats, rng: np.random.Generator) -> Splats:
+def started(splats: Splats, rng: np.random.Generator) -> Splats:
     """Return the splats with start values instead of neutral values without a gradient.
 
     A field changes only if all splats have its neutral value.
