@@ -28,7 +28,7 @@ def with_points(inside: Splats, scene: Scene, cells: Cells, number: int, cap: in
     of_cell = np.flatnonzero(cells.of(scene.points.xyz) == number)
     rows = of_cell[distinct(scene.points.xyz[of_cell])]
     points, room = scene.points, cap - len(inside)
-    if room <= 0 or len(rows) + len(inside) < MIN_POINTS:
+    if room <= 0 or not len(rows) or len(rows) + len(inside) < MIN_POINTS:
         return inside
     if len(rows) > room:
         rows = rows[best_observed(points.xyz[rows], points.track_length[rows], room, scene)]
