@@ -91,8 +91,8 @@ def demo(
 
     An existing OUT/scene is used again. --overwrite replaces OUT/model and OUT/renders.
 
-    The scene is a small world with known ground truth. --large makes a street with 2 million points instead, and
-    trains it in blocks, one by one or on the workers of --cluster. After an interruption `clsplat train --resume -m
+    The scene is a small world with known ground truth. --large makes a street with 2 million points instead. It is
+    trained in blocks, one by one or on the workers of --cluster. After an interruption `clsplat train --resume -m
     OUT/model` goes on.
     """
     from clsplat.blocks.train import PICTURE

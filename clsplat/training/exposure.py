@@ -108,7 +108,7 @@ class ExposureLoss:
         view : index of the photo.
         sums : what `sums` returned after the evaluation of the photo; None if it was the latest evaluation here.
         """
-        if not self.learns or not self.config.appearance.exposure_rate:
+        if not self.learns:
             return
         partial, parts = self._partial.buffer, self._parts
         if sums is not None:

@@ -51,13 +51,13 @@ def test_a_block_of_everything_learns_the_photos(scene: Scene, model: Splats) ->
 
 
 def test_corrections_sum_to_that_of_a_photo_with_another_exposure(scene: Scene, model: Splats) -> None:
-    renderer, exposure = Renderer(), np.column_stack([np.diag([0.8, 0.9, 0.7]), [0.05, 0.0, 0.02]])
+    renderer, exposure = Renderer(), np.array([[0.8, 0.1, 0.0, 0.05], [0.0, 0.9, 0.05, 0], [0.2, 0, 0.6, 0.02]])
     exposures = {view.name: exposure for view in scene.views[::2]}
     learned = [with_block_targets(scene, *pair, renderer, 0.5, exposures) for pair in halves(model, scene)]
     for number, view in enumerate(scene.views):
         color = renderer.render(model, view.camera, scene.background).color
         if view.name in exposures:
-            color = color * [0.8, 0.9, 0.7] + [0.05, 0.0, 0.02]
+            color = np.einsum("ij,hwj->hwi", exposure[:, :3], color) + exposure[:, 3]
         shown = 255 * np.clip(color, 0, 1)
         corrections = sum(part.views[number].image.astype(float) - shown for part in learned)
         assert corrections == pytest.approx(view.image - shown, abs=1.01), "rounding of two images"

@@ -119,6 +119,28 @@ def test_an_interrupted_training_goes_on(
     assert found.path.read_bytes() == finished.path.read_bytes()
 
 
+def test_new_points_do_not_change_what_a_block_learns(
+    finished: BlocksModel, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The picture that it learns from is that of the coarse model, although its run begins with more splats."""
+    pictured, begun = [], []
+
+    def targets(part: Scene, inside: Splats, *arguments: Any) -> Scene:
+        pictured.append(len(inside))
+        return part
+
+    def run(config: TrainConfig, *arguments: Any) -> Any:
+        begun.append(len(Splats.load(config.start.init)))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("clsplat.blocks.job.with_block_targets", targets)
+    monkeypatch.setattr("clsplat.blocks.job.train_in_folder", run)
+    with pytest.raises(KeyboardInterrupt):
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path)
+    assert pictured == [finished.report["partition"]["blocks"][0]["splats"]]
+    assert begun[0] > pictured[0]
+
+
 def test_a_partition_is_where_a_training_goes_on(finished: BlocksModel, scene: Scene, tmp_path: Path) -> None:
     found = partition_scene(scene, TWO, CONFIG, output=tmp_path)
     assert found.to_json() == finished.report["partition"]

@@ -338,6 +338,13 @@ def test_a_run_begins_with_the_exposures_of_its_model(scene: Scene, tmp_path: Pa
     np.testing.assert_array_equal(missing[[view.name == "view_003.png" for view in changed.train]], np.eye(3, 4)[None])
 
 
+def test_exposures_are_read_as_they_were_written(tmp_path: Path) -> None:
+    exposures = some_exposures(3)
+    (tmp_path / "exposure.json").write_text(json.dumps(exposures_json(["a", "b", "c"], exposures)))
+    found = read_exposures(tmp_path / "exposure.json")
+    np.testing.assert_array_equal([found[name] for name in "abc"], exposures)
+
+
 @pytest.mark.parametrize("rows", [[[1, 2], [3, 4]], "much", [[1.0, 0, 0, float("nan")]] * 3, [[10**400] * 4] * 3, None])
 def test_a_damaged_file_of_exposures_is_refused(tmp_path: Path, rows: Any) -> None:
     (tmp_path / "exposure.json").write_text(json.dumps({"a.png": rows}))

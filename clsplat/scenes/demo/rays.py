@@ -42,7 +42,7 @@ class Hits:
 
 
 class RayWorld(Protocol):
-    """A world of which photos can be taken."""
+    """A world for photos."""
 
     def cast(self, origin: Rays, direction: Rays) -> Hits:
         """Return the first hit of each ray, with its colour."""
