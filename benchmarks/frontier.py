@@ -13,6 +13,7 @@ time. Transparent scenes have a white background.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -29,6 +30,8 @@ from clsplat.comparison.table import HEAD, Record, cells, notes, repeats, summar
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.presets import PRESETS
 
+LEAD_LENGTH = 1000  # iterations of the runs whose caps are compared
+LEAD_FROM = 500  # shortest run of a system whose seconds the default gets
 OUT = common.RESULTS / "frontier"
 REFERENCE = "3dgs"
 SYSTEMS = (REFERENCE, "gaussian", DEFAULT, *(name for name in PRESETS if name != REFERENCE))
@@ -97,12 +100,46 @@ def train_group(group: Group, args: argparse.Namespace) -> None:
         )
 
 
+def lead_table(records: Sequence[Record]) -> TextTable:
+    """Return the lead of the default over each system at equal splats and at equal seconds [dB].
+
+    Means and smallest leads are over the scenes, and over the caps or the lengths. In equal seconds the default has
+    those that a run of the other system takes.
+    """
+    splats: dict[str, list[tuple[float, str]]] = {}
+    rows = [row for row in summarise(records) if row["iterations"] == LEAD_LENGTH and row["psnr"]]
+    of_default = {(row["scene"], row["cap"]): row["psnr"]["mean"] for row in rows if row["system"] == DEFAULT}
+    for row in rows:
+        place = (row["scene"], row["cap"])
+        if row["system"] in SYSTEMS and row["system"] != DEFAULT and place in of_default:
+            lead = of_default[place] - row["psnr"]["mean"]
+            splats.setdefault(row["system"], []).append((lead, f"{row['scene']}, {row['cap']}"))
+    seconds: dict[str, list[tuple[float, str]]] = {}
+    for system in splats:
+        points = [point for point in length_rows(records) if point["system"] in (DEFAULT, system)]
+        for row in equal_time_rows(points, system):
+            if row["lead"] is not None and row["reference_iterations"] >= LEAD_FROM:
+                where = f"{row['scene']}, {row['reference_iterations']}"
+                seconds.setdefault(system, []).append((row["lead"], where))
+    head = ("system", "equal splats", "smallest", "where", "equal seconds", "smallest", "where")
+    lines = []
+    for system in splats:
+        cells_ = [system]
+        for leads in (splats[system], seconds.get(system, [])):
+            worst = min(leads, default=(math.nan, ""))
+            mean = math.fsum(lead for lead, _ in leads) / len(leads) if leads else math.nan
+            cells_ += [f"{mean:+.2f}", f"{worst[0]:+.2f}", worst[1]]
+        lines.append(tuple(cells_))
+    return head, lines
+
+
 def print_tables(records: Sequence[Record]) -> None:
     """Print all runs, leads in equal time, splats at equal quality, and seeds."""
     rows, points = summarise(records), point_rows(records)
     leads = equal_time_rows(length_rows(records), REFERENCE)
     tables: list[tuple[str, TextTable]] = [
         ("", (HEAD, [cells(row) for row in rows])),
+        (f"mean lead of {DEFAULT} over each system [dB]", lead_table(records)),
         (f"lead over {REFERENCE} in equal time [dB]", equal_time_table(leads, REFERENCE)),
         (f"splats for the PSNR of {REFERENCE}", equal_table(equal_rows(points, REFERENCE), REFERENCE)),
         ("seeds", seed_table(seed_rows(records))),

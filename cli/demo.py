@@ -34,7 +34,7 @@ class _Size:
 
 
 SMALL = _Size(1500, 6000, 200, 40)  # minutes on two CPU cores
-LARGE = _Size(3000, 600_000, 320, 600)  # an hour on two CPU cores
+LARGE = _Size(3000, 600_000, 320, 600)  # half an hour on two CPU cores
 BLOCKS = "6x1"  # a street has a length, and little else
 
 
