@@ -12,7 +12,7 @@ from clsplat.errors import InputError, OutputError
 from clsplat.scenes.demo.capture import photograph, pixels, rays_through
 from clsplat.scenes.demo.make import make_large_demo_scene
 from clsplat.scenes.demo.rays import SUN
-from clsplat.scenes.demo.solids import Group, Solid, box, gable_roof, post, round_solid
+from clsplat.scenes.demo.solids import Solid, SolidGroup, box, gable_roof, post, round_solid
 from clsplat.scenes.demo.street import DOME, DOME_RADIUS, GROUND, LOT, Street
 from clsplat.scenes.demo.street_scene import street_cameras, write_street
 from clsplat.scenes.scene import Scene, load_scene
@@ -78,7 +78,7 @@ def test_rays_hit_solids_where_they_enter(name: str) -> None:
 def test_groups_find_the_nearest_of_all_solids() -> None:
     solids: list[Solid] = list(SOLIDS.values())
     far = [post("plain", (9.0, 3.0, 0.0), 0.2, 5.0, TINT), box("plain", (-4.0, 4.0, 0.0), (-3.0, 6.0, 3.0), TINT)]
-    group = Group([Group(solids), Group(far)])
+    group = SolidGroup([SolidGroup(solids), SolidGroup(far)])
     rng = np.random.default_rng(2)
     origin = rng.uniform(-12, 12, (6000, 3)).astype(np.float32)
     middles = np.array([solid.centre for solid in (*solids, *far)])[rng.integers(6, size=len(origin))]

@@ -55,17 +55,17 @@ class Solid:
         return self.planes[outside.argmax(axis=1), :3].astype(np.float32)
 
 
-class Group:
+class SolidGroup:
     """Solids or groups, and a sphere around all of them; rays that miss it are not tested against each."""
 
-    def __init__(self, parts: Sequence[Solid | Group]) -> None:
+    def __init__(self, parts: Sequence[Solid | SolidGroup]) -> None:
         self.parts = parts
         self._centres = np.array([part.centre for part in parts])
         self._radii = np.array([part.radius for part in parts])
         self.centre: NDArray[np.float64] = 0.5 * (self._centres.min(axis=0) + self._centres.max(axis=0))
         self.radius: float = float((np.linalg.norm(self._centres - self.centre, axis=1) + self._radii).max())
         self.solids: list[Solid] = [
-            solid for part in parts for solid in (part.solids if isinstance(part, Group) else [part])
+            solid for part in parts for solid in (part.solids if isinstance(part, SolidGroup) else [part])
         ]
 
     def hits(self, origin: Rays, direction: Rays, farthest: Values) -> tuple[Values, NDArray[np.int16]]:
@@ -78,14 +78,14 @@ class Group:
         for column, part in enumerate(self.parts):
             rows = np.flatnonzero(passed[column])
             inner: NDArray[np.int16] | int
-            if isinstance(part, Group):
+            if isinstance(part, SolidGroup):
                 found, inner = part.hits(origin[rows], direction[rows], distance[rows])
             else:
                 found, inner = part.distance(origin[rows], direction[rows]), 0
             closer = found < distance[rows]
             distance[rows[closer]] = found[closer]
             number[rows[closer]] = first + (inner if isinstance(inner, int) else inner[closer])
-            first += len(part.solids) if isinstance(part, Group) else 1
+            first += len(part.solids) if isinstance(part, SolidGroup) else 1
         return distance, number
 
 

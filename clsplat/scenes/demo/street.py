@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .paints import FRONT, PAINTS, PAVEMENT, ROAD, STOREY, paint_ground
 from .rays import FAR, NEAR, SUN, Hits, Noise, Rays, Values, ball, constant, daylight, nonzero, sky
-from .solids import Group, Point, Solid, box, gable_roof, post, round_solid
+from .solids import Point, Solid, SolidGroup, box, gable_roof, post, round_solid
 
 LOT = 14.0  # length of a lot along the street [m]
 DOME_RADIUS = 400.0  # of the sky [m]
@@ -31,7 +31,7 @@ class Street:
     lots: int = 14
     seed: int = 0
     noise: Noise = field(init=False)
-    houses: Group = field(init=False)
+    houses: SolidGroup = field(init=False)
     drives: Values = field(init=False)  # places of the paths to the doors along x
 
     def __post_init__(self) -> None:
@@ -39,7 +39,7 @@ class Street:
         object.__setattr__(self, "noise", Noise.drawn(rng))
         lots = [(index, side) for index in range(self.lots) for side in (-1.0, 1.0)]
         built = [_lot(LOT * index - 0.5 * self.length, side, rng) for index, side in lots]
-        object.__setattr__(self, "houses", Group([Group(solids) for solids, _ in built]))
+        object.__setattr__(self, "houses", SolidGroup([SolidGroup(solids) for solids, _ in built]))
         object.__setattr__(self, "drives", np.array([drive for _, drive in built], np.float32))
 
     @property
