@@ -114,13 +114,16 @@ def demo(
     for made, used in ((folder.path, folder.is_used), (renders, renders.exists())):
         if used and not overwrite:
             raise OutputError(f"{made}: exists already: use --overwrite or another folder")
+    place, exists = out / "scene", (out / "scene").exists()
+    if exists and (place / "transforms.json").exists() != large:
+        raise OutputError(
+            f"{place}: is the scene of the demo {'without' if large else 'with'} --large: use another folder"
+        )
     if not quiet:
-        exists = (out / "scene").exists()
-        message = f"{out / 'scene'}: exists and is used" if exists else f"making {views} photos in {out / 'scene'}"
-        click.echo(message, err=True)
+        click.echo(f"{place}: exists and is used" if exists else f"making {views} photos in {place}", err=True)
     make = make_large_demo_scene if large else make_demo_scene
     with activity_line(quiet):
-        scene = load_scene(make(out / "scene", width or size.width, views), background=config.background)
+        scene = load_scene(make(place, width or size.width, views), background=config.background)
     if divided is not None:
         run_blocks(ctx, scene, config, divided, folder.path, False, overwrite, quiet, cluster)
     else:
@@ -146,7 +149,7 @@ def demo(
     click.echo(describe(DEFAULT_PROTOCOL))
     click.echo(f"all done in {duration(time.perf_counter() - start)}. Look at:")
     first = scene.test[0].name
-    photo = next(path for path in (out / "scene" / first, out / "scene" / "images" / first) if path.exists())
+    photo = next(path for path in (place / first, place / "images" / first) if path.exists())
     for path, what in (
         (measured.report, "the test views beside their photos, in a browser"),
         (renders / f"{output_stems([first])[0]}.png", "a rendered test view"),

@@ -288,6 +288,7 @@ def test_a_large_demo_is_trained_in_blocks(tmp_path: Path) -> None:
     assert "MB in all" in printed
     assert len(json.loads((out / "model" / "blocks.json").read_text())["blocks"]) == 2
     assert "--overwrite" in error_of("demo", out, *small)
+    assert "with --large" in error_of("demo", out, "--overwrite")
     assert "are for --large" in error_of("demo", tmp_path / "x", "--blocks", "2x1", code=2)
     assert "are for --large" in error_of("demo", tmp_path / "x", "--cluster", "local:2", code=2)
     assert "such as 2x2" in error_of("demo", tmp_path / "x", "--large", "--blocks", "7")
