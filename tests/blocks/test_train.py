@@ -221,6 +221,7 @@ def test_a_missing_cluster_is_said_at_once(
     def missing() -> None:
         raise InputError("a cluster needs dask.distributed")
 
+    monkeypatch.setattr("clsplat.cluster.pool.CONNECT_SECONDS", 1)
     if cluster == "local:2":
         monkeypatch.setattr("clsplat.cluster.pool.distributed", missing)
     with pytest.raises(ClsplatError, match=r"no scheduler answers|dask\.distributed"):
