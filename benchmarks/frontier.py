@@ -24,7 +24,7 @@ from clsplat.comparison.length_rows import equal_time_rows, length_rows
 from clsplat.comparison.methods import DEFAULT, parse_methods
 from clsplat.comparison.runs import distinct, read_runs
 from clsplat.comparison.sweep import write_report
-from clsplat.comparison.sweep_rows import equal_rows, point_rows, seed_rows
+from clsplat.comparison.sweep_rows import ChartRow, equal_rows, point_rows, seed_rows
 from clsplat.comparison.sweep_tables import TextTable, equal_table, equal_time_table, seed_table
 from clsplat.comparison.table import HEAD, Record, cells, notes, repeats, summarise
 from clsplat.splats.shapes import SHAPES
@@ -100,46 +100,51 @@ def train_group(group: Group, args: argparse.Namespace) -> None:
         )
 
 
-def lead_table(records: Sequence[Record]) -> TextTable:
+def lead_table(rows: Sequence[Record], lengths: Sequence[ChartRow]) -> TextTable:
     """Return the lead of the default over each system at equal splats and at equal seconds [dB].
 
     Means and smallest leads are over the scenes, and over the caps or the lengths. In equal seconds the default has
     those that a run of the other system takes.
+
+    Parameters
+    ----------
+    rows : of `summarise`. lengths : of `length_rows`.
     """
-    splats: dict[str, list[tuple[float, str]]] = {}
-    rows = [row for row in summarise(records) if row["iterations"] == LEAD_LENGTH and row["psnr"]]
-    of_default = {(row["scene"], row["cap"]): row["psnr"]["mean"] for row in rows if row["system"] == DEFAULT}
-    for row in rows:
-        place = (row["scene"], row["cap"])
-        if row["system"] in SYSTEMS and row["system"] != DEFAULT and place in of_default:
-            lead = of_default[place] - row["psnr"]["mean"]
-            splats.setdefault(row["system"], []).append((lead, f"{row['scene']}, {row['cap']}"))
-    seconds: dict[str, list[tuple[float, str]]] = {}
-    for system in splats:
-        points = [point for point in length_rows(records) if point["system"] in (DEFAULT, system)]
-        for row in equal_time_rows(points, system):
-            if row["lead"] is not None and row["reference_iterations"] >= LEAD_FROM:
-                where = f"{row['scene']}, {row['reference_iterations']}"
-                seconds.setdefault(system, []).append((row["lead"], where))
-    head = ("system", "equal splats", "smallest", "where", "equal seconds", "smallest", "where")
+    of_cap = {
+        (row["system"], row["scene"], row["cap"]): row["psnr"]["mean"]
+        for row in rows
+        if row["iterations"] == LEAD_LENGTH and row["psnr"]
+    }
     lines = []
-    for system in splats:
-        cells_ = [system]
-        for leads in (splats[system], seconds.get(system, [])):
-            worst = min(leads, default=(math.nan, ""))
-            mean = math.fsum(lead for lead, _ in leads) / len(leads) if leads else math.nan
-            cells_ += [f"{mean:+.2f}", f"{worst[0]:+.2f}", worst[1]]
-        lines.append(tuple(cells_))
-    return head, lines
+    for system in (name for name in SYSTEMS if name != DEFAULT):
+        splats = [
+            (of_cap[DEFAULT, scene, cap] - psnr, f"{scene}, {cap}")
+            for (name, scene, cap), psnr in of_cap.items()
+            if name == system and (DEFAULT, scene, cap) in of_cap
+        ]
+        seconds = [
+            (row["lead"], f"{row['scene']}, {row['reference_iterations']}")
+            for row in equal_time_rows(lengths, system)
+            if row["system"] == DEFAULT and row["lead"] is not None and row["reference_iterations"] >= LEAD_FROM
+        ]
+        if splats and seconds:
+            lines.append((system, *mean_and_smallest(splats), *mean_and_smallest(seconds)))
+    return ("system", "equal splats", "smallest", "where", "equal seconds", "smallest", "where"), lines
+
+
+def mean_and_smallest(leads: Sequence[tuple[float, str]]) -> tuple[str, str, str]:
+    """Return the mean of leads, the smallest one, and where that is."""
+    smallest, where = min(leads)
+    return f"{math.fsum(lead for lead, _ in leads) / len(leads):+.2f}", f"{smallest:+.2f}", where
 
 
 def print_tables(records: Sequence[Record]) -> None:
     """Print all runs, leads in equal time, splats at equal quality, and seeds."""
-    rows, points = summarise(records), point_rows(records)
-    leads = equal_time_rows(length_rows(records), REFERENCE)
+    rows, points, lengths = summarise(records), point_rows(records), length_rows(records)
+    leads = equal_time_rows(lengths, REFERENCE)
     tables: list[tuple[str, TextTable]] = [
         ("", (HEAD, [cells(row) for row in rows])),
-        (f"mean lead of {DEFAULT} over each system [dB]", lead_table(records)),
+        (f"mean lead of {DEFAULT} over each system [dB]", lead_table(rows, lengths)),
         (f"lead over {REFERENCE} in equal time [dB]", equal_time_table(leads, REFERENCE)),
         (f"splats for the PSNR of {REFERENCE}", equal_table(equal_rows(points, REFERENCE), REFERENCE)),
         ("seeds", seed_table(seed_rows(records))),

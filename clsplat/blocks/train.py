@@ -229,6 +229,7 @@ class _Stages:
             copy_exposures(self.state.run_folder("coarse"), exposures_beside(folder / START))
             coarse.select(around[block.number]).save(folder / CONTEXT)
             config = block_config(self.config, folder / START, max(cap, len(inside)))
+            config = config.replace(exposure_rate=0.0)  # exposures are common to all blocks
             jobs.append(BlockJob(source.of_views(block.views), config, folder, 1.0 / len(blocks)))
         rows = self.train_all(jobs, [f"block {block.number}" for block in blocks])
         parts = [coarse.select(np.flatnonzero(~np.isin(cell, [block.number for block in blocks])))]
@@ -249,7 +250,6 @@ class _Stages:
             self.steps.tell(4, f"{len(whole)} splats together, {iterations} iterations")
         before = "coarse"
         run = block_config(self.config, self.folder.path, self.config.cap_max)  # its last rates are those of the polish
-        run = run.replace(exposure_rate=self.config.appearance.exposure_rate)
         for number, rate in enumerate(POLISH_RATES if iterations else ()):
             name, part = f"polish_{number}", Part(iterations / len(POLISH_RATES) / run.iterations, rate)
             file = real_path(self.state.folder) / f"{name}.ply"
@@ -293,8 +293,6 @@ class _Stages:
 def block_config(config: TrainConfig, start: Path, cap: int) -> TrainConfig:
     """Return the options of a run that goes on from a model: no random points, no penalties, images at full size.
 
-    Exposures stay those of the model, so that they are common to all blocks.
-
     Parameters
     ----------
     config : complete options of the whole training. start : file of the model.
@@ -310,7 +308,6 @@ def block_config(config: TrainConfig, start: Path, cap: int) -> TrainConfig:
         "noise_lr": 0.0,
         "visible_adam": False,
         "coarse_to_fine": False,
-        "exposure_rate": 0.0,
         "sh_interval": 1,  # the coarse model has all bands
     }
     return TrainConfig(**config.to_json() | changed)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..files.json_file import read_object
+from ..files.json_file import get_matrix, read_object
 from .folder import ModelFolder
 
 Exposures = Mapping[str, NDArray[np.float64]]  # (3, 4) by the name of the photo
@@ -31,16 +31,12 @@ def exposures_json(names: Sequence[str], exposures: NDArray[np.floating]) -> dic
 
 def read_exposures(path: Path) -> Exposures:
     """Return the exposures of a file that `exposures_json` has made; raise InputError if it is damaged."""
-    found = {}
-    for name, rows in read_object(path).items():
-        try:
-            stored = np.array(rows, np.float64)
-        except (OverflowError, TypeError, ValueError):
-            stored = np.empty(0)
-        if stored.shape != (3, 4) or not np.isfinite(stored).all():
-            raise InputError(f"{path}: {name}: is not a matrix of 3 x 4 numbers; remove the file, or copy it again")
-        found[name] = np.concatenate([stored[:, :3].T, stored[:, 3:]], axis=1)
-    return found
+    values, remedy = read_object(path), "remove the file, or copy it again"
+    try:
+        stored = {name: get_matrix(values, name, (3, 4), remedy) for name in values}
+    except InputError as error:
+        raise InputError(f"{path}: {error}; {remedy}") from None
+    return {name: np.concatenate([rows[:, :3].T, rows[:, 3:]], axis=1) for name, rows in stored.items()}
 
 
 def exposures_of_start(init: str) -> Exposures:
@@ -49,11 +45,11 @@ def exposures_of_start(init: str) -> Exposures:
     They are in the file `exposures_beside`, or those of the model in whose folder the file is.
     """
     file = Path(init)
+    if not file.is_file():
+        return {}
     models = [ModelFolder(folder).exposures_path for folder in file.parents[2:3]]  # point_cloud/iteration_N/
-    for path in (exposures_beside(file), *models):
-        if file.is_file() and path.is_file():
-            return read_exposures(path)
-    return {}
+    found = next((path for path in (exposures_beside(file), *models) if path.is_file()), None)
+    return {} if found is None else read_exposures(found)
 
 
 def exposures_beside(splats: Path) -> Path:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...cameras.camera import Camera
+from ...cameras.orbits import look_at
 from .rays import Hits, Rays, RayWorld
 
 _SUBPIXELS = (0.25, 0.75)  # positions of 2x2 samples inside a pixel
@@ -13,14 +14,10 @@ _DEPTH_TOLERANCE = 2e-3  # [world units]; float32 rays have an error of about 1e
 
 
 def upright_camera(
-    width: int, height: int, focal: float, position: NDArray[np.float64], forward: NDArray[np.float64]
+    width: int, height: int, focal: float, position: NDArray[np.float64], target: NDArray[np.float64]
 ) -> Camera:
-    """Return a camera without roll. focal : focal length [px]. forward : unit direction of the view, not upright."""
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
+    """Return a camera without roll that looks at a place. focal : focal length [px]."""
+    pose = look_at(position, target, np.array([0.0, 0.0, 1.0]))
     return Camera(width, height, focal, focal, width / 2, height / 2, pose)
 
 

@@ -88,8 +88,7 @@ def ring_cameras(width: int, height: int, n_views: int) -> list[Camera]:
         ring, place, count = (0, index, low) if index < low else (1, index - low + 0.5, n_views - low)
         angle = 2 * np.pi * place / count
         position = np.array([RING_RADIUS * np.cos(angle), RING_RADIUS * np.sin(angle), _HEIGHTS[ring]])
-        forward = (RING_TARGET - position) / np.linalg.norm(RING_TARGET - position)
-        cameras.append(upright_camera(width, height, _FOCAL * width, position, forward))
+        cameras.append(upright_camera(width, height, _FOCAL * width, position, RING_TARGET))
     return cameras
 
 

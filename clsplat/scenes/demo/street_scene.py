@@ -99,7 +99,7 @@ def street_cameras(street: Street, width: int, height: int, n_views: int) -> lis
         turn, tilt = np.radians(_TURNS[index % len(_TURNS)]), np.radians(_TILTS[high])
         forward = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
         position = np.array([places[stop], _BESIDE * (1 if stop // 2 % 2 else -1), _HEIGHTS[high]])
-        cameras.append(upright_camera(width, height, _FOCAL * width, position, forward))
+        cameras.append(upright_camera(width, height, _FOCAL * width, position, position + forward))
     return cameras
 
 
