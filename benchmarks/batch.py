@@ -10,31 +10,24 @@ of devices must have the same one.
 
 from __future__ import annotations
 
-import hashlib
 import statistics
 import sys
 from typing import Any
 
 from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, spread, table, write_between
 
+from clsplat.comparison.measure import digest
 from clsplat.device.several import open_devices
 from clsplat.device.specs import count_devices
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer
 from clsplat.rendering.tuning import schedule_for
-from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
 from clsplat.training.run import train
 
 PAGE = ROOT / "docs" / "devices.md"
 MARKS = ("<!-- table of batch.py -->", "<!-- end of the table of batch.py -->")
 KEY = ("scene", "resolution", "cap", "iterations", "batch", "devices", "seed")
-
-
-def digest(splats: Splats) -> str:
-    """Return a digest of all parameters."""
-    arrays = splats.arrays
-    return hashlib.sha256(b"".join(arrays[name].tobytes() for name in sorted(arrays))).hexdigest()[:12]
 
 
 def run(case: Case, batch: int, devices: str, seed: int, runs: Runs) -> None:
@@ -58,7 +51,7 @@ def run(case: Case, batch: int, devices: str, seed: int, runs: Runs) -> None:
         "psnr": round(psnr, 3),
         "photo_ms": round(1e3 * model.seconds / (config.iterations * batch), 3),
         "splats": len(model.splats),
-        "bits": digest(model.splats),
+        "bits": digest(model.splats.arrays)[:12],
     }
     runs.add(row | measured | environment(first, schedule_for(first)))
     print(f"{case} batch {batch} on {devices}, seed {seed}: {psnr:.2f} dB", file=sys.stderr)

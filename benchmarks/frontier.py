@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import common
@@ -27,9 +28,12 @@ from clsplat.comparison.sweep import write_report
 from clsplat.comparison.sweep_rows import ChartRow, equal_rows, point_rows, seed_rows
 from clsplat.comparison.sweep_tables import TextTable, equal_table, equal_time_table, seed_table
 from clsplat.comparison.table import HEAD, Record, cells, notes, repeats, summarise
+from clsplat.evaluation.floaters import evenly
+from clsplat.scenes.scene import Scene
 from clsplat.splats.shapes import SHAPES
 from clsplat.training.presets import PRESETS
 
+TEST_VIEWS = 25  # of a scene: 200 take longer than the run that they measure
 LEAD_LENGTH = 1000  # iterations of the runs whose caps are compared
 LEAD_FROM = 500  # shortest run of a system whose seconds the default gets
 OUT = common.RESULTS / "frontier"
@@ -87,7 +91,7 @@ def train_group(group: Group, args: argparse.Namespace) -> None:
     for name, resolution in (group.scenes or dict.fromkeys(args.scenes)).items():
         background = common.background_of(name)
         compare(
-            [common.real_scene(name, resolution, background=background)],
+            [with_few_test_views(common.real_scene(name, resolution, background=background))],
             parse_methods(",".join(group.methods)),
             args.out,
             group.caps,
@@ -98,6 +102,12 @@ def train_group(group: Group, args: argparse.Namespace) -> None:
             extra={"commit": common.commit()},
             on_run=common.print_run,
         )
+
+
+def with_few_test_views(scene: Scene) -> Scene:
+    """Return the scene with at most TEST_VIEWS of its test views, at equal steps."""
+    chosen = evenly(scene.test, TEST_VIEWS)
+    return replace(scene, views=sorted([*scene.train, *chosen], key=lambda view: view.name))
 
 
 def lead_table(rows: Sequence[Record], lengths: Sequence[ChartRow]) -> TextTable:

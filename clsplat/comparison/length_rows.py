@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from .sweep_rows import ChartRow, chart_point, is_auto, with_front
-from .table import Record, summarise
+from .table import Record, group_key, summarise
 
 
 def length_rows(records: Sequence[Record]) -> list[ChartRow]:
-    """Return a point for each system and length of the run, as means over the seeds.
+    """Return a point for each system and length of the run, as means over the seeds that all its lengths have.
 
     Each scene has the cap with the largest number of systems that have runs of several lengths. Other systems and
     scenes are left out.
@@ -21,7 +21,7 @@ def length_rows(records: Sequence[Record]) -> list[ChartRow]:
     "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "seconds", "psnr" [dB] and "ssim". "front":
     whether the point is on the Pareto front of seconds and PSNR in its scene.
     """
-    done = [row for row in summarise(records) if row["psnr"] is not None and not is_auto(row["system"])]
+    done = [row for row in summarise(with_shared_seeds(records)) if row["psnr"] is not None and not is_auto(row["system"])]
     rows: list[ChartRow] = []
     for scene in dict.fromkeys(row["scene"] for row in done):
         lengths: dict[tuple[int, str], set[int]] = {}
@@ -39,6 +39,24 @@ def length_rows(records: Sequence[Record]) -> list[ChartRow]:
         ]
         rows += with_front(group, "seconds", "front")
     return rows
+
+
+def with_shared_seeds(records: Sequence[Record]) -> list[Record]:
+    """Return the records without seeds that only some lengths of a run have, unless no seed has them all.
+
+    Means over other seeds at each length would differ by the seeds, too.
+    """
+    groups: dict[str, dict[int, set[int]]] = {}
+    keys = [group_key(record, ("seed", "iterations")) for record in records]
+    for key, record in zip(keys, records, strict=True):
+        config = record["config"]
+        groups.setdefault(key, {}).setdefault(config["iterations"], set()).add(config["seed"])
+    shared = {key: set.intersection(*lengths.values()) for key, lengths in groups.items()}
+    return [
+        record
+        for key, record in zip(keys, records, strict=True)
+        if not shared[key] or record["config"]["seed"] in shared[key]
+    ]
 
 
 def equal_time_rows(points: Sequence[ChartRow], reference: str) -> list[ChartRow]:

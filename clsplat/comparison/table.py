@@ -40,7 +40,7 @@ def summarise(records: Sequence[Record], measured: Sequence[str] = MEASURED) -> 
     groups: dict[str, list[Record]] = {}
     for record in records:
         if not record.get("repeat"):
-            groups.setdefault(_group_key(record), []).append(record)
+            groups.setdefault(group_key(record), []).append(record)
     rows = [_row(group, measured) for group in groups.values()]
     for row, options in zip(rows, [_differing(row, rows) for row in rows], strict=True):
         row["system"] += options
@@ -63,7 +63,7 @@ def repeats(records: Sequence[Record]) -> list[Record]:
     for record in records:
         if record.get("digest"):
             where = [record[key] for key in ("device", "driver", "schedule", "version")]
-            groups.setdefault(json.dumps([_group_key(record), record["config"]["seed"], where]), []).append(record)
+            groups.setdefault(json.dumps([group_key(record), record["config"]["seed"], where]), []).append(record)
     return [
         {
             "scene": scene_title(group[0]),
@@ -161,9 +161,9 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Co
     return "\n".join("| " + " | ".join(line) + " |" for line in (head, rules, *rows))
 
 
-def _group_key(record: Record) -> str:
-    """Return what runs of one row have in common."""
-    config = {key: value for key, value in record["config"].items() if key != "seed"}
+def group_key(record: Record, differing: Collection[str] = ("seed",)) -> str:
+    """Return what runs have in common that differ in these options only."""
+    config = {key: value for key, value in record["config"].items() if key not in differing}
     return json.dumps([record["scene"], record["system"], config], sort_keys=True)
 
 

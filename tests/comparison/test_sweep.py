@@ -11,7 +11,7 @@ import pytest
 from sweep_records import curve_points, length_records, run_record, seed_records, sweep_records
 
 from clsplat.comparison import compare as compare_module
-from clsplat.comparison.length_rows import equal_time_rows, length_rows, quality_at
+from clsplat.comparison.length_rows import equal_time_rows, length_rows, quality_at, with_shared_seeds
 from clsplat.comparison.methods import parse_methods
 from clsplat.comparison.runs import read_runs
 from clsplat.comparison.sweep import sweep, write_report
@@ -79,6 +79,18 @@ def test_runs_of_several_lengths() -> None:
     # 1 s: 20 dB. 2 s: 21 and 21.5. 4 s: 22 and 22.5. 8 s: 23.5.
     assert [row["front"] for row in rows] == [True, True, False, True, False, True]
     assert length_rows(sweep_records()) == []
+
+
+def test_runs_of_several_lengths_have_the_seeds_of_all_lengths() -> None:
+    more = [run_record("default", 1000, 30.0, 1, iterations=n, shape="skew-normal") for n in (100, 200)]
+    lengths = length_records()
+    assert with_shared_seeds([*lengths, *more]) == lengths, "400 iterations have no seed 1"
+    third = run_record("default", 1000, 30.0, 1, iterations=400, shape="skew-normal")
+    rows = length_rows([*lengths, *more, third])
+    assert {row["seeds"] for row in rows if row["system"] == "default"} == {2}
+    assert {row["seeds"] for row in rows if row["system"] == "gaussian"} == {1}
+    apart = [run_record("3dgs", 500, 20.0, seed, iterations=n) for seed, n in ((0, 100), (1, 200))]
+    assert with_shared_seeds(apart) == apart, "no seed has both lengths"
 
 
 def test_leads_in_equal_time() -> None:
