@@ -21,7 +21,9 @@ def length_rows(records: Sequence[Record]) -> list[ChartRow]:
     "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "seconds", "psnr" [dB] and "ssim". "front":
     whether the point is on the Pareto front of seconds and PSNR in its scene.
     """
-    done = [row for row in summarise(with_shared_seeds(records)) if row["psnr"] is not None and not is_auto(row["system"])]
+    done = [
+        row for row in summarise(with_shared_seeds(records)) if row["psnr"] is not None and not is_auto(row["system"])
+    ]
     rows: list[ChartRow] = []
     for scene in dict.fromkeys(row["scene"] for row in done):
         lengths: dict[tuple[int, str], set[int]] = {}
