@@ -34,9 +34,9 @@ from clsplat.evaluation.metrics import psnr
 from clsplat.models.model import LoadedModel, load_model
 from clsplat.rendering.renderer import Renderer
 from clsplat.rendering.tuning import schedule_for
-from clsplat.splats.any_file import WRITTEN
 from clsplat.splats.approximate import nearest_gaussians
 from clsplat.splats.fields import public_shape
+from clsplat.splats.formats.any_file import WRITTEN
 from clsplat.splats.shapes import GAUSSIAN, SKEW_NORMAL
 from clsplat.splats.splats import Splats
 from clsplat.webpage.page import PageContent, write_web_page

@@ -27,7 +27,7 @@ from clsplat.models.convert import PageOptions, conversion_cost, convert_model
 from clsplat.models.model import LoadedModel, load_model
 from clsplat.rendering.renderer import Renderer
 from clsplat.rendering.tuning import schedule_for
-from clsplat.splats.page_payload import PRECISIONS
+from clsplat.splats.formats.page_payload import PRECISIONS
 
 sys.path.extend(common.TEST_HELPERS)
 

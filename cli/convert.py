@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import click
 
 from clsplat.splats.fields import MAX_SH_DEGREE
-from clsplat.splats.page_payload import PAGE_ENDING, PRECISIONS
+from clsplat.splats.formats.page_payload import PAGE_ENDING, PRECISIONS
+from clsplat.splats.formats.spz import VERSIONS as SPZ_VERSIONS
+from clsplat.splats.formats.streamed_sog import MAX_LEVELS
 from clsplat.splats.shapes import SHAPES
-from clsplat.splats.spz import VERSIONS as SPZ_VERSIONS
-from clsplat.splats.streamed_sog import MAX_LEVELS
 
 from .command import SectionedCommand
 from .options import PATH, device_option, iteration_option, overwrite_option, quiet_option

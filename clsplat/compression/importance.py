@@ -26,9 +26,9 @@ from ..rendering.renderer import Renderer
 from ..scenes.scene import View
 from ..splats.color import BLACK, Color
 from ..splats.fields import Array, DoubleArray, Field, sh_coefficients, sh_degree_of
+from ..splats.formats.ply_compact import movable
 from ..splats.harmonics import SH_C0, sh_basis
 from ..splats.optical_depth import opacity_names
-from ..splats.ply_compact import movable
 from ..splats.shapes import Shape, shape_named
 from ..splats.splats import Splats
 

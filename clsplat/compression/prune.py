@@ -23,7 +23,7 @@ from ..scenes.read_view import keep_photos
 from ..scenes.scene import View
 from ..splats.color import BLACK, Color
 from ..splats.fields import Array, DoubleArray, sh_coefficients
-from ..splats.ply_compact import bands_in_use, in_use, layout_bytes, plan_layout
+from ..splats.formats.ply_compact import bands_in_use, in_use, layout_bytes, plan_layout
 from ..splats.splats import Splats
 from .importance import Importance, lower_bands, measure_importance
 from .rules import standard_error

@@ -14,9 +14,9 @@ from ..files.existing import refuse_existing
 from ..files.real_path import real_path
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
-from ..splats.any_file import check_ending
 from ..splats.color import Color
-from ..splats.page_payload import PAGE_ENDING
+from ..splats.formats.any_file import check_ending
+from ..splats.formats.page_payload import PAGE_ENDING
 from ..splats.splats import Splats
 from ..training.folder import ModelFolder
 from .model import LoadedModel, SceneChoice, model_at

@@ -16,16 +16,16 @@ from ..evaluation.evaluate import MAX_PSNR
 from ..evaluation.metrics import psnr
 from ..files.existing import refuse_existing
 from ..rendering.renderer import Renderer
-from ..splats.any_file import SPZ_ENDING, WRITTEN, check_ending, format_of
 from ..splats.approximate import nearest_gaussians
 from ..splats.convert import as_one_of, convert
 from ..splats.fields import sh_coefficients
+from ..splats.formats.any_file import SPZ_ENDING, WRITTEN, check_ending, format_of
+from ..splats.formats.page_payload import PAGE_ENDING, PRECISIONS
+from ..splats.formats.spz import VERSIONS as SPZ_VERSIONS
+from ..splats.formats.streamed_sog import LEVELS, LOD_META, write_streamed_sog
 from ..splats.near_plane import NEAR_PLANE
-from ..splats.page_payload import PAGE_ENDING, PRECISIONS
 from ..splats.shapes import GAUSSIAN
 from ..splats.splats import Splats
-from ..splats.spz import VERSIONS as SPZ_VERSIONS
-from ..splats.streamed_sog import LEVELS, LOD_META, write_streamed_sog
 from ..webpage.page import PageContent, write_web_page
 from .model import LoadedModel, model_at
 

@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..scenes.info import SceneInfo, is_scene, scene_info
 from ..scenes.reconstruct.photo_files import is_photographs
 from ..scenes.wrong_folder import scene_hint
-from ..splats.any_file import READ_NAMES
+from ..splats.formats.any_file import READ_NAMES
 from ..splats.stats import Complexity, complexity
 from ..training.folder import ModelFolder
 from .model import LoadedModel, load_model

@@ -14,7 +14,7 @@ from ..errors import InputError, OutputError
 from ..files.existing import refuse_existing
 from ..rendering.renderer import Renderer
 from ..scenes.split import hold_out
-from ..splats.any_file import PLY_ENDING
+from ..splats.formats.any_file import PLY_ENDING
 from ..training.log import Progress
 from .model import LoadedModel, SceneChoice, model_at
 

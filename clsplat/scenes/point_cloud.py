@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
-from ..splats.ply_body import read_body
-from ..splats.ply_header import read_header
+from ..splats.formats.ply_body import read_body
+from ..splats.formats.ply_header import read_header
 from .colmap import Points
 
 _GREY = 128  # colour of points in files without colours

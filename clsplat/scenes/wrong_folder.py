@@ -10,7 +10,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..files.image_names import IMAGE_SUFFIXES
 from ..files.real_path import real_path
-from ..splats.any_file import READ_ENDINGS
+from ..splats.formats.any_file import READ_ENDINGS
 from .colmap import find_model, read_model
 from .nerfstudio import read_transforms
 from .photo_listing import is_posed

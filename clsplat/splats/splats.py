@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..files.stop_signals import held
-from .any_file import read_splats, write_splats
 from .checks import check_arrays, sh_degree_for
 from .fields import MAX_SH_DEGREE, Array, Schema, public_shape, sh_coefficients
+from .formats.any_file import read_splats, write_splats
+from .formats.spz import VERSIONS as SPZ_VERSIONS
 from .harmonics import SH_C0
 from .near_plane import NEAR_PLANE, usable_near_plane
 from .shapes import DEFAULT_SHAPE, check_normalisation, shape_named
-from .spz import VERSIONS as SPZ_VERSIONS
 from .stored import StoredSplats
 
 _MIN_SQUARED_DISTANCE = 1e-7  # the floor of 3DGS, for points that coincide

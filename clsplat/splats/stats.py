@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .ply_compact import bands_in_use, in_use, layout_bytes, movable, plan_layout
+from .formats.ply_compact import bands_in_use, in_use, layout_bytes, movable, plan_layout
 from .splats import Splats
 
 

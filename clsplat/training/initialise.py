@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.stop_signals import held
-from ..splats.any_file import READ_ENDINGS
 from ..splats.fields import Array, sh_coefficients
+from ..splats.formats.any_file import READ_ENDINGS
 from ..splats.morton import morton_order
 from ..splats.near_plane import NEAR_PLANE
 from ..splats.shapes import DEFAULT_SHAPE, shape_named

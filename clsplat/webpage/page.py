@@ -19,7 +19,7 @@ from ..files.atomic import atomic_writer
 from ..files.html_page import escape, package_text
 from ..splats.color import BLACK, Color
 from ..splats.convert import as_one_of
-from ..splats.page_payload import PAGE_SHAPES, PRECISIONS, pack
+from ..splats.formats.page_payload import PAGE_SHAPES, PRECISIONS, pack
 from ..splats.splats import Splats
 
 _TOUR, _TOUR_FPS = 24, 0.8  # keys of the tour around the scene, and how many of them pass in a second

@@ -1,4 +1,4 @@
-// payload.js: the splats of the page as arrays of floats. clsplat/splats/page_payload.py describes the format.
+// payload.js: the splats of the page as arrays of floats. clsplat/splats/formats/page_payload.py describes the format.
 
 // Returns the bytes of base64 text. It works in pieces, so that the page can draw its loading bar.
 async function bytesOfBase64(text, progress) {

@@ -25,7 +25,7 @@ from cli_runner import (
 
 from clsplat.cameras.cameras_json import read_cameras
 from clsplat.scenes.scene import load_scene
-from clsplat.splats.ply import read_ply
+from clsplat.splats.formats.ply import read_ply
 
 PROGRAM = [sys.executable, "-c", "from clsplat_cli.start import main; main()"]
 

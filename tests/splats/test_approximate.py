@@ -13,7 +13,7 @@ from scipy.special import ndtr
 from clsplat.errors import InputError
 from clsplat.splats.approximate import line_fits, nearest_gaussians
 from clsplat.splats.convert import convert
-from clsplat.splats.dot_splat import RECORD
+from clsplat.splats.formats.dot_splat import RECORD
 from clsplat.splats.harmonics import SH_C0
 from clsplat.splats.shapes import SHAPES, SKEW_MAX, SLANT_MAX
 from clsplat.splats.splats import Splats

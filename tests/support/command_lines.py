@@ -21,9 +21,9 @@ from fuzz_readers import make_blender, make_compact, make_path, make_photographs
 
 from clsplat.files.images import write_png
 from clsplat.scenes.demo.scene import write_capture
-from clsplat.splats.dot_splat import write_splat
+from clsplat.splats.formats.dot_splat import write_splat
+from clsplat.splats.formats.spz import write_spz
 from clsplat.splats.splats import Splats
-from clsplat.splats.spz import write_spz
 
 SEQUENCES = 0.15  # share of the lines that are the end of a sequence of commands
 # How often a command is tried. Commands that take long or serve until they are stopped are rarer.

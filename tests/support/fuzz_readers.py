@@ -27,7 +27,7 @@ from clsplat.scenes.colmap import find_model, read_model
 from clsplat.scenes.colmap_binary import write_binary_model
 from clsplat.scenes.point_cloud import read_point_cloud
 from clsplat.scenes.scene import load_scene
-from clsplat.splats.ply import read_ply
+from clsplat.splats.formats.ply import read_ply
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 from clsplat.training.checkpoint import Checkpoint

@@ -1,4 +1,4 @@
-"""Scripts for Node with npm packages, which clsplat does not install (see tests/splats/test_peers.py)."""
+"""Scripts for Node with npm packages, which clsplat does not install (see tests/splats/formats/test_peers.py)."""
 
 from __future__ import annotations
 

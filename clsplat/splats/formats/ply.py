@@ -16,18 +16,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
-from ..files.atomic import atomic_writer
-from .checks import Fault, check_arrays, sh_degree_for
-from .fields import Array, Field, Group, Schema, public_shape, sh_coefficients, sh_field
-from .near_plane import NEAR_PLANE, find_near_plane, near_plane_comments
+from ...errors import InputError
+from ...files.atomic import atomic_writer
+from ..checks import Fault, check_arrays, sh_degree_for
+from ..fields import Array, Field, Group, Schema, public_shape, sh_coefficients, sh_field
+from ..near_plane import NEAR_PLANE, find_near_plane, near_plane_comments
+from ..shapes import check_normalisation, shape_named
+from ..stored import StoredSplats, usable_arrays
 from .ply_body import read_body
 from .ply_compact import SideTable, filled_in, plan_layout, side_fields, side_tables
 from .ply_header import VERTEX, read_header
 from .ply_packed import is_packed, unpacked
 from .ply_schema import COMMENT, NORMALS, file_order, find_kernel, find_schema, refuse_point_cloud, warn_of_left_out
-from .shapes import check_normalisation, shape_named
-from .stored import StoredSplats, usable_arrays
 
 _ANTIALIASED = "SplatRenderMode: mip"
 _ANTIALIASED_ELSEWHERE = "antialiased 1"  # as PostShot writes it

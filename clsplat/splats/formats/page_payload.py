@@ -34,12 +34,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from .fields import Array, DoubleArray, sh_coefficients, sh_degree_of
-from .near_plane import usable_near_plane
-from .quaternions import from_rodrigues, to_rodrigues
-from .shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, NORMALISATIONS, SKEW_NORMAL
-from .stored import StoredSplats, usable_arrays
+from ...errors import InputError
+from ..fields import Array, DoubleArray, sh_coefficients, sh_degree_of
+from ..near_plane import usable_near_plane
+from ..quaternions import from_rodrigues, to_rodrigues
+from ..shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, NORMALISATIONS, SKEW_NORMAL
+from ..stored import StoredSplats, usable_arrays
 
 PAGE_ENDING = ".html"
 PAGE_SHAPES = (GAUSSIAN.name, SKEW_NORMAL.name, GENERALISED_EXPONENTIAL.name)  # kernels that a page draws

@@ -23,15 +23,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._version import __version__
-from ..errors import InputError, OutputError
-from ..files.atomic import atomic_writer
+from ..._version import __version__
+from ...errors import InputError, OutputError
+from ...files.atomic import atomic_writer
+from ..fields import Array, DoubleArray, sh_degree_of
+from ..morton import morton_order
+from ..shapes import GAUSSIAN, SKEW_MAX, SKEW_NORMAL
+from ..stored import StoredSplats
 from .codebooks import best_levels, nearest_level, palette
-from .fields import Array, DoubleArray, sh_degree_of
-from .morton import morton_order
-from .shapes import GAUSSIAN, SKEW_MAX, SKEW_NORMAL
 from .sog import EXTRA, META, SKEW_ZERO
-from .stored import StoredSplats
 
 Bytes = NDArray[np.uint8]
 
@@ -78,7 +78,7 @@ def sog_files(path: object, splats: StoredSplats, order: NDArray[np.int64]) -> d
     ------
     InputError, OutputError : as for `write_sog`.
     """
-    from ..files.images import encode_pixels  # lazy: a slow import
+    from ...files.images import encode_pixels  # lazy: a slow import
 
     if splats.shape not in (GAUSSIAN.name, SKEW_NORMAL.name):
         raise InputError(

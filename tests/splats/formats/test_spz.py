@@ -14,11 +14,11 @@ from reference.scenes import random_splats
 
 from clsplat.errors import InputError
 from clsplat.files import zstd
+from clsplat.splats.formats.spz import _other_axes
+from clsplat.splats.formats.spz_streams import SpzHeader, write_container
 from clsplat.splats.harmonics import axis_flip_signs, sh_basis
 from clsplat.splats.quaternions import rotations
 from clsplat.splats.splats import Splats
-from clsplat.splats.spz import _other_axes
-from clsplat.splats.spz_streams import SpzHeader, write_container
 
 HEADER = struct.Struct("<IIIBBBB")
 SMALL = [(1.0, 0.0, 0.0, 0.0), (0.5, -0.5, 0.5, -0.5), (-0.1, 0.7, -0.7, 0.1), (0.0, 0.0, 0.0, -3.0)]

@@ -30,12 +30,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..files.atomic import atomic_writer
-from .axes import flipped
-from .fields import MAX_SH_DEGREE, Array, sh_coefficients, sh_degree_of
-from .quaternions import OTHER_PLACES, from_smallest_three
-from .shapes import GAUSSIAN
+from ...errors import InputError
+from ...files.atomic import atomic_writer
+from ..axes import flipped
+from ..fields import MAX_SH_DEGREE, Array, sh_coefficients, sh_degree_of
+from ..quaternions import OTHER_PLACES, from_smallest_three
+from ..shapes import GAUSSIAN
+from ..stored import StoredSplats, check_gaussian, gaussians
 from .spz_streams import (
     ANTIALIASED,
     GZIP_VERSION,
@@ -46,7 +47,6 @@ from .spz_streams import (
     read_container,
     write_container,
 )
-from .stored import StoredSplats, check_gaussian, gaussians
 
 VERSIONS = (GZIP_VERSION, ZSTD_VERSION)  # that are written, the default first
 

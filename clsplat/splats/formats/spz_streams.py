@@ -29,9 +29,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..files import zstd
-from .fields import sh_coefficients
+from ...errors import InputError
+from ...files import zstd
+from ..fields import sh_coefficients
 
 Bytes = NDArray[np.uint8]
 

@@ -25,16 +25,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._version import __version__
-from ..errors import InputError
-from .activated import EXTRA_FIELDS, OPACITY, SCALE, activated, placed, raw_arrays
-from .axes import LUF
-from .fields import MAX_SH_DEGREE, Array, DoubleArray, public_shape, sh_coefficients
+from ..._version import __version__
+from ...errors import InputError
+from ..activated import EXTRA_FIELDS, OPACITY, SCALE, activated, placed, raw_arrays
+from ..axes import LUF
+from ..fields import MAX_SH_DEGREE, Array, DoubleArray, public_shape, sh_coefficients
+from ..harmonics import SH_C0
+from ..near_plane import NEAR_PLANE, usable_near_plane
+from ..shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, NORMALISATIONS, SKEW_NORMAL, Shape, shape_named
+from ..stored import StoredSplats, joined_parts
 from .glb import GltfFile, Json, read_gltf, write_glb
-from .harmonics import SH_C0
-from .near_plane import NEAR_PLANE, usable_near_plane
-from .shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, NORMALISATIONS, SKEW_NORMAL, Shape, shape_named
-from .stored import StoredSplats, joined_parts
 
 GLB_ENDING, GLTF_ENDING = ".glb", ".gltf"
 EXTENSION = "KHR_gaussian_splatting"

@@ -25,15 +25,15 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, OutputError
-from ..files.atomic import atomic_path
-from ..files.host_memory import limit_address_space
-from .activated import EXTRA_FIELDS, OPACITY, SCALE, activated, placed, raw_arrays
-from .axes import RUB
-from .fields import MAX_SH_DEGREE, DoubleArray, sh_coefficients, sh_degree_of
-from .near_plane import NEAR_PLANE, usable_near_plane
-from .shapes import GAUSSIAN, NORMALISATIONS, shape_named
-from .stored import StoredSplats, joined_parts
+from ...errors import InputError, OutputError
+from ...files.atomic import atomic_path
+from ...files.host_memory import limit_address_space
+from ..activated import EXTRA_FIELDS, OPACITY, SCALE, activated, placed, raw_arrays
+from ..axes import RUB
+from ..fields import MAX_SH_DEGREE, DoubleArray, sh_coefficients, sh_degree_of
+from ..near_plane import NEAR_PLANE, usable_near_plane
+from ..shapes import GAUSSIAN, NORMALISATIONS, shape_named
+from ..stored import StoredSplats, joined_parts
 
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 _MAGICS = (b"#usda", b"PXR-USDC")

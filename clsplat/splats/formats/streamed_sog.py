@@ -19,15 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._version import __version__
-from ..errors import InputError, OutputError
-from ..files.atomic import atomic_writer
-from .fields import Array, DoubleArray
-from .merging import Box, Level, boxes_of, leaves_of, levels_of
-from .morton import morton_order
+from ..._version import __version__
+from ...errors import InputError, OutputError
+from ...files.atomic import atomic_writer
+from ..fields import Array, DoubleArray
+from ..merging import Box, Level, boxes_of, leaves_of, levels_of
+from ..morton import morton_order
+from ..stored import StoredSplats, check_gaussian, joined_parts
 from .sog import META, read_sog
 from .sog_writer import sog_files
-from .stored import StoredSplats, check_gaussian, joined_parts
 
 LOD_META = "lod-meta.json"
 LEVELS, MAX_LEVELS = 4, 8  # by default, and at most

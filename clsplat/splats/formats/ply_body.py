@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ...errors import InputError
 from .ply_header import BYTE_ORDER, INTEGER_TYPES, REAL_TYPES, Element, Header
 
 Columns = Mapping[str, NDArray[Any]]

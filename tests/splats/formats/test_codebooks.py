@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.cluster.hierarchy import linkage
 
-from clsplat.splats import codebooks
-from clsplat.splats.codebooks import best_levels, nearest_level, palette
+from clsplat.splats.formats import codebooks
+from clsplat.splats.formats.codebooks import best_levels, nearest_level, palette
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from .fields import MAX_SH_DEGREE, sh_coefficients
-from .harmonics import SH_C0
+from ...errors import InputError
+from ..fields import MAX_SH_DEGREE, sh_coefficients
+from ..harmonics import SH_C0
+from ..quaternions import from_smallest_three
+from ..shapes import GAUSSIAN
+from ..stored import StoredSplats, gaussians
 from .ply_header import VERTEX, Header
-from .quaternions import from_smallest_three
-from .shapes import GAUSSIAN
-from .stored import StoredSplats, gaussians
 
 Table = Mapping[str, NDArray[Any]]
 

@@ -3,7 +3,7 @@
 The readers are npm packages, which clsplat does not install:
 
     npm install @playcanvas/splat-transform @adobe/spz @mkkellogg/gaussian-splats-3d gsplat @sparkjsdev/spark
-    CLSPLAT_NODE_MODULES=$PWD/node_modules pytest tests/splats/test_peers.py
+    CLSPLAT_NODE_MODULES=$PWD/node_modules pytest tests/splats/formats/test_peers.py
 
 Spark runs in Chromium (extra `test-view`); `pip install plyfile` adds that reader.
 """
@@ -26,11 +26,11 @@ from node_packages import MODULES, node, package, transform
 from reference.scenes import for_shape, random_splats
 
 from clsplat.splats.axes import RUB, flipped
+from clsplat.splats.formats.streamed_sog import LOD_META, write_streamed_sog
 from clsplat.splats.harmonics import SH_C0, axis_flip_signs
 from clsplat.splats.quaternions import rotations
 from clsplat.splats.splats import Splats
 from clsplat.splats.stored import StoredSplats
-from clsplat.splats.streamed_sog import LOD_META, write_streamed_sog
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 N = 40

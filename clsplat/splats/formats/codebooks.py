@@ -16,7 +16,7 @@ import heapq
 import numpy as np
 from numpy.typing import NDArray
 
-from .fields import DoubleArray
+from ..fields import DoubleArray
 
 Rows = NDArray[np.float32]
 Indices = NDArray[np.int64]

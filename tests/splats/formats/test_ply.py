@@ -15,8 +15,8 @@ from scenes_data import scene_folder
 
 from clsplat.errors import InputError
 from clsplat.splats.fields import Field
+from clsplat.splats.formats.ply import read_ply, write_ply
 from clsplat.splats.near_plane import NEAR_PLANE
-from clsplat.splats.ply import read_ply, write_ply
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 

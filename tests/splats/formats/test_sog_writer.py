@@ -18,12 +18,12 @@ from reference.scenes import random_splats
 from clsplat._version import __version__
 from clsplat.errors import InputError, OutputError
 from clsplat.files.images import decode_pixels, encode_pixels
-from clsplat.splats import sog_writer
-from clsplat.splats.codebooks import palette
+from clsplat.splats.formats import sog_writer
+from clsplat.splats.formats.codebooks import palette
+from clsplat.splats.formats.sog_writer import write_sog
 from clsplat.splats.morton import morton_order
 from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import SKEW_MAX
-from clsplat.splats.sog_writer import write_sog
 from clsplat.splats.splats import Splats
 from clsplat.splats.stored import StoredSplats
 

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from .fields import MAX_SH_DEGREE, Array, Field, Schema, sh_coefficients
+from ...errors import InputError
+from ..fields import MAX_SH_DEGREE, Array, Field, Schema, sh_coefficients
 from .ply_header import SIDE_PREFIX, Header
 
 INDEX = "index"

@@ -1,4 +1,4 @@
-"""Splats in OpenUSD files (splats/usd.py): what the library finds, what comes back, named faults."""
+"""Splats in OpenUSD files (splats/formats/usd.py): what the library finds, what comes back, named faults."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from same_splats import model, same
 
 from clsplat.errors import InputError, OutputError
-from clsplat.splats import usd
 from clsplat.splats.axes import RUB, flipped
+from clsplat.splats.formats import usd
 from clsplat.splats.splats import Splats
 from clsplat.splats.transform import joined, transformed
 

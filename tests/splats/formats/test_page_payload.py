@@ -1,4 +1,4 @@
-"""The splats inside a web page (splats/page_payload.py): what comes back, and damaged pages."""
+"""The splats inside a web page (splats/formats/page_payload.py): what comes back, and damaged pages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from model_arrays import random_model
 
 from clsplat.errors import InputError, OutputError
-from clsplat.splats.page_payload import pack, read_page, unpack
+from clsplat.splats.formats.page_payload import pack, read_page, unpack
 from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import GAUSSIAN, SHAPES, SKEW_NORMAL, STUDENT_T
 from clsplat.splats.splats import Splats

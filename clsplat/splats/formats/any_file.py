@@ -7,20 +7,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import InputError, OutputError
-from .activated import EXTRA_FIELDS
+from ...errors import InputError, OutputError
+from ..activated import EXTRA_FIELDS
+from ..shapes import GAUSSIAN, SKEW_NORMAL
+from ..stored import StoredSplats
 from .dot_splat import read_splat, write_splat
 from .glb import is_glb
 from .gltf_splats import GLB_ENDING, GLTF_ENDING, read_gltf_splats, write_gltf_splats
 from .page_payload import PAGE_ENDING, PAGE_SHAPES, read_page
 from .ply import read_ply, write_ply
-from .shapes import GAUSSIAN, SKEW_NORMAL
 from .sog import META, is_sog, read_sog
 from .sog_writer import write_sog
 from .spz import VERSIONS as SPZ_VERSIONS
 from .spz import read_spz, write_spz
 from .spz_streams import is_spz
-from .stored import StoredSplats
 from .streamed_sog import LEVELS, LOD_META, read_streamed_sog, write_streamed_sog
 from .usd import USD_ENDINGS, is_usd, read_usd, write_usd
 

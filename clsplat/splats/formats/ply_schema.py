@@ -5,11 +5,11 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
-from ..errors import InputError
-from .fields import CORE, LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, Group, Schema
+from ...errors import InputError
+from ..fields import CORE, LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, Group, Schema
+from ..shapes import GAUSSIAN, NORMALISATIONS, SHAPES, Shape, check_normalisation, shape_named
 from .ply_compact import side_fields
 from .ply_header import REAL_TYPES, SIDE_PREFIX, VERTEX, Header
-from .shapes import GAUSSIAN, NORMALISATIONS, SHAPES, Shape, check_normalisation, shape_named
 
 COMMENT = "clsplat"  # begins the comment that names the kernel
 NORMALS = ("nx", "ny", "nz")

@@ -1,4 +1,4 @@
-"""Splats in glTF (splats/gltf_splats.py): stored values by the extension's document, what comes back, named faults."""
+"""Splats in glTF (splats/formats/gltf_splats.py): stored values by the document, what comes back, named faults."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..files.atomic import atomic_writer
-from .fields import Array
+from ...errors import InputError
+from ...files.atomic import atomic_writer
+from ..fields import Array
 
 MAGIC = b"glTF"
 Json = dict[str, Any]

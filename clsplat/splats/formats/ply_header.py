@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
-from ..errors import InputError
+from ...errors import InputError
 
 BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 REAL_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clsplat.splats.dot_splat import RECORD, records
+from clsplat.splats.formats.dot_splat import RECORD, records
 from clsplat.splats.shapes import GAUSSIAN
 from clsplat.splats.stored import StoredSplats
 

@@ -1,4 +1,4 @@
-"""Streamed SOG (splats/streamed_sog.py): the files by the format's document, what comes back, and named faults."""
+"""Streamed SOG (splats/formats/streamed_sog.py): the files by the document, what comes back, and named faults."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import pytest
 from model_arrays import random_model
 
 from clsplat.errors import InputError, OutputError
-from clsplat.splats import streamed_sog
+from clsplat.splats.formats import streamed_sog
+from clsplat.splats.formats.sog import read_sog
+from clsplat.splats.formats.streamed_sog import LOD_META, write_streamed_sog
 from clsplat.splats.quaternions import rotations
 from clsplat.splats.shapes import GAUSSIAN
-from clsplat.splats.sog import read_sog
 from clsplat.splats.splats import Splats
 from clsplat.splats.stored import StoredSplats
-from clsplat.splats.streamed_sog import LOD_META, write_streamed_sog
 
 N = 300
 

@@ -12,8 +12,8 @@ from model_strategies import Arrays, random_arrays
 
 from clsplat.errors import InputError
 from clsplat.splats.fields import sh_coefficients
-from clsplat.splats.ply import read_ply, write_ply
-from clsplat.splats.ply_compact import bands_in_use, movable, plan_layout
+from clsplat.splats.formats.ply import read_ply, write_ply
+from clsplat.splats.formats.ply_compact import bands_in_use, movable, plan_layout
 from clsplat.splats.shapes import SHAPES
 from clsplat.splats.splats import Splats
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..files.atomic import atomic_writer
-from .fields import scale_of
-from .harmonics import SH_C0
-from .shapes import GAUSSIAN
-from .stored import StoredSplats, check_gaussian, gaussians
+from ...errors import InputError
+from ...files.atomic import atomic_writer
+from ..fields import scale_of
+from ..harmonics import SH_C0
+from ..shapes import GAUSSIAN
+from ..stored import StoredSplats, check_gaussian, gaussians
 
 RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("quaternion", "u1", 4)])
 

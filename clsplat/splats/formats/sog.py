@@ -30,12 +30,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from .fields import MAX_SH_DEGREE, sh_coefficients
-from .near_plane import NEAR_PLANE, usable_near_plane
-from .quaternions import from_smallest_three
-from .shapes import GAUSSIAN, NORMALISATIONS, SKEW_LIMIT, SKEW_NORMAL
-from .stored import StoredSplats, joined_parts
+from ...errors import InputError
+from ..fields import MAX_SH_DEGREE, sh_coefficients
+from ..near_plane import NEAR_PLANE, usable_near_plane
+from ..quaternions import from_smallest_three
+from ..shapes import GAUSSIAN, NORMALISATIONS, SKEW_LIMIT, SKEW_NORMAL
+from ..stored import StoredSplats, joined_parts
 
 META = "meta.json"
 EXTRA = "clsplat"
@@ -166,7 +166,7 @@ class _Reader:
         return flat[: self.count]
 
     def _image(self, group: str, place: int, *inner: str) -> NDArray[np.uint8]:
-        from ..files.images import decode_pixels  # lazy: a slow import
+        from ...files.images import decode_pixels  # lazy: a slow import
 
         names = self._value(group, *inner, "files")
         if not isinstance(names, list) or len(names) <= place or not isinstance(names[place], str):

@@ -1,0 +1,1 @@
+"""File formats of splats: a reader and a writer each, and what chooses among them."""
