@@ -1,8 +1,8 @@
 """Our .glb files in other programs: Khronos' validator, splat-transform's writer, PlayCanvas and Babylon.js.
 
-    npm install gltf-validator @playcanvas/splat-transform playcanvas @babylonjs/core @babylonjs/loaders
+npm install gltf-validator @playcanvas/splat-transform playcanvas @babylonjs/core @babylonjs/loaders
 
-    CLSPLAT_NODE_MODULES=$PWD/node_modules pytest tests/splats/formats/test_gltf_peers.py
+CLSPLAT_NODE_MODULES=$PWD/node_modules pytest tests/splats/formats/test_gltf_peers.py
 """
 
 from __future__ import annotations
