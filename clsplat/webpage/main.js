@@ -12,8 +12,8 @@ class Page {
     this.canvas = find("view");
     this.changed = true;
     this.touring = null;
-    this.row = null;    // of the sort (sort.js) whose order the renderer has
-    this.drawn = null;  // the same for the last picture
+    this.sortedView = null;  // the view (sort.js) whose order the renderer has
+    this.drawnView = null;   // the same for the last picture
     this.share = 1;     // size of the image while the view moves
     this.whole = true;  // whether the last picture had its full size
     this.gap = null;    // mean time between the pictures of a view that moves [ms]
@@ -25,7 +25,8 @@ class Page {
     const payload = await readPayload(find("payload").textContent, (share) => this.loaded(share));
     find("payload").textContent = "";
     this.renderer = new Renderer(this.canvas, payload, this.settings.shaders);
-    this.sorter = new Sorter(payload.columns.mean, (order, row) => this.sorted(order, row));
+    const splats = { mean: payload.columns.mean, reach: reachOf(payload.columns), near: payload.head.near_plane };
+    this.sorter = new Sorter(splats, (order, view) => this.sorted(order, view));
     this.controls = new Controls(this.canvas, () => this.moved());
     const tour = this.settings.tour.cameras;
     this.middle = middleOf(tour.concat(this.settings.cameras), 3);
@@ -127,9 +128,9 @@ class Page {
     this.moved();
   }
 
-  sorted(order, row) {
+  sorted(order, view) {
     this.renderer.setOrder(order);
-    this.row = row;
+    this.sortedView = view;
     this.changed = true;
   }
 
@@ -177,9 +178,9 @@ class Page {
     const width = Math.max(Math.round(this.canvas.clientWidth * density), 1);
     const height = Math.max(Math.round(this.canvas.clientHeight * density), 1);
     this.renderer.resize(width, height, share);
-    if (!this.isSortedBy(this.row)) this.sorter.request(this.rowOfSort);
+    if (!this.isPresent(this.sortedView)) this.sorter.request(this.view);
     this.renderer.draw(this.controls.pose, lensFor(this.camera, ...this.renderer.size), this.background);
-    this.drawn = this.row;
+    this.drawnView = this.sortedView;
     this.describe();
   }
 
@@ -189,19 +190,23 @@ class Page {
     find("info").textContent = `${count} splats${rate}`;
   }
 
-  get rowOfSort() {
+  // The present view for the sort. Pixels are those of the smallest image, so that its size does not matter.
+  get view() {
     const { position, axes } = this.controls.pose;
-    return [...axes[2], -dot(axes[2], position)];
+    const { width, height } = this.canvas;
+    const { fx, fy, cx, cy } = lensFor(this.camera, width, height);
+    const edges = [-cx / fx, (width - cx) / fx, -cy / fy, (height - cy) / fy];
+    return [...axes.flat(), ...position, ...edges, 1 / (SMALLEST * fx), 1 / (SMALLEST * fy)];
   }
 
-  // Whether the present view has the order that belongs to a row.
-  isSortedBy(row) {
-    return row !== null && this.rowOfSort.every((value, i) => value === row[i]);
+  // Whether a view of the sort is the present one.
+  isPresent(view) {
+    return view !== null && this.view.every((value, i) => value === view[i]);
   }
 
   // True if the picture shows the present view at its full size, with its splats in order.
   get settled() {
-    return Boolean(this.controls) && !this.changed && this.whole && this.isSortedBy(this.drawn);
+    return Boolean(this.controls) && !this.changed && this.whole && this.isPresent(this.drawnView);
   }
 
   fail(error) {

@@ -30,7 +30,7 @@ class Renderer {
     this.screen = this.program(shaders["screen.vert"], shaders["screen.frag"]);
     this.upload();
     this.makeBuffers();
-    this.ordered = false;
+    this.count = null;  // number of splats in the order; null before there is one
     this.size = [0, 0];
   }
 
@@ -136,7 +136,6 @@ class Renderer {
     gl.bindBuffer(gl.ARRAY_BUFFER, this.projected);
     gl.bufferData(gl.ARRAY_BUFFER, 16 * PARTS * ROW * rows, gl.DYNAMIC_COPY);
     gl.bindBuffer(gl.ARRAY_BUFFER, null);
-    this.rows = rows;
     this.makeTexture(3);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, PARTS * ROW, rows);
 
@@ -151,12 +150,13 @@ class Renderer {
     this.feedback = gl.createTransformFeedback();
   }
 
+  // Sets the splats that are drawn, from far to near.
   setOrder(order) {
     const gl = this.gl;
     gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
     gl.bindBuffer(gl.ARRAY_BUFFER, null);
-    this.ordered = true;
+    this.count = order.length;
   }
 
   // Sets the size of the screen, and that of the image as a share of it [px].
@@ -181,22 +181,22 @@ class Renderer {
   draw(pose, lens, background) {
     const gl = this.gl;
     const [width, height] = this.size;
-    if (this.ordered) this.projectSplats(pose, lens);
+    if (this.count) this.projectSplats(pose, lens);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    if (this.ordered) {
+    if (this.count) {
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
       gl.useProgram(this.splat.program);
       gl.uniform2f(this.splat.at.size, width, height);
       gl.uniform1i(this.splat.at.projected, 3);
-      gl.uniform1i(this.splat.at.splats, this.n);
+      gl.uniform1i(this.splat.at.splats, this.count);
       gl.uniform1i(this.splat.at.batch, BATCH);
       gl.uniform1i(this.splat.at.exponential, this.exponential);
       gl.bindVertexArray(this.splatArray);
-      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.n / BATCH));
+      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / BATCH));
       gl.disable(gl.BLEND);
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -235,14 +235,14 @@ class Renderer {
     gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, this.projected);
     gl.enable(gl.RASTERIZER_DISCARD);
     gl.beginTransformFeedback(gl.POINTS);
-    gl.drawArrays(gl.POINTS, 0, this.n);
+    gl.drawArrays(gl.POINTS, 0, this.count);
     gl.endTransformFeedback();
     gl.disable(gl.RASTERIZER_DISCARD);
     gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, null);
     gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, null);
     gl.bindBuffer(gl.PIXEL_UNPACK_BUFFER, this.projected);
     gl.activeTexture(gl.TEXTURE3);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, PARTS * ROW, this.rows, gl.RGBA, gl.FLOAT, 0);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, PARTS * ROW, Math.ceil(this.count / ROW), gl.RGBA, gl.FLOAT, 0);
     gl.bindBuffer(gl.PIXEL_UNPACK_BUFFER, null);
   }
 }

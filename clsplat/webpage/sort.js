@@ -1,24 +1,56 @@
-// sort.js: the order of the splats from far to near, in a worker if the browser allows one.
+// sort.js: the splats that a view can show, from far to near, in a worker if the browser allows one.
 
-// Returns a function from a row (a, b, c, d) to the indices of the splats by falling depth a x + b y + c z + d. mean has
-// all x, then all y, then all z. The radix sort takes 16 bits of a float at a time. It is exact and stable.
-function makeSorter(mean) {
+// Returns for each splat how far it reaches at most, in standard deviations along its longest axis and in that length:
+// {factor, size}. The bounds are those of project.vert for a splat that leans as far as it can, with twice its opacity.
+function reachOf({ log_scale: logScale, opacity, beta }) {
+  const n = opacity.length;
+  const factor = new Float32Array(n);
+  const size = new Float32Array(n);
+  for (let i = 0; i < n; ++i) {
+    const fall = Math.log(Math.max(510 * opacity[i], 1));
+    const radius = Math.sqrt(2 * (beta ? Math.max(fall ** (2 / beta[i]), fall) : fall));
+    factor[i] = 1.65 * radius + 1.31;
+    size[i] = Math.exp(Math.max(logScale[i], logScale[n + i], logScale[2 * n + i]));
+  }
+  return { factor, size };
+}
+
+// Returns a function from a view to the indices of the splats that it can show, by falling depth. mean has all x, then
+// all y, then all z. A view is a list: the three axes of the camera, its position, the left, right, upper and lower edge
+// of the image as tangents, and the size of a pixel as a tangent in both directions. Splats outside of the image stay if
+// they reach into it, or into a margin around it, because the camera moves on while the order is made.
+// The radix sort takes 16 bits of a float at a time. It is exact and stable.
+function makeSorter({ mean, reach, near }) {
+  const MARGIN = 0.1;  // of the image's width and height
   const n = mean.length / 3;
   const keys = new Uint32Array(n);
   const depths = new Float32Array(keys.buffer);
+  const shown = new Uint32Array(n);
   const half = new Uint32Array(n);
   const counts = [new Uint32Array(65536), new Uint32Array(65536)];
-  return (row) => {
-    const order = new Uint32Array(n);
+  return (view) => {
+    const [ax, ay, az, bx, by, bz, cx, cy, cz, px, py, pz, left, right, top, bottom, pixelX, pixelY] = view;
+    const [sideX, sideY] = [MARGIN * (right - left), MARGIN * (bottom - top)];
+    const farX = 2 * Math.max(Math.abs(left), Math.abs(right));
+    const farY = 2 * Math.max(Math.abs(top), Math.abs(bottom));
     for (const count of counts) count.fill(0);
+    let found = 0;
     for (let i = 0; i < n; ++i) {
-      depths[i] = row[0] * mean[i] + row[1] * mean[n + i] + row[2] * mean[2 * n + i] + row[3];
-      const bits = keys[i];
-      // Bits of positive floats rise with their value, those of negative ones fall. The far ones get the small keys.
-      const key = bits & 0x80000000 ? bits : ~bits & 0x7fffffff;
-      keys[i] = key;
+      const [x, y, z] = [mean[i] - px, mean[n + i] - py, mean[2 * n + i] - pz];
+      const depth = cx * x + cy * y + cz * z;
+      if (!(depth > 0.5 * near)) continue;  // project.vert decides about those near the plane
+      const tx = (ax * x + ay * y + az * z) / depth;
+      const ty = (bx * x + by * y + bz * z) / depth;
+      const wide = reach.size[i] / depth;
+      const lengthX = reach.factor[i] * (wide * Math.sqrt(1 + Math.min(tx * tx, farX * farX)) + 0.55 * pixelX) + sideX;
+      const lengthY = reach.factor[i] * (wide * Math.sqrt(1 + Math.min(ty * ty, farY * farY)) + 0.55 * pixelY) + sideY;
+      if (tx + lengthX < left || tx - lengthX > right || ty + lengthY < top || ty - lengthY > bottom) continue;
+      depths[found] = depth;
+      const key = ~keys[found] & 0x7fffffff;  // bits of positive floats rise with their value: the far ones come first
+      keys[found] = key;
       counts[0][key & 65535]++;
       counts[1][key >>> 16]++;
+      shown[found++] = i;
     }
     for (const count of counts) {
       let sum = 0;
@@ -28,57 +60,58 @@ function makeSorter(mean) {
         sum = next;
       }
     }
-    for (let i = 0; i < n; ++i) half[counts[0][keys[i] & 65535]++] = i;
-    for (let i = 0; i < n; ++i) order[counts[1][keys[half[i]] >>> 16]++] = half[i];
+    const order = new Uint32Array(found);
+    for (let k = 0; k < found; ++k) half[counts[0][keys[k] & 65535]++] = k;
+    for (let k = 0; k < found; ++k) order[counts[1][keys[half[k]] >>> 16]++] = shown[half[k]];
     return order;
   };
 }
 
-// Sorts for the latest camera. onOrder(order, row) is called with each result.
+// Sorts for the latest view. onOrder(order, view) is called with each result.
 class Sorter {
-  constructor(mean, onOrder) {
-    Object.assign(this, { onOrder, busy: false, waiting: null, latest: null });
+  constructor(splats, onOrder) {
+    Object.assign(this, { splats, onOrder, busy: false, waiting: null, latest: null });
     try {
       const source = `const make = ${makeSorter};
         let sort;
         onmessage = ({data}) => {
-          if (data.mean) sort = make(data.mean);
-          else { const order = sort(data.row); postMessage({order, row: data.row}, [order.buffer]); }
+          if (data.splats) sort = make(data.splats);
+          else { const order = sort(data.view); postMessage({order, view: data.view}, [order.buffer]); }
         };`;
       this.worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
-      this.worker.onmessage = ({ data }) => this.finish(data.order, data.row);
-      this.worker.onerror = () => this.withoutWorker(mean);
-      this.worker.postMessage({ mean });
+      this.worker.onmessage = ({ data }) => this.finish(data.order, data.view);
+      this.worker.onerror = () => this.withoutWorker();
+      this.worker.postMessage({ splats });
     } catch {
-      this.withoutWorker(mean);
+      this.withoutWorker();
     }
   }
 
   // Sorts in the page itself. Some browsers refuse a worker only after it was made.
-  withoutWorker(mean) {
+  withoutWorker() {
     this.worker = null;
-    this.sort = makeSorter(mean);
+    this.sort = makeSorter(this.splats);
     if (!this.busy) return;
     this.busy = false;
     this.request(this.waiting || this.latest);
   }
 
-  request(row) {
+  request(view) {
     if (this.busy) {
-      this.waiting = row;
+      this.waiting = view;
       return;
     }
     this.busy = true;
-    this.latest = row;
-    if (this.worker) this.worker.postMessage({ row });
-    else setTimeout(() => this.finish(this.sort(row), row), 0);
+    this.latest = view;
+    if (this.worker) this.worker.postMessage({ view });
+    else setTimeout(() => this.finish(this.sort(view), view), 0);
   }
 
-  finish(order, row) {
+  finish(order, view) {
     this.busy = false;
     const next = this.waiting;
     this.waiting = null;
     if (next) this.request(next);
-    this.onOrder(order, row);
+    this.onOrder(order, view);
   }
 }

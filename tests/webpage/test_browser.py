@@ -100,6 +100,31 @@ def test_the_page_draws_what_clsplat_renders(
             assert psnr(canvas_picture(page), expected) > FULL
 
 
+@pytest.mark.parametrize(
+    ("shape", "options"),
+    [("skew-normal", {"normalisation": "pdf"}), ("generalised-exponential", {}), ("gaussian", {"zoom": 3.0})],
+    ids=str,
+)
+def test_splats_outside_of_the_view_are_left_out(
+    browser: Browser, tmp_path: Path, shape: str, options: dict[str, Any]
+) -> None:
+    """Many are, inside the ball. The picture has the bits of one with all splats."""
+    content = scene(shape, 1, **options)
+    with opened(browser, tmp_path / "ball.html", content) as page:
+        page.evaluate("page.controls.pose.position = page.middle; page.moved()")
+        shown = canvas_picture(page)
+        assert 100 < page.evaluate("page.renderer.count") < 0.6 * len(content[0])
+        page.evaluate(
+            """() => { const { columns, head } = page.renderer.payload, huge = columns.opacity.map(() => 1e6);
+            const all = { mean: columns.mean, reach: { factor: huge, size: huge }, near: head.near_plane };
+            page.renderer.setOrder(makeSorter(all)(page.view)); page.draw(1, performance.now()); }"""
+        )
+        more = page.evaluate("page.renderer.count")
+        assert more > page.evaluate("makeSorter(page.sorter.splats)(page.view).length")
+        assert shown.std() > 0.04
+        np.testing.assert_array_equal(canvas_picture(page), shown)
+
+
 def test_compact_pages_are_close_and_python_reads_what_the_browser_reads(browser: Browser, tmp_path: Path) -> None:
     content = scene("skew-normal")
     camera = content[1][0].camera
