@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
-from ..files.json_file import describe, get_matrix, get_number, get_size, get_value, read_json
+from ..files.json_file import describe, get_matrix, get_number, get_objects, get_size, get_value, read_json
 from .camera import Camera
 from .cameras_json import cameras_of
 from .rotations import NearestRotation, NotARotation, nearest_rotation, warn_of_corrections
@@ -145,13 +145,13 @@ def path_of(content: Any, source: str | os.PathLike[str]) -> CameraPath:
         if model != "perspective":
             raise InputError(f"key 'camera_type' is {ascii(model)[:40]}; only perspective cameras can be rendered")
         width, height = get_size(content, "render_width", _REMEDY), get_size(content, "render_height", _REMEDY)
-        frames = _entries(get_value(content, "camera_path", _REMEDY), "camera_path")
+        frames = get_objects(content, "camera_path", _REMEDY)
         if not frames:
             raise InputError("key 'camera_path' is empty; a path needs at least one frame")
         fps = get_number(content, "fps", _REMEDY) if "fps" in content else _fps_of(content, len(frames))
         rotations: dict[str, NearestRotation] = {}
         cameras = _cameras(frames, "camera_path", "camera_to_world", width, height, rotations)
-        entries = _entries(content.get("keyframes", []), "keyframes")
+        entries = get_objects(content, "keyframes", _REMEDY) if "keyframes" in content else []
         keys = _cameras(entries, "keyframes", "matrix", width, height, rotations)
         warn_of_corrections(source, rotations)
         return CameraPath(cameras, fps, keys, content.get("is_cycle") is True)
@@ -189,12 +189,6 @@ def _fps_of(content: dict[str, Any], frames: int) -> float:
     if seconds <= 0:
         raise InputError(f"key 'seconds' is {seconds:g}; it must be above 0")
     return frames / seconds
-
-
-def _entries(value: Any, key: str) -> list[dict[str, Any]]:
-    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-        raise InputError(f"key {key!r} has the wrong form; expected a list of objects")
-    return value
 
 
 def _cameras(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,15 @@ def read_json(path: str | os.PathLike[str], expected: str) -> Any:
         raise InputError(f"{path}: is not JSON ({str(error).splitlines()[0]}); choose {expected}") from error
 
 
+@contextmanager
+def named_place(place: str) -> Iterator[None]:
+    """Begin the messages of InputErrors in the block with a place: a file, and the entry in it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from None
+
+
 def read_object(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the JSON object in a file that clsplat wrote.
 
@@ -66,6 +77,30 @@ def get_value(entry: dict[str, Any], key: str, remedy: str) -> Any:
 def get_number(entry: dict[str, Any], key: str, remedy: str) -> float:
     """Return the finite number at `key`; raises InputError."""
     return _finite(get_value(entry, key, remedy), key)
+
+
+def get_objects(entry: dict[str, Any], key: str, remedy: str) -> list[dict[str, Any]]:
+    """Return the list of objects at `key`; raises InputError."""
+    found = get_value(entry, key, remedy)
+    if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
+        raise InputError(f"key {key!r} has the wrong form; expected a list of objects")
+    return found
+
+
+def get_text(entry: dict[str, Any], key: str, remedy: str) -> str:
+    """Return the text at `key`, which is not empty; raises InputError."""
+    found = get_value(entry, key, remedy)
+    if not isinstance(found, str) or not found:
+        raise InputError(f"key {key!r} is {describe(found)}; expected a text")
+    return found
+
+
+def get_id(entry: dict[str, Any], key: str, remedy: str) -> int:
+    """Return the whole number at `key`, at least 0; raises InputError."""
+    found = get_value(entry, key, remedy)
+    if type(found) is not int or found < 0:
+        raise InputError(f"key {key!r} is {describe(found)}; expected a whole number, at least 0")
+    return found
 
 
 def get_size(entry: dict[str, Any], key: str, remedy: str) -> int:

@@ -31,9 +31,9 @@ from ..files.image_names import IMAGE_SUFFIXES
 from ..files.json_file import read_json, to_real
 from ..files.masks import is_same_file
 from .colmap import Points, read_model
-from .point_cloud import read_point_cloud
+from .point_cloud import join_points, read_point_cloud
 from .posed_images import PosedImages, read_sizes
-from .undistort import Lens, RegisteredImage, make_lens
+from .undistort import Lens, RegisteredImage, brown_lens, make_lens
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
@@ -181,7 +181,7 @@ class _Frame:
             )
         if k4:
             raise InputError(f"{self.place}: k4 of a perspective lens is not supported; undistort the photos first")
-        return make_lens("FULL_OPENCV", width, height, [*core, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0])
+        return brown_lens(width, height, core, (k1, k2, k3), (p1, p2))
 
     def focal(self, key: str, angle: str, size: int, default: float | None = None) -> float | None:
         """Return the focal length [px] at `key`, or from the angle of view at `angle`, or the default."""
@@ -299,7 +299,7 @@ class _Document:
             if (folder / place).is_dir():
                 points = read_model(folder / place).points
                 return Points(self.apply_transform(points.xyz), points.rgb, points.track_length)
-        return Points(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.int64))
+        return join_points([])
 
     def apply_transform(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return points of the COLMAP model in the world of the poses."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from ..splats.formats.ply_body import read_body
 from ..splats.formats.ply_header import read_header
 from .colmap import Points
 
-_GREY = 128  # colour of points in files without colours
+GREY = 128  # colour of points in files without colours
 
 
 def read_point_cloud(path: str | os.PathLike[str]) -> Points:
@@ -44,7 +45,7 @@ def read_point_cloud(path: str | os.PathLike[str]) -> Points:
     bad = np.flatnonzero(~np.isfinite(xyz).all(axis=1))
     if bad.size:
         raise InputError(f"{path}: point {bad[0]} has a position that is not finite; export the points again")
-    rgb = np.full((len(xyz), 3), _GREY, np.uint8)
+    rgb = np.full((len(xyz), 3), GREY, np.uint8)
     if all(name in columns for name in ("red", "green", "blue")):
         rgb = np.stack([np.clip(columns[name], 0, 255).astype(np.uint8) for name in ("red", "green", "blue")], axis=1)
     return Points(xyz, rgb, np.ones(len(xyz), np.int64))
@@ -64,3 +65,14 @@ def write_point_cloud(path: str | os.PathLike[str], points: Points) -> None:
     table["xyz"], table["rgb"] = points.xyz, points.rgb
     with atomic_writer(path) as stream:
         stream.write(("\n".join(head) + "\n").encode("ascii") + table.tobytes())
+
+
+def join_points(clouds: Sequence[Points]) -> Points:
+    """Return several clouds as one; no cloud gives one without points."""
+    nothing = Points(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.int64))
+    parts = [nothing, *clouds]
+    return Points(
+        np.concatenate([part.xyz for part in parts]),
+        np.concatenate([part.rgb for part in parts]),
+        np.concatenate([part.track_length for part in parts]),
+    )

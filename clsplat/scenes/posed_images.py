@@ -108,7 +108,7 @@ def read_colmap(root: Path, images: str | None) -> PosedImages:
     InputError : a folder is missing, or the model is damaged.
     """
     model = read_model(find_model(root))
-    folder = _photo_folder(root, images or "images")
+    folder = photo_folder(root, images or "images")
     placed = place_photos(folder, [photo.name for photo in model.photos])
     files = with_reduced_photos(folder, dict(placed.values()))
     sizes, left_out = read_sizes(files)
@@ -118,7 +118,8 @@ def read_colmap(root: Path, images: str | None) -> PosedImages:
     return PosedImages(photos, files, sizes, model.points, left_out=left_out)
 
 
-def _photo_folder(root: Path, images: str) -> Path:
+def photo_folder(root: Path, images: str) -> Path:
+    """Return the folder of the photos inside a scene; raises InputError if it is missing."""
     folder = root / images
     if not folder.is_dir():
         others = ", ".join(sorted(other.name for other in root.glob("images*") if other.is_dir()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -118,6 +119,21 @@ class RegisteredImage:
 def make_lens(model: str, width: int, height: int, params: list[float]) -> Lens:
     """Return a lens by COLMAP's model name and parameters: focal lengths and centre [px], then distortion."""
     return colmap_library().Camera(model=model, width=width, height=height, params=params)
+
+
+def brown_lens(
+    width: int, height: int, core: Sequence[float], radial: Sequence[float], tangential: Sequence[float]
+) -> Lens:
+    """Return the lens of the Brown-Conrady model, as OpenCV writes it.
+
+    Parameters
+    ----------
+    core : focal lengths fx, fy and centre cx, cy [px].
+    radial : k1, k2, k3, or k1 to k6: from k4 on they are the coefficients of OpenCV's denominator.
+    tangential : p1, p2.
+    """
+    k1, k2, k3, *below = radial
+    return make_lens("FULL_OPENCV", width, height, [*core, k1, k2, *tangential, k3, *(below or [0.0, 0.0, 0.0])])
 
 
 def pinhole_camera(lens: Lens, cam_from_world: NDArray[np.float64], width: int, height: int) -> Camera:
