@@ -45,9 +45,10 @@ def write_cameras_of(
 ) -> None:
     """Write the cameras and points of SOURCE to OUTPUT, a .json file or the folder of a COLMAP model.
 
-    SOURCE is a scene or its transforms.json, a model folder, a cameras.json or a camera path. Cameras of a scene keep
-    their lenses, and the files name its photos. Cameras of a model are those of its training images, undistorted and at
-    their reduced size. Their images are named images/NAME.png, and their points are the centres of opaque splats.
+    SOURCE is a scene or the file of its cameras, a model folder, a cameras.json or a camera path. Cameras of a scene
+    keep their lenses, and the files name its photos. Cameras of a model are those of its training images, undistorted
+    and at their reduced size. Their images are named images/NAME.png, and their points are the centres of opaque
+    splats.
     """
     from clsplat.models.cameras import export_cameras
 

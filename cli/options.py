@@ -185,7 +185,10 @@ def photo_options(function: F) -> F:
 def scene_options(function: F) -> F:
     """Add `-s`, `-i` and `-r`: the scene, and the folder and the size of its photos."""
     return click.option(
-        "-s", "--source-path", type=PATH, help="Folder of the scene, with photos and a COLMAP model or transforms.json."
+        "-s",
+        "--source-path",
+        type=PATH,
+        help="Folder of the scene, with photos and their cameras, or the file of its cameras.",
     )(photo_options(function))
 
 

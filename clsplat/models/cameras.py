@@ -18,6 +18,7 @@ from ..scenes.colmap import Points
 from ..scenes.export import relative_files, write_colmap, write_transforms
 from ..scenes.posed_images import warn_of_left_out
 from ..scenes.scene import read_posed_images
+from ..scenes.scene_files import SCENE_ENDINGS
 from ..scenes.undistort import RegisteredImage, is_pinhole, make_lens, pinhole_camera
 from ..splats.harmonics import SH_C0
 from ..splats.shapes import shape_named
@@ -52,7 +53,7 @@ def export_cameras(
 
     Parameters
     ----------
-    source : a scene or its transforms.json, a model folder, a file of splats, a cameras.json or a camera path.
+    source : a scene or the file of its cameras, a model folder, a file of splats, a cameras.json or a camera path.
     output : a .json file, or the folder of a COLMAP model.
     form : one of `scenes.options.CAMERA_FORMATS`; by default "cameras" for cameras.json, "transforms" for other .json
         files, else "colmap".
@@ -87,9 +88,11 @@ def export_cameras(
 
 
 def _is_scene(source: Path) -> bool:
-    """Return whether the source is a folder without a model, or a transforms.json with its frames."""
+    """Return whether the source is a folder without a model, or a file of cameras that is a scene."""
     if source.is_dir():
         return not (source / "point_cloud").is_dir()
+    if source.suffix.lower() in SCENE_ENDINGS[1:]:
+        return source.is_file()
     if not source.is_file() or source.suffix != ".json":
         return False
     content = read_json(source, "a cameras.json or a transforms.json")

@@ -10,6 +10,7 @@ from typing import Any
 from ..errors import InputError
 from ..scenes.info import SceneInfo, is_scene, scene_info
 from ..scenes.reconstruct.photo_files import is_photographs
+from ..scenes.scene_files import OTHER_KINDS
 from ..scenes.wrong_folder import scene_hint
 from ..splats.formats.any_file import READ_NAMES
 from ..splats.stats import Complexity, complexity
@@ -65,7 +66,7 @@ def inspect(
 
 def _is_scene(path: Path) -> bool:
     if path.is_file() or not path.is_dir() or ModelFolder(path).iterations():
-        return path.is_file() and path.suffix == ".json" and path.name not in READ_NAMES
+        return path.is_file() and is_scene(path) and path.name not in READ_NAMES
     if is_scene(path):
         return True
     if ModelFolder(path).is_used:
@@ -74,4 +75,4 @@ def _is_scene(path: Path) -> bool:
         raise InputError(hint)
     if is_photographs(path):
         raise InputError(f"{path}: photographs without poses: clsplat reconstruct {path} -o SCENE finds them")
-    raise InputError(f"{path}: neither a model (point_cloud/) nor a scene (sparse/ or transforms.json)")
+    raise InputError(f"{path}: neither a model (point_cloud/) nor a scene (sparse/, {OTHER_KINDS})")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, reason_of
 from ..splats.quaternions import rotations
 from .colmap_binary import check_binary_model, count_registered
+from .scene_files import OTHER_KINDS
 from .undistort import RegisteredImage, colmap_library
 
 _FILES = ("cameras", "images", "points3D")
@@ -60,12 +61,12 @@ def find_model(scene: Path) -> Path:
     InputError : the scene has no COLMAP model.
     """
     if not scene.is_dir():
-        raise InputError(f"{scene}: no such folder; give a scene folder with images/ and sparse/, or transforms.json")
+        raise InputError(f"{scene}: no such folder; give a folder with images/ and sparse/, or {OTHER_KINDS}")
     sparse = scene / "sparse"
     if not sparse.is_dir():
         raise InputError(
-            f"{scene}: no folder 'sparse'; a scene needs a COLMAP model in sparse/0 "
-            "(clsplat reconstruct makes one of photos), or a transforms.json"
+            f"{scene}: no folder 'sparse'; a scene needs a COLMAP model in sparse/0 (clsplat reconstruct makes one of "
+            f"photos), or {OTHER_KINDS}"
         )
     candidates = [sparse, *sorted(folder for folder in sparse.iterdir() if folder.is_dir())]
     models = [folder for folder in candidates if _suffix(folder)]

@@ -21,7 +21,7 @@ from .pose_checks import check_lenses
 from .posed_images import PosedImages
 from .reconstruct.options import RECORD
 from .scene import find_masks, read_posed_images, select_test_names
-from .transforms_files import find_transforms
+from .scene_files import SCENE_ENDINGS, find_scene_files
 from .undistort import is_pinhole
 
 _DIGITS = 6  # significant digits of a focal length; lenses that agree to these digits count as one
@@ -56,7 +56,7 @@ class SceneInfo:
 
     Parameters
     ----------
-    kind : "COLMAP" or the names of the transforms files.
+    kind : "COLMAP" or the names of the files that describe the cameras.
     photos : number of photos with poses.
     unregistered : names of photos in the same folder without a pose.
     left_out : reason why a photo with a pose is missing or cannot be read, by name. Pixels are not decoded.
@@ -105,8 +105,10 @@ class SceneInfo:
 
 
 def is_scene(path: Path) -> bool:
-    """Return whether a path looks like a scene: a folder with `sparse` or a transforms file, or such a file."""
-    return path.suffix == ".json" if path.is_file() else (path / "sparse").is_dir() or bool(find_transforms(path))
+    """Return whether a path looks like a scene: a folder with `sparse` or a file of cameras, or such a file."""
+    if path.is_file():
+        return path.suffix.lower() in SCENE_ENDINGS
+    return (path / "sparse").is_dir() or bool(find_scene_files(path))
 
 
 def scene_info(path: str | os.PathLike[str], images: str | None = None, test_every: int = 8) -> SceneInfo:
@@ -123,9 +125,9 @@ def scene_info(path: str | os.PathLike[str], images: str | None = None, test_eve
     tracks = posed.points.track_length
     masks = find_masks(root, posed, None)
     held_out = select_test_names(posed, test_every, None) if len(posed.listed) > 1 else frozenset()
-    transforms = [] if (root / "sparse").is_dir() else find_transforms(root)
+    described_by = [] if (root / "sparse").is_dir() else find_scene_files(root)
     return SceneInfo(
-        " and ".join(file.name for file in transforms) or "COLMAP",
+        " and ".join(file.name for file in described_by) or "COLMAP",
         len(posed.listed),
         _unregistered(root, posed, masks.values()),
         posed.left_out,

@@ -12,7 +12,7 @@ from ..files.images import is_render
 from ..files.json_file import read_json
 from ..files.masks import MASK_FOLDER
 from .reconstruct.options import RECORD
-from .transforms_files import find_transforms
+from .scene_files import find_scene_files
 
 _MODEL_FILES, _ENDS = ("cameras", "images"), (".bin", ".txt")  # of COLMAP
 
@@ -80,8 +80,8 @@ def is_output(folder: Path) -> bool:
 
 
 def is_posed(folder: Path) -> bool:
-    """Return whether a folder holds poses: a COLMAP model in `sparse`, or a transforms file."""
-    if find_transforms(folder):
+    """Return whether a folder holds poses: a COLMAP model in `sparse`, or files that describe cameras."""
+    if find_scene_files(folder):
         return True
     sparse = folder / "sparse"
     try:

@@ -22,13 +22,13 @@ from ..files.real_path import real_path
 from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
 from .colmap import Points
-from .nerfstudio import read_transforms
+from .described import read_described
 from .options import ALPHA_USES
 from .photo_size import check_memory
 from .pose_checks import check_lenses, check_poses, without_far_points
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
 from .read_view import PhotoReader, read_views
-from .transforms_files import find_transforms
+from .scene_files import SCENE_ENDINGS, find_scene_files
 from .view import View
 from .wrong_folder import describe_file, scene_hint
 
@@ -44,7 +44,7 @@ class Scene:
     Parameters
     ----------
     name : name of the scene's folder.
-    path : the scene's folder, or its transforms file.
+    path : the scene's folder, or the file of its cameras.
     views : all views, sorted by name.
     points : point cloud, may be empty.
     test_names : names of the views held out for evaluation, with those left out.
@@ -123,13 +123,16 @@ def load_scene(
     read_photos: bool = True,
     only: Collection[str] | None = None,
 ) -> Scene:
-    """Read a scene: a folder with photos and a COLMAP model in `sparse`, or with transforms.json.
+    """Read a scene: a folder with photos and their cameras.
+
+    The cameras are a COLMAP model in `sparse`, transforms.json, an OPF project (.opf), or the XML file of Metashape. A
+    folder with several of them is read as the first in this order.
 
     Parameters
     ----------
-    path : the scene's folder, or one of its transforms files. A folder with both is read as a COLMAP scene.
-    images : folder of the photos inside the scene, by default "images" or the folder in transforms.json. If its photos
-        are reduced (images_4), the cameras are scaled.
+    path : the scene's folder, or the file of its cameras.
+    images : folder of the photos inside the scene, by default "images", or the folder that the file names. If its
+        photos are reduced (images_4), the cameras are scaled.
     resolution : 3DGS's -r. The values 1, 2, 4 and 8 divide the size; -1 keeps the size but reduces images wider than
         1600 px to that width; another number is the width [px].
     test_every : every n-th name of the sorted names, from the first on, is a test view. Names of photos that are left
@@ -255,11 +258,11 @@ def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, 
 
 def read_posed_images(root: Path, images: str | None) -> PosedImages:
     """Read a scene's photos with poses, without decoding them; parameters and errors as `load_scene`."""
-    if root.is_file() and root.suffix.lower() != ".json":
+    if root.is_file() and root.suffix.lower() not in SCENE_ENDINGS:
         raise InputError(f"{root}: {describe_file(root)}")
-    transforms, has_model = find_transforms(root), (root / "sparse").is_dir()
-    if transforms and not has_model:
-        posed = read_transforms(transforms, images)
+    files, has_model = find_scene_files(root), (root / "sparse").is_dir()
+    if files and not has_model:
+        posed = read_described(files, images)
     elif root.is_dir() and not has_model and (hint := scene_hint(root)) is not None:
         raise InputError(hint)
     else:

@@ -12,9 +12,9 @@ from ..files.image_names import IMAGE_SUFFIXES
 from ..files.real_path import real_path
 from ..splats.formats.any_file import READ_ENDINGS
 from .colmap import find_model, read_model
-from .nerfstudio import read_transforms
+from .described import read_described
 from .photo_listing import is_posed
-from .transforms_files import find_transforms
+from .scene_files import OTHER_KINDS, find_scene_files
 
 _LEVELS_UP = 3  # a model's files are two folders below the scene, and photos may be in a subfolder of `images`
 _LEVELS_DOWN = 2
@@ -45,8 +45,10 @@ def describe_file(file: Path) -> str:
     if kind in IMAGE_SUFFIXES:
         return "is one photo; give the folder of the photos"
     if kind in _MODEL_SUFFIXES:
-        return "is a model or a point cloud, not a scene; give the scene's folder, or its transforms.json"
-    return "is not a scene; give a folder with photos, a transforms.json, or a video"
+        return f"is a model or a point cloud, not a scene; give the scene's folder, or {OTHER_KINDS}"
+    if kind == ".csv":
+        return "is a table, which says too little about lenses; export the cameras of RealityScan as a COLMAP model"
+    return f"is not a scene; give a folder with photos, a video, {OTHER_KINDS}"
 
 
 def scene_above(path: Path) -> Path | None:
@@ -88,7 +90,7 @@ def _has_photos_of(scene: Path, photos: Path, place: Path) -> bool:
             if (scene / "sparse").is_dir():
                 files = [photos / photo.name for photo in read_model(find_model(scene)).photos]
             else:
-                files = list(read_transforms(find_transforms(scene)).files.values())
+                files = list(read_described(find_scene_files(scene)).files.values())
     except InputError:
         return False
     return any(file.is_file() and real_path(file).is_relative_to(place) for file in files)

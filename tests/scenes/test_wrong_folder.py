@@ -89,7 +89,7 @@ def test_relative_paths_stay_relative(data: Path, monkeypatch: pytest.MonkeyPatc
     [
         ("a.jpg", "is one photo; give the folder of the photos"),
         ("points.ply", "is a model or a point cloud, not a scene; give the scene's folder"),
-        ("notes.txt", "is not a scene; give a folder with photos, a transforms.json, or a video"),
+        ("notes.txt", "is not a scene; give a folder with photos, a video, a transforms.json, an OPF project"),
     ],
 )
 def test_files_that_are_not_scenes(tmp_path: Path, name: str, remedy: str) -> None:

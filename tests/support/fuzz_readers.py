@@ -13,6 +13,7 @@ from typing import Any
 import glb_files
 import numpy as np
 import packed_ply
+import photogrammetry_files
 import sog_files
 from model_arrays import random_model
 from small_scene import FX, FY, NAMES, as_text, cloud, model_views, photo_of
@@ -121,6 +122,27 @@ def make_transforms(folder: Path) -> None:
     }
     (folder / "transforms.json").write_text(json.dumps(values), encoding="utf-8")
     make_ascii(folder)
+
+
+def make_survey(folder: Path) -> None:
+    for index, name in enumerate(photogrammetry_files.NAMES):
+        photo = photo_of(index, photogrammetry_files.WIDTH, photogrammetry_files.HEIGHT)
+        write_png(folder / "images" / name, photo)
+
+
+def make_opf(folder: Path) -> None:
+    make_survey(folder)
+    xyz, rgb = photogrammetry_files.points()
+    tracks = folder / "calibration" / "tracks.gltf"
+    photogrammetry_files.write_opf_cloud(tracks, xyz, rgb, [3] * len(xyz), (1.0, 2.0, 3.0))
+    photogrammetry_files.opf_project().write(folder)
+
+
+def make_metashape(folder: Path) -> None:
+    make_survey(folder)
+    make_ascii(folder)
+    text = photogrammetry_files.metashape_xml(chunk=photogrammetry_files.similarity())
+    (folder / "cameras.xml").write_text(text, encoding="utf-8")
 
 
 def read_scene(folder: Path) -> None:
@@ -379,6 +401,8 @@ READERS = {
     "test-list": Sample(make_listed, read_listed, "test.txt"),
     "transforms": Sample(make_transforms, read_scene),
     "blender": Sample(make_blender, read_scene),
+    "opf": Sample(make_opf, read_scene),
+    "metashape": Sample(make_metashape, read_scene, "cameras.xml"),
     "photographs": Sample(make_photographs, read_photographs),
     "scene-facts": Sample(make_masked, read_facts),
     "cameras-json": Sample(make_cameras, lambda f: read_cameras(f / "cameras.json")),

@@ -1,0 +1,56 @@
+"""Files that describe the cameras of a scene in place of a COLMAP model: transforms files, OPF, Metashape's XML."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from .transforms_files import find_transforms
+
+OPF_ENDING, METASHAPE_ENDING = ".opf", ".xml"
+SCENE_ENDINGS = (".json", OPF_ENDING, METASHAPE_ENDING)
+OTHER_KINDS = "a transforms.json, an OPF project (.opf) or Metashape's cameras (.xml)"  # beside COLMAP, for messages
+_METASHAPE_NAME = "cameras.xml"  # the name that Metashape proposes
+# Other programs leave XML files beside photos. The first bytes tell Metashape's from them.
+_METASHAPE_START = re.compile(rb"<document\b[^>]*>\s*<chunk\b")
+_START_BYTES = 4096
+
+
+def find_scene_files(path: Path) -> list[Path]:
+    """Return the files that describe a scene's cameras; an empty list without any.
+
+    The kinds are looked for in a fixed order, and the first that is there counts: transforms files, an OPF project,
+    cameras of Metashape. A COLMAP model comes before them all; `read_posed_images` looks for it first.
+
+    Parameters
+    ----------
+    path : the scene's folder, or one of its files.
+
+    Returns
+    -------
+    One file, or the transforms files of training and test photos. Several files of another kind are no scene until one
+    of them is named.
+    """
+    if path.is_file():
+        return [path] if path.suffix.lower() in SCENE_ENDINGS[1:] else find_transforms(path)
+    return find_transforms(path) or _ending(path, OPF_ENDING) or _metashape_files(path)
+
+
+def _metashape_files(folder: Path) -> list[Path]:
+    files = [file for file in _ending(folder, METASHAPE_ENDING) if _is_metashape(file)]
+    return [file for file in files if file.name == _METASHAPE_NAME] or files
+
+
+def _ending(folder: Path, ending: str) -> list[Path]:
+    try:
+        return sorted(file for file in folder.iterdir() if file.suffix.lower() == ending and file.is_file())
+    except OSError:  # no folder, or none that may be read
+        return []
+
+
+def _is_metashape(file: Path) -> bool:
+    try:
+        with file.open("rb") as stream:
+            return _METASHAPE_START.search(stream.read(_START_BYTES)) is not None
+    except OSError:
+        return False
