@@ -29,9 +29,10 @@ from clsplat.training.run import train
 
 KEY = ("scene", "resolution", "cap", "iterations", "photos", "system", "seed", "views")
 MEASURED = 20  # validation views that are measured, at most
-UNCHECKED = "default:occluder_check=false"
-BEFORE = "default:dropout=0,random_points=0.05,occluder_check=false"  # the default of scenes with many photos
-ON_PAGE = ("default", UNCHECKED, BEFORE, "3dgs")  # systems of the page, in its order; --table has all
+STEEP = "default:depth_smoothness=0"
+UNCHECKED = "default:depth_smoothness=0,occluder_check=false"
+BEFORE = "default:depth_smoothness=0,dropout=0,random_points=0.05,occluder_check=false"  # as with many photos
+ON_PAGE = ("default", STEEP, UNCHECKED, BEFORE, "3dgs")  # systems of the page, in its order; --table has all
 PAGE = ROOT / "benchmarks" / "SYSTEMS.md"
 MARKS = ("<!-- table of few_views.py -->", "<!-- end of the table of few_views.py -->")
 

@@ -16,7 +16,14 @@ from clsplat.device.schedule import SCHEDULES
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.group_binner import group_binning_program
 from clsplat.rendering.radix_sort import sort_program
-from clsplat.training.programs import columns_program, dropout_program, lazy_program, loss_program, optim_program
+from clsplat.training.programs import (
+    columns_program,
+    depth_program,
+    dropout_program,
+    lazy_program,
+    loss_program,
+    optim_program,
+)
 
 OPTIONS = (*COMMON_OPTIONS, *GPU_OPTIONS)
 SHAPES = ("gaussian", "skew-normal")
@@ -42,6 +49,8 @@ def programs() -> dict[str, str]:
             texts[f"optimize visible {shape}"] = built.pop()
             columns_program(device, kernels)
             texts[f"densify {shape}"] = built.pop()
+            depth_program(device, kernels)
+            texts[f"depth {shape}"] = built.pop()
             for name in GPU_SCHEDULES:
                 KernelBuild(shape, _SH_DEGREE, SCHEDULES[name]).pixel_program(device)
                 texts[f"pixels {shape} {name}"] = built.pop()

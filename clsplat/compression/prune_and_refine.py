@@ -161,6 +161,7 @@ def fine_tuning(config: TrainConfig, splats: Splats, part: Part, start: Path) ->
         sh_interval=1,
         strategy="adc",
         densify_until=0.0,
+        depth_smoothness=0.0,
         occluder_check=False,
         noise_lr=0.0,
         position_optimizer="adam",

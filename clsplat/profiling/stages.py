@@ -14,15 +14,23 @@ from ..splats.flops import ADAM, BLEND, BLEND_VJP, LOSS
 from ..splats.shapes import shape_named
 
 STAGES = {
-    "project": ("project_splats", "drop_splats"),
+    "project": ("project_splats", "drop_splats", "color_by_depth"),
     "depth sort": ("depth_span", "depth_histogram", "depth_scatter", "depth_buckets"),
     "binning": ("count_tiles", "total_tiles", "count_isects", "scan_isects", "emit_isects"),
     "tile sort": ("list_isects", "find_tile_ranges"),
     "rasterize": ("rasterize",),
-    "loss": ("unpack_image", "photo_of_render", "image_loss", "image_loss_vjp", "photo_of_render_vjp", "step_exposure"),
+    "loss": (
+        "unpack_image",
+        "photo_of_render",
+        "image_loss",
+        "image_loss_vjp",
+        "photo_of_render_vjp",
+        "step_exposure",
+        "smooth_depth",
+    ),
     "rasterize_vjp": ("rasterize_vjp",),
     "gather": ("gather_isect_grads",),
-    "project_vjp": ("project_splats_vjp",),
+    "project_vjp": ("project_splats_vjp", "add_depth_gradient"),
     "step": (
         "step_splats",
         "turn_skew_gradient",

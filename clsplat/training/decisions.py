@@ -7,8 +7,9 @@
 - Beside the points of a scene, some splats start at random places too: a plain wall has no points, and would else get
   no splats. They also need the penalty.
 - With few photos, splats that fit a single photo are cheap, and other views see them. A part of the splats is not drawn
-  in each iteration (dropout.py). Splats that only views between the photos show large are removed (occluders.py). With
-  very few photos, no splat starts at a random place beside the scene's points.
+  in each iteration (dropout.py). Depths have a penalty on steps (depth_smoothness.py). Splats that only views between
+  the photos show large are removed (occluders.py). With very few photos, no splat starts at a random place beside the
+  scene's points.
 - Splats that start at random places have a longer way, so their learning rates are twice as high.
 - On several devices, an iteration has a photo for each of them.
 - A step of Adam reads and writes every parameter, also of splats that the image does not show. On a GPU it takes a
@@ -49,6 +50,7 @@ RANDOM_SHARE_OF_FEW = 0.1  # the same, if the scene has fewer points than this s
 FEW_VIEWS = 12  # with more training views, dropout costs more than it gains
 VERY_FEW_VIEWS = 6  # with more training views, random points beside the scene's gain more than they cost
 DROPOUT = 0.3  # part of the splats that is not drawn in an iteration of a run with few views
+SMOOTHNESS = 0.1  # weight of the penalty on steps of the depth of a run with few views
 RANDOM_START_RATES = 2.0  # factor on the learning rates of a run that starts at random
 SEEN_SHARE = 0.7  # of the scene's points in a photo: with a smaller share, only visible splats step on a GPU
 UNSEEN_SPLATS = 50_000  # fewer splats outside of a photo save less time than the two further commands take
@@ -99,6 +101,9 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if len(scene.train) <= FEW_VIEWS and "dropout" not in config.named_options:
         chosen["dropout"] = DROPOUT
         reasons.append(f"a dropout of {DROPOUT:.0%} of the splats, because there are only {len(scene.train)} photos")
+    if len(scene.train) <= FEW_VIEWS and "depth_smoothness" not in config.named_options:
+        chosen["depth_smoothness"] = SMOOTHNESS
+        reasons.append("a penalty on steps of the depth")
     if len(scene.train) <= FEW_VIEWS and "occluder_check" not in config.named_options:
         chosen["occluder_check"] = True
         reasons.append("no splats that would cover the view between the photos")

@@ -22,6 +22,7 @@ from .targets import target_budget, target_bytes, target_channels
 _ROLES = 5
 # Planes of an image: colour and transmittance, the same for rendering in bands, gradients of the SSIM maps, v_color.
 _IMAGE_PLANES = 4 + 4 + 9 + 3
+_DEPTH_PLANES = 4 + 4 + 3  # the same for images of depths, without the gradients of the SSIM maps
 # Splat-tile pairs of an image: 100 for each tile and 4 for each splat, more than real scenes have at the end of a run.
 _ISECTS_PER_TILE, _ISECTS_PER_SPLAT = 100, 4
 _MIN_ISECTS = 1 << 20  # isects that must fit; images with more are rendered in bands
@@ -94,13 +95,17 @@ def estimate(
     batch = config.schedule.batch
     if batch > 1:  # the mean gradients, and rows that come from another device
         extra += 2 * rows[Group.GEOM] + (batch + 1) * COMPACT_ROWS + SplatStatistics.ROWS
+    planes = _IMAGE_PLANES
+    if config.views.depth_smoothness:  # a copy of the splats with depths as colours, its gradients, and its images
+        extra += 2 * rows[Group.GEOM] + 3 + COMPACT_ROWS
+        screen, n_isects, planes = 2 * screen, 2 * n_isects, planes + _DEPTH_PLANES
     widest = max(*rows.values(), kernels.record, kernels.v_record)  # of the buffers with a column for each splat
     color_roles = _ROLES - 1 - config.optim.half_moments  # two moments of 16 bits are one word
     splat = _ROLES * rows[Group.GEOM] + color_roles * rows[Group.SH] + COMPACT_ROWS + extra
     return Estimate(
         n * (splat * real + screen),
         n_isects * isect,
-        _IMAGE_PLANES * layout.plane * real + target_bytes,
+        planes * layout.plane * real + target_bytes,
         isect,
         max(widest * n * real, 9 * layout.plane * real),
     )

@@ -36,6 +36,7 @@ _RATES = {
     "average_last": 0.0,
     "random_points": 0.0,
     "dropout": 0.0,
+    "depth_smoothness": 0.0,
     "occluder_check": False,
     "visible_adam": False,
     "random_background": False,

@@ -128,6 +128,13 @@ def dropout_program(device: Device) -> Program:
     return build(device, ("math/lanes.clh", "math/philox.clh", "train/dropout.cl"), defines)
 
 
+def depth_program(device: Device, kernels: KernelBuild) -> Program:
+    """Return the program of smooth depths. It depends on the fields and the precision only."""
+    defines = layout_defines(shape_named(kernels.shape), kernels.schema)
+    defines |= {"LANES": 1, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y}
+    return build(device, ("math/lanes.clh", "train/depth.cl"), defines, kernels.real)
+
+
 def _optim_defines(kernels: KernelBuild, half_moments: bool) -> dict[str, Define]:
     geometry = kernels.schema.group(Group.GEOM)
     widths = {field.name: field.width for field in geometry if field.name not in ("mean", "quat", "log_scale", "skew")}

@@ -14,6 +14,7 @@ from ..scenes.scene import Scene
 from ..splats.color import Color
 from ..splats.fields import Array
 from .config import TrainConfig
+from .depth_smoothness import DepthSmoothness
 from .dropout import SplatDropout
 from .exposure import ExposureLoss
 from .loss import ImageLoss, LossResult
@@ -64,6 +65,12 @@ class Replica:
         self.targets = Targets(device, kernels, scene.train, target_budget(device), channels)
         self.exposure = ExposureLoss(self.loss, self.targets, config, scene.background)
         self.dropout = SplatDropout(config, self.splats)
+        self.smoothness = DepthSmoothness(config, kernels, self.splats, scene.train, max_isects)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of device memory of frames, their gradients and the photos."""
+        return self.pipeline.pool.nbytes + self.targets.nbytes + self.smoothness.nbytes
 
     def copy_on(self, device: Device, first: Mapping[str, Array]) -> Replica:
         """Return the same on another device; it has the same schedule, if the device is of the same kind."""
@@ -73,8 +80,13 @@ class Replica:
         return Replica(device, kernels, memory, self.scene, self.config, first, self.splats.capacity)
 
     def learn(self, target: Target, background: Color, sh_degree: int, iteration: int) -> tuple[Frame, LossResult]:
-        """Render a photo's view, and write the gradients of its loss into `grads`. Nothing waits for the device."""
+        """Render a photo's view, and write the gradients of its loss into `grads`, with those of smooth depths.
+
+        Nothing waits for the device.
+        """
         frame = self.pipeline.forward(self.splats, target.camera, background, sh_degree, self.dropout.of(iteration))
         result = self.exposure.evaluate(target, frame.images.color.buffer, background)
         self.pipeline.backward(frame, result.v_color, self.grads)
+        if self.smoothness.is_due(iteration):
+            self.smoothness.add(self.grads, target, self.targets.planes(target), iteration)
         return frame, result

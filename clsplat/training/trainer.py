@@ -241,7 +241,7 @@ class Trainer:
             self.iteration,
             self.seconds,
             peak_bytes(),
-            self.pipeline.pool.nbytes + self.targets.nbytes,
+            self.main.nbytes,
             self.evaluations,
             self.evaluation_seconds,
             None if folder is None else folder.path,

@@ -80,7 +80,7 @@ def test_the_qualities_rise() -> None:
 
 def test_train_says_what_it_decided_by_the_scene(scene: Path, tmp_path: Path) -> None:
     """The scene has few photos, which alone would be a reason for dropout and checks."""
-    short = ("--iterations", "1", "--cap-max", "30", "--dropout", "0", "--no-occluder-check")
+    short = ("--iterations", "1", "--cap-max", "30", "--dropout", "0", "--depth-smoothness", "0", "--no-occluder-check")
     said = run("train", scene, "-m", tmp_path / "a", "--init", "random", *short).stderr
     assert said.count("decided: a penalty on opacity of 0.001, because the start is random") == 1
     assert config_of(tmp_path / "a")["opacity_reg"] == 0.001

@@ -23,6 +23,7 @@ from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 from clsplat.training.optim.skew_map import SKEW_MAPS
 from clsplat.training.programs import (
     columns_program,
+    depth_program,
     dropout_program,
     exposure_program,
     lazy_program,
@@ -88,6 +89,7 @@ def test_every_kernel_builds_without_warnings(compiler: Device) -> None:
         group_binning_program(compiler, kernels, 64)
         kernels.binning_program(compiler, CHUNK_FILES, ORDER_DEFINES)
     columns_program(compiler, kernels)
+    depth_program(compiler, kernels)
     dropout_program(compiler)
     there = {
         f"{folder.name}/{file.name}"

@@ -27,7 +27,7 @@ OPTIONS = (
     {},
     {"exposure": True},
     {"strategy": "mcmc", "position_optimizer": "sghmc"},
-    {"random_background": True, "dropout": 0.3},
+    {"random_background": True, "dropout": 0.3, "depth_smoothness": 0.2},
     {"shape": "gaussian", "half_moments": True},
 )
 

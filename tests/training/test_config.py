@@ -71,6 +71,7 @@ DEFAULTS = {
     "smooth_l1": 0.05,
     "bisect_reg": 0.0,
     "dropout": 0.0,
+    "depth_smoothness": 0.0,
     "occluder_check": False,
     "position_lr_init": 1.6e-4,
     "position_lr_final": 1.6e-6,

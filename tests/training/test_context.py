@@ -23,6 +23,7 @@ RUN: dict[str, Any] = {
     "near_plane": 0.01,
     "random_points": 0.0,
     "dropout": 0.0,
+    "depth_smoothness": 0.0,
     "coarse_to_fine": False,
     "grad_threshold": 0.0,
 }

@@ -29,6 +29,7 @@ from clsplat.training.decisions import (
     RANDOM_SHARE,
     RANDOM_SHARE_OF_FEW,
     RANDOM_START_RATES,
+    SMOOTHNESS,
     VERY_FEW_VIEWS,
     Decision,
     as_decided,
@@ -48,8 +49,8 @@ def without_points(scene: Scene) -> Scene:
 
 
 def options_of(**named: Any) -> TrainConfig:
-    """Return options with a near plane, without dropout and occluder checks, which else depend on the scene."""
-    return TrainConfig(**{"near_plane": 0.1, "dropout": 0.0, "occluder_check": False} | named)
+    """Return options with a near plane, and without what few photos need; else they depend on the scene."""
+    return TrainConfig(**{"near_plane": 0.1, "dropout": 0.0, "depth_smoothness": 0.0, "occluder_check": False} | named)
 
 
 def some_splats(scene: Scene, file: Path) -> Path:
@@ -123,7 +124,7 @@ def with_views(scene: Scene, count: int) -> Scene:
         (FEW_VIEWS + 1, 0.0, RANDOM_SHARE),
     ],
 )
-def test_few_photos_get_dropout_and_checks_and_very_few_no_random_points(
+def test_few_photos_get_dropout_smooth_depths_and_checks_and_very_few_no_random_points(
     scene: Scene, count: int, dropout: float, share: float
 ) -> None:
     few = with_views(scene, count)
@@ -131,12 +132,14 @@ def test_few_photos_get_dropout_and_checks_and_very_few_no_random_points(
     decision = decide(few, config)
     assert decision.config == config.replace(
         dropout=dropout,
+        depth_smoothness=SMOOTHNESS if count <= FEW_VIEWS else 0.0,
         occluder_check=count <= FEW_VIEWS,
         random_points=share or None,
         opacity_reg=PENALTY if share else 0.0,
     )
     assert (f"a dropout of 30% of the splats, because there are only {count} photos" in str(decision)) == (dropout > 0)
     assert decide(few, config.replace(dropout=0.1)).config.views.dropout == 0.1
+    assert decide(few, config.replace(depth_smoothness=0.5)).config.views.depth_smoothness == 0.5
 
 
 def test_test_and_validation_views_do_not_count(scene: Scene) -> None:

@@ -28,6 +28,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "skew-normal with exposure": {"shape": "skew-normal", "strategy": "mcmc", "exposure": True},
     "lazy steps": {"shape": "gaussian", "visible_adam": True},
     "half moments": {"shape": "gaussian", "half_moments": True},
+    "smooth depths": {"shape": "skew-normal", "depth_smoothness": 0.1},
     "momentum": {"shape": "student-t", "position_optimizer": "sghmc"},
 }
 

@@ -98,6 +98,13 @@ class ViewsConfig(OptionGroup):
         below=1,
         by_scene=True,
     )
+    depth_smoothness: float = option(
+        0.0,
+        help="Weight of a penalty on steps of the depth between neighbouring pixels, in the photos and between them, "
+        "until 0.9 of the run.",
+        at_least=0,
+        by_scene=True,
+    )
     occluder_check: bool = option(
         False,
         help="Remove splats that cameras between the photos show much larger than any photo does, after each tenth of "

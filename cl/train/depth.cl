@@ -1,0 +1,87 @@
+// depth.cl: smooth depths (clsplat/training/depth_smoothness.py). A depth is drawn as a colour: each splat has that of its
+// centre in all three channels. Images are planar with a zero margin (rasterize.cl).
+
+#define STEEPEST R(0.01)  // relative step of the depth above which the penalty grows linearly, below it quadratically
+#define MOST_LIGHT R(0.2)  // pixels that let more light through have no depth
+#define SH_0 R(0.28209479177387814)
+#define BYTE R(255.0)
+
+// Writes sh [3, capacity], the constant harmonic with which a splat has the colour axis . mean + offset, its depth. Global
+// size: at least n.
+kernel void color_by_depth(
+    global const real *restrict geom,
+    global real *restrict sh,
+    ulong capacity,
+    uint n,
+    real axis_x,
+    real axis_y,
+    real axis_z,
+    real offset
+) {
+    const uint i = get_global_id(0);
+    if (i >= n) return;
+    global const real *mean = geom + ROW_MEAN * capacity + i;
+    const real depth = axis_x * mean[0] + axis_y * mean[capacity] + axis_z * mean[2 * capacity] + offset;
+    for (uint c = 0; c < 3; ++c) sh[c * capacity + i] = (depth - R(0.5)) / SH_0;
+}
+
+// How much a pixel of the photo differs from its neighbour: the mean over the colours, 0 to 1.
+static inline real difference(global const uchar *restrict truth, ulong at, ulong other, ulong plane) {
+    real sum = 0;
+    for (uint c = 0; c < 3; ++c) sum += fabs((real)truth[c * plane + at] - (real)truth[c * plane + other]);
+    return sum / (3 * BYTE);
+}
+
+// Overwrites v_color [3 planes] with the gradient of weight * sum of exp(-edge * difference) * h((d - e) / m). The sum is
+// over all pairs of neighbours with depths d and e, m is their mean, and h is |x| with a quadratic middle. m counts as
+// a constant. edge: 0 for views without a photo. Global size: (at least width, height).
+kernel void smooth_depth(
+    global const real *restrict color,
+    global const real *restrict transmittance,
+    global const uchar *restrict truth,
+    global real *restrict v_color,
+    int width,
+    int height,
+    int stride,
+    ulong plane,
+    real weight,
+    real edge
+) {
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + x;
+    real sum = 0;
+    for (int side = 0; side < 4; ++side) {
+        const int dx = side < 2 ? 2 * side - 1 : 0, dy = side < 2 ? 0 : 2 * side - 5;
+        const int u = x + dx, v = y + dy;
+        if (u < 0 || v < 0 || u >= width || v >= height) continue;
+        const ulong other = (ulong)(v + MARGIN_Y) * stride + MARGIN_X + u;
+        if (transmittance[at] >= MOST_LIGHT || transmittance[other] >= MOST_LIGHT) continue;
+        const real middle = fmax(R(0.5) * (color[at] + color[other]), R(1e-12));
+        const real slope = clamp((color[at] - color[other]) / (middle * STEEPEST), R(-1.0), R(1.0));
+        const real flat = edge > 0 ? exp(-edge * difference(truth, at, other, plane)) : R(1.0);
+        sum += flat * slope / middle;
+    }
+    v_color[at] = weight * sum;
+    v_color[plane + at] = v_color[2 * plane + at] = 0;
+}
+
+// Adds to grad_geom [rows, capacity] the gradient of splats whose colour is their depth: other_geom [rows, capacity], and
+// what the gradient of their colours, the first 3 rows of other_sh, means for their positions. Global size: at least n.
+kernel void add_depth_gradient(
+    global real *restrict grad_geom,
+    global const real *restrict other_geom,
+    global const real *restrict other_sh,
+    ulong capacity,
+    uint n,
+    real axis_x,
+    real axis_y,
+    real axis_z
+) {
+    const uint i = get_global_id(0);
+    if (i >= n) return;
+    const real axis[3] = {axis_x, axis_y, axis_z};
+    const real v_depth = other_sh[i] + other_sh[capacity + i] + other_sh[2 * capacity + i];
+    for (uint row = 0; row < GEOM_ROWS; ++row) grad_geom[row * capacity + i] += other_geom[row * capacity + i];
+    for (uint c = 0; c < 3; ++c) grad_geom[(ROW_MEAN + c) * capacity + i] += axis[c] * v_depth;
+}
