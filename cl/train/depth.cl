@@ -57,8 +57,8 @@ kernel void smooth_depth(
         if (u < 0 || v < 0 || u >= width || v >= height) continue;
         const ulong other = (ulong)(v + MARGIN_Y) * stride + MARGIN_X + u;
         if (transmittance[at] >= MOST_LIGHT || transmittance[other] >= MOST_LIGHT) continue;
-        const real middle = fmax(R(0.5) * (color[at] + color[other]), R(1e-12));
-        const real slope = clamp((color[at] - color[other]) / (middle * STEEPEST), R(-1.0), R(1.0));
+        const real middle = max(R(0.5) * (color[at] + color[other]), R(1e-12));
+        const real slope = lanes_clamp((color[at] - color[other]) / (middle * STEEPEST), R(-1.0), R(1.0));
         const real flat = edge > 0 ? exp(-edge * difference(truth, at, other, plane)) : R(1.0);
         sum += flat * slope / middle;
     }
