@@ -1,7 +1,7 @@
 // depth.cl: smooth depths (clsplat/training/depth_smoothness.py). A depth is drawn as a colour: each splat has that of its
 // centre in all three channels. Images are planar with a zero margin (rasterize.cl).
 
-#define STEEPEST R(0.01)  // relative step of the depth above which the penalty grows linearly, below it quadratically
+#define STEEPEST R(0.01)   // relative step of the depth above which the penalty grows linearly, below it quadratically
 #define MOST_LIGHT R(0.2)  // pixels that let more light through have no depth
 #define SH_0 R(0.28209479177387814)
 #define BYTE R(255.0)
