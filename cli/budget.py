@@ -108,7 +108,7 @@ def result_lines(result: Budgeted) -> list[str]:
     report, final = result.report, result.report["final"]
     held_out = report["held_out"]
     lines = [
-        f"rounds: {report['rounds'][report['chosen']]['splats']} of {report['rounds'][0]['splats']} splats remain",
+        f"rounds: {final['splats']} of {report['rounds'][0]['splats']} splats remain",
         f"validation views: PSNR {held_out['psnr_pruned']:.2f} dB, with all splats and parameters "
         f"{report['rounds'][0]['psnr']:.2f} dB",
         f"{result.path}: {final['splats']} splats, {final['skewed_fraction']:.0%} skewed, "
