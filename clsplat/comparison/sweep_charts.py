@@ -107,7 +107,7 @@ def size_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
         for line, scene in enumerate(scenes):
             shown = [row for row in rows if row["scene"] == scene]
             for axes, (cost, (name, unit)) in zip(panels[line], _COSTS.items(), strict=True):
-                _cost_panel(axes, shown, cost, unit, styles)
+                _cost_panel(axes, [row for row in shown if row[cost] is not None], cost, unit, styles)
                 front = sorted((row for row in shown if row[f"front_{cost}"]), key=lambda row: not row["auto"])
                 names = ["auto" if row["auto"] else short_count(row["cap"]) for row in front]
                 labels.append(

@@ -60,7 +60,8 @@ def point_rows(records: Sequence[Record]) -> list[ChartRow]:
     Returns
     -------
     "scene", "system", "shape", "cap", "iterations", "seeds" (their number), "auto", "psnr" [dB], "ssim", "seconds",
-    "parameters" and COSTS. "front_C" for each cost C: whether the point is on the Pareto front of its scene.
+    "parameters" and COSTS; a cost that no run measured is None. "front_C" for each cost C: whether the point is on the
+    Pareto front of its scene.
     """
     measured = ("psnr", "ssim", "seconds", "parameters", *COSTS)
     rows = [
@@ -86,7 +87,7 @@ def chart_point(row: Record, measured: Sequence[str], **more: Any) -> ChartRow:
     Returns
     -------
     "scene", "system", "shape", "cap", "iterations", "seeds" (the number of those that did not fail), `more`, and the
-    mean of each value measured.
+    mean of each value measured; None if no run measured it.
     """
     return {
         "scene": row["scene"],
@@ -96,14 +97,17 @@ def chart_point(row: Record, measured: Sequence[str], **more: Any) -> ChartRow:
         "iterations": row["iterations"],
         "seeds": len(row["seeds"]) - len(row["failed"]),
         **more,
-        **{key: row[key]["mean"] for key in measured},
+        **{key: None if row[key] is None else row[key]["mean"] for key in measured},
     }
 
 
 def with_front(points: Sequence[ChartRow], cost: str, name: str) -> list[ChartRow]:
-    """Return the points, each with `name`: whether it is on the Pareto front of `cost` and PSNR."""
-    best = pareto([(point[cost], point["psnr"]) for point in points])
-    return [point | {name: place in best} for place, point in enumerate(points)]
+    """Return the points, each with `name`: whether it is on the Pareto front of `cost` and PSNR.
+
+    Points without the cost are not.
+    """
+    best = pareto([(math.inf if point[cost] is None else point[cost], point["psnr"]) for point in points])
+    return [point | {name: place in best and point[cost] is not None} for place, point in enumerate(points)]
 
 
 def is_auto(system: str) -> bool:

@@ -59,6 +59,15 @@ def test_quality_in_equal_time_is_linear_in_log_seconds() -> None:
     assert quality_at([], 1.0) is None
 
 
+def test_a_cost_that_was_not_measured_has_no_point() -> None:
+    records = [record | {"render_ms": None} for record in sweep_records()]
+    rows = point_rows(records)
+    assert len(rows) == len(point_rows(sweep_records()))
+    assert not any(row["front_render_ms"] for row in rows)
+    assert any(row["front_bytes"] for row in rows)
+    assert {row["render_ms"] for row in rows} == {None}
+
+
 def test_runs_of_several_lengths() -> None:
     """The cap with most systems counts. A run of one length, an automatic and a failed run are left out."""
     others = [
