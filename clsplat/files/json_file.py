@@ -17,6 +17,8 @@ from ..errors import InputError
 from .atomic import atomic_writer
 from .whole_file import read_whole
 
+MAX_NUMBER = 1e30  # numbers of files are smaller than this where float32 must store them
+
 
 def read_json(path: str | os.PathLike[str], expected: str) -> Any:
     """Return the content of a JSON file.

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .json_file import MAX_NUMBER
 from .whole_file import read_whole
-
-_MAX_NUMBER = 1e30  # numbers are smaller than this, so that float32 can store them
 
 
 class _PlainBuilder(ET.TreeBuilder):
@@ -58,7 +57,7 @@ def get_numbers(parent: ET.Element, name: str, count: int) -> NDArray[np.float64
         return None
     words = (child.text or "").split()
     values = np.array([to_number(word) for word in words])
-    if len(words) != count or not (np.abs(values) < _MAX_NUMBER).all():
+    if len(words) != count or not (np.abs(values) < MAX_NUMBER).all():
         form = "a number" if count == 1 else f"{count} numbers"
         raise InputError(f"<{name}> is {ascii(' '.join(words))[:60]}; expected {form}")
     return values

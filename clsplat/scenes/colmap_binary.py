@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
+from .photo_size import MAX_SIDE
 
 # Number of parameters of each camera model, by COLMAP's model id (https://colmap.github.io/cameras.html), from
 # SIMPLE_PINHOLE to EQUIRECTANGULAR.
@@ -82,7 +83,7 @@ def _walk_camera(cursor: _Cursor) -> None:
             f"{cursor.path}: camera {camera_id} has the unknown model id {model}; "
             "convert it to PINHOLE with COLMAP's image_undistorter"
         )
-    if not (0 < width < 1 << 20 and 0 < height < 1 << 20):
+    if not (0 < width < MAX_SIDE and 0 < height < MAX_SIDE):
         raise InputError(f"{cursor.path}: camera {camera_id} is {width}x{height} px; the file is damaged: rebuild it")
     cursor.skip(8 * _MODEL_PARAMS[int(model)])
 

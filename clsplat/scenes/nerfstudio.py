@@ -28,18 +28,17 @@ from ..cameras.rotations import NearestRotation, NotARotation, nearest_rotation,
 from ..errors import InputError
 from ..files.file_names import can_be_file
 from ..files.image_names import IMAGE_SUFFIXES
-from ..files.json_file import read_json, to_real
+from ..files.json_file import MAX_NUMBER, read_json, to_real
 from ..files.masks import is_same_file
 from .colmap import Points, read_model
+from .photo_size import MAX_SIDE
 from .point_cloud import join_points, read_point_cloud
 from .posed_images import PosedImages, read_sizes
 from .undistort import Lens, RegisteredImage, brown_lens, make_lens
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
-_MAX_SIDE = 1 << 20  # largest side of an image [px]
 _LAST_ROW = 1e-6  # largest error of the last row of a pose
-_MAX_NUMBER = 1e30  # numbers are smaller than this, so that float32 can store them
 _LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists of photos
 _COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0")  # where nerfstudio and COLMAP put a COLMAP model
 _SUFFIXES = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
@@ -163,8 +162,8 @@ class _Frame:
     def lens(self, size: tuple[int, int]) -> Lens:
         """Return the lens, with the size in the file, or else the photo's size."""
         width, height = int(self.number("w", size[0])), int(self.number("h", size[1]))
-        if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
-            raise InputError(f"{self.place}: w x h is {width} x {height}; both must be 1 to {_MAX_SIDE}")
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise InputError(f"{self.place}: w x h is {width} x {height}; both must be 1 to {MAX_SIDE}")
         fx = self.focal("fl_x", "camera_angle_x", width)
         fy = self.focal("fl_y", "camera_angle_y", height, fx)
         if fx is None or fy is None:
@@ -205,7 +204,7 @@ class _Frame:
         if value is None:
             return default
         real = to_real(value)
-        if real is None or not abs(real) < _MAX_NUMBER:
+        if real is None or not abs(real) < MAX_NUMBER:
             raise InputError(f"{self.place}: {key} is {str(value)[:40]!r}; it must be a number")
         return real
 
@@ -305,7 +304,7 @@ class _Document:
         """Return points of the COLMAP model in the world of the poses."""
         matrix = _matrix(self.values["applied_transform"])
         scale = to_real(self.values.get("applied_scale", 1.0))
-        if matrix is None or scale is None or not 0 < scale < _MAX_NUMBER:
+        if matrix is None or scale is None or not 0 < scale < MAX_NUMBER:
             raise InputError(f"{self.path}: applied_transform must be 3 x 4 numbers and applied_scale above 0")
         return scale * (xyz @ matrix[:3, :3].T + matrix[:3, 3])
 

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from ..errors import SMALLER_IMAGES, InputError
 from ..files.host_memory import available_bytes
 
+MAX_SIDE = 1 << 20  # largest side of an image that a file may name [px]
 MAX_WIDTH = 1600  # with resolution -1, wider images are reduced to this width [px], as in 3DGS
 _CHANNELS = 3
 _DECODING = 2  # copies of a photo at its stored size while it is read: decoded, and as an array

@@ -21,11 +21,11 @@ import numpy as np
 
 from ...errors import InputError
 from ...files.xml_file import get_numbers
+from ..photo_size import MAX_SIDE
 from ..undistort import Lens, brown_lens, make_lens
 from .lens_fit import MAX_ERROR, quotient
 
 _FRAME, _FISHEYE = "frame", "fisheye"
-_MAX_SIDE = 1 << 20  # largest side of an image [px]
 _REMEDY = "export undistorted photos, and their cameras, as a COLMAP model"
 
 
@@ -78,7 +78,7 @@ def _size(calibration: ET.Element, sensor: ET.Element) -> tuple[int, int]:
     resolution = sensor.find("resolution") if resolution is None else resolution
     texts = [(resolution.get(key, "") if resolution is not None else "") for key in ("width", "height")]
     sides = [int(text) if text.isdecimal() and len(text) < 9 else 0 for text in texts]
-    if not all(1 <= side <= _MAX_SIDE for side in sides):
+    if not all(1 <= side <= MAX_SIDE for side in sides):
         raise InputError(f"its <resolution> is {' x '.join(ascii(text)[:20] for text in texts)}; expected pixels")
     return sides[0], sides[1]
 

@@ -24,12 +24,11 @@ from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...files.json_file import get_matrix, get_text, get_value
+from ...files.json_file import MAX_NUMBER, get_matrix, get_text, get_value
 from ..undistort import Lens, brown_lens, make_lens
 from .lens_fit import MAX_ERROR, odd_powers
 
 REMEDY = "export the project again"
-_MAX_NUMBER = 1e30  # numbers are smaller than this, so that float32 can store them
 _MAX_TERMS = 10  # the polynomial of a fisheye has 4
 
 
@@ -98,8 +97,8 @@ _READERS = {"perspective": _perspective, "fisheye": _fisheye}
 def numbers(entry: dict[str, Any], key: str, count: int) -> NDArray[np.float64]:
     """Return the `count` numbers at a key, all below 1e30; raises InputError."""
     found = get_matrix(entry, key, (count,), REMEDY)
-    if np.abs(found).max() >= _MAX_NUMBER:
-        raise InputError(f"key {key!r} has a number above {_MAX_NUMBER:g}; {REMEDY}")
+    if np.abs(found).max() >= MAX_NUMBER:
+        raise InputError(f"key {key!r} has a number above {MAX_NUMBER:g}; {REMEDY}")
     return found
 
 
