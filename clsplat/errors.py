@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 
 
 class Remedy:
@@ -83,3 +84,12 @@ def _sentence(message: str, remedies: list[str]) -> str:
 def reason_of(error: Exception, max_length: int = 200) -> str:
     """Return another library's message as one line of at most `max_length` characters."""
     return " ".join(str(error).split())[:max_length] or type(error).__name__
+
+
+@contextmanager
+def named_place(place: str) -> Iterator[None]:
+    """Begin the messages of InputErrors in the block with a place: a file, and the entry in it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from None

@@ -1,9 +1,9 @@
 // depth.cl: smooth depths (clsplat/training/depth_smoothness.py). A depth is drawn as a colour: each splat has that of its
-// centre in all three channels. Images are planar with a zero margin (rasterize.cl).
+// centre in all three channels. SH_C0 is the constant harmonic (clsplat/splats/harmonics.py). Images are planar with a zero
+// margin (rasterize.cl).
 
 #define STEEPEST R(0.01)   // relative step of the depth above which the penalty grows linearly, below it quadratically
 #define MOST_LIGHT R(0.2)  // pixels that let more light through have no depth
-#define SH_0 R(0.28209479177387814)
 #define BYTE R(255.0)
 
 // Writes sh [3, capacity], the constant harmonic with which a splat has the colour axis . mean + offset, its depth. Global
@@ -22,7 +22,7 @@ kernel void color_by_depth(
     if (i >= n) return;
     global const real *mean = geom + ROW_MEAN * capacity + i;
     const real depth = axis_x * mean[0] + axis_y * mean[capacity] + axis_z * mean[2 * capacity] + offset;
-    for (uint c = 0; c < 3; ++c) sh[c * capacity + i] = (depth - R(0.5)) / SH_0;
+    for (uint c = 0; c < 3; ++c) sh[c * capacity + i] = (depth - R(0.5)) / SH_C0;
 }
 
 // How much a pixel of the photo differs from its neighbour: the mean over the colours, 0 to 1.

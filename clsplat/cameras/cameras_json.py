@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, named_place
 from ..files.atomic import atomic_writer
 from ..files.image_names import bare_name
 from ..files.json_file import describe, get_matrix, get_number, get_size, get_value, read_json
@@ -74,12 +74,10 @@ def cameras_of(entries: Any, path: str | os.PathLike[str]) -> list[NamedCamera]:
             raise InputError(f"{place}: is {describe(entry)}; expected an object with img_name, width, ...")
         if isinstance(entry.get("img_name"), str):
             place += f" ({ascii(entry['img_name'])[:80]})"
-        try:
+        with named_place(place):
             rotation = _rotation(entry)
             named.append(_named_camera(entry, rotation.matrix))
             rotations[f"entry {index}"] = rotation
-        except InputError as error:
-            raise InputError(f"{place}: {error}") from None
     warn_of_corrections(path, rotations)
     return named
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, named_place
 from ..files.atomic import atomic_writer
 from ..files.json_file import describe, get_matrix, get_number, get_objects, get_size, get_value, read_json
 from .camera import Camera
@@ -140,7 +140,7 @@ def path_of(content: Any, source: str | os.PathLike[str]) -> CameraPath:
         return CameraPath(tuple(item.camera for item in named))
     if not isinstance(content, dict):
         raise InputError(f"{source}: holds {describe(content)}; expected a camera_path.json or a cameras.json")
-    try:
+    with named_place(str(source)):
         model = content.get("camera_type", "perspective")
         if model != "perspective":
             raise InputError(f"key 'camera_type' is {ascii(model)[:40]}; only perspective cameras can be rendered")
@@ -155,8 +155,6 @@ def path_of(content: Any, source: str | os.PathLike[str]) -> CameraPath:
         keys = _cameras(entries, "keyframes", "matrix", width, height, rotations)
         warn_of_corrections(source, rotations)
         return CameraPath(cameras, fps, keys, content.get("is_cycle") is True)
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from None
 
 
 def pose_of(camera: Camera) -> NDArray[np.float64]:
@@ -202,12 +200,10 @@ def _cameras(
     """Return the cameras of frames or keyframes, and add their rotations to `rotations`."""
     cameras = []
     for index, entry in enumerate(entries):
-        try:
+        with named_place(f"{key}[{index}]"):
             pose, rotation = _pose(entry, pose_key)
             cameras.append(_camera(entry, pose, width, height))
             rotations[f"{key}[{index}]"] = rotation
-        except InputError as error:
-            raise InputError(f"{key}[{index}]: {error}") from None
     return tuple(cameras)
 
 

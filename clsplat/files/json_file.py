@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -39,15 +37,6 @@ def read_json(path: str | os.PathLike[str], expected: str) -> Any:
         raise InputError(f"{path}: cannot be read ({reason}); check its name and permissions") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON ({str(error).splitlines()[0]}); choose {expected}") from error
-
-
-@contextmanager
-def named_place(place: str) -> Iterator[None]:
-    """Begin the messages of InputErrors in the block with a place: a file, and the entry in it."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{place}: {error}") from None
 
 
 def read_object(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from ..scenes.colmap import Points
 from ..scenes.export import relative_files, write_colmap, write_transforms
 from ..scenes.posed_images import warn_of_left_out
 from ..scenes.scene import read_posed_images
-from ..scenes.scene_files import SCENE_ENDINGS
+from ..scenes.scene_files import PHOTOGRAMMETRY_ENDINGS
 from ..scenes.undistort import RegisteredImage, is_pinhole, make_lens, pinhole_camera
 from ..splats.harmonics import SH_C0
 from ..splats.shapes import shape_named
@@ -91,7 +91,7 @@ def _is_scene(source: Path) -> bool:
     """Return whether the source is a folder without a model, or a file of cameras that is a scene."""
     if source.is_dir():
         return not (source / "point_cloud").is_dir()
-    if source.suffix.lower() in SCENE_ENDINGS[1:]:
+    if source.suffix.lower() in PHOTOGRAMMETRY_ENDINGS:
         return source.is_file()
     if not source.is_file() or source.suffix != ".json":
         return False

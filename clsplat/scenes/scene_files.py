@@ -8,7 +8,8 @@ from pathlib import Path
 from .transforms_files import find_transforms
 
 OPF_ENDING, METASHAPE_ENDING = ".opf", ".xml"
-SCENE_ENDINGS = (".json", OPF_ENDING, METASHAPE_ENDING)
+PHOTOGRAMMETRY_ENDINGS = (OPF_ENDING, METASHAPE_ENDING)
+SCENE_ENDINGS = (".json", *PHOTOGRAMMETRY_ENDINGS)
 OTHER_KINDS = "a transforms.json, an OPF project (.opf) or Metashape's cameras (.xml)"  # beside COLMAP, for messages
 _METASHAPE_NAME = "cameras.xml"  # the name that Metashape proposes
 # Other programs leave XML files beside photos. The first bytes tell Metashape's from them.
@@ -32,7 +33,7 @@ def find_scene_files(path: Path) -> list[Path]:
     of them is named.
     """
     if path.is_file():
-        return [path] if path.suffix.lower() in SCENE_ENDINGS[1:] else find_transforms(path)
+        return [path] if path.suffix.lower() in PHOTOGRAMMETRY_ENDINGS else find_transforms(path)
     return find_transforms(path) or _ending(path, OPF_ENDING) or _metashape_files(path)
 
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import named_place
 from .axes import Signs, flipped
 from .fields import Array, DoubleArray
 from .shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, SKEW_NORMAL, shape_named
@@ -67,9 +67,7 @@ def placed(path: object, splats: StoredSplats, matrix: DoubleArray, signs: Signs
     matrix = flips @ matrix @ flips
     if np.array_equal(matrix, np.eye(4)):
         return splats
-    try:
+    with named_place(f"{path}: the place of its splats"):
         scale, rotation, translation = similarity(matrix)
-    except InputError as error:
-        raise InputError(f"{path}: the place of its splats: {error}") from None
     arrays = moved(splats.arrays, scale, rotation, translation)
     return replace(splats, arrays=arrays, near_plane=scale * splats.near_plane)

@@ -98,15 +98,15 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if "random_points" not in config.named_options and (beside := share_beside(scene, config, transparent)):
         chosen["random_points"] = share_random = beside
         reasons.append(f"random points beside the scene's ({beside:.0%} of the cap), because some parts may have none")
-    if len(scene.train) <= FEW_VIEWS and "dropout" not in config.named_options:
-        chosen["dropout"] = DROPOUT
-        reasons.append(f"a dropout of {DROPOUT:.0%} of the splats, because there are only {len(scene.train)} photos")
-    if len(scene.train) <= FEW_VIEWS and "depth_smoothness" not in config.named_options:
-        chosen["depth_smoothness"] = SMOOTHNESS
-        reasons.append("a penalty on steps of the depth")
-    if len(scene.train) <= FEW_VIEWS and "occluder_check" not in config.named_options:
-        chosen["occluder_check"] = True
-        reasons.append("no splats that would cover the view between the photos")
+    if (n_photos := len(scene.train)) <= FEW_VIEWS:
+        for name, value, reason in (
+            ("dropout", DROPOUT, f"a dropout of {DROPOUT:.0%} of the splats, because there are only {n_photos} photos"),
+            ("depth_smoothness", SMOOTHNESS, "a penalty on steps of the depth"),
+            ("occluder_check", True, "no splats that would cover the view between the photos"),
+        ):
+            if name not in config.named_options:
+                chosen[name] = value
+                reasons.append(reason)
     if transparent and "random_background" not in config.named_options:
         chosen["random_background"] = True
         part = "" if config.random_background_until == 1 else f" for {config.random_background_until:.0%} of the run"

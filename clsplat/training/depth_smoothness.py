@@ -55,7 +55,7 @@ class DepthSmoothness:
         self.last = int(UNTIL * config.iterations) if self.weight else 0
         if not self.last:
             return
-        self.shown, self.views = splats, views
+        self.shown = splats
         self.between = between([view.camera for view in views])
         device, plain = splats.device, replace(kernels, sh_degree=0)
         self.pipeline, self.program = Pipeline(device, plain, max_isects), depth_program(device, plain)
@@ -79,18 +79,18 @@ class DepthSmoothness:
         ----------
         target : the photo of the iteration. planes : its pixels.
         """
+        self.splats.n = self.shown.n
+        copy(self.splats.device, self.shown.geom, self.splats.geom, self.splats.group_bytes(Group.GEOM))
         self._add(grads, target.camera, planes, EDGE)
         if self.between:
             chosen = np.random.default_rng((self.seed, _ANY_VIEW, iteration, target.index)).integers(len(self.between))
-            downscale = max(round(self.views[target.index].camera.width / target.camera.width), 1)
-            self._add(grads, reduced_camera(self.between[chosen], downscale), planes, 0.0)
+            self._add(grads, reduced_camera(self.between[chosen], target.downscale), planes, 0.0)
 
     def _add(self, grads: CompactGradients, camera: Camera, planes: Buffer, edge: float) -> None:
-        splats, n = self.splats, self.shown.n
+        """Add the gradient for one camera, whose image has the edges of a photo if `edge` is above 0."""
+        splats, n = self.splats, self.splats.n
         axis = dict(zip(("axis_x", "axis_y", "axis_z"), camera.rotation[2].tolist(), strict=True))
         layout = ImageLayout(camera.width, camera.height)
-        splats.n = n
-        copy(splats.device, self.shown.geom, splats.geom, splats.group_bytes(Group.GEOM))
         common = {"capacity": splats.capacity, "n": n, **axis}
         self.program.color_by_depth.over(
             n, GROUP_ITEMS, geom=splats.geom, sh=splats.sh, offset=float(camera.translation[2]), **common

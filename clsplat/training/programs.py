@@ -9,6 +9,7 @@ from ..device.program import Define, Program, build
 from ..device.schedule import Schedule
 from ..rendering.build import CULLED_KEY, MARGIN_X, MARGIN_Y, KernelBuild, layout_defines
 from ..splats.fields import Group
+from ..splats.harmonics import SH_C0
 from ..splats.near_plane import NEAR_PLANE
 from ..splats.optical_depth import MAX_COORDINATE
 from ..splats.shapes import shape_named
@@ -131,7 +132,7 @@ def dropout_program(device: Device) -> Program:
 def depth_program(device: Device, kernels: KernelBuild) -> Program:
     """Return the program of smooth depths. It depends on the fields and the precision only."""
     defines = layout_defines(shape_named(kernels.shape), kernels.schema)
-    defines |= {"LANES": 1, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y}
+    defines |= {"LANES": 1, "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y, "SH_C0": SH_C0}
     return build(device, ("math/lanes.clh", "train/depth.cl"), defines, kernels.real)
 
 

@@ -42,12 +42,13 @@ class Target:
 
     Attributes
     ----------
-    index : index of the view.
+    index : index of the view. downscale : its image has 1/downscale of the view's size.
     unmasked : fraction of the pixels that are not masked.
     buffer : bytes [channels, rows, stride] with a zero margin.
     """
 
     index: int
+    downscale: int
     camera: Camera
     layout: ImageLayout
     unmasked: float
@@ -106,7 +107,7 @@ class Targets:
         stays = self._kept_bytes + nbytes <= self.budget
         buffer = self.device.alloc(nbytes) if stays else self._visitor.reserve(nbytes)
         unmasked = 1.0 if view.mask is None else float(view.mask.mean())
-        target = Target(index, view.camera, layout, unmasked, buffer)
+        target = Target(index, downscale, view.camera, layout, unmasked, buffer)
         self._uploads[index] = self._start_upload(self._bytes(view))
         if stays:
             self._kept[index] = target

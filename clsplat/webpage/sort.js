@@ -36,7 +36,9 @@ function makeSorter({ mean, reach, near }) {
     for (const count of counts) count.fill(0);
     let found = 0;
     for (let i = 0; i < n; ++i) {
-      const [x, y, z] = [mean[i] - px, mean[n + i] - py, mean[2 * n + i] - pz];
+      const x = mean[i] - px;
+      const y = mean[n + i] - py;
+      const z = mean[2 * n + i] - pz;
       const depth = cx * x + cy * y + cz * z;
       if (!(depth > 0.5 * near)) continue;  // project.vert decides about those near the plane
       const tx = (ax * x + ay * y + az * z) / depth;

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...cameras.rotations import NearestRotation, NotARotation, nearest_rotation, warn_of_corrections
-from ...errors import InputError
-from ...files.json_file import named_place
+from ...errors import InputError, named_place
 from ...files.xml_file import get_numbers, read_xml
 from ..colmap import Points
 from ..point_cloud import join_points, read_point_cloud

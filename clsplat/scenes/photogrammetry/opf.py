@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...cameras.path import cam_from_world_of
-from ...errors import InputError
+from ...errors import InputError, named_place
 from ...files.file_names import can_be_file
-from ...files.json_file import get_id, get_objects, get_size, get_text, get_value, named_place, read_json
+from ...files.json_file import get_id, get_objects, get_size, get_text, get_value, read_json
 from ..colmap import Points
 from ..point_cloud import join_points
 from ..posed_images import PosedImages, read_sizes

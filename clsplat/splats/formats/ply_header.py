@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
-from ...errors import InputError
+from ...errors import InputError, named_place
 
 BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 REAL_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
@@ -112,10 +112,8 @@ def read_header(path: object, stream: BinaryIO) -> Header:
         keyword = words[0] if words else ""
         if keyword == "end_header":
             break
-        try:
+        with named_place(f"{path}: header line {number}"):
             _take(header, keyword, words, line)
-        except InputError as error:
-            raise InputError(f"{path}: header line {number}: {error}") from None
     else:
         raise InputError(f"{path}: no end_header within {_MAX_LINES} lines; the header is damaged")
     if not header.encoding:

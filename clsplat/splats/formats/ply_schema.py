@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
-from ...errors import InputError
+from ...errors import InputError, named_place
 from ..fields import CORE, LOG_SCALE, MEAN, OPACITY_LOGIT, QUAT, Group, Schema
 from ..shapes import GAUSSIAN, NORMALISATIONS, SHAPES, Shape, check_normalisation, shape_named
 from .ply_compact import side_fields
@@ -40,11 +40,9 @@ def find_kernel(path: Path, header: Header) -> tuple[Shape, str]:
         values = dict(word.split("=", 1) for word in words[1:] if "=" in word)
         if words[:1] != [COMMENT] or "shape" not in values:
             continue
-        try:
+        with named_place(f"{path}: comment {comment[:80]!r}"):
             shape = shape_named(values["shape"])
             return shape, check_normalisation(values.get("normalisation", NORMALISATIONS[0]))
-        except InputError as error:
-            raise InputError(f"{path}: comment {comment[:80]!r}: {error}") from None
     columns = {shape.name: {name for field in shape.fields for name in field.ply} for shape in SHAPES.values()}
     held = [name for element in header.elements for name in element.names]
     shape_columns = set(held) & set().union(*columns.values())

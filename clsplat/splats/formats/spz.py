@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
+from ...errors import InputError, named_place
 from ...files.atomic import atomic_writer
 from ..axes import flipped
 from ..fields import MAX_SH_DEGREE, Array, sh_coefficients, sh_degree_of
@@ -86,10 +86,8 @@ def write_spz(path: str | os.PathLike[str], splats: StoredSplats, version: int =
         _rotations(arrays["quat"]),
         _harmonics(arrays["sh"][:, 1:]),
     ]
-    try:
+    with named_place(str(path)):
         data = write_container(header, [part.tobytes() for part in parts])
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     with atomic_writer(path) as stream:
         stream.write(data)
 
