@@ -207,32 +207,13 @@ class _Round:
 
     def _collect(self, future: Any, number: int) -> Outcome | None:
         """Return the outcome of a future that is done; None if its job was sent again."""
-        job = self.jobs[number]
-        if future.status == "cancelled":
-            raise self._gone()
-        if future.status == "error":
-            error = future.exception()
-            if type(error).__name__ == "KilledWorker":
-                self.deaths[number] += 1
-                if self.deaths[number] >= MOST_DEATHS:
-                    raise ClusterError(
-                        f"{job.name}: the workers that did this died again and again: look at their logs, and use "
-                        "smaller images or fewer splats if memory was short; finished runs are kept"
-                    )
-                self._submit(number)
-                return None
-            if isinstance(error, ImportError | AttributeError):  # while the job was unpickled
-                return Outcome(
-                    error=ClusterError(
-                        f"{job.name}: a worker cannot load it ({error}): install clsplat {__version__} on each machine"
-                    )
-                )
-            raise error
         try:
             outcome: Outcome = future.result(timeout=CONNECT_SECONDS)
         except TimeoutError:  # its worker died before the result was here
             self.futures[future] = number
             return None
+        except Exception as error:  # also of a job that had ended: it is done again if its worker dies before this
+            return self._failed(error, number)
         if outcome.error is not None and outcome.elsewhere:
             self.failed_at[number].add(outcome.worker)
             others = [at for at, name in _workers(self.client).items() if name not in self.failed_at[number]]
@@ -242,6 +223,25 @@ class _Round:
         if outcome.error is not None and len(self.failed_at[number]) and outcome.worker:
             return Outcome(error=ClusterError(f"worker {outcome.worker}: {outcome.error}"))
         return outcome
+
+    def _failed(self, error: Exception, number: int) -> Outcome | None:
+        """Return the outcome of a job that Dask could not have done; None if the job was sent again."""
+        name, kind = self.jobs[number].name, type(error).__name__
+        if kind == "FutureCancelledError":
+            raise self._gone()
+        if kind == "KilledWorker":
+            self.deaths[number] += 1
+            if self.deaths[number] >= MOST_DEATHS:
+                raise ClusterError(
+                    f"{name}: the workers that did this died again and again: look at their logs, and use smaller "
+                    "images or fewer splats if memory was short; finished runs are kept"
+                )
+            self._submit(number)
+            return None
+        if isinstance(error, ImportError | AttributeError):  # while the job was unpickled
+            text = f"{name}: a worker cannot load it ({error}): install clsplat {__version__} on each machine"
+            return Outcome(error=ClusterError(text))
+        raise error
 
     def _gone(self) -> ClusterError:
         return ClusterError(

@@ -67,6 +67,28 @@ def test_a_job_whose_worker_dies_is_done_again(pool: WorkerPool, tmp_path: Path)
     assert [tries > times for tries, times in zip(results(pool, *jobs), (0, 1, 5), strict=True)] == [True] * 3
 
 
+def test_a_result_that_is_lost_while_it_is_fetched_is_made_again(
+    pool: WorkerPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its worker dies after the job has ended, and so do the workers that Dask has do the job once more."""
+    from distributed import Future
+    from distributed.scheduler import KilledWorker
+
+    fetch = Future.result
+    lost: list[Future[Any]] = []
+
+    def lose_the_first(future: Future[Any], timeout: float | None = None) -> Any:
+        if not lost:
+            lost.append(future)
+            assert future.status == "finished"
+            raise KilledWorker(future.key, None, 3)
+        return fetch(future, timeout)
+
+    monkeypatch.setattr(Future, "result", lose_the_first)
+    assert results(pool, *[Job("square", cluster_jobs.squared, (number,)) for number in (2, 3)]) == [4, 9]
+    assert len(lost) == 1
+
+
 def test_a_worker_that_dies_while_it_starts_is_started_again(pool: WorkerPool) -> None:
     """Dask gives such a worker up."""
     import psutil  # comes with dask.distributed
