@@ -1,7 +1,7 @@
 // main.js: the page. It reads the splats, draws them when something changes, and answers the buttons.
 
 // While the view moves, the image is smaller on slow devices. Sizes are shares of the screen's width and height.
-const SMALLEST = 0.35;
+const SMALLEST = 0.25;
 const SLOW = 60, FAST = 25;  // time from one picture to the next [ms] above which the image shrinks, below which it grows
 const REST = 250;            // time without a change [ms] after which the image has its full size
 const find = (id) => document.getElementById(id);

@@ -9,6 +9,7 @@ uniform vec3 translation, eye;
 uniform vec4 lens, bounds;  // fx, fy, cx, cy [px]; lowest and highest x/z, then y/z, in the Jacobian
 uniform vec2 size;          // of the image [px]
 uniform float near;
+uniform float cutoff;  // smallest alpha of a pixel
 uniform int normalisation, antialiased, degree;
 uniform int exponential;  // 1: generalised exponentials, cl/shape/generalised_exponential.clh
 
@@ -18,7 +19,7 @@ out vec4 form;   // -d'Pd/2 as three coefficients; red
 out vec4 lean;   // g, slope
 out vec4 rest;   // green, blue, the rectangle's other edge, unused
 
-const float LOW_PASS = 0.3, ALPHA_MIN = 1.0 / 255.0, SKEW_SQUARE = 1.69977443;
+const float LOW_PASS = 0.3, SKEW_SQUARE = 1.69977443;
 const float KAPPA = 0.57079632679, HALF_PI = 1.57079632679;
 const float DENSITY_0 = 0.3989422804;  // of the normal distribution at 0
 
@@ -32,7 +33,7 @@ float logPeak(float c) {
   return log(phi(c * r)) - 0.5 * c * r * r;
 }
 
-float radius(float amplitude) { return sqrt(2.0 * log(max(amplitude / ALPHA_MIN, 1.0))); }
+float radius(float amplitude) { return sqrt(2.0 * log(max(amplitude / cutoff, 1.0))); }
 
 // How far the splat reaches on one side: skew_extent.
 float extent(float v, float variance, float t, float r1, float r2) {
@@ -117,7 +118,7 @@ void main() {
   float r1 = radius(bound), r2 = radius(0.5 * amplitude);
   if (exponential == 1) {
     amplitude = opacity;
-    r1 = r2 = sqrt(2.0 * pow(log(max(opacity / ALPHA_MIN, 1.0)), 2.0 / skew.w));
+    r1 = r2 = sqrt(2.0 * pow(log(max(opacity / cutoff, 1.0)), 2.0 / skew.w));
   }
   vec4 reach = vec4(extent(-v.x, xx, t, r1, r2) + v.x, extent(v.x, xx, t, r1, r2) - v.x,
     extent(-v.y, yy, t, r1, r2) + v.y, extent(v.y, yy, t, r1, r2) - v.y);

@@ -7,6 +7,9 @@ const TEXELS = 4096;  // width of the textures that hold the splats
 const PARTS = 5;      // texels of a projected splat
 const ROW = 800;      // projected splats in a row of their texture
 const BATCH = 1024;   // splats of a drawn instance: a single one would be a slow instance, on processors above all
+// Smallest alpha of a pixel: that of clsplat's kernels, and one for images below full size. Most pixels of the rectangles
+// are faint, and the time of a device without a graphics card goes with their number.
+const FINE = 1 / 255, ROUGH = 1 / 64;
 const TANGENT_MARGIN = 0.3;  // beyond the image's edge, as in clsplat/rendering/camera_block.py
 
 // Returns the format of the image in which splats are blended. Processors blend 32 bits faster than 16.
@@ -32,6 +35,7 @@ class Renderer {
     this.makeBuffers();
     this.count = null;  // number of splats in the order; null before there is one
     this.size = [0, 0];
+    this.cutoff = FINE;
   }
 
   program(vertex, fragment, outputs = null) {
@@ -161,6 +165,7 @@ class Renderer {
 
   // Sets the size of the screen, and that of the image as a share of it [px].
   resize(screenWidth, screenHeight, share = 1) {
+    this.cutoff = share < 1 ? ROUGH : FINE;
     const width = Math.max(Math.round(screenWidth * share), 1);
     const height = Math.max(Math.round(screenHeight * share), 1);
     if (this.canvas.width !== screenWidth) this.canvas.width = screenWidth;
@@ -195,6 +200,7 @@ class Renderer {
       gl.uniform1i(this.splat.at.splats, this.count);
       gl.uniform1i(this.splat.at.batch, BATCH);
       gl.uniform1i(this.splat.at.exponential, this.exponential);
+      gl.uniform1f(this.splat.at.cutoff, this.cutoff);
       gl.bindVertexArray(this.splatArray);
       gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / BATCH));
       gl.disable(gl.BLEND);
@@ -226,6 +232,7 @@ class Renderer {
     gl.uniform4f(at.bounds, -cx / fx - x, (width - cx) / fx + x, -cy / fy - y, (height - cy) / fy + y);
     gl.uniform2f(at.size, width, height);
     gl.uniform1f(at.near, head.near_plane);
+    gl.uniform1f(at.cutoff, this.cutoff);
     gl.uniform1i(at.normalisation, head.normalisation);
     gl.uniform1i(at.antialiased, head.antialiased ? 1 : 0);
     gl.uniform1i(at.degree, this.degree);

@@ -1,6 +1,7 @@
 // splat.frag: alpha of a pixel, as cl/shape/skew_pixel.clh, cl/shape/generalised_exponential.clh and cl/render/blend.clh
 // compute it. Row 0 of the image is at the bottom here.
 uniform int exponential;  // 1: generalised exponentials
+uniform float cutoff;     // smallest alpha of a pixel
 flat in vec4 vPlace, vForm, vLean;
 flat in vec3 vColour;
 out vec4 colour;
@@ -16,6 +17,6 @@ void main() {
     height = exp(e) * (u == 0.0 ? 0.5 : phi(u));
   }
   float alpha = min(vPlace.z * height, 0.99);
-  if (!(alpha >= 1.0 / 255.0)) discard;
+  if (!(alpha >= cutoff)) discard;
   colour = vec4(vColour * alpha, alpha);
 }

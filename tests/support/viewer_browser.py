@@ -33,9 +33,14 @@ def chromium(*flags: str) -> Iterator[Browser]:
 def canvas_picture(page: Page) -> NDArray[np.float32]:
     """Return what the canvas of a web page shows as soon as its view is at rest, (H, W, 3), 0 to 1."""
     page.wait_for_function("page.settled", timeout=120_000)
+    return shown(page)
+
+
+def shown(page: Page) -> NDArray[np.float32]:
+    """Return what the canvas of a web page shows now, (H, W, 3), 0 to 1."""
     data = page.evaluate("page.canvas.toDataURL('image/png')").split(",")[1]
-    shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
-    return shown.astype(np.float32) / 255
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+    return picture.astype(np.float32) / 255
 
 
 def wall() -> Splats:

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install clsplat[test-view])")
 
 from playwright.sync_api import Browser, Page
-from viewer_browser import CHROMIUM, canvas_picture, chromium
+from viewer_browser import CHROMIUM, canvas_picture, chromium, shown
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
 from clsplat.evaluation.metrics import psnr
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.random_scene import synthetic_scene
+from clsplat.splats.shapes import shape_named
 from clsplat.splats.splats import Splats
 from clsplat.webpage.page import PageContent, write_web_page
 
@@ -286,6 +287,29 @@ def test_a_slow_device_gets_smaller_images_while_it_moves(page: Page) -> None:
     page.wait_for_function(f"page.renderer.size[0] < {WIDTH}")
     page.wait_for_function(SETTLED)
     assert page.evaluate("page.renderer.size") == [WIDTH, HEIGHT], "a view at rest has its full size"
+
+
+@pytest.mark.parametrize("shape", ["skew-normal", "generalised-exponential"])
+def test_smaller_images_leave_out_faint_pixels(browser: Browser, tmp_path: Path, shape: str) -> None:
+    """Half of the splats show no pixel above 1/64. Only the picture at full size has them."""
+    splats, cameras = scene(shape, 0)
+    arrays = splats.to_numpy()
+    faint = np.arange(len(splats)) % 2 == 0
+    arrays["opacity_logit"][faint] = shape_named(shape).raw_opacity(np.float32(0.013))
+    bright = Splats(shape, {name: array[~faint] for name, array in arrays.items()})
+    with opened(browser, tmp_path / "all.html", (Splats(shape, arrays), cameras)) as page:
+        whole, half = canvas_picture(page), below_full_size(page)
+    with opened(browser, tmp_path / "bright.html", (bright, cameras)) as page:
+        assert np.abs(canvas_picture(page) - whole).max() > 0.02
+        np.testing.assert_array_equal(below_full_size(page), half)
+    assert psnr(half, whole) > 22
+
+
+def below_full_size(page: Page) -> NDArray[np.float32]:
+    """Return the picture of an image at half the size."""
+    page.evaluate("page.frame = () => {}")  # nothing draws it at full size then
+    page.evaluate("page.draw(0.5, 0)")
+    return shown(page)
 
 
 @pytest.mark.parametrize(
