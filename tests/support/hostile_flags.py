@@ -23,6 +23,7 @@ from clsplat_cli.main import COMMANDS, main
 
 SECONDS = 20  # a line that takes longer is a fault
 MEMORY = 256 << 20  # bytes that the device pretends to have free
+WIDE, TOO_WIDE = 400, 1 << 30  # photos of a width between these are read as if WIDE: larger ones only take longer
 INTERRUPTED = 130
 
 NUMBERS = (
@@ -170,6 +171,7 @@ def bounded(patch: pytest.MonkeyPatch, plan_only: bool = False) -> Iterator[None
     import clsplat_cli.progress  # noqa: F401
 
     from clsplat.profiling.roofline import Roofline
+    from clsplat.scenes.photo_size import target_size
     from clsplat.training.progress import TrainingDisplay
     from clsplat.viewer.session import ViewingSession
 
@@ -187,6 +189,9 @@ def bounded(patch: pytest.MonkeyPatch, plan_only: bool = False) -> Iterator[None
         if 50 <= at.iteration < at.iterations:
             raise KeyboardInterrupt
 
+    def smaller(width: int, height: int, resolution: int) -> tuple[int, int]:
+        return target_size(width, height, WIDE if WIDE < resolution < TOO_WIDE else resolution)
+
     def run_twice(run: Any, record: Any) -> None:
         if run.repeat > 2:
             raise KeyboardInterrupt
@@ -195,6 +200,7 @@ def bounded(patch: pytest.MonkeyPatch, plan_only: bool = False) -> Iterator[None
     patch.setattr("clsplat.profiling.roofline.measure_roofline", lambda device: Roofline(1e10, 1e11))
     patch.setattr("clsplat_cli.progress.ViewCount.__call__", third_view)
     patch.setattr(TrainingDisplay, "__call__", progress)
+    patch.setattr("clsplat.scenes.read_view.target_size", smaller)
     patch.setattr(ViewingSession, "run", interrupt)
     patch.setattr("clsplat.scenes.reconstruct.reconstruct.run_sfm", interrupt)
     for module in ("clsplat.device.device", "clsplat.scenes.photo_size"):
