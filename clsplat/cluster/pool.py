@@ -8,6 +8,7 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import Any
@@ -226,10 +227,10 @@ class _Round:
 
     def _failed(self, error: Exception, number: int) -> Outcome | None:
         """Return the outcome of a job that Dask could not have done; None if the job was sent again."""
-        name, kind = self.jobs[number].name, type(error).__name__
-        if kind == "FutureCancelledError":
+        name = self.jobs[number].name
+        if isinstance(error, CancelledError):
             raise self._gone()
-        if kind == "KilledWorker":
+        if type(error).__name__ == "KilledWorker":
             self.deaths[number] += 1
             if self.deaths[number] >= MOST_DEATHS:
                 raise ClusterError(
