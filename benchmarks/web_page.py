@@ -135,7 +135,7 @@ def smoke_model(folder: Path) -> Path:
     from clsplat.training.run import train
 
     scene = load_scene(write_capture(folder / "scene", 48, 36, 6))
-    train(scene, TrainConfig(iterations=2, cap_max=60), output=folder / "smoke")
+    train(scene, TrainConfig(shape="skew-normal", iterations=2, cap_max=60), output=folder / "smoke")
     return folder / "smoke"
 
 

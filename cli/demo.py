@@ -11,6 +11,7 @@ import click
 from clsplat.blocks.cells import parse_blocks
 from clsplat.blocks.state import BlocksOptions
 from clsplat.errors import OutputError
+from clsplat.splats.shapes import DEFAULT_SHAPE
 from clsplat.training.config import TrainConfig
 from clsplat.training.folder import ModelFolder
 
@@ -107,7 +108,10 @@ def demo(
     if not large and (blocks or cluster):
         raise click.UsageError("--blocks and --cluster are for --large")
     check_device(device, cluster)
-    config = TrainConfig(iterations=iterations or size.iterations, cap_max=cap or size.cap, device=device)
+    # The demo shows the skew, which such a short run would leave out.
+    config = TrainConfig(
+        shape=DEFAULT_SHAPE, iterations=iterations or size.iterations, cap_max=cap or size.cap, device=device
+    )
     divided = BlocksOptions(*parse_blocks(blocks or BLOCKS, config.cap_max)) if large else None
     check_cluster(cluster, device)
     folder, renders, views = ModelFolder(out / "model"), out / "renders", views or size.views

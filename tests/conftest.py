@@ -127,5 +127,7 @@ def scene(capture_folder: Path) -> Scene:
 def model_folder(capture_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a model of the small capture, trained by the command line; tests must not write into it."""
     folder = tmp_path_factory.mktemp("small") / "model"
-    clsplat("train", capture_folder, "-m", folder, "--eval", "--save-iterations", "20,40", *SHORT)
+    clsplat(
+        "train", capture_folder, "-m", folder, "--eval", "--save-iterations", "20,40", "--shape", "skew-normal", *SHORT
+    )
     return folder

@@ -211,6 +211,7 @@ SHAPES = {
     )
 }
 DEFAULT_SHAPE = SKEW_NORMAL.name
+PLAIN_SHAPE = GAUSSIAN.name  # the one that the others generalise
 
 
 def register_shape(shape: Shape, sources: str | Path | None = None) -> Shape:

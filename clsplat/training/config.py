@@ -63,7 +63,13 @@ class TrainConfig:
     InputError : a value is out of range. TypeError : an unknown option.
     """
 
-    shape: str = option(DEFAULT_SHAPE, help="Kernel of the splats: the form of a single splat.", choices=SHAPES)
+    shape: str = option(
+        DEFAULT_SHAPE,
+        help="Kernel of the splats: the form of a single splat. Short runs have gaussian, unless they name an option of "
+        "the skew.",
+        choices=SHAPES,
+        by_scene=True,
+    )
     iterations: int = option(
         7000, help="Number of training steps. Each one learns from a single photo.", at_least=1, aliases=["--steps"]
     )

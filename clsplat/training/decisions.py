@@ -1,5 +1,7 @@
-"""What a run decides by itself: options that the caller did not name, from what the scene shows.
+"""What a run decides by itself: options that the caller did not name, from what the scene shows and how long it is.
 
+- A short run learns Gaussians. A step with skewed splats takes longer, and in as much time a short run gains more from
+  further steps. An option that is named and has no effect without a skew keeps the skew.
 - Transparent photos are trained over random backgrounds for most of the run. Over one colour, a splat of that colour
   costs nothing wherever it is, and other views see it before the object.
 - A run that starts at random places, or at few points of the scene, has splats that no photo needs. Transparent photos
@@ -30,6 +32,7 @@ from typing import TYPE_CHECKING, Any
 from ..cameras.seen import mean_share_seen, sampled
 from ..device.device import open_device
 from ..device.specs import count_devices, first_device
+from ..splats.shapes import PLAIN_SHAPE
 from .config import OPTIONS, TrainConfig
 from .initialise import MIN_POINTS
 from .log import Progress
@@ -54,6 +57,8 @@ SMOOTHNESS = 0.1  # weight of the penalty on steps of the depth of a run with fe
 RANDOM_START_RATES = 2.0  # factor on the learning rates of a run that starts at random
 SEEN_SHARE = 0.7  # of the scene's points in a photo: with a smaller share, only visible splats step on a GPU
 UNSEEN_SPLATS = 50_000  # fewer splats outside of a photo save less time than the two further commands take
+SHORT_RUN = 2500  # photos in all iterations: in longer runs the skew gains as much as further iterations do, or more
+SKEW_OPTIONS = {"shape", "normalisation", "skew_lr", "skew_map", "alternation"}  # who names one wants a skew
 FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
 _RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
 
@@ -123,8 +128,15 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if (devices := count_devices(config.device)) > 1 and "batch" not in config.named_options:
         chosen["batch"] = devices
         reasons.append(f"{devices} photos in an iteration, because there are {devices} devices")
-    one_photo = chosen.get("batch", config.schedule.batch) == 1
-    if one_photo and "visible_adam" not in config.named_options and (seen_by_photo := waits_for_sight(scene, config)):
+    batch = chosen.get("batch", config.schedule.batch)
+    if (
+        starts_at_points(config)
+        and not SKEW_OPTIONS & config.named_options.keys()
+        and config.iterations * batch <= SHORT_RUN
+    ):
+        chosen["shape"] = PLAIN_SHAPE
+        reasons.append(f"shape {PLAIN_SHAPE}, because a short run gains more from quick iterations than from skew")
+    if batch == 1 and "visible_adam" not in config.named_options and (seen_by_photo := waits_for_sight(scene, config)):
         chosen["visible_adam"] = True
         reasons.append(f"steps of visible splats only, because a photo shows {seen_by_photo:.0%} of the points")
     if config.near_plane is None:
@@ -145,6 +157,11 @@ def _with(config: TrainConfig, chosen: Mapping[str, Any]) -> TrainConfig:
     """Return the complete options. Those that the caller named replace the defaults of the chosen strategy."""
     decided = TrainConfig(**({**config.named_options, **chosen})) if "strategy" in chosen else config.replace(**chosen)
     return TrainConfig.from_json(decided.to_json())
+
+
+def starts_at_points(config: TrainConfig) -> bool:
+    """Return whether a run starts at points, of the scene or at random, and not at the splats of a file."""
+    return config.start.init in ("sfm", "random")
 
 
 def random_start(scene: Scene, config: TrainConfig) -> str:

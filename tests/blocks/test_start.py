@@ -21,7 +21,7 @@ N_COARSE = 40
 
 @pytest.fixture(scope="module")
 def config(scene: Scene) -> TrainConfig:
-    return decide(scene, TrainConfig(iterations=20, cap_max=N_COARSE, sh_degree=1)).config
+    return decide(scene, TrainConfig(shape="skew-normal", iterations=20, cap_max=N_COARSE, sh_degree=1)).config
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from clsplat.training.exposure_file import read_exposures
 from clsplat.training.folder import ModelFolder
 from clsplat.training.run import train
 
-CONFIG = TrainConfig(iterations=20, cap_max=120, sh_degree=1, densify_interval=5)
+CONFIG = TrainConfig(shape="skew-normal", iterations=20, cap_max=120, sh_degree=1, densify_interval=5)
 TWO = BlocksOptions(2, 1, polish=8)
 
 
@@ -37,7 +37,7 @@ def finished(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> BlocksMo
 
 @pytest.fixture(scope="module")
 def coarse(scene: Scene) -> Splats:
-    return train(scene, TrainConfig(iterations=40, cap_max=100, sh_degree=1)).splats
+    return train(scene, TrainConfig(shape="skew-normal", iterations=40, cap_max=100, sh_degree=1)).splats
 
 
 def test_a_partition_says_what_the_photos_show(scene: Scene, coarse: Splats) -> None:

@@ -14,7 +14,19 @@ from clsplat.splats.convert import convert
 from clsplat.splats.splats import Splats
 from clsplat.training.folder import ModelFolder
 
-SEARCH = ("--eval", "--iterations", 20, "--cap-max", 150, "--sh-degree", 0, "--densify-interval", 5)
+SEARCH = (
+    "--shape",
+    "skew-normal",
+    "--eval",
+    "--iterations",
+    20,
+    "--cap-max",
+    150,
+    "--sh-degree",
+    0,
+    "--densify-interval",
+    5,
+)
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,9 @@ from clsplat.training.run import train
 from clsplat.training.trainer import Trainer, Visit
 
 AUTO = BudgetOptions()
-CONFIG = TrainConfig(iterations=30, cap_max=200, sh_degree=1, densify_interval=5, occluder_check=False)
+CONFIG = TrainConfig(
+    shape="skew-normal", iterations=30, cap_max=200, sh_degree=1, densify_interval=5, occluder_check=False
+)
 
 
 def rows(*psnr: float, **more: Any) -> list[dict[str, Any]]:

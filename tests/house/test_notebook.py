@@ -55,7 +55,8 @@ def test_demo(tmp_path: Path) -> None:
     shell, notebook = tmp_path / "shell", tmp_path / "notebook"
     clsplat("demo", shell, "--steps", ITERATIONS, "--cap-max", CAP, "--width", 48, "--views", 8, "-q")
     scene = package.load_scene(package.make_demo_scene(notebook / "scene", 48, 8))
-    trained = package.train(scene, package.TrainConfig(iterations=ITERATIONS, cap_max=CAP), output=notebook / "model")
+    config = package.TrainConfig(shape="skew-normal", iterations=ITERATIONS, cap_max=CAP)
+    trained = package.train(scene, config, output=notebook / "model")
     measured = package.evaluate(notebook / "model", renders=notebook / "renders")
     assert trained.finished
     for part in ("scene", "renders", "model/point_cloud"):
@@ -63,8 +64,8 @@ def test_demo(tmp_path: Path) -> None:
     for name in ("cameras.json", "per_view.json"):
         assert (notebook / "model" / name).read_bytes() == (shell / "model" / name).read_bytes()
     assert entries(notebook / "model" / "results.json") == entries(shell / "model" / "results.json")
-    config = (notebook / "model" / "config.json").read_text()
-    assert config.replace(str(notebook), str(shell)) == (shell / "model" / "config.json").read_text()
+    stored = (notebook / "model" / "config.json").read_text()
+    assert stored.replace(str(notebook), str(shell)) == (shell / "model" / "config.json").read_text()
     assert measured.report == notebook / "model" / "report.html"
     assert measured.psnr == measured.result["PSNR"]
 

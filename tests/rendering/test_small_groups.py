@@ -129,7 +129,9 @@ def test_a_run_in_groups_of_one_has_the_same_bits(
     monkeypatch.setenv(tuning.SCHEDULE_VARIABLE, str(default_schedule(device.info)))
     trained = []
     for make in (lambda: device, lambda: pretend(max_group=max_group)):
-        config = TrainConfig(iterations=12, cap_max=300, densify_interval=5, **RUNS[name])
+        config = TrainConfig(
+            **{"shape": "skew-normal", "iterations": 12, "cap_max": 300, "densify_interval": 5, **RUNS[name]}
+        )
         trainer = Trainer(scene, config, device=make())
         for _ in range(config.iterations):
             trainer.step()

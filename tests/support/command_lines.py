@@ -218,7 +218,18 @@ def write_inputs(root: Path, data: Path | None) -> None:
     for name, make in (("transforms", make_transforms), ("blender", make_blender), ("photos", make_photographs)):
         (root / name).mkdir()
         make(root / name)
-    clsplat("train", root / "scene", "-m", root / "model", "--eval", *SHORT["train"], "--checkpoint-interval", "4")
+    clsplat(
+        "train",
+        root / "scene",
+        "-m",
+        root / "model",
+        "--eval",
+        "--shape",
+        "skew-normal",
+        *SHORT["train"],
+        "--checkpoint-interval",
+        "4",
+    )
     files, precious = root / "files", root / "precious"
     files.mkdir()
     small_splats().save(files / "skew.ply")

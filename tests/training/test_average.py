@@ -23,7 +23,13 @@ from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
 
 CONFIG = TrainConfig(
-    iterations=60, cap_max=400, sh_degree=1, average_last=0.4, densify_interval=10, checkpoint_interval=50
+    shape="skew-normal",
+    iterations=60,
+    cap_max=400,
+    sh_degree=1,
+    average_last=0.4,
+    densify_interval=10,
+    checkpoint_interval=50,
 )
 SAMPLED = range(37, 61)  # the last 24 iterations
 

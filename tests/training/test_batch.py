@@ -22,7 +22,15 @@ from clsplat.training.replica import Replica
 from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
 
-SHORT = {"iterations": 30, "cap_max": 900, "sh_degree": 2, "densify_interval": 5, "sh_interval": 4, "near_plane": 0.1}
+SHORT = {
+    "shape": "skew-normal",
+    "iterations": 30,
+    "cap_max": 900,
+    "sh_degree": 2,
+    "densify_interval": 5,
+    "sh_interval": 4,
+    "near_plane": 0.1,
+}
 OPTIONS = (
     {},
     {"exposure": True},

@@ -16,6 +16,7 @@ from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
 
 RUN: dict[str, Any] = {
+    "shape": "skew-normal",
     "iterations": 30,
     "cap_max": 60,
     "sh_degree": 1,

@@ -29,6 +29,7 @@ from clsplat.training.decisions import (
     RANDOM_SHARE,
     RANDOM_SHARE_OF_FEW,
     RANDOM_START_RATES,
+    SHORT_RUN,
     SMOOTHNESS,
     VERY_FEW_VIEWS,
     Decision,
@@ -41,6 +42,7 @@ from clsplat.training.near_plane import FARTHEST, check_near_plane
 from clsplat.training.presets import PRESETS, preset
 from clsplat.training.run import train
 from clsplat.training.silhouettes import transparent_share
+from clsplat.training.trainer import Visit
 
 
 def without_points(scene: Scene) -> Scene:
@@ -246,6 +248,45 @@ def test_random_starts_have_higher_rates_unless_a_rate_is_named(scene: Scene, na
     assert decide(scene, TrainConfig(cap_max=len(scene.points))).config.optim.lr_factor == 1
     assert decide(start, TrainConfig(iterations=FEWEST_ITERATIONS - 1)).config.optim.lr_factor == 1
     assert decide(start, TrainConfig(**named)).config.optim == TrainConfig(**named).optim
+
+
+@pytest.mark.parametrize(
+    ("options", "shape"),
+    [
+        ({"iterations": SHORT_RUN}, "gaussian"),
+        ({"iterations": SHORT_RUN + 1}, "skew-normal"),
+        ({"iterations": 100, "init": "random"}, "gaussian"),
+        ({"iterations": SHORT_RUN // 2, "batch": 2}, "gaussian"),
+        ({"iterations": SHORT_RUN // 2 + 1, "batch": 2}, "skew-normal"),
+        ({"iterations": SHORT_RUN // 2 + 1, "device": "cpu/2"}, "skew-normal"),
+        ({"iterations": 100, "init": "model.ply"}, "skew-normal"),
+        ({"iterations": 100, "shape": "skew-normal"}, "skew-normal"),
+        ({"iterations": 100, "shape": "student-t"}, "student-t"),
+        ({"iterations": 100, "skew_lr": 1e-3}, "skew-normal"),
+        ({"iterations": 100, "skew_map": "cube-root"}, "skew-normal"),
+        ({"iterations": 100, "alternation": "cyclic"}, "skew-normal"),
+        ({"iterations": 100, "normalisation": "pdf"}, "skew-normal"),
+    ],
+    ids=str,
+)
+def test_short_runs_have_gaussians_unless_a_skew_is_named(scene: Scene, options: dict[str, Any], shape: str) -> None:
+    decision = decide(scene, TrainConfig(**options))
+    assert decision.config.shape == shape
+    assert ("shape gaussian, because" in str(decision)) == (shape == "gaussian")
+    assert decide(scene, decision.config).config == decision.config
+
+
+def test_a_longer_run_keeps_the_shape_of_the_short_one(scene: Scene, tmp_path: Path) -> None:
+    short = TrainConfig(iterations=4, cap_max=40, sh_degree=0)
+    train(scene, short, output=tmp_path)
+    longer = train(scene, short.replace(iterations=SHORT_RUN + 1), output=tmp_path, resume=True, visit=stop_at(5))
+    assert longer.splats.shape == "gaussian"
+    assert longer.iteration == 5
+
+
+def stop_at(iteration: int) -> Visit:
+    """Return a visit that ends the run after an iteration."""
+    return lambda trainer, stop: stop.set() if trainer.iteration == iteration else None
 
 
 @pytest.mark.parametrize("name", PRESETS)

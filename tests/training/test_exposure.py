@@ -180,7 +180,14 @@ def test_without_any_of_it_no_kernel_runs(device: Device) -> None:
 # Splats stay: new ones at iteration 100 would not be learned yet, and differ between the runs that are compared.
 # L1 is not smooth: smooth L1 draws splats to the mean of the photos, which is nearly right here even without exposures.
 CONFIG = TrainConfig(
-    iterations=200, cap_max=2500, sh_degree=0, coarse_to_fine=False, turnover=0.0, smooth_l1=0.0, seed=1
+    shape="skew-normal",
+    iterations=200,
+    cap_max=2500,
+    sh_degree=0,
+    coarse_to_fine=False,
+    turnover=0.0,
+    smooth_l1=0.0,
+    seed=1,
 )
 
 

@@ -31,7 +31,9 @@ from clsplat.training.run import train
 from clsplat.training.trainer import Trainer
 from clsplat.training.view_sampler import ViewSampler
 
-CONFIG = TrainConfig(iterations=60, cap_max=4000, sh_degree=1, densify_interval=10, checkpoint_interval=17)
+CONFIG = TrainConfig(
+    shape="skew-normal", iterations=60, cap_max=4000, sh_degree=1, densify_interval=10, checkpoint_interval=17
+)
 # Splats of low opacity die soon, so that relocation acts in a short run.
 MCMC = {"strategy": "mcmc", "densify_until": 1.0, "init_opacity": 0.02, "opacity_reg": 0.1}
 # Only some splats are above the threshold: which of them depends on the sums of gradients.
@@ -166,7 +168,7 @@ def test_two_runs_do_not_write_into_one_folder(scene: Scene, tmp_path: Path) -> 
 
 # --- runs that become longer ------------------------------------------------------------------
 
-SHORT_RUN = TrainConfig(iterations=30, cap_max=300, sh_degree=3, densify_interval=10)
+SHORT_RUN = TrainConfig(shape="skew-normal", iterations=30, cap_max=300, sh_degree=3, densify_interval=10)
 LONGER = 46
 
 

@@ -29,7 +29,13 @@ from clsplat.training.trainer import Trainer
 
 # Every part of the strategy is active: growth from 2252 points to the cap, noise, all resolutions and SH degrees.
 CONFIG = TrainConfig(
-    iterations=80, cap_max=2400, sh_degree=1, densify_interval=10, checkpoint_interval=30, strategy="mcmc"
+    shape="skew-normal",
+    iterations=80,
+    cap_max=2400,
+    sh_degree=1,
+    densify_interval=10,
+    checkpoint_interval=30,
+    strategy="mcmc",
 )
 CAMERA = clsplat.Camera(27, 19, 25.0, 26.0, 13.0, 9.0, np.eye(4))
 

@@ -33,9 +33,19 @@ from clsplat.viewer.source import ModelSource, ViewPicture
 from clsplat.viewer.training import MOVING_SHARE, SHARE, TrainingSource, TrainingView, run_line
 from clsplat.viewer.viewer import ViewerImage
 
-CONFIG = TrainConfig(iterations=40, cap_max=2400, sh_degree=1, densify_interval=10, strategy="mcmc")
-LAZY = TrainConfig(iterations=30, cap_max=2400, sh_degree=1, densify_interval=10, strategy="mcmc", visible_adam=True)
-LONG = TrainConfig(iterations=100_000, cap_max=2400, sh_degree=1, strategy="mcmc")
+CONFIG = TrainConfig(
+    shape="skew-normal", iterations=40, cap_max=2400, sh_degree=1, densify_interval=10, strategy="mcmc"
+)
+LAZY = TrainConfig(
+    shape="skew-normal",
+    iterations=30,
+    cap_max=2400,
+    sh_degree=1,
+    densify_interval=10,
+    strategy="mcmc",
+    visible_adam=True,
+)
+LONG = TrainConfig(shape="skew-normal", iterations=100_000, cap_max=2400, sh_degree=1, strategy="mcmc")
 
 
 def pose_of(scene: Scene) -> Pose:
