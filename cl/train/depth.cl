@@ -2,7 +2,8 @@
 // centre in all three channels. SH_C0 is the constant harmonic (clsplat/splats/harmonics.py). Images are planar with a zero
 // margin (rasterize.cl).
 
-#define STEEPEST R(0.01)   // relative step of the depth above which the penalty grows linearly, below it quadratically
+#define STEEPEST R(0.01)   // relative step of the depth from one pixel of the photo to the next; the penalty grows linearly
+                           // above it and quadratically below it
 #define MOST_LIGHT R(0.2)  // pixels that let more light through have no depth
 #define BYTE R(255.0)
 
@@ -25,16 +26,20 @@ kernel void color_by_depth(
     for (uint c = 0; c < 3; ++c) sh[c * capacity + i] = (depth - R(0.5)) / SH_C0;
 }
 
-// How much a pixel of the photo differs from its neighbour: the mean over the colours, 0 to 1.
+static inline ulong pixel_at(int x, int y, int stride) { return (ulong)(y + MARGIN_Y) * stride + MARGIN_X + x; }
+
+// How much a pixel of the photo differs from another one: the mean over the colours, 0 to 1.
 static inline real difference(global const uchar *restrict truth, ulong at, ulong other, ulong plane) {
     real sum = 0;
     for (uint c = 0; c < 3; ++c) sum += fabs((real)truth[c * plane + at] - (real)truth[c * plane + other]);
     return sum / (3 * BYTE);
 }
 
-// Overwrites v_color [3 planes] with the gradient of weight * sum of exp(-edge * difference) * h((d - e) / m). The sum is
-// over all pairs of neighbours with depths d and e, m is their mean, and h is |x| with a quadratic middle. m counts as
-// a constant. edge: 0 for views without a photo. Global size: (at least width, height).
+// Overwrites v_color [3 planes] with the gradient of weight * sum of exp(-edge * difference) * h((d - e) / (r m)). The sum
+// is over all pairs of neighbours with depths d and e, m is their mean, and h is |x| with a quadratic middle. m counts as
+// a constant. r is `reduction`: the photo is r times as wide and as high as the depths, and the pixel that belongs to a
+// depth is the first one of r x r. photo_stride, photo_plane: of the photo. edge: 0 for views without a photo. Global size:
+// (at least width, height).
 kernel void smooth_depth(
     global const real *restrict color,
     global const real *restrict transmittance,
@@ -44,23 +49,27 @@ kernel void smooth_depth(
     int height,
     int stride,
     ulong plane,
+    int photo_stride,
+    ulong photo_plane,
+    int reduction,
     real weight,
     real edge
 ) {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
-    const ulong at = (ulong)(y + MARGIN_Y) * stride + MARGIN_X + x;
+    const ulong at = pixel_at(x, y, stride), in_photo = pixel_at(x * reduction, y * reduction, photo_stride);
     real sum = 0;
     for (int side = 0; side < 4; ++side) {
         const int dx = side < 2 ? 2 * side - 1 : 0, dy = side < 2 ? 0 : 2 * side - 5;
         const int u = x + dx, v = y + dy;
         if (u < 0 || v < 0 || u >= width || v >= height) continue;
-        const ulong other = (ulong)(v + MARGIN_Y) * stride + MARGIN_X + u;
+        const ulong other = pixel_at(u, v, stride);
         if (transmittance[at] >= MOST_LIGHT || transmittance[other] >= MOST_LIGHT) continue;
-        const real middle = max(R(0.5) * (color[at] + color[other]), R(1e-12));
-        const real slope = lanes_clamp((color[at] - color[other]) / (middle * STEEPEST), R(-1.0), R(1.0));
-        const real flat = edge > 0 ? exp(-edge * difference(truth, at, other, plane)) : R(1.0);
-        sum += flat * slope / middle;
+        const real scale = reduction * max(R(0.5) * (color[at] + color[other]), R(1e-12));
+        const real slope = lanes_clamp((color[at] - color[other]) / (scale * STEEPEST), R(-1.0), R(1.0));
+        const ulong beside = pixel_at(u * reduction, v * reduction, photo_stride);
+        const real flat = edge > 0 ? exp(-edge * difference(truth, in_photo, beside, photo_plane)) : R(1.0);
+        sum += flat * slope / scale;
     }
     v_color[at] = weight * sum;
     v_color[plane + at] = v_color[2 * plane + at] = 0;

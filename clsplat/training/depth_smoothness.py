@@ -7,7 +7,9 @@ unless the colours differ, too (Niemeyer et al. 2022, RegNeRF, has such a penalt
 any size of the scene.
 
 An iteration draws the splats twice more: from the camera of its photo, and from one between two photos. Their colours
-are then the depths of their centres, with which the kernels of the renderer draw depths and find the gradient.
+are then the depths of their centres, with which the kernels of the renderer draw depths and find the gradient. Planes
+need no fine image, so large images of depths are smaller than the photo. A step then counts by the distance of its
+pixels in the photo.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ from .programs import depth_program
 from .targets import Target, reduced_camera
 
 EDGE = 10.0  # how fast the penalty falls with the difference of two pixels of the photo, 0 to 1
+SMALLEST_SIDE = 100  # pixels: images of depths are as small as whole factors allow, but no smaller than this
 _ANY_VIEW = 0x6465  # of the random numbers that choose the camera between the photos
 
 
@@ -81,14 +84,15 @@ class DepthSmoothness:
         """
         self.splats.n = self.shown.n
         copy(self.splats.device, self.shown.geom, self.splats.geom, self.splats.group_bytes(Group.GEOM))
-        self._add(grads, target.camera, planes, EDGE)
+        self._add(grads, target.camera, target, planes, EDGE)
         if self.between:
             chosen = np.random.default_rng((self.seed, _ANY_VIEW, iteration, target.index)).integers(len(self.between))
-            self._add(grads, reduced_camera(self.between[chosen], target.downscale), planes, 0.0)
+            self._add(grads, reduced_camera(self.between[chosen], target.downscale), target, planes, 0.0)
 
-    def _add(self, grads: CompactGradients, camera: Camera, planes: Buffer, edge: float) -> None:
-        """Add the gradient for one camera, whose image has the edges of a photo if `edge` is above 0."""
-        splats, n = self.splats, self.splats.n
+    def _add(self, grads: CompactGradients, camera: Camera, target: Target, planes: Buffer, edge: float) -> None:
+        """Add the gradient for one camera. If `edge` is above 0, it is that of the photo, and its edges count."""
+        splats, n, factor = self.splats, self.splats.n, reduction(camera.width, camera.height)
+        camera = reduced_camera(camera, factor)
         axis = dict(zip(("axis_x", "axis_y", "axis_z"), camera.rotation[2].tolist(), strict=True))
         layout = ImageLayout(camera.width, camera.height)
         common = {"capacity": splats.capacity, "n": n, **axis}
@@ -109,6 +113,9 @@ class DepthSmoothness:
             height=layout.height,
             stride=layout.stride,
             plane=layout.plane,
+            photo_stride=target.layout.stride,
+            photo_plane=target.layout.plane,
+            reduction=factor,
             weight=self.weight / (layout.width * layout.height),
             edge=edge,
         )
@@ -116,3 +123,8 @@ class DepthSmoothness:
         self.program.add_depth_gradient.over(
             n, GROUP_ITEMS, grad_geom=grads.geom, other_geom=self.grads.geom, other_sh=self.grads.sh, **common
         )
+
+
+def reduction(width: int, height: int) -> int:
+    """Return by how much an image of depths is smaller than the photo, in width and in height."""
+    return max(min(width, height) // SMALLEST_SIDE, 1)

@@ -14,6 +14,7 @@ from ..rendering.splat_buffers import CAPACITY_STEP, COMPACT_ROWS, SplatStatisti
 from ..scenes.scene import View
 from ..splats.fields import Group
 from .config import TrainConfig
+from .depth_smoothness import reduction
 from .exposure import exposure_bytes
 from .optim.skew_map import SkewMap
 from .targets import target_budget, target_bytes, target_channels
@@ -95,17 +96,18 @@ def estimate(
     batch = config.schedule.batch
     if batch > 1:  # the mean gradients, and rows that come from another device
         extra += 2 * rows[Group.GEOM] + (batch + 1) * COMPACT_ROWS + SplatStatistics.ROWS
-    planes = _IMAGE_PLANES
+    planes: float = _IMAGE_PLANES
     if config.views.depth_smoothness:  # a copy of the splats with depths as colours, its gradients, and its images
         extra += 2 * rows[Group.GEOM] + 3 + COMPACT_ROWS
-        screen, n_isects, planes = 2 * screen, 2 * n_isects, planes + _DEPTH_PLANES
+        screen, n_isects = 2 * screen, 2 * n_isects
+        planes += _DEPTH_PLANES / reduction(layout.width, layout.height) ** 2
     widest = max(*rows.values(), kernels.record, kernels.v_record)  # of the buffers with a column for each splat
     color_roles = _ROLES - 1 - config.optim.half_moments  # two moments of 16 bits are one word
     splat = _ROLES * rows[Group.GEOM] + color_roles * rows[Group.SH] + COMPACT_ROWS + extra
     return Estimate(
         n * (splat * real + screen),
         n_isects * isect,
-        planes * layout.plane * real + target_bytes,
+        int(planes * layout.plane * real) + target_bytes,
         isect,
         max(widest * n * real, 9 * layout.plane * real),
     )

@@ -21,13 +21,14 @@ from clsplat.device.memory import to_host
 from clsplat.device.program import Real
 from clsplat.device.schedule import Schedule
 from clsplat.rendering.build import KernelBuild
-from clsplat.rendering.frame import DeviceImage
+from clsplat.rendering.frame import DeviceImage, ImageLayout
 from clsplat.rendering.renderer import Renderer
 from clsplat.rendering.splat_buffers import CompactGradients, SplatBuffers
 from clsplat.scenes.scene import Scene, View
+from clsplat.training import depth_smoothness
 from clsplat.training.config import TrainConfig
-from clsplat.training.depth_smoothness import EDGE, DepthSmoothness
-from clsplat.training.targets import Targets
+from clsplat.training.depth_smoothness import EDGE, SMALLEST_SIDE, DepthSmoothness, reduction
+from clsplat.training.targets import Targets, reduced_camera
 from clsplat.training.trainer import Trainer
 
 Image = NDArray[np.float64]
@@ -47,7 +48,10 @@ def neighbours(image: NDArray[Any]) -> tuple[tuple[NDArray[Any], NDArray[Any]], 
     return (image[:, :-1], image[:, 1:]), (image[:-1], image[1:])
 
 
-def pairs_of(depth: Image, light: Image, photo: NDArray[np.uint8] | None) -> Pairs:
+def pairs_of(depth: Image, light: Image, photo: NDArray[np.uint8] | None, factor: int = 1) -> Pairs:
+    """factor : the photo's width over that of the depths. A depth has the colour of the first pixel of its square."""
+    if photo is not None:
+        photo = photo[::factor, ::factor][: depth.shape[0], : depth.shape[1]]
     weights, middles = [], []
     for axis in (0, 1):
         (one, other), (dim, bright) = neighbours(depth)[axis], neighbours(light)[axis]
@@ -60,11 +64,11 @@ def pairs_of(depth: Image, light: Image, photo: NDArray[np.uint8] | None) -> Pai
     return Pairs((weights[0], weights[1]), (middles[0], middles[1]))
 
 
-def penalty(depth: Image, pairs: Pairs) -> float:
-    """Return the penalty of a depth image; the mean depths of the pairs are those of `pairs`."""
+def penalty(depth: Image, pairs: Pairs, factor: int = 1) -> float:
+    """Return the penalty of a depth image; the mean depths are those of `pairs`. factor : see `pairs_of`."""
     total = 0.0
     for (one, other), weight, middle in zip(neighbours(depth), *pairs, strict=True):
-        step = np.abs((one - other) / middle)
+        step = np.abs((one - other) / (factor * middle))
         height = np.where(step < STEEPEST, step**2 / (2 * STEEPEST), step - STEEPEST / 2)
         total += float((weight * height).sum())
     return WEIGHT * total / depth.size
@@ -116,12 +120,14 @@ def smoothed(device: Device, schedule: Schedule, real: Real, views: Sequence[Vie
     return Smoothed(DepthSmoothness(config, kernels, splats, views, 10**5), splats, targets)
 
 
-def test_the_gradient_of_an_image_is_that_of_the_penalty(scheduled: tuple[Device, Schedule]) -> None:
+@pytest.mark.parametrize("factor", [1, 3])
+def test_the_gradient_of_an_image_is_that_of_the_penalty(scheduled: tuple[Device, Schedule], factor: int) -> None:
     device, schedule = scheduled
     (view,) = views = views_of(1)
     made, rng = smoothed(device, schedule, "double", views), np.random.default_rng(0)
     target, dtype = made.targets.get(0, 1), made.splats.dtype
-    layout, height, width = target.layout, view.camera.height, view.camera.width
+    height, width = view.camera.height // factor, view.camera.width // factor
+    layout = ImageLayout(width, height)
     depth = 2 + 0.03 * rng.random((height, width))
     light = np.where(rng.random((height, width)) < 0.2, 0.5, 0.1)
     pool, smoothness = made.smoothness.pipeline.pool, made.smoothness
@@ -139,25 +145,36 @@ def test_the_gradient_of_an_image_is_that_of_the_penalty(scheduled: tuple[Device
             height=layout.height,
             stride=layout.stride,
             plane=layout.plane,
+            photo_stride=target.layout.stride,
+            photo_plane=target.layout.plane,
+            reduction=factor,
             weight=WEIGHT / depth.size,
             edge=edge,
         )
         found = layout.unpack(to_host(device, v_color, np.empty((3, layout.rows, layout.stride), dtype)))
-        pairs, step = pairs_of(depth, light, photo), 1e-7
+        pairs, step = pairs_of(depth, light, photo, factor), 1e-7
         expected = np.zeros_like(depth)
         for place in np.ndindex(*depth.shape):
             ends = [depth.copy(), depth.copy()]
             for sign, moved in zip((1, -1), ends, strict=True):
                 moved[place] += sign * step
-            expected[place] = (penalty(ends[0], pairs) - penalty(ends[1], pairs)) / (2 * step)
+            expected[place] = (penalty(ends[0], pairs, factor) - penalty(ends[1], pairs, factor)) / (2 * step)
         assert relative_error(found[:, :, 0], expected) < 1e-6
         assert not found[:, :, 1:].any()
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_the_gradient_of_splats_is_that_of_the_penalty(device: Device, count: int) -> None:
-    """With several photos, a camera between two of them counts, too. It is another one in each iteration."""
+@pytest.mark.parametrize(("count", "factor"), [(1, 1), (3, 1), (3, 2)])
+def test_the_gradient_of_splats_is_that_of_the_penalty(
+    device: Device, count: int, factor: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With several photos, a camera between two of them counts, too. It is another one in each iteration.
+
+    Images of depths are smaller than large photos.
+    """
     views = views_of(count)
+    side = min(views[0].camera.width, views[0].camera.height)
+    monkeypatch.setattr(depth_smoothness, "SMALLEST_SIDE", side // factor)
+    assert reduction(views[0].camera.width, views[0].camera.height) == factor
     made = smoothed(device, Schedule(1, 16, 16), "double", views)
     arrays = {name: array.astype(np.float64) for name, array in made.splats.download(made.splats.n).items()}
     arrays["opacity_logit"] = arrays["opacity_logit"].reshape(-1)
@@ -170,15 +187,17 @@ def test_the_gradient_of_splats_is_that_of_the_penalty(device: Device, count: in
             index = np.random.default_rng((SEED, 0x6465, iteration, 0)).integers(len(between))
             chosen.append(index)
             cameras.append((between[index], None))
+        cameras = [(reduced_camera(camera, factor), photo) for camera, photo in cameras]
         images = [render_reference(arrays, camera, **SMOOTH) for camera, _ in cameras]
         pairs = [
-            pairs_of(image.depth, 1 - image.alpha, photo) for image, (_, photo) in zip(images, cameras, strict=True)
+            pairs_of(image.depth, 1 - image.alpha, photo, factor)
+            for image, (_, photo) in zip(images, cameras, strict=True)
         ]
         assert all(side.weights[0].mean() > 0.1 for side in pairs)
 
         def total(moved: dict[str, NDArray[np.float64]]) -> float:
             return math.fsum(
-                penalty(render_reference(moved, camera, **SMOOTH).depth, side)
+                penalty(render_reference(moved, camera, **SMOOTH).depth, side, factor)
                 for (camera, _), side in zip(cameras, pairs, strict=True)  # noqa: B023
             )
 
@@ -194,6 +213,14 @@ def test_the_gradient_of_splats_is_that_of_the_penalty(device: Device, count: in
                 expected = (ends[0] - ends[1]) / (2 * step)
                 assert found[name].reshape(arrays[name].shape)[place] == pytest.approx(expected, rel=1e-4, abs=1e-7)
     assert len(set(chosen)) == len(chosen)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "factor"), [(99, 400, 1), (199, 356, 1), (200, 200, 2), (713, 400, 4), (90, 50, 1)]
+)
+def test_images_of_depths_have_a_shorter_side_of_at_least_100_pixels(width: int, height: int, factor: int) -> None:
+    assert reduction(width, height) == factor
+    assert min(width, height) // factor >= min(SMALLEST_SIDE, width, height)
 
 
 def trainer_of(scene: Scene, device: Device, **options: Any) -> Trainer:
