@@ -2,8 +2,9 @@
 // centre in all three channels. SH_C0 is the constant harmonic (clsplat/splats/harmonics.py). Images are planar with a zero
 // margin (rasterize.cl).
 
-#define STEEPEST R(0.01)   // relative step of the depth from one pixel of the photo to the next; the penalty grows linearly
-                           // above it and quadratically below it
+// Relative step of the depth from one pixel of the photo to the next. The penalty grows linearly above it, and quadratically
+// below it.
+#define STEEPEST R(0.01)
 #define MOST_LIGHT R(0.2)  // pixels that let more light through have no depth
 #define BYTE R(255.0)
 

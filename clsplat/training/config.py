@@ -65,8 +65,8 @@ class TrainConfig:
 
     shape: str = option(
         DEFAULT_SHAPE,
-        help="Kernel of the splats: the form of a single splat. Short runs have gaussian, unless they name an option of "
-        "the skew.",
+        help="Kernel of the splats: the form of a single splat. Short runs have gaussian, unless they name an option "
+        "of the skew.",
         choices=SHAPES,
         by_scene=True,
     )
