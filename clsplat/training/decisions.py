@@ -34,7 +34,7 @@ from ..device.device import open_device
 from ..device.specs import count_devices, first_device
 from ..splats.shapes import PLAIN_SHAPE
 from .config import OPTIONS, TrainConfig
-from .initialise import MIN_POINTS
+from .initialise import FROM_POINTS, MIN_POINTS
 from .log import Progress
 from .near_plane import FARTHEST, choose_near_plane
 from .options.density import Adc, Mcmc
@@ -130,7 +130,7 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
         reasons.append(f"{devices} photos in an iteration, because there are {devices} devices")
     batch = chosen.get("batch", config.schedule.batch)
     if (
-        starts_at_points(config)
+        config.start.init in FROM_POINTS
         and not SKEW_OPTIONS & config.named_options.keys()
         and config.iterations * batch <= SHORT_RUN
     ):
@@ -157,11 +157,6 @@ def _with(config: TrainConfig, chosen: Mapping[str, Any]) -> TrainConfig:
     """Return the complete options. Those that the caller named replace the defaults of the chosen strategy."""
     decided = TrainConfig(**({**config.named_options, **chosen})) if "strategy" in chosen else config.replace(**chosen)
     return TrainConfig.from_json(decided.to_json())
-
-
-def starts_at_points(config: TrainConfig) -> bool:
-    """Return whether a run starts at points, of the scene or at random, and not at the splats of a file."""
-    return config.start.init in ("sfm", "random")
 
 
 def random_start(scene: Scene, config: TrainConfig) -> str:

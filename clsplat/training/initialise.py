@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ..scenes.scene import Scene
     from .config import TrainConfig
 
+FROM_POINTS = ("sfm", "random")  # starts that are not the path of a file
 RANDOM_POINTS = 100_000  # 3DGS
 _MOST_CELLS = 4096  # of the grid of `best_observed`, per unit of length; contracted space has 4 units
 _KEY = 4 * _MOST_CELLS + 1  # more than the number of cells in a direction
@@ -100,7 +101,7 @@ def initial_splats(
         raise InputError(f"cap {cap}: at least 1 splat is needed")
     check_near_plane(scene, near_plane)
     rng = np.random.default_rng(seed)
-    if init in ("sfm", "random"):
+    if init in FROM_POINTS:
         xyz, rgb, message = _points(scene, init, cap, rng, random_share)
         order = morton_order(xyz)
         xyz, rgb = xyz[order], rgb[order]
