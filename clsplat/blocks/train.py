@@ -37,6 +37,7 @@ from ..training.config import TrainConfig
 from ..training.decisions import as_decided, decide
 from ..training.exposure_file import copy_exposures, exposures_beside
 from ..training.folder import ModelFolder, scene_record
+from ..training.initialise import FROM_POINTS
 from ..training.log import Progress
 from ..training.options.density import Adc
 from ..training.stages import StepReports
@@ -154,7 +155,7 @@ def check_options(config: TrainConfig) -> None:
     """Raise InputError for options that a training in blocks cannot have."""
     if config.validation.validate:
         raise InputError("validate: each block has other photos: leave --validate out")
-    if config.start.init not in ("sfm", "random"):
+    if config.start.init not in FROM_POINTS:
         raise InputError(f"init {config.start.init}: blocks start from a coarse model of their own: leave --init out")
 
 
