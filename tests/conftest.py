@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from cli_runner import HEIGHT, N_VIEWS, SHORT, WIDTH, clsplat
+from cli_runner import HEIGHT, MODEL_RUN, N_VIEWS, WIDTH, clsplat
 from device_schedules import schedule_on, suits
 
 from clsplat.device.device import Device, list_devices, open_device
@@ -127,7 +127,5 @@ def scene(capture_folder: Path) -> Scene:
 def model_folder(capture_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a model of the small capture, trained by the command line; tests must not write into it."""
     folder = tmp_path_factory.mktemp("small") / "model"
-    clsplat(
-        "train", capture_folder, "-m", folder, "--eval", "--save-iterations", "20,40", "--shape", "skew-normal", *SHORT
-    )
+    clsplat("train", capture_folder, "-m", folder, *MODEL_RUN)
     return folder

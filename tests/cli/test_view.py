@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import ITERATIONS, N_VIEWS, SHORT, TEST_NAMES, clsplat, error_of, run
+from cli_runner import ITERATIONS, MODEL_RUN, N_VIEWS, SHORT, TEST_NAMES, clsplat, error_of, run
 from PIL import Image
 
 from clsplat.cameras.camera import Camera
@@ -202,18 +202,6 @@ def test_train_view_shows_the_run(tmp_path: Path, capture_folder: Path) -> None:
 def test_a_watched_model_has_the_same_bits(tmp_path: Path, capture_folder: Path, model_folder: Path) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
     model = model_folder
-    clsplat(
-        "train",
-        capture_folder,
-        "-m",
-        tmp_path / "run",
-        "--eval",
-        "--save-iterations",
-        "20,40",
-        "--view",
-        "--port",
-        0,
-        *SHORT,
-    )
+    clsplat("train", capture_folder, "-m", tmp_path / "run", "--view", "--port", 0, *MODEL_RUN)
     name = Path("point_cloud") / f"iteration_{ITERATIONS}" / "point_cloud.ply"
     assert (tmp_path / "run" / name).read_bytes() == (model / name).read_bytes()

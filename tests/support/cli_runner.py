@@ -22,6 +22,8 @@ SHORT = [
     "--densify-interval",
     "10",
 ]
+# Options of the run behind the fixture `model_folder`. Such a short run has a skew only if it names one.
+MODEL_RUN = ["--eval", "--save-iterations", "20,40", "--shape", "skew-normal", *SHORT]
 
 
 def run(*args: object) -> Result:
