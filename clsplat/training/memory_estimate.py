@@ -14,7 +14,7 @@ from ..rendering.splat_buffers import CAPACITY_STEP, COMPACT_ROWS, SplatStatisti
 from ..scenes.scene import View
 from ..splats.fields import Group
 from .config import TrainConfig
-from .depth_smoothness import reduction
+from .depth_smoothness import SMALLEST_SIDE
 from .exposure import exposure_bytes
 from .optim.skew_map import SkewMap
 from .targets import target_budget, target_bytes, target_channels
@@ -100,7 +100,8 @@ def estimate(
     if config.views.depth_smoothness:  # a copy of the splats with depths as colours, its gradients, and its images
         extra += 2 * rows[Group.GEOM] + 3 + COMPACT_ROWS
         screen, n_isects = 2 * screen, 2 * n_isects
-        planes += _DEPTH_PLANES / reduction(layout.width, layout.height) ** 2
+        # The shorter side of an image of depths is below twice SMALLEST_SIDE, also while the photos are small.
+        planes += _DEPTH_PLANES * min(2 * SMALLEST_SIDE / min(layout.width, layout.height), 1.0) ** 2
     widest = max(*rows.values(), kernels.record, kernels.v_record)  # of the buffers with a column for each splat
     color_roles = _ROLES - 1 - config.optim.half_moments  # two moments of 16 bits are one word
     splat = _ROLES * rows[Group.GEOM] + color_roles * rows[Group.SH] + COMPACT_ROWS + extra
