@@ -1,7 +1,7 @@
 """What a run decides by itself: options that the caller did not name, from what the scene shows and how long it is.
 
 - A short run learns Gaussians. A step with skewed splats takes longer, and in as much time a short run gains more from
-  further steps. An option that is named and has no effect without a skew keeps the skew.
+  further steps. A run that names its shape or an option of the skew keeps its shape.
 - Transparent photos are trained over random backgrounds for most of the run. Over one colour, a splat of that colour
   costs nothing wherever it is, and other views see it before the object.
 - A run that starts at random places, or at few points of the scene, has splats that no photo needs. Transparent photos
