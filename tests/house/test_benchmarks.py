@@ -11,6 +11,7 @@ from pathlib import Path
 import budget
 import defaults
 import few_views
+import folds
 import formats
 import pytest
 
@@ -307,6 +308,50 @@ def test_the_page_has_the_stored_searches() -> None:
     rows = budget.Runs(BENCHMARKS / "results" / "budget.jsonl", budget.KEY).rows
     assert rows
     assert budget.page(rows) in budget.PAGE.read_text(encoding="utf-8"), "run budget.py --page"
+
+
+def test_the_page_has_the_stored_folds() -> None:
+    rows = folds.Runs(BENCHMARKS / "results" / "folds.jsonl", folds.KEY).rows
+    assert rows
+    assert folds.page(rows) in folds.PAGE.read_text(encoding="utf-8"), "run folds.py --page"
+
+
+def test_folds_hold_out_each_training_photo_once(capture_folder: Path) -> None:
+    scene = load_scene(capture_folder, eval=True)
+    training = [view.name for view in scene.train]
+    split = [folds.hold_out_fold(scene, fold, 4) for fold in range(4)]
+    assert sorted(view.name for fold in split for view in fold.test) == training
+    for fold in split:
+        assert sorted(view.name for view in (*fold.train, *fold.test)) == training, "no test view of the scene"
+
+
+def test_a_lead_is_over_the_photos_of_both_systems() -> None:
+    ours = {(0, "a"): 20.0, (0, "b"): 22.0, (0, "c"): 30.0, (1, "a"): 9.0}
+    others = {(0, "a"): 19.0, (0, "b"): 19.0, (0, "c"): 28.0, (2, "a"): 1.0}
+    mean, error, n = folds.lead(ours, others)
+    assert (mean, n) == (2.0, 3)
+    assert error == pytest.approx(1 / 3**0.5), "differences of 1, 3 and 2 dB"
+    assert folds.lead(ours, {(0, "a"): 19.0})[::2] == (1.0, 1)
+
+
+@pytest.mark.slow
+def test_folds(tmp_path: Path, capture_folder: Path) -> None:
+    out = tmp_path / "folds.jsonl"
+    environment = os.environ | {"CLSPLAT_DATA": str(capture_folder.parent)}
+    command = [sys.executable, str(BENCHMARKS / "folds.py"), "--out", str(out), "--folds", "2"]
+    command += ["--cases", f"{capture_folder.name}:-1:60:4", "--systems", "default,3dgs"]
+    for _ in range(2):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [(row["fold"], row["system"]) for row in rows] == [
+        (fold, system) for fold in range(2) for system in ("default", "3dgs")
+    ], "each once"
+    whole = load_scene(capture_folder, eval=True)
+    for system in ("default", "3dgs"):
+        names = [name for row in rows if row["system"] == system for name in row["psnr"]]
+        assert sorted(names) == [view.name for view in whole.train]
+        mean = sum(value for row in rows if row["system"] == system for value in row["psnr"].values()) / len(names)
+        assert f"| {system} | {mean:.2f} |" in done.stdout
 
 
 @pytest.mark.slow
