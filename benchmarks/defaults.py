@@ -16,6 +16,7 @@ from __future__ import annotations
 import statistics
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -67,15 +68,7 @@ def changes(config: TrainConfig) -> dict[str, Any]:
 
 def run(case: Case, method: Method, seed: int, args: Any, runs: Runs) -> None:
     """Do one run, if it is not among `runs`."""
-    row: dict[str, Any] = {
-        "scene": case.scene,
-        "resolution": case.resolution,
-        "cap": case.cap,
-        "iterations": case.iterations,
-        "system": method.label,
-        "seed": seed,
-        "views": args.views,
-    }
+    row = asdict(case) | {"system": method.label, "seed": seed, "views": args.views}
     if row in runs:
         return
     scene = case.load(args.views)

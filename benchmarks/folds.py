@@ -18,7 +18,7 @@ import math
 import statistics
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, table, write_between
@@ -43,16 +43,7 @@ def hold_out_fold(scene: Scene, fold: int, folds: int) -> Scene:
 
 def run(case: Case, method: Method, seed: int, fold: int, args: Any, runs: Runs) -> None:
     """Do one run, if it is not among `runs`."""
-    row: dict[str, Any] = {
-        "scene": case.scene,
-        "resolution": case.resolution,
-        "cap": case.cap,
-        "iterations": case.iterations,
-        "system": method.label,
-        "seed": seed,
-        "fold": fold,
-        "folds": args.folds,
-    }
+    row = asdict(case) | {"system": method.label, "seed": seed, "fold": fold, "folds": args.folds}
     if row in runs:
         return
     scene = hold_out_fold(case.load("test"), fold, args.folds)
