@@ -16,7 +16,6 @@ from __future__ import annotations
 import statistics
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +67,7 @@ def changes(config: TrainConfig) -> dict[str, Any]:
 
 def run(case: Case, method: Method, seed: int, args: Any, runs: Runs) -> None:
     """Do one run, if it is not among `runs`."""
-    row = asdict(case) | {"system": method.label, "seed": seed, "views": args.views}
+    row = vars(case) | {"system": method.label, "seed": seed, "views": args.views}
     if row in runs:
         return
     scene = case.load(args.views)

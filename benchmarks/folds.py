@@ -18,7 +18,7 @@ import math
 import statistics
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 from common import RESULTS, ROOT, Case, Runs, background_of, environment, groups, parser, table, write_between
@@ -38,12 +38,14 @@ MARKS = ("<!-- table of folds.py -->", "<!-- end of the table of folds.py -->")
 def hold_out_fold(scene: Scene, fold: int, folds: int) -> Scene:
     """Return the scene without its test views, and with the training views of one fold as test views instead."""
     views = scene.train
+    if not 2 <= folds <= len(views):
+        raise SystemExit(f"--folds {folds}: {scene.name} has {len(views)} training views; name 2 to {len(views)} folds")
     return replace(scene, views=views, test_names=frozenset(view.name for view in views[fold::folds]))
 
 
 def run(case: Case, method: Method, seed: int, fold: int, args: Any, runs: Runs) -> None:
     """Do one run, if it is not among `runs`."""
-    row = asdict(case) | {"system": method.label, "seed": seed, "fold": fold, "folds": args.folds}
+    row = vars(case) | {"system": method.label, "seed": seed, "fold": fold, "folds": args.folds}
     if row in runs:
         return
     scene = hold_out_fold(case.load("test"), fold, args.folds)
@@ -86,7 +88,7 @@ def lead(ours: dict[tuple[int, str], float], others: dict[tuple[int, str], float
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """Return a Markdown table: means over the held-out photos, and the difference to the first system of the case."""
     lines = []
-    for (scene, resolution, cap, iterations), case in groups(rows, *KEY[:4]).items():
+    for (scene, resolution, cap, iterations, _), case in groups(rows, *KEY[:4], "folds").items():
         first = by_photo([row for row in case if row["system"] == case[0]["system"]])
         for (system,), same in groups(case, "system").items():
             psnr = by_photo(same)

@@ -323,6 +323,9 @@ def test_folds_hold_out_each_training_photo_once(capture_folder: Path) -> None:
     assert sorted(view.name for fold in split for view in fold.test) == training
     for fold in split:
         assert sorted(view.name for view in (*fold.train, *fold.test)) == training, "no test view of the scene"
+    for wrong in (1, len(training) + 1):
+        with pytest.raises(SystemExit, match=f"--folds {wrong}: .* training views; name 2 to {len(training)} folds"):
+            folds.hold_out_fold(scene, 0, wrong)
 
 
 def test_a_lead_is_over_the_photos_of_both_systems() -> None:
