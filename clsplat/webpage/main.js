@@ -1,7 +1,10 @@
 // main.js: the page. It reads the splats, draws them when something changes, and answers the buttons.
 
-// While the view moves, the image is smaller on slow devices. Sizes are shares of the screen's width and height.
+// While the view moves, the image is smaller on slow devices. Sizes are shares of the screen's width and height. If the
+// smallest image is too slow as well, the faintest of its splats are left out, up to a part of them.
 const SMALLEST = 0.25;
+const FEWEST = 0.6;
+const STEP = 1.05;           // factor of the size or of the part from one picture to the next
 const SLOW = 60, FAST = 25;  // time from one picture to the next [ms] above which the image shrinks, below which it grows
 const REST = 250;            // time without a change [ms] after which the image has its full size
 const find = (id) => document.getElementById(id);
@@ -15,7 +18,9 @@ class Page {
     this.sortedView = null;  // the view (sort.js) whose order the renderer has
     this.drawnView = null;   // the same for the last picture
     this.share = 1;     // size of the image while the view moves
-    this.whole = true;  // whether the last picture had its full size
+    this.part = 1;      // part of its splats, below 1 only in the smallest image
+    this.whole = true;  // whether the last picture had its full size, or the next one will
+    this.ordered = false;  // whether a picture of full size waits for nothing but its drawing
     this.gap = null;    // mean time between the pictures of a view that moves [ms]
     this.cameras = settings.cameras.length ? settings.cameras : settings.tour.cameras;
     this.background = settings.background;
@@ -25,7 +30,9 @@ class Page {
     const payload = await readPayload(find("payload").textContent, (share) => this.loaded(share));
     find("payload").textContent = "";
     this.renderer = new Renderer(this.canvas, payload, this.settings.shaders);
-    const splats = { mean: payload.columns.mean, reach: reachOf(payload.columns), near: payload.head.near_plane };
+    const { columns, head } = payload;
+    const splats = { mean: columns.mean, reach: reachOf(columns), near: head.near_plane, opacity: columns.opacity };
+    splats.blur = head.antialiased ? 0 : 0.3;
     this.sorter = new Sorter(splats, (order, view) => this.sorted(order, view));
     this.controls = new Controls(this.canvas, () => this.moved());
     const tour = this.settings.tour.cameras;
@@ -131,7 +138,8 @@ class Page {
   sorted(order, view) {
     this.renderer.setOrder(order);
     this.sortedView = view;
-    this.changed = true;
+    if (!this.whole) this.changed = true;
+    else if (this.isPresent(view)) this.ordered = true;
   }
 
   frame(now) {
@@ -145,7 +153,9 @@ class Page {
     } else if (now - this.lastDraw > REST && (!this.whole || this.gap !== null)) {
       this.gap = null;
       if (this.whole) this.describe();
-      else this.draw(1, now);
+      else this.rest(now);
+    } else if (this.ordered) {
+      this.draw(1, now);
     }
     requestAnimationFrame((next) => this.frame(next));
   }
@@ -161,17 +171,29 @@ class Page {
     this.changed = true;
   }
 
-  // Chooses the size of the next image from the time since the last one.
+  // Draws the view at its full size, as soon as all of its splats are in order.
+  rest(now) {
+    this.whole = true;
+    if (this.isPresent(this.sortedView)) this.draw(1, now);
+    else this.sorter.request(this.view);
+  }
+
+  // Chooses the size of the next image, and the part of its splats, from the time since the last one.
   adapt(now) {
     const gap = now - (this.lastDraw || 0);
     this.gap = gap > 1000 ? null : 0.9 * (this.gap || gap) + 0.1 * gap;
     if (this.gap === null || gap <= 0) return;  // the view was at rest
-    if (gap > SLOW) this.share = Math.max(this.share * Math.sqrt(SLOW / gap), SMALLEST);
-    else if (gap < FAST) this.share = Math.min(this.share * 1.05, 1);
+    if (gap > SLOW) {
+      if (this.share === SMALLEST) this.part = Math.max(this.part / STEP, FEWEST);
+      else this.share = Math.max(this.share * Math.sqrt(SLOW / gap), SMALLEST);
+    } else if (gap < FAST) {
+      if (this.part < 1) this.part = Math.min(this.part * STEP, 1);
+      else this.share = Math.min(this.share * STEP, 1);
+    }
   }
 
   draw(share, now) {
-    this.changed = false;
+    this.changed = this.ordered = false;
     this.whole = share === 1;
     this.lastDraw = now;
     const density = Math.min(devicePixelRatio || 1, 2);
@@ -196,7 +218,8 @@ class Page {
     const { width, height } = this.canvas;
     const { fx, fy, cx, cy } = lensFor(this.camera, width, height);
     const edges = [-cx / fx, (width - cx) / fx, -cy / fy, (height - cy) / fy];
-    return [...axes.flat(), ...position, ...edges, 1 / (SMALLEST * fx), 1 / (SMALLEST * fy)];
+    const part = this.whole ? 1 : this.part;
+    return [...axes.flat(), ...position, ...edges, 1 / (SMALLEST * fx), 1 / (SMALLEST * fy), part];
   }
 
   // Whether a view of the sort is the present one.

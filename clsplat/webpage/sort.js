@@ -17,10 +17,12 @@ function reachOf({ log_scale: logScale, opacity, beta }) {
 
 // Returns a function from a view to the indices of the splats that it can show, by falling depth. mean has all x, then
 // all y, then all z. A view is a list: the three axes of the camera, its position, the left, right, upper and lower edge
-// of the image as tangents, and the size of a pixel as a tangent in both directions. Splats outside of the image stay if
-// they reach into it, or into a margin around it, because the camera moves on while the order is made.
+// of the image as tangents, the size of a pixel as a tangent in both directions, and the part of the splats to keep.
+// Splats outside of the image stay if they reach into it, or into a margin around it, because the camera moves on while
+// the order is made. With a part below 1, those with the least opacity times length on the image are left out. blur is
+// the variance that a model without antialiasing adds to each splat [px^2].
 // The radix sort takes 16 bits of a float at a time. It is exact and stable.
-function makeSorter({ mean, reach, near }) {
+function makeSorter({ mean, reach, near, opacity, blur }) {
   const MARGIN = 0.1;  // of the image's width and height
   const n = mean.length / 3;
   const keys = new Uint32Array(n);
@@ -28,12 +30,33 @@ function makeSorter({ mean, reach, near }) {
   const shown = new Uint32Array(n);
   const half = new Uint32Array(n);
   const counts = [new Uint32Array(65536), new Uint32Array(65536)];
+  const weights = new Float32Array(n);
+  const weightBits = new Uint32Array(weights.buffer);
+
+  // Keeps this part of the first `found` splats, and returns their number. Weights are squares, told apart by 16 bits.
+  function keepHeaviest(found, part, pixel) {
+    const count = counts[0].fill(0);
+    for (let k = 0; k < found; ++k) {
+      const length = reach.size[shown[k]] / depths[k] / pixel;
+      weights[k] = opacity[shown[k]] ** 2 * (length * length + blur);
+      count[weightBits[k] >>> 16]++;
+    }
+    let least = 0;
+    for (let out = count[0]; out <= (1 - part) * found; out += count[++least]);
+    let kept = 0;
+    for (let k = 0; k < found; ++k) {
+      if (weightBits[k] >>> 16 < least) continue;
+      shown[kept] = shown[k];
+      depths[kept++] = depths[k];
+    }
+    return kept;
+  }
+
   return (view) => {
-    const [ax, ay, az, bx, by, bz, cx, cy, cz, px, py, pz, left, right, top, bottom, pixelX, pixelY] = view;
+    const [ax, ay, az, bx, by, bz, cx, cy, cz, px, py, pz, left, right, top, bottom, pixelX, pixelY, part] = view;
     const [sideX, sideY] = [MARGIN * (right - left), MARGIN * (bottom - top)];
     const farX = 2 * Math.max(Math.abs(left), Math.abs(right));
     const farY = 2 * Math.max(Math.abs(top), Math.abs(bottom));
-    for (const count of counts) count.fill(0);
     let found = 0;
     for (let i = 0; i < n; ++i) {
       const x = mean[i] - px;
@@ -48,11 +71,15 @@ function makeSorter({ mean, reach, near }) {
       const lengthY = reach.factor[i] * (wide * Math.sqrt(1 + Math.min(ty * ty, farY * farY)) + 0.55 * pixelY) + sideY;
       if (tx + lengthX < left || tx - lengthX > right || ty + lengthY < top || ty - lengthY > bottom) continue;
       depths[found] = depth;
-      const key = ~keys[found] & 0x7fffffff;  // bits of positive floats rise with their value: the far ones come first
-      keys[found] = key;
+      shown[found++] = i;
+    }
+    if (part < 1 && found) found = keepHeaviest(found, part, pixelX);
+    for (const count of counts) count.fill(0);
+    for (let k = 0; k < found; ++k) {
+      const key = ~keys[k] & 0x7fffffff;  // bits of positive floats rise with their value: the far ones come first
+      keys[k] = key;
       counts[0][key & 65535]++;
       counts[1][key >>> 16]++;
-      shown[found++] = i;
     }
     for (const count of counts) {
       let sum = 0;

@@ -289,6 +289,51 @@ def test_a_slow_device_gets_smaller_images_while_it_moves(page: Page) -> None:
     assert page.evaluate("page.renderer.size") == [WIDTH, HEIGHT], "a view at rest has its full size"
 
 
+def test_the_smallest_images_have_fewer_splats_on_a_slow_device(page: Page) -> None:
+    page.evaluate("page.frame = () => {}")  # no picture changes the sizes in between
+    try:
+        page.evaluate("page.part = 1; page.share = SMALLEST; page.lastDraw = 0; page.adapt(200)")
+        assert page.evaluate("page.share") == page.evaluate("SMALLEST")
+        assert page.evaluate("FEWEST < page.part && page.part < 1")
+        page.evaluate("for (let i = 1; i < 60; ++i) { page.lastDraw = 200 * i; page.adapt(200 * i + 200); }")
+        assert page.evaluate("page.part === FEWEST")
+        page.evaluate("page.lastDraw = 0; page.adapt(20)")
+        assert page.evaluate("page.part > FEWEST && page.share === SMALLEST"), "the splats come back first"
+        page.evaluate("for (let i = 1; i < 90; ++i) { page.lastDraw = 20 * i; page.adapt(20 * i + 20); }")
+        assert page.evaluate("[page.part, page.share]") == [1, 1]
+    finally:
+        page.evaluate("delete page.frame; requestAnimationFrame((now) => page.frame(now))")
+
+
+def test_a_view_at_rest_has_all_its_splats(page: Page) -> None:
+    whole, shown = page.evaluate("page.renderer.count"), canvas_picture(page)
+    page.evaluate("page.share = SMALLEST; page.part = FEWEST; page.changed = true")
+    page.wait_for_function(f"page.renderer.count < {whole}")
+    page.wait_for_function(SETTLED)
+    assert page.evaluate("[page.renderer.count, page.whole]") == [whole, True]
+    np.testing.assert_array_equal(canvas_picture(page), shown)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_faintest_splats_are_left_out_first(browser: Browser, tmp_path: Path, antialiased: bool) -> None:
+    """The weight of a splat is its opacity times its length on the smallest image, widened by the low pass."""
+    content = scene("gaussian", 0, antialiased=antialiased)
+    with opened(browser, tmp_path / "ball.html", content) as page:
+        view = page.evaluate("page.view")
+        order, kept = page.evaluate(
+            "[1, 0.6].map((part) => [...makeSorter(page.sorter.splats)([...page.view.slice(0, -1), part])])"
+        )
+    arrays = content[0].to_numpy()
+    depth = (arrays["mean"][order] - np.array(view[9:12])) @ np.array(view[6:9])
+    length = np.exp(arrays["log_scale"][order].max(axis=1)) / depth / view[16]
+    opacity = 1 / (1 + np.exp(-arrays["opacity_logit"][order].ravel().astype(np.float64)))
+    weight = opacity * np.sqrt(length**2 + (0.0 if antialiased else 0.3))
+    stays = np.isin(order, kept)
+    assert list(np.array(order)[stays]) == kept, "from far to near"
+    assert 0.6 * len(order) <= len(kept) < 0.61 * len(order)
+    assert weight[stays].min() > 0.99 * weight[~stays].max()
+
+
 @pytest.mark.parametrize("shape", ["skew-normal", "generalised-exponential"])
 def test_smaller_images_leave_out_faint_pixels(browser: Browser, tmp_path: Path, shape: str) -> None:
     """Half of the splats show no pixel above 1/64. Only the picture at full size has them."""
