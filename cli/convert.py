@@ -158,6 +158,10 @@ def convert_model(
         click.echo(f"{converted.removed} splats of negative opacity are left out, which {after.shape} does not support")
     if converted.lacks_near_plane:
         click.echo(f"the near plane is not in the file: splats nearer than {after.near_plane:.4g} units are drawn")
+    if converted.lacks_antialiasing:
+        click.echo("the file does not say that its splats are antialiased: programs draw small splats too thick")
+    elif converted.lacks_low_pass:
+        click.echo(f"the low pass of {after.low_pass:g} px² is not in the file: programs blur a little more")
     if not converted.is_exact:
         click.echo(_cost_line(conversion_cost(converted, cameras, device)))
     for number, (level, cost) in enumerate(

@@ -89,6 +89,7 @@ def prune_in_rounds(
         normalisation=splats.normalisation,
         antialiased=splats.antialiased,
         near_plane=splats.near_plane,
+        low_pass=splats.low_pass,
         iterations=_RUN * iterations,
         background=validation.background,
         strategy=Adc.strategy,  # rounds add no splats, and adc has no penalties
@@ -154,6 +155,7 @@ def fine_tuning(config: TrainConfig, splats: Splats, part: Part, start: Path) ->
         normalisation=splats.normalisation,
         antialiased=splats.antialiased,
         near_plane=splats.near_plane,
+        low_pass=splats.low_pass,
         sh_degree=splats.sh_degree,
         cap_max=len(splats),
         init=str(start),

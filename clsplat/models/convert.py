@@ -19,10 +19,11 @@ from ..rendering.renderer import Renderer
 from ..splats.approximate import nearest_gaussians
 from ..splats.convert import as_one_of, convert
 from ..splats.fields import sh_coefficients
-from ..splats.formats.any_file import SPZ_ENDING, WRITTEN, check_ending, format_of
+from ..splats.formats.any_file import SPZ_ENDING, WRITTEN, WrittenFormat, check_ending, format_of
 from ..splats.formats.page_payload import PAGE_ENDING, PRECISIONS
 from ..splats.formats.spz import VERSIONS as SPZ_VERSIONS
 from ..splats.formats.streamed_sog import LEVELS, LOD_META, write_streamed_sog
+from ..splats.low_pass import LOW_PASS
 from ..splats.near_plane import NEAR_PLANE
 from ..splats.shapes import GAUSSIAN
 from ..splats.splats import Splats
@@ -62,12 +63,26 @@ class ConvertedModel:
     @property
     def lacks_near_plane(self) -> bool:
         """Whether the model has a near plane that the file does not hold."""
-        return self.splats.near_plane != NEAR_PLANE and not WRITTEN[format_of(self.output)].near_plane
+        return self.splats.near_plane != NEAR_PLANE and not self._written.numbers
+
+    @property
+    def lacks_low_pass(self) -> bool:
+        """Whether the model has a low pass that the file does not hold."""
+        return self.splats.low_pass != LOW_PASS and not self._written.numbers
+
+    @property
+    def lacks_antialiasing(self) -> bool:
+        """Whether the model is antialiased, and the file does not say so."""
+        return self.splats.antialiased and not self._written.antialiased
 
     @property
     def rounds(self) -> bool:
         """Whether the file holds fewer digits than float32."""
-        return WRITTEN[format_of(self.output)].rounds
+        return self._written.rounds
+
+    @property
+    def _written(self) -> WrittenFormat:
+        return WRITTEN[format_of(self.output)]
 
 
 @dataclass(frozen=True)

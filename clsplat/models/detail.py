@@ -74,7 +74,7 @@ class DetailLevels:
     def _as_model(self, arrays: dict[str, Array]) -> Splats:
         """Return Gaussians with the kernel of the model, whose further fields are neutral."""
         model = self.splats
-        gaussians = Splats(GAUSSIAN.name, arrays, model.normalisation, model.antialiased, model.near_plane)
+        gaussians = model.like(GAUSSIAN.name, arrays, model.normalisation)
         return gaussians if model.shape == GAUSSIAN.name else gaussians.as_shape(model.shape)
 
     def choose(self, camera: Camera, pixels: float) -> Choice:

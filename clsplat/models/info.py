@@ -38,6 +38,7 @@ class ModelInfo:
             "normalisation": splats.normalisation,
             "sh_degree": splats.sh_degree,
             "antialiased": splats.antialiased,
+            "low_pass": splats.low_pass,
             "bytes": self.model.ply.stat().st_size,
             **self.complexity.to_json(),
         }

@@ -23,6 +23,7 @@ from ..rendering.pipeline import Pipeline
 from ..scenes.scene import Scene
 from ..splats.splats import Splats
 from ..training.config import PUBLISHED_ITERATIONS, TrainConfig
+from ..training.decisions import screen_filter
 from ..training.trainer import Trainer
 from .roofline import Roofline
 from .stages import HOST, STAGES, Sizes, by_stage, work_of
@@ -120,7 +121,7 @@ def bench_trainer(scene: Scene, device: Device, shape: str, start: Splats | int,
             coarse_to_fine=False,
             init=init,
         )
-        return Trainer(scene, config, device=device)
+        return Trainer(scene, config.replace(**screen_filter(config)), device=device)
 
 
 def measure_training(trainer: Trainer, limits: Roofline, iterations: int) -> Report:

@@ -12,6 +12,7 @@ from ..device.device import Device
 from ..device.program import GROUP_ITEMS, Define, Program, Real, build
 from ..device.schedule import TILE, Schedule
 from ..splats.fields import Group, Schema
+from ..splats.low_pass import LOW_PASS
 from ..splats.near_plane import NEAR_PLANE
 from ..splats.shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, Shape, shape_named
 from .camera_block import CAMERA_MEMBERS
@@ -20,7 +21,6 @@ MARGIN_X, MARGIN_Y = 16, 8  # zero margin of every image plane: the SSIM window 
 BATCH = 64
 
 ALPHA_MIN, ALPHA_MAX, T_MIN = 1.0 / 255.0, 0.99, 1e-4  # of gsplat and 3DGS
-LOW_PASS = 0.3  # px^2
 CULLED_KEY = 0xFFFFFFFF  # depth key of a splat that the image does not show
 
 # First slots of a screen record: mean_px [px], colour, camera z, and the first and last pixel row and column that the
@@ -64,6 +64,7 @@ class KernelBuild:
     alpha_max: float = ALPHA_MAX
     t_min: float = T_MIN
     antialiased: bool = False
+    low_pass: float = LOW_PASS
     near_plane: float = NEAR_PLANE  # no constant of the kernels: a member of the camera
 
     @cached_property
@@ -162,7 +163,7 @@ class KernelBuild:
                 "ANTIALIASED": int(self.antialiased),
                 "NORMALISATION": NORMALISATIONS.index(self.normalisation),
                 "PEAK_STEPS": 2 if self.real == "float" else 4,  # relative errors of r: 6e-6 and rounding
-                "LOW_PASS": LOW_PASS,
+                "LOW_PASS": self.low_pass,
                 "ALPHA_MIN": self.alpha_min,
                 "ALPHA_MAX": self.alpha_max,
                 "T_MIN": self.t_min,

@@ -182,6 +182,7 @@ class Renderer:
             t_min=t_min,
             antialiased=splats.antialiased,
             near_plane=splats.near_plane,
+            low_pass=splats.low_pass,
         ).for_rendering()
         if kernels not in self._pipelines:
             self._pipelines[kernels] = Pipeline(self.device, kernels)

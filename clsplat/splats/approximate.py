@@ -67,7 +67,7 @@ def nearest_gaussians(splats: Splats) -> Splats:
     fitted = _lopsided(model, source) if parameter is None else _round(model, source, parameter)
     for name, values in fitted.items():
         arrays[name][changed] = values
-    return Splats(GAUSSIAN.name, arrays, antialiased=splats.antialiased, near_plane=splats.near_plane)
+    return splats.like(GAUSSIAN.name, arrays, _PEAK)
 
 
 def _lopsided(model: dict[str, DoubleArray], source: Shape) -> dict[str, DoubleArray]:

@@ -45,7 +45,7 @@ def convert(splats: Splats, shape: str) -> Splats:
         model, normalisation = _gaussian(model, splats.normalisation, source, target), "peak"
     dtype = splats.mean.dtype
     arrays = {name: values.astype(dtype) for name, values in model.items()}
-    return Splats(shape, arrays, normalisation, splats.antialiased, splats.near_plane)
+    return splats.like(shape, arrays, normalisation)
 
 
 def as_one_of(splats: Splats, shapes: Sequence[str], holder: str) -> Splats:

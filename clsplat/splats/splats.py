@@ -17,7 +17,8 @@ from .fields import MAX_SH_DEGREE, Array, Schema, public_shape, sh_coefficients
 from .formats.any_file import read_splats, write_splats
 from .formats.spz import VERSIONS as SPZ_VERSIONS
 from .harmonics import SH_C0
-from .near_plane import NEAR_PLANE, usable_near_plane
+from .low_pass import LOW_PASS, LOW_PASSES
+from .near_plane import NEAR_PLANE, NEAR_PLANES
 from .shapes import DEFAULT_SHAPE, check_normalisation, shape_named
 from .stored import StoredSplats
 
@@ -40,16 +41,18 @@ class Splats:
     normalisation : "peak", "pdf" or "none".
     antialiased : whether the opacity of a small splat falls as the low-pass filter widens it, as in training.
     near_plane : depth below which a splat is not drawn, by its centre [world units].
+    low_pass : variance that widens each splat in the image [px²].
 
     Raises
     ------
     InputError : a name is unknown, an array has a wrong shape, or a value is unusable.
     """
 
-    __slots__ = ("_antialiased", "_arrays", "_near_plane", "_normalisation", "_schema", "_shape")
+    __slots__ = ("_antialiased", "_arrays", "_low_pass", "_near_plane", "_normalisation", "_schema", "_shape")
 
     _antialiased: bool
     _arrays: dict[str, Array]
+    _low_pass: float
     _near_plane: float
     _normalisation: str
     _schema: Schema
@@ -62,6 +65,7 @@ class Splats:
         normalisation: str = "peak",
         antialiased: bool = False,
         near_plane: float = NEAR_PLANE,
+        low_pass: float = LOW_PASS,
     ) -> None:
         descriptor = shape_named(shape)
         double = all(getattr(values, "dtype", None) == np.float64 for values in arrays.values())
@@ -82,7 +86,8 @@ class Splats:
         self._shape = descriptor.name
         self._normalisation = check_normalisation(normalisation)
         self._antialiased = bool(antialiased)
-        self._near_plane = usable_near_plane(near_plane)
+        self._near_plane = NEAR_PLANES.usable(near_plane)
+        self._low_pass = LOW_PASSES.usable(low_pass)
         self._schema = schema
         self._arrays = {field.name: fields[field.name] for field in schema}
 
@@ -99,7 +104,7 @@ class Splats:
         InputError : the file is missing or damaged, or has another format.
         """
         found = read_splats(path)
-        return cls(found.shape, found.arrays, found.normalisation, found.antialiased, found.near_plane)
+        return cls(found.shape, found.arrays, found.normalisation, found.antialiased, found.near_plane, found.low_pass)
 
     def save(self, path: str | os.PathLike[str], compact: bool = False, *, spz_version: int = SPZ_VERSIONS[0]) -> None:
         """Write a .splat, .spz, .sog, .glb or OpenUSD file, or else a PLY file in float32, atomically.
@@ -119,7 +124,9 @@ class Splats:
 
     def stored(self) -> StoredSplats:
         """Return the content of a file of these splats, which shares the arrays."""
-        return StoredSplats(self._shape, self._normalisation, self._antialiased, self._arrays, self._near_plane)
+        return StoredSplats(
+            self._shape, self._normalisation, self._antialiased, self._arrays, self._near_plane, self._low_pass
+        )
 
     @classmethod
     def from_points(
@@ -199,6 +206,11 @@ class Splats:
         return self._near_plane
 
     @property
+    def low_pass(self) -> float:
+        """Variance that widens each splat in the image [px²]."""
+        return self._low_pass
+
+    @property
     def schema(self) -> Schema:
         """Fields of these splats."""
         return self._schema
@@ -256,13 +268,20 @@ class Splats:
 
     def with_arrays(self, arrays: Mapping[str, ArrayLike]) -> Splats:
         """Return splats of the same kind with other arrays of any length. Raises InputError as `Splats` does."""
-        return Splats(self._shape, arrays, self._normalisation, self._antialiased, self._near_plane)
+        return self.like(self._shape, arrays, self._normalisation)
 
     def with_near_plane(self, depth: float) -> Splats:
         """Return the same splats with another near plane [world units]. Raises InputError if it is not above 0."""
         if depth == self._near_plane:
             return self
-        return Splats(self._shape, self._arrays, self._normalisation, self._antialiased, depth)
+        return Splats(self._shape, self._arrays, self._normalisation, self._antialiased, depth, self._low_pass)
+
+    def like(self, shape: str, arrays: Mapping[str, ArrayLike], normalisation: str) -> Splats:
+        """Return splats of any shape that are drawn with the antialiasing, near plane and low pass of these.
+
+        Raises InputError as `Splats` does.
+        """
+        return Splats(shape, arrays, normalisation, self._antialiased, self._near_plane, self._low_pass)
 
     def select(self, indices: ArrayLike) -> Splats:
         """Return the splats at `indices`: whole numbers in any order with repeats, or an (N,) boolean mask.
@@ -303,7 +322,7 @@ class Splats:
                     "remove them or choose another shape"
                 )
             arrays["opacity_logit"] = target.raw_opacity(np.clip(opacity, *_OPACITIES)).astype(raw.dtype)
-        return Splats(name, arrays, self._normalisation, self._antialiased, self._near_plane)
+        return self.like(name, arrays, self._normalisation)
 
 
 def _real(name: str, values: ArrayLike, dtype: np.dtype[Any]) -> Array:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .checks import Fault, first_fault, unusable
 from .fields import Array, Field, Schema, sh_degree_of
+from .low_pass import LOW_PASS
 from .near_plane import NEAR_PLANE
 from .shapes import GAUSSIAN, shape_named
 
@@ -32,7 +33,7 @@ class StoredSplats:
     Parameters
     ----------
     shape, normalisation : names of the kernel and its normalisation.
-    antialiased, near_plane : see `Splats`.
+    antialiased, near_plane, low_pass : see `Splats`.
     arrays : public arrays by field name, all of one real type.
     """
 
@@ -41,6 +42,7 @@ class StoredSplats:
     antialiased: bool
     arrays: Mapping[str, Array]
     near_plane: float = NEAR_PLANE
+    low_pass: float = LOW_PASS
 
 
 def gaussians(path: object, arrays: Mapping[str, NDArray[np.floating]], antialiased: bool = False) -> StoredSplats:
@@ -96,7 +98,7 @@ def joined_parts(path: object, parts: Sequence[StoredSplats]) -> StoredSplats:
     InputError : the parts have several kernels.
     """
     first = parts[0]
-    kinds = {(part.shape, part.normalisation, part.antialiased) for part in parts}
+    kinds = {(part.shape, part.normalisation, part.antialiased, part.low_pass) for part in parts}
     if len(kinds) > 1:
         raise InputError(f"{path}: has splats of several kernels; export each of them as a file")
     width = max(part.arrays["sh"].shape[1] for part in parts)

@@ -32,12 +32,16 @@ def joined(parts: Sequence[Splats]) -> Splats:
 
     Raises
     ------
-    InputError : there are no parts, the shapes or normalisations differ, or only some parts are antialiased.
+    InputError : there are no parts; the shapes, normalisations or low passes differ; or only some parts are
+        antialiased.
     """
     if not parts:
         raise InputError("join: no splats")
     if len({part.antialiased for part in parts if len(part)}) > 1:
         raise InputError("join: some of the models are antialiased, others are not; show one model at a time")
+    if len(widths := {part.low_pass for part in parts if len(part)}) > 1:
+        found = " and ".join(f"{width:g}" for width in sorted(widths))
+        raise InputError(f"join: the models have low passes of {found} px²; show one model at a time")
     shapes = list(dict.fromkeys(part.shape for part in parts))
     for shape in shapes:
         try:

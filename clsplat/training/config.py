@@ -90,10 +90,20 @@ class TrainConfig:
         "none: half of pdf.",
         choices=NORMALISATIONS,
     )
-    antialiased: bool = option(
-        False,
+    antialiased: bool | None = option(
+        None,
         help="Lower the opacity of small splats by the factor by which the screen filter enlarges them "
-        "(Mip-Splatting). The model then looks similar at other image sizes.",
+        "(Mip-Splatting). The model then looks similar at other image sizes. On, unless the run starts from a model "
+        "without it.",
+        by_scene=True,
+    )
+    low_pass: float | None = option(
+        None,
+        help="Variance by which the screen filter widens each splat [px^2]: 0.1, about that of a pixel, with "
+        "--antialiased, else 0.3 as in 3DGS.",
+        above=0,
+        metavar="VARIANCE",
+        by_scene=True,
     )
     near_plane: float | None = option(
         None,

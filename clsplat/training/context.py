@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..rendering.build import KernelBuild
 from ..rendering.splat_buffers import CompactGradients, SplatBuffers
 from ..splats.fields import Array, Group
+from ..splats.low_pass import LOW_PASS
 from ..splats.splats import Splats
 from .columns import Columns
 from .config import TrainConfig
@@ -35,9 +36,10 @@ def check_context(context: Splats | None, config: TrainConfig) -> None:
     resets = isinstance(config.density, Adc) and config.density.opacity_reset
     if config.density.opacity_reg or config.density.scale_reg or config.loss.bisect_reg or resets:
         raise InputError("a context needs a run without penalties and without opacity resets")
-    kinds = (context.shape, context.sh_degree, context.normalisation, context.antialiased)
-    if kinds != (config.shape, config.sh_degree, config.normalisation, config.antialiased):
-        raise InputError("the splats of the context have another shape, SH degree or normalisation than the run")
+    low_pass = config.low_pass or LOW_PASS
+    kind = (context.shape, context.sh_degree, context.normalisation, context.antialiased, context.low_pass)
+    if kind != (config.shape, config.sh_degree, config.normalisation, bool(config.antialiased), low_pass):
+        raise InputError("the context has another shape, SH degree, normalisation or low pass than the run")
 
 
 class FrozenSplats:

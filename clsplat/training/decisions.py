@@ -16,6 +16,8 @@
 - On several devices, an iteration has a photo for each of them.
 - A step of Adam reads and writes every parameter, also of splats that the image does not show. On a GPU it takes a
   large part of an iteration. If photos show a part of a large scene, only visible splats step (optim/lazy.py).
+- A model is antialiased, with a low pass as wide as a pixel. It then looks alike at all sizes of the image, and sharper
+  at that of the photos. A run that starts from a model keeps the model's filter.
 - Splats very close to a camera are not drawn (`near_plane.py`): one of them can hide a whole scene from views between
   those of the photos.
 
@@ -32,9 +34,11 @@ from typing import TYPE_CHECKING, Any
 from ..cameras.seen import mean_share_seen, sampled
 from ..device.device import open_device
 from ..device.specs import count_devices, first_device
+from ..splats.low_pass import LOW_PASS, PIXEL
 from ..splats.shapes import PLAIN_SHAPE
+from ..splats.splats import Splats
 from .config import OPTIONS, TrainConfig
-from .initialise import FROM_POINTS, MIN_POINTS
+from .initialise import FROM_POINTS, MIN_POINTS, names_model
 from .log import Progress
 from .near_plane import FARTHEST, choose_near_plane
 from .options.density import Adc, Mcmc
@@ -59,6 +63,7 @@ SEEN_SHARE = 0.7  # of the scene's points in a photo: with a smaller share, only
 UNSEEN_SPLATS = 50_000  # fewer splats outside of a photo save less time than the two further commands take
 SHORT_RUN = 2500  # photos in all iterations: in longer runs the skew gains as much as further iterations do, or more
 SKEW_OPTIONS = {"shape", "normalisation", "skew_lr", "skew_map", "alternation"}  # who names one wants a skew
+SCREEN_FILTER = ("antialiased", "low_pass")
 FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
 _RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
 
@@ -139,6 +144,10 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if batch == 1 and "visible_adam" not in config.named_options and (seen_by_photo := waits_for_sight(scene, config)):
         chosen["visible_adam"] = True
         reasons.append(f"steps of visible splats only, because a photo shows {seen_by_photo:.0%} of the points")
+    filtered = screen_filter(config)
+    chosen |= filtered
+    if filtered.get("antialiased") is False:
+        reasons.append("no antialiasing, because the model that it starts from has none")
     if config.near_plane is None:
         chosen["near_plane"] = near = choose_near_plane(scene)
         if near < FARTHEST:
@@ -149,7 +158,7 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
 def as_decided(config: TrainConfig, stored: Mapping[str, Any]) -> TrainConfig:
     """Return the options with the decisions of a stored run. stored : options of the run in the form of `to_json`."""
     undecided = [name for name in DECIDED if name not in config.named_options]
-    undecided += ["near_plane"] if config.near_plane is None else []
+    undecided += [name for name in ("near_plane", *SCREEN_FILTER) if getattr(config, name) is None]
     return _with(config, {name: stored[name] for name in undecided})
 
 
@@ -157,6 +166,23 @@ def _with(config: TrainConfig, chosen: Mapping[str, Any]) -> TrainConfig:
     """Return the complete options. Those that the caller named replace the defaults of the chosen strategy."""
     decided = TrainConfig(**({**config.named_options, **chosen})) if "strategy" in chosen else config.replace(**chosen)
     return TrainConfig.from_json(decided.to_json())
+
+
+def screen_filter(config: TrainConfig) -> dict[str, Any]:
+    """Return the antialiasing and the low pass [px²] of a run, but for those that the caller named.
+
+    Raises InputError if the run starts from a model that cannot be read.
+    """
+    undecided = [name for name in SCREEN_FILTER if getattr(config, name) is None]
+    if not undecided:
+        return {}
+    if names_model(config.start.init):
+        model = Splats.load(config.start.init)
+        found = {"antialiased": model.antialiased, "low_pass": model.low_pass}
+    else:
+        antialiased = config.antialiased is not False
+        found = {"antialiased": antialiased, "low_pass": PIXEL if antialiased else LOW_PASS}
+    return {name: found[name] for name in undecided}
 
 
 def random_start(scene: Scene, config: TrainConfig) -> str:

@@ -48,7 +48,7 @@ def first_arrays(
         config.start.init,
         config.seed,
         normalisation=config.normalisation,
-        antialiased=config.antialiased,
+        antialiased=bool(config.antialiased),
         near_plane=near_plane,
         random_share=config.start.random_points,
         opacity=config.density.init_opacity,
@@ -114,11 +114,16 @@ def initial_splats(
             opacity=opacity,
             scale_factor=scale_factor,
         )
-    elif init.lower().endswith(READ_ENDINGS) or Path(init).is_file():
+    elif names_model(init):
         splats, message = _from_model(init, shape, cap, sh_degree, normalisation, antialiased)
     else:
         raise InputError(f"init {init!r}: choose sfm, random, or the path of a file of splats")
     return started(splats, rng).with_near_plane(near_plane), message
+
+
+def names_model(init: str) -> bool:
+    """Return whether the option `init` names a file of splats."""
+    return init not in FROM_POINTS and (init.lower().endswith(READ_ENDINGS) or Path(init).is_file())
 
 
 def _points(
@@ -221,10 +226,8 @@ def _from_model(
             f"choose normalisation {loaded.normalisation}"
         )
     if loaded.antialiased != antialiased:
-        raise InputError(
-            f"{path}: its splats are {'' if loaded.antialiased else 'not '}antialiased: "
-            f"{'use' if loaded.antialiased else 'leave out'} --antialiased"
-        )
+        found = "antialiased: use --antialiased" if loaded.antialiased else "not antialiased: use --no-antialiased"
+        raise InputError(f"{path}: its splats are {found}")
     message = f"{len(loaded)} splats from {path}"
     if len(loaded) > cap:
         strength = shape_named(loaded.shape).strength(loaded.arrays)

@@ -40,6 +40,7 @@ _RATES = {
     "occluder_check": False,
     "visible_adam": False,
     "random_background": False,
+    "antialiased": False,
     "turnover": 0.0,
     "split": "published",
 }

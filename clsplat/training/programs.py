@@ -10,6 +10,7 @@ from ..device.schedule import Schedule
 from ..rendering.build import CULLED_KEY, MARGIN_X, MARGIN_Y, KernelBuild, layout_defines
 from ..splats.fields import Group
 from ..splats.harmonics import SH_C0
+from ..splats.low_pass import LOW_PASS
 from ..splats.near_plane import NEAR_PLANE
 from ..splats.optical_depth import MAX_COORDINATE
 from ..splats.shapes import shape_named
@@ -30,8 +31,9 @@ def kernel_build(config: TrainConfig, schedule: Schedule) -> KernelBuild:
         schedule,
         config.normalisation,
         skew_map=config.skew_map or SKEW_MAPS[0],
-        antialiased=config.antialiased,
+        antialiased=bool(config.antialiased),
         near_plane=config.near_plane or NEAR_PLANE,
+        low_pass=config.low_pass or LOW_PASS,
     )
 
 

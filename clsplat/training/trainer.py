@@ -335,14 +335,10 @@ class Trainer:
         sound = finite_rows(arrays)
         if len(sound) and not sound.any():
             raise TrainingError(f"iteration {self.iteration}: no splat is finite any more: lower the learning rates")
+        kept, kernels = {name: array[sound] for name, array in arrays.items()}, self.kernels
+        numbers = kernels.near_plane, kernels.low_pass
         try:
-            return Splats(
-                self.config.shape,
-                {name: array[sound] for name, array in arrays.items()},
-                self.config.normalisation,
-                self.config.antialiased,
-                self.kernels.near_plane,
-            )
+            return Splats(kernels.shape, kept, kernels.normalisation, kernels.antialiased, *numbers)
         except InputError as error:
             raise TrainingError(f"iteration {self.iteration}: {error}: lower the learning rates") from None
 

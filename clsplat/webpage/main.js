@@ -32,7 +32,7 @@ class Page {
     this.renderer = new Renderer(this.canvas, payload, this.settings.shaders);
     const { columns, head } = payload;
     const splats = { mean: columns.mean, reach: reachOf(columns), near: head.near_plane, opacity: columns.opacity };
-    splats.blur = head.antialiased ? 0 : 0.3;
+    splats.blur = head.antialiased ? 0 : head.low_pass;
     this.sorter = new Sorter(splats, (order, view) => this.sorted(order, view));
     this.controls = new Controls(this.canvas, () => this.moved());
     const tour = this.settings.tour.cameras;

@@ -9,6 +9,7 @@ uniform vec3 translation, eye;
 uniform vec4 lens, bounds;  // fx, fy, cx, cy [px]; lowest and highest x/z, then y/z, in the Jacobian
 uniform vec2 size;          // of the image [px]
 uniform float near;
+uniform float lowPass;  // variance that widens each splat [px^2]
 uniform float cutoff;  // smallest alpha of a pixel
 uniform int normalisation, antialiased, degree;
 uniform int exponential;  // 1: generalised exponentials, cl/shape/generalised_exponential.clh
@@ -19,7 +20,7 @@ out vec4 form;   // -d'Pd/2 as three coefficients; red
 out vec4 lean;   // g, slope
 out vec4 rest;   // green, blue, the rectangle's other edge, unused
 
-const float LOW_PASS = 0.3, SKEW_SQUARE = 1.69977443;
+const float SKEW_SQUARE = 1.69977443;
 const float KAPPA = 0.57079632679, HALF_PI = 1.57079632679;
 const float DENSITY_0 = 0.3989422804;  // of the normal distribution at 0
 
@@ -97,8 +98,8 @@ void main() {
   vec3 m = skew.xyz * min(sqrt(SKEW_SQUARE / max(dot(skew.xyz, skew.xyz), 1e-20)), 1.0);
   vec3 area = cross(b0, b1);
   float flatness = dot(area, area);
-  float xx = dot(b0, b0) + LOW_PASS, xy = dot(b0, b1), yy = dot(b1, b1) + LOW_PASS;
-  float det = flatness + LOW_PASS * (xx + yy - LOW_PASS);
+  float xx = dot(b0, b0) + lowPass, xy = dot(b0, b1), yy = dot(b1, b1) + lowPass;
+  float det = flatness + lowPass * (xx + yy - lowPass);
   vec3 conic = vec3(yy, -xy, xx) / det;
   vec2 v = vec2(dot(b0, m), dot(b1, m));
   vec2 u = vec2(conic.x * v.x + conic.y * v.y, conic.y * v.x + conic.z * v.y);
@@ -106,7 +107,7 @@ void main() {
   float h = sqrt(HALF_PI * oneT * oneKt), steep = HALF_PI * t * oneKt, normSteep = steep;
   if (antialiased == 1) {
     float mm = dot(m, m), along = dot(area, m), stretched = (1.0 + mm) * flatness - along * along;
-    float whole = stretched + LOW_PASS * (xx + yy - LOW_PASS + v.x * v.x + v.y * v.y);
+    float whole = stretched + lowPass * (xx + yy - lowPass + v.x * v.x + v.y * v.y);
     opacity *= sqrt(stretched / whole);
     float inv = flatness > 1e-24 ? inversesqrt(flatness) : 0.0;
     float sharp = clamp(mm - along * along * inv * inv, 0.0, SKEW_SQUARE);

@@ -232,6 +232,7 @@ class Renderer {
     gl.uniform4f(at.bounds, -cx / fx - x, (width - cx) / fx + x, -cy / fy - y, (height - cy) / fy + y);
     gl.uniform2f(at.size, width, height);
     gl.uniform1f(at.near, head.near_plane);
+    gl.uniform1f(at.lowPass, head.low_pass);
     gl.uniform1f(at.cutoff, this.cutoff);
     gl.uniform1i(at.normalisation, head.normalisation);
     gl.uniform1i(at.antialiased, head.antialiased ? 1 : 0);

@@ -178,6 +178,17 @@ def test_a_lost_near_plane_is_named(tmp_path: Path, ending: str, kept: bool) -> 
     assert Splats.load(tmp_path / f"a{ending}").near_plane == (0.25 if kept else 0.01)
 
 
+@pytest.mark.parametrize("ending", [".splat", ".spz", ".sog"])
+def test_a_lost_filter_is_named(tmp_path: Path, ending: str) -> None:
+    arrays = random_model(GAUSSIAN, 9, 0, dead=0)
+    Splats("gaussian", arrays, antialiased=True, low_pass=0.1).save(tmp_path / "a.ply")
+    said = clsplat("convert", tmp_path / "a.ply", tmp_path / f"a{ending}")
+    assert ("does not say that its splats are antialiased" in said) == (ending == ".splat")
+    assert ("the low pass of 0.1 px² is not in the file" in said) == (ending == ".spz")
+    read = Splats.load(tmp_path / f"a{ending}")
+    assert (read.antialiased, read.low_pass) == (ending != ".splat", 0.1 if ending == ".sog" else 0.3)
+
+
 def test_levels_of_detail_are_written_and_measured(model: Path, tmp_path: Path) -> None:
     out = tmp_path / "scene" / "lod-meta.json"
     said = clsplat("convert", model, out, "--approximate", "--levels", 3).splitlines()

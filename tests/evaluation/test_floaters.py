@@ -99,6 +99,7 @@ def test_photos_that_cannot_be_decoded_are_left_out(renderer: Renderer, splats: 
 
 
 def test_a_floater_before_a_camera_is_near(renderer: Renderer, splats: Splats, scene: Scene) -> None:
+    splats = splats.with_near_plane(0.1)
     before = measure_floaters(renderer, splats, scene.train)
     depth = 1.05 * splats.near_plane
     after = measure_floaters(renderer, joined(splats, blob(scene, 0, depth, 0.08 * depth)), scene.train)

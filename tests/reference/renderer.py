@@ -88,13 +88,19 @@ def project(
     normalisation: str = "peak",
     sh_degree: int | None = None,
     antialiased: bool = False,
+    low_pass: float | None = None,
 ) -> Screen:
-    """Project raw splats (fields as stored, real or complex) to the screen. `sh_degree` None means all degrees."""
+    """Project raw splats (fields as stored, real or complex) to the screen.
+
+    `sh_degree` None means all degrees, and `low_pass` None LOW_PASS.
+    """
     world = projected_point(arrays, shape)
     point = world @ camera.rotation.T + camera.translation
     z = point[:, 2]
     mean_px = point[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     geometry = Geometry(mean_px, jacobian(point, camera) @ camera.rotation, axes_of(arrays))
+    if low_pass is not None:
+        geometry = replace(geometry, low_pass=low_pass)
     make = antialiased_kernel if antialiased else plain_kernel
     kernel = make(arrays, geometry, shape, normalisation)
 
@@ -179,6 +185,7 @@ def render_reference(
     sh_degree: int | None = None,
     antialiased: bool = False,
     near_plane: float = NEAR_PLANE,
+    low_pass: float | None = None,
 ) -> Rendered:
     """Render raw splats.
 
@@ -191,7 +198,8 @@ def render_reference(
     if len(order) == 0:
         color = np.broadcast_to(np.asarray(background, dtype=np.float64), (*size, 3)).copy()
         return Rendered(color, np.zeros(size), np.zeros(size))
-    screen = project({k: v[order] for k, v in values.items()}, camera, shape, normalisation, sh_degree, antialiased)
+    options = (camera, shape, normalisation, sh_degree, antialiased, low_pass)
+    screen = project({k: v[order] for k, v in values.items()}, *options)
     alphas = alpha_maps(screen, camera, alpha_min, alpha_max)
     image = blend(alphas[:, None], screen.color[:, None], screen.depth[:, None], background, t_min)
     return Rendered(image.color.reshape(*size, 3), image.alpha.reshape(size), image.depth.reshape(size))
@@ -212,6 +220,7 @@ def reference_gradients(
     fields: Sequence[str] | None = None,
     antialiased: bool = False,
     near_plane: float = NEAR_PLANE,
+    low_pass: float | None = None,
 ) -> dict[str, Array]:
     """Return the gradient of sum(v_color * color) + sum(v_alpha * alpha) with respect to the raw values.
 
@@ -225,7 +234,7 @@ def reference_gradients(
     order = visible_order(values, camera, shape, near_plane)
     if len(order) == 0:
         return gradients
-    options = (camera, shape, normalisation, sh_degree, antialiased)
+    options = (camera, shape, normalisation, sh_degree, antialiased, low_pass)
     scene = _Blended(
         project({k: v[order] for k, v in values.items()}, *options),
         camera,

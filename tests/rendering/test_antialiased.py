@@ -20,6 +20,7 @@ from clsplat.device.device import Device
 from clsplat.errors import InputError
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
+from clsplat.splats.approximate import nearest_gaussians
 from clsplat.splats.convert import convert
 from clsplat.splats.splats import Splats
 from clsplat.splats.transform import joined
@@ -55,6 +56,18 @@ def test_image_and_gradients_equal_the_reference(
     case = case_of(shape, normalisation)
     plain = replace(case, antialiased=False)
     assert np.abs(case.image.color - plain.image.color).max() > 0.05, "the mode should change the image"
+    case.check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("shape", ["gaussian", "skew-normal"])
+def test_a_model_has_a_low_pass_of_its_own(
+    make_renderer: MakeRenderer, device: Device, shape: str, antialiased: bool
+) -> None:
+    """Training has 0.1 px². A narrower low pass makes splats sharper."""
+    case = replace(case_of(shape), antialiased=antialiased, low_pass=0.1)
+    wide = replace(case, low_pass=0.3)
+    assert np.abs(case.image.color - wide.image.color).max() > 0.02
     case.check(make_renderer(device), IMAGE_FLOAT32, GRADIENT_FLOAT32)
 
 
@@ -147,9 +160,38 @@ def test_files_and_operations_keep_the_mode(tmp_path: Path) -> None:
         joined([splats, _model(False)])
 
 
-def _model(antialiased: bool) -> Splats:
+def test_files_and_operations_keep_the_low_pass(tmp_path: Path) -> None:
+    splats = _model(True, 0.1)
+    for compact in (False, True):
+        splats.save(tmp_path / "a.ply", compact)
+        assert b"comment clsplat low_pass=0.1\n" in (tmp_path / "a.ply").read_bytes()
+        assert Splats.load(tmp_path / "a.ply").low_pass == 0.1
+    _model(True).save(tmp_path / "b.ply")
+    assert b"low_pass" not in (tmp_path / "b.ply").read_bytes(), "as in other programs"
+    assert Splats.load(tmp_path / "b.ply").low_pass == 0.3
+    for same in (
+        splats.select([1, 2]),
+        splats.as_shape("skew-normal"),
+        splats.with_near_plane(0.5),
+        convert(splats, "skew-normal"),
+        nearest_gaussians(splats.as_shape("skew-normal")),
+        joined([splats, splats]),
+    ):
+        assert (same.antialiased, same.low_pass) == (True, 0.1)
+    with pytest.raises(InputError, match=r"join: the models have low passes of 0\.1 and 0\.3 px²"):
+        joined([splats, _model(True)])
+    for wrong in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match=r"low pass .*: give a variance above 0 \[px²\]"):
+            _model(True, wrong)
+    for wrong in ("0", "wide"):
+        (tmp_path / "c.ply").write_bytes((tmp_path / "a.ply").read_bytes().replace(b"s=0.1\n", f"s={wrong}\n".encode()))
+        with pytest.raises(InputError, match=rf"c\.ply: comment 'clsplat low_pass={wrong}': give a variance above 0"):
+            Splats.load(tmp_path / "c.ply")
+
+
+def _model(antialiased: bool, low_pass: float = 0.3) -> Splats:
     arrays = {name: value for name, value in random_splats(1, 5, 1).items() if name != "skew"}
-    return Splats("gaussian", arrays, antialiased=antialiased)
+    return Splats("gaussian", arrays, antialiased=antialiased, low_pass=low_pass)
 
 
 def test_training_and_the_command_line(tmp_path: Path, capture_folder: Path) -> None:
@@ -172,6 +214,7 @@ def test_training_and_the_command_line(tmp_path: Path, capture_folder: Path) -> 
         folder,
         "-m",
         tmp_path / "other",
+        "--no-antialiased",
         "--init",
         tmp_path / "model" / "point_cloud" / "iteration_20" / "point_cloud.ply",
     )

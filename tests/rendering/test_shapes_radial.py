@@ -23,8 +23,9 @@ from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device
 from clsplat.device.memory import to_device, to_host
 from clsplat.device.program import build_text, source
-from clsplat.rendering.build import ALPHA_MAX, ALPHA_MIN, LOW_PASS
+from clsplat.rendering.build import ALPHA_MAX, ALPHA_MIN
 from clsplat.rendering.renderer import Renderer
+from clsplat.splats.low_pass import LOW_PASS
 from clsplat.splats.shapes import BETA_BOUNDS, NU_BOUNDS, SHAPES
 from clsplat.splats.splats import Splats
 

@@ -23,6 +23,7 @@ from reference.tolerances import relative_error
 from clsplat.cameras.camera import Camera
 from clsplat.rendering import renderer as render
 from clsplat.rendering.build import ALPHA_MAX, ALPHA_MIN, T_MIN
+from clsplat.splats.low_pass import LOW_PASS
 from clsplat.splats.near_plane import NEAR_PLANE
 from clsplat.splats.shapes import NORMALISATIONS, SHAPES
 from clsplat.splats.splats import Splats
@@ -62,6 +63,7 @@ class Case:
     thresholds: dict[str, float] = field(default_factory=dict)
     antialiased: bool = False
     near_plane: float = NEAR_PLANE
+    low_pass: float = LOW_PASS
 
     @cached_property
     def values(self) -> Arrays:
@@ -69,7 +71,7 @@ class Case:
 
     @cached_property
     def splats(self) -> Splats:
-        return Splats(self.shape, self.values, self.normalisation, self.antialiased, self.near_plane)
+        return Splats(self.shape, self.values, self.normalisation, self.antialiased, self.near_plane, self.low_pass)
 
     @cached_property
     def image(self) -> Rendered:
@@ -81,6 +83,7 @@ class Case:
             BACKGROUND,
             antialiased=self.antialiased,
             near_plane=self.near_plane,
+            low_pass=self.low_pass,
             **self.thresholds,
         )
 
@@ -96,6 +99,7 @@ class Case:
             fields=self.fields,
             antialiased=self.antialiased,
             near_plane=self.near_plane,
+            low_pass=self.low_pass,
             **self.thresholds,
         )
 
@@ -108,7 +112,8 @@ class Case:
         if self.thresholds or not len(order):
             return np.ones(shape, bool)
         ordered = {name: value[order] for name, value in values.items()}
-        screen = project(ordered, self.camera, self.shape, self.normalisation, antialiased=self.antialiased)
+        filters = {"antialiased": self.antialiased, "low_pass": self.low_pass}
+        screen = project(ordered, self.camera, self.shape, self.normalisation, **filters)
         raw = alpha_maps(screen, self.camera, 0.0, np.inf)
         behind = np.cumprod(1.0 - alpha_maps(screen, self.camera), axis=0)
         size = np.abs(raw)

@@ -25,6 +25,7 @@ def same(found: Splats, wanted: Splats, tolerance: float = 1e-6) -> None:
         wanted.antialiased,
     )
     assert found.near_plane == pytest.approx(wanted.near_plane)
+    assert found.low_pass == wanted.low_pass
     for name in set(wanted.arrays) - {"quat"}:
         np.testing.assert_allclose(
             found.arrays[name], wanted.arrays[name], rtol=tolerance, atol=tolerance, err_msg=name

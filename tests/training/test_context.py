@@ -22,6 +22,8 @@ RUN: dict[str, Any] = {
     "sh_degree": 1,
     "densify_interval": 5,
     "near_plane": 0.01,
+    "antialiased": True,
+    "low_pass": 0.1,
     "random_points": 0.0,
     "dropout": 0.0,
     "depth_smoothness": 0.0,

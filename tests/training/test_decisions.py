@@ -51,8 +51,9 @@ def without_points(scene: Scene) -> Scene:
 
 
 def options_of(**named: Any) -> TrainConfig:
-    """Return options with a near plane, and without what few photos need; else they depend on the scene."""
-    return TrainConfig(**{"near_plane": 0.1, "dropout": 0.0, "depth_smoothness": 0.0, "occluder_check": False} | named)
+    """Return options with a near plane and a filter, and without what few photos need; else a scene decides them."""
+    usual = {"near_plane": 0.1, "antialiased": True, "low_pass": 0.1}
+    return TrainConfig(**usual | {"dropout": 0.0, "depth_smoothness": 0.0, "occluder_check": False} | named)
 
 
 def some_splats(scene: Scene, file: Path) -> Path:
@@ -86,7 +87,7 @@ def transparent(scene: Scene, share: float) -> Scene:
 def test_good_points_and_opaque_photos_need_no_decision(scene: Scene) -> None:
     config = options_of(cap_max=len(scene.points), random_points=0.0)
     assert decide(scene, config) == Decision(config, ())
-    assert decide(scene, options_of(init="model.ply")).reasons == ()
+    assert decide(scene, options_of(init="model.ply")).reasons == (), "its filter is named"
     assert decide(transparent(scene, 0.5), config).config == config.replace(random_background=True)
 
 
@@ -132,6 +133,7 @@ def test_few_photos_get_dropout_smooth_depths_and_checks_and_very_few_no_random_
     few = with_views(scene, count)
     config = TrainConfig(near_plane=0.1, cap_max=len(scene.points))
     decision = decide(few, config)
+    config = config.replace(antialiased=True, low_pass=0.1)
     assert decision.config == config.replace(
         dropout=dropout,
         depth_smoothness=SMOOTHNESS if count <= FEW_VIEWS else 0.0,
@@ -259,7 +261,7 @@ def test_random_starts_have_higher_rates_unless_a_rate_is_named(scene: Scene, na
         ({"iterations": SHORT_RUN // 2, "batch": 2}, "gaussian"),
         ({"iterations": SHORT_RUN // 2 + 1, "batch": 2}, "skew-normal"),
         ({"iterations": SHORT_RUN // 2 + 1, "device": "cpu/2"}, "skew-normal"),
-        ({"iterations": 100, "init": "model.ply"}, "skew-normal"),
+        ({"iterations": 100, "init": "model.ply", "antialiased": True, "low_pass": 0.1}, "skew-normal"),
         ({"iterations": 100, "shape": "skew-normal"}, "skew-normal"),
         ({"iterations": 100, "shape": "student-t"}, "student-t"),
         ({"iterations": 100, "skew_lr": 1e-3}, "skew-normal"),
@@ -290,9 +292,11 @@ def stop_at(iteration: int) -> Visit:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_decide_the_near_plane_only(scene: Scene, name: str) -> None:
-    assert decide(scene, TrainConfig(**preset(name))).config.near_plane is not None
-    config = options_of(**preset(name))
+def test_presets_decide_the_near_plane_and_the_low_pass_only(scene: Scene, name: str) -> None:
+    decided = decide(scene, TrainConfig(**preset(name))).config
+    assert decided.near_plane is not None
+    assert (decided.antialiased, decided.low_pass) == (False, 0.3)
+    config = options_of(**preset(name) | {"low_pass": 0.3})
     decision = decide(transparent(without_points(scene), 0.5), config)
     assert decision.config == config
     assert decision.reasons == ()
@@ -344,6 +348,47 @@ def test_a_run_of_an_earlier_version_keeps_its_near_plane(scene: Scene, tmp_path
     checkpoint.save(ModelFolder(tmp_path).checkpoint_path)
     train(scene, config.replace(iterations=3), output=tmp_path, resume=True)
     assert load_model(tmp_path).splats.near_plane == NEAR_PLANE
+
+
+def test_models_are_antialiased_with_a_low_pass_as_wide_as_a_pixel(scene: Scene, tmp_path: Path) -> None:
+    config = TrainConfig(iterations=2, cap_max=40, sh_degree=0)
+    filters = {
+        (True, 0.1): {},
+        (False, 0.3): {"antialiased": False},
+        (True, 0.2): {"low_pass": 0.2},
+        (False, 0.2): {"antialiased": False, "low_pass": 0.2},
+    }
+    for expected, named in filters.items():
+        decided = decide(scene, config.replace(**named)).config
+        assert (decided.antialiased, decided.low_pass) == expected
+        splats = train(scene, config.replace(**named)).splats
+        assert (splats.antialiased, splats.low_pass) == expected
+
+
+def test_a_run_that_starts_from_a_model_keeps_its_filter(scene: Scene, tmp_path: Path) -> None:
+    config = TrainConfig(iterations=2, cap_max=40, sh_degree=0)
+    points = Splats.from_points(scene.points.xyz, scene.points.rgb)
+    for antialiased, low_pass in ((True, 0.1), (True, 0.3), (False, 0.3)):
+        file = tmp_path / f"{antialiased}{low_pass}.ply"
+        Splats(points.shape, points.arrays, antialiased=antialiased, low_pass=low_pass).save(file)
+        decision = decide(scene, config.replace(init=str(file)))
+        assert ("no antialiasing, because the model" in str(decision)) == (not antialiased)
+        splats = train(scene, config.replace(init=str(file))).splats
+        assert (splats.antialiased, splats.low_pass) == (antialiased, low_pass)
+
+
+def test_a_run_of_an_earlier_version_keeps_its_filter(scene: Scene, tmp_path: Path) -> None:
+    """Earlier versions had a low pass of 0.3 in all runs, and stored none."""
+    for antialiased in (False, True):
+        folder = tmp_path / str(antialiased)
+        train(scene, TrainConfig(iterations=2, cap_max=40, sh_degree=0, antialiased=antialiased), output=folder)
+        checkpoint = Checkpoint.load(ModelFolder(folder).checkpoint_path)
+        del checkpoint.config["low_pass"]
+        checkpoint.save(ModelFolder(folder).checkpoint_path)
+        longer = TrainConfig(iterations=3, cap_max=40, sh_degree=0)
+        train(scene, longer, output=folder, resume=True)
+        splats = load_model(folder).splats
+        assert (splats.antialiased, splats.low_pass) == (antialiased, 0.3)
 
 
 def test_decisions_of_a_stored_run_replace_undecided_options() -> None:

@@ -326,7 +326,7 @@ def test_a_run_begins_with_the_exposures_of_its_model(scene: Scene, tmp_path: Pa
     changed = exposed(scene, np.linspace(0.8, 1.2, n))
     train(changed, replace(CONFIG, iterations=60, exposure=True), output=tmp_path / "first")
     folder = ModelFolder(tmp_path / "first")
-    start = replace(CONFIG, iterations=10, exposure=True, init=str(folder.latest_ply()[0]))
+    start = decide(scene, replace(CONFIG, iterations=10, exposure=True, init=str(folder.latest_ply()[0]))).config
     first = read_exposures(folder.exposures_path)
     assert {view.name for view in scene.train} == set(first)
     trainer = Trainer(changed, start)

@@ -85,6 +85,8 @@ def rendered(splats: Splats, camera: Camera) -> NDArray[np.float32]:
         ("generalised-exponential", 2, {}),
         ("generalised-exponential", 0, {"antialiased": True, "shrink": 10.0}),
         ("skew-normal", 3, {"antialiased": True, "shrink": 10.0}),
+        ("skew-normal", 0, {"antialiased": True, "shrink": 10.0, "low_pass": 0.1}),
+        ("gaussian", 0, {"shrink": 10.0, "low_pass": 0.1}),
     ],
     ids=str,
 )

@@ -38,19 +38,21 @@ class WrittenFormat:
     ----------
     shapes : the kernels that it holds; None: all.
     rounds : whether the file holds fewer digits than float32.
-    near_plane : whether the file holds the near plane of the model.
+    numbers : whether the file holds the near plane and the low pass of the model.
+    antialiased : whether the file says that a model is antialiased.
     """
 
     shapes: tuple[str, ...] | None
     rounds: bool
-    near_plane: bool = True
+    numbers: bool = True
+    antialiased: bool = True
 
 
 _GAUSSIAN_ONLY, _EXTENDED = (GAUSSIAN.name,), tuple(EXTRA_FIELDS)
 # By ending or whole name, in the order of messages. `clsplat convert` writes pages, because they have cameras as well.
 WRITTEN = {
     PLY_ENDING: WrittenFormat(None, False),
-    SPLAT_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True, False),
+    SPLAT_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True, False, False),
     SPZ_ENDING: WrittenFormat(_GAUSSIAN_ONLY, True, False),
     SOG_ENDING: WrittenFormat((GAUSSIAN.name, SKEW_NORMAL.name), True),
     LOD_META: WrittenFormat(_GAUSSIAN_ONLY, True),
@@ -135,6 +137,7 @@ def write_splats(
             compact,
             splats.antialiased,
             splats.near_plane,
+            splats.low_pass,
         )
 
 

@@ -15,7 +15,6 @@ The ellipse of a skew-normal has its mean, its covariance and its peak. So one m
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from collections.abc import Iterator
@@ -31,7 +30,8 @@ from ..activated import EXTRA_FIELDS, OPACITY, SCALE, activated, placed, raw_arr
 from ..axes import LUF
 from ..fields import MAX_SH_DEGREE, Array, DoubleArray, public_shape, sh_coefficients
 from ..harmonics import SH_C0
-from ..near_plane import NEAR_PLANE, usable_near_plane
+from ..low_pass import LOW_PASSES
+from ..near_plane import NEAR_PLANES
 from ..shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, NORMALISATIONS, SKEW_NORMAL, Shape, shape_named
 from ..stored import StoredSplats, joined_parts
 from .glb import GltfFile, Json, read_gltf, write_glb
@@ -95,7 +95,13 @@ def write_gltf_splats(path: str | os.PathLike[str], splats: StoredSplats) -> Non
         "mode": _POINTS,
         "attributes": {name: index for index, name in enumerate(attributes)},
         "extensions": {EXTENSION: extension},
-        "extras": {_EXTRAS: {"antialiased": splats.antialiased, "nearPlane": splats.near_plane}},
+        "extras": {
+            _EXTRAS: {
+                "antialiased": splats.antialiased,
+                "nearPlane": splats.near_plane,
+                "lowPass": splats.low_pass,
+            }
+        },
     }
     document = {
         "asset": {"version": "2.0", "generator": f"clsplat {__version__}"},
@@ -193,9 +199,9 @@ def _primitive(file: GltfFile, primitive: Json, matrix: DoubleArray) -> StoredSp
     for field in shape.fields:
         found[field.name] = values(_attribute(shape.name), field.width).reshape(public_shape(field, count))
     arrays = raw_arrays(shape.name, found, LUF)
-    near_plane, antialiased = _extras(file, primitive)
-    normalisation = _normalisation(file, parameters)
-    return placed(file.path, StoredSplats(shape.name, normalisation, antialiased, arrays, near_plane), matrix, LUF)
+    antialiased, *numbers = _extras(file, primitive)
+    splats = StoredSplats(shape.name, _normalisation(file, parameters), antialiased, arrays, *numbers)
+    return placed(file.path, splats, matrix, LUF)
 
 
 def _kernel(file: GltfFile, extension: Json) -> tuple[Shape, Json]:
@@ -225,16 +231,18 @@ def _normalisation(file: GltfFile, parameters: Json) -> str:
     return str(found)
 
 
-def _extras(file: GltfFile, primitive: Json) -> tuple[float, bool]:
-    """Return the near plane, and whether the splats are antialiased."""
+def _extras(file: GltfFile, primitive: Json) -> tuple[bool, float, float]:
+    """Return whether the splats are antialiased, the near plane and the low pass."""
     extras = primitive.get("extras")
-    found = extras.get(_EXTRAS) if isinstance(extras, dict) else None
-    if not isinstance(found, dict):
-        return NEAR_PLANE, False
-    depth = found.get("nearPlane", NEAR_PLANE)
-    if type(depth) not in (int, float) or not 0.0 < depth < math.inf:
-        raise file.fault(f"extras.{_EXTRAS}.nearPlane is {str(depth)[:40]!r}")
-    return usable_near_plane(depth), found.get("antialiased") is True
+    extra = extras.get(_EXTRAS) if isinstance(extras, dict) else None
+    found = extra if isinstance(extra, dict) else {}
+    numbers = []
+    for name, number in (("nearPlane", NEAR_PLANES), ("lowPass", LOW_PASSES)):
+        value = found.get(name, number.usual)
+        if not number.accepts(value):
+            raise file.fault(f"extras.{_EXTRAS}.{name} is {str(value)[:40]!r}")
+        numbers.append(number.usable(value))
+    return found.get("antialiased") is True, numbers[0], numbers[1]
 
 
 def _coefficients(attributes: Json) -> int:

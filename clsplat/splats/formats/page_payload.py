@@ -36,7 +36,8 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ..fields import Array, DoubleArray, sh_coefficients, sh_degree_of
-from ..near_plane import usable_near_plane
+from ..low_pass import LOW_PASS, LOW_PASSES
+from ..near_plane import NEAR_PLANES
 from ..quaternions import from_rodrigues, to_rodrigues
 from ..shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, NORMALISATIONS, SKEW_NORMAL
 from ..stored import StoredSplats, usable_arrays
@@ -104,6 +105,7 @@ def pack(splats: StoredSplats, precision: str = PRECISIONS[0]) -> bytes:
             "normalisation": NORMALISATIONS.index(splats.normalisation) if splats.shape == SKEW_NORMAL.name else 0,
             "antialiased": splats.antialiased,
             "near_plane": splats.near_plane,
+            "low_pass": splats.low_pass,
             "columns": columns,
         }
     ).encode()
@@ -149,7 +151,8 @@ def unpack(path: object, payload: bytes) -> StoredSplats:
         whole = stream.decompress(payload, total + 1)
         if len(whole) != total or not stream.eof or not isinstance(head["antialiased"], bool):
             raise ValueError
-        near_plane = usable_near_plane(head["near_plane"])
+        near_plane = NEAR_PLANES.usable(head["near_plane"])
+        low_pass = LOW_PASSES.usable(head.get("low_pass", LOW_PASS))
         normalisation = NORMALISATIONS[head["normalisation"]]
     except (InputError, zlib.error, ValueError, KeyError, TypeError, IndexError, RecursionError, OverflowError):
         raise _damaged(path, "its payload cannot be read") from None
@@ -171,7 +174,7 @@ def unpack(path: object, payload: bytes) -> StoredSplats:
         single: dict[str, Array] = {name: np.ascontiguousarray(each, np.float32) for name, each in arrays.items()}
     degree = sh_degree_of(single["sh"].shape[1])
     usable = usable_arrays(path, shape.schema(degree), single)
-    return StoredSplats(shape.name, normalisation, head["antialiased"], usable, near_plane)
+    return StoredSplats(shape.name, normalisation, head["antialiased"], usable, near_plane, low_pass)
 
 
 def _damaged(path: object, what: str) -> InputError:

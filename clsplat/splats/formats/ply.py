@@ -20,7 +20,8 @@ from ...errors import InputError
 from ...files.atomic import atomic_writer
 from ..checks import Fault, check_arrays, sh_degree_for
 from ..fields import Array, Field, Group, Schema, public_shape, sh_coefficients, sh_field
-from ..near_plane import NEAR_PLANE, find_near_plane, near_plane_comments
+from ..low_pass import LOW_PASSES
+from ..near_plane import NEAR_PLANES
 from ..shapes import check_normalisation, shape_named
 from ..stored import StoredSplats, usable_arrays
 from .ply_body import read_body
@@ -66,8 +67,8 @@ def read_ply(path: str | os.PathLike[str]) -> StoredSplats:
         schema = shape.schema(sh_degree_for(arrays))
     warn_of_left_out(path, header, shape, schema)
     antialiased = any(comment in (_ANTIALIASED, _ANTIALIASED_ELSEWHERE) for comment in header.comments)
-    near_plane = find_near_plane(path, header.comments)
-    return StoredSplats(shape.name, normalisation, antialiased, usable_arrays(path, schema, arrays, _place), near_plane)
+    numbers = [number.find(path, header.comments) for number in (NEAR_PLANES, LOW_PASSES)]
+    return StoredSplats(shape.name, normalisation, antialiased, usable_arrays(path, schema, arrays, _place), *numbers)
 
 
 def write_ply(
@@ -77,7 +78,8 @@ def write_ply(
     arrays: Mapping[str, Array],
     compact: bool = False,
     antialiased: bool = False,
-    near_plane: float = NEAR_PLANE,
+    near_plane: float = NEAR_PLANES.usual,
+    low_pass: float = LOW_PASSES.usual,
 ) -> None:
     """Write a splat model, binary little-endian float32 (float64 is rounded), atomically.
 
@@ -113,7 +115,7 @@ def write_ply(
         columns.update(zip(field.ply, flat.T, strict=True))
     head = ["ply", "format binary_little_endian 1.0", f"comment {COMMENT} shape={shape} normalisation={normalisation}"]
     head += [f"comment {_ANTIALIASED}"] if antialiased else []
-    head += [f"comment {comment}" for comment in near_plane_comments(near_plane)]
+    head += [f"comment {comment}" for comment in NEAR_PLANES.comments(near_plane) + LOW_PASSES.comments(low_pass)]
     for element, table in (("vertex", columns), *tables):
         head.append(f"element {element} {len(next(iter(table.values())))}")
         head += [f"property {'float' if values.dtype.kind == 'f' else 'uint'} {name}" for name, values in table.items()]

@@ -32,7 +32,9 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ..fields import MAX_SH_DEGREE, sh_coefficients
-from ..near_plane import NEAR_PLANE, usable_near_plane
+from ..low_pass import LOW_PASSES
+from ..model_number import ModelNumber
+from ..near_plane import NEAR_PLANES
 from ..quaternions import from_smallest_three
 from ..shapes import GAUSSIAN, NORMALISATIONS, SKEW_LIMIT, SKEW_NORMAL
 from ..stored import StoredSplats, joined_parts
@@ -110,7 +112,8 @@ class _Reader:
         if self._value(EXTRA, "skew") is not None:
             shape, arrays["skew"] = SKEW_NORMAL.name, self._skew()
         antialiased = self._value("antialias", default=False) is True
-        found = StoredSplats(shape, self._normalisation(), antialiased, arrays, self._near_plane())
+        near_plane, low_pass = self._number("nearPlane", NEAR_PLANES), self._number("lowPass", LOW_PASSES)
+        found = StoredSplats(shape, self._normalisation(), antialiased, arrays, near_plane, low_pass)
         return joined_parts(self.path, [found])
 
     def _skew(self) -> NDArray[np.float64]:
@@ -127,11 +130,11 @@ class _Reader:
             raise InputError(f"{self.path}: normalisation {str(found)[:40]!r} in {META} is unknown; export it again")
         return str(found)
 
-    def _near_plane(self) -> float:
-        found = self._value(EXTRA, "nearPlane", default=NEAR_PLANE)
-        if type(found) not in (int, float) or not 0.0 < found < math.inf:
-            raise InputError(f"{self.path}: {EXTRA}.nearPlane in {META} is {str(found)[:40]!r}; give a depth above 0")
-        return usable_near_plane(found)
+    def _number(self, name: str, number: ModelNumber) -> float:
+        found = self._value(EXTRA, name, default=number.usual)
+        if not number.accepts(found):
+            raise InputError(f"{self.path}: {EXTRA}.{name} in {META} is {str(found)[:40]!r}; give {number.what}")
+        return number.usable(found)
 
     def _quaternions(self) -> NDArray[np.float64]:
         """Return quaternions (N, 4) as w, x, y, z; zeros, which are unusable, for wrong tags."""

@@ -93,7 +93,7 @@ def sog_files(path: object, splats: StoredSplats, order: NDArray[np.int64]) -> d
         "asset": {"generator": f"clsplat {__version__}"},
         "count": count,
         "antialias": splats.antialiased,
-        EXTRA: {"nearPlane": splats.near_plane},
+        EXTRA: {"nearPlane": splats.near_plane, "lowPass": splats.low_pass},
     }
     if "skew" in arrays:
         meta[EXTRA]["normalisation"] = splats.normalisation

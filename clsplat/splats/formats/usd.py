@@ -5,15 +5,14 @@ position, a unit quaternion, standard deviations, an opacity 0..1 and SH coeffic
 back.
 
 The kernels of the schema are Gaussians. Attributes in the namespace `clsplat` hold what they lack: the shape with its
-normalisation, its field (`clsplat:skew` or `clsplat:beta`), `clsplat:antialiased` and `clsplat:nearPlane`. Other
-programs show a skew-normal as the Gaussian with its mean, its covariance and its peak.
+normalisation, its field (`clsplat:skew` or `clsplat:beta`), `clsplat:antialiased`, `clsplat:nearPlane` and
+`clsplat:lowPass`. Other programs show a skew-normal as the Gaussian with its mean, its covariance and its peak.
 """
 
 from __future__ import annotations
 
 import io
 import json
-import math
 import os
 import re
 import subprocess
@@ -31,7 +30,9 @@ from ...files.host_memory import limit_address_space
 from ..activated import EXTRA_FIELDS, OPACITY, SCALE, activated, placed, raw_arrays
 from ..axes import RUB
 from ..fields import MAX_SH_DEGREE, DoubleArray, sh_coefficients, sh_degree_of
-from ..near_plane import NEAR_PLANE, usable_near_plane
+from ..low_pass import LOW_PASSES
+from ..model_number import ModelNumber
+from ..near_plane import NEAR_PLANES
 from ..shapes import GAUSSIAN, NORMALISATIONS, shape_named
 from ..stored import StoredSplats, joined_parts
 
@@ -47,8 +48,8 @@ _SUPPORT = 3.0  # standard deviations: the extent of a splat in bounding boxes
 _HARMONICS = "radiance:sphericalHarmonicsCoefficients"
 _DEGREE = "radiance:sphericalHarmonicsDegree"
 _NAMES = {"mean": "positions", "quat": "orientations", SCALE: "scales", OPACITY: "opacities", "sh": _HARMONICS}
-_SHAPE, _NORMALISATION, _ANTIALIASED, _NEAR_PLANE = (
-    f"clsplat:{name}" for name in ("shape", "normalisation", "antialiased", "nearPlane")
+_SHAPE, _NORMALISATION, _ANTIALIASED, _NEAR_PLANE, _LOW_PASS = (
+    f"clsplat:{name}" for name in ("shape", "normalisation", "antialiased", "nearPlane", "lowPass")
 )
 
 
@@ -124,6 +125,7 @@ def _define(stage: Any, splats: StoredSplats) -> None:
     put(_NORMALISATION, kinds.Token, splats.normalisation, True)
     put(_ANTIALIASED, kinds.Bool, splats.antialiased, True)
     put(_NEAR_PLANE, kinds.Double, splats.near_plane, True)
+    put(_LOW_PASS, kinds.Double, splats.low_pass, True)
     extra = EXTRA_FIELDS[splats.shape]
     if extra:
         array = values[extra].astype(np.float32)
@@ -180,7 +182,7 @@ def answer() -> None:
 def _packed(parts: list[StoredSplats]) -> bytes:
     """Return parts as bytes."""
     stream = io.BytesIO()
-    kinds = [[part.shape, part.normalisation, part.antialiased, part.near_plane] for part in parts]
+    kinds = [[part.shape, part.normalisation, part.antialiased, part.near_plane, part.low_pass] for part in parts]
     arrays = {f"{index}.{name}": array for index, part in enumerate(parts) for name, array in part.arrays.items()}
     np.savez(stream, allow_pickle=False, kinds=np.array(json.dumps(kinds)), **arrays)
     return stream.getvalue()
@@ -190,10 +192,10 @@ def _unpacked(data: bytes) -> list[StoredSplats]:
     """Return the parts that `_packed` has packed."""
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         found: list[StoredSplats] = []
-        for index, (shape, normalisation, antialiased, near_plane) in enumerate(json.loads(str(stored["kinds"]))):
+        for index, (shape, normalisation, antialiased, *numbers) in enumerate(json.loads(str(stored["kinds"]))):
             start = f"{index}."
             arrays = {name.removeprefix(start): stored[name] for name in stored.files if name.startswith(start)}
-            found.append(StoredSplats(shape, normalisation, antialiased, arrays, near_plane))
+            found.append(StoredSplats(shape, normalisation, antialiased, arrays, *numbers))
     return found
 
 
@@ -231,12 +233,10 @@ def _part(prim: Any, transforms: Any, upright: DoubleArray) -> StoredSplats:
     """Return the splats of a prim in float64, with the axes of a PLY."""
     shape = _attribute(prim, _SHAPE) or GAUSSIAN.name
     normalisation = _attribute(prim, _NORMALISATION) or NORMALISATIONS[0]
-    depth = _attribute(prim, _NEAR_PLANE)
     kind = f"{shape}, {normalisation}"
     if not (isinstance(shape, str) and shape in EXTRA_FIELDS and normalisation in NORMALISATIONS):
         raise InputError(f"{prim.GetPath()}: kernel {kind[:60]!r} is unknown; export it again")
-    if depth is not None and not (isinstance(depth, float) and 0.0 < depth < math.inf):
-        raise InputError(f"{prim.GetPath()}: {_NEAR_PLANE} is {str(depth)[:20]}, give a depth above 0")
+    numbers = [_number(prim, _NEAR_PLANE, NEAR_PLANES), _number(prim, _LOW_PASS, LOW_PASSES)]
     count = len(_attribute(prim, _NAMES["mean"]) or _attribute(prim, _NAMES["mean"] + "h") or ())
     degree = _attribute(prim, _DEGREE)
     degree = MAX_SH_DEGREE if degree is None else degree
@@ -270,11 +270,19 @@ def _part(prim: Any, transforms: Any, upright: DoubleArray) -> StoredSplats:
         normalisation,
         _attribute(prim, _ANTIALIASED) is True,
         raw_arrays(shape, found, RUB),
-        NEAR_PLANE if depth is None else usable_near_plane(depth),
+        *numbers,
     )
     # USD's matrices are for rows.
     world = upright @ np.array(transforms.GetLocalToWorldTransform(prim)).T
     return placed(prim.GetPath(), splats, world, RUB)
+
+
+def _number(prim: Any, name: str, number: ModelNumber) -> float:
+    """Return a number of the model, or its usual value. Raises InputError if it is unusable."""
+    found = _attribute(prim, name)
+    if found is not None and not number.accepts(found):
+        raise InputError(f"{prim.GetPath()}: {name} is {str(found)[:20]}, give {number.what}")
+    return number.usual if found is None else number.usable(found)
 
 
 def _attribute(prim: Any, name: str) -> Any:

@@ -38,7 +38,7 @@ def file(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal", "generalised-exponential"])
 def test_the_model_comes_back(file: Path, shape: str, degree: int) -> None:
-    before = model(shape, degree, antialiased=degree > 1, near_plane=0.07)
+    before = model(shape, degree, antialiased=degree > 1, near_plane=0.07, low_pass=0.1 * degree + 0.1)
     before.save(file)
     same(Splats.load(file), before)
 
@@ -291,6 +291,7 @@ FAULTS: dict[str, tuple[Change, str]] = {
     "no turn": (lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0]), "rotation of a node is 0"),
     "no number": (lambda d: d["nodes"][0].update(translation=["a", 1, 1]), "translation of a node is not 3 numbers"),
     "near plane": (lambda d: primitive(d).update(extras={"clsplat": {"nearPlane": -1}}), "nearPlane is '-1'"),
+    "low pass": (lambda d: primitive(d).update(extras={"clsplat": {"lowPass": "x"}}), "lowPass is 'x'"),
     "normalisation": (
         lambda d: primitive(d)["extensions"][KHR]["extensions"].update({SKEWED: {"normalisation": "sum"}}),
         "normalisation 'sum'",

@@ -52,10 +52,10 @@ def rewritten(payload: bytes, **changes: Any) -> bytes:
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal", "generalised-exponential"])
 def test_full_precision_keeps_what_an_image_depends_on(shape: str, degree: int) -> None:
-    before = stored(degree=degree, shape=shape, antialiased=True, near_plane=0.07)
+    before = stored(degree=degree, shape=shape, antialiased=True, near_plane=0.07, low_pass=0.1)
     after = unpack("page", pack(before, "full"))
     assert (after.shape, after.normalisation, after.antialiased) == (shape, "peak", True)
-    assert after.near_plane == pytest.approx(0.07)
+    assert (after.near_plane, after.low_pass) == (0.07, 0.1)
     further = {"skew-normal": ["skew"], "generalised-exponential": ["beta"]}.get(shape, [])
     for name in ("mean", "log_scale", "sh", *further):
         np.testing.assert_array_equal(after.arrays[name], before.arrays[name], err_msg=name)
@@ -152,6 +152,8 @@ def test_every_cut_off_payload_is_refused_in_one_line(tmp_path: Path) -> None:
         {"normalisation": "peak"},
         {"near_plane": -1.0},
         {"near_plane": "near"},
+        {"low_pass": 0},
+        {"low_pass": [0.1]},
         {"antialiased": []},
     ],
     ids=str,

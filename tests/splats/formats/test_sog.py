@@ -145,13 +145,16 @@ def test_files_of_a_folder_lie_in_it(tmp_path: Path) -> None:
         Splats.load(tmp_path / "inner" / "meta.json")
 
 
-def test_the_near_plane_is_kept_where_other_programs_do_not_look(file: Path) -> None:
-    Splats("gaussian", Splats.load(written(file)).arrays, near_plane=0.2).save(file)
-    assert Splats.load(file).near_plane == 0.2
+def test_near_plane_and_low_pass_are_kept_where_other_programs_do_not_look(file: Path) -> None:
+    Splats("gaussian", Splats.load(written(file)).arrays, near_plane=0.2, low_pass=0.1).save(file)
+    assert (Splats.load(file).near_plane, Splats.load(file).low_pass) == (0.2, 0.1)
     meta, images = sog_files.some(5, 0)
     for depth in (0, -1, "x", None, True):
         sog_files.write(file, meta | {"clsplat": {"nearPlane": depth}}, images)
         with pytest.raises(InputError, match=r"clsplat\.nearPlane in meta\.json is .*; give a depth above 0"):
+            Splats.load(file)
+        sog_files.write(file, meta | {"clsplat": {"lowPass": depth}}, images)
+        with pytest.raises(InputError, match=r"clsplat\.lowPass in meta\.json is .*; give a variance above 0"):
             Splats.load(file)
 
 

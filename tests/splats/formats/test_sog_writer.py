@@ -336,7 +336,7 @@ def test_the_skew_comes_back_in_an_image_of_its_own(tmp_path: Path) -> None:
 def test_gaussians_have_no_image_of_skews(tmp_path: Path) -> None:
     write_sog(tmp_path / "a.sog", gaussians())
     meta, images = content(tmp_path / "a.sog")
-    assert set(meta["clsplat"]) == {"nearPlane"}
+    assert set(meta["clsplat"]) == {"nearPlane", "lowPass"}
     assert "skew" not in images
 
 

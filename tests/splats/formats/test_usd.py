@@ -27,7 +27,7 @@ def file(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("ending", usd.USD_ENDINGS)
 @pytest.mark.parametrize("shape", ["gaussian", "skew-normal", "generalised-exponential"])
 def test_the_model_comes_back(tmp_path: Path, shape: str, ending: str) -> None:
-    before = model(shape, 3, antialiased=True, near_plane=0.07)
+    before = model(shape, 3, antialiased=True, near_plane=0.07, low_pass=0.1)
     before.save(tmp_path / f"model{ending}")
     same(Splats.load(tmp_path / f"model{ending}"), before)
     assert [path.name for path in tmp_path.iterdir()] == [f"model{ending}"]
@@ -142,6 +142,7 @@ FAULTS = {
     "clsplat:shape": ("cube", "kernel 'cube, peak' is unknown"),
     "clsplat:normalisation": ("sum", "kernel 'skew-normal, sum' is unknown"),
     "clsplat:nearPlane": (-1.0, "nearPlane is -1.0, give a depth above 0"),
+    "clsplat:lowPass": (0.0, "lowPass is 0.0, give a variance above 0"),
     "clsplat:skew": ([Gf.Vec3f(1)], "clsplat:skew is missing, or not 3 numbers for each of 30"),
     "radiance:sphericalHarmonicsDegree": (7, "has SH degree 7, expected 0 to 3"),
     "radiance:sphericalHarmonicsCoefficients": ([Gf.Vec3f(1)], "is missing, or not 27 numbers"),
