@@ -45,6 +45,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "random-background": {"random_background": True, "random_background_until": 1.0},
     "antialiased": {"antialiased": True},
     "antialiased-direct": {"antialiased": True, "shape": "skew-normal-direct"},
+    "pixel": {"antialiased": True, "low_pass": 0.1},
     "visible-adam": {"visible_adam": True},
     "sghmc": {"position_optimizer": "sghmc"},
     "sghmc-sss": {"position_optimizer": "sghmc-sss", "shape": "student-t"},
@@ -67,6 +68,8 @@ COMMON = {
     "init": "random",
     "seed": 3,
     "coarse_to_fine": False,
+    "antialiased": False,
+    "low_pass": 0.3,
 }
 WIDTH, HEIGHT, VIEWS = 72, 56, 6
 
