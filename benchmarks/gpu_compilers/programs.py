@@ -16,6 +16,7 @@ from clsplat.device.schedule import SCHEDULES
 from clsplat.rendering.build import KernelBuild
 from clsplat.rendering.group_binner import group_binning_program
 from clsplat.rendering.radix_sort import sort_program
+from clsplat.splats.low_pass import PIXEL
 from clsplat.training.programs import (
     columns_program,
     depth_program,
@@ -40,7 +41,7 @@ def programs() -> dict[str, str]:
     gpu = SCHEDULES[GPU_SCHEDULES[0]]
     with _recorded() as (device, built):
         for shape in SHAPES:
-            kernels = KernelBuild(shape, _SH_DEGREE, gpu)
+            kernels = KernelBuild(shape, _SH_DEGREE, gpu, antialiased=True, low_pass=PIXEL)  # as training has it
             kernels.projection_program(device)
             texts[f"project {shape}"] = built.pop()
             optim_program(device, kernels)

@@ -22,6 +22,7 @@ from ..device.program import wrong_numbers
 from ..device.schedule import Schedule
 from ..errors import DeviceError
 from ..splats.fields import Array
+from ..splats.low_pass import PIXEL
 from ..splats.shapes import DEFAULT_SHAPE, SKEW_MAX
 from ..splats.splats import Splats
 from .build import CULLED_KEY, KernelBuild
@@ -48,7 +49,7 @@ def check_rendering(device: Device, schedule: Schedule) -> None:
     ------
     DeviceError : the kernels do not build, or compute wrong numbers; the message names the first wrong stage.
     """
-    kernels = KernelBuild(DEFAULT_SHAPE, SH_DEGREE, schedule)
+    kernels = KernelBuild(DEFAULT_SHAPE, SH_DEGREE, schedule, antialiased=True, low_pass=PIXEL)
     pipeline = Pipeline(device, kernels)
     splats = SplatBuffers.of(device, scene(), kernels.dtype)
     try:
@@ -119,7 +120,7 @@ def stored_numbers() -> Numbers:
 
 @cache
 def scene() -> Splats:
-    """Return splats of every opacity and skew, some without skew, some behind the camera."""
+    """Return antialiased splats of every opacity and skew, some without skew, some behind the camera."""
     direction = _spread(3, 20) - 0.5
     direction /= np.sqrt((direction * direction).sum(1, keepdims=True))
     skew = direction * SKEW_MAX * 0.95 * _spread(1, 23)
@@ -131,11 +132,13 @@ def scene() -> Splats:
         {
             "mean": mean,
             "quat": _spread(4, 3) - 0.5,
-            "log_scale": -2.4 + 1.6 * _spread(3, 7),
+            "log_scale": -2.35 + 1.6 * _spread(3, 7),
             "opacity_logit": -4.2 + 6.0 * _spread(1, 10)[:, 0],
             "sh": 0.6 * (_spread(3 * (SH_DEGREE + 1) ** 2, 24) - 0.4).reshape(_N, -1, 3),
             "skew": skew,
         },
+        antialiased=True,
+        low_pass=PIXEL,
     )
 
 

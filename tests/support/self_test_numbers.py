@@ -24,7 +24,8 @@ DIGITS = 7
 def case() -> Case:
     """Return the scene of the self-test with its float32 values."""
     splats = self_test.scene()
-    return Case(splats.to_numpy(), self_test.camera(), splats.shape)
+    filters = {"antialiased": splats.antialiased, "low_pass": splats.low_pass}
+    return Case(splats.to_numpy(), self_test.camera(), splats.shape, **filters)
 
 
 def numbers() -> self_test.Numbers:
@@ -43,7 +44,16 @@ def numbers() -> self_test.Numbers:
 
 def gradients(one: Case) -> self_test.Numbers:
     v_color = self_test.gradient_of_image()
-    found = reference_gradients(one.values, one.camera, v_color, None, one.shape, background=self_test.BACKGROUND)
+    found = reference_gradients(
+        one.values,
+        one.camera,
+        v_color,
+        None,
+        one.shape,
+        background=self_test.BACKGROUND,
+        antialiased=one.antialiased,
+        low_pass=one.low_pass,
+    )
     return self_test.summed_bands(found)
 
 
