@@ -3,7 +3,7 @@
 // While the view moves, the image is smaller on slow devices. Sizes are shares of the screen's width and height. If the
 // smallest image is too slow as well, the faintest of its splats are left out, up to a part of them.
 const SMALLEST = 0.25;
-const FEWEST = 0.4;
+const FEWEST = 0.5;
 const STEP = 1.05;           // factor of the size or of the part from one picture to the next
 const SLOW = 60, FAST = 25;  // time from one picture to the next [ms] above which the image shrinks, below which it grows
 const REST = 250;            // time without a change [ms] after which the image has its full size
