@@ -1,10 +1,10 @@
 // main.js: the page. It reads the splats, draws them when something changes, and answers the buttons.
 
 // While the view moves, the image is smaller on slow devices. Sizes are shares of the screen's width and height. If the
-// smallest image is too slow as well, the faintest of its splats are left out, up to a part of them.
+// smallest image is too slow as well, the faintest of its splats are left out.
 const SMALLEST = 0.25;
-const FEWEST = 0.5;
-const STEP = 1.05;           // factor of the size or of the part from one picture to the next
+const FEWEST = 0.5;          // the part of the splats that stays
+const STEP = 1.05;           // factor of the size or of that part from one picture to the next
 const SLOW = 60, FAST = 25;  // time from one picture to the next [ms] above which the image shrinks, below which it grows
 const REST = 250;            // time without a change [ms] after which the image has its full size
 const find = (id) => document.getElementById(id);
