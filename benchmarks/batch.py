@@ -81,12 +81,11 @@ def _is_whole(row: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 def main() -> None:
-    flags = parser(__doc__, RESULTS / "batch.jsonl", smoke=False)
+    flags = parser(__doc__, RESULTS / "batch.jsonl", smoke=False, page=PAGE)
     flags.add_argument("--cases", nargs="+", default=["fox:4:8000:2000"])
     flags.add_argument("--batches", default="1,2,4")
     flags.add_argument("--devices", default="cpu,cpu/2")
     flags.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    flags.add_argument("--page", action="store_true", help="write the table of docs/devices.md, and run nothing")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
     if args.page:

@@ -146,7 +146,7 @@ def page(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    flags = parser(__doc__, RESULTS / "blocks.jsonl", device=False)
+    flags = parser(__doc__, RESULTS / "blocks.jsonl", device=False, page=PAGE)
     flags.add_argument(
         "--cases",
         nargs="+",
@@ -154,7 +154,6 @@ def main() -> None:
     )
     flags.add_argument("--polish", type=int, help="iterations of the polish; default: half of those of a block")
     flags.add_argument("--workers", type=int, default=1, help="local workers; 0: train the blocks in one process")
-    flags.add_argument("--page", action="store_true", help="write the table of docs/blocks.md, and run nothing")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
     if args.page:

@@ -138,14 +138,13 @@ def page(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    flags = parser(__doc__, RESULTS / "budget.jsonl")
+    flags = parser(__doc__, RESULTS / "budget.jsonl", page=PAGE)
     flags.add_argument("--cases", nargs="+", default=["fox:4:12000:1000"])
     flags.add_argument("--shape", default=TrainConfig().shape)
     flags.add_argument("--seeds", nargs="+", type=int, default=[0])
     flags.add_argument("--tolerance", type=float, default=TOLERANCE)
     flags.add_argument("--views", choices=("validation", "test"), default="validation")
     flags.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "clsplat-budget")
-    flags.add_argument("--page", action="store_true", help="write docs/small-models.md, and run nothing")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
     if args.page:

@@ -143,8 +143,7 @@ def page(found: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    flags = parser(__doc__, RESULTS / "cluster.jsonl", device=False)
-    flags.add_argument("--page", action="store_true", help="write the table of docs/cluster.md, and run nothing")
+    flags = parser(__doc__, RESULTS / "cluster.jsonl", device=False, page=PAGE)
     flags.add_argument("--kills", type=int, default=20, help="number of workers to kill")
     flags.add_argument("--scene", type=Path, help="scene of --smoke")
     args = flags.parse_args()

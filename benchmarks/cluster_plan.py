@@ -300,8 +300,7 @@ def _time(hours: float) -> str:
 
 
 def main() -> None:
-    flags = parser(__doc__, RESULTS / "cluster_plan.jsonl", device=False)
-    flags.add_argument("--page", action="store_true", help="write the tables of docs/sizes.md, and run nothing")
+    flags = parser(__doc__, RESULTS / "cluster_plan.jsonl", device=False, page=PAGE)
     flags.add_argument("--seeds", type=int, default=20, help="simulations of a case")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)

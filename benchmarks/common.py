@@ -32,7 +32,13 @@ REDUCTION = {"fox": 2}  # `resolution` of load_scene; the other scenes are read 
 
 
 def parser(
-    doc: str | None, out: Path | None = None, *, device: bool = True, table: bool = True, smoke: bool = True
+    doc: str | None,
+    out: Path | None = None,
+    *,
+    device: bool = True,
+    table: bool = True,
+    smoke: bool = True,
+    page: Path | None = None,
 ) -> argparse.ArgumentParser:
     """Return a parser with the flags that most benchmarks have.
 
@@ -41,6 +47,7 @@ def parser(
     doc : text of --help, usually the module's docstring.
     out : default of --out; None: no such flag.
     device, table, smoke : whether to add --device, --table and --smoke.
+    page : the page that --page writes; None: no such flag.
     """
     result = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     if device:
@@ -51,6 +58,9 @@ def parser(
         result.add_argument("--table", action="store_true", help="print the results in --out and run nothing")
     if smoke:
         result.add_argument("--smoke", action="store_true", help="a tiny case, for tests")
+    if page is not None:
+        what = f"write the tables of {page.relative_to(ROOT)}, and run nothing"
+        result.add_argument("--page", action="store_true", help=what)
     return result
 
 

@@ -148,13 +148,12 @@ def test_table(rows: list[dict[str, Any]], scenes: Sequence[str]) -> str:
 
 
 def main() -> None:
-    flags = parser(__doc__, RESULTS / "defaults.jsonl", smoke=False)
+    flags = parser(__doc__, RESULTS / "defaults.jsonl", smoke=False, page=PAGE)
     flags.add_argument("--cases", nargs="+", default=["lego:-1:30000:1500", "fox:2:20000:1000"])
     flags.add_argument("--systems", default="default")
     flags.add_argument("--seeds", nargs="+", type=int, default=[0])
     flags.add_argument("--views", choices=("validation", "test"), default="validation")
     flags.add_argument("--work", type=Path, help="folder of the models, for runs that may be interrupted")
-    flags.add_argument("--page", action="store_true", help="write the tables of SYSTEMS.md, and run nothing")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
     if args.page:

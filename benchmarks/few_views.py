@@ -100,12 +100,11 @@ def page(rows: list[dict[str, Any]], systems: Sequence[str] = ON_PAGE) -> str:
 
 
 def main() -> None:
-    flags = parser(__doc__, RESULTS / "few_views.jsonl", smoke=False)
+    flags = parser(__doc__, RESULTS / "few_views.jsonl", smoke=False, page=PAGE)
     flags.add_argument("--cases", nargs="+", default=["fox:4:20000:2000:6"])
     flags.add_argument("--systems", default="default,default:dropout=0")
     flags.add_argument("--seeds", nargs="+", type=int, default=[0])
     flags.add_argument("--views", choices=("validation", "test"), default="validation")
-    flags.add_argument("--page", action="store_true", help="write the table of SYSTEMS.md, and run nothing")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
     if args.page:

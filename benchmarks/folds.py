@@ -109,12 +109,11 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    flags = parser(__doc__, RESULTS / "folds.jsonl", smoke=False)
+    flags = parser(__doc__, RESULTS / "folds.jsonl", smoke=False, page=PAGE)
     flags.add_argument("--cases", nargs="+", default=["kitchen:-1:20000:1500"])
     flags.add_argument("--systems", default="default,3dgs")
     flags.add_argument("--seeds", nargs="+", type=int, default=[0])
     flags.add_argument("--folds", type=int, default=7)
-    flags.add_argument("--page", action="store_true", help="write the table of SYSTEMS.md, and run nothing")
     args = flags.parse_args()
     runs = Runs(args.out, KEY)
     if args.page:
