@@ -106,10 +106,12 @@ def bench_trainer(scene: Scene, device: Device, shape: str, start: Splats | int,
     ------
     DeviceError : the device does not have the memory. InputError : the scene has no training view.
     """
+    screen: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         if isinstance(start, Splats):
             init, cap = str(Path(folder) / "start.ply"), len(start)
             start.save(init)
+            screen = {"antialiased": start.antialiased, "low_pass": start.low_pass}
         else:
             init, cap = "sfm", start
         config = TrainConfig(
@@ -120,6 +122,7 @@ def bench_trainer(scene: Scene, device: Device, shape: str, start: Splats | int,
             sh_interval=1,
             coarse_to_fine=False,
             init=init,
+            **screen,
         )
         return Trainer(scene, config.replace(**screen_filter(config)), device=device)
 

@@ -27,6 +27,7 @@ docs/decisions.md has the measurements.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -171,13 +172,16 @@ def _with(config: TrainConfig, chosen: Mapping[str, Any]) -> TrainConfig:
 def screen_filter(config: TrainConfig) -> dict[str, Any]:
     """Return the antialiasing and the low pass [px²] of a run, but for those that the caller named.
 
-    Raises InputError if the run starts from a model that cannot be read.
+    Raises InputError if the run starts from a model that cannot be read. What the file lacks is said when its splats
+    are read for the run, not here.
     """
     undecided = [name for name in SCREEN_FILTER if getattr(config, name) is None]
     if not undecided:
         return {}
     if names_model(config.start.init):
-        model = Splats.load(config.start.init)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model = Splats.load(config.start.init)
         found = {"antialiased": model.antialiased, "low_pass": model.low_pass}
     else:
         antialiased = config.antialiased is not False

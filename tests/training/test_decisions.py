@@ -377,6 +377,18 @@ def test_a_run_that_starts_from_a_model_keeps_its_filter(scene: Scene, tmp_path:
         assert (splats.antialiased, splats.low_pass) == (antialiased, low_pass)
 
 
+def test_what_a_model_lacks_is_said_once(scene: Scene, tmp_path: Path) -> None:
+    """Its filter is looked at before its splats are read for the run."""
+    file = some_splats(scene, tmp_path / "s.ply")
+    content = bytearray(file.read_bytes())
+    first = content.index(b"end_header\n") + len(b"end_header\n")
+    content[first : first + 4] = np.float32(np.nan).tobytes()
+    file.write_bytes(content)
+    with pytest.warns(UserWarning, match="left out 1 of") as said:
+        train(scene, TrainConfig(iterations=2, cap_max=40, sh_degree=0, init=str(file)))
+    assert len(said) == 1
+
+
 def test_a_run_of_an_earlier_version_keeps_its_filter(scene: Scene, tmp_path: Path) -> None:
     """Earlier versions had a low pass of 0.3 in all runs, and stored none."""
     for antialiased in (False, True):
