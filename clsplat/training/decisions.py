@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 DECIDED = tuple(name for name, definition in OPTIONS.items() if definition.by_scene)
 FEW_POINTS = 0.05  # fewer points than this share of the cap are few
-PENALTY = Mcmc().opacity_reg  # weight of the mean opacity in a run with splats that start at random and adc
+PENALTY = 0.005  # weight of the mean opacity in a run with splats that start at random and adc
 RANDOM_SHARE = 0.05  # share of the cap that starts at random places beside the scene's points
 RANDOM_SHARE_OF_FEW = 0.1  # the same, if the scene has fewer points than this share
 FEW_VIEWS = 12  # with more training views, dropout costs more than it gains

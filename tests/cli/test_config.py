@@ -83,12 +83,12 @@ def test_train_says_what_it_decided_by_the_scene(scene: Path, tmp_path: Path) ->
     short = ("--iterations", "1", "--cap-max", "30", "--dropout", "0", "--depth-smoothness", "0", "--no-occluder-check")
     said = run("train", scene, "-m", tmp_path / "a", "--init", "random", *short).stderr
     assert (
-        said.count("decided: a penalty on opacity of 0.001, because the start is random; shape gaussian, because") == 1
+        said.count("decided: a penalty on opacity of 0.005, because the start is random; shape gaussian, because") == 1
     )
     assert config_of(tmp_path / "a")["shape"] == "gaussian"
-    assert config_of(tmp_path / "a")["opacity_reg"] == 0.001
+    assert config_of(tmp_path / "a")["opacity_reg"] == 0.005
     assert "decided:" not in run("train", "--resume", "-m", tmp_path / "a", "--iterations", "2").stderr
-    assert config_of(tmp_path / "a")["opacity_reg"] == 0.001
+    assert config_of(tmp_path / "a")["opacity_reg"] == 0.005
     flags = ("--init", "random", "--opacity-reg", "0", "--random-background", "--shape", "skew-normal")
     assert "decided:" not in run("train", scene, "-m", tmp_path / "b", *flags, *short).stderr
     assert config_of(tmp_path / "b")["random_background"] is True
