@@ -147,7 +147,7 @@ def test_interchange_files_keep_the_skew(model: Path, tmp_path: Path, ending: st
     assert said.strip().endswith("skew-normal to skew-normal, with the same images")
     camera = load_model(model).read_cameras()[0].camera
     renders = [Renderer().render(splats, camera).color for splats in (load_model(model).splats, Splats.load(out))]
-    np.testing.assert_allclose(renders[1], renders[0], rtol=0, atol=1e-5)  # not rounded to 8 bits, as by `psnr`
+    assert psnr(*renders, rounded=False) > 90
     assert "skew-normal" in clsplat("info", out)
     student = Splats("student-t", random_model(SHAPES["student-t"], 9, 0, dead=0))
     student.save(tmp_path / "t.ply")
