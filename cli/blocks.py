@@ -92,13 +92,12 @@ def run_blocks(
         report_interruption(ctx, model_path)
     if quiet:
         return
-    head = ("block", "photos", "splats", "kept", "around it", "seconds", "MB of device", "MB in all")
+    head = ("block", "photos", "splats", "around it", "seconds", "MB of device", "MB in all")
     rows = [
         (
             str(row["number"]),
             str(row["views"]),
             str(row["splats"]),
-            str(row["kept"]),
             str(row["context"]),
             f"{row['seconds']:.0f}",
             f"{row['device_bytes'] / 1e6:.0f}",

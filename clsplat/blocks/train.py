@@ -4,7 +4,7 @@
 2. Partition. Cells that fill equal parts of the photos, and the photos that show each of them (partition.py).
 3. Blocks. Each block goes on from its splats of the coarse model and points of its cell (start.py), with its share of
    the cap. It learns its own part of the photos (targets.py). The coarse splats around it are shown and do not change.
-   In the end it keeps the splats in its cell, so nothing stands twice.
+   Each splat of the coarse model belongs to one block, and so do all that come from it. So nothing stands twice.
 4. Polish. A short run of all blocks together, without new splats.
 
 state.py keeps finished stages. An interrupted stage goes on from its checkpoint.
@@ -213,7 +213,10 @@ class _Stages:
         self.state.put("partition", partition.to_json())
 
     def train_blocks(self, partition: Partition) -> None:
-        """Train each block that a photo shows, and merge the splats that are in its cell."""
+        """Train each block that a photo shows, and merge their splats.
+
+        A block keeps splats that have moved over its border: what they show would be missing, as no other block has it.
+        """
         coarse = self.coarse()
         blocks = [block for block in partition.blocks if block.views]
         cap = self.config.cap_max // self.options.count
@@ -236,9 +239,8 @@ class _Stages:
         parts = [coarse.select(np.flatnonzero(~np.isin(cell, [block.number for block in blocks])))]
         for block, job, row in zip(blocks, jobs, rows, strict=True):
             trained = Splats.load(ModelFolder(job.folder / RUN).latest_ply()[0])
-            learned = trained.select(np.arange(len(trained) - row["context"]))
-            parts.append(learned.select(partition.cells.of(learned.mean) == block.number))
-            row |= {"number": block.number, "views": len(block.views), "kept": len(parts[-1])}
+            parts.append(trained.select(np.arange(len(trained) - row["context"])))
+            row |= {"number": block.number, "views": len(block.views)}
         joined([part for part in parts if len(part)]).save(self.state.folder / MERGED)
         self.state.put("blocks", rows)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from clsplat.blocks import train as module
+from clsplat.blocks.job import CONTEXT, START, BlockJob
 from clsplat.blocks.partition import Partition, make_partition, surroundings
 from clsplat.blocks.state import BlocksOptions, BlocksState
 from clsplat.blocks.train import PICTURE, BlocksModel, partition_scene, train_in_blocks
@@ -20,6 +21,7 @@ from clsplat.models.resume import resume
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
 from clsplat.splats.splats import Splats
+from clsplat.splats.transform import joined
 from clsplat.training.config import TrainConfig
 from clsplat.training.exposure_file import read_exposures
 from clsplat.training.folder import ModelFolder
@@ -67,12 +69,28 @@ def test_a_photo_that_shows_a_block_is_among_its_views(scene: Scene, coarse: Spl
             assert alpha[0] - alpha[1] < 0.02 or view.name in block.views
 
 
-def test_the_model_has_each_place_once(finished: BlocksModel, scene: Scene) -> None:
+def test_the_model_has_all_splats_of_all_blocks(finished: BlocksModel, scene: Scene) -> None:
     report = finished.report
-    assert len(finished.splats) == sum(row["kept"] for row in report["blocks"]) <= CONFIG.cap_max
+    assert len(finished.splats) == sum(row["splats"] for row in report["blocks"]) <= CONFIG.cap_max
     assert [row["number"] for row in report["blocks"]] == [0, 1]
-    assert all(row["kept"] <= row["splats"] <= CONFIG.cap_max // 2 for row in report["blocks"])
+    assert all(row["splats"] <= CONFIG.cap_max // 2 for row in report["blocks"])
     assert report["final"]["splats"] == len(finished.splats)
+
+
+def test_splats_that_move_over_a_border_stay(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No other block shows what they show. What is around a block is not among its splats."""
+    moved = []
+
+    def far_away(job: BlockJob, scene: Scene, folder: Path, *arguments: Any) -> dict[str, Any]:
+        start, context = Splats.load(job.folder / START), Splats.load(job.folder / CONTEXT)
+        moved.append(start.with_arrays(start.to_numpy() | {"mean": 1000 - 3 * start.mean}))
+        ModelFolder(folder).save(joined([moved[-1], context]), CONFIG.iterations)
+        return {"splats": len(start), "context": len(context)}
+
+    monkeypatch.setattr(module, "train_block", far_away)
+    found = train_in_blocks(scene, BlocksOptions(2, 1, polish=0), CONFIG, output=tmp_path)
+    assert len(moved) == 2
+    assert (found.splats.mean == np.concatenate([part.mean for part in moved])).all()
 
 
 def test_the_folder_is_that_of_a_run(finished: BlocksModel, scene: Scene) -> None:
@@ -164,7 +182,9 @@ def test_a_block_that_no_photo_shows_stays_as_it_is(
     assert [row["number"] for row in found.report["blocks"]] == [1]
     cells = Partition.from_json(found.report["partition"]).cells
     first = found.report["partition"]["blocks"][0]
-    assert np.count_nonzero(cells.of(found.splats.mean) == 0) == first["splats"]
+    n = first["splats"]
+    assert (cells.of(found.splats.mean[:n]) == 0).all()
+    assert len(found.splats) == n + found.report["blocks"][0]["splats"]
 
 
 def test_what_cannot_be_resumed_or_replaced(finished: BlocksModel, scene: Scene, tmp_path: Path) -> None:

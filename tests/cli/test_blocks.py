@@ -19,7 +19,7 @@ def test_a_partition_is_shown_and_then_trained(scene: Path, tmp_path: Path) -> N
     trained = run("train", "--resume", "-m", tmp_path / "m")
     assert trained.exit_code == 0, trained.output
     lines = trained.stdout.splitlines()
-    assert lines[0].split()[:4] == ["block", "photos", "splats", "kept"]
+    assert lines[0].split()[:3] == ["block", "photos", "splats"]
     assert "test views (2): PSNR" in lines[-1]
     assert "step 3 of 4, 2 blocks with at most 40 splats" in trained.stderr
     assert clsplat("eval", tmp_path / "m") != ""
