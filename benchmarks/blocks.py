@@ -4,8 +4,9 @@
     python benchmarks/blocks.py --page         # write the table of docs/blocks.md
     python benchmarks/blocks.py --smoke --cases NAME:1:100:20
 
-A case is scene:resolution:cap:iterations; the iterations are those of a block. A run in one piece has as many as the
-coarse run, the blocks and the polish together. Each training has a process of its own, whose largest memory counts.
+A case is scene:resolution:cap:iterations; the iterations are those of a block. They are compared with two runs in one
+piece. One has as many iterations as the coarse run, the blocks and the polish together. The other has as many as a
+block: it is the same command without --blocks. Each training has a process of its own, whose largest memory counts.
 Test views, one seed. Pixels near a seam show a place whose distance to a border is at most 5 % of the extent of the
 scene.
 """
@@ -95,7 +96,7 @@ def measure(case: Case, polish: int, args: Any) -> dict[str, Any]:
     scene = case.load("test")
     total = (1 + BLOCKS) * case.iterations + polish
     with tempfile.TemporaryDirectory() as folder:
-        blocks, whole = Path(folder) / "blocks", Path(folder) / "whole"
+        blocks, whole, same = (Path(folder) / name for name in ("blocks", "whole", "same"))
         common = [*CLSPLAT, "train", str(scene.path), "-r", str(case.resolution), "--eval", "-q"]
         common += ["--cap-max", str(case.cap), "--background", ",".join(map(str, scene.background))]
         more = ["--blocks", "2x2", "--iterations", str(case.iterations), "--polish", str(polish)]
@@ -103,17 +104,19 @@ def measure(case: Case, polish: int, args: Any) -> dict[str, Any]:
             more += ["--cluster", f"local:{args.workers}"]
         trained([*common, "-m", str(blocks), *more])
         one = trained([*common, "-m", str(whole), "--iterations", str(total)])
+        trained([*common, "-m", str(same), "--iterations", str(case.iterations)])
         report = json.loads((blocks / "blocks.json").read_text(encoding="utf-8"))
         cells = Cells.from_json(report["partition"]["cells"])
-        models = [load_model(path).splats for path in (blocks, whole)]
+        models = [load_model(path).splats for path in (blocks, same, whole)]
         found = errors(scene, models, cells)
         log = [json.loads(line) for line in (whole / "log.jsonl").read_text(encoding="utf-8").splitlines()]
     rows = report["blocks"]
     return {
         **{f"blocks_{key}": round(value, 3) for key, value in found[0].items()},
-        **{f"whole_{key}": round(value, 3) for key, value in found[1].items()},
+        **{f"same_{key}": round(value, 3) for key, value in found[1].items()},
+        **{f"whole_{key}": round(value, 3) for key, value in found[2].items()},
         "blocks_splats": len(models[0]),
-        "whole_splats": len(models[1]),
+        "whole_splats": len(models[2]),
         "block_device_bytes": max(row["device_bytes"] for row in rows),
         "block_bytes": max(row["peak_bytes"] for row in rows),
         "whole_bytes": one["bytes"],
@@ -132,6 +135,7 @@ def page(rows: list[dict[str, Any]]) -> str:
             row["iterations"],
             row["polish"],
             f"{row['blocks_psnr']:.2f}",
+            f"{row['same_psnr']:.2f}",
             f"{row['whole_psnr']:.2f}",
             f"{row['blocks_seam_psnr']:.2f}",
             f"{row['whole_seam_psnr']:.2f}",
@@ -140,8 +144,8 @@ def page(rows: list[dict[str, Any]]) -> str:
         )
         for row in rows
     ]
-    head = ("scene", "splats", "iterations", "polish", "blocks [dB]", "one run [dB]", "blocks, seams", "one run, seams")
-    head += ("a block [MB]", "one run [MB]")
+    head = ("scene", "splats", "iterations", "polish", "blocks [dB]", "one run, same command [dB]")
+    head += ("one run, all iterations [dB]", "blocks, seams", "one run, seams", "a block [MB]", "one run [MB]")
     return table(head, lines, right=head[1:])
 
 
@@ -150,7 +154,10 @@ def main() -> None:
     flags.add_argument(
         "--cases",
         nargs="+",
-        default=["fox:4:8000:1500", "south_building_large:4:20000:1000", "lego_full:4:20000:1000"],
+        default=[
+            *("fox:4:8000:1500", "fox:4:8000:5000", "south_building_large:4:20000:1000"),
+            *("lego_full:4:20000:1000", "lego_full:4:20000:5000"),
+        ],
     )
     flags.add_argument("--polish", type=int, help="iterations of the polish; default: half of those of a block")
     flags.add_argument("--workers", type=int, default=1, help="local workers; 0: train the blocks in one process")
