@@ -9,9 +9,9 @@
 - Beside the points of a scene, some splats start at random places too: a plain wall has no points, and would else get
   no splats. They also need the penalty.
 - With few photos, splats that fit a single photo are cheap, and other views see them. A part of the splats is not drawn
-  in each iteration (dropout.py). Depths have a penalty on steps (depth_smoothness.py). Splats that only views between
-  the photos show large are removed (occluders.py). With very few photos, no splat starts at a random place beside the
-  scene's points.
+  in each iteration (dropout.py). Longer runs fit each photo more closely, so they need this with more photos, too.
+  Depths have a penalty on steps (depth_smoothness.py). Splats that only views between the photos show large are removed
+  (occluders.py). With very few photos, no splat starts at a random place beside the scene's points.
 - Splats that start at random places have a longer way, so their learning rates are twice as high.
 - On several devices, an iteration has a photo for each of them.
 - A step of Adam reads and writes every parameter, also of splats that the image does not show. On a GPU it takes a
@@ -55,9 +55,11 @@ FEW_POINTS = 0.05  # fewer points than this share of the cap are few
 PENALTY = 0.005  # weight of the mean opacity in a run with splats that start at random and adc
 RANDOM_SHARE = 0.05  # share of the cap that starts at random places beside the scene's points
 RANDOM_SHARE_OF_FEW = 0.1  # the same, if the scene has fewer points than this share
-FEW_VIEWS = 12  # with more training views, dropout costs more than it gains
+FEW_VIEWS = 12  # with more training views, a short run loses more by dropout than it gains
+FEW_FOR_LONG_RUN = 18  # the same for a longer run, which fits each photo more closely
 VERY_FEW_VIEWS = 6  # with more training views, random points beside the scene's gain more than they cost
 DROPOUT = 0.3  # part of the splats that is not drawn in an iteration of a run with few views
+SMALL_DROPOUT = 0.1  # the same with few views for a long run
 SMOOTHNESS = 0.1  # weight of the penalty on steps of the depth of a run with few views
 RANDOM_START_RATES = 2.0  # factor on the learning rates of a run that starts at random
 SEEN_SHARE = 0.7  # of the scene's points in a photo: with a smaller share, only visible splats step on a GPU
@@ -109,15 +111,15 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if "random_points" not in config.named_options and (beside := share_beside(scene, config, transparent)):
         chosen["random_points"] = share_random = beside
         reasons.append(f"random points beside the scene's ({beside:.0%} of the cap), because some parts may have none")
-    if (n_photos := len(scene.train)) <= FEW_VIEWS:
-        for name, value, reason in (
-            ("dropout", DROPOUT, f"a dropout of {DROPOUT:.0%} of the splats, because there are only {n_photos} photos"),
-            ("depth_smoothness", SMOOTHNESS, "a penalty on steps of the depth"),
-            ("occluder_check", True, "no splats that would cover the view between the photos"),
-        ):
-            if name not in config.named_options:
-                chosen[name] = value
-                reasons.append(reason)
+    if (devices := count_devices(config.device)) > 1 and "batch" not in config.named_options:
+        chosen["batch"] = devices
+        reasons.append(f"{devices} photos in an iteration, because there are {devices} devices")
+    batch = chosen.get("batch", config.schedule.batch)
+    is_short = config.iterations * batch <= SHORT_RUN
+    for name, value, reason in for_few_photos(len(scene.train), is_short):
+        if name not in config.named_options:
+            chosen[name] = value
+            reasons.append(reason)
     if transparent and "random_background" not in config.named_options:
         chosen["random_background"] = True
         part = "" if config.random_background_until == 1 else f" for {config.random_background_until:.0%} of the run"
@@ -131,15 +133,7 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if why and config.iterations >= FEWEST_ITERATIONS and not {"lr_factor", *_RATES} & config.named_options.keys():
         chosen["lr_factor"] = RANDOM_START_RATES
         reasons.append(f"learning rates times {RANDOM_START_RATES:g}, because {why}")
-    if (devices := count_devices(config.device)) > 1 and "batch" not in config.named_options:
-        chosen["batch"] = devices
-        reasons.append(f"{devices} photos in an iteration, because there are {devices} devices")
-    batch = chosen.get("batch", config.schedule.batch)
-    if (
-        config.start.init in FROM_POINTS
-        and not SKEW_OPTIONS & config.named_options.keys()
-        and config.iterations * batch <= SHORT_RUN
-    ):
+    if is_short and config.start.init in FROM_POINTS and not SKEW_OPTIONS & config.named_options.keys():
         chosen["shape"] = PLAIN_SHAPE
         reasons.append(f"shape {PLAIN_SHAPE}, because a short run gains more from quick iterations than from skew")
     if batch == 1 and "visible_adam" not in config.named_options and (seen_by_photo := waits_for_sight(scene, config)):
@@ -197,6 +191,26 @@ def random_start(scene: Scene, config: TrainConfig) -> str:
     if init != "sfm" or n_points >= max(FEW_POINTS * config.cap_max, MIN_POINTS):
         return ""
     return f"the scene has only {n_points} points" if n_points else "the scene has no points"
+
+
+def for_few_photos(n_photos: int, is_short: bool) -> list[tuple[str, Any, str]]:
+    """Return name, value and reason of the options of a run with few photos; an empty list with many.
+
+    Parameters
+    ----------
+    n_photos : number of training views. is_short : whether all iterations have at most SHORT_RUN photos.
+    """
+    if n_photos > (FEW_VIEWS if is_short else FEW_FOR_LONG_RUN):
+        return []
+    rate = DROPOUT if n_photos <= FEW_VIEWS else SMALL_DROPOUT
+    dropout = ("dropout", rate, f"a dropout of {rate:.0%} of the splats, because there are only {n_photos} photos")
+    if n_photos > FEW_VIEWS:
+        return [dropout]
+    return [
+        dropout,
+        ("depth_smoothness", SMOOTHNESS, "a penalty on steps of the depth"),
+        ("occluder_check", True, "no splats that would cover the view between the photos"),
+    ]
 
 
 def share_beside(scene: Scene, config: TrainConfig, transparent: bool) -> float:

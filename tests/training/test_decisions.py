@@ -23,6 +23,7 @@ from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import (
     DROPOUT,
+    FEW_FOR_LONG_RUN,
     FEW_VIEWS,
     FEWEST_ITERATIONS,
     PENALTY,
@@ -30,6 +31,7 @@ from clsplat.training.decisions import (
     RANDOM_SHARE_OF_FEW,
     RANDOM_START_RATES,
     SHORT_RUN,
+    SMALL_DROPOUT,
     SMOOTHNESS,
     VERY_FEW_VIEWS,
     Decision,
@@ -124,7 +126,9 @@ def with_views(scene: Scene, count: int) -> Scene:
         (VERY_FEW_VIEWS, DROPOUT, 0.0),
         (VERY_FEW_VIEWS + 1, DROPOUT, RANDOM_SHARE),
         (FEW_VIEWS, DROPOUT, RANDOM_SHARE),
-        (FEW_VIEWS + 1, 0.0, RANDOM_SHARE),
+        (FEW_VIEWS + 1, SMALL_DROPOUT, RANDOM_SHARE),
+        (FEW_FOR_LONG_RUN, SMALL_DROPOUT, RANDOM_SHARE),
+        (FEW_FOR_LONG_RUN + 1, 0.0, RANDOM_SHARE),
     ],
 )
 def test_few_photos_get_dropout_smooth_depths_and_checks_and_very_few_no_random_points(
@@ -141,16 +145,33 @@ def test_few_photos_get_dropout_smooth_depths_and_checks_and_very_few_no_random_
         random_points=share or None,
         opacity_reg=PENALTY if share else 0.0,
     )
-    assert (f"a dropout of 30% of the splats, because there are only {count} photos" in str(decision)) == (dropout > 0)
-    assert decide(few, config.replace(dropout=0.1)).config.views.dropout == 0.1
+    reason = f"a dropout of {dropout:.0%} of the splats, because there are only {count} photos"
+    assert (reason in str(decision)) == (dropout > 0)
+    assert decide(few, config.replace(dropout=0.2)).config.views.dropout == 0.2
     assert decide(few, config.replace(depth_smoothness=0.5)).config.views.depth_smoothness == 0.5
 
 
+@pytest.mark.parametrize(
+    ("count", "short", "long"),
+    [(FEW_VIEWS, DROPOUT, DROPOUT), (FEW_VIEWS + 1, 0.0, SMALL_DROPOUT), (FEW_FOR_LONG_RUN, 0.0, SMALL_DROPOUT)],
+)
+def test_long_runs_have_dropout_with_more_photos(scene: Scene, count: int, short: float, long: float) -> None:
+    """The photos of all iterations decide how long a run is."""
+    few = with_views(scene, count)
+
+    def dropout(iterations: int, batch: int = 1) -> float:
+        return decide(few, TrainConfig(iterations=iterations, batch=batch)).config.views.dropout
+
+    assert dropout(SHORT_RUN) == short
+    assert dropout(SHORT_RUN + 1) == long
+    assert dropout(SHORT_RUN // 2 + 1, batch=2) == long
+
+
 def test_test_and_validation_views_do_not_count(scene: Scene) -> None:
-    many = with_views(scene, FEW_VIEWS + 2)
+    many = with_views(scene, FEW_FOR_LONG_RUN + 2)
     held_out = replace(many, test_names=frozenset({many.names[0]}), validation_names=frozenset({many.names[1]}))
     assert decide(many, TrainConfig()).config.views.dropout == 0
-    assert decide(held_out, TrainConfig()).config.views.dropout == DROPOUT
+    assert decide(held_out, TrainConfig()).config.views.dropout == SMALL_DROPOUT
 
 
 @pytest.mark.parametrize("options", [{"init": "random"}, {"cap_max": 1_000_000}, {}])
