@@ -12,6 +12,7 @@ import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Self
 
 from blender_scenes import OBJECTS
@@ -19,6 +20,7 @@ from blender_scenes import OBJECTS
 from clsplat.comparison.runs import Run
 from clsplat.comparison.table import Record, markdown_table
 from clsplat.device.device import Device
+from clsplat.errors import ClsplatError
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.scenes.split import hold_out
 from clsplat.splats.color import BLACK, WHITE, Color
@@ -31,6 +33,14 @@ TRANSPARENT = ("lego", "lego_full", *OBJECTS)  # scenes with transparent photos
 REDUCTION = {"fox": 2}  # `resolution` of load_scene; the other scenes are read as they are
 
 
+def _in_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Print an error of clsplat without its traceback, and others as Python does."""
+    if isinstance(error, ClsplatError):
+        print(f"error: {error}", file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
 def parser(
     doc: str | None,
     out: Path | None = None,
@@ -40,7 +50,7 @@ def parser(
     smoke: bool = True,
     page: Path | None = None,
 ) -> argparse.ArgumentParser:
-    """Return a parser with the flags that most benchmarks have.
+    """Return a parser with the flags that most benchmarks have. From then on, a wrong value is one line, as in clsplat.
 
     Parameters
     ----------
@@ -49,6 +59,7 @@ def parser(
     device, table, smoke : whether to add --device, --table and --smoke.
     page : the page that --page writes; None: no such flag.
     """
+    sys.excepthook = _in_one_line
     result = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     if device:
         result.add_argument("--device", help="OpenCL device, as for clsplat; default: the best")

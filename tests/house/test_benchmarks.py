@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import blocks
 import budget
 import defaults
 import few_views
@@ -302,6 +303,23 @@ def test_the_page_has_the_stored_runs_with_few_photos() -> None:
     rows = few_views.Runs(BENCHMARKS / "results" / "few_views.jsonl", few_views.KEY).rows
     assert rows
     assert few_views.page(rows) in few_views.PAGE.read_text(encoding="utf-8"), "run few_views.py --page"
+
+
+def test_the_page_has_the_stored_trainings_in_blocks() -> None:
+    rows = blocks.Runs(BENCHMARKS / "results" / "blocks.jsonl", blocks.KEY).rows
+    assert rows
+    assert blocks.page(rows) in blocks.PAGE.read_text(encoding="utf-8"), "run blocks.py --page"
+
+
+def test_a_wrong_value_is_one_line() -> None:
+    for arguments in (["--systems", "nothing"], ["--cases", "nowhere:1:10:10"]):
+        done = subprocess.run(
+            [sys.executable, str(BENCHMARKS / "folds.py"), *arguments], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 1
+        (line,) = done.stderr.splitlines()
+        assert line.startswith("error: ")
+        assert arguments[1].split(":")[0] in line
 
 
 def test_the_page_has_the_stored_searches() -> None:
