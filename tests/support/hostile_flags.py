@@ -24,6 +24,7 @@ from clsplat_cli.main import COMMANDS, main
 SECONDS = 20  # a line that takes longer is a fault
 MEMORY = 256 << 20  # bytes that the device pretends to have free
 WIDE, TOO_WIDE = 400, 1 << 30  # photos of a width between these are read as if WIDE: larger ones only take longer
+DRAWN = 100  # largest width of photos that the demo draws: larger ones only take longer
 INTERRUPTED = 130
 
 NUMBERS = (
@@ -171,6 +172,7 @@ def bounded(patch: pytest.MonkeyPatch, plan_only: bool = False) -> Iterator[None
     import clsplat_cli.progress  # noqa: F401
 
     from clsplat.profiling.roofline import Roofline
+    from clsplat.scenes.demo import make
     from clsplat.scenes.photo_size import target_size
     from clsplat.training.progress import TrainingDisplay
     from clsplat.viewer.session import ViewingSession
@@ -192,6 +194,12 @@ def bounded(patch: pytest.MonkeyPatch, plan_only: bool = False) -> Iterator[None
     def smaller(width: int, height: int, resolution: int) -> tuple[int, int]:
         return target_size(width, height, WIDE if WIDE < resolution < TOO_WIDE else resolution)
 
+    def narrow(write: Any) -> Any:
+        def written(folder: Path, width: int, height: int, *more: Any) -> None:
+            write(folder, *((DRAWN, DRAWN * 3 // 4) if width > DRAWN else (width, height)), *more)
+
+        return written
+
     def run_twice(run: Any, record: Any) -> None:
         if run.repeat > 2:
             raise KeyboardInterrupt
@@ -201,6 +209,8 @@ def bounded(patch: pytest.MonkeyPatch, plan_only: bool = False) -> Iterator[None
     patch.setattr("clsplat_cli.progress.ViewCount.__call__", third_view)
     patch.setattr(TrainingDisplay, "__call__", progress)
     patch.setattr("clsplat.scenes.read_view.target_size", smaller)
+    for name in ("write_capture", "write_street"):  # the demo draws its photos on one core
+        patch.setattr(make, name, narrow(getattr(make, name)))
     patch.setattr(ViewingSession, "run", interrupt)
     patch.setattr("clsplat.scenes.reconstruct.reconstruct.run_sfm", interrupt)
     for module in ("clsplat.device.device", "clsplat.scenes.photo_size"):
