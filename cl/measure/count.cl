@@ -29,9 +29,8 @@ kernel void count_pairs(
     const vmask inside = (px < (vreal)width) & (py < (vreal)height);
     vreal T = lanes_if(inside, (vreal)1, (vreal)-1), count = (vreal)0;
     for (uint at = range.x; at < range.y && lanes_any(lanes_not(BLEND_DONE(T))); ++at) {
-        global const real *from = records + (ulong)isect_splat[lists[at]] * RECORD;
-        real rec[RECORD];
-        for (int j = 0; j < RECORD; ++j) rec[j] = from[j];
+        real rec[RECORD_STRIDE];
+        load_record(record_at(records, isect_splat[lists[at]]), rec);
         shape_pixel pixel;
         vreal alpha = shape_alpha(px - rec[HEAD_X], py - rec[HEAD_Y], rec + HEAD, &pixel);
         const vmask live = lanes_not(BLEND_DONE(T));

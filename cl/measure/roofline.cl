@@ -1,9 +1,14 @@
 // roofline.cl: kernels that measure the peak rates of a device: a copy, and fused multiply-adds on CHAINS vectors.
 
-// Copies n vectors of LANES reals. Global size: n.
-kernel void copy_vectors(global const real *restrict values, global real *restrict copied, ulong n) {
+// Copies n vectors. GPUs take four reals, because a work-item with one has too few bytes under way. Global size: n.
+#if LANES == 1
+typedef real4 copied_vector;
+#else
+typedef vreal copied_vector;
+#endif
+kernel void copy_vectors(global const copied_vector *restrict values, global copied_vector *restrict copied, ulong n) {
     const ulong i = get_global_id(0);
-    if (i < n) lanes_store(lanes_load(values + i * LANES), copied + i * LANES);
+    if (i < n) copied[i] = values[i];
 }
 
 // Overwrites sums [items] with the sum of all chains of a work-item. A chain starts at its number plus the number of

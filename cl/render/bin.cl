@@ -100,8 +100,8 @@ kernel void list_isects(
         const uint i = order[rank], first = at;
         const ushort4 rect = ranked_rect[rank];
 #if CULLS_STRIPS
-        real rec[RECORD];
-        read_splat(records, i, rec);
+        real rec[RECORD_STRIDE];
+        load_record(record_at(records, i), rec);
 #endif
         const int end_y = min((int)rect.w, end_row);
         for (int y = max((int)rect.y, first_row); y < end_y; ++y) {

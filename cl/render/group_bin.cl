@@ -1,7 +1,7 @@
 // group_bin.cl: isects by splat, for devices with many work-items, and the range of each tile after a sort by tile (sort.cl).
 //
-// A work-item has RUN depth ranks. A group counts the isects of its block of ranks; one group scans the counts of all
-// blocks; then each group scans the counts of its items and writes their isects.
+// A work-item has a depth rank. A group counts the isects of its ranks; one group scans the counts of all groups; then each
+// group scans the counts of its items and writes their isects.
 
 // Tiles of the band that a rectangle of tiles meets.
 static inline uint tiles_in_band(int4 rect, int first_tile, int end_tile, int tiles_x) {
@@ -14,23 +14,7 @@ static inline uint tiles_in_band(int4 rect, int first_tile, int end_tile, int ti
     return count;
 }
 
-// Isects of the ranks of this work-item.
-static inline uint tiles_of_run(
-    global const uint *order,
-    global const int4 *tile_rect,
-    uint n_splats,
-    int first_tile,
-    int end_tile,
-    int tiles_x
-) {
-    const ulong start = (ulong)get_global_id(0) * RUN;
-    uint count = 0;
-    for (ulong rank = start; rank < start + RUN && rank < n_splats; ++rank)
-        count += tiles_in_band(tile_rect[order[rank]], first_tile, end_tile, tiles_x);
-    return count;
-}
-
-// Overwrites block_counts [groups]: the isects of the band in each block of depth ranks.
+// Overwrites block_counts [groups]: the isects of the band in each group's depth ranks.
 SCAN_ATTRIBUTE
 kernel void count_isects(
     global const uint *restrict order,
@@ -42,7 +26,9 @@ kernel void count_isects(
     int tiles_x
 ) {
     local ulong sums[SCAN_GROUP];
-    scan_group(tiles_of_run(order, tile_rect, n_splats, first_tile, end_tile, tiles_x), sums);
+    const uint rank = get_global_id(0);
+    const int4 rect = rank < n_splats ? tile_rect[order[rank]] : (int4)(0, 0, 0, 0);
+    scan_group(tiles_in_band(rect, first_tile, end_tile, tiles_x), sums);
     if (get_local_id(0) == 0) block_counts[get_group_id(0)] = (uint)sums[SCAN_GROUP - 1];
 }
 
@@ -75,29 +61,28 @@ kernel void emit_isects(
     int tiles_x
 ) {
     local ulong sums[SCAN_GROUP];
-    const uint count = tiles_of_run(order, tile_rect, n_splats, first_tile, end_tile, tiles_x);
-    uint at = block_starts[get_group_id(0)] + (uint)scan_group(count, sums);
-    const ulong first_rank = (ulong)get_global_id(0) * RUN;
-    for (ulong rank = first_rank; rank < first_rank + RUN && rank < n_splats; ++rank) {
-        const uint i = order[rank], start = at;
-        const int4 rect = tile_rect[i];
+    const uint rank = get_global_id(0), i = rank < n_splats ? order[rank] : 0;
+    const int4 rect = rank < n_splats ? tile_rect[i] : (int4)(0, 0, 0, 0);
+    const uint before = (uint)scan_group(tiles_in_band(rect, first_tile, end_tile, tiles_x), sums);
+    if (rank >= n_splats) return;
+    const uint start = block_starts[get_group_id(0)] + before;
+    uint at = start;
 #if CULLS_STRIPS
-        real rec[RECORD];
-        read_splat(records, i, rec);
+    real rec[RECORD_STRIDE];
+    load_record(record_at(records, i), rec);
 #endif
-        const int end_y = min(rect.w, end_row_of(end_tile, tiles_x));
-        for (int y = max(rect.y, first_row_of(first_tile, tiles_x)); y < end_y; ++y) {
-            const int row = y * tiles_x, end_x = min(rect.z, end_tile - row);
-            for (int x = max(rect.x, first_tile - row); x < end_x; ++x, ++at) {
+    const int end_y = min(rect.w, end_row_of(end_tile, tiles_x));
+    for (int y = max(rect.y, first_row_of(first_tile, tiles_x)); y < end_y; ++y) {
+        const int row = y * tiles_x, end_x = min(rect.z, end_tile - row);
+        for (int x = max(rect.x, first_tile - row); x < end_x; ++x, ++at) {
 #if CULLS_STRIPS
-                isect_blocks[at] = strips_reached(rec, x * TILE, y * TILE);
+            isect_blocks[at] = strips_reached(rec, x * TILE, y * TILE);
 #endif
-                isect_tile[at] = (uint)(row + x);
-                isect_splat[at] = i;
-            }
+            isect_tile[at] = (uint)(row + x);
+            isect_splat[at] = i;
         }
-        splat_isects[i] = (uint2)(start, at);
     }
+    splat_isects[i] = (uint2)(start, at);
 }
 
 // The first of n sorted values that is not below `value`, or n.

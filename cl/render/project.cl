@@ -1,7 +1,7 @@
 // project.cl: the projection of splats to screen records, and its gradient. A work-item has LANES splats.
 //
 // geom, sh: component-major parameter buffers [rows, capacity] (clsplat/splats/fields.py). ROW_<FIELD> is the first row of a
-// field in geom. The screen record of splat i is RECORD reals at records[i * RECORD]: HEAD slots, which
+// field in geom. The screen record of splat i (record.clh) has HEAD slots, which
 // clsplat/rendering/build.py lists, and the shape's SHAPE_N slots. Splats that the image does not show have CULLED_KEY.
 
 // The build fails here if a shape file and its descriptor in clsplat/splats/shapes.py disagree.
@@ -76,7 +76,7 @@ static inline vec3 unit_direction(constant camera *cam, vec3 mean, vreal *inv_no
 }
 
 // Overwrites depth_key [n], which grows with depth, or is CULLED_KEY for a splat that is not seen. Overwrites tile_rect [n]: x
-// and y of the first tile, then of the tile past the end. Overwrites records [n, RECORD], but leaves alone those of a vector
+// and y of the first tile, then of the tile past the end. Overwrites records [n, RECORD_STRIDE], but leaves alone those of a vector
 // of splats without a seen one. Global size: splats / LANES.
 kernel void project_splats(
     global const real *restrict geom,
@@ -134,10 +134,10 @@ kernel void project_splats(
         for (int c = 0; c < 3; ++c) rgb[c] += basis[k] * lanes_load(sh + first + (ulong)(3 * k + c) * capacity);
     for (int c = 0; c < 3; ++c) out[HEAD_RED + c] = max(rgb[c], (vreal)0);
 
-    real lane[LANES][RECORD], edge[5][LANES];
+    real lane[LANES][RECORD_STRIDE], edge[5][LANES];
     real column[LANES];
-    for (int j = 0; j < RECORD; ++j) {
-        lanes_store(out[j], column);
+    for (int j = 0; j < RECORD_STRIDE; ++j) {
+        lanes_store(j < RECORD ? out[j] : (vreal)0, column);
         for (int l = 0; l < LANES; ++l) lane[l][j] = column[l];
     }
     lanes_store(x_lo, edge[0]);
@@ -148,7 +148,7 @@ kernel void project_splats(
     for (int l = 0; l < LANES && first + l < n_splats; ++l) {
         const uint i = first + l;
         const bool keep = edge[4][l] > 0;
-        for (int j = 0; j < RECORD; ++j) records[(ulong)i * RECORD + j] = lane[l][j];
+        store_record(lane[l], record_at(records, i));
         depth_key[i] = keep ? as_uint((float)lane[l][HEAD_DEPTH]) : CULLED_KEY;
         const int4 rect = {
             max((int)edge[0][l], 0) / TILE, max((int)edge[2][l], 0) / TILE, min((int)edge[1][l] / TILE + 1, tiles_x),
@@ -198,7 +198,7 @@ kernel void project_splats_vjp(
     }
     for (int l = 0; l < LANES; ++l) {
         const ulong i = min(first + l, n_splats - 1);
-        for (int c = 0; c < 3; ++c) seen_rgb[c][l] = records[i * RECORD + HEAD_RED + c] > 0 ? flag[l] : 0;
+        for (int c = 0; c < 3; ++c) seen_rgb[c][l] = record_at(records, i)[HEAD_RED + c] > 0 ? flag[l] : 0;
     }
     const splat_terms s = splat_project(geom + first, capacity, cam);
 

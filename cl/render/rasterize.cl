@@ -88,7 +88,7 @@ kernel void rasterize(
     real background_b
 ) {
     BATCH_MEMORY;
-    local real scratch[GROUP_SCRATCH(1)];
+    local real scratch[GROUP_SCRATCH];
     const int tile = get_group_id(0);
     const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
     const uint2 range = tile_ranges[tile];
@@ -117,8 +117,8 @@ kernel void rasterize(
 #if CULLS_BLOCKS  // for the whole batch first: the processor then knows early which blocks come next
         block_set reached[BATCH];
         for (int k = 0; k < n; ++k) {
-            real rec[RECORD];
-            read_record(batch_record(k), rec);
+            real rec[RECORD_STRIDE];
+            read_record(k, rec);
             reached[k] = blocks_reached(rec, tile_x, tile_y) & live;
             isect_blocks[lists[start + k]] = reached[k];
         }
@@ -128,8 +128,8 @@ kernel void rasterize(
             const block_set blocks = strips[k];
             if (!blocks) continue;  // uniform over the group
 #endif
-            real rec[RECORD];
-            read_record(batch_record(k), rec);
+            real rec[RECORD_STRIDE];
+            read_record(k, rec);
 #if CULLS_BLOCKS
             const block_set blocks = reached[k];
 #elif !CULLS_STRIPS
@@ -211,7 +211,8 @@ kernel void rasterize_vjp(
     ulong plane
 ) {
     BATCH_MEMORY;
-    local real scratch[GROUP_SCRATCH(V_RECORD)];
+    local real scratch[GROUP_SCRATCH];
+    SUMS_MEMORY(V_RECORD);
     const int tile = get_group_id(0);
     const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
     const uint2 range = tile_ranges[tile];
@@ -242,15 +243,15 @@ kernel void rasterize_vjp(
         stage_records(start, n);
 #if CULLS_STRIPS
         for (int k = LID; k < n; k += GROUP)
-            if (!strips[k]) zero_grads(isect_grads + (ulong)lists[start + k] * V_RECORD);
+            if (!strips[k]) zero_grads(isect_grads + (ulong)batch_isect(k) * V_RECORD);
 #endif
         for (int k = 0; k < n; ++k) {
 #if CULLS_STRIPS
             const block_set blocks = strips[k];
             if (!blocks) continue;  // uniform over the group
 #endif
-            real rec[RECORD];
-            read_record(batch_record(k), rec);
+            real rec[RECORD_STRIDE];
+            read_record(k, rec);
             vreal sums[V_RECORD];
             UNROLL for (int j = 0; j < V_RECORD; ++j) sums[j] = (vreal)0;
 #if CULLS_BLOCKS
@@ -291,7 +292,8 @@ kernel void rasterize_vjp(
             real item_sums[V_RECORD];  // over the blocks of this work-item
             lanes_sums(sums, V_RECORD, item_sums);
             if (plain) shape_sums_plain(item_sums);
-            group_sum_store(item_sums, V_RECORD, scratch, isect_grads + (ulong)lists[start + k] * V_RECORD);
+            sums_store(item_sums, V_RECORD, batch_isect(k), isect_grads);
         }
+        sums_finish(V_RECORD, isect_grads);
     }
 }

@@ -31,12 +31,13 @@ kernel void map_skew(global real *restrict geom, global const real *restrict ske
 #endif
 #endif
 
-// Steps all parameters. The second index of a work-item says what it steps. The first `coefficients` are those of the colour.
-// Then come `parts` of the geometry, from first_part on, and then the skew. With a map that depends on the rotation, the skew
+// Steps all parameters. The second index of a work-item says what it steps. The first are the `coefficients` of the colour:
+// COEFFICIENTS of them each. CPUs take one, so that few memory streams are open at the same time. GPUs take all, so that the
+// gradient is read once, and many loads are under way. Then come `parts` of the geometry, from first_part on, and then the skew. With a map that depends on the rotation, the skew
 // has a launch of its own after the geometry. lr is the rate of the colour's constant band, rest_lr the rate of the others.
 // With LAZY, vectors of splats with a negative age do not step (lazy.clh). Their geometry and skew do, unless geometry_waits.
 // With `catches_up`, the others do their skipped steps first.
-// Global size: (capacity / LANES, coefficients + parts, and one more for the skew).
+// Global size: (capacity / LANES, coefficients / COEFFICIENTS, rounded up, + parts, and one more for the skew).
 kernel void step_splats(
     global real *restrict sh,
     global const real *restrict grad_sh,
@@ -87,27 +88,34 @@ kernel void step_splats(
     const uint k = get_global_id(1);
 #if LAZY
     const int2 age = ages[get_global_id(0)];
-    if ((k < coefficients || geometry_waits) && age.x < 0) return;
+    if ((k * COEFFICIENTS < coefficients || geometry_waits) && age.x < 0) return;
     const int2 skipped = catches_up ? age : (int2)(0, 0);
 #endif
-    if (k < coefficients) {
+    const uint color_items = (coefficients + COEFFICIENTS - 1) / COEFFICIENTS;
+    if (k < color_items) {
 #if HALF_MOMENTS
         const color_moments adam = {sh_moments + i, correct1, correct2, (uint2)(seed_lo, seed_hi), step, i};
 #else
         const color_moments adam = {sh_m + i, sh_v + i, correct1, correct2};
 #endif
+        UNROLL for (uint j = 0; j < COEFFICIENTS; ++j) {
+            const uint c = COEFFICIENTS == SH_COUNT ? j : k * COEFFICIENTS + j;
+            if (c < coefficients) {
+                const real rate = c == 0 ? lr : rest_lr;
 #if LAZY
-        catch_up_coefficient(k, skipped.x, decays, k == 0 ? lr : rest_lr, sh + i, adam, capacity, false);
+                catch_up_coefficient(c, skipped.x, decays, rate, sh + i, adam, capacity, false);
 #endif
-        step_coefficient(k, sh_degree, k == 0 ? lr : rest_lr, sh + i, grad_sh + i, adam, capacity);
-    } else if (k < coefficients + parts) {
+                step_coefficient(c, sh_degree, rate, sh + i, grad_sh + i, adam, capacity);
+            }
+        }
+    } else if (k < color_items + parts) {
         const adam_moments adam = {geom_m + i, geom_v + i, correct1, correct2};
 #if LAZY
         if (geometry_waits)
-            catch_up_part(first_part + k - coefficients, skipped.x, decays, rates, geom + i, adam, capacity, false);
+            catch_up_part(first_part + k - color_items, skipped.x, decays, rates, geom + i, adam, capacity, false);
 #endif
         step_part(
-            first_part + k - coefficients, geom + i, grad_geom + i, adam, rates, capacity, mean_lr, opacity_scale,
+            first_part + k - color_items, geom + i, grad_geom + i, adam, rates, capacity, mean_lr, opacity_scale,
             scale_scale, bisect_scale
         );
     } else {

@@ -65,7 +65,7 @@ def measure_roofline(device: Device, repeats: int = _REPEATS, nbytes: int | None
 
 def _copy(device: Device, nbytes: int, repeats: int) -> float:
     kernel = roofline_program(device, CHAINS[0]).copy_vectors
-    vector = 64 if device.info.type == "CPU" else 4  # bytes
+    vector = 64 if device.info.type == "CPU" else 16  # bytes
     n = nbytes // vector
     source, target = device.alloc(n * vector), device.alloc(n * vector)
     fill_zero(device, source, n * vector)

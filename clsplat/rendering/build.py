@@ -39,6 +39,7 @@ _BELOW_SHAPE = (
     "shape/forms.clh",
     "shape/contract.clh",
     "shape/rectangle.clh",
+    "render/record.clh",
 )
 _PROJECTION = ("render/antialias.clh", "render/project.cl")
 _PIXELS = ("render/batch.clh", "render/blocks.clh", "render/rasterize.cl", "render/gather.cl")
@@ -78,8 +79,9 @@ class KernelBuild:
 
     @property
     def record(self) -> int:
-        """Reals of a screen record."""
-        return len(RECORD_HEAD) + shape_named(self.shape).record
+        """Length of a screen record [reals]: whole vectors of four with one lane (cl/render/record.clh)."""
+        used = len(RECORD_HEAD) + shape_named(self.shape).record
+        return -(-used // 4) * 4 if self.lanes == 1 else used
 
     @property
     def v_record(self) -> int:

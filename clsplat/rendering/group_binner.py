@@ -1,4 +1,4 @@
-"""The binner for devices with many work-items: a work-item for a few splats, and two sorts."""
+"""The binner for devices with many work-items: a work-item for each splat, and two sorts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from .frame import Band, ProjectedSplats, TileLists
 from .radix_sort import Sorter, SortMemory, sort_group
 
 DEPTH_BITS = 30  # of a depth key above that of the near plane: all depths up to 2^128 times the nearest one
-_RUN = 4  # splats of a work-item that counts or lists isects
 
 
 def make_binner(pool: Pool, kernels: KernelBuild) -> Binner:
@@ -29,7 +28,7 @@ def make_binner(pool: Pool, kernels: KernelBuild) -> Binner:
 def group_binning_program(device: Device, kernels: KernelBuild, group: int) -> Program:
     """Return the program that lists isects by splat, for work-groups of `group` items."""
     files = ("render/scan.clh", "render/band.clh", "render/group_bin.cl")
-    return kernels.binning_program(device, files, {"SCAN_GROUP": group, "RUN": _RUN})
+    return kernels.binning_program(device, files, {"SCAN_GROUP": group})
 
 
 class GroupBinner:
@@ -100,7 +99,7 @@ class GroupBinner:
     @property
     def _n_blocks(self) -> int:
         """Blocks of depth ranks; a work-group has one."""
-        return -(-self._splats.n // (self.group * _RUN))
+        return -(-self._splats.n // self.group)
 
     def _count(self, first: int, end: int) -> None:
         """Write the first isect of each block, and the number of isects."""

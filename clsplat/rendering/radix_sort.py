@@ -11,7 +11,7 @@ from ..device.program import Program, build
 
 DIGIT_BITS = 6  # sorted by one pass
 _MAX_GROUP, _GROUP_STEP = 128, 1 << DIGIT_BITS  # a group has a whole number of work-items for each digit
-_RUN = 16  # pairs of a work-item
+_RUN = 16  # pairs of a work-item, a multiple of 4
 _IN_GROUPS = ("radix_histogram", "radix_scan", "radix_scatter")  # kernels whose work-items work together
 
 
@@ -22,7 +22,8 @@ def radix_passes(key_bits: int) -> int:
 
 def sort_program(device: Device, group: int) -> Program:
     """Return the program of sorts, for work-groups of `group` items."""
-    return build(device, ("render/scan.clh", "render/sort.cl"), {"SCAN_GROUP": group, "RADIX_BITS": DIGIT_BITS})
+    defines = {"SCAN_GROUP": group, "RADIX_BITS": DIGIT_BITS, "RUN": _RUN}
+    return build(device, ("math/lanes.clh", "render/scan.clh", "render/sort.cl"), {"LANES": 1, **defines})
 
 
 def sort_group(device: Device) -> int:
@@ -80,7 +81,7 @@ class Sorter:
         target = memory.spare_keys.reserve(n), memory.spare_values.reserve(n)
         spare = memory.keys.reserve(n), values
         for shift in range(0, key_bits, DIGIT_BITS):
-            part = {"n": n, "run": _RUN, "base": smallest, "top": (1 << key_bits) - 1, "shift": shift}
+            part = {"n": n, "base": smallest, "top": (1 << key_bits) - 1, "shift": shift}
             self.program.radix_histogram(size, local, keys=keys, counts=counts, **part)
             self.program.radix_scan((self.group << DIGIT_BITS,), local, counts=counts, totals=totals, n_blocks=n_blocks)
             self.program.radix_scatter(

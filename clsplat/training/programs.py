@@ -8,7 +8,7 @@ from ..device.device import Device
 from ..device.program import Define, Program, build
 from ..device.schedule import Schedule
 from ..rendering.build import CULLED_KEY, MARGIN_X, MARGIN_Y, KernelBuild, layout_defines
-from ..splats.fields import Group
+from ..splats.fields import Group, sh_coefficients
 from ..splats.harmonics import SH_C0
 from ..splats.low_pass import LOW_PASS
 from ..splats.near_plane import NEAR_PLANE
@@ -71,6 +71,11 @@ def exposure_program(device: Device, kernels: KernelBuild, group: int = EXPOSURE
         "SUMS": EXPOSURE_SUMS,
     }
     return build(device, ("math/lanes.clh", "train/exposure.cl"), defines, kernels.real)
+
+
+def coefficients_of_item(kernels: KernelBuild) -> int:
+    """Return the number of coefficients of the colour that one work-item steps (cl/train/optim.cl)."""
+    return sh_coefficients(kernels.sh_degree) if kernels.lanes == 1 else 1
 
 
 # Parts of a geometry step (cl/train/optim.cl): a work-item steps the rows of one part.
@@ -147,6 +152,7 @@ def _optim_defines(kernels: KernelBuild, half_moments: bool) -> dict[str, Define
     return defines | {
         "PART_ROWS": max(4, sum(widths.values())),
         "LANES": kernels.lanes,
+        "COEFFICIENTS": coefficients_of_item(kernels),
         "HALF_MOMENTS": int(half_moments),
         "FULL_MOMENTS": int(not half_moments),
         "SKEW_MAP": SKEW_MAPS.index(kernels.skew_map),

@@ -23,7 +23,8 @@ CHILD = """
 import hashlib, sys
 import numpy as np
 from clsplat.cameras.camera import Camera
-from clsplat.device.schedule import SCHEDULES
+from clsplat.device.device import open_device
+from clsplat.device.schedule import default_schedule
 from clsplat.rendering.renderer import Renderer
 from clsplat.splats.splats import Splats
 rng = np.random.default_rng(0)
@@ -31,7 +32,8 @@ splats = Splats("gaussian", {"mean": rng.uniform(-1, 1, (50, 3)), "quat": rng.st
     "log_scale": np.full((50, 3), -2.0), "opacity_logit": np.zeros(50), "sh": rng.standard_normal((50, 1, 3))})
 pose = np.eye(4)
 pose[2, 3] = 4
-image = Renderer(sys.argv[1], schedule=SCHEDULES["cpu16"]).render(splats, Camera(40, 30, 40, 40, 20, 15, pose))
+device = open_device(sys.argv[1])
+image = Renderer(device, schedule=default_schedule(device.info)).render(splats, Camera(40, 30, 40, 40, 20, 15, pose))
 assert image.color.max() > 0.1
 print(hashlib.sha256(image.color.tobytes()).hexdigest())
 """

@@ -27,7 +27,7 @@ def test_fma_takes_every_step_on_every_chain(device: Device, chains: int) -> Non
 
 
 def test_copy_copies_all_and_no_more(device: Device) -> None:
-    lanes = 16 if device.info.type == "CPU" else 1
+    lanes = 16 if device.info.type == "CPU" else 4
     values = np.random.default_rng(0).random((100, lanes), np.float32)
     source, target = device.alloc(values.nbytes), device.alloc(values.nbytes)
     to_device(device, source, values)

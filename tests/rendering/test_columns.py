@@ -98,6 +98,8 @@ def test_native_pixels_agree_with_the_reference(
 
 def test_native_pixels_are_other_ones(make_renderer: MakeRenderer, device: Device) -> None:
     """The test above would pass without native functions: here they change the last bits."""
+    if device.info.type == "GPU":
+        pytest.skip("both would have native functions")
     case = Case(random_splats(11, 24, 3), random_camera(1, 41, 27), "skew-normal")
     native, exact = (
         case.render(make_renderer(one, schedule=SCHEDULES["gpu32"])).color for one in (as_gpu(device), device)

@@ -47,7 +47,7 @@ FAULTS = {
 OF_A_KIND = [  # faults of the binners
     ("CPU", "++bottom[rect.z];", ""),
     ("CPU", "depth_order[start + k] =", "depth_order[n - 1 - start - k] ="),
-    ("GPU", "numbered ? (uint)k", "numbered ? (uint)(n - 1 - k)"),
+    ("GPU", "numbered ? (uint)start + k", "numbered ? n - 1 - (uint)start - k"),
     ("GPU", "n_isects, tile + 1)", "n_isects, tile)"),
 ]
 

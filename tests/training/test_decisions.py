@@ -204,7 +204,8 @@ def test_transparent_photos_get_random_backgrounds(scene: Scene) -> None:
 
 def test_only_visible_splats_step_on_a_gpu_that_sees_a_part(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Photos show half of the points of this scene: the others are behind all cameras."""
-    points, device = scene.points, SimpleNamespace(info=SimpleNamespace(type="GPU"))
+    points = scene.points
+    devices = {kind: SimpleNamespace(info=SimpleNamespace(type=kind)) for kind in ("CPU", "GPU")}
     behind = points.xyz + 1e4
     doubled = [
         np.concatenate([a, b]) for a, b in ((points.xyz, behind), *[(a, a) for a in (points.rgb, points.track_length)])
@@ -212,8 +213,9 @@ def test_only_visible_splats_step_on_a_gpu_that_sees_a_part(scene: Scene, monkey
     part = replace(scene, points=Points(*doubled))
     assert mean_share_seen([view.camera for view in part.train], part.points.xyz) < 0.5
     config = options_of(cap_max=200_000)
-    assert not decide(part, config).config.optim.visible_adam, "a CPU"
-    monkeypatch.setattr("clsplat.training.decisions.open_device", lambda name: device)
+    monkeypatch.setattr("clsplat.training.decisions.open_device", lambda name: devices["CPU"])
+    assert not decide(part, config).config.optim.visible_adam
+    monkeypatch.setattr("clsplat.training.decisions.open_device", lambda name: devices["GPU"])
     decision = decide(part, config)
     assert decision.config.optim.visible_adam
     assert re.search(r"steps of visible splats only, because a photo shows [34]\d% of the points", str(decision))

@@ -15,7 +15,7 @@ from ...rendering.splat_buffers import CompactGradients, SplatBuffers
 from ...splats.fields import Array, Group, Schema, sh_coefficients
 from ..columns import Columns
 from ..density.edit import DensifyEdit
-from ..programs import PARTS, columns_program, optim_program
+from ..programs import PARTS, coefficients_of_item, columns_program, optim_program
 from .adam import BETA1, BETA2
 from .moments import AdamMoments
 from .rules import Rules, StepCounts, check_state
@@ -185,10 +185,11 @@ class FusedOptimizer:
         self, arguments: dict[str, Any], with_skew: bool, coefficients: int = 0, first_part: int = 0, parts: int = 0
     ) -> None:
         """Step coefficients of the colour, parts of the geometry, and the skew."""
+        color_items = -(-coefficients // coefficients_of_item(self.kernels))
         self.program.step_splats.over(
             self._columns,
             GROUP_ITEMS,
-            coefficients + parts + int(with_skew),
+            color_items + parts + int(with_skew),
             coefficients=coefficients,
             first_part=first_part,
             parts=parts,
