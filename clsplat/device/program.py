@@ -99,9 +99,9 @@ def _built(device: Device, text: str, defines: Mapping[str, Define], real: Real)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)  # some compilers warn at every success
-            built = _compiled(device, with_defines(text, defines, real, device.info), _options(device.info))
+            built = _compiled(device, whole := with_defines(text, defines, real, device.info), _options(device.info))
     except cl.Error as error:
-        raise _build_error(device, error, defines, real) from None
+        raise _build_error(device, error, whole, defines, real) from None
     return built, parse_signatures(text, real, defines)
 
 
@@ -343,11 +343,25 @@ def _literal(name: str, value: Define, real: Real) -> str:
     return f"({text})" if value < 0 else text
 
 
-def _build_error(device: Device, error: Exception, defines: Mapping[str, Define], real: Real) -> DeviceError:
+def _build_error(device: Device, error: Exception, text: str, defines: Mapping[str, Define], real: Real) -> DeviceError:
+    """Return the error of a build. text : what the compiler read."""
     log = str(error)
     if "unknown target CPU" in log:
         return DeviceError(f"device {device.info}: {BROKEN_POCL}")
     lines = [line.strip() for line in log.splitlines()]
     reason = next((line for line in lines if re.search(r"\berror\b\s*:", line, re.I)), first_line(error))
+    reason = _with_file(reason, text)
     values = " ".join(f"{name}={value}" for name, value in defines.items())
     return DeviceError(f"kernels do not build on {device.info}: {reason} (real={real} {values})")
+
+
+def _with_file(message: str, text: str) -> str:
+    """Return a message with a file and its line instead of a line of the whole text: NVIDIA's compiler skips `#line`."""
+    found = re.match(r"<kernel>:(\d+)", message)
+    if found is None:
+        return message
+    lines = text.splitlines()[: int(found[1])]
+    for back, line in enumerate(reversed(lines)):
+        if start := re.match(r'#line (\d+) "(.*)"', line):
+            return f"{start[2]}:{int(start[1]) + back - 1}{message[found.end() :]}"
+    return message

@@ -130,6 +130,23 @@ def test_build_error_names_file_line_device_and_defines(device):
         assert part in message
 
 
+def test_a_line_of_the_whole_text_becomes_a_file_and_its_line(monkeypatch):
+    """NVIDIA's compiler counts the lines of the text, and skips `#line`."""
+
+    def refuse(*args):
+        line = 1 + args[1].splitlines().index("second of b")
+        raise cl.RuntimeError(f"<kernel>:{line}:28: error: unknown type")
+
+    monkeypatch.setattr(cl, "Program", refuse)
+    for text, place in (
+        ('#line 1 "a.clh"\none\n#line 1 "b.cl"\n\nsecond of b\n', " b.cl:2:28: error: unknown type"),
+        ("second of b\n", " <kernel>:5:28: error"),
+    ):
+        with pytest.raises(DeviceError) as caught:
+            build_text(open_device(), text, {"LANES": 16})
+        assert place in str(caught.value)
+
+
 def test_unknown_cpu_is_named_as_the_broken_wheel(monkeypatch):
     def refuse(*args):
         raise cl.RuntimeError("error: unknown target CPU 'generic'")
