@@ -31,7 +31,7 @@ from clsplat.profiling.gpu_counts import Shares, counts_of
 from clsplat.profiling.gpu_model import Predicted, fastest_schedule, predict, total_ms
 from clsplat.profiling.gpus import GPUS, Gpu
 from clsplat.profiling.stages import Sizes
-from clsplat.rendering.build import BATCH, CULLED_KEY, KernelBuild
+from clsplat.rendering.build import CULLED_KEY, GROUP_BATCH, KernelBuild
 from clsplat.rendering.overdraw import count_pairs
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.splat_buffers import SplatBuffers
@@ -140,7 +140,7 @@ def frame_work(trainer: Trainer, scene: str) -> Workload:
     place = order - ranges[tile, 0]  # in the list of its tile
     last = np.zeros(layout.n_tiles, np.int64)
     np.maximum.at(last, tile, np.where(blocks[order] != 0, place + 1, 0))
-    looked = place < -(-last[tile] // BATCH) * BATCH
+    looked = place < -(-last[tile] // GROUP_BATCH) * GROUP_BATCH
     seen = np.zeros(n_isects, bool)
     seen[ids[order]] = looked
 

@@ -32,7 +32,7 @@ GPU_SCHEDULES = tuple(name for name, schedule in SCHEDULES.items() if schedule.g
 SCAN_GROUP, ITEM_GROUP = 128, 64
 _SH_DEGREE = 3
 _PIXEL_KERNELS = ("rasterize", "rasterize_vjp")
-_SCAN_KERNELS = ("radix_histogram", "radix_scan", "radix_scatter", "count_isects", "scan_isects", "emit_isects")
+_SCAN_KERNELS = ("radix_histogram", "radix_scan", "radix_scatter", "count_isects", "scan_isects")
 
 
 def programs() -> dict[str, str]:

@@ -1,7 +1,8 @@
 // group_bin.cl: isects by splat, for devices with many work-items, and the range of each tile after a sort by tile (sort.cl).
 //
-// A work-item has a depth rank. A group counts the isects of its ranks; one group scans the counts of all groups; then each
-// group scans the counts of its items and writes their isects.
+// A work-item counts the isects of a depth rank, and a group scans the counts of its block of ranks. One group scans the
+// sums of all blocks. Then a work-item lists one isect: if it listed those of a splat, everything would wait for the splats
+// that cover the image.
 
 // Tiles of the band that a rectangle of tiles meets.
 static inline uint tiles_in_band(int4 rect, int first_tile, int end_tile, int tiles_x) {
@@ -14,47 +15,15 @@ static inline uint tiles_in_band(int4 rect, int first_tile, int end_tile, int ti
     return count;
 }
 
-// Overwrites block_counts [groups]: the isects of the band in each group's depth ranks.
+// Overwrites block_counts [groups] with the isects of the band in each block of depth ranks, and rank_starts [n], by rank, with
+// those of the block before the rank. Overwrites splat_isects [n] with empty ranges.
 SCAN_ATTRIBUTE
 kernel void count_isects(
     global const uint *restrict order,
     global const int4 *restrict tile_rect,
     global uint *restrict block_counts,
-    uint n_splats,
-    int first_tile,
-    int end_tile,
-    int tiles_x
-) {
-    local ulong sums[SCAN_GROUP];
-    const uint rank = get_global_id(0);
-    const int4 rect = rank < n_splats ? tile_rect[order[rank]] : (int4)(0, 0, 0, 0);
-    scan_group(tiles_in_band(rect, first_tile, end_tile, tiles_x), sums);
-    if (get_local_id(0) == 0) block_counts[get_group_id(0)] = (uint)sums[SCAN_GROUP - 1];
-}
-
-// Replaces block_counts [n_blocks] by their exclusive scan, modulo 2^32, and writes their sum to total[0]. One group.
-SCAN_ATTRIBUTE
-kernel void scan_isects(global uint *restrict block_counts, global ulong *restrict total, uint n_blocks) {
-    local ulong sums[SCAN_GROUP];
-    const ulong sum = scan_blocks(block_counts, n_blocks, sums);
-    if (get_local_id(0) == 0) total[0] = sum;
-}
-
-// Overwrites splat_isects [n], by splat, with the first isect and the end; and for each isect [n_isects] isect_tile, the key
-// of the sort, and isect_splat. CULLS_STRIPS: isect_blocks, too, with the strips that the splat reaches (strips.clh).
-// block_starts [groups]: what scan_isects wrote.
-SCAN_ATTRIBUTE
-kernel void emit_isects(
-    global const uint *restrict order,
-    global const int4 *restrict tile_rect,
-    global const uint *restrict block_starts,
+    global uint *restrict rank_starts,
     global uint2 *restrict splat_isects,
-    global uint *restrict isect_tile,
-    global uint *restrict isect_splat,
-#if CULLS_STRIPS
-    global const real *restrict records,
-    global uint *restrict isect_blocks,
-#endif
     uint n_splats,
     int first_tile,
     int end_tile,
@@ -64,25 +33,18 @@ kernel void emit_isects(
     const uint rank = get_global_id(0), i = rank < n_splats ? order[rank] : 0;
     const int4 rect = rank < n_splats ? tile_rect[i] : (int4)(0, 0, 0, 0);
     const uint before = (uint)scan_group(tiles_in_band(rect, first_tile, end_tile, tiles_x), sums);
+    if (get_local_id(0) == 0) block_counts[get_group_id(0)] = (uint)sums[SCAN_GROUP - 1];
     if (rank >= n_splats) return;
-    const uint start = block_starts[get_group_id(0)] + before;
-    uint at = start;
-#if CULLS_STRIPS
-    real rec[RECORD_STRIDE];
-    load_record(record_at(records, i), rec);
-#endif
-    const int end_y = min(rect.w, end_row_of(end_tile, tiles_x));
-    for (int y = max(rect.y, first_row_of(first_tile, tiles_x)); y < end_y; ++y) {
-        const int row = y * tiles_x, end_x = min(rect.z, end_tile - row);
-        for (int x = max(rect.x, first_tile - row); x < end_x; ++x, ++at) {
-#if CULLS_STRIPS
-            isect_blocks[at] = strips_reached(rec, x * TILE, y * TILE);
-#endif
-            isect_tile[at] = (uint)(row + x);
-            isect_splat[at] = i;
-        }
-    }
-    splat_isects[i] = (uint2)(start, at);
+    rank_starts[rank] = before;
+    splat_isects[i] = (uint2)(0, 0);
+}
+
+// Replaces block_counts [n_blocks] by their exclusive scan, modulo 2^32, and writes their sum to total[0]. One group.
+SCAN_ATTRIBUTE
+kernel void scan_isects(global uint *restrict block_counts, global ulong *restrict total, uint n_blocks) {
+    local ulong sums[SCAN_GROUP];
+    const ulong sum = scan_blocks(block_counts, n_blocks, sums);
+    if (get_local_id(0) == 0) total[0] = sum;
 }
 
 // The first of n sorted values that is not below `value`, or n.
@@ -94,6 +56,55 @@ static inline uint first_not_below(global const uint *sorted, uint n, uint value
         else high = middle;
     }
     return low;
+}
+
+// The tile of isect `k` of a splat: tiles of its rectangle row by row. The band cuts the first row, and the last one.
+static inline int tile_of_isect(int4 rect, uint k, int first_tile, int tiles_x) {
+    const int y = max(rect.y, first_row_of(first_tile, tiles_x)), skipped = max(first_tile - y * tiles_x - rect.x, 0);
+    const int width = rect.z - rect.x, place = (int)k + min(skipped, width);
+    return (y + place / width) * tiles_x + rect.x + place % width;
+}
+
+// Overwrites for each isect [n_isects] isect_tile, the key of the sort, and isect_splat. CULLS_STRIPS: isect_blocks, too, with
+// the strips that the splat reaches (strips.clh). Overwrites splat_isects of splats with isects: the first one and the end.
+// block_starts [n_blocks] and rank_starts: what scan_isects and count_isects wrote.
+kernel void emit_isects(
+    global const uint *restrict order,
+    global const int4 *restrict tile_rect,
+    global const uint *restrict block_starts,
+    global const uint *restrict rank_starts,
+    global uint2 *restrict splat_isects,
+    global uint *restrict isect_tile,
+    global uint *restrict isect_splat,
+#if CULLS_STRIPS
+    global const real *restrict records,
+    global uint *restrict isect_blocks,
+#endif
+    uint n_splats,
+    uint n_blocks,
+    uint n_isects,
+    int first_tile,
+    int end_tile,
+    int tiles_x
+) {
+    const uint isect = get_global_id(0);
+    if (isect >= n_isects) return;
+    // The last block, and in it the last rank, that starts at this isect or before.
+    const uint block = first_not_below(block_starts, n_blocks, isect + 1) - 1;
+    const uint first_rank = block * SCAN_GROUP, in_block = isect - block_starts[block];
+    const uint ranks = min(n_splats - first_rank, (uint)SCAN_GROUP);
+    const uint rank = first_rank + first_not_below(rank_starts + first_rank, ranks, in_block + 1) - 1;
+    const uint i = order[rank], k = in_block - rank_starts[rank];
+    const int4 rect = tile_rect[i];
+    const int tile = tile_of_isect(rect, k, first_tile, tiles_x);
+    isect_tile[isect] = (uint)tile;
+    isect_splat[isect] = i;
+    if (k == 0) splat_isects[i] = (uint2)(isect, isect + tiles_in_band(rect, first_tile, end_tile, tiles_x));
+#if CULLS_STRIPS
+    real rec[RECORD_STRIDE];
+    load_record(record_at(records, i), rec);
+    isect_blocks[isect] = strips_reached(rec, tile % tiles_x * TILE, tile / tiles_x * TILE);
+#endif
 }
 
 // Overwrites tile_ranges [n_tiles]: first position and end of each tile in the sorted list; equal for tiles without isects.

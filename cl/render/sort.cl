@@ -160,7 +160,7 @@ kernel void radix_scatter(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     const ulong first_pair = (ulong)get_group_id(0) * BLOCK;
-    const uint n_pairs = (uint)min((ulong)BLOCK, n - first_pair);
+    const uint n_pairs = first_pair + BLOCK <= n ? BLOCK : (uint)(n - first_pair);
     for (uint place = lid; place < n_pairs; place += SCAN_GROUP) {
         const uint key = words[place], to = place + moves[digit_of(key, base, top, shift)];
         keys_out[to] = key;

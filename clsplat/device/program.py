@@ -356,7 +356,10 @@ def _build_error(device: Device, error: Exception, text: str, defines: Mapping[s
 
 
 def _with_file(message: str, text: str) -> str:
-    """Return a message with a file and its line instead of a line of the whole text: NVIDIA's compiler skips `#line`."""
+    """Return a message with a file and its line instead of a line of the whole text.
+
+    NVIDIA's compiler does not read `#line`.
+    """
     found = re.match(r"<kernel>:(\d+)", message)
     if found is None:
         return message

@@ -18,7 +18,7 @@ from ..splats.shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, Shape, shape_na
 from .camera_block import CAMERA_MEMBERS
 
 MARGIN_X, MARGIN_Y = 16, 8  # zero margin of every image plane: the SSIM window reaches 5 pixels out
-BATCH = 64
+BATCH, GROUP_BATCH = 64, 32  # isects of a tile that are looked at together; a group has little local memory
 
 ALPHA_MIN, ALPHA_MAX, T_MIN = 1.0 / 255.0, 0.99, 1e-4  # of gsplat and 3DGS
 CULLED_KEY = 0xFFFFFFFF  # depth key of a splat that the image does not show
@@ -89,6 +89,11 @@ class KernelBuild:
         return shape_named(self.shape).moments + 3
 
     @property
+    def batch(self) -> int:
+        """Isects of a tile that are looked at together (cl/render/batch.clh)."""
+        return BATCH if self.schedule.group == 1 else GROUP_BATCH
+
+    @property
     def culls_blocks(self) -> bool:
         """Whether an isect has a set of blocks, a bit each (cl/render/blocks.clh)."""
         return self.schedule.group == 1 and self.schedule.lanes > 1
@@ -150,7 +155,7 @@ class KernelBuild:
                 "CAMERA_MEMBERS": ", ".join(CAMERA_MEMBERS),
                 "CULLED_KEY": f"{CULLED_KEY:#x}u",
                 "TILE": TILE,
-                "BATCH": BATCH,
+                "BATCH": self.batch,
                 "MARGIN_X": MARGIN_X,
                 "MARGIN_Y": MARGIN_Y,
                 "GROUP": self.schedule.group,

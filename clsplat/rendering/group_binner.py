@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ..device.device import Device
@@ -48,14 +50,17 @@ class GroupBinner:
         self._ranges, self._splat_isects = pool.buffer(np.uint32, 2), pool.buffer(np.uint32, 2)
         self._isect_splat, self._isect_strips = pool.buffer(np.uint32), pool.buffer(np.uint32)
         self._splats: ProjectedSplats
-        self._order: Buffer
+        self._order: Buffer  # splats by depth
+        self._rank_starts: Buffer  # in the memory of the sorted depths, which nothing else needs
         self._tiles_x, self._n_tiles = 0, 0
         self._counted: tuple[int, int] | None = None  # tiles whose counts are in the buffer
 
     def order(self, splats: ProjectedSplats) -> None:
         self._splats = splats
         self._by_depth.reserve(splats.capacity)
-        self._order = self.sorter.sort(splats.depth_key, splats.n, DEPTH_BITS, self._by_depth, self.smallest_key)[1]
+        self._rank_starts, self._order = self.sorter.sort(
+            splats.depth_key, splats.n, DEPTH_BITS, self._by_depth, self.smallest_key
+        )
 
     def begin(self, tiles_x: int, tiles_y: int) -> None:
         self._tiles_x, self._n_tiles, self._counted = tiles_x, tiles_x * tiles_y, None
@@ -70,22 +75,17 @@ class GroupBinner:
             self._count(band.first, band.end)
         ids = self._by_tile.values.reserve(n_isects)
         tiles = self._by_tile.keys.reserve(n_isects)
-        splat_isects, isect_splat = self._splat_isects.reserve(splats.capacity), self._isect_splat.reserve(n_isects)
+        isect_splat = self._isect_splat.reserve(n_isects)
         strips = self._isect_strips.reserve(n_isects) if self.kernels.culls_strips else None
-        self.program.emit_isects(
-            (self._n_blocks * self.group,),
-            (self.group,),
-            order=self._order,
-            tile_rect=splats.tile_rect,
+        self.program.emit_isects.over(
+            n_isects,
             block_starts=self._blocks.buffer,
-            splat_isects=splat_isects,
             isect_tile=tiles,
             isect_splat=isect_splat,
+            n_blocks=self._n_blocks,
+            n_isects=n_isects,
             **strip_arguments(splats, strips),
-            n_splats=splats.n,
-            first_tile=band.first,
-            end_tile=band.end,
-            tiles_x=self._tiles_x,
+            **self._shared(band.first, band.end),
         )
         if n_isects:
             bits = max((self._n_tiles - 1).bit_length(), 1)
@@ -94,26 +94,31 @@ class GroupBinner:
         self.program.find_tile_ranges.over(
             self._n_tiles, sorted_tile=tiles, tile_ranges=ranges, n_isects=n_isects, n_tiles=self._n_tiles
         )
-        return TileLists(ranges, ids, isect_splat, splat_isects, strips)
+        return TileLists(ranges, ids, isect_splat, self._splat_isects.buffer, strips)
 
     @property
     def _n_blocks(self) -> int:
         """Blocks of depth ranks; a work-group has one."""
         return -(-self._splats.n // self.group)
 
+    def _shared(self, first: int, end: int) -> dict[str, Any]:
+        """Arguments of the kernels that count and list the isects of a band."""
+        return {
+            "order": self._order,
+            "tile_rect": self._splats.tile_rect,
+            "rank_starts": self._rank_starts,
+            "splat_isects": self._splat_isects.reserve(self._splats.capacity),
+            "n_splats": self._splats.n,
+            "first_tile": first,
+            "end_tile": end,
+            "tiles_x": self._tiles_x,
+        }
+
     def _count(self, first: int, end: int) -> None:
         """Write the first isect of each block, and the number of isects."""
-        splats, blocks = self._splats, self._blocks.reserve(self._n_blocks)
+        blocks = self._blocks.reserve(self._n_blocks)
         self.program.count_isects(
-            (self._n_blocks * self.group,),
-            (self.group,),
-            order=self._order,
-            tile_rect=splats.tile_rect,
-            block_counts=blocks,
-            n_splats=splats.n,
-            first_tile=first,
-            end_tile=end,
-            tiles_x=self._tiles_x,
+            (self._n_blocks * self.group,), (self.group,), block_counts=blocks, **self._shared(first, end)
         )
         self.program.scan_isects(
             (self.group,),

@@ -18,7 +18,7 @@ from clsplat.cameras.camera import Camera
 from clsplat.device.device import Device
 from clsplat.device.schedule import SCHEDULES, TILE, Schedule, default_schedule
 from clsplat.errors import InputError
-from clsplat.rendering.build import BATCH, KernelBuild
+from clsplat.rendering.build import BATCH, GROUP_BATCH, KernelBuild
 from clsplat.rendering.frame import DeviceImage
 from clsplat.rendering.pipeline import Pipeline
 from clsplat.rendering.renderer import Renderer
@@ -115,7 +115,7 @@ def thin_cases(shape: str) -> dict[str, Case]:
     for width, height in ((1, 1), (TILE, TILE), (TILE + 1, TILE - 1), (200, 5), (5, 130), (33, 64)):
         camera = random_camera(5, width, height)
         cases[f"{width} x {height}"] = Case(random_splats(5, 12, 3), camera, shape, fields=fields)
-    for n in (1, 7, 8, 9, 15, 16, 17, BATCH - 1, BATCH, BATCH + 1, 2 * BATCH + 1):
+    for n in (1, 7, 8, 9, 15, 16, 17, GROUP_BATCH - 1, GROUP_BATCH + 1, BATCH - 1, BATCH, BATCH + 1, 2 * BATCH + 1):
         arrays = random_splats(n, n, 3)
         arrays["opacity_logit"] -= 2.0  # splats are faint, so that every one contributes
         cases[f"{n} splats"] = Case(arrays, random_camera(3, 13, 11), shape, fields=fields)

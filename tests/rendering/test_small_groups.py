@@ -40,7 +40,6 @@ WITH_BARRIERS = {
     "radix_scatter",
     "count_isects",
     "scan_isects",
-    "emit_isects",
     "step_exposure",
 }
 IN_GROUPS = {"rasterize", "rasterize_vjp", "gather_isect_grads"}
