@@ -58,9 +58,9 @@ class Gpu:
 
 # Sources of units, lanes, clock, bandwidth and memory: the makers' data sheets. NVIDIA: "GA102/AD102 GPU Architecture"
 # and the pages of the RTX 3060, RTX 4090, H100 SXM and H200 SXM. AMD: "RDNA 3 Instruction Set Architecture" and the
-# page of the RX 7900 XTX; pairs of instructions in one clock are not counted, because compilers rarely find them. Intel: "Xe-HPG
-# Architecture" and the page of the Arc A770 with 16 GB. A unit of local memory has 32 banks of 4 bytes on NVIDIA's
-# and AMD's. For Intel's this is an assumption, and so are the times of launches.
+# page of the RX 7900 XTX; pairs of instructions in one clock are not counted, because compilers rarely find them.
+# Intel: "Xe-HPG Architecture" and the page of the Arc A770 with 16 GB. A unit of local memory has 32 banks of 4 bytes
+# on NVIDIA's and AMD's. For Intel's this is an assumption, and so are the times of launches.
 GPUS = (
     Gpu("RTX 3060", units=28, lanes=128, clock=1.78, bandwidth=360, memory=12 * _GIB),
     Gpu("RTX 4090", units=128, lanes=128, clock=2.52, bandwidth=1008, memory=24 * _GIB),
