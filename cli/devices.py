@@ -44,14 +44,15 @@ def devices(ctx: click.Context) -> None:
     """
     from clsplat.device.device import NO_PLATFORM, list_devices, open_device
 
+    infos, default = [], None
     try:
         infos = list_devices()
-        default = open_device().info.index if infos else None
+        if infos:
+            default = open_device().info.index
+        else:
+            click.echo(f"error: {NO_PLATFORM}", err=True)
     except DeviceError as error:
         click.echo(f"error: {error}", err=True)
-        default = None
-    if not infos:
-        click.echo(f"error: {NO_PLATFORM}", err=True)
     working = 0
     for info in infos:
         mark = "  (default)" if info.index == default else ""

@@ -103,8 +103,8 @@ kernel void radix_scatter(
     uint shift,
     uint numbered
 ) {
-    local uint
-        words[COUNTER_WORDS(2) > 2 * BLOCK ? COUNTER_WORDS(2) : 2 * BLOCK];  // the counters, then the sorted pairs
+    // The counters, then the sorted pairs.
+    local uint words[COUNTER_WORDS(2) > 2 * BLOCK ? COUNTER_WORDS(2) : 2 * BLOCK];
     local uint parts[SCAN_GROUP], all[RADIX], in_block[RADIX];
     local uint moves[RADIX];  // from the place of a digit's pairs in the block to that in the output, modulo 2^32
     local ushort *counters = (local ushort *)words;
@@ -115,8 +115,9 @@ kernel void radix_scatter(
     for (uint word = lid; word < COUNTER_WORDS(2); word += SCAN_GROUP) words[word] = 0;
     if (lid < RADIX) all[lid] = totals[lid];
     barrier(CLK_LOCAL_MEM_FENCE);
-    UNROLL for (uint k = 0; k < RUN;
-                ++k) if (start + k < n)++ counters[counter_at(digit_of(run[k], base, top, shift), lid, 2)];
+    UNROLL for (uint k = 0; k < RUN; ++k) {
+        if (start + k < n) counters[counter_at(digit_of(run[k], base, top, shift), lid, 2)] += 1;
+    }
     barrier(CLK_LOCAL_MEM_FENCE);
 
     local uint *row = words + lid * ROW_WORDS(2);
@@ -149,8 +150,9 @@ kernel void radix_scatter(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    UNROLL for (uint k = 0; k < RUN; ++k) places[k] =
-        start + k < n ? counters[counter_at(digit_of(run[k], base, top, shift), lid, 2)]++ : BLOCK;
+    UNROLL for (uint k = 0; k < RUN; ++k) {
+        places[k] = start + k < n ? counters[counter_at(digit_of(run[k], base, top, shift), lid, 2)]++ : BLOCK;
+    }
     barrier(CLK_LOCAL_MEM_FENCE);
     UNROLL for (uint k = 0; k < RUN; ++k) {
         if (places[k] < BLOCK) {

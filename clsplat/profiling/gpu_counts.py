@@ -19,15 +19,15 @@ from ..training.loss import ITEMS_PER_UNIT, MIN_ROWS
 from .stages import Sizes, work_of
 
 WARP = 32  # work-items that run together
+SUM_ROWS = 24  # of cl/render/group.clh
 GPU_SCHEDULES = {name: schedule for name, schedule in SCHEDULES.items() if schedule.group > 1}
-SUM_JOBS = 2 * 73  # instructions of the jobs of a group's sums as the compiler unrolls them: stored, but rarely run
-_JOB = 20  # instructions of one such job
-_RECORD_READS = 11  # reads of a record by a warp; longer records are read 16 bytes at once
+SUM_ROUND = 64  # instructions of a round of a group's sums: eight reads of 16 bytes, their additions, and the place
+_PART_READS = 32  # accesses of a warp that reads 32 values of 32 sums
 _ROWS, _ROWS_VJP = 295, 193  # instructions of image_loss and image_loss_vjp for a pixel of a row and channel
 _WINDOW_ROWS = 10  # rows that a work-item of the loss reads besides its own
 _SKIPPED = 6  # instructions of an isect whose tile the splat does not reach
-_EMIT, _STRIP = 27, 56  # instructions of emit_isects for an isect, and for each of its strips
-_EMIT_SKEWED, _STRIP_SKEWED = 45, 87
+_EMIT, _STRIP = 210, 56  # instructions of emit_isects for an isect, with two searches, and for each of its strips
+_EMIT_SKEWED, _STRIP_SKEWED = 230, 87
 _WAITING = 28  # bytes of each splat that the selection of visible splats reads and writes
 _PER_FLOP = 1.1  # instructions of a pixel for each operation; for shapes that the compilers were not asked about
 
@@ -53,8 +53,8 @@ class PixelLoop:
         return isect + (1 - tiles) * _SKIPPED
 
 
-FORWARD = {"gaussian": PixelLoop(36.25, 24, 18.25), "skew-normal": PixelLoop(50.25, 21, 33)}
-BACKWARD = {"gaussian": PixelLoop(186, 90, 38.5), "skew-normal": PixelLoop(205, 133, 52.25)}
+FORWARD = {"gaussian": PixelLoop(31.25, 19, 18.25), "skew-normal": PixelLoop(52, 22, 32.25)}
+BACKWARD = {"gaussian": PixelLoop(79, 51, 33.25), "skew-normal": PixelLoop(107, 59, 54.25)}  # without the sums
 
 
 @dataclass(frozen=True)
@@ -117,11 +117,9 @@ def counts_of(
     forward, backward = loops_of(kernels.shape)
     looked, group = shares.looked * sizes.isects, schedule.group
     warps, tiles, reached = group / WARP, shares.tiles, shares.reached(schedule)
-    jobs, sum_reads = sum_work(kernels.v_record, group)
-    last_sum = 2 * parts_of(group)  # instructions of the sum over the parts: the first warp alone runs them
-    sums = _JOB * jobs / warps - last_sum * (1 - 1 / warps)
-    gradient = backward.of(schedule.vecs, tiles, reached) + tiles * sums
-    reads = warps * _RECORD_READS
+    rounds, sum_reads = sum_work(kernels.v_record, group)
+    gradient = backward.of(schedule.vecs, tiles, reached) + tiles * SUM_ROUND * rounds / warps
+    reads = warps * -(-kernels.record // 4)  # 16 bytes at once
     skewed = shape_named(kernels.shape).skew_form is not None
     emit, strip = (_EMIT_SKEWED, _STRIP_SKEWED) if skewed else (_EMIT, _STRIP)
     instructions = {
@@ -181,19 +179,16 @@ def _with_block(loop: PixelLoop, block: float) -> PixelLoop:
     return PixelLoop(loop.single + block - loop.block, loop.isect, block)
 
 
-def parts_of(group: int) -> int:
-    """Return the parts of a group's sums (GROUP_PARTS of cl/render/group.clh)."""
-    return 32 if group >= 256 else group // 8
+def sum_work(n: int, group: int) -> tuple[float, float]:
+    """Return the rounds of warps for an isect, and their accesses to local memory, of `n` sums over a group.
 
-
-def sum_work(n: int, group: int) -> tuple[int, int]:
-    """Return the rounds of jobs, and the accesses of warps to local memory, of `n` sums over a group.
-
-    The accesses are the stored values, the values and parts of the jobs, and the parts of the last sum.
+    A warp adds up parts of 32 values. Small groups wait for several isects (SUM_BATCH of cl/render/group.clh).
     """
-    parts = parts_of(group)
-    jobs = -(-n * parts // WARP)
-    return jobs, n * group // WARP + jobs * (group // parts + 1) + parts
+    batch = 1 if group > 64 or n > SUM_ROWS else SUM_ROWS // n
+    parts = group // WARP
+    rounds = -(-batch * n * parts // WARP) / batch
+    last = (parts > 1) * (1 + parts) / batch  # parts are stored, and one warp adds them up
+    return rounds, n * parts + rounds * _PART_READS + last
 
 
 def _halo(pixels: int, units: int) -> float:

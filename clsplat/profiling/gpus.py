@@ -9,8 +9,8 @@ from ..device.device import Device
 from .roofline import Roofline
 
 _GIB = 1 << 30
-# Shares of the stated rates that kernels reach. They are assumptions, not measurements.
-BANDWIDTH_USE, ISSUE_USE, LOCAL_USE = 0.9, 0.65, 0.85
+# Shares of the stated rates that kernels reach: fitted to an H100 (benchmarks/GPU.md). That of local memory is assumed.
+BANDWIDTH_USE, ISSUE_USE, LOCAL_USE = 0.8, 0.42, 0.85
 # Words after the name of a GPU that make it another one.
 _OTHER_MODELS = ("Ti", "SUPER", "Laptop", "Max-Q", "D", "NVL")
 
@@ -38,7 +38,7 @@ class Gpu:
     bandwidth: float
     memory: int
     local: int = 128
-    launch_us: float = 3.0
+    launch_us: float = 6.0
 
     @property
     def bytes_per_ms(self) -> float:
@@ -60,14 +60,15 @@ class Gpu:
 # and the pages of the RTX 3060, RTX 4090, H100 SXM and H200 SXM. AMD: "RDNA 3 Instruction Set Architecture" and the
 # page of the RX 7900 XTX; pairs of instructions in one clock are not counted, because compilers rarely find them.
 # Intel: "Xe-HPG Architecture" and the page of the Arc A770 with 16 GB. A unit of local memory has 32 banks of 4 bytes
-# on NVIDIA's and AMD's. For Intel's this is an assumption, and so are the times of launches.
+# on NVIDIA's and AMD's. For Intel's this is an assumption. The time of a launch was fitted to an H100; those of AMD and
+# Intel are assumed.
 GPUS = (
     Gpu("RTX 3060", units=28, lanes=128, clock=1.78, bandwidth=360, memory=12 * _GIB),
     Gpu("RTX 4090", units=128, lanes=128, clock=2.52, bandwidth=1008, memory=24 * _GIB),
     Gpu("H100 80GB HBM3", units=132, lanes=128, clock=1.98, bandwidth=3350, memory=80 * 10**9),
     Gpu("H200", units=132, lanes=128, clock=1.98, bandwidth=4800, memory=141 * 10**9),
-    Gpu("RX 7900 XTX", units=96, lanes=64, clock=2.5, bandwidth=960, memory=24 * _GIB, launch_us=5.0),
-    Gpu("A770", units=32, lanes=128, clock=2.1, bandwidth=560, memory=16 * _GIB, launch_us=8.0),
+    Gpu("RX 7900 XTX", units=96, lanes=64, clock=2.5, bandwidth=960, memory=24 * _GIB, launch_us=10.0),
+    Gpu("A770", units=32, lanes=128, clock=2.1, bandwidth=560, memory=16 * _GIB, launch_us=16.0),
 )
 _REFERENCE = GPUS[0]  # an unknown GPU is this one with other units and another clock
 
