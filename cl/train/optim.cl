@@ -33,8 +33,9 @@ kernel void map_skew(global real *restrict geom, global const real *restrict ske
 
 // Steps all parameters. The second index of a work-item says what it steps. The first are the `coefficients` of the colour:
 // COEFFICIENTS of them each. CPUs take one, so that few memory streams are open at the same time. GPUs take all, so that the
-// gradient is read once, and many loads are under way. Then come `parts` of the geometry, from first_part on, and then the skew. With a map that depends on the rotation, the skew
-// has a launch of its own after the geometry. lr is the rate of the colour's constant band, rest_lr the rate of the others.
+// gradient is read once, and many loads are under way. Then come `parts` of the geometry, from first_part on, and then the
+// skew. With a map that depends on the rotation, the skew has a launch of its own after the geometry. lr is the rate of the
+// colour's constant band, rest_lr the rate of the others.
 // With LAZY, vectors of splats with a negative age do not step (lazy.clh). Their geometry and skew do, unless geometry_waits.
 // With `catches_up`, the others do their skipped steps first.
 // Global size: (capacity / LANES, coefficients / COEFFICIENTS, rounded up, + parts, and one more for the skew).

@@ -10,10 +10,12 @@ from pathlib import Path
 
 import blocks
 import budget
+import common
 import defaults
 import few_views
 import folds
 import formats
+import gsplat_steps
 import pytest
 
 from clsplat.scenes.scene import load_scene
@@ -70,6 +72,24 @@ def test_stages(tmp_path: Path) -> None:
     lines = printed.splitlines()[2:]
     assert len(lines) == 4
     assert all("| 0.50 | 1.00 |" in line for line in lines), printed
+
+
+def test_gsplat_steps(tmp_path: Path) -> None:
+    """Without PyTorch and CUDA only clsplat is measured."""
+    out = tmp_path / "steps.jsonl"
+    command = [sys.executable, str(BENCHMARKS / "gsplat_steps.py"), "--smoke", "--out", str(out)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    systems = {row["system"] for row in rows}
+    assert {"clsplat gaussian", "clsplat skew-normal"} <= systems
+    assert [row["task"] for row in rows] == ["image", "step"] * len(systems)
+    assert all(0 < row["least_ms"] <= row["ms"] <= row["most_ms"] for row in rows)
+    assert "| clsplat gaussian |" in said
+
+
+def test_the_page_has_the_steps_beside_gsplat() -> None:
+    page = gsplat_steps.PAGE.read_text(encoding="utf-8")
+    assert gsplat_steps.table(common.read(common.RESULTS / "gsplat_steps.jsonl")) in page
 
 
 def test_gpu_model(tmp_path: Path) -> None:

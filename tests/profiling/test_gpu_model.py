@@ -167,6 +167,8 @@ def pretended(name: str, type: str = "GPU", units: int = 40, clock: int = 2000) 
     [
         ("NVIDIA GeForce RTX 3060", "RTX 3060"),
         ("NVIDIA H200", "H200"),
+        ("NVIDIA H100 80GB HBM3", "H100 80GB HBM3"),
+        ("NVIDIA H100 PCIe", None),
         ("AMD Radeon RX 7900 XTX (radeonsi, navi31, LLVM 17)", "RX 7900 XTX"),
         ("Intel(R) Arc(TM) A770 Graphics", "A770"),
         ("NVIDIA GeForce RTX 3060 Ti", None),
