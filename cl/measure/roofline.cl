@@ -1,12 +1,8 @@
 // roofline.cl: kernels that measure the peak rates of a device: a copy, and fused multiply-adds on CHAINS vectors.
 
-// Copies n vectors. GPUs take four reals, because a work-item with one has too few bytes under way. Global size: n.
-#if LANES == 1
-typedef real4 copied_vector;
-#else
-typedef vreal copied_vector;
-#endif
-kernel void copy_vectors(global const copied_vector *restrict values, global copied_vector *restrict copied, ulong n) {
+// Copies n values of type COPIED. On GPUs it has four reals: with one, too few bytes of a work-item are under way.
+// Global size: n.
+kernel void copy_vectors(global const COPIED *restrict values, global COPIED *restrict copied, ulong n) {
     const ulong i = get_global_id(0);
     if (i < n) copied[i] = values[i];
 }

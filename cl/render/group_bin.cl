@@ -15,8 +15,8 @@ static inline uint tiles_in_band(int4 rect, int first_tile, int end_tile, int ti
     return count;
 }
 
-// Overwrites block_counts [groups] with the isects of the band in each block of depth ranks, and rank_starts [n], by rank, with
-// those of the block before the rank. Overwrites splat_isects [n] with empty ranges.
+// Overwrites block_counts [groups] with the isects of the band in each block of depth ranks. Overwrites rank_starts [n], by
+// rank, with those of its block before the rank, and splat_isects [n] with empty ranges.
 SCAN_ATTRIBUTE
 kernel void count_isects(
     global const uint *restrict order,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from ..device.device import Device
 from ..device.memory import fill_zero
 from ..device.opencl import Event, elapsed_ms
-from ..device.program import GROUP_ITEMS, Program, build
+from ..device.program import GROUP_ITEMS, Define, Program, build
 
 # Independent sums of a work-item. Few leave units idle and many spill registers, so the fastest number counts.
 CHAINS = (4, 8, 12)
@@ -40,8 +40,9 @@ class Roofline:
 
 def roofline_program(device: Device, chains: int) -> Program:
     """Return the program of the two kernels. CPUs use vectors of 16, whatever the schedule."""
-    lanes = 16 if device.info.type == "CPU" else 1
-    return build(device, ("math/lanes.clh", "measure/roofline.cl"), {"LANES": lanes, "CHAINS": chains})
+    lanes, copied = (16, "vreal") if device.info.type == "CPU" else (1, "real4")
+    defines: dict[str, Define] = {"LANES": lanes, "COPIED": copied, "CHAINS": chains}
+    return build(device, ("math/lanes.clh", "measure/roofline.cl"), defines)
 
 
 def measure_roofline(device: Device, repeats: int = _REPEATS, nbytes: int | None = None) -> Roofline:

@@ -79,9 +79,14 @@ class KernelBuild:
 
     @property
     def record(self) -> int:
-        """Length of a screen record [reals]: whole vectors of four with one lane (cl/render/record.clh)."""
+        """Length of a screen record [reals]."""
         used = len(RECORD_HEAD) + shape_named(self.shape).record
-        return -(-used // 4) * 4 if self.lanes == 1 else used
+        return -(-used // 4) * 4 if self.record_in_fours else used
+
+    @property
+    def record_in_fours(self) -> bool:
+        """Whether a screen record is a whole number of vectors of four (cl/render/record.clh)."""
+        return self.lanes == 1
 
     @property
     def v_record(self) -> int:
@@ -161,6 +166,7 @@ class KernelBuild:
                 "GROUP": self.schedule.group,
                 "VECS": self.schedule.vecs,
                 "LANES": self.lanes,
+                "RECORD_IN_FOURS": int(self.record_in_fours),
                 "CULLS_BLOCKS": int(self.culls_blocks),
                 "CULLS_STRIPS": int(self.culls_strips),
                 "COLUMNS": int(self.culls_strips),
