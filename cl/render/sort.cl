@@ -41,8 +41,8 @@ kernel void radix_histogram(
     const uint lid = get_local_id(0);
     for (uint word = lid; word < COUNTER_WORDS(1); word += SCAN_GROUP) words[word] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    const ulong first =
-        (ulong)get_group_id(0) * BLOCK + lid;  // the order does not matter here: neighbours read neighbours
+    // The order of pairs does not matter here, so neighbours read neighbours.
+    const ulong first = (ulong)get_group_id(0) * BLOCK + lid;
     UNROLL for (uint k = 0; k < RUN; ++k) {
         const ulong at = first + k * SCAN_GROUP;
         if (at < n) ++counters[counter_at(digit_of(keys[at], base, top, shift), lid, 1)];
@@ -131,7 +131,8 @@ kernel void radix_scatter(
         in_block[lid] = pairs;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    // Each counter becomes the place in the sorted block of the first pair with its digit and from its run.
+    // Each counter becomes the place in the sorted block of the first pair with its digit and from its run. The first of two
+    // counters is the lower half of a word: devices of OpenCL are little-endian, or the self-test refuses them.
     uint before = 0, before_all = 0;
     for (uint d = 0; d < RADIX; ++d) {
         before += d < lid / HELPERS ? in_block[d] : 0;
