@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..device.schedule import SCHEDULES, Schedule
-from ..rendering.build import KernelBuild
+from ..rendering.build import SUM_ROWS, KernelBuild
 from ..rendering.group_binner import DEPTH_BITS
 from ..rendering.radix_sort import radix_passes
 from ..splats.flops import BLEND, BLEND_VJP
@@ -19,7 +19,6 @@ from ..training.loss import ITEMS_PER_UNIT, MIN_ROWS
 from .stages import Sizes, work_of
 
 WARP = 32  # work-items that run together
-SUM_ROWS = 24  # of cl/render/group.clh
 GPU_SCHEDULES = {name: schedule for name, schedule in SCHEDULES.items() if schedule.group > 1}
 SUM_ROUND = 64  # instructions of a round of a group's sums: eight reads of 16 bytes, their additions, and the place
 _PART_READS = 32  # accesses of a warp that reads 32 values of 32 sums

@@ -19,6 +19,7 @@ from .camera_block import CAMERA_MEMBERS
 
 MARGIN_X, MARGIN_Y = 16, 8  # zero margin of every image plane: the SSIM window reaches 5 pixels out
 BATCH, GROUP_BATCH = 64, 32  # isects of a tile that are looked at together; a group has little local memory
+SUM_ROWS = 24  # sums that a small group of work-items takes at once (cl/render/group.clh)
 
 ALPHA_MIN, ALPHA_MAX, T_MIN = 1.0 / 255.0, 0.99, 1e-4  # of gsplat and 3DGS
 CULLED_KEY = 0xFFFFFFFF  # depth key of a splat that the image does not show
@@ -161,6 +162,7 @@ class KernelBuild:
                 "CULLED_KEY": f"{CULLED_KEY:#x}u",
                 "TILE": TILE,
                 "BATCH": self.batch,
+                "SUM_ROWS": SUM_ROWS,
                 "MARGIN_X": MARGIN_X,
                 "MARGIN_Y": MARGIN_Y,
                 "GROUP": self.schedule.group,
