@@ -88,7 +88,7 @@ kernel void rasterize(
     real background_b
 ) {
     BATCH_MEMORY;
-    local real scratch[GROUP_SCRATCH];
+    local real scratch[1];
     const int tile = get_group_id(0);
     const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;
     const uint2 range = tile_ranges[tile];
@@ -211,7 +211,7 @@ kernel void rasterize_vjp(
     ulong plane
 ) {
     BATCH_MEMORY;
-    local real scratch[GROUP_SCRATCH];
+    local real scratch[1];
     SUMS_MEMORY(V_RECORD);
     const int tile = get_group_id(0);
     const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;

@@ -105,7 +105,8 @@ kernel void radix_scatter(
 ) {
     // The counters, then the sorted pairs.
     local uint words[COUNTER_WORDS(2) > 2 * BLOCK ? COUNTER_WORDS(2) : 2 * BLOCK];
-    local uint parts[SCAN_GROUP], all[RADIX], in_block[RADIX];
+    local ulong sums[SCAN_GROUP];
+    local uint all[RADIX];
     local uint moves[RADIX];  // from the place of a digit's pairs in the block to that in the output, modulo 2^32
     local ushort *counters = (local ushort *)words;
     const uint lid = get_local_id(0);
@@ -123,27 +124,15 @@ kernel void radix_scatter(
     local uint *row = words + lid * ROW_WORDS(2);
     uint sum = 0;
     for (uint k = 0; k < SHARE / 2; ++k) sum += (row[k] & 0xFFFFu) + (row[k] >> 16);
-    parts[lid] = sum;
-    barrier(CLK_LOCAL_MEM_FENCE);
+    // Each counter becomes the place in the sorted block of the first pair with its digit and from its run. Rows are in the
+    // order of these places. The first of two counters is the lower half of a word: devices of OpenCL are little-endian, or
+    // the self-test refuses them.
+    uint before = (uint)scan_group(sum, sums);
     if (lid < RADIX) {
-        uint pairs = 0;
-        for (uint h = 0; h < HELPERS; ++h) pairs += parts[lid * HELPERS + h];
-        in_block[lid] = pairs;
+        uint start_of_digit = counts[lid * get_num_groups(0) + get_group_id(0)];
+        for (uint d = 0; d < lid; ++d) start_of_digit += all[d];
+        moves[lid] = start_of_digit - (lid ? (uint)sums[lid * HELPERS - 1] : 0);
     }
-    barrier(CLK_LOCAL_MEM_FENCE);
-    // Each counter becomes the place in the sorted block of the first pair with its digit and from its run. The first of two
-    // counters is the lower half of a word: devices of OpenCL are little-endian, or the self-test refuses them.
-    uint before = 0, before_all = 0;
-    for (uint d = 0; d < RADIX; ++d) {
-        before += d < lid / HELPERS ? in_block[d] : 0;
-        before_all += d < lid ? all[d] : 0;
-    }
-    if (lid < RADIX) {
-        uint first = 0;
-        for (uint d = 0; d < RADIX; ++d) first += d < lid ? in_block[d] : 0;
-        moves[lid] = before_all + counts[lid * get_num_groups(0) + get_group_id(0)] - first;
-    }
-    for (uint h = lid / HELPERS * HELPERS; h < lid; ++h) before += parts[h];
     for (uint k = 0; k < SHARE / 2; ++k) {
         const uint two = row[k], middle = before + (two & 0xFFFFu);
         row[k] = before | middle << 16;
