@@ -37,9 +37,8 @@ ROUNDS, WARM_UP = 5, 10
 PAGE = common.ROOT / "benchmarks" / "GPU.md"
 _BEGIN, _END = "<!-- table of gsplat_steps.py -->", "<!-- end of the table of gsplat_steps.py -->"
 
-Tasks = dict[
-    str, tuple[Callable[[], Any], Callable[[], Any]]
-]  # of each task: an iteration, and the wait for the device
+# An iteration of each task, and the wait for the device.
+Tasks = tuple[dict[str, Callable[[], Any]], Callable[[], Any]]
 
 
 def main() -> None:
@@ -69,14 +68,16 @@ def measure_all(runs: common.Runs, args: argparse.Namespace) -> None:
             args.splats, args.width, args.height, "gaussian" if system == "gsplat" else system
         )
         if system != "gsplat":
-            tasks, schedule, name = *clsplat_tasks(scene, splats, device), f"clsplat {system}"
+            (tasks, finish), schedule = clsplat_tasks(scene, splats, device)
+            name = f"clsplat {system}"
         elif has_gsplat():
-            tasks, schedule, name = gsplat_tasks(scene, splats), "", f"gsplat {metadata.version('gsplat')}"
+            (tasks, finish), schedule = gsplat_tasks(scene, splats), ""
+            name = f"gsplat {metadata.version('gsplat')}"
         else:
             print("no gsplat here: it needs PyTorch and CUDA")
             continue
         where = common.environment(device, schedule)
-        for task, (iteration, finish) in tasks.items():
+        for task, iteration in tasks.items():
             row = {"system": name, "task": task, **case, **where}
             if row in runs:
                 continue
@@ -106,7 +107,7 @@ def clsplat_tasks(scene: Scene, splats: Splats, device: Device) -> tuple[Tasks, 
     def image() -> None:
         trainer.pipeline.forward(trainer.splats, next(cameras))
 
-    return {"image": (image, device.finish), "step": (trainer.step, device.finish)}, str(trainer.kernels.schedule)
+    return ({"image": image, "step": trainer.step}, device.finish), str(trainer.kernels.schedule)
 
 
 def has_gsplat() -> bool:
@@ -139,6 +140,8 @@ def gsplat_tasks(scene: Scene, splats: Splats) -> Tasks:
         "sh_0": sh[:, :1].contiguous(),
         "sh_rest": sh[:, 1:].contiguous(),
     }
+    for leaf in leaves.values():
+        leaf.requires_grad_(True)
     target = torch.rand((1, height, width, 3), device="cuda")
     optimizer = torch.optim.Adam(list(leaves.values()), lr=0.0, eps=1e-15, fused=True)
     order: Iterator[tuple[Any, Any]] = itertools.cycle(views)
@@ -164,13 +167,11 @@ def gsplat_tasks(scene: Scene, splats: Splats) -> Tasks:
             render()
 
     def step() -> None:
-        for leaf in leaves.values():
-            leaf.requires_grad_(True)
         optimizer.zero_grad(set_to_none=True)
         (render() - target).abs().mean().backward()
         optimizer.step()
 
-    return {"image": (image, torch.cuda.synchronize), "step": (step, torch.cuda.synchronize)}
+    return {"image": image, "step": step}, torch.cuda.synchronize
 
 
 def _intrinsics(camera: Any) -> list[list[float]]:
