@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -32,6 +33,18 @@ def copied(tmp_path: Path, model: Path) -> Path:
 
 def last_ply(model: Path) -> Path:
     return sorted(model.glob("point_cloud/*/point_cloud.ply"))[-1]
+
+
+def test_devices_without_pyopencl(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module that is None in sys.modules cannot be imported."""
+    monkeypatch.setitem(sys.modules, "pyopencl", None)
+    result = run("devices")
+    assert isinstance(result.exception, SystemExit)
+    assert result.exit_code == 1
+    first, *hints = result.stderr.splitlines()
+    assert first.startswith("error: pyopencl cannot be imported")
+    assert first.endswith("`pip install pyopencl`")
+    assert all(line.startswith("hint: ") for line in hints)
 
 
 # --- scenes ------------------------------------------------------------------------------------

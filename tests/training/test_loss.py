@@ -126,13 +126,17 @@ def test_work_for_every_unit_and_no_segment_too_short(devices: list[Device]) -> 
     assert rows[-1] == 480
 
 
-def test_equal_images_have_no_loss(device: Device) -> None:
-    """Bytes are powers of two. So x - b / 255 is 0 also on devices that round it only once."""
-    truth = (1 << np.random.default_rng(0).integers(0, 8, (30, 40, 3))).astype(np.uint8)
+@pytest.mark.parametrize("values", ["all bytes", "powers of two"])
+def test_equal_images_have_no_loss(device: Device, values: str) -> None:
+    """A GPU may round x - b / 255 once, where b / 255 was rounded before. With powers of two, both are 0."""
+    truth = pair(40, 30)[1]
+    if values == "powers of two":
+        truth = (1 << (truth >> 5)).astype(np.uint8)
     value, gradient = compared(loss_of(device), truth.astype(np.float32) * np.float32(1 / 255), truth)
-    assert value.l1 < 1e-7
+    assert value.l1 < 1e-7  # x - b / 255 may be rounded once, and b / 255 was rounded before
     assert value.ssim == pytest.approx(1, abs=1e-6)
-    assert np.abs(gradient).max() < 1e-7
+    if device.info.type == "CPU" or values == "powers of two":
+        assert np.abs(gradient).max() < 1e-7
 
 
 def test_float32_keeps_digits_near_the_truth(device: Device) -> None:

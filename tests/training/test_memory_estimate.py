@@ -37,7 +37,7 @@ RUNS: dict[str, dict[str, Any]] = {
 def test_a_run_allocates_at_most_its_estimate(
     device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """The peak of the buffers that were alive at the same time."""
+    """The test adds up all allocations, including those of buffers that are released again."""
     check_allocations(device, tmp_path, monkeypatch, name)
 
 
@@ -53,15 +53,16 @@ def test_a_gpu_allocates_at_most_its_estimate(
 
 
 def check_allocations(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    live = peak = 0
+    live = peak = allocated = 0
 
     class CountedBuffer(cl.Buffer):
         """A buffer that is counted as long as it is alive."""
 
         def __init__(self, *args: Any, **more: Any) -> None:
-            nonlocal live, peak
+            nonlocal live, peak, allocated
             super().__init__(*args, **more)
             live += self.size
+            allocated += self.size
             peak = max(peak, live)
 
         def __del__(self) -> None:
@@ -77,6 +78,8 @@ def check_allocations(device: Device, tmp_path: Path, monkeypatch: pytest.Monkey
         trainer.step()
     trainer.device.finish()
     assert trainer.memory.total / 2 < peak <= trainer.memory.total
+    if not (device.info.type == "GPU" and config.strategy == "mcmc"):  # sorts and moves release more there
+        assert allocated <= trainer.memory.total
 
 
 def test_training_allocates_no_depth(device: Device, tmp_path: Path) -> None:
