@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,6 +62,7 @@ def _model_lines(info: ModelInfo) -> list[str]:
     return [
         f"{info.model.ply}: {values['splats']} splats, shape {values['shape']}, SH degree {values['sh_degree']}, "
         f"{'antialiased, ' if values['antialiased'] else ''}{values['bytes'] / 1e6:.2f} MB",
+        *([f"origin at ({_place(values['origin'])}) of the scene's coordinates"] if any(values["origin"]) else []),
         table(("", "in use", "of"), model_rows(values)),
     ]
 
@@ -110,6 +112,8 @@ def scene_rows(info: SceneInfo) -> list[tuple[str, str]]:
         rows.append(("", f"and {len(info.lenses) - _MAX_LISTED} more lenses"))
     seen = f", each in {info.track_mean:.1f} photos (median {info.track_median:g})" if info.track_mean > 1 else ""
     rows.append(("points", f"{info.points}{seen}"))
+    if any(info.origin):
+        rows.append(("origin", f"at ({_place(info.origin)}) of the files' coordinates"))
     remaining = info.photos - len(info.left_out) - len(info.test)
     held_out = f"{_list_names(info.test)} with clsplat train --eval; {remaining} remain for training"
     rows.append(("test views", held_out if info.photos > 1 else "none: clsplat train --eval needs at least 2 photos"))
@@ -123,6 +127,10 @@ def _lens(lens: LensUse) -> str:
         f"{lens.focal:.1f} px ({lens.field_of_view:.0f} degrees across): {lens.photos} photos"
     )
     return text if lens.pinhole else f"{text}, undistorted when they are read"
+
+
+def _place(origin: Sequence[float]) -> str:
+    return ", ".join(f"{value:.15g}" for value in origin)
 
 
 def _list_names(names: tuple[str, ...]) -> str:

@@ -39,6 +39,7 @@ class ModelInfo:
             "sh_degree": splats.sh_degree,
             "antialiased": splats.antialiased,
             "low_pass": splats.low_pass,
+            "origin": list(self.model.origin),
             "bytes": self.model.ply.stat().st_size,
             **self.complexity.to_json(),
         }

@@ -11,7 +11,7 @@ from ..cameras.cameras_json import NamedCamera, read_cameras
 from ..errors import InputError, Remedy
 from ..files.image_names import bare_name
 from ..files.json_file import describe, to_real
-from ..scenes.options import ALPHA_USES
+from ..scenes.options import ALPHA_USES, ORIGIN
 from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from ..training.folder import ModelFolder
@@ -82,6 +82,12 @@ class LoadedModel:
         """Names of the views that the run held out to choose between its models."""
         return frozenset(self.scene_record.get("validation_names", ()))
 
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """The point of the scene's files that is the origin of the model, as of `Scene`."""
+        x, y, z = self.scene_record.get("origin", ORIGIN)
+        return float(x), float(y), float(z)
+
     def read_cameras(self) -> list[NamedCamera]:
         """Return the cameras in the folder's cameras.json; an empty list if there is no such file."""
         if self.folder is None or not self.folder.cameras_path.is_file():
@@ -129,6 +135,7 @@ class LoadedModel:
             masks=choice.masks or record.get("masks"),
             alpha=choice.alpha or record.get("alpha", ALPHA_USES[0]),
             read_photos=False,
+            origin=self.origin,
         )
         as_recorded = all(getattr(choice, name) in (None, record.get(name)) for name in ("images", "masks"))
         if check and as_recorded:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..blocks.state import BlocksOptions, BlocksState
 from ..compression.rules import BudgetOptions
 from ..compression.state import BudgetState
+from ..scenes.options import ORIGIN
 from ..training.config import TrainConfig
 from ..training.log import Progress
 from ..training.stored_run import StoredRun, load_recorded_scene, stored_run
@@ -75,7 +76,9 @@ def resume(
 
     stored = find_unfinished(path)
     config = TrainConfig(**(stored.run.options | options))
-    loaded = load_recorded_scene(scene or stored.run.scene_path, stored.run.scene, config.background)
+    # A run that has recorded no origin has not moved its scene.
+    record = {"origin": list(ORIGIN), **stored.run.scene}
+    loaded = load_recorded_scene(scene or stored.run.scene_path, record, config.background)
     check_photos(loaded, stored.run.scene["photos"], Path(path), allow=allow_changed_photos, all_views=True)
     if stored.blocks is not None:
         return train_in_blocks(loaded, stored.blocks, config, progress, output=Path(path), resume=True)

@@ -64,6 +64,7 @@ class SceneInfo:
     photo_bytes : total size of the files of the photos that can be used.
     lenses : lenses, the most used first.
     points : number of points.
+    origin : the point of the files' coordinates that is the origin of the scene, as of `Scene`.
     track_mean, track_median : number of photos that see a point; 0 without points.
     test : names of the test views.
     masked : number of photos with a mask.
@@ -79,6 +80,7 @@ class SceneInfo:
     photo_bytes: int
     lenses: tuple[LensUse, ...]
     points: int
+    origin: tuple[float, float, float]
     track_mean: float
     track_median: float
     test: tuple[str, ...]
@@ -96,6 +98,7 @@ class SceneInfo:
             "sizes": [{"width": size[0], "height": size[1], "photos": n} for size, n in self.sizes],
             "lenses": [asdict(lens) for lens in self.lenses],
             "points": self.points,
+            "origin": list(self.origin),
             "track_mean": self.track_mean,
             "track_median": self.track_median,
             "test": list(self.test),
@@ -135,6 +138,7 @@ def scene_info(path: str | os.PathLike[str], images: str | None = None, test_eve
         sum(posed.files[name].stat().st_size for name in posed.names),
         _lenses(posed),
         len(posed.points),
+        posed.origin,
         float(tracks.mean()) if len(tracks) else 0.0,
         float(np.median(tracks)) if len(tracks) else 0.0,
         tuple(sorted(held_out - set(posed.left_out))),

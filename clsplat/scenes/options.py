@@ -3,5 +3,6 @@
 ALPHA_USES = ("background", "mask")  # transparent pixels are composited over the background, or are masked out.
 
 # Arguments of `load_scene`, besides the path and the background, that a run records to read its scene again.
-READING_OPTIONS = ("images", "resolution", "masks", "alpha", "test_every", "test_list", "eval")
+READING_OPTIONS = ("images", "resolution", "masks", "alpha", "test_every", "test_list", "eval", "origin")
+ORIGIN = (0.0, 0.0, 0.0)  # of the coordinates of a scene's files
 CAMERA_FORMATS = ("transforms", "colmap", "colmap-text", "cameras")  # formats that `clsplat cameras` writes

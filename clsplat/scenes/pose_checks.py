@@ -8,17 +8,16 @@ from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from .colmap import Points
+from .origin import FAR, size_of
 from .posed_images import PosedImages
 
 _MAX_POINT = 1e30  # the largest coordinate of a point; float32 ends at 3e38
 _MAX_POSITION = 1e12  # training in float32 breaks between this and 1e15
-# Largest distance of a camera from the origin, in units of the scene's size. Training in float32 loses image quality
-# from the first number on. At the second, steps of float32 are a twentieth of the scene.
-_FAR, _TOO_FAR = 1e4, 1e6
+# Distance of a camera from the origin, in units of the scene's size, at which steps of float32 are a twentieth of it.
+_TOO_FAR = 1e6
 _DIGITS = 9  # poses that agree to these decimals count as equal
 _LEAST_FOCAL = 1e-3  # of the side of an image: an angle of view of 179.9 degrees
 _SHRUNK, _GROWN = 0.21, 1.99  # COLMAP's undistortion scales a side by 0.2 to 2; such sides are at the limits
@@ -29,7 +28,7 @@ def check_poses(root: Path, posed: PosedImages) -> None:
 
     Warns
     -----
-    UserWarning : the scene is far from the origin for its size, or different photos have equal poses.
+    UserWarning : a camera is far from the scene for its size, or different photos have equal poses.
 
     Raises
     ------
@@ -62,25 +61,16 @@ def _check_positions(root: Path, posed: PosedImages) -> None:
             f"{root}: the translation of {name!r} is {distance:.2g}, more than {_MAX_POSITION:g}; "
             "scale the poses down, or correct this one"
         )
-    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-    size = _spread(posed.points.xyz) or _spread(centres) or 1.0
+    size = size_of(posed)
     ratio = distance / size
-    if ratio < _FAR:
+    if ratio < FAR:
         return
     text = (
         f"{root}: the translation of {name!r} is {distance:.2g}, {ratio:.1g} times the size of the scene ({size:.2g})"
     )
     if ratio >= _TOO_FAR:
-        raise InputError(f"{text}, so float32 cannot hold it; move the scene to the origin, or correct the pose")
-    warnings.warn(f"{text}; images lose sharpness in float32. Move the scene to the origin", stacklevel=4)
-
-
-def _spread(xyz: NDArray[np.float64]) -> float:
-    """Return the median distance of points from their median, which outliers do not change."""
-    if not len(xyz):
-        return 0.0
-    with np.errstate(over="ignore"):  # outliers may be at any distance
-        return float(np.median(np.abs(xyz - np.median(xyz, axis=0)).max(axis=1)))
+        raise InputError(f"{text}, so float32 cannot hold it; correct the pose")
+    warnings.warn(f"{text}; its image loses sharpness in float32. Correct the pose", stacklevel=4)
 
 
 def _warn_of_equal_poses(root: Path, posed: PosedImages) -> None:

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..files.image_names import IMAGE_SUFFIXES
 from ..files.images import image_size
 from .colmap import Points, find_model, read_model
+from .options import ORIGIN
 from .photo_listing import list_images
 from .photo_names import place_photos
 from .reduced_photos import with_reduced_photos
@@ -36,6 +37,7 @@ class PosedImages:
         files do not specify any.
     masks : mask files named in the scene's files, by photo name.
     left_out : reason why a photo with a pose cannot be used, by name.
+    origin : the point of the file's coordinates that is the origin of the poses and points (origin.py).
     """
 
     photos: list[RegisteredImage]
@@ -45,6 +47,7 @@ class PosedImages:
     test_names: frozenset[str] | None = None
     masks: dict[str, Path] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
+    origin: tuple[float, float, float] = ORIGIN
 
     @property
     def names(self) -> list[str]:

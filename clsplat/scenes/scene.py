@@ -23,7 +23,8 @@ from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
 from .colmap import Points
 from .described import read_described
-from .options import ALPHA_USES
+from .options import ALPHA_USES, ORIGIN
+from .origin import near_origin
 from .photo_size import check_memory
 from .pose_checks import check_lenses, check_poses, without_far_points
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
@@ -54,6 +55,7 @@ class Scene:
     photo_digests : digest of each photo's file and its mask's file (`file_digest`) by name; empty without files.
     photo_files : files of the photos and their masks.
     validation_names : names of the views held out to choose between models; they are no training views.
+    origin : the point of the files' coordinates that is the origin of cameras and points (`load_scene`).
     """
 
     name: str
@@ -67,6 +69,7 @@ class Scene:
     photo_digests: Mapping[str, str] = field(default_factory=dict)
     photo_files: Sequence[Path] = ()
     validation_names: frozenset[str] = frozenset()
+    origin: tuple[float, float, float] = ORIGIN
 
     @property
     def cameras(self) -> list[Camera]:
@@ -122,6 +125,7 @@ def load_scene(
     alpha: str = ALPHA_USES[0],
     read_photos: bool = True,
     only: Collection[str] | None = None,
+    origin: Sequence[float] | None = None,
 ) -> Scene:
     """Read a scene: a folder with photos and their cameras.
 
@@ -149,11 +153,14 @@ def load_scene(
         decoded at each use instead (`View.loaded`).
     only : names of the photos to read, for a part of a large scene. The files of the others are not opened, except for
         their sizes. Test views are chosen among all photos.
+    origin : the point of the files' coordinates that becomes the origin, (3,). By default that is a round point inside
+        a scene that is so far from the origin that float32 cannot hold it, and other scenes are not moved.
 
     Warns
     -----
     UserWarning : the model registers fewer than 80 % of the photos in the folder. Photos that are missing, unreadable
-        or hidden by their masks are left out. Rotations, poses or lenses look wrong (`check_poses`).
+        or hidden by their masks are left out. Rotations, poses or lenses look wrong (`check_poses`). The scene is
+        moved, and `origin` is None.
 
     Raises
     ------
@@ -165,7 +172,7 @@ def load_scene(
         raise InputError(f"alpha {alpha!r}: choose one of {', '.join(ALPHA_USES)}")
     if resolution < 1 and resolution != -1:
         raise InputError(f"resolution {resolution}: use 1, 2, 4, 8, a width in pixels, or -1")
-    posed = read_posed_images(root, images)
+    posed = read_posed_images(root, images, origin)
     check_lenses(root, posed)
     test_names = select_test_names(posed, test_every, test_list) if eval else frozenset()
     mask_of = find_masks(root, posed, masks)
@@ -215,10 +222,12 @@ def load_scene(
             test_every=test_every,
             test_list=None if test_list is None else str(real_path(test_list)),
             eval=eval,
+            origin=list(posed.origin) if any(posed.origin) else None,
         ),
         left_out,
         dict(zip(names, digests, strict=True)),
         [file for name in names for file in _files_of(name, posed, mask_of)],
+        origin=posed.origin,
     )
 
 
@@ -256,7 +265,7 @@ def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, 
     return posed.masks | masks
 
 
-def read_posed_images(root: Path, images: str | None) -> PosedImages:
+def read_posed_images(root: Path, images: str | None, origin: Sequence[float] | None = None) -> PosedImages:
     """Read a scene's photos with poses, without decoding them; parameters and errors as `load_scene`."""
     if root.is_file() and root.suffix.lower() not in SCENE_ENDINGS:
         raise InputError(f"{root}: {describe_file(root)}")
@@ -268,6 +277,7 @@ def read_posed_images(root: Path, images: str | None) -> PosedImages:
     else:
         posed = read_colmap(root, images)
     check_left_out(root, posed.left_out, len(posed.listed))
+    posed = near_origin(root, posed, origin)
     check_poses(root, posed)
     return replace(posed, points=without_far_points(root, posed.points))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ..files.json_file import describe, read_object, to_real
+from ..files.json_file import MAX_NUMBER, describe, read_object, to_real
 from ..scenes.options import ALPHA_USES, READING_OPTIONS
 from ..splats.color import BLACK, Color
 from .config import FREE_OPTIONS, TrainConfig, read_options
@@ -92,6 +92,12 @@ def _is_list_of_names(value: object) -> bool:
     return isinstance(value, list) and all(isinstance(name, str) for name in value)
 
 
+def _is_place(value: object) -> bool:
+    if not isinstance(value, list) or len(value) != 3:
+        return False
+    return all((number := to_real(each)) is not None and abs(number) < MAX_NUMBER for each in value)
+
+
 def _is_count(value: object) -> bool:
     return type(value) is int and 1 <= value <= _LARGEST
 
@@ -112,6 +118,7 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "resolution": (f"-1, or 1 to {_LARGEST}", lambda value: _is_count(value) or (type(value) is int and value == -1)),
     "test_every": (f"a whole number from 1 to {_LARGEST}", _is_count),
     "eval": ("true or false", lambda value: isinstance(value, bool)),
+    "origin": ("three numbers", _is_place),
     "photos": ("the digest of each photo by name", lambda value: isinstance(value, dict)),
     "test_names": ("a list of names", _is_list_of_names),
     "validation_names": ("a list of names", _is_list_of_names),

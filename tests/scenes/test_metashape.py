@@ -123,11 +123,52 @@ def test_points_are_optional_and_must_be_one_file(tmp_path: Path) -> None:
     assert len(read_posed_images(tmp_path, None).points) == 0
 
 
-def test_a_georeferenced_chunk_is_refused_if_it_was_moved(tmp_path: Path) -> None:
-    earth = 'GEOGCS["WGS 84",DATUM["World Geodetic System 1984"]]'
-    assert read_posed_images(write(tmp_path, made.metashape_xml(reference=earth)), None).names == made.NAMES
-    write(tmp_path, made.metashape_xml(reference=earth, chunk=made.similarity()))
-    assert "is georeferenced" in error_of("info", tmp_path)
+EARTH = 'GEOGCS["WGS 84",DATUM["World Geodetic System 1984"]]'
+
+
+@pytest.mark.parametrize(
+    ("place", "within"),
+    [((0.7, -2.1, 0.0), 1e-8), ((-0.4, 1.2, 3000.0), 1e-4), ((1.5707, 0.3, 0.0), 1e-6)],
+    ids=["at sea level", "on a mountain", "near the pole"],
+)
+def test_a_georeferenced_scene_has_the_axes_east_north_and_up(
+    tmp_path: Path, place: tuple[float, float, float], within: float
+) -> None:
+    chunk = made.similarity()
+    text = made.metashape_xml(reference=EARTH, chunk=chunk, placement=made.on_earth(chunk, *place))
+    with pytest.warns(UserWarning, match=r"the points of cameras\.ply are in a map projection: they are left out"):
+        posed = read_posed_images(write(tmp_path, text), None)
+    assert len(posed.points) == 0
+    assert not any(posed.origin), "the reader itself has moved it"
+    middle = np.mean([shot.centre for shot in made.shots()], axis=0)
+    for photo, shot in zip(posed.photos, made.shots(), strict=True):
+        local = made.points()[0] - middle
+        found = local @ photo.cam_from_world[:3, :3].T + photo.cam_from_world[:3, 3]
+        np.testing.assert_allclose(found, shot.local(made.points()[0]), rtol=0, atol=within)
+
+
+def test_photos_that_are_missing_do_not_move_a_georeferenced_scene(tmp_path: Path) -> None:
+    chunk = made.similarity()
+    place = made.on_earth(chunk, 0.7, -2.1, 0.0)
+    write(tmp_path, made.metashape_xml(reference=EARTH, chunk=chunk, placement=place))
+    (tmp_path / "cameras.ply").unlink()
+    expected = read_posed_images(tmp_path, None).photos[0].cam_from_world
+    (tmp_path / "images" / made.NAMES[3]).unlink()
+    np.testing.assert_array_equal(read_posed_images(tmp_path, None).photos[0].cam_from_world, expected)
+
+
+def test_a_georeferenced_chunk_without_a_transform_is_local(tmp_path: Path) -> None:
+    assert_same_pixels(write(tmp_path, made.metashape_xml(reference=EARTH)), made.FRAME)
+
+
+def test_a_georeferenced_camera_at_the_centre_of_the_earth_is_read(tmp_path: Path) -> None:
+    """No program writes it, but a file may hold it."""
+    centres = np.array([shot.centre for shot in made.shots()])
+    nowhere = made.Similarity(np.eye(3), -centres.mean(axis=0), 1.0)
+    write(tmp_path, made.metashape_xml(reference=EARTH, placement=nowhere))
+    with pytest.warns(UserWarning, match="map projection"):
+        posed = read_posed_images(tmp_path, None)
+    assert np.isfinite([photo.cam_from_world for photo in posed.photos]).all()
 
 
 LENSES: dict[str, tuple[dict[str, Any], list[str]]] = {

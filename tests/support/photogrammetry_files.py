@@ -277,6 +277,28 @@ def similarity() -> Similarity:
     return Similarity(turn * np.sign(np.linalg.det(turn)), np.array([3.0, -2.0, 5.0]), 2.5)
 
 
+def on_earth(world: Similarity, latitude: float, longitude: float, height: float) -> Similarity:
+    """The transform to geocentric coordinates if the world has the axes east, north and up at a place.
+
+    The mean of the shots is at the place. Angles are in radians, the height above the ellipsoid of WGS 84 in metres.
+    """
+    a, f = 6378137.0, 1 / 298.257223563
+    across, along = math.cos(latitude), math.sin(latitude)
+    normal = a / math.sqrt(1 - f * (2 - f) * along**2)
+    position = np.array(
+        [
+            (normal + height) * across * math.cos(longitude),
+            (normal + height) * across * math.sin(longitude),
+            ((1 - f) ** 2 * normal + height) * along,
+        ]
+    )
+    east = np.array([-math.sin(longitude), math.cos(longitude), 0.0])
+    up = np.array([across * math.cos(longitude), across * math.sin(longitude), along])
+    axes = np.stack([east, np.cross(up, east), up], axis=1)
+    middle = np.mean([shot.centre for shot in shots()], axis=0)
+    return Similarity(axes @ world.rotation, axes @ (world.translation - middle) + position, world.scale)
+
+
 @dataclass(frozen=True)
 class Label:
     """What a <camera> has beside its pose."""
@@ -294,8 +316,12 @@ def metashape_xml(
     chunk: Similarity | None = None,
     reference: str = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0]]',
     in_component: bool = True,
+    placement: Similarity | None = None,
 ) -> str:
-    """The XML file of the shots of `shots`, whose world the chunk's transform leads to."""
+    """The XML file of the shots of `shots`, whose world the chunk's transform leads to.
+
+    `placement` is written instead of that transform.
+    """
     labels = [Label(Path(name).stem) for name in NAMES] if labels is None else labels
     world = Similarity(np.eye(3), np.zeros(3), 1.0) if chunk is None else chunk
     cameras = []
@@ -311,12 +337,13 @@ def metashape_xml(
             f'enabled="{label.enabled}">{transform}<orientation>1</orientation></camera>'
         )
     numbers = "".join(f"<{key}>{value!r}</{key}>" for key, value in lens.items() if key != "type" and value)
+    written = placement or chunk
     placed = (
         ""
-        if chunk is None
+        if written is None
         else (
-            f'<transform><rotation locked="false">{_text(chunk.rotation)}</rotation>'
-            f"<translation>{_text(chunk.translation)}</translation><scale>{chunk.scale!r}</scale></transform>"
+            f'<transform><rotation locked="false">{_text(written.rotation)}</rotation>'
+            f"<translation>{_text(written.translation)}</translation><scale>{written.scale!r}</scale></transform>"
         )
     )
     size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'

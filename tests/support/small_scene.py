@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,3 +58,24 @@ def as_text(model: Path, target: Path) -> None:
 
     target.mkdir(parents=True, exist_ok=True)
     pycolmap.Reconstruction(str(model)).write_text(str(target))
+
+
+def write_model(garden: Path, poses: list[np.ndarray], shift: float = 0.0, points: bool = True) -> None:
+    """Write the garden's model with other poses; `shift` moves its points."""
+    xyz, rgb = cloud()
+    views = [replace(view, cam_from_world=pose) for view, pose in zip(model_views(), poses, strict=True)]
+    if not points:
+        nothing = (np.empty((0, 2)), np.empty(0, np.int64))
+        views = [replace(view, pixels=nothing[0], point_index=nothing[1]) for view in views]
+        xyz, rgb = xyz[:0], rgb[:0]
+    write_binary_model(garden / "sparse" / "0", views, xyz + shift, rgb)
+
+
+def moved(scale: float = 1.0, shift: float = 0.0) -> list[np.ndarray]:
+    """Return the poses of cameras whose centres are scaled, then moved."""
+    poses = []
+    for view in model_views():
+        pose = view.cam_from_world.copy()
+        pose[:3, 3] = -pose[:3, :3] @ (-scale * pose[:3, :3].T @ pose[:3, 3] + shift)
+        poses.append(pose)
+    return poses

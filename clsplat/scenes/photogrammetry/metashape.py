@@ -1,17 +1,16 @@
 """Scenes of Agisoft Metashape: the XML file of "Export Cameras", and points in a PLY file beside it.
 
 The file has a <chunk> with <sensors>, <components> and <cameras>. The <transform> of a camera is camera-to-chunk, 16
-numbers row by row, with OpenCV's axes (x right, y down, z forward; the manual's appendix "Camera models"). The
-<transform> of a component, or else of the chunk, leads to the world: p -> scale R p + t, with <rotation> row by row,
-<translation> and <scale> (`Chunk.transform` of the Metashape Python Reference).
+numbers row by row, with OpenCV's axes (x right, y down, z forward; the manual's appendix "Camera models"). Cameras of
+other components than the active one are left out, because nothing relates their poses.
 
-The world of a georeferenced chunk is geocentric, where float32 has half a metre left, and its points are exported in a
-map projection. Such chunks are refused. Cameras of other components than the active one are left out, because nothing
-relates their poses.
+A georeferenced scene lies around the mean of its cameras. Its points are exported in a map projection, which is not
+read, so they are left out.
 """
 
 from __future__ import annotations
 
+import warnings
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Collection, Iterable
@@ -21,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...cameras.rotations import NearestRotation, NotARotation, nearest_rotation, warn_of_corrections
+from ...cameras.rotations import NearestRotation, warn_of_corrections
 from ...errors import InputError, named_place
 from ...files.xml_file import get_numbers, read_xml
 from ..colmap import Points
@@ -29,10 +28,10 @@ from ..point_cloud import join_points, read_point_cloud
 from ..posed_images import PosedImages, read_sizes
 from ..undistort import Lens, RegisteredImage
 from .metashape_lens import metashape_lens
+from .metashape_world import World, rotation_of
 from .named_photos import find_named_photos
 
 _EXPECTED = "the XML file of Metashape's Export Cameras"
-_LOCAL = "LOCAL_CS"  # how the coordinate system of a chunk begins that is not georeferenced
 _LAST_ROW = 1e-6  # largest error of the last row of a pose
 _OFF = ("0", "false")
 
@@ -49,12 +48,12 @@ def read_metashape(path: Path, images: str | None = None) -> PosedImages:
 
     Warns
     -----
-    UserWarning : rotations were corrected.
+    UserWarning : rotations were corrected, or the points of a georeferenced chunk are left out.
 
     Raises
     ------
-    InputError : the file is damaged, a number is missing or bad, the chunk is georeferenced, or a lens has no
-        counterpart. The message names file, camera and element.
+    InputError : the file is damaged, a number is missing or bad, or a lens has no counterpart. The message names file,
+        camera and element.
     """
     chunk = read_xml(path, _EXPECTED).find("chunk")
     if chunk is None:
@@ -67,15 +66,20 @@ def read_metashape(path: Path, images: str | None = None) -> PosedImages:
     reasons = {name: reason for name, camera in named.items() if (reason := camera.unused(active)) is not None}
     sizes, left_out = read_sizes({name: file for name, file in files.items() if name not in reasons})
     left_out |= {name: f"{path}: {reason}" for name, reason in reasons.items()}
-    world = _World.of(path, chunk, active)
     lenses = _lenses(path, chunk, {named[name].sensor for name in sizes})
     poses = {name: named[name].pose() for name in sorted(sizes)}
+    world = World.of(path, chunk, active)
+    if world.is_geocentric:
+        aligned = [camera.pose()[1] for name, camera in named.items() if name not in reasons]
+        local = world.around(np.mean(aligned, axis=0))
+    else:
+        local = world
     warn_of_corrections(path, {named[name].place: rotation for name, (rotation, _) in poses.items()})
     photos = [
-        RegisteredImage(name, world.camera_pose(rotation.matrix, position), lenses[named[name].sensor])
+        RegisteredImage(name, local.camera_pose(rotation.matrix, position), lenses[named[name].sensor])
         for name, (rotation, position) in poses.items()
     ]
-    return PosedImages(photos, files, sizes, _points(path), left_out=left_out)
+    return PosedImages(photos, files, sizes, _points(path, world.is_geocentric), left_out=left_out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,49 +119,7 @@ class _MetashapeCamera:
             matrix = np.zeros((4, 4)) if found is None else found.reshape(4, 4)
             if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > _LAST_ROW:
                 raise InputError("the last row of <transform> is not 0 0 0 1; export the cameras again")
-            return _rotation_of(matrix[:3, :3], "the left 3 x 3 block of <transform>"), matrix[:3, 3]
-
-
-@dataclass(frozen=True, eq=False)
-class _World:
-    """Chunk to world: p -> scale * rotation p + translation."""
-
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    scale: float
-
-    @staticmethod
-    def of(path: Path, chunk: ET.Element, component: str | None) -> _World:
-        """Return the transform of a component, or else of the chunk; without either the chunk is the world."""
-        components = [each for each in chunk.iterfind("components/component") if each.get("id") == component]
-        holder = next((each for each in (*components, chunk) if each.find("transform") is not None), None)
-        element = None if holder is None else holder.find("transform")
-        if element is None:
-            return _World(np.eye(3), np.zeros(3), 1.0)
-        system = (chunk.findtext("reference") or _LOCAL).strip()
-        if not system.startswith(_LOCAL):
-            raise InputError(
-                f"{path}: the chunk is georeferenced (<reference> is {ascii(system)[:40]}), so its cameras are in "
-                "geocentric coordinates; export the cameras and points as a COLMAP model instead"
-            )
-        with named_place(f"{path}: <transform> of the chunk"):
-            rotation, translation, scale = (
-                get_numbers(element, name, count) for name, count in (("rotation", 9), ("translation", 3), ("scale", 1))
-            )
-            if scale is not None and scale[0] <= 0.0:
-                raise InputError(f"<scale> is {scale[0]:g}; it must be above 0")
-            turn = np.eye(3) if rotation is None else _rotation_of(rotation.reshape(3, 3), "<rotation>").matrix
-        return _World(
-            turn, np.zeros(3) if translation is None else translation, 1.0 if scale is None else float(scale[0])
-        )
-
-    def camera_pose(self, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return world-to-camera, (4, 4), for a camera-to-chunk rotation and a position in the chunk."""
-        centre = self.scale * (self.rotation @ position) + self.translation
-        pose = np.eye(4)
-        pose[:3, :3] = (self.rotation @ rotation).T
-        pose[:3, 3] = -pose[:3, :3] @ centre
-        return pose
+            return rotation_of(matrix[:3, :3], "the left 3 x 3 block of <transform>"), matrix[:3, 3]
 
 
 def _cameras(path: Path, chunk: ET.Element) -> dict[str, _MetashapeCamera]:
@@ -198,17 +160,22 @@ def _lenses(path: Path, chunk: ET.Element, used: Collection[str]) -> dict[str, L
     return lenses
 
 
-def _rotation_of(matrix: NDArray[np.float64], what: str) -> NearestRotation:
-    try:
-        return nearest_rotation(matrix)
-    except NotARotation as error:
-        raise InputError(f"{what} {error}; export the cameras again") from None
+def _points(path: Path, in_projection: bool) -> Points:
+    """Return the points of the PLY file with the name of the XML file, or else of the only PLY file in its folder.
 
-
-def _points(path: Path) -> Points:
-    """Return the points of the PLY file with the name of the XML file, or else of the only PLY file in its folder."""
+    Parameters
+    ----------
+    in_projection : whether the points are in a map projection, so they are left out.
+    """
     files = sorted(file for file in path.parent.iterdir() if file.suffix.lower() == ".ply" and file.is_file())
     named = [file for file in files if file.stem == path.stem] or files
+    if named and in_projection:
+        warnings.warn(
+            f"{path}: the chunk is georeferenced, so the points of {named[0].name} are in a map projection: they are "
+            "left out. Export a COLMAP model to have points",
+            stacklevel=5,
+        )
+        return join_points([])
     if len(named) > 1:
         raise InputError(
             f"{path}: {len(named)} PLY files are beside it; name that of the points {path.with_suffix('.ply').name}"

@@ -1,0 +1,85 @@
+"""Scenes whose coordinates are large numbers, as those of maps are. They are moved, because float32 trains them.
+
+A scene is moved by round numbers. So a photo more or less does not change them.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .posed_images import PosedImages
+
+# Largest distance from the origin in units of the scene's size. Beyond it, training in float32 loses image quality.
+FAR = 1e4
+_LOST = 1e10  # beyond this distance, float64 has lost the scene, too
+
+
+def near_origin(root: Path, posed: PosedImages, origin: Sequence[float] | None = None) -> PosedImages:
+    """Return a scene in coordinates that float32 holds.
+
+    Parameters
+    ----------
+    origin : the point of the file's coordinates that becomes the origin, (3,). By default that is a round point inside
+        a scene that is far from the origin, and other scenes are not moved.
+
+    Warns
+    -----
+    UserWarning : the scene is moved, and `origin` is None.
+    """
+    shift = _round_point(posed) if origin is None else np.asarray(origin, np.float64)
+    if not shift.any():
+        return posed
+    if origin is None:
+        place = ", ".join(f"{value:.15g}" for value in shift)
+        warnings.warn(
+            f"{root}: is more than {FAR:g} times its size away from the origin, which float32 cannot hold: "
+            f"({place}) becomes the origin of the scene and of its model",
+            stacklevel=4,
+        )
+    photos = []
+    for photo in posed.photos:
+        pose = photo.cam_from_world.copy()
+        pose[:3, 3] += pose[:3, :3] @ shift
+        photos.append(replace(photo, cam_from_world=pose))
+    points = replace(posed.points, xyz=posed.points.xyz - shift)
+    return replace(posed, photos=photos, points=points, origin=(float(shift[0]), float(shift[1]), float(shift[2])))
+
+
+def camera_centres(posed: PosedImages) -> NDArray[np.float64]:
+    """Return the centre of each photo's camera, (N, 3)."""
+    poses = np.array([photo.cam_from_world for photo in posed.photos])
+    return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+
+
+def size_of(posed: PosedImages) -> float:
+    """Return the median distance of the points, or else of the cameras, from their median; 1 if all are in one place.
+
+    Outliers do not change it.
+    """
+    return _spread(posed.points.xyz) or _spread(camera_centres(posed)) or 1.0
+
+
+def _spread(xyz: NDArray[np.float64]) -> float:
+    if not len(xyz):
+        return 0.0
+    with np.errstate(over="ignore"):  # outliers may be at any distance
+        return float(np.median(np.abs(xyz - np.median(xyz, axis=0)).max(axis=1)))
+
+
+def _round_point(posed: PosedImages) -> NDArray[np.float64]:
+    """Return a round point inside a scene that is far from the origin; the origin for other scenes."""
+    if not posed.photos:
+        return np.zeros(3)
+    size = size_of(posed)
+    centre = np.median(posed.points.xyz if len(posed.points) else camera_centres(posed), axis=0)
+    ratio = float(np.abs(centre).max()) / size
+    if not FAR <= ratio <= _LOST:
+        return np.zeros(3)
+    unit = 10.0 ** np.ceil(np.log10(size))
+    return np.asarray(np.round(centre / unit) * unit, np.float64)

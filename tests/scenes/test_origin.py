@@ -1,0 +1,138 @@
+"""Scenes with the coordinates of a map: they are moved, and their models know by how much."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_runner import clsplat, error_of, run
+from small_scene import cloud, moved, write_garden, write_model
+
+from clsplat.models.model import load_model
+from clsplat.scenes.scene import load_scene
+from clsplat.scenes.source import SceneSource
+
+MAP = 4e6  # coordinates of a map [m]
+
+
+@pytest.fixture
+def garden(tmp_path: Path) -> Path:
+    return write_garden(tmp_path)
+
+
+def write_far(garden: Path, shift: float = MAP, points: bool = True) -> None:
+    write_model(garden, moved(shift=shift), shift, points)
+
+
+@pytest.mark.parametrize("points", [True, False])
+@pytest.mark.parametrize("shift", [1e5, -4e6, 1e9])
+def test_a_scene_far_from_the_origin_is_moved(garden: Path, shift: float, points: bool) -> None:
+    write_model(garden, moved(), 0.0, points)
+    expected = load_scene(garden)
+    write_far(garden, shift, points)
+    with pytest.warns(UserWarning, match=r"which float32 cannot hold: \(-?\d+, .*\) becomes the origin of the scene"):
+        scene = load_scene(garden)
+    np.testing.assert_allclose(scene.origin, shift, rtol=0, atol=20.0)
+    step = 1e-15 * abs(shift) * 10
+    for view, other in zip(scene.views, expected.views, strict=True):
+        np.testing.assert_allclose(view.camera.position + scene.origin, other.camera.position + shift, atol=step)
+        np.testing.assert_array_equal(view.camera.rotation, other.camera.rotation)
+    if points:
+        np.testing.assert_allclose(scene.points.xyz + scene.origin, cloud()[0] + shift, rtol=0, atol=step)
+    assert all(value == round(value) for value in scene.origin), "it is round"
+
+
+def test_other_scenes_stay_where_they_are(garden: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for scale, shift, points in ((1e6, 0.0, False), (1.0, 1e3, True), (1.0, 1e3, False)):
+            write_model(garden, moved(scale, shift), shift, points)
+            scene = load_scene(garden)
+            assert scene.origin == (0.0, 0.0, 0.0)
+            assert "origin" not in clsplat("info", garden)
+
+
+def test_the_origin_can_be_chosen(garden: Path) -> None:
+    write_far(garden)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = load_scene(garden, origin=(MAP, MAP, MAP - 7.0))
+    np.testing.assert_allclose(scene.points.xyz, cloud()[0] + (0.0, 0.0, 7.0), atol=1e-8)
+    assert scene.reading["origin"] == [MAP, MAP, MAP - 7.0]
+
+
+def test_photos_that_are_missing_do_not_move_it(garden: Path) -> None:
+    write_far(garden)
+    with pytest.warns(UserWarning, match="becomes the origin"):
+        expected = load_scene(garden).origin
+    for name in ("shot_2.png", "shot_7.png"):
+        (garden / "images" / name).unlink()
+    with pytest.warns(UserWarning, match="becomes the origin"):
+        assert load_scene(garden).origin == expected
+
+
+def test_coordinates_that_no_number_holds_are_refused(garden: Path) -> None:
+    write_far(garden, 3e11)
+    assert "so float32 cannot hold it; correct the pose" in error_of("info", garden)
+
+
+def test_a_model_is_evaluated_and_resumed_at_its_origin(garden: Path, tmp_path: Path) -> None:
+    write_far(garden)
+    result = run("train", garden, "-m", tmp_path / "m", "--iterations", 6, "--eval", "--cap-max", 40)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.count("becomes the origin of the scene and of its model") == 1
+    model = load_model(tmp_path / "m")
+    np.testing.assert_allclose(model.origin, MAP, rtol=0, atol=20.0)
+    assert np.abs(model.splats.mean).max() < 1e3
+    shown = clsplat("info", tmp_path / "m")
+    assert f"origin at ({', '.join(f'{value:.0f}' for value in model.origin)}) of the scene's coordinates" in shown
+    assert json.loads(clsplat("info", "--json", tmp_path / "m"))["origin"] == list(model.origin)
+    near = {view.name: view.camera.position for view in model.load_scene().views}
+    # The record counts, even if the photos that are left would give another point.
+    config = tmp_path / "m" / "config.json"
+    values = json.loads(config.read_text())
+    values["scene"]["origin"][0] += 1000.0
+    config.write_text(json.dumps(values))
+    for view in load_model(tmp_path / "m").load_scene().views:
+        np.testing.assert_allclose(view.camera.position, near[view.name] - (1000.0, 0.0, 0.0), atol=1e-6)
+    values["scene"]["origin"][0] -= 1000.0
+    config.write_text(json.dumps(values))
+    for command in (("eval", tmp_path / "m"), ("train", "-m", tmp_path / "m", "--resume", "--iterations", 8)):
+        result = run(*command)
+        assert result.exit_code == 0, result.output
+        assert "becomes the origin" not in result.stderr
+
+
+def test_a_run_that_moved_nothing_is_read_as_it_was(garden: Path, tmp_path: Path) -> None:
+    """Runs of scenes that lie far away, from before scenes were moved, have no origin in their record."""
+    clsplat("train", garden, "-m", tmp_path / "m", "--iterations", 4, "--cap-max", 40)
+    assert json.loads((tmp_path / "m" / "config.json").read_text())["scene"].get("origin") is None
+    write_far(garden, 1e5)
+    assert load_model(tmp_path / "m").origin == (0.0, 0.0, 0.0)
+    with pytest.warns(UserWarning, match="loses sharpness in float32"):
+        scene = load_model(tmp_path / "m").load_scene()
+    assert scene.views[0].camera.position[0] > 9e4
+
+
+def test_a_scene_is_read_again_at_its_origin(garden: Path) -> None:
+    write_far(garden)
+    with pytest.warns(UserWarning, match="becomes the origin"):
+        scene = load_scene(garden)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = SceneSource.of(scene).load()
+    assert again.origin == scene.origin
+    np.testing.assert_array_equal(again.points.xyz, scene.points.xyz)
+
+
+@pytest.mark.parametrize("value", [5, [1, 2], [1, 2, "3"], [1, 2, 1e300], {"x": 1}])
+def test_a_damaged_record_is_one_line(garden: Path, tmp_path: Path, value: object) -> None:
+    clsplat("train", garden, "-m", tmp_path / "m", "--iterations", 4, "--cap-max", 40)
+    config = tmp_path / "m" / "config.json"
+    values = json.loads(config.read_text())
+    values["scene"]["origin"] = value
+    config.write_text(json.dumps(values))
+    assert "scene.origin is" in error_of("info", tmp_path / "m")
