@@ -112,6 +112,7 @@ class LoadedModel:
             `choice` names other test views than the record.
         """
         from ..scenes.changed_photos import check_photos
+        from ..scenes.origin import is_far
         from ..scenes.scene import load_scene  # imported late: it loads an image library, which would slow down --help
 
         choice, record = choice or SceneChoice(), self.scene_record
@@ -120,6 +121,8 @@ class LoadedModel:
             raise InputError(f"{self.path}: does not record its scene: give the scene's folder with -s")
         if choice.path is None and not Path(path).exists():
             raise InputError(f"{self.path}: its scene {path} does not exist: give the scene's folder with -s")
+        # A file of splats records nothing. Splats far away have the coordinates of the scene's files.
+        origin = self.origin if "origin" in record or is_far(self.splats.mean) else None
         test_names = self.test_names
         if test_names is not None and (choice.test_every or choice.test_list):
             leave_out = Remedy("leave out the choice of others", "--test-every", "--test-list")
@@ -135,7 +138,7 @@ class LoadedModel:
             masks=choice.masks or record.get("masks"),
             alpha=choice.alpha or record.get("alpha", ALPHA_USES[0]),
             read_photos=False,
-            origin=self.origin,
+            origin=origin,
         )
         as_recorded = all(getattr(choice, name) in (None, record.get(name)) for name in ("images", "masks"))
         if check and as_recorded:

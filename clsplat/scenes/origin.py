@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
+from ..splats.fields import Array
 from .posed_images import PosedImages
 
 # Largest distance from the origin in units of the scene's size. Beyond it, training in float32 loses image quality.
@@ -31,8 +33,12 @@ def near_origin(root: Path, posed: PosedImages, origin: Sequence[float] | None =
     Warns
     -----
     UserWarning : the scene is moved, and `origin` is None.
+
+    Raises
+    ------
+    InputError : `origin` is not three finite numbers.
     """
-    shift = _round_point(posed) if origin is None else np.asarray(origin, np.float64)
+    shift = _round_point(posed) if origin is None else _checked(origin)
     if not shift.any():
         return posed
     if origin is None:
@@ -51,10 +57,26 @@ def near_origin(root: Path, posed: PosedImages, origin: Sequence[float] | None =
     return replace(posed, photos=photos, points=points, origin=(float(shift[0]), float(shift[1]), float(shift[2])))
 
 
+def _checked(origin: Sequence[float]) -> NDArray[np.float64]:
+    try:
+        point = np.asarray(origin, np.float64)
+    except (TypeError, ValueError):
+        point = np.empty(0)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise InputError(f"origin {origin!r}: choose three finite numbers")
+    return point
+
+
 def camera_centres(posed: PosedImages) -> NDArray[np.float64]:
     """Return the centre of each photo's camera, (N, 3)."""
     poses = np.array([photo.cam_from_world for photo in posed.photos])
     return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+
+
+def is_far(xyz: Array) -> bool:
+    """Return whether points, (N, 3), are further from the origin than scenes may be."""
+    wide = xyz.astype(np.float64)
+    return len(wide) > 0 and _ratio(np.median(wide, axis=0), _spread(wide) or 1.0) >= FAR
 
 
 def size_of(posed: PosedImages) -> float:
@@ -72,14 +94,17 @@ def _spread(xyz: NDArray[np.float64]) -> float:
         return float(np.median(np.abs(xyz - np.median(xyz, axis=0)).max(axis=1)))
 
 
+def _ratio(centre: NDArray[np.float64], size: float) -> float:
+    return float(np.abs(centre).max()) / size
+
+
 def _round_point(posed: PosedImages) -> NDArray[np.float64]:
     """Return a round point inside a scene that is far from the origin; the origin for other scenes."""
     if not posed.photos:
         return np.zeros(3)
     size = size_of(posed)
     centre = np.median(posed.points.xyz if len(posed.points) else camera_centres(posed), axis=0)
-    ratio = float(np.abs(centre).max()) / size
-    if not FAR <= ratio <= _LOST:
+    if not FAR <= _ratio(centre, size) <= _LOST:
         return np.zeros(3)
     unit = 10.0 ** np.ceil(np.log10(size))
     return np.asarray(np.round(centre / unit) * unit, np.float64)

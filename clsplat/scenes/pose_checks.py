@@ -69,7 +69,7 @@ def _check_positions(root: Path, posed: PosedImages) -> None:
         f"{root}: the translation of {name!r} is {distance:.2g}, {ratio:.1g} times the size of the scene ({size:.2g})"
     )
     if ratio >= _TOO_FAR:
-        raise InputError(f"{text}, so float32 cannot hold it; correct the pose")
+        raise InputError(f"{text}, so float32 cannot hold it; correct the pose, or choose another origin")
     warnings.warn(f"{text}; its image loses sharpness in float32. Correct the pose", stacklevel=4)
 
 

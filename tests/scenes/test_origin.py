@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from cli_runner import clsplat, error_of, run
 from small_scene import cloud, moved, write_garden, write_model
 
-from clsplat.models.model import load_model
+from clsplat.errors import InputError
+from clsplat.models.model import SceneChoice, load_model
 from clsplat.scenes.scene import load_scene
 from clsplat.scenes.source import SceneSource
 
@@ -106,15 +110,36 @@ def test_a_model_is_evaluated_and_resumed_at_its_origin(garden: Path, tmp_path: 
         assert "becomes the origin" not in result.stderr
 
 
-def test_a_run_that_moved_nothing_is_read_as_it_was(garden: Path, tmp_path: Path) -> None:
-    """Runs of scenes that lie far away, from before scenes were moved, have no origin in their record."""
+def test_splats_with_the_coordinates_of_the_files_are_read_with_them(garden: Path, tmp_path: Path) -> None:
+    """So are runs of scenes that lie far away, from before scenes were moved, which have no origin in their record."""
     clsplat("train", garden, "-m", tmp_path / "m", "--iterations", 4, "--cap-max", 40)
     assert json.loads((tmp_path / "m" / "config.json").read_text())["scene"].get("origin") is None
     write_far(garden, 1e5)
-    assert load_model(tmp_path / "m").origin == (0.0, 0.0, 0.0)
+    model = load_model(tmp_path / "m")
+    assert model.origin == (0.0, 0.0, 0.0)
+    with pytest.warns(UserWarning, match="becomes the origin"):
+        assert model.load_scene().views[0].camera.position[0] < 1e3
+    far = replace(
+        model, splats=model.splats.with_arrays({**model.splats.arrays, "mean": model.splats.mean + np.float32(1e5)})
+    )
     with pytest.warns(UserWarning, match="loses sharpness in float32"):
-        scene = load_model(tmp_path / "m").load_scene()
-    assert scene.views[0].camera.position[0] > 9e4
+        assert far.load_scene().views[0].camera.position[0] > 9e4
+
+
+def test_a_file_of_splats_of_a_moved_scene_fits_it(garden: Path, tmp_path: Path) -> None:
+    write_far(garden)
+    assert run("train", garden, "-m", tmp_path / "m", "--iterations", 6, "--eval", "--cap-max", 40).exit_code == 0
+    model = load_model(tmp_path / "m")
+    clsplat("convert", tmp_path / "m", tmp_path / "small.ply")
+    with pytest.warns(UserWarning, match="becomes the origin"):
+        scene = load_model(tmp_path / "small.ply").load_scene(SceneChoice(path=garden))
+    assert scene.origin == model.origin
+
+
+@pytest.mark.parametrize("origin", [(1.0, 2.0), "here", (0.0, 0.0, math.nan), 5.0])
+def test_a_bad_origin_is_one_line(garden: Path, origin: Any) -> None:
+    with pytest.raises(InputError, match="choose three finite numbers"):
+        load_scene(garden, origin=origin)
 
 
 def test_a_scene_is_read_again_at_its_origin(garden: Path) -> None:
