@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -138,13 +139,16 @@ class Renderer:
             raise InputError("count_splats: render an image first")
         return splats_per_pixel(*self._last)
 
-    def backward(self, v_color: ArrayLike, v_alpha: ArrayLike | None = None) -> dict[str, Array]:
+    def backward(
+        self, v_color: ArrayLike, v_alpha: ArrayLike | None = None, names: Sequence[str] | None = None
+    ) -> dict[str, Array]:
         """Return the gradients of a loss of the last render with respect to the raw parameters.
 
         Parameters
         ----------
         v_color : (H, W, 3), gradient of the loss with respect to `color`.
         v_alpha : (H, W), gradient of the loss with respect to `alpha`; None for zero.
+        names : the fields to return; None for all. Colours are most of what a device sends.
 
         Returns
         -------
@@ -152,11 +156,14 @@ class Renderer:
 
         Raises
         ------
-        InputError : nothing is rendered yet, or the arrays have another size than the image.
+        InputError : nothing is rendered yet, the arrays have another size than the image, or a field is unknown.
         """
         if self._last is None:
             raise InputError("backward: render an image first")
         pipeline, frame = self._last
+        unknown = [name for name in names or () if name not in frame.splats.schema.names]
+        if unknown:
+            raise InputError(f"names: {unknown[0]!r} is no field; choose from {', '.join(frame.splats.schema.names)}")
         size = (frame.layout.height, frame.layout.width)
         color = self._v_color.write(frame.layout, _checked("v_color", v_color, (*size, 3)))
         alpha = self._v_alpha.write(
@@ -165,7 +172,7 @@ class Renderer:
         splats = frame.splats
         grads = ParameterBuffers(self.device, splats.schema, splats.capacity, splats.dtype)
         pipeline.backward(frame, color, grads, alpha)
-        return grads.download(splats.n)
+        return grads.download(splats.n, names)
 
     def _pipeline(self, splats: Splats) -> Pipeline:
         real = PRECISIONS[self.precision]

@@ -4,7 +4,7 @@ column for each splat.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -62,10 +62,10 @@ class ParameterBuffers:
             padded[:, : rows.shape[1]] = rows
             to_device(self.device, self.buffers[field.group], padded, self._offset_bytes(field.name))
 
-    def download(self, n: int, names: tuple[str, ...] | None = None) -> dict[str, Array]:
+    def download(self, n: int, names: Sequence[str] | None = None) -> dict[str, Array]:
         """Return the arrays of the first n splats, by field."""
         arrays: dict[str, Array] = {}
-        for name in names or self.schema.names:
+        for name in self.schema.names if names is None else names:
             field = self.schema[name]
             rows: Array = np.empty((field.width, self.capacity), self.dtype)
             to_host(self.device, self.buffers[field.group], rows, self._offset_bytes(name))

@@ -380,6 +380,16 @@ def test_gradients_without_alpha_are_those_of_zero_alpha_weights(make_renderer: 
     assert not np.array_equal(without["mean"], renderer.backward(v_color, v_alpha)["mean"])
 
 
+def test_gradients_of_some_fields_are_those_of_all(make_renderer: MakeRenderer, device: Device) -> None:
+    case, renderer = cloud(SKEWED), make_renderer(device)
+    case.render(renderer)
+    every = renderer.backward(case.weights[0])
+    some = renderer.backward(case.weights[0], names=("skew", "mean"))
+    assert list(some) == ["skew", "mean"]
+    assert all(np.array_equal(some[name], every[name]) for name in some)
+    assert renderer.backward(case.weights[0], names=()) == {}
+
+
 def test_wrong_calls_are_errors(make_renderer: MakeRenderer, device: Device) -> None:
     case, renderer = cloud("gaussian"), Renderer(device)
     with pytest.raises(InputError, match="render an image first"):
@@ -390,6 +400,8 @@ def test_wrong_calls_are_errors(make_renderer: MakeRenderer, device: Device) -> 
         with pytest.raises(InputError, match="background"):
             renderer.render(case.splats, case.camera, background)
     case.render(renderer)
+    with pytest.raises(InputError, match=r"names: 'skew' is no field; choose from mean, quat,"):
+        renderer.backward(np.zeros((27, 41, 3)), names=["mean", "skew"])
     with pytest.raises(InputError, match=r"v_color: shape \(41, 27, 3\), expected \(27, 41, 3\)"):
         renderer.backward(np.zeros((41, 27, 3)))
     with pytest.raises(InputError, match=r"v_alpha: shape \(27, 41, 1\)"):
