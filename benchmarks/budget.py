@@ -33,6 +33,7 @@ from clsplat.training.config import TrainConfig
 from clsplat.training.run import train
 
 KEY = ("scene", "resolution", "cap", "iterations", "shape", "tolerance", "seed", "views")
+DECIDED = "default"
 SHARES = (1.0, 0.4, 0.1)  # of the cap: the runs beside a search
 PAGE = ROOT / "docs" / "small-models.md"
 MARKS = ("<!-- table of budget.py -->", "<!-- end of the table of budget.py -->")
@@ -53,7 +54,7 @@ def search(case: Case, seed: int, args: Any, runs: Runs) -> None:
     background = background_of(case.scene)
     scene = case.load(args.views)
     config = TrainConfig(
-        shape=args.shape,
+        **({} if args.shape == DECIDED else {"shape": args.shape}),
         iterations=case.iterations,
         cap_max=case.cap,
         seed=seed,
@@ -75,6 +76,7 @@ def search(case: Case, seed: int, args: Any, runs: Runs) -> None:
         "psnr": round(found.psnr, 3),
         "ssim": round(found.ssim, 4),
         "splats": len(result.splats),
+        "kernel": result.splats.shape,
         "bytes": result.path.stat().st_size,
         "seconds": round(result.seconds, 1),
         "search": {key: result.report[key] for key in ("rounds", "chosen", "held_out", "all_views", "final")},
@@ -124,7 +126,7 @@ def page(rows: list[dict[str, Any]]) -> str:
             (
                 f"`{scene}`{'' if resolution == -1 else f' `-r {resolution}`'}, {iterations} iterations"
                 + ("" if tolerance == TOLERANCE else f", {tolerance:g} dB"),
-                shape,
+                case[0].get("kernel", shape),
                 views,
                 len(case),
                 f"{runs[0]['cap']}: {best:.2f}",
@@ -140,7 +142,7 @@ def page(rows: list[dict[str, Any]]) -> str:
 def main() -> None:
     flags = parser(__doc__, RESULTS / "budget.jsonl", page=PAGE)
     flags.add_argument("--cases", nargs="+", default=["fox:4:12000:1000"])
-    flags.add_argument("--shape", default=TrainConfig().shape)
+    flags.add_argument("--shape", default=DECIDED, help="kernel of all runs; by default that which a run decides on")
     flags.add_argument("--seeds", nargs="+", type=int, default=[0])
     flags.add_argument("--tolerance", type=float, default=TOLERANCE)
     flags.add_argument("--views", choices=("validation", "test"), default="validation")

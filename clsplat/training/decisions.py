@@ -67,6 +67,7 @@ UNSEEN_SPLATS = 50_000  # fewer splats outside of a photo save less time than th
 SHORT_RUN = 2500  # photos in all iterations: in longer runs the skew gains as much as further iterations do, or more
 SKEW_OPTIONS = {"shape", "normalisation", "skew_lr", "skew_map", "alternation"}  # who names one wants a skew
 SCREEN_FILTER = ("antialiased", "low_pass")
+BY_TRANSPARENCY = {"random_points", "random_background", "strategy"}  # decided by transparent photos
 FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
 _RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
 
@@ -104,7 +105,8 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     """
     chosen: dict[str, Any] = {}
     reasons = []
-    share = transparent_share(scene.train)
+    # Photos that are not in memory are decoded for it, which takes longer than all other decisions.
+    share = transparent_share(scene.train) if BY_TRANSPARENCY - config.named_options.keys() else 0.0
     transparent = share >= TRANSPARENT_SHARE
     why = random_start(scene, config)
     share_random = config.start.random_points if config.start.init == "sfm" else 0.0

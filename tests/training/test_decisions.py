@@ -19,6 +19,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Points, Scene
 from clsplat.splats.near_plane import NEAR_PLANE
 from clsplat.splats.splats import Splats
+from clsplat.training import decisions
 from clsplat.training.checkpoint import Checkpoint
 from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import (
@@ -240,6 +241,19 @@ def test_named_options_stay(scene: Scene) -> None:
     again = decide(scene, complete)
     assert again.config == complete, "nothing is decided twice"
     assert again.reasons == ()
+
+
+def test_complete_options_decode_no_photo(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = transparent(without_points(scene), 0.5)
+    complete = decide(start, options_of()).config
+    asked: list[str] = []
+    monkeypatch.setattr(decisions, "transparent_share", lambda views: asked.append("photos") or 0.5)
+    assert decide(start, complete.replace(iterations=40, random_points=0.1)).config.random_background
+    assert not asked
+    for name in ("random_points", "random_background", "strategy"):
+        others = {key: value for key, value in complete.named_options.items() if key != name}
+        decide(start, options_of(**others))
+        assert asked.pop() == "photos", name
 
 
 def test_the_near_plane_is_that_of_3dgs_unless_the_scene_is_small_or_near(scene: Scene) -> None:
