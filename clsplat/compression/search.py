@@ -28,6 +28,7 @@ from ..cluster.training import TrainJob, marked, train_in_place, unmark
 from ..errors import OutputError
 from ..files.lock import folder_lock
 from ..rendering.renderer import Renderer
+from ..scenes.in_memory import with_small_photos_in_memory
 from ..scenes.scene import Scene
 from ..scenes.source import SceneSource
 from ..scenes.split import hold_out
@@ -135,9 +136,9 @@ class _Search:
         cluster: str | None = None,
     ) -> None:
         self.cluster = cluster
-        self.scene, self.options = scene, options
+        self.scene, self.options = with_small_photos_in_memory(scene), options
         self.state, self.folder = state, folder
-        self.split = hold_out(scene)
+        self.split = hold_out(self.scene)
         self.renderer = Renderer(config.device)
         self.validation = Validation(self.renderer, self.split.test, config.background)
         self.config = config.replace(save_iterations=(), test_iterations=())
