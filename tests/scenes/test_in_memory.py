@@ -43,8 +43,10 @@ def test_small_photos_are_never_decoded_again(tmp_path: Path, decoded: list[str]
     assert sorted(decoded) == [view.name for view in scene.train], "each of them once, no test view"
     for view in held.views:
         view.release()
-    for view, other in zip(held.train, scene.train, strict=True):
-        np.testing.assert_array_equal(view.image, other.loaded().image)
+    images = [view.image for view in held.train]
+    assert len(decoded) == len(images), "they stay"
+    for image, other in zip(images, scene.train, strict=True):
+        np.testing.assert_array_equal(image, other.image)
     assert held.test == scene.test
     assert (held.names, held.test_names, held.reading) == (scene.names, scene.test_names, scene.reading)
 
@@ -54,7 +56,8 @@ def test_large_photos_stay_files(scene: Scene, monkeypatch: pytest.MonkeyPatch) 
     assert with_small_photos_in_memory(scene) is scene
 
 
-def test_a_search_decodes_no_photo_twice(scene: Scene, decoded: list[str], tmp_path: Path) -> None:
+def test_a_search_decodes_no_photo_twice(decoded: list[str], tmp_path: Path) -> None:
+    scene = load_scene(write_garden(tmp_path))
     config = TrainConfig(iterations=10, cap_max=60, device="cpu")
     train_budget(scene, config, BudgetOptions(1.0), output=tmp_path / "m")
     assert not decoded, "the scene has decoded them"
