@@ -74,11 +74,11 @@ def measure_importance(
     rows, columns = np.triu_indices(coefficients)
     removal, dropped = np.zeros(n), {field.name: np.zeros(n) for field in fields}
     colour = np.zeros((n, len(rows)), np.float32) if parts else None
-    wanted = [*opacities, *dropped, *(["sh"] if parts else [])]
+    names = [*opacities, *dropped, *(["sh"] if parts else [])]
     for view in views:
         image = renderer.render(splats, view.camera, background)
         signs = rng.choice(np.array([-1.0, 1.0]), size=image.color.shape)
-        grads = renderer.backward(signs, names=wanted)
+        grads = renderer.backward(signs, names=names)
         removal += np.sum([factor * grads[name] for name, factor in opacities.items()], axis=0) ** 2
         for field in fields:
             dropped[field.name] += _first_order(field, arrays[field.name], grads[field.name]) ** 2

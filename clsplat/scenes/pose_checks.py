@@ -16,8 +16,7 @@ from .posed_images import PosedImages
 
 _MAX_POINT = 1e30  # the largest coordinate of a point; float32 ends at 3e38
 _MAX_POSITION = 1e12  # training in float32 breaks between this and 1e15
-# Distance of a camera from the origin, in units of the scene's size, at which steps of float32 are a twentieth of it.
-_TOO_FAR = 1e6
+_TOO_FAR = 1e6  # sizes of the scene from the origin: steps of float32 are a twentieth of the scene there
 _DIGITS = 9  # poses that agree to these decimals count as equal
 _LEAST_FOCAL = 1e-3  # of the side of an image: an angle of view of 179.9 degrees
 _SHRUNK, _GROWN = 0.21, 1.99  # COLMAP's undistortion scales a side by 0.2 to 2; such sides are at the limits

@@ -153,8 +153,8 @@ def load_scene(
         decoded at each use instead (`View.loaded`).
     only : names of the photos to read, for a part of a large scene. The files of the others are not opened, except for
         their sizes. Test views are chosen among all photos.
-    origin : the point of the files' coordinates that becomes the origin, (3,). By default that is a round point inside
-        a scene that is so far from the origin that float32 cannot hold it, and other scenes are not moved.
+    origin : the point of the files' coordinates that becomes the origin, (3,). By default, a scene that is too far from
+        the origin for float32 gets a round point inside it, and other scenes are not moved.
 
     Warns
     -----

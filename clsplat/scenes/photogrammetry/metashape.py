@@ -28,7 +28,7 @@ from ..point_cloud import join_points, read_point_cloud
 from ..posed_images import PosedImages, read_sizes
 from ..undistort import Lens, RegisteredImage
 from .metashape_lens import metashape_lens
-from .metashape_world import World, rotation_of
+from .metashape_world import ChunkWorld, rotation_of
 from .named_photos import find_named_photos
 
 _EXPECTED = "the XML file of Metashape's Export Cameras"
@@ -68,7 +68,7 @@ def read_metashape(path: Path, images: str | None = None) -> PosedImages:
     left_out |= {name: f"{path}: {reason}" for name, reason in reasons.items()}
     lenses = _lenses(path, chunk, {named[name].sensor for name in sizes})
     poses = {name: named[name].pose() for name in sorted(sizes)}
-    world = World.of(path, chunk, active)
+    world = ChunkWorld.of(path, chunk, active)
     if world.is_geocentric:
         aligned = [camera.pose()[1] for name, camera in named.items() if name not in reasons]
         local = world.around(np.mean(aligned, axis=0))

@@ -23,7 +23,7 @@ _FLATTENED = 0.996647189335**2  # square of the polar radius of WGS 84 over the 
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class ChunkWorld:
     """Chunk to world: p -> scale * rotation p + translation."""
 
     rotation: NDArray[np.float64]
@@ -32,13 +32,13 @@ class World:
     is_geocentric: bool = False
 
     @staticmethod
-    def of(path: Path, chunk: ET.Element, component: str | None) -> World:
+    def of(path: Path, chunk: ET.Element, component: str | None) -> ChunkWorld:
         """Return the transform of a component, or else of the chunk; without either the chunk is the world."""
         components = [each for each in chunk.iterfind("components/component") if each.get("id") == component]
         holder = next((each for each in (*components, chunk) if each.find("transform") is not None), None)
         element = None if holder is None else holder.find("transform")
         if element is None:
-            return World(np.eye(3), np.zeros(3), 1.0)
+            return ChunkWorld(np.eye(3), np.zeros(3), 1.0)
         with named_place(f"{path}: <transform> of the chunk"):
             rotation, translation, scale = (
                 get_numbers(element, name, count) for name, count in (("rotation", 9), ("translation", 3), ("scale", 1))
@@ -47,14 +47,14 @@ class World:
                 raise InputError(f"<scale> is {scale[0]:g}; it must be above 0")
             turn = np.eye(3) if rotation is None else rotation_of(rotation.reshape(3, 3), "<rotation>").matrix
         system = (chunk.findtext("reference") or _LOCAL).strip()
-        return World(
+        return ChunkWorld(
             turn,
             np.zeros(3) if translation is None else translation,
             1.0 if scale is None else float(scale[0]),
             not system.startswith(_LOCAL),
         )
 
-    def around(self, position: NDArray[np.float64]) -> World:
+    def around(self, position: NDArray[np.float64]) -> ChunkWorld:
         """Return the world with its origin at a position in the chunk, and the axes east, north and up.
 
         Parameters
@@ -68,7 +68,7 @@ class World:
         east = np.array([-up[1], up[0], 0.0])
         east = east / np.linalg.norm(east) if east.any() else np.array([0.0, 1.0, 0.0])  # at a pole
         axes = np.stack([east, np.cross(up, east), up])
-        return World(axes @ self.rotation, axes @ (self.translation - origin), self.scale)
+        return ChunkWorld(axes @ self.rotation, axes @ (self.translation - origin), self.scale)
 
     def camera_pose(self, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return world-to-camera, (4, 4), for a camera-to-chunk rotation and a position in the chunk."""
