@@ -53,7 +53,7 @@ class Group(NamedTuple):
 
 
 GROUPS = {
-    "lengths": Group(SYSTEMS, (20_000,), (250, 500, 1000, 2000)),
+    "lengths": Group(SYSTEMS, (20_000,), (250, 500, 1000, 2000), seeds=3),
     "caps": Group(SYSTEMS, (1000, 5000, 20_000, 50_000), seeds=3),
     "table": Group(SYSTEMS, (5000, 20_000), seeds=3, scenes={"fox": 2, "kitchen": -1}),
     "seeds": Group(tuple(SHAPES), (1000,), (300,), seeds=5, repeat=3, scenes={"fox": 4}),
