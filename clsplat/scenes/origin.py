@@ -22,11 +22,12 @@ FAR = 1e4
 _LOST = 1e10  # beyond this distance, float64 has lost the scene, too
 
 
-def near_origin(root: Path, posed: PosedImages, origin: Sequence[float] | None = None) -> PosedImages:
+def near_origin(root: Path, posed: PosedImages, size: float, origin: Sequence[float] | None = None) -> PosedImages:
     """Return a scene in coordinates that float32 holds.
 
     Parameters
     ----------
+    size : of the scene (`size_of`).
     origin : the point of the file's coordinates that becomes the origin, (3,). By default that is a round point inside
         a scene that is far from the origin, and other scenes are not moved.
 
@@ -38,7 +39,7 @@ def near_origin(root: Path, posed: PosedImages, origin: Sequence[float] | None =
     ------
     InputError : `origin` is not three finite numbers.
     """
-    shift = _round_point(posed) if origin is None else _checked(origin)
+    shift = _round_point(posed, size) if origin is None else _checked(origin)
     if not shift.any():
         return posed
     if origin is None:
@@ -69,7 +70,7 @@ def _checked(origin: Sequence[float]) -> NDArray[np.float64]:
 
 def camera_centres(posed: PosedImages) -> NDArray[np.float64]:
     """Return the centre of each photo's camera, (N, 3)."""
-    poses = np.array([photo.cam_from_world for photo in posed.photos])
+    poses = np.array([photo.cam_from_world for photo in posed.photos]).reshape(-1, 4, 4)
     return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
 
 
@@ -98,11 +99,10 @@ def _ratio(centre: NDArray[np.float64], size: float) -> float:
     return float(np.abs(centre).max()) / size
 
 
-def _round_point(posed: PosedImages) -> NDArray[np.float64]:
+def _round_point(posed: PosedImages, size: float) -> NDArray[np.float64]:
     """Return a round point inside a scene that is far from the origin; the origin for other scenes."""
     if not posed.photos:
         return np.zeros(3)
-    size = size_of(posed)
     centre = np.median(posed.points.xyz if len(posed.points) else camera_centres(posed), axis=0)
     if not FAR <= _ratio(centre, size) <= _LOST:
         return np.zeros(3)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from .colmap import Points
-from .origin import FAR, size_of
+from .origin import FAR
 from .posed_images import PosedImages
 
 _MAX_POINT = 1e30  # the largest coordinate of a point; float32 ends at 3e38
@@ -22,8 +22,12 @@ _LEAST_FOCAL = 1e-3  # of the side of an image: an angle of view of 179.9 degree
 _SHRUNK, _GROWN = 0.21, 1.99  # COLMAP's undistortion scales a side by 0.2 to 2; such sides are at the limits
 
 
-def check_poses(root: Path, posed: PosedImages) -> None:
+def check_poses(root: Path, posed: PosedImages, size: float) -> None:
     """Refuse a scene that float32 cannot hold, and warn of poses that cannot be right.
+
+    Parameters
+    ----------
+    size : of the scene (`origin.size_of`).
 
     Warns
     -----
@@ -34,7 +38,7 @@ def check_poses(root: Path, posed: PosedImages) -> None:
     InputError : a camera is further from the origin than float32 can hold, as such or for the scene's size.
     """
     if posed.photos:
-        _check_positions(root, posed)
+        _check_positions(root, posed, size)
         _warn_of_equal_poses(root, posed)
 
 
@@ -50,7 +54,7 @@ def without_far_points(root: Path, points: Points) -> Points:
     return Points(points.xyz[near], points.rgb[near], points.track_length[near])
 
 
-def _check_positions(root: Path, posed: PosedImages) -> None:
+def _check_positions(root: Path, posed: PosedImages, size: float) -> None:
     poses = np.array([photo.cam_from_world for photo in posed.photos])
     distances = np.abs(poses[:, :3, 3]).max(axis=1)  # squares could overflow
     farthest = int(distances.argmax())
@@ -60,7 +64,6 @@ def _check_positions(root: Path, posed: PosedImages) -> None:
             f"{root}: the translation of {name!r} is {distance:.2g}, more than {_MAX_POSITION:g}; "
             "scale the poses down, or correct this one"
         )
-    size = size_of(posed)
     ratio = distance / size
     if ratio < FAR:
         return

@@ -24,7 +24,7 @@ from ..splats.color import BLACK, Color
 from .colmap import Points
 from .described import read_described
 from .options import ALPHA_USES, ORIGIN
-from .origin import near_origin
+from .origin import near_origin, size_of
 from .photo_size import check_memory
 from .pose_checks import check_lenses, check_poses, without_far_points
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
@@ -277,8 +277,9 @@ def read_posed_images(root: Path, images: str | None, origin: Sequence[float] | 
     else:
         posed = read_colmap(root, images)
     check_left_out(root, posed.left_out, len(posed.listed))
-    posed = near_origin(root, posed, origin)
-    check_poses(root, posed)
+    size = size_of(posed)
+    posed = near_origin(root, posed, size, origin)
+    check_poses(root, posed, size)
     return replace(posed, points=without_far_points(root, posed.points))
 
 
