@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import activity
+from ..errors import InputError
 from ..evaluation.contributions import contributions
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
@@ -104,12 +105,13 @@ def surroundings(scene: Scene, coarse: Splats, renderer: Renderer, partition: Pa
 
 
 def _shares(scene: Scene, splats: Splats, renderer: Renderer) -> Iterator[DoubleArray]:
-    """Yield for each training view the part of it that each splat fills, (N,)."""
-    for number, seen in enumerate(contributions(renderer, splats, scene.train, LONGEST_SIDE)):
-        activity.report(f"looking at photo {number + 1} of {len(scene.train)}")
-        camera = scene.train[number].camera
-        scale = min(1.0, LONGEST_SIDE / max(camera.width, camera.height))
-        yield seen.weight / (camera.width * camera.height * scale**2)
+    """Yield for each training view the part of it that each splat fills, (N,); raise InputError if its mask is gone."""
+    number = 0
+    for number, seen in enumerate(contributions(renderer, splats, scene.train, LONGEST_SIDE), 1):
+        activity.report(f"looking at photo {number} of {len(scene.train)}")
+        yield seen.weight / seen.pixels
+    if number < len(scene.train):
+        raise InputError(f"{scene.path}: a photo or its mask cannot be read any more: copy it there again")
 
 
 def _views_of_block(shares: DoubleArray) -> NDArray[np.int64]:

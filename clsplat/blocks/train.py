@@ -29,6 +29,7 @@ from ..errors import InputError, OutputError, Remedy
 from ..files.lock import folder_lock
 from ..files.real_path import real_path
 from ..rendering.renderer import Renderer
+from ..scenes.in_memory import with_small_photos_in_memory
 from ..scenes.scene import Scene
 from ..scenes.source import SceneSource
 from ..splats.splats import Splats
@@ -143,6 +144,7 @@ def _begin(
             Remedy("choose another folder"),
         )
     folder.prepare()
+    scene = with_small_photos_in_memory(scene)
     if not resume:
         config = decide(scene, config).tell(progress)
         with folder_lock(folder.path):

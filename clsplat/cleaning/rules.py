@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..cameras.seen import seen
 from ..evaluation.contributions import contributions
+from ..evaluation.decoded import decoded
 from ..evaluation.floaters import is_near
 from ..rendering.build import ALPHA_MIN
 from ..rendering.renderer import Renderer
@@ -78,9 +79,8 @@ def candidates_of_views(splats: Splats, views: Sequence[View], renderer: Rendere
         "few views": (seen > 0) & (seen < min(min_views, len(views))) & light,
         "near cameras": near > 0.5 * weight,
     }
-    if any(view.alpha is not None for view in views):
-        masks["outside"] = is_outside(splats, views)
-    return masks
+    outside = is_outside(splats, views)
+    return masks if outside is None else masks | {"outside": outside}
 
 
 def is_faint(splats: Splats) -> Mask:
@@ -131,24 +131,25 @@ def is_isolated(splats: Splats) -> Mask:
     return isolated
 
 
-def is_outside(splats: Splats, views: Sequence[View]) -> Mask:
+def is_outside(splats: Splats, views: Sequence[View]) -> Mask | None:
     """Return (N,) whether the centre is outside the visual hull (Laurentini 1994) of photos with transparency.
 
     At least two views must see the centre where their photo is wholly transparent, with a margin of 1.5 % of its size.
-    A splat in the background's colour is there without a trace in these photos, and covers the object in others.
+    A splat in the background's colour is there without a trace in these photos, and covers the object in others. None
+    if no photo has transparency.
     """
     from scipy.ndimage import maximum_filter1d  # lazy: a slow import
 
-    outside = np.zeros(len(splats), np.int64)
+    outside, found = np.zeros(len(splats), np.int64), False
     mean = splats.mean.astype(np.float64)
-    for view in views:
+    for view in decoded(views, "looked at"):
         if view.alpha is None:
             continue
-        camera, widened = view.camera, view.alpha
+        camera, widened, found = view.camera, view.alpha, True
         _, pixel, inside = seen(camera, mean)
         size = 2 * max(round(_MARGIN * max(camera.width, camera.height)), 1) + 1
         for axis in (0, 1):
             widened = maximum_filter1d(widened, size, axis=axis, mode="constant")
         column, row = pixel[inside].astype(np.int64).T
         outside[inside] += widened[row, column] == 0
-    return outside >= min(_OUTSIDE_VIEWS, len(views))
+    return outside >= min(_OUTSIDE_VIEWS, len(views)) if found else None

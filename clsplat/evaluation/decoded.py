@@ -9,12 +9,13 @@ from ..errors import InputError
 from ..scenes.scene import View
 
 
-def decoded(views: Sequence[View], purpose: str) -> Iterator[View]:
+def decoded(views: Sequence[View], purpose: str, *, only_masked: bool = False) -> Iterator[View]:
     """Return the views with their pixels in memory, each only as long as it is used.
 
     Parameters
     ----------
     purpose : what is done with the photos, such as "measured".
+    only_masked : leave photos as they are, without decoding them, if no mask hides pixels of them.
 
     Warns
     -----
@@ -27,7 +28,7 @@ def decoded(views: Sequence[View], purpose: str) -> Iterator[View]:
     damaged: list[str] = []
     for stored in views:
         try:
-            view = stored.loaded()
+            view = stored if only_masked and not stored.may_hide_pixels else stored.loaded()
         except InputError as error:
             damaged.append(str(error))
             continue

@@ -57,8 +57,8 @@ class PhotoReader:
         return width * height * (_DECODED_BYTES if is_pinhole(self.photo.lens) else _UNDISTORTED_BYTES)
 
     @property
-    def is_hidden_perhaps(self) -> bool:
-        """Whether a mask may hide every pixel."""
+    def may_hide_pixels(self) -> bool:
+        """Whether a mask may hide some of the pixels, or all."""
         return self.mask_file is not None or self.alpha_hides
 
     def camera(self) -> Camera:
@@ -135,12 +135,14 @@ def read_views(readers: Sequence[PhotoReader], now: Sequence[bool]) -> list[View
         if keep:
             activity.report(f"reading photo {next(numbers)} of {n}")
         view = None
-        if keep or reader.is_hidden_perhaps or not is_whole(reader.file):
+        if keep or reader.may_hide_pixels or not is_whole(reader.file):
             found = reader.read()
             if isinstance(found, str):
                 return found
             view = found if keep else None
-        return StoredView(reader.photo.name, reader.camera(), reader.view, reader.decoding_bytes, view)
+        return StoredView(
+            reader.photo.name, reader.camera(), reader.view, reader.decoding_bytes, view, reader.may_hide_pixels
+        )
 
     workers = decoding_threads([reader.decoding_bytes for reader in readers])
     with ThreadPoolExecutor(workers) as pool:  # decoding and resizing release the interpreter lock

@@ -30,6 +30,11 @@ class View:
     mask: Mask | None = None
     alpha: ImageU8 | None = None
 
+    @property
+    def may_hide_pixels(self) -> bool:
+        """Whether a mask may hide some of the pixels."""
+        return self.mask is not None
+
     def loaded(self) -> View:
         """Return the view with its pixels in memory."""
         return self
@@ -63,20 +68,29 @@ class StoredView(View):
     read : decodes the photo. It raises InputError if the photo cannot be used.
     decoding_bytes : memory that this needs beside the result.
     kept : the view with its pixels in memory; None if they are not kept.
+    may_hide_pixels : whether a mask may hide some of the pixels.
     """
 
     decoding_bytes: int
     _read: Callable[[], View]
     _kept: View | None
+    _may_hide_pixels: bool
 
     def __new__(cls, *_: Any, **fields: Any) -> Any:
         """Return a `View` for the fields of one, because `dataclasses.replace` calls the class with them."""
         return View(**fields) if "image" in fields else super().__new__(cls)
 
     def __init__(
-        self, name: str, camera: Camera, read: Callable[[], View], decoding_bytes: int = 0, kept: View | None = None
+        self,
+        name: str,
+        camera: Camera,
+        read: Callable[[], View],
+        decoding_bytes: int = 0,
+        kept: View | None = None,
+        may_hide_pixels: bool = True,
     ) -> None:
         values = {"name": name, "camera": camera, "decoding_bytes": decoding_bytes, "_read": read, "_kept": kept}
+        values["_may_hide_pixels"] = may_hide_pixels
         for key, value in values.items():
             object.__setattr__(self, key, value)  # the base class is frozen
 
@@ -97,6 +111,11 @@ class StoredView(View):
     def alpha(self) -> ImageU8 | None:
         """Opacity of the photo, as for `View`."""
         return self.loaded().alpha
+
+    @property
+    def may_hide_pixels(self) -> bool:
+        """Whether a mask may hide some of the pixels. This does not decode the photo."""
+        return self._may_hide_pixels
 
     @property
     def is_kept(self) -> bool:

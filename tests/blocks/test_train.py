@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from clsplat.errors import ClsplatError, InputError, OutputError
 from clsplat.models.resume import resume
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
+from clsplat.scenes.view import StoredView, View
 from clsplat.splats.splats import Splats
 from clsplat.splats.transform import joined
 from clsplat.training.config import TrainConfig
@@ -67,6 +69,50 @@ def test_a_photo_that_shows_a_block_is_among_its_views(scene: Scene, coarse: Spl
         for view in scene.train:
             alpha = [renderer.render(splats, view.camera).alpha.mean() for splats in (coarse, others)]
             assert alpha[0] - alpha[1] < 0.02 or view.name in block.views
+
+
+def undecodable() -> View:
+    raise InputError("a photo is decoded")
+
+
+def test_a_partition_decodes_only_photos_with_a_mask(scene: Scene, coarse: Splats) -> None:
+    views: list[View] = [StoredView(v.name, v.camera, undecodable, may_hide_pixels=False) for v in scene.views]
+    renderer, closed = Renderer(), replace(scene, views=views)
+    found, same = (make_partition(each, coarse, renderer, 2, 2) for each in (scene, closed))
+    assert found.to_json() == same.to_json()
+    around = [surroundings(each, coarse, renderer, found) for each in (scene, closed)]
+    assert all((a == b).all() for a, b in zip(*around, strict=True))
+    masked = scene.views.index(scene.train[0])
+    views[masked] = StoredView(views[masked].name, views[masked].camera, undecodable, may_hide_pixels=True)
+    with (
+        pytest.warns(UserWarning, match="1 of 8 photos are not looked at: a photo is decoded"),
+        pytest.raises(InputError, match="a photo or its mask cannot be read any more"),
+    ):
+        make_partition(replace(scene, views=views), coarse, renderer, 2, 2)
+
+
+def test_pixels_that_a_mask_hides_are_not_filled(scene: Scene, coarse: Splats) -> None:
+    """A single block fills a photo as far as the model is opaque where the mask shows it."""
+    renderer, first = Renderer(), scene.train[0]
+    mask = np.zeros((first.camera.height, first.camera.width), bool)
+    mask[:, first.camera.width // 3 :] = True
+    views = [replace(view, mask=mask) if view is first else view for view in scene.views]
+    (block,) = make_partition(replace(scene, views=views), coarse, renderer, 1, 1).blocks
+    alpha = {view.name: renderer.render(coarse, view.camera).alpha for view in scene.train}
+    alpha[first.name] = alpha[first.name] * mask
+    shares = dict(zip(block.views, block.shares, strict=True))
+    assert shares == pytest.approx({name: alpha[name].mean() for name in shares}, abs=1e-4)
+    assert first.name in shares
+
+
+def test_small_photos_are_decoded_once(scene: Scene, tmp_path: Path) -> None:
+    decoded: list[str] = []
+
+    def stored(view: View) -> View:
+        return StoredView(view.name, view.camera, lambda: decoded.append(view.name) or view)
+
+    train_in_blocks(replace(scene, views=[stored(view) for view in scene.views]), TWO, CONFIG, output=tmp_path)
+    assert sorted(decoded) == sorted(view.name for view in scene.train)
 
 
 def test_the_model_has_all_splats_of_all_blocks(finished: BlocksModel, scene: Scene) -> None:

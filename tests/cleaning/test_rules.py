@@ -85,4 +85,7 @@ def test_splats_outside_the_hull_of_two_photos_are_named() -> None:
     # The one at [1, 0, 0] is beside the object in both views; the far one is behind it in one. The margin is 2 px.
     assert np.flatnonzero(is_outside(splats, views)).tolist() == [2, 3]
     assert np.flatnonzero(is_outside(splats, [views[0], replace(views[1], alpha=None)])).tolist() == []
-    assert not is_outside(splats, [replace(one, alpha=np.full_like(alpha, 255)) for one in views]).any()
+    assert is_outside(splats, [replace(one, alpha=np.full_like(alpha, 255)) for one in views]).tolist() == [
+        False
+    ] * len(splats)
+    assert is_outside(splats, [replace(one, alpha=None) for one in views]) is None
