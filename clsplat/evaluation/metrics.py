@@ -6,7 +6,9 @@ names its `MetricProtocol`.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -181,10 +183,9 @@ def ssim(
 
 def _similarity(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the map of the structural similarity of one channel, (H, W)."""
-    mean_x, mean_y = _blur(x), _blur(y)
-    var_x = _blur(x * x) - mean_x * mean_x
-    var_y = _blur(y * y) - mean_y * mean_y
-    cov = _blur(x * y) - mean_x * mean_y
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 5)) as pool:  # SciPy's filters release the interpreter lock
+        mean_x, mean_y, mean_xx, mean_yy, mean_xy = pool.map(_blur, (x, y, x * x, y * y, x * y))
+    var_x, var_y, cov = mean_xx - mean_x * mean_x, mean_yy - mean_y * mean_y, mean_xy - mean_x * mean_y
     luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
     structure = (2 * cov + SSIM_C2) / (var_x + var_y + SSIM_C2)
     return np.asarray(luminance * structure)
