@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from clsplat.device.device import list_devices, open_device
+from clsplat.device.device import Device, list_devices, open_device
 from clsplat.device.several import open_devices
 from clsplat.errors import DeviceError, InputError, TrainingError
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.rendering.renderer import Renderer
+from clsplat.rendering.tuning import SCHEDULE_VARIABLE
 from clsplat.scenes.scene import Scene
 from clsplat.splats.splats import Splats
 from clsplat.training.config import TrainConfig
@@ -88,6 +90,28 @@ def test_parts_of_a_device_have_the_bits_of_the_whole(
     whole = train(scene, config_of(batch=batch, device="cpu", **options))
     parts = train(scene, config_of(batch=batch, device=halves, **options))
     assert_same_bits(whole.splats, parts.splats)
+
+
+@pytest.mark.parametrize("options", [{}, {"strategy": "mcmc", "exposure": True}], ids=["adc", "mcmc"])
+def test_devices_that_count_as_gpus_have_the_bits_of_one(
+    scene: Scene, halves: str, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
+) -> None:
+    """With the schedule, the lists of isects and the sorts of GPUs."""
+    opened: list[Device] = []
+
+    def as_gpus(spec: str | None) -> list[Device]:
+        devices = open_devices(spec)
+        for device in devices:
+            device.info = replace(device.info, type="GPU")
+        opened.extend(devices)
+        return devices
+
+    monkeypatch.setattr("clsplat.training.trainer.open_devices", as_gpus)
+    monkeypatch.setenv(SCHEDULE_VARIABLE, "gpu256")
+    config = config_of(batch=2, iterations=12, cap_max=300, **options)
+    models = [train(scene, config.replace(device=spec)) for spec in ("cpu", halves)]
+    assert [device.info.type for device in opened] == ["GPU"] * 3
+    assert_same_bits(models[0].splats, models[1].splats)
 
 
 def test_a_run_goes_on_with_another_number_of_devices(scene: Scene, halves: str, tmp_path: Path) -> None:
