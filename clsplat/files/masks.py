@@ -47,11 +47,16 @@ def is_same_file(a: Path, b: Path) -> bool:
 def read_mask(path: Path) -> Mask:
     """Return a mask, (H, W), True if the photo's pixel counts.
 
+    Values from the middle up count. In a mask of black and one dark value, such as 0 and 1, the dark one counts.
+
     Raises
     ------
     InputError : the file cannot be read as an image.
     """
-    return read_image(path)[:, :, :3].mean(axis=2) >= _THRESHOLD
+    values = read_image(path)[:, :, :3].mean(axis=2)
+    largest = values.max()
+    numbered = largest == 1 or (values.min() == 0 and np.isin(values, (0.0, largest)).all())
+    return values > 0 if numbered and largest < _THRESHOLD else values >= _THRESHOLD
 
 
 def resize_mask(mask: Mask, width: int, height: int) -> Mask:

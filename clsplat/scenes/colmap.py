@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ..errors import InputError, reason_of
 from ..splats.quaternions import rotations
 from .colmap_binary import check_binary_model, count_registered
+from .colmap_folder import FILES, colmap_folder, model_suffix
 from .scene_files import OTHER_KINDS
 from .undistort import RegisteredImage, colmap_library
 
-_FILES = ("cameras", "images", "points3D")
 _WORDS_BEFORE_NAME = 9  # words before the name in a line of images.txt
 _UNIT = 1e-6  # largest error of the norm of a quaternion that pycolmap turns into a rotation as it is
 
@@ -54,7 +54,8 @@ class SparseReconstruction:
 def find_model(scene: Path) -> Path:
     """Return the folder of a scene's COLMAP model.
 
-    Among `sparse` and `sparse/*`, this is the model with the most registered images.
+    Among `sparse` and `sparse/*`, this is the model with the most registered images. Without `sparse` it is the one
+    beside the photos.
 
     Raises
     ------
@@ -62,14 +63,16 @@ def find_model(scene: Path) -> Path:
     """
     if not scene.is_dir():
         raise InputError(f"{scene}: no such folder; give a folder with images/ and sparse/, or {OTHER_KINDS}")
-    sparse = scene / "sparse"
-    if not sparse.is_dir():
+    sparse = colmap_folder(scene)
+    if sparse is None:
         raise InputError(
             f"{scene}: no folder 'sparse'; a scene needs a COLMAP model in sparse/0 (clsplat reconstruct makes one of "
             f"photos), or {OTHER_KINDS}"
         )
+    if sparse == scene:
+        return scene
     candidates = [sparse, *sorted(folder for folder in sparse.iterdir() if folder.is_dir())]
-    models = [folder for folder in candidates if _suffix(folder)]
+    models = [folder for folder in candidates if model_suffix(folder)]
     if not models:
         raise InputError(
             f"{sparse}: no COLMAP model (cameras and images, .bin or .txt) in this folder or below; "
@@ -116,7 +119,7 @@ def points_of_photos(folder: Path, photos: Collection[str], at_least: int) -> Po
 @contextmanager
 def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str]]]:
     """Yield a pycolmap.Reconstruction and names that replace its own. Raise InputError if it cannot be read."""
-    suffix = _suffix(folder)
+    suffix = model_suffix(folder)
     if not suffix:
         raise InputError(f"{folder}: cameras or images file is missing (.bin or .txt)")
     if suffix == ".bin":
@@ -133,21 +136,13 @@ def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str]]]:
         ) from None
 
 
-def _suffix(folder: Path) -> str:
-    """Return the suffix of the model's files as pycolmap chooses it, ".bin" or ".txt", or "" without a model."""
-    for suffix in (".bin", ".txt"):
-        if all((folder / f"{stem}{suffix}").is_file() for stem in _FILES[:2]):
-            return suffix
-    return ""
-
-
 @contextmanager
 def _complete(folder: Path, suffix: str) -> Iterator[Path]:
     """Yield the model's folder, or a copy with an empty points3D file if this file is missing.
 
     pycolmap refuses a model without that file. Pipes are left out, because opening one would wait for ever.
     """
-    points = folder / f"points3D{suffix}"
+    points = folder / f"{FILES[2]}{suffix}"
     if points.is_file():
         yield folder
         return

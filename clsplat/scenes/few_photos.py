@@ -9,7 +9,9 @@ import numpy as np
 
 from ..errors import InputError
 from .colmap import Points, find_model, points_of_photos
+from .colmap_folder import colmap_folder
 from .scene import Scene
+from .scene_files import described_by
 
 SEEN_BY = 2  # photos that a point needs: one alone gives no depth
 
@@ -35,6 +37,6 @@ def few_photos(scene: Scene, count: int) -> Scene:
 
 
 def _points(scene: Scene, photos: Collection[str]) -> Points:
-    if not (scene.path / "sparse").is_dir():
+    if described_by(scene.path) or colmap_folder(scene.path) is None:
         return scene.points
     return points_of_photos(find_model(scene.path), photos, SEEN_BY)

@@ -16,12 +16,13 @@ from ..errors import InputError
 from ..files.image_names import IMAGE_SUFFIXES
 from ..files.json_file import read_json, to_real
 from ..files.real_path import real_path
+from .colmap_folder import colmap_folder
 from .photo_listing import list_images
 from .pose_checks import check_lenses
 from .posed_images import PosedImages
 from .reconstruct.options import RECORD
 from .scene import find_masks, read_posed_images, select_test_names
-from .scene_files import SCENE_ENDINGS, find_scene_files
+from .scene_files import SCENE_ENDINGS, described_by, find_scene_files
 from .undistort import is_pinhole
 
 _DIGITS = 6  # significant digits of a focal length; lenses that agree to these digits count as one
@@ -108,10 +109,10 @@ class SceneInfo:
 
 
 def is_scene(path: Path) -> bool:
-    """Return whether a path looks like a scene: a folder with `sparse` or a file of cameras, or such a file."""
+    """Return whether a path looks like a scene: a folder with a COLMAP model or a file of cameras, or such a file."""
     if path.is_file():
         return path.suffix.lower() in SCENE_ENDINGS
-    return (path / "sparse").is_dir() or bool(find_scene_files(path))
+    return colmap_folder(path) is not None or bool(find_scene_files(path))
 
 
 def scene_info(path: str | os.PathLike[str], images: str | None = None, test_every: int = 8) -> SceneInfo:
@@ -128,9 +129,9 @@ def scene_info(path: str | os.PathLike[str], images: str | None = None, test_eve
     tracks = posed.points.track_length
     masks = find_masks(root, posed, None)
     held_out = select_test_names(posed, test_every, None) if len(posed.listed) > 1 else frozenset()
-    described_by = [] if (root / "sparse").is_dir() else find_scene_files(root)
+    described = described_by(root)
     return SceneInfo(
-        " and ".join(file.name for file in described_by) or "COLMAP",
+        " and ".join(file.name for file in described) or "COLMAP",
         len(posed.listed),
         _unregistered(root, posed, masks.values()),
         posed.left_out,

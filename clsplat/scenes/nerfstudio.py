@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..cameras.path import cam_from_world_of
 from ..cameras.rotations import NearestRotation, NotARotation, nearest_rotation, warn_of_corrections
-from ..errors import InputError
+from ..errors import InputError, Remedy
 from ..files.file_names import can_be_file
 from ..files.image_names import IMAGE_SUFFIXES
 from ..files.json_file import MAX_NUMBER, read_json, to_real
@@ -39,6 +39,7 @@ from .undistort import Lens, RegisteredImage, brown_lens, make_lens
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _LAST_ROW = 1e-6  # largest error of the last row of a pose
+_HELD_OUT = "test_frames"  # of ScanNet++, beside the list `frames`
 _LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists of photos
 _COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0")  # where nerfstudio and COLMAP put a COLMAP model
 _SUFFIXES = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
@@ -61,7 +62,7 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
     InputError : a file is damaged or has no frames, a key is missing or unusable, no photo of a list has a frame, or
         the points cannot be read. The message names file, frame and key.
     """
-    documents = [_Document.read(file) for file in files]
+    documents = [_Document.read(file, may_be_empty=number > 0) for number, file in enumerate(files)]
     frames = [frame for document in documents for frame in document.frames(images)]
     photos: dict[str, _Frame] = {}
     for frame in frames:
@@ -72,17 +73,22 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
     listed = {name: frame for name, frame in sorted(photos.items()) if name in used}
     photo_files = {name: frame.file for name, frame in listed.items()}
     sizes, left_out = read_sizes(photo_files)
+    for name in [name for name in sizes if listed[name].is_lost]:
+        left_out[name] = f"{listed[name].place}: its transform_matrix is not finite"
+        del sizes[name]
     kept = {name: listed[name] for name in sizes}
     for document in documents:
         of_file = (frame for frame in kept.values() if frame.document is document)
-        warn_of_corrections(document.path, {f"frame {frame.index}": frame.rotation for frame in of_file})
+        warn_of_corrections(
+            document.path, {frame.place.removeprefix(f"{document.path}: "): frame.rotation for frame in of_file}
+        )
     return PosedImages(
         [frame.photo(sizes[name]) for name, frame in kept.items()],
         photo_files,
         sizes,
         documents[0].points(),
         _held_out(documents, listed),
-        {name: mask for name, frame in kept.items() for mask in [frame.mask_file()] if mask is not None},
+        {name: frame.mask_file for name, frame in kept.items() if frame.values.get("mask_path") is not None},
         left_out,
     )
 
@@ -91,6 +97,8 @@ def _held_out(documents: list[_Document], frames: dict[str, _Frame]) -> frozense
     """Return the names of the test views that the files hold out; None if they hold none out."""
     if len(documents) == 2:
         return frozenset(name for name, frame in frames.items() if frame.document is documents[1])
+    if held_out := frozenset(name for name, frame in frames.items() if frame.held_out):
+        return held_out
     for key in ("test_filenames", "val_filenames"):
         if documents[0].listed_names(key):
             return frozenset(documents[0].listed_names(key) & set(frames))
@@ -102,29 +110,34 @@ class _Frame:
     """A frame of a transforms file, with its photo's name and file."""
 
     document: _Document
-    index: int
+    place: str
     values: dict[str, Any]
     name: str
     file: Path
-
-    @property
-    def place(self) -> str:
-        return f"{self.document.path}: frame {self.index}"
+    held_out: bool
 
     def photo(self, size: tuple[int, int]) -> RegisteredImage:
         """Return the photo, whose file has this size [px], with its pose and lens."""
         return RegisteredImage(self.name, self.pose(), self.lens(size))
 
-    def mask_file(self) -> Path | None:
-        """Return the mask file named by nerfstudio's `mask_path`, or None."""
+    @property
+    def is_lost(self) -> bool:
+        """Whether the pose is a matrix with numbers that are not finite: ScanNet has them where tracking failed."""
+        matrix = _matrix(self.values.get("transform_matrix"))
+        return matrix is not None and not np.isfinite(matrix).all()
+
+    def mask_file(self) -> Path:
+        """Return the mask file named by nerfstudio's `mask_path`; raise InputError if it cannot be used."""
         mask = self.values.get("mask_path")
-        if mask is None:
-            return None
         if not isinstance(mask, str) or not mask.isprintable() or not can_be_file(mask):
             raise InputError(f"{self.place}: mask_path {mask!r} is not the name of a file; name a mask, or remove it")
         file = self.document.path.parent / mask.replace("\\", "/")
         if not file.is_file():
-            raise InputError(f"{self.place}: mask_path {mask!r} is not a file; copy the mask there, or remove the key")
+            raise InputError(
+                f"{self.place}: mask_path {mask!r} is not a file",
+                Remedy("copy it there"),
+                Remedy("use no masks", "--masks none"),
+            )
         if is_same_file(file, self.file):
             raise InputError(f"{self.place}: mask_path {mask!r} is the photo itself; name a mask, or remove it")
         return file
@@ -133,7 +146,7 @@ class _Frame:
     def matrix(self) -> NDArray[np.float64]:
         """The transform_matrix as it is in the file, (4, 4)."""
         matrix = _matrix(self.values.get("transform_matrix"))
-        if matrix is None:
+        if matrix is None or not np.isfinite(matrix).all():
             raise InputError(f"{self.place}: transform_matrix must be 4 x 4 finite numbers; write the poses again")
         if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > _LAST_ROW:
             row = " ".join(f"{value:g}" for value in matrix[3])
@@ -221,19 +234,27 @@ class _Document:
     values: dict[str, Any]
 
     @staticmethod
-    def read(path: Path) -> _Document:
+    def read(path: Path, *, may_be_empty: bool = False) -> _Document:
         values = read_json(path, "a transforms.json of NeRF, instant-ngp or nerfstudio")
-        if not isinstance(values, dict) or not isinstance(values.get("frames"), list) or not values["frames"]:
+        frames = values.get("frames") if isinstance(values, dict) else None
+        if (
+            not isinstance(frames, list)
+            or not (frames or may_be_empty)
+            or not isinstance(values.get(_HELD_OUT, []), list)
+        ):
             raise InputError(f"{path}: has no list 'frames'; give a transforms.json of NeRF, instant-ngp or nerfstudio")
         return _Document(path, values)
 
     def frames(self, images: str | None) -> Iterator[_Frame]:
         """Yield all frames, including frames without an existing photo."""
-        for number, values in enumerate(self.values["frames"]):
-            if not isinstance(values, dict) or not isinstance(values.get("file_path"), str) or not values["file_path"]:
-                raise InputError(f"{self.path}: frame {number}: has no file_path; name its photo")
-            file = self.photo_file(values["file_path"], images)
-            yield _Frame(self, number, values, self.name_of(file), file)
+        for held_out, key in ((False, "frames"), (True, _HELD_OUT)):
+            for number, values in enumerate(self.values.get(key) or []):
+                place = f"{self.path}: {'test frame' if held_out else 'frame'} {number}"
+                path = values.get("file_path") if isinstance(values, dict) else None
+                if not isinstance(path, str) or not path:
+                    raise InputError(f"{place}: has no file_path; name its photo")
+                file = self.photo_file(path, images)
+                yield _Frame(self, place, values, self.name_of(file), file, held_out)
 
     def photo_file(self, file_path: str, images: str | None = None) -> Path:
         """Return the photo's file; Blender sets omit the suffix. Raises InputError if no file can have the name."""
@@ -304,17 +325,17 @@ class _Document:
         """Return points of the COLMAP model in the world of the poses."""
         matrix = _matrix(self.values["applied_transform"])
         scale = to_real(self.values.get("applied_scale", 1.0))
-        if matrix is None or scale is None or not 0 < scale < MAX_NUMBER:
+        if matrix is None or not np.isfinite(matrix).all() or scale is None or not 0 < scale < MAX_NUMBER:
             raise InputError(f"{self.path}: applied_transform must be 3 x 4 numbers and applied_scale above 0")
         return scale * (xyz @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 def _matrix(value: Any) -> NDArray[np.float64] | None:
-    """Return nested lists of 4 x 4 or 3 x 4 finite numbers as a (4, 4) matrix; None for other values."""
+    """Return nested lists of 4 x 4 or 3 x 4 numbers as a (4, 4) matrix; None for other values."""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (OverflowError, TypeError, ValueError):
         return None
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
-    return matrix if matrix.shape == (4, 4) and np.isfinite(matrix).all() else None
+    return matrix if matrix.shape == (4, 4) else None

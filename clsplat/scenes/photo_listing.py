@@ -11,10 +11,9 @@ from ..errors import InputError
 from ..files.images import is_render
 from ..files.json_file import read_json
 from ..files.masks import MASK_FOLDER
+from .colmap_folder import colmap_folder, model_suffix
 from .reconstruct.options import RECORD
 from .scene_files import find_scene_files
-
-_MODEL_FILES, _ENDS = ("cameras", "images"), (".bin", ".txt")  # of COLMAP
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ def is_output(folder: Path) -> bool:
 
 
 def is_posed(folder: Path) -> bool:
-    """Return whether a folder holds poses: a COLMAP model in `sparse`, or files that describe cameras."""
+    """Return whether a folder holds poses: a COLMAP model, or files that describe cameras."""
     if find_scene_files(folder):
         return True
     sparse = folder / "sparse"
@@ -88,7 +87,7 @@ def is_posed(folder: Path) -> bool:
         places = [sparse, *sparse.iterdir()] if sparse.is_dir() else []
     except OSError:
         return False
-    return any(_are_files(place, *(f"{stem}{end}" for stem in _MODEL_FILES)) for place in places for end in _ENDS)
+    return colmap_folder(folder) == folder or any(model_suffix(place) for place in places)
 
 
 def _is_made_scene(folder: Path) -> bool:

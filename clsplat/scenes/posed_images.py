@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,9 +12,11 @@ from ..errors import InputError
 from ..files.image_names import IMAGE_SUFFIXES
 from ..files.images import image_size
 from .colmap import Points, find_model, read_model
+from .colmap_folder import PHOTOS, colmap_folder
 from .options import ORIGIN
 from .photo_listing import list_images
 from .photo_names import place_photos
+from .point_cloud import read_point_cloud
 from .reduced_photos import with_reduced_photos
 from .undistort import RegisteredImage
 
@@ -35,7 +37,7 @@ class PosedImages:
     points : point cloud, may be empty.
     test_names : names of the photos that the scene's files hold out for evaluation, with those left out; None if the
         files do not specify any.
-    masks : mask files named in the scene's files, by photo name.
+    masks : by photo name, functions that look up the mask which the scene's files name. They raise InputError.
     left_out : reason why a photo with a pose cannot be used, by name.
     origin : the point of the file's coordinates that is the origin of the poses and points (origin.py).
     """
@@ -45,7 +47,7 @@ class PosedImages:
     sizes: dict[str, tuple[int, int]]
     points: Points
     test_names: frozenset[str] | None = None
-    masks: dict[str, Path] = field(default_factory=dict)
+    masks: Mapping[str, Callable[[], Path]] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     origin: tuple[float, float, float] = ORIGIN
 
@@ -71,15 +73,24 @@ def read_sizes(files: Mapping[str, Path]) -> tuple[dict[str, tuple[int, int]], d
     return sizes, left_out
 
 
-def check_left_out(root: Path, left_out: Mapping[str, str], n: int) -> None:
-    """Raise InputError if fewer than a quarter of a scene's `n` photos can be used."""
-    used = n - len(left_out)
-    if left_out and used < max(1, MIN_USABLE * n):
-        number = f"only {used}" if used else "none"
-        raise InputError(
-            f"{root}: {number} of its {n} photos can be used, at least {math.ceil(MIN_USABLE * n)} must be; "
-            f"copy them there, or name another folder of photos ({next(iter(left_out.values()))})"
-        )
+def check_left_out(root: Path, posed: PosedImages, left_out: Mapping[str, str]) -> None:
+    """Raise InputError if fewer than a quarter of a scene's photos can be used.
+
+    A quarter of the training photos is enough if the scene's files name the test views. BlenderNeRF writes poses of
+    test views without photos.
+    """
+    if not left_out:
+        return
+    listed = set(posed.listed)
+    for names in (listed, listed - (posed.test_names or set())):
+        if len(names - set(left_out)) >= max(1, MIN_USABLE * len(names)):
+            return
+    n, used = len(listed), len(listed) - len(left_out)
+    number = f"only {used}" if used else "none"
+    raise InputError(
+        f"{root}: {number} of its {n} photos can be used, at least {math.ceil(MIN_USABLE * n)} must be; "
+        f"copy them there, or name another folder of photos ({next(iter(left_out.values()))})"
+    )
 
 
 def warn_of_left_out(root: Path, left_out: Mapping[str, str], n: int) -> None:
@@ -95,12 +106,12 @@ def warn_of_left_out(root: Path, left_out: Mapping[str, str], n: int) -> None:
 
 
 def read_colmap(root: Path, images: str | None) -> PosedImages:
-    """Read a folder with photos and a COLMAP model in `sparse`.
+    """Read a folder with photos and a COLMAP model.
 
     Parameters
     ----------
     root : the scene's folder.
-    images : folder of the photos inside it; "images" by default.
+    images : folder of the photos inside it; by default "images". Without it, that of a model beside its photos.
 
     Warns
     -----
@@ -110,15 +121,23 @@ def read_colmap(root: Path, images: str | None) -> PosedImages:
     ------
     InputError : a folder is missing, or the model is damaged.
     """
-    model = read_model(find_model(root))
-    folder = photo_folder(root, images or "images")
+    place = find_model(root)
+    model = read_model(place)
+    beside = colmap_folder(root) == root and not (root / PHOTOS).is_dir()
+    folder = photo_folder(root, images or ("." if beside else PHOTOS))
     placed = place_photos(folder, [photo.name for photo in model.photos])
     files = with_reduced_photos(folder, dict(placed.values()))
     sizes, left_out = read_sizes(files)
     _warn_of_unregistered(folder, len(model.photos))
     named = sorted((replace(photo, name=placed[photo.name][0]) for photo in model.photos), key=lambda photo: photo.name)
     photos = [photo for photo in named if photo.name in sizes]
-    return PosedImages(photos, files, sizes, model.points, left_out=left_out)
+    return PosedImages(photos, files, sizes, _points_of(place, model.points), left_out=left_out)
+
+
+def _points_of(model: Path, points: Points) -> Points:
+    """Return the points of a model, or of the points3D.ply beside it: some programs write no other file of points."""
+    file = model / "points3D.ply"
+    return points if len(points) or not file.is_file() else read_point_cloud(file)
 
 
 def photo_folder(root: Path, images: str) -> Path:

@@ -22,6 +22,7 @@ from ..files.real_path import real_path
 from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
 from .colmap import Points
+from .colmap_folder import colmap_folder
 from .described import read_described
 from .options import ALPHA_USES, ORIGIN
 from .origin import near_origin, size_of
@@ -29,7 +30,7 @@ from .photo_size import check_memory
 from .pose_checks import check_lenses, check_poses, without_far_points
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
 from .read_view import PhotoReader, read_views
-from .scene_files import SCENE_ENDINGS, find_scene_files
+from .scene_files import SCENE_ENDINGS, described_by
 from .view import View
 from .wrong_folder import describe_file, scene_hint
 
@@ -199,7 +200,7 @@ def load_scene(
     views = [view for view in results if isinstance(view, View)]
     unusable = {photo.name: view for photo, view in zip(photos, results, strict=True) if isinstance(view, str)}
     left_out, n = dict(sorted((posed.left_out | unusable).items())), len(posed.listed)
-    check_left_out(root, left_out, n)
+    check_left_out(root, posed, left_out)
     warn_of_left_out(root, left_out, n)
     if only is None and all(view.name in test_names for view in views):
         raise InputError(
@@ -262,21 +263,21 @@ def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, 
     masks = mask_files(path, {name: posed.files[name] for name in posed.names})
     if folder is not None and posed.names and not masks:
         raise InputError(f"{path}: no mask of any photo in it; a mask of {posed.names[0]!r} is {posed.names[0]}.png")
-    return posed.masks | masks
+    named = {name: find() for name, find in posed.masks.items() if name not in masks}
+    return named | masks
 
 
 def read_posed_images(root: Path, images: str | None, origin: Sequence[float] | None = None) -> PosedImages:
     """Read a scene's photos with poses, without decoding them; parameters and errors as `load_scene`."""
     if root.is_file() and root.suffix.lower() not in SCENE_ENDINGS:
         raise InputError(f"{root}: {describe_file(root)}")
-    files, has_model = find_scene_files(root), (root / "sparse").is_dir()
-    if files and not has_model:
+    if files := described_by(root):
         posed = read_described(files, images)
-    elif root.is_dir() and not has_model and (hint := scene_hint(root)) is not None:
+    elif root.is_dir() and colmap_folder(root) is None and (hint := scene_hint(root)) is not None:
         raise InputError(hint)
     else:
         posed = read_colmap(root, images)
-    check_left_out(root, posed.left_out, len(posed.listed))
+    check_left_out(root, posed, posed.left_out)
     size = size_of(posed)
     posed = near_origin(root, posed, size, origin)
     check_poses(root, posed, size)

@@ -21,7 +21,7 @@ def find_scene_files(path: Path) -> list[Path]:
     """Return the files that describe a scene's cameras; an empty list without any.
 
     The kinds are looked for in a fixed order, and the first that is there counts: transforms files, an OPF project,
-    cameras of Metashape. A COLMAP model comes before them all; `read_posed_images` looks for it first.
+    cameras of Metashape.
 
     Parameters
     ----------
@@ -35,6 +35,11 @@ def find_scene_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path] if path.suffix.lower() in PHOTOGRAMMETRY_ENDINGS else find_transforms(path)
     return find_transforms(path) or _ending(path, OPF_ENDING) or _metashape_files(path)
+
+
+def described_by(scene: Path) -> list[Path]:
+    """Return the files that a scene is read from in place of a COLMAP model. A folder `sparse` comes before them."""
+    return [] if (scene / "sparse").is_dir() else find_scene_files(scene)
 
 
 def _metashape_files(folder: Path) -> list[Path]:

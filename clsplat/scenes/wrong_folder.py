@@ -14,7 +14,7 @@ from ..splats.formats.any_file import READ_ENDINGS
 from .colmap import find_model, read_model
 from .described import read_described
 from .photo_listing import is_posed
-from .scene_files import OTHER_KINDS, find_scene_files
+from .scene_files import OTHER_KINDS, described_by
 
 _LEVELS_UP = 3  # a model's files are two folders below the scene, and photos may be in a subfolder of `images`
 _LEVELS_DOWN = 2
@@ -87,10 +87,10 @@ def _has_photos_of(scene: Path, photos: Path, place: Path) -> bool:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            if (scene / "sparse").is_dir():
-                files = [photos / photo.name for photo in read_model(find_model(scene)).photos]
+            if described := described_by(scene):
+                files = list(read_described(described).files.values())
             else:
-                files = list(read_described(find_scene_files(scene)).files.values())
+                files = [photos / photo.name for photo in read_model(find_model(scene)).photos]
     except InputError:
         return False
     return any(file.is_file() and real_path(file).is_relative_to(place) for file in files)

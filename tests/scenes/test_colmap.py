@@ -12,12 +12,17 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from small_scene import CX, CY, FX, FY, HEIGHT, WIDTH, cloud, model_views, write_garden
+from small_scene import CX, CY, FX, FY, HEIGHT, WIDTH, as_text, cloud, model_views, write_garden
 
 from clsplat.errors import InputError
 from clsplat.scenes import undistort
-from clsplat.scenes.colmap import read_model
+from clsplat.scenes.colmap import Points, read_model
 from clsplat.scenes.colmap_binary import check_binary_model, write_binary_model
+from clsplat.scenes.few_photos import few_photos
+from clsplat.scenes.info import scene_info
+from clsplat.scenes.photo_listing import is_posed
+from clsplat.scenes.point_cloud import write_point_cloud
+from clsplat.scenes.reconstruct.photo_files import is_photographs
 from clsplat.scenes.scene import load_scene
 from clsplat.scenes.undistort import RegisteredImage, make_lens
 
@@ -26,6 +31,54 @@ from clsplat.scenes.undistort import RegisteredImage, make_lens
 def folder(tmp_path: Path) -> Path:
     """A small scene."""
     return write_garden(tmp_path)
+
+
+# --- where the files lie ---
+
+
+@pytest.mark.parametrize("photos", ["images", "."])
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_a_model_beside_its_photos(folder: Path, photos: str, suffix: str) -> None:
+    """RealityScan writes a text model into the folder of the photos."""
+    wanted = load_scene(folder)
+    if suffix == ".bin":
+        for file in (folder / "sparse" / "0").iterdir():
+            shutil.move(file, folder)
+    else:
+        as_text(folder / "sparse" / "0", folder)
+    shutil.rmtree(folder / "sparse")
+    if photos == ".":
+        shutil.copytree(folder / "images", folder, dirs_exist_ok=True)
+        shutil.rmtree(folder / "images")
+    scene, info = load_scene(folder), scene_info(folder)
+    assert scene.names == wanted.names
+    for view, same in zip(scene.train, wanted.train, strict=True):
+        np.testing.assert_allclose(view.camera.cam_from_world, same.camera.cam_from_world, atol=1e-9)
+        assert (view.image == same.image).all()
+    np.testing.assert_allclose(scene.points.xyz, wanted.points.xyz)
+    assert (info.kind, info.photos, info.unregistered) == ("COLMAP", len(wanted.names), ())
+    assert not is_photographs(folder), "train does not look for poses"
+    assert is_posed(folder)
+    assert len(few_photos(scene, 3).points) <= len(scene.points)
+
+
+def test_a_model_without_photos_is_no_scene(folder: Path) -> None:
+    """The folder of a model is a part of the scene above."""
+    assert not is_posed(folder / "sparse" / "0")
+    with pytest.raises(InputError, match="is a part of the scene"):
+        load_scene(folder / "sparse" / "0")
+
+
+def test_points_of_a_ply_beside_the_model(folder: Path) -> None:
+    """InstantSplat writes no points3D.bin. A model's own points come before those of a PLY."""
+    model, points = folder / "sparse" / "0", load_scene(folder).points
+    other = Points(points.xyz[:5] + 1.0, points.rgb[:5], points.track_length[:5])
+    write_point_cloud(model / "points3D.ply", other)
+    assert len(load_scene(folder).points) == len(points)
+    (model / "points3D.bin").unlink()
+    found = load_scene(folder).points
+    np.testing.assert_allclose(found.xyz, other.xyz, rtol=1e-6)
+    assert (found.rgb == other.rgb).all()
 
 
 # --- lenses --------------------------------------------------------------------------------

@@ -46,6 +46,24 @@ def test_masks_are_found_by_the_names_of_their_photos(folder: Path, form: str) -
     assert all(view.mask is None for view in load_scene(folder, masks="none").views)
 
 
+@pytest.mark.parametrize(
+    ("stored", "counts"),
+    [
+        ([[0, 255], [127, 128]], [[0, 1], [0, 1]]),
+        ([[0, 1], [1, 0]], [[0, 1], [1, 0]]),  # as numbers of classes
+        ([[0, 38], [0, 0]], [[0, 1], [0, 0]]),  # a dark colour of a palette
+        ([[1, 1], [1, 1]], [[1, 1], [1, 1]]),
+        ([[0, 0], [0, 0]], [[0, 0], [0, 0]]),
+        ([[60, 60], [60, 60]], [[0, 0], [0, 0]]),  # one grey alone says nothing
+        ([[0, 20], [40, 60]], [[0, 0], [0, 0]]),  # a dark picture does not number classes
+    ],
+)
+def test_values_that_count(tmp_path: Path, stored: list[list[int]], counts: list[list[int]]) -> None:
+    file = tmp_path / "mask.png"
+    write_png(file, np.array(stored, np.uint8))
+    assert read_mask(file).tolist() == np.array(counts, bool).tolist()
+
+
 def test_masks_in_folders_of_photos(tmp_path: Path) -> None:
     for file in ("a.jpg.png", "left/b.png"):
         write_mask(tmp_path / file, left_half())

@@ -158,6 +158,59 @@ def test_blender_set(tmp_path: Path) -> None:
     assert load_scene(folder / "transforms_train.json").test_names == scene.test_names
 
 
+def test_test_views_without_photos_are_left_out(tmp_path: Path) -> None:
+    """BlenderNeRF writes poses of test views whose photos the user has yet to render, and maybe no such pose."""
+    folder = blender_set(tmp_path)
+    test = json.loads((folder / "transforms_test.json").read_text())
+    shutil.rmtree(folder / "test")
+    many = [test["frames"][0] | {"file_path": f"./test/{number}"} for number in range(60)]
+    write(folder, test | {"frames": many}, "transforms_test.json")
+    with pytest.warns(UserWarning, match="60 of 69 photos are left out"):
+        scene = load_scene(folder)
+    assert (len(scene.train), len(scene.test)) == (9, 0)
+    write(folder, test | {"frames": []}, "transforms_test.json")
+    assert (len(load_scene(folder).train), len(load_scene(folder).test)) == (9, 0)
+    write(folder, test | {"frames": []}, "transforms_train.json")
+    with pytest.raises(InputError, match=r"transforms_train\.json: has no list 'frames'"):
+        load_scene(folder)
+
+
+def test_test_frames_of_scannetpp(folder: Path) -> None:
+    """They are held out. A mask is looked up only if masks are wanted, and none is in the folder of masks."""
+    every = [frame | {"mask_path": Path(frame["file_path"]).with_suffix(".png").name} for frame in frames()]
+    write(folder, LENS | {"frames": every[:6], "test_frames": every[6:]})
+    scene = load_scene(folder, masks="none")
+    assert scene.test_names == {f"images/{name}" for name in NAMES[6:]}
+    assert len(scene.train) == 6
+    with pytest.raises(InputError, match=r"frame 0: mask_path '.*' is not a file"):
+        load_scene(folder)
+    for name in NAMES:
+        write_png(folder / "masks" / "images" / f"{name}.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    assert len(load_scene(folder).views) == len(NAMES)
+    write(folder, LENS | {"frames": every[:6], "test_frames": 3})
+    with pytest.raises(InputError, match="has no list 'frames'"):
+        load_scene(folder)
+    write(folder, LENS | {"frames": every[:6], "test_frames": [{}]})
+    with pytest.raises(InputError, match="test frame 0: has no file_path"):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("value", [float("-inf"), float("nan")])
+def test_a_frame_without_a_finite_pose_is_left_out(folder: Path, value: float) -> None:
+    """ScanNet has such poses where tracking failed."""
+    all_frames = frames()
+    all_frames[3] = all_frames[3] | {"transform_matrix": np.full((4, 4), value).tolist()}
+    write(folder, LENS | {"frames": all_frames})
+    with pytest.warns(UserWarning, match="1 of 9 photos are left out .*frame 3: its transform_matrix is not finite"):
+        scene = load_scene(folder)
+    assert scene.names == [f"images/{name}" for index, name in enumerate(NAMES) if index != 3]
+    write(
+        folder, LENS | {"frames": [frame | {"transform_matrix": np.full((4, 4), value).tolist()} for frame in frames()]}
+    )
+    with pytest.raises(InputError, match="none of its 9 photos can be used"):
+        load_scene(folder)
+
+
 def test_lists_of_nerfstudio_split(folder: Path) -> None:
     names = [f"images/{name}" for name in NAMES]
     lists = {"train_filenames": names[:5], "val_filenames": names[5:6], "test_filenames": names[6:8]}

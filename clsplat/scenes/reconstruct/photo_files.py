@@ -26,6 +26,7 @@ from ...files.images import (
 )
 from ...files.masks import MASK_FOLDER, Mask, mask_files, read_mask, resize_mask
 from ...files.real_path import real_path
+from ..colmap_folder import colmap_folder
 from ..photo_listing import Listing, list_images
 from ..scene_files import find_scene_files
 from ..wrong_folder import describe_scenes, scene_hint
@@ -84,7 +85,7 @@ def is_photographs(path: Path) -> bool:
     """Return whether the path is a video, or a folder with photos but without poses."""
     if not path.is_dir():
         return is_video(path)
-    posed = (path / "sparse").exists() or any(path.glob("transforms*.json")) or bool(find_scene_files(path))
+    posed = colmap_folder(path) is not None or any(path.glob("transforms*.json")) or bool(find_scene_files(path))
     return not posed and bool(list_images(_photo_folder(path), IMAGE_SUFFIXES).names)
 
 

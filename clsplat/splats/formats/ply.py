@@ -28,7 +28,17 @@ from .ply_body import read_body
 from .ply_compact import SideTable, filled_in, plan_layout, side_fields, side_tables
 from .ply_header import VERTEX, read_header
 from .ply_packed import is_packed, unpacked
-from .ply_schema import COMMENT, NORMALS, file_order, find_kernel, find_schema, refuse_point_cloud, warn_of_left_out
+from .ply_schema import (
+    COMMENT,
+    NORMALS,
+    SURFEL_COLUMN,
+    SURFEL_LOG_SCALE,
+    file_order,
+    find_kernel,
+    find_schema,
+    refuse_point_cloud,
+    warn_of_left_out,
+)
 
 _ANTIALIASED = "SplatRenderMode: mip"
 _ANTIALIASED_ELSEWHERE = "antialiased 1"  # as PostShot writes it
@@ -61,6 +71,8 @@ def read_ply(path: str | os.PathLike[str]) -> StoredSplats:
         reason = error.strerror or str(error)
         raise InputError(f"{path}: cannot be read ({reason}); check name and rights") from error
     columns = {name: values for name, values in body[VERTEX].items() if any(name in field.ply for field in schema)}
+    if "scale_0" in columns:
+        columns.setdefault(SURFEL_COLUMN, np.full(header.count, SURFEL_LOG_SCALE, np.float32))
     arrays = {field.name: _gather(field, columns, header.count) for field in schema if field not in moved.values()}
     if header.side_elements:
         arrays = filled_in(path, header, body, schema, arrays)

@@ -44,8 +44,11 @@ def _read_binary(path: object, stream: BinaryIO, header: Header) -> dict[str, di
     available = os.fstat(stream.fileno()).st_size - stream.tell()
     if _is_wrong(header, available, expected):
         raise _wrong_size(path, header, f"{expected} bytes", f"{available}", available < expected)
-    body = {}
+    body: dict[str, dict[str, NDArray[Any]]] = {}
     for element, dtype in zip(header.tables, dtypes, strict=True):
+        if not element.properties:  # gsplat's exporter writes such an element for a model without SH bands
+            body[element.name] = {}
+            continue
         table: NDArray[Any] = np.frombuffer(stream.read(element.count * dtype.itemsize), dtype=dtype)
         body[element.name] = {name: table[name].astype(_CODES[kind]) for kind, name in element.properties}
     return body

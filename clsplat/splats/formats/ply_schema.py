@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from .ply_header import REAL_TYPES, SIDE_PREFIX, VERTEX, Header
 
 COMMENT = "clsplat"  # begins the comment that names the kernel
 NORMALS = ("nx", "ny", "nz")
+# 2DGS (Huang et al. 2024) has surfels without a third scale. The log of one that is as good as none stands for it.
+SURFEL_COLUMN, SURFEL_LOG_SCALE = "scale_2", math.log(1e-6)
 _REST_COUNTS = (0, 9, 24, 45)  # f_rest_* of SH degree 0 to 3
 
 
@@ -54,7 +57,7 @@ def find_kernel(path: Path, header: Header) -> tuple[Shape, str]:
 
 
 def find_schema(path: Path, header: Header, shape: Shape) -> Schema:
-    """Return the schema of the columns; raise InputError if they do not form one."""
+    """Return the schema of the columns; raise InputError if they do not form one. Surfels lack SURFEL_COLUMN."""
     names = set(header.names)
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in _REST_COUNTS:
@@ -64,7 +67,11 @@ def find_schema(path: Path, header: Header, shape: Shape) -> Schema:
     moved = {name for field in side_fields(path, header, schema).values() for name in field.ply}
     needed = set(file_order(schema)) - set(NORMALS) - moved
     missing = [name for name in file_order(schema) if name in needed - names]
-    if missing:
+    if missing == [SURFEL_COLUMN] and not any(comment.startswith(COMMENT) for comment in header.comments):
+        warnings.warn(
+            f"{path}: holds surfels (no {SURFEL_COLUMN}), as 2DGS writes them; they become flat splats", stacklevel=3
+        )
+    elif missing:
         of_shape = any(missing[0] in field.ply for field in shape.fields)
         remedy = (
             f"shape {shape.name} has it; export the shape's columns, or name the shape that the file holds"

@@ -214,6 +214,18 @@ def test_float64_is_rounded_on_writing(file: Path) -> None:
         write_ply(file, "gaussian", "peak", arrays)
 
 
+def test_surfels_become_flat_splats(file: Path) -> None:
+    """2DGS has two scales. A file of clsplat has three, so that one without is damaged."""
+    columns = plain()
+    del columns["scale_2"]
+    with pytest.warns(UserWarning, match="holds surfels"):
+        splats = Splats.load(save(file, columns))
+    np.testing.assert_array_equal(splats.log_scale[:, :2].T, [columns["scale_0"], columns["scale_1"]])
+    assert splats.log_scale[:, 2] == pytest.approx(np.log(1e-6))
+    with pytest.raises(InputError, match="property 'scale_2' is missing"):
+        Splats.load(save(file, columns, comments=("clsplat shape=gaussian normalisation=peak",)))
+
+
 def without(name: str) -> dict[str, list[float]]:
     columns = plain(skew=True)
     del columns[name]

@@ -30,6 +30,18 @@ def by_hand(colors: bool = True) -> packed_ply.Packed:
     return packed_ply.Packed(np.array([limits], "<f4"), np.array(words, "<u4"), np.array(rest, np.uint8))
 
 
+def test_an_element_of_bands_without_columns(file: Path) -> None:
+    """gsplat's exporter names the element of the bands also if there are none."""
+    model = by_hand()
+    packed_ply.write(file, model._replace(rest=model.rest[:, :0]))
+    wanted = Splats.load(file)
+    file.write_bytes(file.read_bytes().replace(b"end_header", b"element sh 2\nend_header", 1))
+    found = Splats.load(file)
+    assert found.sh_degree == 0
+    assert (found.sh == wanted.sh).all()
+    assert (found.mean == wanted.mean).all()
+
+
 @pytest.mark.parametrize("colors", [True, False])
 def test_a_file_made_by_hand_is_read(file: Path, colors: bool) -> None:
     packed_ply.write(file, by_hand(colors))
