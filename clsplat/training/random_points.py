@@ -29,6 +29,7 @@ _BOX_MARGIN = 0.1  # of the box's sides, for what these points do not reach
 _DEEPEST = 3.0  # largest depth of these points, in median distances of the cameras
 _FARTHEST = 9.0  # largest distance from the centre, in median distances of the cameras
 _AHEAD = 3.0  # distance of the centre in front of parallel cameras, in scene extents
+_SPREAD_SHARE = 0.5  # of the points: if fewer are found in the whole contracted space, the hull is that of an object
 _DRAWS = 16  # number of draws of `count` points; points that cameras see are kept
 _HULL_DRAWS = 64  # the same in the box around the visual hull: thin objects fill little of it
 _TESTED_CAMERAS = 32  # cameras that the points are tested against
@@ -76,9 +77,9 @@ class _Sight:
         """Return (count, 3) points that are uniform in the contracted space."""
         return self.middle + self.unit * _uncontracted(count, rng)
 
-    def distance(self, xyz: DoubleArray) -> float:
-        """Return the largest distance of points from the middle; 0 for none."""
-        return float(np.linalg.norm(xyz - self.middle, axis=1).max(initial=0.0))
+    def distances(self, xyz: DoubleArray) -> DoubleArray:
+        """Return the distances of points from the middle, (P,)."""
+        return np.asarray(np.linalg.norm(xyz - self.middle, axis=1))
 
     def cameras_seeing(self, xyz: DoubleArray) -> NDArray[np.int64]:
         """Return the number of cameras that see each point, (P,)."""
@@ -89,7 +90,8 @@ def _in_hull(sight: _Sight, silhouettes: Silhouettes, count: int, rng: np.random
     """Return at most `count` points that are in the visual hull and that many cameras see.
 
     An object nearer than the cameras gets uniform points in the box around it. What reaches farther, such as a
-    landscape without its sky, gets points of the contracted space.
+    landscape without its sky, gets points of the contracted space. The hull of few photos reaches farther, too, behind
+    the object, but fills little of that space. Such an object gets points in the box around the near part of the hull.
     """
     min_cameras = max(sight.min_cameras, HULL_SHARE * len(sight.cameras))
 
@@ -108,9 +110,12 @@ def _in_hull(sight: _Sight, silhouettes: Silhouettes, count: int, rng: np.random
     found = gather(lambda: silhouettes.draw(_BOX_POINTS, _DEEPEST * sight.unit, rng), _BOX_POINTS, _DRAWS)
     if not len(found):
         return found
-    if sight.distance(found) > sight.unit:
-        return gather(lambda: sight.draw(count, rng), count, _DRAWS)
-    low, high = found.min(axis=0), found.max(axis=0)
+    near = found[sight.distances(found) <= sight.unit]
+    if len(near) < len(found):
+        spread = gather(lambda: sight.draw(count, rng), count, _DRAWS)
+        if len(spread) >= _SPREAD_SHARE * count or 2 * len(near) < len(found):
+            return spread
+    low, high = near.min(axis=0), near.max(axis=0)
     margin = _BOX_MARGIN * (high - low)
     return gather(lambda: rng.uniform(low - margin, high + margin, (count, 3)), count, _HULL_DRAWS)
 
@@ -128,7 +133,7 @@ def _in_sight(sight: _Sight, count: int, rng: np.random.Generator) -> DoubleArra
         unseen = drawn[n_seeing < sight.min_cameras]
         if len(outer) >= count - half:
             break
-    reach = sight.distance(central)
+    reach = float(sight.distances(central).max(initial=0.0))
     for _ in range(_DRAWS if reach > 0 else 0):  # the central region is often a small part of the visible space
         if len(central) >= half:
             break

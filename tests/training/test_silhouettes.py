@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from looking_cameras import looking, ring
+from scenes_data import scene_folder
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.seen import seen
+from clsplat.scenes.scene import load_scene
 from clsplat.scenes.view import View
 from clsplat.training.random_points import random_points
 from clsplat.training.silhouettes import Silhouettes, transparent_share
@@ -69,6 +71,19 @@ def test_few_points_fill_the_object_too(radius: float, size: int) -> None:
         assert len(xyz) == 300
         assert (xyz.min(axis=0) < -0.8).all()
         assert (xyz.max(axis=0) > 0.8).all()
+
+
+@pytest.mark.parametrize("count", [8, 16, 52])
+def test_far_parts_of_the_hull_do_not_decide(count: int) -> None:
+    """The hull of some photos has parts far behind the object, in which there is nothing."""
+    whole = load_scene(scene_folder("lego"), resolution=8)
+    chosen = {whole.train[i].name for i in np.linspace(0, len(whole.train) - 1, count).round().astype(int)}
+    scene = replace(whole, views=[view for view in whole.views if view.name in chosen])
+    xyz, _, where = random_points(scene, 5000, np.random.default_rng(0))
+    assert where == "inside the silhouettes of the photos"
+    assert len(xyz) == 5000
+    cameras = [np.linalg.norm(view.camera.position) for view in scene.train]
+    assert np.linalg.norm(xyz, axis=1).max() < 2.1 * np.median(cameras), "the corners of a box"
 
 
 def test_large_photos_are_reduced() -> None:
