@@ -22,7 +22,7 @@ from clsplat.training.decisions import decide
 from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
 from clsplat.training.quality import NORMAL, QUALITIES, quality
-from clsplat.training.stored_run import load_recorded_scene, read_options_file
+from clsplat.training.stored_run import check_reading, load_recorded_scene, read_options_file
 from clsplat.viewer.options import ServerOptions
 
 from .blocks import blocks_options, given_blocks, run_blocks
@@ -236,6 +236,7 @@ def train(
         stored = find_unfinished(model_path)
         if search is not None and stored.search is None:
             raise InputError(f"{model_path}: no search to resume from: start without --resume")
+        check_reading(stored.run.scene, reading, model_path)
         options, reading = stored.run.options | options, stored.run.scene | reading
         recorded, photos = stored.run.scene_path, stored.run.scene["photos"]
         path, search, blocks = path or recorded, search or stored.search, stored.blocks
@@ -254,19 +255,15 @@ def train(
     warn_without_effect([decide(loaded, config).config], flags)
     check_photos(loaded, photos, model_path, allow=allow_changed_photos, all_views=True)
     if blocks is not None:
-        BudgetState.remove_from(model_path)
         run_blocks(ctx, loaded, config, blocks, model_path, resume, overwrite, quiet, cluster)
         return
     if search is not None:
         if view:
             raise click.UsageError(f"{model_path} is a search of many runs: resume it without --view")
-        BlocksState.remove_from(model_path)
         run_search(ctx, loaded, config, search, model_path, resume, overwrite, quiet, cluster)
         return
     serving = ServerOptions(host, port, names, token)
     with _viewer(loaded, config, model_path, serving, quiet) if view else nullcontext() as live:
-        BudgetState.remove_from(model_path)
-        BlocksState.remove_from(model_path)
         model = run_training(loaded, config, model_path, resume, overwrite, quiet, live)
         if not model.finished:
             report_interruption(ctx, model)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..training.folder import BLOCKS
 from ..training.stages import StagesState
 
 
@@ -30,5 +31,5 @@ class BlocksOptions:
 class BlocksState(StagesState):
     """blocks.json in a model's folder, written after every stage."""
 
-    FILE, FOLDER, NAME, OPTIONS = "blocks.json", "blocks", "training", BlocksOptions
+    FILE, NAME, OPTIONS = BLOCKS, "training", BlocksOptions
     FINISHED = "the training in blocks is finished: nothing to resume"

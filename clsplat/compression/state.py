@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..splats.splats import Splats
+from ..training.folder import BUDGET
 from ..training.stages import StagesState
 from .rules import BudgetOptions
 
@@ -13,7 +14,7 @@ from .rules import BudgetOptions
 class BudgetState(StagesState):
     """budget.json in a model's folder, written after every stage, and the models and runs of the stages."""
 
-    FILE, FOLDER, NAME, OPTIONS = "budget.json", "budget", "search", BudgetOptions
+    FILE, NAME, OPTIONS = BUDGET, "search", BudgetOptions
     FINISHED = "the search is finished: nothing to resume"
 
     def load(self) -> None:

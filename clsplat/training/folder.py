@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,8 @@ from ..splats.splats import Splats
 if TYPE_CHECKING:
     from ..scenes.scene import Scene, View
 
+BUDGET, BLOCKS = "budget.json", "blocks.json"
+STAGES = {BUDGET: "budget", BLOCKS: "blocks"}  # files of trainings of several stages, and the folders of their runs
 _ITERATION = re.compile(r"iteration_(\d+)")
 
 
@@ -113,9 +116,11 @@ class ModelFolder:
             self.config_path,
             self.cameras_path,
             self.exposures_path,
-            *(self.path / name for name in ("results.json", "per_view.json", "report.html")),
+            *(self.path / name for name in ("results.json", "per_view.json", "report.html", *STAGES)),
         ):
             path.unlink(missing_ok=True)
+        for folder in STAGES.values():
+            shutil.rmtree(self.path / folder, ignore_errors=True)
         for iteration in self.iterations():
             self.remove_ply(iteration)
 

@@ -12,9 +12,8 @@ from typing import Any, ClassVar
 
 from ..errors import InputError
 from ..files.json_file import read_object, write_json
-from ..files.lock import folder_lock
 from .config import FREE_OPTIONS, TrainConfig
-from .folder import ModelFolder
+from .folder import STAGES, ModelFolder
 from .log import Progress
 from .stored_run import DAMAGE, StoredRun
 
@@ -24,18 +23,17 @@ class StagesState:
 
     Attributes
     ----------
-    FILE, FOLDER : their names. NAME, FINISHED : what messages say of it. OPTIONS : the class of its own options.
+    FILE : its name, one of STAGES. NAME, FINISHED : what messages say of it. OPTIONS : the class of its own options.
     values : "config", "options", "scene" (how it was read), and a key for each finished stage.
     """
 
     FILE: ClassVar[str]
-    FOLDER: ClassVar[str]
     NAME: ClassVar[str]
     FINISHED: ClassVar[str]
     OPTIONS: ClassVar[type[Any]]
 
     def __init__(self, output: Path) -> None:
-        self.path, self.folder = output / self.FILE, output / self.FOLDER
+        self.path, self.folder = output / self.FILE, output / STAGES[self.FILE]
         self.values: dict[str, Any] = {}
 
     def begin(self, config: TrainConfig, options: Any, scene: Mapping[str, Any]) -> None:
@@ -102,15 +100,6 @@ class StagesState:
         if "final" in state.values:
             raise InputError(f"{output}: {cls.FINISHED}")
         return stored, options
-
-    @classmethod
-    def remove_from(cls, output: Path) -> None:
-        """Remove such a training before another run uses its folder. Raise OutputError if it is running."""
-        if cls.is_in(output):
-            with folder_lock(output):
-                state = cls(output)
-                state.end()
-                state.path.unlink(missing_ok=True)
 
 
 class StepReports:

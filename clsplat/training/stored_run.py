@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from ..files.json_file import MAX_NUMBER, describe, read_object, to_real
+from ..files.real_path import real_path
 from ..scenes.options import ALPHA_USES, READING_OPTIONS
 from ..splats.color import BLACK, Color
 from .config import FREE_OPTIONS, TrainConfig, read_options
@@ -140,6 +142,27 @@ def stored_run(path: str | os.PathLike[str]) -> StoredRun:
         return StoredRun.from_json(stored, folder.path)
     except DAMAGE as error:
         raise InputError(f"{folder.config_path}: damaged ({error}): start again with --overwrite") from None
+
+
+def check_reading(recorded: Mapping[str, Any], given: Mapping[str, Any], model: Path) -> None:
+    """Raise InputError if a run would go on with a scene that is read in another way.
+
+    Parameters
+    ----------
+    recorded : arguments of `load_scene` of the run; None stands for the default. given : those that a user has named.
+    model : the model's folder, for the message.
+    """
+    from ..scenes.scene import load_scene  # imported late, as below
+
+    for key, value in given.items():
+        default = inspect.signature(load_scene).parameters[key].default
+        before = default if recorded.get(key) is None else recorded[key]
+        now = str(real_path(Path(value))) if key == "test_list" else value
+        if now != before:
+            raise InputError(
+                f"{model}: --resume with {key}={now}, but the run was started with {key}={before}: use the same "
+                "options, or --overwrite to start again"
+            )
 
 
 def holds_run(folder: ModelFolder, config: TrainConfig) -> bool:

@@ -247,7 +247,7 @@ def test_what_cannot_be_resumed_or_replaced(finished: BlocksModel, scene: Scene,
     (tmp_path / "blocks.json").write_text('{"config": {}, "options": {}, "scene": {}}')
     with pytest.raises(InputError, match=r"blocks\.json: damaged"):
         BlocksState.stored(tmp_path)
-    BlocksState.remove_from(tmp_path)
+    train(scene, CONFIG.replace(iterations=2), output=tmp_path, overwrite=True)
     assert not (tmp_path / "blocks").exists()
     assert BlocksState.stored(tmp_path) is None
 

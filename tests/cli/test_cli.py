@@ -254,6 +254,49 @@ def test_interrupt_then_resume(scene: Path, tmp_path: Path) -> None:
     assert "cap_max=50" in error_of("train", "--resume", "-m", model, "--cap-max", "51")
 
 
+@pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        (["--test-every", "5"], "test_every=5, but the run was started with test_every=8"),
+        (["-r", "2"], "resolution=2, but the run was started with resolution=-1"),
+        (["--masks", "none"], "masks=none, but the run was started with masks=None"),
+        (["--alpha", "mask"], "alpha=mask, but the run was started with alpha=background"),
+    ],
+)
+def test_resume_reads_the_scene_as_before(copied_model: Path, flags: list[str], text: str) -> None:
+    """Other photos would be trained on, or be measured after they were trained on."""
+    before = (copied_model / "config.json").read_bytes()
+    longer = ["--resume", "-m", copied_model, "--iterations", "500"]
+    assert f"--resume with {text}: use the same options" in error_of("train", *longer, *flags)
+    assert (copied_model / "config.json").read_bytes() == before
+
+
+def test_resume_holds_out_no_photo_that_was_trained_on(scene: Path, tmp_path: Path) -> None:
+    tiny = ["--cap-max", "60", "--iterations"]
+    clsplat("train", scene, "-m", tmp_path, *tiny, "2")
+    message = error_of("train", "--resume", "-m", tmp_path, *tiny, "4", "--eval")
+    assert "--resume with eval=True, but the run was started with eval=False" in message
+    clsplat("train", "--resume", "-m", tmp_path, *tiny, "4")
+
+
+def test_resume_with_the_same_reading(copied_model: Path) -> None:
+    clsplat("train", "--resume", "-m", copied_model, "--eval", "--test-every", "8", "-r", "-1")
+
+
+@pytest.mark.parametrize("kind", ["budget.json", "blocks.json"])
+def test_a_failed_overwrite_keeps_what_can_be_resumed(scene: Path, tmp_path: Path, kind: str) -> None:
+    """An error that is found after the options are read must not cost a search or a training in blocks."""
+    run = tmp_path / kind.removesuffix(".json") / "run"
+    run.mkdir(parents=True)
+    (tmp_path / kind).write_text("{}")
+    error_of("train", scene, "-m", tmp_path, "--overwrite", "--device", "no such device", "--iterations", "2")
+    assert (tmp_path / kind).read_text() == "{}"
+    assert run.is_dir()
+    clsplat("train", scene, "-m", tmp_path, "--overwrite", "--iterations", "2", "--cap-max", "60")
+    assert not (tmp_path / kind).exists()
+    assert not run.exists()
+
+
 def test_resume_of_a_finished_run_changes_nothing(model: Path) -> None:
     before = ply(model).read_bytes()
     out = clsplat("train", "--resume", "-m", model)

@@ -19,6 +19,9 @@ from clsplat.compression.state import BudgetState
 from clsplat.errors import OutputError
 from clsplat.files import lock
 from clsplat.files.lock import folder_lock
+from clsplat.scenes.scene import Scene
+from clsplat.training.config import TrainConfig
+from clsplat.training.run import train
 
 pytest.importorskip("fcntl")
 
@@ -93,18 +96,18 @@ def refused(folder: Path, start: str) -> bool:
     return "another run writes into it" in done.stderr
 
 
-def test_a_running_search_keeps_its_results(folder: Path, start: str) -> None:
+def test_a_running_search_keeps_its_results(folder: Path, start: str, scene: Scene) -> None:
     """A second run with --overwrite is refused before it removes anything."""
     (folder / BudgetState.FILE).write_text("{}")
     process = holder(folder, start)
     try:
         with pytest.raises(OutputError, match="another run writes into it"):
-            BudgetState.remove_from(folder)
+            train(scene, TrainConfig(iterations=2, cap_max=60), output=folder, overwrite=True)
         assert (folder / BudgetState.FILE).exists()
     finally:
         process.kill()
         process.wait(10)
-    BudgetState.remove_from(folder)
+    train(scene, TrainConfig(iterations=2, cap_max=60), output=folder, overwrite=True)
     assert not (folder / BudgetState.FILE).exists()
 
 
