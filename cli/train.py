@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from clsplat.blocks.state import BlocksState
-from clsplat.compression.state import BudgetState
 from clsplat.device.specs import count_devices
 from clsplat.errors import InputError, OutputError
 from clsplat.files.real_path import real_path
@@ -231,7 +229,6 @@ def train(
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
     model_path = model_path or _default_folder(path)
     recorded, photos, blocks = None, {}, None
-    is_used = ModelFolder(model_path).is_used or BudgetState.is_in(model_path) or BlocksState.is_in(model_path)
     if resume:
         stored = find_unfinished(model_path)
         if search is not None and stored.search is None:
@@ -240,7 +237,7 @@ def train(
         options, reading = stored.run.options | options, stored.run.scene | reading
         recorded, photos = stored.run.scene_path, stored.run.scene["photos"]
         path, search, blocks = path or recorded, search or stored.search, stored.blocks
-    elif is_used and not overwrite:
+    elif ModelFolder(model_path).is_used and not overwrite:
         # The function train checks this too, but only after the scene is read.
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
     assert path is not None

@@ -136,7 +136,7 @@ def _begin(
         state.load()
         config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
         state.check(config, options)
-    elif (folder.is_used or state.path.exists()) and not overwrite:
+    elif folder.is_used and not overwrite:
         raise OutputError(
             f"{folder.path}: already holds a model",
             Remedy("replace it", "--overwrite"),
@@ -314,5 +314,6 @@ def block_config(config: TrainConfig, start: Path, cap: int) -> TrainConfig:
         "visible_adam": False,
         "coarse_to_fine": False,
         "sh_interval": 1,  # the coarse model has all bands
+        **{"opacity_reset": 0, "bisect_reg": 0.0, "position_optimizer": "adam", "optimizer": "fused"},  # check_context
     }
     return TrainConfig(**config.to_json() | changed)

@@ -142,6 +142,7 @@ class _Round:
         self.futures: dict[Any, int] = {}
         self.deaths = [0] * len(jobs)
         self.failed_at: list[set[str]] = [set() for _ in jobs]
+        self.pinned: dict[Any, set[str]] = {}  # addresses of the only workers that may do a job
         self.begun: set[int] = set()
         self.announced: set[int] = set()
         self.at: dict[int, str] = {}  # workers of jobs that have begun
@@ -157,6 +158,7 @@ class _Round:
             self._submit(number)
         while self.futures:
             self._report()
+            self._unpin()
             self.changed.wait(POLL)
             self.changed.clear()
             self._announce()
@@ -204,7 +206,21 @@ class _Round:
             pure=False,
         )
         self.futures[future] = number
+        if workers is not None:
+            self.pinned[future] = set(workers)
         future.add_done_callback(lambda _: self.changed.set())
+
+    def _unpin(self) -> None:
+        """Send jobs again whose workers are all gone. A worker that starts anew has another address."""
+        self.pinned = {future: places for future, places in self.pinned.items() if future in self.futures}
+        workers = _workers(self.client) if self.pinned else {}
+        for future, places in list(self.pinned.items()):
+            number = self.futures[future]
+            others = [at for at, name in workers.items() if name not in self.failed_at[number]]
+            if others and not places & workers.keys():
+                del self.pinned[future], self.futures[future]
+                self.client.cancel([future], asynchronous=False)
+                self._submit(number, others)
 
     def _collect(self, future: Any, number: int) -> Outcome | None:
         """Return the outcome of a future that is done; None if its job was sent again."""

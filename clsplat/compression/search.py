@@ -110,7 +110,7 @@ def train_budget(
         state.load()
         config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
         state.check(config, options)
-    elif (folder.is_used or state.path.exists()) and not overwrite:
+    elif folder.is_used and not overwrite:
         raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
     folder.prepare()
     if not resume:

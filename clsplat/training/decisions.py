@@ -138,7 +138,10 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     if is_short and config.start.init in FROM_POINTS and not SKEW_OPTIONS & config.named_options.keys():
         chosen["shape"] = PLAIN_SHAPE
         reasons.append(f"shape {PLAIN_SHAPE}, because a short run gains more from quick iterations than from skew")
-    if batch == 1 and "visible_adam" not in config.named_options and (seen_by_photo := waits_for_sight(scene, config)):
+    # Smooth depths also move splats that the photo does not show.
+    smooths = chosen.get("depth_smoothness", config.views.depth_smoothness)
+    waits = batch == 1 and not smooths and "visible_adam" not in config.named_options
+    if waits and (seen_by_photo := waits_for_sight(scene, config)):
         chosen["visible_adam"] = True
         reasons.append(f"steps of visible splats only, because a photo shows {seen_by_photo:.0%} of the points")
     filtered = screen_filter(config)

@@ -75,8 +75,9 @@ class ModelFolder:
 
     @property
     def is_used(self) -> bool:
-        """Whether a run has written into the folder."""
-        return any(p.exists() for p in (self.config_path, self.checkpoint_path, self.path / "point_cloud"))
+        """Whether a run or a training of several stages has written into the folder."""
+        names = ("point_cloud", *STAGES)
+        return any(p.exists() for p in (self.config_path, self.checkpoint_path, *(self.path / name for name in names)))
 
     def iterations(self) -> list[int]:
         """Iterations with a point cloud, in rising order."""

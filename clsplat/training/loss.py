@@ -94,7 +94,8 @@ class PendingValue:
         result = self.result
         smooth, ssim, l1, mse = (self.parts.astype(np.float64).sum(axis=1) / result.count).tolist()
         total = (1 - self.weight) * smooth + self.weight * (1 - ssim)
-        return LossValue(total, l1 / result.unmasked, 1 - (1 - ssim) / result.unmasked, mse / result.unmasked)
+        seen = result.unmasked or 1.0  # a mask may hide all of a small image: the errors are 0 then
+        return LossValue(total, l1 / seen, 1 - (1 - ssim) / seen, mse / seen)
 
 
 class ImageLoss:

@@ -8,6 +8,7 @@ splats now and then. A splat goes if one of them shows it much larger than any p
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +58,9 @@ class OccluderCheck:
 
     def occluders(self, splats: Splats) -> NDArray[np.bool_]:
         """Return which splats cover much of a view between the photos, (N,)."""
-        shares = np.stack(list(shares_of_images(self.renderer, splats, [*self.photos, *self.between])))
-        shown, covering = shares[: len(self.photos)].max(axis=0), shares[len(self.photos) :].max(axis=0)
+        shown, covering = (
+            reduce(np.maximum, shares_of_images(self.renderer, splats, cameras), np.zeros(len(splats)))
+            for cameras in (self.photos, self.between)
+        )
         found: NDArray[np.bool_] = (covering > LEAST) & (covering > LARGER * shown)
         return found

@@ -144,17 +144,17 @@ def stored_run(path: str | os.PathLike[str]) -> StoredRun:
         raise InputError(f"{folder.config_path}: damaged ({error}): start again with --overwrite") from None
 
 
-def check_reading(recorded: Mapping[str, Any], given: Mapping[str, Any], model: Path) -> None:
+def check_reading(recorded: Mapping[str, Any], reading: Mapping[str, Any], model: Path) -> None:
     """Raise InputError if a run would go on with a scene that is read in another way.
 
     Parameters
     ----------
-    recorded : arguments of `load_scene` of the run; None stands for the default. given : those that a user has named.
+    recorded : arguments of `load_scene` of the run; None stands for the default. reading : those that a user has named.
     model : the model's folder, for the message.
     """
     from ..scenes.scene import load_scene  # imported late, as below
 
-    for key, value in given.items():
+    for key, value in reading.items():
         default = inspect.signature(load_scene).parameters[key].default
         before = default if recorded.get(key) is None else recorded[key]
         now = str(real_path(Path(value))) if key == "test_list" else value

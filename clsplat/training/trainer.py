@@ -101,7 +101,9 @@ class Trainer:
         check_batch(config, 1 + len(others))
         schedule = schedule_for(self.device, checkpoint.schedule if checkpoint else None)
         self.kernels = kernel_build(config, schedule)
-        self.memory = run_memory(self.device, self.kernels, config, scene.train)
+        n_frozen = 0 if context is None else len(context)
+        whole = config.replace(cap_max=config.cap_max + n_frozen)
+        self.memory = run_memory(self.device, self.kernels, whole, scene.train)
         self.rng = np.random.default_rng(config.seed)
         self.iteration, self.seconds = 0, 0.0
         new = partial(first_arrays, scene, config, self.kernels.near_plane, context)
@@ -139,7 +141,7 @@ class Trainer:
         self.clock = RunClock(config, self.schedule, self.views, self.pipeline, self.splats, self.iteration)
         self.running = RunningLoss(len(scene.train))
         self.noise = ExplorationNoise(config, self.kernels, self.splats, scene.extent)
-        self.renderer = Renderer(self.device)
+        self.renderer = Renderer(self.device, schedule=self.kernels.schedule)
         self.occluders = OccluderCheck(config, scene.train, self.renderer, self.density, self.average.begin)
         self.validation = RunValidation(
             self.renderer, scene.validation, config.background, config.iterations, config.output.save_iterations
@@ -170,6 +172,8 @@ class Trainer:
     def _load_state(self, checkpoint: Checkpoint) -> None:
         state = dict(checkpoint.optimizer)
         self.exposure.load_state(state)
+        for replica in self.batch.replicas[1:] if self.batch is not None else ():
+            replica.exposure.follow(self.exposure)
         self.optimizer.load_state(state)
         self.pipeline.statistics.write(checkpoint.signals, self.splats.capacity)
 

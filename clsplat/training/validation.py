@@ -57,6 +57,7 @@ class RunValidation:
         """
         stored = set(folder.iterations())
         for measured in _logged(folder, iteration):
+            self.last = measured
             if measured.psnr > self.best.psnr and measured.iteration in stored:
                 self.best = measured
         self.kept.add(self.best.iteration)

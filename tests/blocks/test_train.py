@@ -27,6 +27,7 @@ from clsplat.splats.transform import joined
 from clsplat.training.config import TrainConfig
 from clsplat.training.exposure_file import read_exposures
 from clsplat.training.folder import ModelFolder
+from clsplat.training.presets import PRESETS, with_preset
 from clsplat.training.run import train
 
 CONFIG = TrainConfig(shape="skew-normal", iterations=20, cap_max=120, sh_degree=1, densify_interval=5)
@@ -121,6 +122,27 @@ def test_the_model_has_all_splats_of_all_blocks(finished: BlocksModel, scene: Sc
     assert [row["number"] for row in report["blocks"]] == [0, 1]
     assert all(row["splats"] <= CONFIG.cap_max // 2 for row in report["blocks"])
     assert report["final"]["splats"] == len(finished.splats)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_blocks_of_every_preset(scene: Scene, tmp_path: Path, preset: str) -> None:
+    """Also of those whose penalties, opacity resets or SGHMC a block cannot have."""
+    options = with_preset(preset, {"iterations": 6, "cap_max": 80, "sh_degree": 1})
+    found = train_in_blocks(scene, BlocksOptions(2, 1, polish=2), TrainConfig(**options), output=tmp_path)
+    assert 0 < len(found.splats) <= 80
+
+
+@pytest.mark.parametrize("kind", ["budget", "blocks"])
+def test_an_unfinished_training_is_replaced_only_if_asked(scene: Scene, tmp_path: Path, kind: str) -> None:
+    (tmp_path / kind / "run").mkdir(parents=True)
+    (tmp_path / f"{kind}.json").write_text("{}")
+    with pytest.raises(OutputError, match="already holds a model"):
+        train(scene, CONFIG, output=tmp_path)
+    with pytest.raises(OutputError, match="already holds a model"):
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path)
+    with pytest.raises(OutputError, match="already holds a model"):
+        train_budget(scene, CONFIG, output=tmp_path)
+    assert (tmp_path / kind / "run").is_dir()
 
 
 def test_splats_that_move_over_a_border_stay(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from clsplat.errors import InputError
 from clsplat.files.images import read_image, write_png
 from clsplat.files.masks import mask_files, read_mask, resize_mask
 from clsplat.scenes.scene import load_scene
+from clsplat.training.config import TrainConfig
+from clsplat.training.trainer import Trainer
 
 
 @pytest.fixture
@@ -114,6 +117,23 @@ def test_a_white_mask_is_dropped_and_a_black_mask_leaves_the_photo_out(folder: P
         scene = load_scene(folder)
     assert NAMES[1] not in scene.names
     assert scene.views[0].mask is None
+
+
+def test_a_mask_may_hide_all_of_a_small_image(folder: Path) -> None:
+    """A run begins with small images, in which one row of a photo may vanish. Such an image has no error."""
+    scene = load_scene(folder)
+    name = scene.train[0].name
+    views = [
+        replace(view.loaded(), mask=np.arange(HEIGHT)[:, None] == np.full((1, WIDTH), 0)) if view.name == name else view
+        for view in scene.views
+    ]
+    trainer = Trainer(replace(scene, views=views), TrainConfig(iterations=40, cap_max=60, coarse_to_fine=False))
+    masked = next(index for index, view in enumerate(trainer.targets.views) if view.name == name)
+    target = trainer.targets.get(masked, 4)
+    assert target.unmasked == 0
+    frame_loss = trainer.loss.value_later(trainer.main.learn(target, (0.0, 0.0, 0.0), 0, 1)[1]).wait()
+    assert (frame_loss.l1, frame_loss.mse) == pytest.approx((0.0, 0.0), abs=1e-7)
+    assert frame_loss.ssim == pytest.approx(1.0, abs=1e-6)
 
 
 def test_bad_masks_are_named(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,9 @@ from clsplat.scenes.scene import load_scene, read_posed_images
 PIXEL = 1e-6  # px
 
 
-def write(folder: Path, text: str | None = None, suffix: str = ".png") -> Path:
+def write(folder: Path, text: str | None = None, suffix: str = ".png", names: Sequence[str] = made.NAMES) -> Path:
     """Write photos, points and the cameras, and return the folder."""
-    for index, name in enumerate(made.NAMES):
+    for index, name in enumerate(names):
         write_png(folder / "images" / name, np.full((made.HEIGHT, made.WIDTH, 3), 20 * index, np.uint8))
         (folder / "images" / name).rename((folder / "images" / name).with_suffix(suffix))
     xyz, rgb = made.points()
@@ -42,7 +43,11 @@ def assert_same_pixels(folder: Path, lens: dict[str, Any], within: float = PIXEL
         np.testing.assert_allclose(photo.lens.img_from_cam(local), expected, rtol=0, atol=within)
 
 
-@pytest.mark.parametrize("lens", [made.FRAME, made.ROUND], ids=lambda lens: lens["type"])
+EQUIDISTANT = made.ROUND | {"type": "equidistant_fisheye"}
+EQUISOLID = made.ROUND | {"type": "equisolid_fisheye"}
+
+
+@pytest.mark.parametrize("lens", [made.FRAME, made.ROUND, EQUIDISTANT], ids=lambda lens: lens["type"])
 @pytest.mark.parametrize("chunk", [None, made.similarity()], ids=["local", "moved"])
 def test_points_land_on_the_pixels_of_the_manual(
     tmp_path: Path, lens: dict[str, Any], chunk: made.Similarity | None
@@ -58,6 +63,28 @@ def test_the_transform_of_the_chunk_counts_without_one_of_the_component(tmp_path
 def test_k4_of_a_frame_camera_is_close(tmp_path: Path) -> None:
     lens = made.FRAME | {"k1": -0.0919, "k2": -0.0763, "k3": 0.1163, "k4": -0.0761}
     assert_same_pixels(write(tmp_path, made.metashape_xml(lens)), lens, 1e-3)
+
+
+# Tangential terms have no exact counterpart. Those of ROUND move a pixel by up to 0.1 px.
+@pytest.mark.parametrize(("tangential", "within"), [((0.0, 0.0), 1e-3), ((0.0012, -0.0009), 0.006)])
+@pytest.mark.parametrize("focal", [40.0, 22.0], ids=["narrow", "wide"])
+def test_an_equisolid_fisheye_is_close(
+    tmp_path: Path, focal: float, tangential: tuple[float, float], within: float
+) -> None:
+    lens = EQUISOLID | {"f": focal} | dict(zip(("p1", "p2"), tangential, strict=True))
+    assert_same_pixels(write(tmp_path, made.metashape_xml(lens)), lens, within)
+
+
+def test_an_equisolid_fisheye_is_close_in_the_whole_image(tmp_path: Path) -> None:
+    lens = EQUISOLID | {"f": 22.0}
+    posed = read_posed_images(write(tmp_path, made.metashape_xml(lens)), None)
+    angle, turn = (grid.ravel() for grid in np.meshgrid(np.linspace(0.05, 1.4, 40), np.linspace(0.0, 6.2, 40)))
+    local = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=1)
+    expected = made.metashape_pixels(lens, local)
+    inside = (expected >= 0).all(axis=1) & (expected <= (made.WIDTH, made.HEIGHT)).all(axis=1)
+    assert angle[inside].max() > 1.2
+    found = posed.photos[0].lens.img_from_cam(local[inside])
+    np.testing.assert_allclose(found, expected[inside], rtol=0, atol=0.006)
 
 
 def test_a_small_b2_is_close(tmp_path: Path) -> None:
@@ -123,6 +150,132 @@ def test_points_are_optional_and_must_be_one_file(tmp_path: Path) -> None:
     assert len(read_posed_images(tmp_path, None).points) == 0
 
 
+def rig_photos(slaves: int) -> list[str]:
+    return [f"{made.rig_name(frame, camera)}.png" for frame in range(made.RIG_FRAMES) for camera in range(slaves + 1)]
+
+
+@pytest.mark.parametrize("form", made.RIG_FORMS)
+@pytest.mark.parametrize("slaves", [1, 2])
+@pytest.mark.parametrize("located", [True, False], ids=["with location", "without location"])
+@pytest.mark.parametrize("chunk", [None, made.similarity()], ids=["local", "moved"])
+def test_the_slaves_of_a_rig_follow_their_master(
+    tmp_path: Path, form: str, slaves: int, located: bool, chunk: made.Similarity | None
+) -> None:
+    mounts, names = made.mounts(slaves, located), rig_photos(slaves)
+    posed = read_posed_images(write(tmp_path, made.rig_xml(mounts, form, chunk), names=names), None)
+    assert (posed.names, posed.left_out) == (names, {})
+    for index, photo in enumerate(posed.photos):
+        frame, number = divmod(index, slaves + 1)
+        expected = made.shots()[frame].local(made.points()[0])
+        if number:
+            mount = mounts[number - 1]
+            place = np.zeros(3) if mount.location is None else mount.location * (1.0 if chunk is None else chunk.scale)
+            expected = (expected - place) @ mount.rotation
+        local = posed.points.xyz @ photo.cam_from_world[:3, :3].T + photo.cam_from_world[:3, 3]
+        np.testing.assert_allclose(local, expected, rtol=0, atol=1e-9)
+        assert (expected[:, 2] > 0).all()
+        pixels = made.metashape_pixels(made.rig_lens(number), expected)
+        np.testing.assert_allclose(photo.lens.img_from_cam(local), pixels, rtol=0, atol=PIXEL)
+
+
+RIG = made.rig_xml(made.mounts(2))
+MASTER, SLAVE = f'label="{made.rig_name(0, 0)}" enabled="true"', f'label="{made.rig_name(0, 1)}"'
+POSE = RIG[RIG.index("<transform>") : RIG.index("</transform>") + len("</transform>")]
+# Change of the file, and the cameras of the first frame that are left out, with a part of the reason.
+RIGS: dict[str, tuple[str, str, dict[int, str]]] = {
+    "a disabled slave": (SLAVE, f'{SLAVE} enabled="false"', {1: "is disabled"}),
+    "a disabled master": (MASTER, MASTER.replace("true", "false"), dict.fromkeys(range(3), "is disabled")),
+    "an unaligned master": (
+        POSE,
+        "",
+        {0: "it was not aligned"} | dict.fromkeys((1, 2), "its master, camera 'frame0_camera0', was not aligned"),
+    ),
+    "a master of another component": (
+        f'component_id="0" {MASTER}',
+        f'component_id="1" {MASTER}',
+        dict.fromkeys(range(3), "belongs to component 1, and 0 is the active one"),
+    ),
+    "a master that names itself": (MASTER, f'{MASTER} master_id="0"', {}),
+}
+
+
+@pytest.mark.parametrize("case", RIGS)
+def test_cameras_of_a_rig_are_left_out_with_a_reason(tmp_path: Path, case: str) -> None:
+    old, new, parts = RIGS[case]
+    assert RIG.count(old) == 1
+    posed = read_posed_images(write(tmp_path, RIG.replace(old, new), names=rig_photos(2)), None)
+    assert posed.listed == rig_photos(2)
+    assert sorted(posed.left_out) == [f"{made.rig_name(0, number)}.png" for number in sorted(parts)]
+    for number, part in parts.items():
+        reason = posed.left_out[f"{made.rig_name(0, number)}.png"]
+        assert reason.startswith(f"{tmp_path / 'cameras.xml'}: camera '{made.rig_name(0, number)}' ")
+        assert part in reason
+        assert reason.count("cameras.xml") == 1, "the path once"
+
+
+def test_an_enabled_slave_does_not_need_an_enabled_master(tmp_path: Path) -> None:
+    text = RIG.replace(MASTER, MASTER.replace("true", "false")).replace(SLAVE, f'{SLAVE} enabled="true"')
+    posed = read_posed_images(write(tmp_path, text, names=rig_photos(2)), None)
+    assert sorted(posed.left_out) == [f"{made.rig_name(0, number)}.png" for number in (0, 2)]
+    whole = tmp_path / "whole"
+    expected = read_posed_images(write(whole, RIG, names=rig_photos(2)), None).photos[1]
+    assert (posed.photos[0].name, expected.name) == (f"{made.rig_name(0, 1)}.png",) * 2
+    np.testing.assert_array_equal(posed.photos[0].cam_from_world, expected.cam_from_world)
+
+
+def test_the_pose_of_a_slave_with_its_own_transform_is_its_own(tmp_path: Path) -> None:
+    text = RIG.replace(f"{SLAVE}/>", f"{SLAVE}>{POSE}</camera>")
+    write(tmp_path, text, names=rig_photos(2))
+    with pytest.warns(UserWarning, match="1 of 6 photos have the pose of another photo"):
+        master, slave, *_ = read_posed_images(tmp_path, None).photos
+    np.testing.assert_array_equal(slave.cam_from_world, master.cam_from_world)
+
+
+def test_rounded_rotations_of_a_rig_are_warned_of_with_one_path(tmp_path: Path) -> None:
+    rotation = " ".join(f"{value:.2f}" for value in made.mounts(1)[0].rotation.ravel())
+    start = RIG.index("<rotation>", RIG.index('<sensor id="1"')) + len("<rotation>")
+    text = RIG[:start] + rotation + RIG[RIG.index("</rotation>", start) :]
+    write(tmp_path, text, names=rig_photos(2))
+    with pytest.warns(UserWarning, match=r"2 of 6 rotations are rounded, most of all that of camera 'frame0_camera1'"):
+        read_posed_images(tmp_path, None)
+
+
+BAD_RIGS: dict[str, tuple[str, str, list[str]]] = {
+    "an unknown master": (
+        'sensor_id="1" master_id="0"',
+        'sensor_id="1" master_id="77"',
+        ["camera 'frame0_camera1'", "master_id is '77'", "no cameras have this id", "export all cameras of the rig"],
+    ),
+    "an empty master": ('sensor_id="1" master_id="0"', 'sensor_id="1" master_id=""', ["master_id is ''"]),
+    "two masters of one id": ('camera id="10"', 'camera id="0"', ["master_id is '0', and 2 cameras have this id"]),
+    "a slave of a slave": (
+        'sensor_id="1" master_id="0"',
+        'sensor_id="1" master_id="2"',
+        ["camera 'frame0_camera1': its master, camera 'frame0_camera2', has a master too"],
+    ),
+    "an unknown sensor": ('sensor_id="1" master_id="0"', 'sensor_id="8" master_id="0"', ["sensor '8': is not among"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_RIGS)
+def test_bad_rigs_are_one_line(tmp_path: Path, case: str) -> None:
+    old, new, parts = BAD_RIGS[case]
+    assert RIG.count(old) == 1
+    write(tmp_path, RIG.replace(old, new), names=rig_photos(2))
+    message = error_of("info", tmp_path / "cameras.xml")
+    for part in ("cameras.xml", *parts):
+        assert part in message, message
+
+
+@pytest.mark.parametrize(("name", "count"), [("rotation", 9), ("location", 3)])
+def test_bad_places_in_a_rig_are_one_line(tmp_path: Path, name: str, count: int) -> None:
+    start = RIG.index(f"<{name}>", RIG.index('<sensor id="1"')) + len(f"<{name}>")
+    write(tmp_path, RIG[:start] + "1 " + RIG[start:], names=rig_photos(2))
+    message = error_of("info", tmp_path / "cameras.xml")
+    for part in ("cameras.xml", "sensor '1'", f"<{name}> is", f"expected {count} numbers"):
+        assert part in message, message
+
+
 EARTH = 'GEOGCS["WGS 84",DATUM["World Geodetic System 1984"]]'
 
 
@@ -182,6 +335,14 @@ LENSES: dict[str, tuple[dict[str, Any], list[str]]] = {
         ["no counterpart in COLMAP within", "do not fit k4"],
     ),
     "a spherical camera": ({"type": "spherical"}, ["its type is 'spherical'", "perspective views"]),
+    "large tangential terms of an equisolid fisheye": (
+        EQUISOLID | {"f": 22.0, "p1": 0.3},
+        ["p1 and p2 have no counterpart in COLMAP within", "export undistorted photos"],
+    ),
+    "large radial terms of an equisolid fisheye": (
+        EQUISOLID | {"f": 22.0, "k1": 0.0, "k2": -2.0, "k3": 2.5, "k4": -0.8, "p1": 0.0, "p2": 0.0},
+        ["k1 to k4, p1 and p2 have no counterpart"],
+    ),
     "a text": ({"k1": "many"}, ["<k1> is", "expected a number"]),
     "not a number": ({"k1": float("nan")}, ["<k1> is 'nan'"]),
     "a huge number": ({"cx": 1e300}, ["<cx> is '1e+300'"]),
@@ -194,6 +355,14 @@ def test_bad_lenses_are_one_line(tmp_path: Path, case: str) -> None:
     message = error_of("info", write(tmp_path, made.metashape_xml(made.FRAME | values)))
     for part in ("cameras.xml", *parts):
         assert part in message, message
+
+
+@pytest.mark.parametrize("in_sensor", [True, False])
+def test_a_spherical_camera_without_a_calibration_is_refused_by_its_type(tmp_path: Path, in_sensor: bool) -> None:
+    text = made.metashape_xml().replace("calibration", "calibrated")
+    write(tmp_path, text.replace('type="frame"', 'type="spherical"') if in_sensor else text)
+    message = error_of("info", tmp_path / "cameras.xml")
+    assert ("its type is 'spherical'" in message, "has no <calibration>" in message) == (in_sensor, not in_sensor)
 
 
 GOOD = made.metashape_xml(chunk=made.similarity())

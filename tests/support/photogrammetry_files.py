@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import uuid
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -244,12 +245,21 @@ ROUND = {
 }
 
 
+# The length of (x, y) at an angle from the axis.
+FISHEYES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "fisheye": lambda angle: angle,
+    "equidistant_fisheye": lambda angle: angle,
+    "equisolid_fisheye": lambda angle: 2 * np.sin(angle / 2),
+}
+
+
 def metashape_pixels(lens: dict[str, Any], local: np.ndarray) -> np.ndarray:
     """The pixels of points in a camera, (N, 2), by the appendix of Metashape's manual."""
     x, y = local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]
-    if lens["type"] == "fisheye":
+    if lens["type"] in FISHEYES:
         radius = np.hypot(x, y)
-        x, y = x * np.arctan(radius) / radius, y * np.arctan(radius) / radius
+        length = FISHEYES[lens["type"]](np.arctan(radius))
+        x, y = x * length / radius, y * length / radius
     r = np.sqrt(x**2 + y**2)
     radial = 1 + lens["k1"] * r**2 + lens["k2"] * r**4 + lens["k3"] * r**6 + lens["k4"] * r**8
     p1, p2 = lens["p1"], lens["p2"]
@@ -299,6 +309,9 @@ def on_earth(world: Similarity, latitude: float, longitude: float, height: float
     return Similarity(axes @ world.rotation, axes @ (world.translation - middle) + position, world.scale)
 
 
+LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0]]'
+
+
 @dataclass(frozen=True)
 class Label:
     """What a <camera> has beside its pose."""
@@ -314,7 +327,7 @@ def metashape_xml(
     lens: dict[str, Any] = FRAME,
     labels: list[Label] | None = None,
     chunk: Similarity | None = None,
-    reference: str = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0]]',
+    reference: str = LOCAL,
     in_component: bool = True,
     placement: Similarity | None = None,
 ) -> str:
@@ -323,21 +336,109 @@ def metashape_xml(
     `placement` is written instead of that transform.
     """
     labels = [Label(Path(name).stem) for name in NAMES] if labels is None else labels
-    world = Similarity(np.eye(3), np.zeros(3), 1.0) if chunk is None else chunk
     cameras = []
     for index, (label, shot) in enumerate(zip(labels, shots(), strict=True)):
-        right, top, back = shot.axes.T
-        pose = np.eye(4)
-        pose[:3, :3] = world.rotation.T @ np.stack([right, -top, -back], axis=1)
-        pose[:3, 3] = world.inverse(shot.centre)
-        transform = f"<transform>{_text(pose)}</transform>" if label.aligned else ""
+        transform = f"<transform>{_text(_pose(shot, chunk))}</transform>" if label.aligned else ""
         component = "" if label.component is None else f' component_id="{label.component}"'
         cameras.append(
             f'<camera id="{index}" sensor_id="{label.sensor}"{component} label="{label.text}" '
             f'enabled="{label.enabled}">{transform}<orientation>1</orientation></camera>'
         )
+    sensors = _sensor(0, lens)
+    cameras.insert(2, '<group id="0" label="g" type="folder">')
+    return _document(sensors, "".join([*cameras, "</group>"]), placement or chunk, reference, in_component)
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A slave of a rig: its axes as columns and its place, both in the master's camera, in units of the chunk."""
+
+    rotation: np.ndarray
+    location: np.ndarray | None
+
+
+RIG_FRAMES = 2
+RIG_FORMS = ("flat", "slaves first", "in a group", "nested", "nested without master_id")
+
+
+def mounts(count: int, located: bool = True) -> list[Mount]:
+    """Slaves that look to the sides and are turned about the axis, so their three angles matter."""
+    angles = [(12.0, -20.0, 90.0), (-15.0, 25.0, -40.0)]
+    places = [np.array([0.3, -0.05, 0.1]), np.array([-0.2, 0.15, -0.25])]
+    return [
+        Mount(Shot("", turn, place).axes, place if located else None)
+        for turn, place in zip(angles[:count], places[:count], strict=True)
+    ]
+
+
+def rig_name(frame: int, camera: int) -> str:
+    """The label of a photo of a rig; camera 0 is the master."""
+    return f"frame{frame}_camera{camera}"
+
+
+def rig_lens(camera: int) -> dict[str, Any]:
+    return FRAME | {"f": 41.0 + camera}
+
+
+def rig_xml(slaves: list[Mount], form: str = "flat", chunk: Similarity | None = None) -> str:
+    """The XML file of a rig, whose master has the poses of the first shots."""
+    identity = "<rotation>1 0 0 0 1 0 0 0 1</rotation><location>0 0 0</location>"
+    sensors = _sensor(0, rig_lens(0), identity)
+    for number, mount in enumerate(slaves, 1):
+        place = "" if mount.location is None else f"<location>{_text(mount.location)}</location>"
+        spread = f"<covariance>{_text(np.eye(6))}</covariance><rotation_covariance>{_text(np.eye(3))}"
+        offset = f"<rotation>{_text(mount.rotation)}</rotation>{place}{spread}</rotation_covariance>"
+        sensors += _sensor(number, rig_lens(number), offset, ' master_id="0"')
+    cameras = ""
+    for frame, shot in zip(range(RIG_FRAMES), shots(), strict=False):
+        master = 10 * frame
+        named = "" if form == "nested without master_id" else f' master_id="{master}"'
+        others = "".join(
+            f'<camera id="{master + number}" sensor_id="{number}"{named} label="{rig_name(frame, number)}"/>'
+            for number in range(1, len(slaves) + 1)
+        )
+        inside = others if form.startswith("nested") else ""
+        first = (
+            f'<camera id="{master}" sensor_id="0" component_id="0" label="{rig_name(frame, 0)}" enabled="true">'
+            f"<transform>{_text(_pose(shot, chunk))}</transform>{inside}</camera>"
+        )
+        cameras += {
+            "flat": first + others,
+            "slaves first": others + first,
+            "in a group": f'{first}<group id="{frame}" label="g" type="folder">{others}</group>',
+        }.get(form, first)
+    return _document(sensors, cameras, chunk)
+
+
+def _pose(shot: Shot, chunk: Similarity | None) -> np.ndarray:
+    """Camera-to-chunk of a shot, (4, 4)."""
+    world = Similarity(np.eye(3), np.zeros(3), 1.0) if chunk is None else chunk
+    right, top, back = shot.axes.T
+    pose = np.eye(4)
+    pose[:3, :3] = world.rotation.T @ np.stack([right, -top, -back], axis=1)
+    pose[:3, 3] = world.inverse(shot.centre)
+    return pose
+
+
+def _sensor(number: int, lens: dict[str, Any], offset: str = "", attributes: str = "") -> str:
+    """A <sensor> with an initial and an adjusted calibration."""
+    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
     numbers = "".join(f"<{key}>{value!r}</{key}>" for key, value in lens.items() if key != "type" and value)
-    written = placement or chunk
+    return (
+        f'<sensor id="{number}" label="camera" type="{lens["type"]}"{attributes}>{size}'
+        f'<calibration type="{lens["type"]}" class="initial">{size}<f>1.0</f></calibration>'
+        f'<calibration type="{lens["type"]}" class="adjusted">{size}{numbers}</calibration>{offset}</sensor>'
+    )
+
+
+def _document(
+    sensors: str,
+    cameras: str,
+    written: Similarity | None,
+    reference: str = LOCAL,
+    in_component: bool = True,
+) -> str:
+    """The XML file of sensors, cameras and the transform of the chunk or of its component."""
     placed = (
         ""
         if written is None
@@ -346,16 +447,13 @@ def metashape_xml(
             f"<translation>{_text(written.translation)}</translation><scale>{written.scale!r}</scale></transform>"
         )
     )
-    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
     inside, outside = (placed, "") if in_component else ("", placed)
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n<document version="2.0.0">\n  <chunk label="Chunk 1" enabled="true">'
-        f'<sensors next_id="1"><sensor id="0" label="camera" type="{lens["type"]}">{size}'
-        f'<calibration type="{lens["type"]}" class="initial">{size}<f>1.0</f></calibration>'
-        f'<calibration type="{lens["type"]}" class="adjusted">{size}{numbers}</calibration></sensor></sensors>'
+        f'<sensors next_id="1">{sensors}</sensors>'
         f'<components next_id="2" active_id="0"><component id="0" label="Component 1">{inside}</component></components>'
-        f'<cameras next_id="9" next_group_id="1">{"".join(cameras[:2])}<group id="0" label="g" type="folder">'
-        f"{''.join(cameras[2:])}</group></cameras>{outside}<reference>{reference}</reference></chunk>\n</document>\n"
+        f'<cameras next_id="9" next_group_id="1">{cameras}</cameras>{outside}<reference>{reference}</reference></chunk>'
+        "\n</document>\n"
     )
 
 

@@ -127,6 +127,18 @@ def test_a_run_goes_on_with_another_number_of_devices(scene: Scene, halves: str,
     assert_same_bits(whole.splats, resumed.splats)
 
 
+def test_a_run_with_exposures_goes_on_on_several_devices(scene: Scene, halves: str, tmp_path: Path) -> None:
+    """All devices have the exposures of the checkpoint before the first iteration."""
+    config = config_of(batch=2, device=halves, exposure=True)
+
+    def stops(trainer: Trainer, stop: Any) -> None:
+        if trainer.iteration == 12:
+            stop.set()
+
+    train(scene, config, output=tmp_path, visit=stops)
+    assert_same_bits(train(scene, config).splats, train(scene, config, output=tmp_path, resume=True).splats)
+
+
 @pytest.mark.parametrize("optimizer", ["fused", "numpy"])
 def test_both_optimizers_take_the_mean(scene: Scene, optimizer: str) -> None:
     """One step of three photos: the rates have the factor √3."""

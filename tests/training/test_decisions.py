@@ -221,6 +221,7 @@ def test_only_visible_splats_step_on_a_gpu_that_sees_a_part(scene: Scene, monkey
     assert decision.config.optim.visible_adam
     assert re.search(r"steps of visible splats only, because a photo shows [34]\d% of the points", str(decision))
     assert not decide(part, config.replace(visible_adam=False)).config.optim.visible_adam
+    assert not decide(part, config.replace(depth_smoothness=0.5)).config.optim.visible_adam, "hidden splats move, too"
     assert not decide(part, config.replace(cap_max=60_000)).config.optim.visible_adam, "too few splats"
     assert not decide(without_points(scene), config).config.optim.visible_adam
     assert decide(part, decision.config).config == decision.config

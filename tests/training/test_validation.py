@@ -74,7 +74,10 @@ def test_a_run_holds_them_out_and_measures_them(scene: Scene, tmp_path: Path) ->
     own = evaluate(Renderer(), model.splats, expected.validation, CONFIG.background).psnr
     assert values[41] == pytest.approx(own, abs=1e-9)
     assert model.best_iteration == max(values, key=values.__getitem__)
-    assert said[-1].startswith(f"{len(expected.validation)} validation views: PSNR {own:.2f} dB at the end")
+    ending = f"{len(expected.validation)} validation views: PSNR {own:.2f} dB at the end"
+    assert said[-1].startswith(ending)
+    train(scene, CONFIG, lambda progress: said.append(progress.message), output=tmp_path / "m", resume=True)
+    assert said[-1].startswith(ending), "a finished run has measured them before"
 
     loaded = load_model(tmp_path / "m")
     names = {view.name for view in expected.validation}

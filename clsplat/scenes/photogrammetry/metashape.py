@@ -4,6 +4,10 @@ The file has a <chunk> with <sensors>, <components> and <cameras>. The <transfor
 numbers row by row, with OpenCV's axes (x right, y down, z forward; the manual's appendix "Camera models"). Cameras of
 other components than the active one are left out, because nothing relates their poses.
 
+The cameras of a rig are a master and its slaves. A slave has a `master_id` and no <transform>. Its <sensor> has the
+place of the slave in the master's camera: <rotation>, 9 numbers row by row, and <location>, in units of the chunk.
+Camera-to-chunk of the slave is that of the master times [rotation | location].
+
 A georeferenced scene lies around the mean of its cameras. Its points are exported in a map projection, which is not
 read, so they are left out.
 """
@@ -13,8 +17,8 @@ from __future__ import annotations
 import warnings
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +43,8 @@ _OFF = ("0", "false")
 def read_metashape(path: Path, images: str | None = None) -> PosedImages:
     """Read the photos with poses of an XML file of Metashape, and the points in a PLY file beside it.
 
-    Photos that are disabled, that have no pose, or that belong to another component are left out.
+    Photos that are disabled, that have no pose, or that belong to another component are left out. A slave of a rig has
+    a pose if its master has one.
 
     Parameters
     ----------
@@ -52,21 +57,22 @@ def read_metashape(path: Path, images: str | None = None) -> PosedImages:
 
     Raises
     ------
-    InputError : the file is damaged, a number is missing or bad, or a lens has no counterpart. The message names file,
-        camera and element.
+    InputError : the file is damaged, a number is missing or bad, a slave's master is unknown, or a lens has no
+        counterpart. The message names file, camera and element.
     """
     chunk = read_xml(path, _EXPECTED).find("chunk")
     if chunk is None:
         raise InputError(f"{path}: has no <chunk>; choose {_EXPECTED}")
-    cameras = _cameras(path, chunk)
+    sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
+    cameras = _cameras(path, chunk, sensors)
     placed = find_named_photos(path, list(cameras), images)
     named = {placed[label][0]: camera for label, camera in cameras.items()}
     files = dict(placed.values())
     active = _active_component(chunk, cameras.values())
     reasons = {name: reason for name, camera in named.items() if (reason := camera.unused(active)) is not None}
     sizes, left_out = read_sizes({name: file for name, file in files.items() if name not in reasons})
-    left_out |= {name: f"{path}: {reason}" for name, reason in reasons.items()}
-    lenses = _lenses(path, chunk, {named[name].sensor for name in sizes})
+    left_out |= reasons
+    lenses = _lenses(path, sensors, {named[name].sensor for name in sizes})
     poses = {name: named[name].pose() for name in sorted(sizes)}
     world = ChunkWorld.of(path, chunk, active)
     if world.is_geocentric:
@@ -74,7 +80,7 @@ def read_metashape(path: Path, images: str | None = None) -> PosedImages:
         local = world.around(np.mean(aligned, axis=0))
     else:
         local = world
-    warn_of_corrections(path, {named[name].place: rotation for name, (rotation, _) in poses.items()})
+    warn_of_corrections(path, {named[name].title: rotation for name, (rotation, _) in poses.items()})
     photos = [
         RegisteredImage(name, local.camera_pose(rotation.matrix, position), lenses[named[name].sensor])
         for name, (rotation, position) in poses.items()
@@ -84,10 +90,28 @@ def read_metashape(path: Path, images: str | None = None) -> PosedImages:
 
 @dataclass(frozen=True, eq=False)
 class _MetashapeCamera:
-    """A <camera>, with its place for messages."""
+    """A <camera>.
 
-    place: str
+    Parameters
+    ----------
+    path : the XML file, for messages.
+    element : the <camera>, with a label.
+    sensors : each <sensor> of the chunk, by id.
+    master : for a slave of a rig, the camera whose pose leads to its own.
+    """
+
+    path: Path
     element: ET.Element
+    sensors: Mapping[str, ET.Element]
+    master: _MetashapeCamera | None = None
+
+    @property
+    def title(self) -> str:
+        return f"camera {self.element.get('label')!r}"
+
+    @property
+    def place(self) -> str:
+        return f"{self.path}: {self.title}"
 
     @property
     def sensor(self) -> str:
@@ -95,7 +119,16 @@ class _MetashapeCamera:
 
     @property
     def component(self) -> str | None:
-        return self.element.get("component_id")
+        return self._posed.element.get("component_id")
+
+    @property
+    def has_transform(self) -> bool:
+        return self.element.find("transform") is not None
+
+    @property
+    def _posed(self) -> _MetashapeCamera:
+        """The camera with the <transform>: the master of a slave, and any other camera itself."""
+        return self.master or self
 
     def unused(self, active: str | None) -> str | None:
         """Return why the camera is left out, or None.
@@ -104,16 +137,27 @@ class _MetashapeCamera:
         ----------
         active : id of the component whose cameras are used.
         """
-        if self.element.get("enabled", "1").lower() in _OFF:
+        if self.element.get("enabled", self._posed.element.get("enabled", "1")).lower() in _OFF:
             return f"{self.place} is disabled"
-        if self.element.find("transform") is None:
-            return f"{self.place} has no pose: it was not aligned"
+        if not self._posed.has_transform:
+            whose = "it" if self.master is None else f"its master, {self.master.title},"
+            return f"{self.place} has no pose: {whose} was not aligned"
         if active is not None and self.component not in (None, active):
             return f"{self.place} belongs to component {self.component}, and {active} is the active one"
         return None
 
     def pose(self) -> tuple[NearestRotation, NDArray[np.float64]]:
         """Return the rotation of camera-to-chunk and the position in the chunk, (3,)."""
+        if self.master is None:
+            return self._stored_pose()
+        rotation, position = self.master.pose()
+        turn, location = self._mount()
+        combined = NearestRotation(
+            rotation.matrix @ turn.matrix, max(rotation.deviation, turn.deviation), rotation.scale * turn.scale
+        )
+        return combined, position + rotation.matrix @ location
+
+    def _stored_pose(self) -> tuple[NearestRotation, NDArray[np.float64]]:
         with named_place(self.place):
             found = get_numbers(self.element, "transform", 16)
             matrix = np.zeros((4, 4)) if found is None else found.reshape(4, 4)
@@ -121,9 +165,17 @@ class _MetashapeCamera:
                 raise InputError("the last row of <transform> is not 0 0 0 1; export the cameras again")
             return rotation_of(matrix[:3, :3], "the left 3 x 3 block of <transform>"), matrix[:3, 3]
 
+    def _mount(self) -> tuple[NearestRotation, NDArray[np.float64]]:
+        """Return the rotation of slave-to-master, and the slave's position in the master's camera, (3,)."""
+        with named_place(_sensor_place(self.path, self.sensor)):
+            sensor = _known_sensor(self.sensors, self.sensor)
+            rotation, location = get_numbers(sensor, "rotation", 9), get_numbers(sensor, "location", 3)
+            turn = np.eye(3) if rotation is None else rotation.reshape(3, 3)
+            return rotation_of(turn, "<rotation>"), np.zeros(3) if location is None else location
 
-def _cameras(path: Path, chunk: ET.Element) -> dict[str, _MetashapeCamera]:
-    """Return the cameras of a chunk and of its groups, by label."""
+
+def _cameras(path: Path, chunk: ET.Element, sensors: Mapping[str, ET.Element]) -> dict[str, _MetashapeCamera]:
+    """Return the cameras of a chunk, of its groups and below their masters, by label."""
     cameras: dict[str, _MetashapeCamera] = {}
     for index, element in enumerate(chunk.iterfind("cameras//camera")):
         label = element.get("label", "")
@@ -133,10 +185,40 @@ def _cameras(path: Path, chunk: ET.Element) -> dict[str, _MetashapeCamera]:
             raise InputError(
                 f"{path}: two cameras have the label {label!r}; rename one in Metashape, and export the cameras again"
             )
-        cameras[label] = _MetashapeCamera(f"{path}: camera {label!r}", element)
+        cameras[label] = _MetashapeCamera(path, element, sensors)
     if not cameras:
         raise InputError(f"{path}: has no <camera>; choose {_EXPECTED}")
-    return cameras
+    return _with_masters(cameras)
+
+
+def _with_masters(cameras: Mapping[str, _MetashapeCamera]) -> dict[str, _MetashapeCamera]:
+    """Return the cameras by label, the slaves of rigs with their masters.
+
+    A master is the camera that the slave's `master_id` names, or else the <camera> that the slave is in.
+    """
+    by_id: dict[str | None, list[_MetashapeCamera]] = {}
+    parents: dict[ET.Element, _MetashapeCamera] = {}
+    for camera in cameras.values():
+        by_id.setdefault(camera.element.get("id"), []).append(camera)
+        parents |= dict.fromkeys(camera.element.iterfind("camera"), camera)
+    masters = {}
+    for label, camera in cameras.items():
+        number = camera.element.get("master_id")
+        found = [parents.get(camera.element, camera)] if number is None else by_id.get(number, [])
+        if camera.has_transform or found == [camera]:
+            continue
+        if len(found) != 1:
+            raise InputError(
+                f"{camera.place}: its master_id is {ascii(number)[:40]}, and {len(found) or 'no'} cameras have this "
+                "id; export all cameras of the rig again"
+            )
+        masters[label] = found[0]
+    for label, master in masters.items():
+        if master.element.get("label") in masters:
+            raise InputError(
+                f"{cameras[label].place}: its master, {master.title}, has a master too; export the cameras again"
+            )
+    return {label: replace(camera, master=masters.get(label)) for label, camera in cameras.items()}
 
 
 def _active_component(chunk: ET.Element, cameras: Iterable[_MetashapeCamera]) -> str | None:
@@ -148,16 +230,23 @@ def _active_component(chunk: ET.Element, cameras: Iterable[_MetashapeCamera]) ->
     return counts.most_common(1)[0][0] if counts else None
 
 
-def _lenses(path: Path, chunk: ET.Element, used: Collection[str]) -> dict[str, Lens]:
+def _lenses(path: Path, sensors: Mapping[str, ET.Element], used: Collection[str]) -> dict[str, Lens]:
     """Return the lenses of the sensors that are used, by id."""
-    sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
     lenses = {}
     for number in sorted(used):
-        with named_place(f"{path}: sensor {number[:40]!r}"):
-            if number not in sensors:
-                raise InputError("is not among the <sensors>; export the cameras again")
-            lenses[number] = metashape_lens(sensors[number])
+        with named_place(_sensor_place(path, number)):
+            lenses[number] = metashape_lens(_known_sensor(sensors, number))
     return lenses
+
+
+def _sensor_place(path: Path, number: str) -> str:
+    return f"{path}: sensor {number[:40]!r}"
+
+
+def _known_sensor(sensors: Mapping[str, ET.Element], number: str) -> ET.Element:
+    if number not in sensors:
+        raise InputError("is not among the <sensors>; export the cameras again")
+    return sensors[number]
 
 
 def _points(path: Path, in_projection: bool) -> Points:
