@@ -314,6 +314,9 @@ def block_config(config: TrainConfig, start: Path, cap: int) -> TrainConfig:
         "visible_adam": False,
         "coarse_to_fine": False,
         "sh_interval": 1,  # the coarse model has all bands
-        **{"opacity_reset": 0, "bisect_reg": 0.0, "position_optimizer": "adam", "optimizer": "fused"},  # check_context
+        "opacity_reset": 0,
+        "bisect_reg": 0.0,
+        "position_optimizer": "adam",
+        "optimizer": "fused",
     }
     return TrainConfig(**config.to_json() | changed)

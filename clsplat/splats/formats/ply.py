@@ -71,8 +71,8 @@ def read_ply(path: str | os.PathLike[str]) -> StoredSplats:
         reason = error.strerror or str(error)
         raise InputError(f"{path}: cannot be read ({reason}); check name and rights") from error
     columns = {name: values for name, values in body[VERTEX].items() if any(name in field.ply for field in schema)}
-    if "scale_0" in columns:
-        columns.setdefault(SURFEL_COLUMN, np.full(header.count, SURFEL_LOG_SCALE, np.float32))
+    if "scale_0" in columns and SURFEL_COLUMN not in columns:
+        columns[SURFEL_COLUMN] = np.full(header.count, SURFEL_LOG_SCALE, np.float32)
     arrays = {field.name: _gather(field, columns, header.count) for field in schema if field not in moved.values()}
     if header.side_elements:
         arrays = filled_in(path, header, body, schema, arrays)
