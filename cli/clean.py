@@ -117,7 +117,7 @@ def _summary(result: CleanedModel) -> list[str]:
             f"{rule.rule}: {DESCRIPTIONS[rule.rule]}",
             str(rule.candidates),
             str(rule.removed),
-            *([] if cleaned.before is None else [f"{-(rule.cost or 0.0):+.3f}"]),
+            *([] if cleaned.before is None else [f"{0.0 - round(rule.cost or 0.0, 3):+.3f}"]),
         )
         for rule in cleaned.rules
     ]

@@ -76,7 +76,7 @@ def model_rows(values: dict[str, Any]) -> list[tuple[str, str, str]]:
         for band, count in enumerate(values["sh_coefficients"])
     ]
     rows.append(("parameters", str(values["parameters_in_use"]), str(values["parameters"])))
-    rows.append(("bytes, written compactly", str(values["compact_bytes"]), str(values["bytes"])))
+    rows.append(("bytes, as a compact PLY file", str(values["compact_bytes"]), str(values["bytes"])))
     return rows
 
 

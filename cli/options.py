@@ -174,8 +174,8 @@ def photo_options(function: F) -> F:
         "--resolution",
         type=int,
         metavar="N",
-        help="Size of the photos. 1, 2, 4 or 8 divide it; another number is the width in pixels; -1 keeps it up to a "
-        "width of 1600 pixels.",
+        help="Size of the photos. 1, 2, 4 or 8 divide it; a number from 16 on is the width in pixels; -1 keeps it up "
+        "to a width of 1600 pixels.",
     )(function)
     return click.option("-i", "--images", metavar="NAME", help="Folder of photos inside the scene, such as images_4.")(
         function
@@ -225,7 +225,8 @@ def split_options(function: F) -> F:
         "--test-every",
         type=int,
         metavar="N",
-        help="Every Nth of the sorted views is a test view; implies --eval.  [default: 8]",
+        help="Every Nth of the sorted views is a test view; implies --eval. No effect if the scene's files name test "
+        "views.  [default: 8]",
     )(function)
 
 

@@ -20,7 +20,7 @@ from clsplat.training.decisions import decide
 from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
 from clsplat.training.quality import NORMAL, QUALITIES, quality
-from clsplat.training.stored_run import check_reading, load_recorded_scene, read_options_file
+from clsplat.training.stored_run import check_reading, existing_scene, load_recorded_scene, read_options_file
 from clsplat.viewer.options import ServerOptions
 
 from .blocks import blocks_options, given_blocks, run_blocks
@@ -196,6 +196,7 @@ def train(
     """
     from clsplat.scenes.changed_photos import check_photos
     from clsplat.scenes.reconstruct.photo_files import is_photographs
+    from clsplat.training.run import check_start
 
     if resume and overwrite:
         raise click.UsageError("give --resume or --overwrite, not both")
@@ -236,7 +237,7 @@ def train(
         check_reading(stored.run.scene, reading, model_path)
         options, reading = stored.run.options | options, stored.run.scene | reading
         recorded, photos = stored.run.scene_path, stored.run.scene["photos"]
-        path, search, blocks = path or recorded, search or stored.search, stored.blocks
+        path, search, blocks = path or existing_scene(recorded, model_path), search or stored.search, stored.blocks
     elif ModelFolder(model_path).is_used and not overwrite:
         # The function train checks this too, but only after the scene is read.
         raise OutputError(f"{model_path}: already holds a model: use --overwrite, --resume or another folder")
@@ -245,6 +246,8 @@ def train(
     blocks = blocks_for(config) if blocks_for is not None else blocks
     if cluster is not None and search is None and blocks is None:
         raise click.UsageError("--cluster is for several runs: give --blocks or --budget auto too")
+    if cluster is None:  # else each worker has its own devices
+        check_start(config)
     if is_photographs(path):
         path = scene_of_photos(path, model_path, overwrite, quiet, recorded)
     with activity_line(quiet):

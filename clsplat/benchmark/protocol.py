@@ -12,13 +12,13 @@ from typing import Any
 from ..errors import InputError, Remedy
 from ..files.masks import NO_MASKS
 from ..scenes.few_photos import few_photos
+from ..scenes.options import TEST_EVERY
 from ..scenes.photo_size import target_size
 from ..scenes.scene import Scene, load_scene, read_posed_images, select_test_names
 from ..scenes.transforms_files import TEST, TRAIN
 from ..splats.color import Color
 from .sets import BLENDER, BenchmarkSet, SetScene
 
-TEST_EVERY = 8  # every 8th view of the sorted names is a test view (Barron et al. 2022)
 _SAME_SIZE = 2  # largest difference of two sizes that count as equal [px]: programs round differently
 
 

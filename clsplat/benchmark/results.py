@@ -12,7 +12,7 @@ from ..comparison.sweep_rows import write_rows
 from ..comparison.table import MEASURED, Record, markdown_table, scene_title, summarise
 from ..comparison.table import notes as notes_of_runs
 from ..files.atomic import atomic_writer
-from .protocol import TEST_EVERY
+from ..scenes.options import TEST_EVERY
 from .sets import BLENDER, METRICS, BenchmarkSet, Published
 
 AS_PUBLISHED = "the published protocol"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import statistics
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -16,6 +17,7 @@ from ..evaluation.floaters import measure_floaters
 from ..evaluation.metrics import DEFAULT_PROTOCOL, MetricProtocol
 from ..evaluation.perceptual import Flip, Lpips
 from ..files.existing import refuse_existing
+from ..files.image_names import match_names
 from ..files.json_file import read_object, write_json
 from ..files.real_path import real_path
 from ..rendering.outputs import ImageWriter, output_stems
@@ -110,7 +112,8 @@ def evaluate_models(
 ) -> list[ModelEvaluation]:
     """Measure several models like `evaluate`, and return their measurements.
 
-    A model is also measured if its result files cannot be written; see `ModelEvaluation.write_error`.
+    A model is also measured if its result files cannot be written; see `ModelEvaluation.write_error`. A warning tells
+    that models were measured on different views. With `comparison`, that is an InputError.
 
     Parameters
     ----------
@@ -126,6 +129,11 @@ def evaluate_models(
     for path in paths:
         folder = renders / real_path(path).name if renders is not None and len(paths) > 1 else renders
         measured.append(evaluator(load_model(path, iteration), folder, progress))
+        if not _on_equal_views(measured[0], measured[-1]):
+            differ = f"{path} and {paths[0]} are measured on different views or sizes"
+            if comparison is not None:
+                raise InputError(f"{differ}: compare models of one scene, or measure them without a common report")
+            warnings.warn(f"{differ}: do not compare their numbers", stacklevel=2)
     if numbers is not None:
         entries = zip(paths, measured, strict=True)
         write_json(numbers, {str(path): {"results": one.result, "per_view": one.per_view} for path, one in entries})
@@ -239,6 +247,13 @@ class Evaluator:
                 file, options.scene_name or scene.name, [evaluation], [real_path(model.path).name]
             ),
         )
+
+
+def _on_equal_views(one: ModelEvaluation, other: ModelEvaluation) -> bool:
+    """Return whether two models were measured on views of equal names and sizes."""
+    sizes, others = one.view_sizes, other.view_sizes
+    named = match_names(list(sizes), list(others))
+    return named is not None and all(sizes[named[name]] == size for name, size in others.items())
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:

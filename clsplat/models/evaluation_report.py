@@ -68,7 +68,7 @@ def _facts(measured: ModelEvaluation) -> list[tuple[str, str]]:
         ),
         ("splats", f"{result['splats']}" + (f", {result['skewed']} of them skewed" if result["skewed"] else "")),
         ("SH degree", str(model.splats.sh_degree)),
-        ("bytes", f"{result['bytes']} ({result['compact_bytes']} written compactly)"),
+        ("bytes", f"{result['bytes']} ({result['compact_bytes']} as a compact PLY file)"),
         ("background", ", ".join(f"{part:g}" for part in result["background"])),
     ]
     if measured.floaters is not None:

@@ -53,6 +53,12 @@ class ModelEvaluation:
         return float(self.result["SSIM"])
 
     @property
+    def view_sizes(self) -> dict[str, tuple[int, int]]:
+        """(width, height) [px] of the measured views by name."""
+        cameras = {view.name: view.camera for view in self.scene.views}
+        return {name: (cameras[name].width, cameras[name].height) for name in self.per_view["PSNR"]}
+
+    @property
     def floaters(self) -> FloaterMeasures | None:
         """Measures of floaters on the training views; None without training views."""
         stored = self.result.get("floaters")

@@ -11,11 +11,11 @@ from ..cameras.cameras_json import NamedCamera, read_cameras
 from ..errors import InputError, Remedy
 from ..files.image_names import bare_name
 from ..files.json_file import describe, to_real
-from ..scenes.options import ALPHA_USES, ORIGIN
+from ..scenes.options import ALPHA_USES, ORIGIN, TEST_EVERY
 from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from ..training.folder import ModelFolder
-from ..training.stored_run import checked_record
+from ..training.stored_run import checked_record, existing_scene
 from .cfg_args import read_cfg_args
 
 if TYPE_CHECKING:
@@ -119,8 +119,8 @@ class LoadedModel:
         path = choice.path or record.get("path")
         if path is None:
             raise InputError(f"{self.path}: does not record its scene: give the scene's folder with -s")
-        if choice.path is None and not Path(path).exists():
-            raise InputError(f"{self.path}: its scene {path} does not exist: give the scene's folder with -s")
+        if choice.path is None:
+            path = existing_scene(path, self.path)
         # A file of splats records nothing. Splats far away have the coordinates of the scene's files.
         origin = self.origin if "origin" in record or is_far(self.splats.mean) else None
         test_names = self.test_names
@@ -131,7 +131,7 @@ class LoadedModel:
             path,
             choice.images or record.get("images"),
             record.get("resolution", -1) if choice.resolution is None else choice.resolution,
-            test_every=8 if choice.test_every is None else choice.test_every,
+            test_every=TEST_EVERY if choice.test_every is None else choice.test_every,
             test_list=choice.test_list,
             eval=test_names is None,
             background=self.background if background is None else background,

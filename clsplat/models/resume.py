@@ -14,7 +14,7 @@ from ..compression.state import BudgetState
 from ..scenes.options import ORIGIN
 from ..training.config import TrainConfig
 from ..training.log import Progress
-from ..training.stored_run import StoredRun, load_recorded_scene, stored_run
+from ..training.stored_run import StoredRun, existing_scene, load_recorded_scene, stored_run
 
 if TYPE_CHECKING:
     from ..blocks.train import BlocksModel
@@ -78,7 +78,8 @@ def resume(
     config = TrainConfig(**(stored.run.options | options))
     # A run that has recorded no origin has not moved its scene.
     record = {"origin": list(ORIGIN), **stored.run.scene}
-    loaded = load_recorded_scene(scene or stored.run.scene_path, record, config.background)
+    found = scene or existing_scene(stored.run.scene_path, Path(path))
+    loaded = load_recorded_scene(found, record, config.background)
     check_photos(loaded, stored.run.scene["photos"], Path(path), allow=allow_changed_photos, all_views=True)
     if stored.blocks is not None:
         return train_in_blocks(loaded, stored.blocks, config, progress, output=Path(path), resume=True)

@@ -17,6 +17,7 @@ from ..files.image_names import IMAGE_SUFFIXES
 from ..files.json_file import read_json, to_real
 from ..files.real_path import real_path
 from .colmap_folder import colmap_folder
+from .options import TEST_EVERY
 from .photo_listing import list_images
 from .pose_checks import check_lenses
 from .posed_images import PosedImages
@@ -115,7 +116,7 @@ def is_scene(path: Path) -> bool:
     return colmap_folder(path) is not None or bool(find_scene_files(path))
 
 
-def scene_info(path: str | os.PathLike[str], images: str | None = None, test_every: int = 8) -> SceneInfo:
+def scene_info(path: str | os.PathLike[str], images: str | None = None, test_every: int = TEST_EVERY) -> SceneInfo:
     """Return the contents of a scene; parameters as of `load_scene`.
 
     Raises

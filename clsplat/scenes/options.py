@@ -4,5 +4,6 @@ ALPHA_USES = ("background", "mask")  # transparent pixels are composited over th
 
 # Arguments of `load_scene`, besides the path and the background, that a run records to read its scene again.
 READING_OPTIONS = ("images", "resolution", "masks", "alpha", "test_every", "test_list", "eval", "origin")
+TEST_EVERY = 8  # every 8th view of the sorted names is a test view (Barron et al. 2022), as in 3DGS
 ORIGIN = (0.0, 0.0, 0.0)  # of the coordinates of a scene's files
 CAMERA_FORMATS = ("transforms", "colmap", "colmap-text", "cameras")  # formats that `clsplat cameras` writes

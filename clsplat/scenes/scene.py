@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -24,9 +25,9 @@ from ..splats.color import BLACK, Color
 from .colmap import Points
 from .colmap_folder import colmap_folder
 from .described import read_described
-from .options import ALPHA_USES, ORIGIN
+from .options import ALPHA_USES, ORIGIN, TEST_EVERY
 from .origin import near_origin, size_of
-from .photo_size import check_memory
+from .photo_size import check_memory, check_resolution
 from .pose_checks import check_lenses, check_poses, without_far_points
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
 from .read_view import PhotoReader, read_views
@@ -118,7 +119,7 @@ def load_scene(
     path: str | os.PathLike[str],
     images: str | None = None,
     resolution: int = -1,
-    test_every: int = 8,
+    test_every: int = TEST_EVERY,
     test_list: str | os.PathLike[str] | None = None,
     eval: bool = True,
     background: Color = BLACK,
@@ -139,7 +140,7 @@ def load_scene(
     images : folder of the photos inside the scene, by default "images", or the folder that the file names. If its
         photos are reduced (images_4), the cameras are scaled.
     resolution : 3DGS's -r. The values 1, 2, 4 and 8 divide the size; -1 keeps the size but reduces images wider than
-        1600 px to that width; another number is the width [px].
+        1600 px to that width; another number, at least 16, is the width [px].
     test_every : every n-th name of the sorted names, from the first on, is a test view. Names of photos that are left
         out count, so a missing photo moves no other photo between training and test views. If the scene's files hold
         views out (transforms_test.json, nerfstudio's lists), those are the test views instead.
@@ -161,7 +162,7 @@ def load_scene(
     -----
     UserWarning : the model registers fewer than 80 % of the photos in the folder. Photos that are missing, unreadable
         or hidden by their masks are left out. Rotations, poses or lenses look wrong (`check_poses`). The scene is
-        moved, and `origin` is None.
+        moved, and `origin` is None. `test_every` has no effect.
 
     Raises
     ------
@@ -171,8 +172,7 @@ def load_scene(
     root = Path(path)
     if alpha not in ALPHA_USES:
         raise InputError(f"alpha {alpha!r}: choose one of {', '.join(ALPHA_USES)}")
-    if resolution < 1 and resolution != -1:
-        raise InputError(f"resolution {resolution}: use 1, 2, 4, 8, a width in pixels, or -1")
+    check_resolution(resolution)
     posed = read_posed_images(root, images, origin)
     check_lenses(root, posed)
     test_names = select_test_names(posed, test_every, test_list) if eval else frozenset()
@@ -289,6 +289,12 @@ def select_test_names(posed: PosedImages, test_every: int, test_list: str | os.P
     names = posed.listed
     if test_list is None and posed.test_names is not None:
         chosen = sorted(posed.test_names)
+        if test_every != TEST_EVERY:
+            warnings.warn(
+                f"test_every {test_every} has no effect: the scene's files name its test views; a test_list replaces "
+                "them",
+                stacklevel=3,
+            )
     elif test_list is None:
         if test_every < 2:
             raise InputError(f"test_every {test_every}: must be at least 2; to train on all views, turn eval off")

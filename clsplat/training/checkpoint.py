@@ -100,7 +100,7 @@ class Checkpoint:
             meta = json.loads(arrays.pop("meta").tobytes())
             version = meta["version"]
         except FileNotFoundError:
-            raise InputError(f"{path}: no checkpoint to resume from: start with --overwrite") from None
+            raise InputError(f"{path}: no checkpoint to resume from: start without --resume") from None
         except _DAMAGE as error:
             raise _unreadable(path, "no archive of NumPy" if "pickle" in str(error) else str(error)) from None
         if version not in READABLE:

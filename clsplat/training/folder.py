@@ -76,8 +76,12 @@ class ModelFolder:
     @property
     def is_used(self) -> bool:
         """Whether a run or a training of several stages has written into the folder."""
-        names = ("point_cloud", *STAGES)
-        return any(p.exists() for p in (self.config_path, self.checkpoint_path, *(self.path / name for name in names)))
+        return self.can_resume or self.config_path.exists() or (self.path / "point_cloud").exists()
+
+    @property
+    def can_resume(self) -> bool:
+        """Whether the folder has a checkpoint, or the state of a training of several stages."""
+        return any(p.exists() for p in (self.checkpoint_path, *(self.path / name for name in STAGES)))
 
     def iterations(self) -> list[int]:
         """Iterations with a point cloud, in rising order."""
@@ -91,6 +95,10 @@ class ModelFolder:
     def latest_ply(self, iteration: int | None = None) -> tuple[Path, int]:
         """Return the file and the iteration of a point cloud, by default the last. Raise InputError without one."""
         found = self.iterations()
+        if not found and self.can_resume:
+            raise InputError(
+                f"{self.path}: its training has written no point cloud yet: continue it with clsplat train --resume"
+            )
         if not found:
             raise InputError(f"{self.path}: no point_cloud/iteration_N/point_cloud.ply in it: train a model first")
         if iteration is not None and iteration not in found:

@@ -114,11 +114,18 @@ def initial_splats(
             opacity=opacity,
             scale_factor=scale_factor,
         )
-    elif names_model(init):
-        splats, message = _from_model(init, shape, cap, sh_degree, normalisation, antialiased)
     else:
-        raise InputError(f"init {init!r}: choose sfm, random, or the path of a file of splats")
+        check_init(init)
+        splats, message = _from_model(init, shape, cap, sh_degree, normalisation, antialiased)
     return started(splats, rng).with_near_plane(near_plane), message
+
+
+def check_init(init: str) -> None:
+    """Raise InputError if the option `init` is unknown, or names a file that does not exist. The file is not read."""
+    if names_model(init) and not Path(init).exists():
+        raise InputError(f"init {init}: no such file; check its name")
+    if not names_model(init) and init not in FROM_POINTS:
+        raise InputError(f"init {init!r}: choose sfm, random, or the path of a file of splats")
 
 
 def names_model(init: str) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from ..device.several import open_devices
 from ..device.specs import first_device
 from ..errors import OutputError
 from ..evaluation.evaluate import Evaluation, evaluate
@@ -16,6 +17,7 @@ from .config import TrainConfig
 from .decisions import as_decided, decide
 from .extension import fitting_checkpoint
 from .folder import ModelFolder
+from .initialise import check_init
 from .log import Progress
 from .model import Model
 from .trainer import Trainer, Visit
@@ -77,6 +79,17 @@ def train(
             folder.write_run(config.to_json(), trainer.scene)
             folder.write_views([*scene.test, *trainer.scene.validation, *trainer.scene.train])
         return trainer.run(folder, visit)
+
+
+def check_start(config: TrainConfig) -> None:
+    """Raise what would stop a run before its first iteration, as far as the options alone show it.
+
+    Raises
+    ------
+    InputError : `init` is unknown, or its file does not exist. DeviceError : a device cannot be opened.
+    """
+    check_init(config.start.init)
+    open_devices(config.device)
 
 
 def evaluate_test_views(splats: Splats, scene: Scene, config: TrainConfig) -> Evaluation | None:

@@ -135,13 +135,23 @@ def stored_run(path: str | os.PathLike[str]) -> StoredRun:
     InputError : there is no checkpoint, or config.json is damaged.
     """
     folder = ModelFolder(Path(path))
+    if not folder.path.is_dir():
+        raise InputError(f"{folder.path}: no such folder: there is nothing to resume")
     if not folder.checkpoint_path.is_file():
-        raise InputError(f"{folder.path}: no checkpoint to resume from: start with --overwrite")
+        remedy = "start again with --overwrite" if folder.is_used else "start without --resume"
+        raise InputError(f"{folder.path}: no checkpoint to resume from: {remedy}")
     stored = folder.read_config()
     try:
         return StoredRun.from_json(stored, folder.path)
     except DAMAGE as error:
         raise InputError(f"{folder.config_path}: damaged ({error}): start again with --overwrite") from None
+
+
+def existing_scene(recorded: str | Path, model: Path) -> Path:
+    """Return the path of the scene that a model's folder records. Raise InputError if it does not exist."""
+    if not Path(recorded).exists():
+        raise InputError(f"{model}: its scene {recorded} does not exist: give the scene's folder with -s")
+    return Path(recorded)
 
 
 def check_reading(recorded: Mapping[str, Any], reading: Mapping[str, Any], model: Path) -> None:

@@ -10,11 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import N_VIEWS, SHORT, WIDTH, error_of, run
+from cli_runner import ITERATIONS, N_VIEWS, SHORT, WIDTH, error_of, run
 from clsplat_cli import main as main_module
+from clsplat_cli import train as train_command
 from clsplat_cli.main import _one_line
 
+from clsplat.errors import InputError
 from clsplat.files.images import write_png
+from clsplat.models.resume import resume
 
 MODEL_FILES = ["cameras.bin", "images.bin", "points3D.bin"]
 
@@ -106,6 +109,8 @@ def test_bad_splits(scene: Path, tmp_path: Path) -> None:
         (["--test-list", tmp_path / "none"], "none"),
         (["--test-every", "1"], "test_every"),
         (["-r", "0"], "resolution"),
+        (["-r", "3"], "resolution 3: use 1, 2, 4, 8, a width of at least 16 pixels, or -1"),
+        (["-r", "15"], "resolution 15"),
     ):
         assert word in error_of("train", scene, "-m", scene / "m", *args)
 
@@ -139,7 +144,7 @@ def test_bad_splits(scene: Path, tmp_path: Path) -> None:
         (["--device", "abacus"], "abacus", 1),
         (["--cap-max", "1000000000000"], "--cap-max", 1),
         (["--resume", "--overwrite"], "not both", 2),
-        (["--resume"], "no checkpoint", 1),
+        (["--resume"], "m: no such folder: there is nothing to resume", 1),
         (["--no-such-flag"], "--no-such-flag", 2),
     ],
 )
@@ -234,6 +239,42 @@ def test_bad_models(copied: Path, tmp_path: Path) -> None:
     assert "at least one" in error_of("eval", code=2)
     (tmp_path / "empty").mkdir()
     assert "train a model first" in error_of("eval", tmp_path / "empty")
+    assert "no checkpoint to resume from: start without --resume" in error_of(
+        "train", "--resume", "-m", tmp_path / "empty"
+    )
+    (tmp_path / "empty" / "config.json").write_text("{}")
+    assert "train a model first" in error_of("eval", tmp_path / "empty")
+    assert "start again with --overwrite" in error_of("train", "--resume", "-m", tmp_path / "empty")
+
+
+@pytest.mark.parametrize("command", ["eval", "info", "view"])
+@pytest.mark.parametrize("state", ["checkpoint.npz", "budget.json", "blocks.json"])
+def test_a_training_without_a_point_cloud_yet(tmp_path: Path, command: str, state: str) -> None:
+    (tmp_path / state).touch()
+    assert (
+        f"{tmp_path}: its training has written no point cloud yet: continue it with clsplat train --resume"
+        in error_of(command, tmp_path)
+    )
+
+
+def test_a_run_whose_scene_has_moved(copied: Path, scene: Path, tmp_path: Path) -> None:
+    stored = json.loads((copied / "config.json").read_text())
+    stored["scene"]["path"] = str(tmp_path / "gone")
+    (copied / "config.json").write_text(json.dumps(stored))
+    message = f"{copied}: its scene {tmp_path / 'gone'} does not exist: give the scene's folder with -s"
+    assert message in error_of("train", "--resume", "-m", copied, "--iterations", ITERATIONS + 1)
+    with pytest.raises(InputError, match="give the scene's folder with -s"):
+        resume(copied)
+    assert resume(copied, scene=scene, iterations=ITERATIONS + 1).finished
+
+
+@pytest.mark.parametrize(("args", "words"), [(["--device", "abacus"], "abacus"), (["--init", "a.ply"], "no such file")])
+def test_device_and_start_are_checked_before_poses_are_searched(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], words: str
+) -> None:
+    shutil.copytree(scene / "images", tmp_path / "photos")
+    monkeypatch.setattr(train_command, "scene_of_photos", lambda *_: pytest.fail("poses were searched"))
+    assert words in error_of("train", tmp_path / "photos", "-m", tmp_path / "m", *args)
 
 
 def test_damaged_model_files(copied: Path, tmp_path: Path) -> None:

@@ -133,7 +133,8 @@ def test_the_gap_is_that_of_the_test_views(renderer: Renderer, splats: Splats, s
     assert measured.psnr_gap == train_psnr - 20.0
     assert measured.to_json()["psnr_gap"] == measured.psnr_gap
     assert "psnr_gap" not in measure_floaters(renderer, splats, scene.train).to_json()
-    assert f"{train_psnr - 20.0:+.2f} dB above the test views" in measured.describe()
+    assert f", {20.0 - train_psnr:.2f} dB below the test views" in measured.describe()
+    assert ", 5.74 dB above the test views" in replace(measured, psnr_gap=5.74).describe()
 
 
 def test_a_model_without_splats_has_no_floaters(renderer: Renderer, splats: Splats, scene: Scene) -> None:

@@ -158,6 +158,14 @@ def test_blender_set(tmp_path: Path) -> None:
     assert load_scene(folder / "transforms_train.json").test_names == scene.test_names
 
 
+def test_a_choice_of_every_nth_view_has_no_effect_beside_named_test_views(folder: Path) -> None:
+    frames_of_test = {"test_frames": frames()[6:]}
+    write(folder, LENS | frames_of_test | {"frames": frames()[:6]})
+    with pytest.warns(UserWarning, match="test_every 3 has no effect: the scene's files name its test views"):
+        scene = load_scene(folder, test_every=3)
+    assert scene.test_names == {f"images/{name}" for name in NAMES[6:]}
+
+
 def test_test_views_without_photos_are_left_out(tmp_path: Path) -> None:
     """BlenderNeRF writes poses of test views whose photos the user has yet to render, and maybe no such pose."""
     folder = blender_set(tmp_path)
