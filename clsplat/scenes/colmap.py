@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import tempfile
+import warnings
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from ..errors import InputError, reason_of
 from ..splats.quaternions import rotations
 from .colmap_binary import check_binary_model, count_registered
-from .colmap_folder import FILES, colmap_folder, model_suffix
+from .colmap_copies import complete_model, image_lines, without_observations
+from .colmap_folder import colmap_folder, model_suffix
 from .scene_files import OTHER_KINDS
 from .undistort import RegisteredImage, colmap_library
 
 _WORDS_BEFORE_NAME = 9  # words before the name in a line of images.txt
+_LACKING = "does not exist"  # in pycolmap's message on a frame of an image that the model lacks
 _UNIT = 1e-6  # largest error of the norm of a quaternion that pycolmap turns into a rotation as it is
 
 
@@ -88,8 +90,10 @@ def read_model(folder: Path) -> SparseReconstruction:
     ------
     InputError : a file is missing, truncated or damaged, or the model has no registered image.
     """
-    with _opened(folder) as (reconstruction, names):
-        photos, points = read_registered(reconstruction, names), read_points(reconstruction)
+    with _opened(folder) as (reconstruction, names, tracks):
+        photos = read_registered(reconstruction, names)
+        lengths = {number: len(images) for number, images in tracks.items()}
+        points = read_points(reconstruction, lengths or None)
     if not photos:
         raise InputError(f"{folder}: the model registers no image; rebuild it with COLMAP's mapper")
     bad = int((~np.isfinite(points.xyz)).any(axis=1).sum())
@@ -107,28 +111,46 @@ def points_of_photos(folder: Path, photos: Collection[str], at_least: int) -> Po
     ------
     InputError : as `read_model`.
     """
-    with _opened(folder) as (reconstruction, names):
+    with _opened(folder) as (reconstruction, names, tracks):
         images = {number for number, image in reconstruction.images.items() if names.get(number, image.name) in photos}
-        counts = {
-            number: len({element.image_id for element in point.track.elements} & images)
+        tracks = tracks or {
+            number: {element.image_id for element in point.track.elements}
             for number, point in reconstruction.points3D.items()
         }
+        counts = {number: len(track & images) for number, track in tracks.items()}
         return read_points(reconstruction, {number: count for number, count in counts.items() if count >= at_least})
 
 
 @contextmanager
-def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str]]]:
-    """Yield a pycolmap.Reconstruction and names that replace its own. Raise InputError if it cannot be read."""
+def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str], dict[int, set[int]]]]:
+    """Yield a pycolmap.Reconstruction, names that replace its own, and tracks that do so; the two may be empty.
+
+    A track is the set of the ids of images that observe a point. Raise InputError if the model cannot be read.
+    """
     suffix = model_suffix(folder)
     if not suffix:
         raise InputError(f"{folder}: cameras or images file is missing (.bin or .txt)")
     if suffix == ".bin":
         check_binary_model(folder)
     pycolmap = colmap_library()
+    tracks: dict[int, set[int]] = {}
     try:
-        with _complete(folder, suffix) as whole:
-            reconstruction = pycolmap.Reconstruction(str(whole))
-        yield reconstruction, _names_with_spaces(folder / "images.txt") if suffix == ".txt" else {}
+        with complete_model(folder, suffix) as whole:
+            try:
+                reconstruction = pycolmap.Reconstruction(str(whole))
+                reconstruction.reg_image_ids()  # pycolmap checks the frames here
+            except (IndexError, ValueError) as error:
+                if not isinstance(error, IndexError) and _LACKING not in str(error):
+                    raise
+                with without_observations(whole, suffix) as (bare, named):
+                    reconstruction = pycolmap.Reconstruction(str(bare))
+                tracks = {number: images & set(reconstruction.images) for number, images in named.items()}
+                warnings.warn(
+                    f"{folder}: its points or frames name images or observations that the model lacks; they are left "
+                    "out",
+                    stacklevel=5,
+                )
+            yield reconstruction, _names_with_spaces(whole / "images.txt") if suffix == ".txt" else {}, tracks
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
         raise InputError(
             f"{folder}: COLMAP cannot read the model ({reason_of(error)}); the files are "
@@ -136,39 +158,16 @@ def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str]]]:
         ) from None
 
 
-@contextmanager
-def _complete(folder: Path, suffix: str) -> Iterator[Path]:
-    """Yield the model's folder, or a copy with an empty points3D file if this file is missing.
-
-    pycolmap refuses a model without that file. Pipes are left out, because opening one would wait for ever.
-    """
-    points = folder / f"{FILES[2]}{suffix}"
-    if points.is_file():
-        yield folder
-        return
-    with tempfile.TemporaryDirectory() as temporary:
-        whole = Path(temporary)
-        for file in filter(Path.is_file, folder.glob(f"*{suffix}")):
-            (whole / file.name).write_bytes(file.read_bytes())
-        (whole / points.name).write_bytes(bytes(8) if suffix == ".bin" else b"")
-        yield whole
-
-
 def _names_with_spaces(images: Path) -> dict[int, str]:
     """Return the names with spaces in images.txt, by image id.
 
-    COLMAP ends a name at the first space, but other programs write whole names. An image has two lines: its pose and
-    name, then its observations, which may be empty.
+    COLMAP ends a name at the first space, but other programs write whole names.
     """
     names = {}
-    with images.open(encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            words = line.strip().split(maxsplit=_WORDS_BEFORE_NAME)
-            if not words or words[0].startswith("#"):
-                continue
-            if len(words) > _WORDS_BEFORE_NAME and words[0].isdecimal() and len(words[-1].split()) > 1:
-                names[int(words[0])] = words[-1]
-            next(lines, None)
+    for line in image_lines(images, errors="replace"):
+        words = line.split(maxsplit=_WORDS_BEFORE_NAME)
+        if len(words) > _WORDS_BEFORE_NAME and words[0].isdecimal() and len(words[-1].split()) > 1:
+            names[int(words[0])] = words[-1]
     return names
 
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,14 +121,19 @@ _WALKERS: dict[str, Callable[[_Cursor], None]] = {
 }
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[_Cursor]:
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        yield _Cursor(path, data)
+
+
 def _check_file(path: Path) -> int:
     """Check every record of one file and return their number."""
     walk = _WALKERS[path.name]
     size = path.stat().st_size
     if size < _COUNT.size:
         raise InputError(f"{path}: only {size} bytes; the file is empty or truncated: copy or rebuild it")
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        cursor = _Cursor(path, data)
+    with _opened(path) as cursor:
         count = int(cursor.take(_COUNT)[0])
         for _ in range(count):  # a wrong count ends at the end of the file
             walk(cursor)
@@ -153,6 +159,32 @@ def check_binary_model(folder: Path) -> None:
         path = folder / name
         if path.is_file():
             _check_file(path)
+
+
+def binary_without_observations(images: Path, points: Path) -> tuple[bytes, bytes, dict[int, list[int]]]:
+    """Return images.bin without observations, points3D.bin without tracks, and the image ids of each point's track.
+
+    Parameters
+    ----------
+    images, points : files that `check_binary_model` has accepted.
+    """
+    tracks = {}
+    with _opened(images) as cursor:
+        bare_images = [cursor.data[: _COUNT.size]]
+        for _ in range(int(cursor.take(_COUNT)[0])):
+            start = cursor.at
+            cursor.take(_IMAGE)
+            cursor.text()
+            bare_images += [cursor.data[start : cursor.at], _COUNT.pack(0)]
+            cursor.skip(_OBSERVATION_BYTES * int(cursor.take(_COUNT)[0]))
+    with _opened(points) as cursor:
+        bare_points = [cursor.data[: _COUNT.size]]
+        for _ in range(int(cursor.take(_COUNT)[0])):
+            *point, length = cursor.take(_POINT)
+            bare_points.append(_POINT.pack(*point, 0))
+            start = cursor.skip(_TRACK_BYTES * int(length))
+            tracks[int(point[0])] = np.frombuffer(cursor.data[start : cursor.at], "<u4")[::2].tolist()
+    return b"".join(bare_images), b"".join(bare_points), tracks
 
 
 def count_registered(folder: Path) -> int:

@@ -38,8 +38,13 @@ def find_scene_files(path: Path) -> list[Path]:
 
 
 def described_by(scene: Path) -> list[Path]:
-    """Return the files that a scene is read from in place of a COLMAP model. A folder `sparse` comes before them."""
-    return [] if (scene / "sparse").is_dir() else find_scene_files(scene)
+    """Return the files that a scene is read from in place of a COLMAP model.
+
+    A folder `sparse` with files comes before them. An empty one is left by programs that found no poses.
+    """
+    if any(file.is_file() for file in (scene / "sparse").rglob("*")):
+        return []
+    return find_scene_files(scene)
 
 
 def _metashape_files(folder: Path) -> list[Path]:

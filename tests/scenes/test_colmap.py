@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import shutil
 import signal
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +20,12 @@ from clsplat.errors import InputError
 from clsplat.scenes import undistort
 from clsplat.scenes.colmap import Points, read_model
 from clsplat.scenes.colmap_binary import check_binary_model, write_binary_model
+from clsplat.scenes.export import write_transforms
 from clsplat.scenes.few_photos import few_photos
 from clsplat.scenes.info import scene_info
 from clsplat.scenes.photo_listing import is_posed
 from clsplat.scenes.point_cloud import write_point_cloud
+from clsplat.scenes.posed_images import read_colmap
 from clsplat.scenes.reconstruct.photo_files import is_photographs
 from clsplat.scenes.scene import load_scene
 from clsplat.scenes.undistort import RegisteredImage, make_lens
@@ -60,6 +64,91 @@ def test_a_model_beside_its_photos(folder: Path, photos: str, suffix: str) -> No
     assert not is_photographs(folder), "train does not look for poses"
     assert is_posed(folder)
     assert len(few_photos(scene, 3).points) <= len(scene.points)
+
+
+def test_an_empty_folder_of_models_hides_no_other_cameras(folder: Path) -> None:
+    posed = read_colmap(folder, None)
+    names = [f"images/{name}" for name in posed.names]
+    write_transforms(folder / "transforms.json", posed.photos, names, posed.points)
+    shutil.rmtree(folder / "sparse")
+    (folder / "sparse" / "0").mkdir(parents=True)
+    assert load_scene(folder).names == names
+    assert scene_info(folder).kind == "transforms.json"
+    (folder / "sparse" / "0" / "cameras.bin").touch()
+    with pytest.raises(InputError, match="no COLMAP model"):
+        load_scene(folder)
+
+
+def lacking(model: Path, target: Path, suffix: str, *, image: bool) -> None:
+    """Write a model whose points name an image that it lacks, or observations that an image lacks."""
+    as_text(model, target)
+    head, body = [], []
+    for line in (target / "images.txt").read_text().splitlines():
+        (head if line.startswith("#") else body).append(line)
+    body = body[2:] if image else [body[0], "", *body[2:]]
+    if suffix == ".txt":
+        (target / "images.txt").write_text("\n".join(head + body) + "\n")
+        return
+    shutil.copytree(model, target, dirs_exist_ok=True)
+    for file in target.glob("*.txt"):
+        file.unlink()
+    views = model_views()[::-1]
+    first = replace(views[0], pixels=np.empty((0, 2)), point_index=np.empty(0, np.int64))
+    points = (target / "points3D.bin").read_bytes()
+    write_binary_model(target, views[:-1] if image else [first, *views[1:]], *cloud())
+    (target / "points3D.bin").write_bytes(points)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("image", [True, False])
+def test_points_that_name_what_the_model_lacks(folder: Path, tmp_path: Path, suffix: str, image: bool) -> None:
+    """People remove images from a model and leave its points as they are."""
+    wanted, changed = load_scene(folder), tmp_path / "changed"
+    shutil.copytree(folder / "images", changed / "images")
+    lacking(folder / "sparse" / "0", changed / "sparse" / "0", suffix, image=image)
+    with pytest.warns(UserWarning, match="its points or frames name images or observations that the model lacks"):
+        scene = load_scene(changed)
+    assert len(scene.views) == len(wanted.views) - image
+    by_name = {view.name: view for view in wanted.views}
+    for view in scene.views:
+        expected = by_name[view.name].camera
+        np.testing.assert_allclose(view.camera.cam_from_world, expected.cam_from_world, atol=1e-9)
+        assert (view.camera.fx, view.camera.cx) == (expected.fx, expected.cx)
+    np.testing.assert_allclose(scene.points.xyz, wanted.points.xyz)
+    assert (scene.points.rgb == wanted.points.rgb).all()
+    lost = wanted.points.track_length - scene.points.track_length
+    assert lost.sum() == (8 if image else 0), "tracks without the observations of the image that is gone"
+    with pytest.warns(UserWarning, match="its points or frames"):
+        seen = few_photos(scene, 3).points
+    assert 0 < len(seen) <= len(scene.points)
+
+
+def test_frames_of_images_that_are_gone(folder: Path) -> None:
+    """A text model of COLMAP 3.12 without points names its images in frames.txt, too."""
+    model = folder / "sparse" / "0"
+    as_text(model, model)
+    for file in model.glob("*.bin"):
+        file.unlink()
+    lines = [line for line in (model / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    (model / "images.txt").write_text("\n".join(lines[2:]) + "\n")
+    (model / "points3D.txt").write_text("")
+    assert (model / "frames.txt").is_file()
+    with pytest.warns(UserWarning, match="its points or frames"):
+        assert len(load_scene(folder).views) == len(lines) // 2 - 1
+
+
+def test_text_with_a_byte_order_mark(folder: Path) -> None:
+    """Editors of Windows write one."""
+    wanted, model = load_scene(folder), folder / "sparse" / "0"
+    as_text(model, model)
+    for file in model.iterdir():
+        if file.suffix == ".bin":
+            file.unlink()
+        else:
+            file.write_bytes(codecs.BOM_UTF8 + file.read_bytes())
+    scene = load_scene(folder)
+    assert scene.names == wanted.names
+    assert (scene.points.track_length == wanted.points.track_length).all()
 
 
 def test_a_model_without_photos_is_no_scene(folder: Path) -> None:
@@ -360,6 +449,7 @@ def test_wrong_counts_are_refused(whole: dict[str, dict[str, bytes]], tmp_path: 
                 read_model(_put(tmp_path / "m", {**whole[".bin"], name: damaged}))
 
 
+@pytest.mark.filterwarnings("ignore:.*its points or frames")
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())

@@ -14,7 +14,7 @@ from PIL import Image
 from clsplat.errors import InputError
 from clsplat.files.digest import file_digest
 from clsplat.files.image_names import READS_HEIC
-from clsplat.files.images import read_image, read_photo_header, write_photo
+from clsplat.files.images import read_image, read_photo_header, write_photo, write_png
 from clsplat.scenes.reconstruct.photo_files import (
     PhotoFile,
     StagedPhoto,
@@ -72,6 +72,15 @@ def test_images_folder_and_its_masks(tmp_path: Path) -> None:
     assert (photo.file, photo.mask) == (tmp_path / "images" / "a.png", tmp_path / "masks" / "a.png.png")
     (tmp_path / "sparse").mkdir()
     assert not is_photographs(tmp_path)
+
+
+@pytest.mark.parametrize("folder", ["images", "corrected_images"])
+def test_raw_data_of_polycam_has_photos_in_one_folder(tmp_path: Path, folder: str) -> None:
+    """Depth, confidence and photos before their correction are no photos of their own."""
+    for name in {"depth", "confidence", "images", folder}:
+        write_png(tmp_path / "keyframes" / name / "1.png", np.zeros((4, 4, 3)))
+    assert is_photographs(tmp_path)
+    assert [photo.file for photo in find_photos(tmp_path)] == [tmp_path / "keyframes" / folder / "1.png"]
 
 
 def test_scene_names_stay_unique(tmp_path: Path) -> None:

@@ -32,6 +32,8 @@ from ..scene_files import find_scene_files
 from ..wrong_folder import describe_scenes, scene_hint
 
 VIDEO_SUFFIXES = frozenset((".mp4", ".m4v", ".mov", ".mkv", ".avi", ".webm", ".mts", ".mpg", ".mpeg"))
+# Polycam's raw data has maps of depth beside its photos, which are no photos, and may have the same photos undistorted.
+_PHOTO_FOLDERS = ("images", "keyframes/corrected_images", "keyframes/images")
 _MIN_ALPHA = 128  # features are not searched for in pixels with a smaller alpha
 
 
@@ -92,8 +94,8 @@ def is_photographs(path: Path) -> bool:
 def find_photos(path: Path) -> list[PhotoFile]:
     """Return the photos in a folder and its subfolders, sorted by name, with their masks.
 
-    If the folder `images` inside it has photos, only those are returned. Masks are in the folder `masks`. Hidden files
-    and folders are ignored. Scenes, models and renders below the folder are left out; `left_out_below` names them.
+    If a folder of _PHOTO_FOLDERS inside it has photos, only those are returned. Masks are in the folder `masks`.
+    Hidden files and folders are ignored. Scenes, models and renders below the folder are left out (`left_out_below`).
 
     Raises
     ------
@@ -239,9 +241,11 @@ def group_by_camera(photos: Sequence[StagedPhoto], mode: str) -> list[list[Stage
 
 
 def _photo_folder(path: Path) -> Path:
-    """Return the folder `images` inside a folder if it has photos, or else the folder itself."""
-    images = path / "images"
-    return images if images.is_dir() and list_images(images, IMAGE_SUFFIXES).names else path
+    """Return the first folder of _PHOTO_FOLDERS inside a folder that has photos, or else the folder itself."""
+    for images in (path / name for name in _PHOTO_FOLDERS):
+        if images.is_dir() and list_images(images, IMAGE_SUFFIXES).names:
+            return images
+    return path
 
 
 def _count_unsupported(home: Path) -> str:
