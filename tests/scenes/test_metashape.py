@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -106,6 +107,18 @@ def test_the_scene_is_loaded(tmp_path: Path) -> None:
 def test_labels_with_and_without_folders_and_suffixes(tmp_path: Path, form: str) -> None:
     labels = [made.Label(form.format(Path(name).stem)) for name in made.NAMES]
     assert read_posed_images(write(tmp_path, made.metashape_xml(labels=labels)), None).names == made.NAMES
+
+
+def test_photos_in_subfolders_are_found_by_their_labels(tmp_path: Path) -> None:
+    """Drones write a folder for each thousand photos. A label that two photos have is left out."""
+    folder = write(tmp_path)
+    for index, name in enumerate(made.NAMES):
+        (folder / "images" / f"{100 + index % 2}MEDIA").mkdir(exist_ok=True)
+        (folder / "images" / name).rename(folder / "images" / f"{100 + index % 2}MEDIA" / name)
+    assert load_scene(folder).names == sorted(f"{100 + i % 2}MEDIA/{name}" for i, name in enumerate(made.NAMES))
+    shutil.copy(folder / "images" / "100MEDIA" / made.NAMES[0], folder / "images" / "101MEDIA" / made.NAMES[0])
+    with pytest.warns(UserWarning, match=f"1 of {len(made.NAMES)} photos are left out"):
+        assert f"100MEDIA/{made.NAMES[0]}" not in load_scene(folder).names
 
 
 def test_suffixes_of_photos_may_be_large(tmp_path: Path) -> None:

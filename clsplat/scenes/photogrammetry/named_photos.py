@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from ...errors import InputError
 from ...files.file_names import can_be_file
 from ...files.image_names import IMAGE_SUFFIXES
+from ..photo_listing import list_images
 from ..photo_names import place_photos
 from ..posed_images import photo_folder
 from ..reduced_photos import with_reduced_photos
@@ -20,7 +21,8 @@ def find_named_photos(source: Path, names: Sequence[str], images: str | None) ->
     """Return a photo's name and its file for each name in a file.
 
     The photos are in the scene's folder `images` or in the scene's folder: the one that has more of them. A name may be
-    a path on another computer, whose last parts are looked for, and may lack its suffix.
+    a path on another computer, whose last parts are looked for, and may lack its suffix. The photo may be in a
+    subfolder of `images`, if it is the only one of its name.
 
     Parameters
     ----------
@@ -47,6 +49,7 @@ def find_named_photos(source: Path, names: Sequence[str], images: str | None) ->
     scene = source.parent
     folders = [scene / _FOLDER, scene] if images is None else [photo_folder(scene, images)]
     found = [{name: _found(folder, name, images is None) for name in names} for folder in folders]
+    found[0] |= _found_below(folders[0], [name for name, path in found[0].items() if path is None])
     best = max(range(len(folders)), key=lambda index: sum(each is not None for each in found[index].values()))
     stored = {name: path or PurePosixPath(_slashed(name)).name for name, path in found[best].items()}
     owners: dict[str, str] = {}
@@ -60,6 +63,21 @@ def find_named_photos(source: Path, names: Sequence[str], images: str | None) ->
     placed = place_photos(folders[best], list(owners))
     files = with_reduced_photos(folders[best], dict(placed.values()))
     return {name: (placed[path][0], files[placed[path][0]]) for name, path in stored.items()}
+
+
+def _found_below(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """Return the paths of photos that are in subfolders of a folder, by their names without folders."""
+    below: dict[str, list[str]] = {}
+    if names and folder.is_dir():
+        for path in list_images(folder, IMAGE_SUFFIXES).names:
+            below.setdefault(PurePosixPath(path).name, []).append(path)
+    found = {}
+    for name in names:
+        bare = PurePosixPath(_slashed(name)).name
+        paths = [path for suffix in _suffixes(bare) for path in below.get(bare + suffix, [])]
+        if len(paths) == 1:  # of several photos of one name, nothing says which it is
+            found[name] = paths[0]
+    return found
 
 
 def _found(folder: Path, name: str, anywhere: bool) -> str | None:
