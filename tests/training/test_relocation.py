@@ -20,7 +20,7 @@ from clsplat.splats.optical_depth import opacity_names
 from clsplat.splats.shapes import BETA_BOUNDS, NU_BOUNDS, SKEW_MAX, SLANT_MAX, Shape
 from clsplat.training.density.edit import DensifyEdit
 from clsplat.training.density.halves import split_along_axis, twice
-from clsplat.training.density.relocation import MIN_OPACITY, N_MAX, RULES, plan_relocation, relocation
+from clsplat.training.density.relocation import MIN_OPACITY, N_MAX, RULES, _draw, _stacked, plan_relocation, relocation
 from clsplat.training.density.table import HostSplats
 
 TWO_SIDED = [s for s in ALL_SHAPES if any(f.name == "opacity_minus_logit" for f in s.fields)]
@@ -396,3 +396,13 @@ BAD_OPTIONS = [{"rule": "area"}, {"growth": 0.9}, {"growth": math.nan}, {"min_op
 def test_bad_options(options: dict[str, object]) -> None:
     with pytest.raises(InputError):
         planned(gaussians(np.zeros(3)), shapes.GAUSSIAN, np.random.default_rng(0), 5, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("count", [0, 1, 40, 3000])
+def test_stacks_of_the_drawn_splats_are_those_of_unique(count: int) -> None:
+    rng = np.random.default_rng(count)
+    drawn, order = _draw(rng.random(50) ** 4, count, rng)
+    for found, expected in zip(
+        _stacked(drawn, order), np.unique(drawn, return_inverse=True, return_counts=True), strict=True
+    ):
+        np.testing.assert_array_equal(found, expected)

@@ -147,9 +147,10 @@ def _above_threshold(
     """
     times = np.maximum(stats[2], 1.0)
     with np.errstate(over="ignore"):  # a threshold may be too large for float32: nothing exceeds it
-        loud = stats[0] > 0.5 * grad_threshold * times
-        if depth_threshold > 0:
-            loud |= stats[1] * extent > 0.5 * depth_threshold * times
+        deep = stats[1] * extent > 0.5 * depth_threshold * times if depth_threshold > 0 else None
+        loud = stats[0] > np.multiply(times, 0.5 * grad_threshold, out=times)  # faster than new memory
+        if deep is not None:
+            loud |= deep
     rows = np.flatnonzero(loud)  # only these can exceed a threshold: few, so they may be in double precision
     screen, depth, seen = stats[:, rows]
     seen = np.maximum(seen.astype(np.float64), 1.0)

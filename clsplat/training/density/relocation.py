@@ -111,17 +111,17 @@ def plan_relocation(
         weights = np.where(alive, strength, 0.0)
     else:
         weights = np.where(alive & np.isfinite(gradient), gradient, 0.0)
-    drawn = _draw(weights if weights.any() else alive, len(moving) + n_new - n, rng)
+    drawn, order = _draw(weights if weights.any() else alive, len(moving) + n_new - n, rng)
     source = np.arange(n_new, dtype=np.int64)
     source[moving] = drawn[: len(moving)]
     source[n:] = drawn[len(moving) :]
 
-    targets, stack, copies = np.unique(drawn, return_inverse=True, return_counts=True)
+    targets, stack, copies = _stacked(drawn, order)
     places = np.concatenate([moving, np.arange(n, n_new)])  # of the copies
     old = splats.take(targets)
     halved = (copies == 1) & (split == "long-axis")
     piled = ~halved
-    stacks = _stacks({name: array[piled] for name, array in old.items()}, copies[piled] + 1, shape, rule, min_opacity)
+    stacks = _stacks(_rows(old, piled), copies[piled] + 1, shape, rule, min_opacity)
     number = np.cumsum(piled) - 1  # of the stack of a target
     rows = np.concatenate([targets[piled], places[piled[stack]]])
     of_stack = np.concatenate([number[piled], number[stack][piled[stack]]])
@@ -129,9 +129,8 @@ def plan_relocation(
     if halved.any():
         beside = np.empty_like(targets)
         beside[stack] = places
-        parents = {name: array[halved] for name, array in old.items()}
         rows = np.concatenate([targets[halved], beside[halved]])
-        values = _merged(values, rows, split_along_axis(parents, shape, min_opacity))
+        values = _merged(values, rows, split_along_axis(_rows(old, halved), shape, min_opacity))
 
     fresh = np.zeros(n_new, np.bool_)
     fresh[targets] = True
@@ -187,13 +186,42 @@ def relocation(
     return raw, factor
 
 
-def _draw(weights: Array | NDArray[np.bool_], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Draw `count` indices in proportion to `weights` (at least 0, not all 0), with replacement."""
+def _rows(arrays: Mapping[str, Array], chosen: NDArray[np.bool_]) -> dict[str, Array]:
+    """Return the chosen rows of all arrays."""
+    rows = np.flatnonzero(chosen)  # a mask takes longer than numbers of rows
+    return {name: np.take(array, rows, axis=0) for name, array in arrays.items()}
+
+
+def _draw(
+    weights: Array | NDArray[np.bool_], count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Draw `count` indices in proportion to `weights` (at least 0, not all 0), with replacement.
+
+    Returns
+    -------
+    drawn : (count,) the indices. order : (count,) numbers that sort them.
+    """
     drawn = np.empty(count, np.int64)
-    if count:
-        cumulative = np.cumsum(weights, dtype=np.float64)  # a float32 sum of all splats would lose small weights
-        places = rng.random(count) * cumulative[-1]
-        last = np.searchsorted(cumulative, cumulative[-1])  # random() * total may round up to the total
-        order = np.argsort(places)  # a search in rising order reads the memory in order
-        drawn[order] = np.minimum(np.searchsorted(cumulative, places[order], side="right"), last)
-    return drawn
+    if not count:
+        return drawn, drawn.copy()
+    cumulative = np.cumsum(weights, dtype=np.float64)  # a float32 sum of all splats would lose small weights
+    places = rng.random(count) * cumulative[-1]
+    last = np.searchsorted(cumulative, cumulative[-1])  # random() * total may round up to the total
+    order = np.argsort(places)  # a search in rising order reads the memory in order
+    drawn[order] = np.minimum(np.searchsorted(cumulative, places[order], side="right"), last)
+    return drawn, order
+
+
+def _stacked(
+    drawn: NDArray[np.int64], order: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return different indices in rising order, the number of each drawn one among them, and how often each was drawn.
+
+    It is `np.unique` without another sort. drawn, order : from `_draw`.
+    """
+    rising = drawn[order]
+    first = np.flatnonzero(np.diff(rising, prepend=-1))
+    copies = np.diff(first, append=len(drawn))
+    stack = np.empty_like(drawn)
+    stack[order] = np.repeat(np.arange(len(first)), copies)
+    return rising[first], stack, copies
