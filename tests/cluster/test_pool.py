@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -119,12 +120,30 @@ def test_an_error_of_the_job_is_its_result(pool: WorkerPool) -> None:
     assert right == 9
 
 
+def wait_for_both(pool: WorkerPool) -> None:
+    """Wait for a worker that an earlier test has ended."""
+    give_up = time.monotonic() + PATIENCE
+    while pool.n_workers < 2 and time.monotonic() < give_up:
+        time.sleep(0.1)
+
+
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 def test_a_fault_of_one_worker_sends_the_job_to_another(pool: WorkerPool, tmp_path: Path) -> None:
-    give_up = time.monotonic() + PATIENCE
-    while pool.n_workers < 2 and time.monotonic() < give_up:  # an earlier test ended one of them
-        time.sleep(0.1)
+    wait_for_both(pool)
     assert results(pool, Job("full", cluster_jobs.full_on_one, (tmp_path,))) == ["done"]
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+def test_the_only_worker_for_a_job_may_start_anew(pool: WorkerPool, tmp_path: Path) -> None:
+    """The other worker cannot do the job. This one has another address after its death."""
+    wait_for_both(pool)
+    found: list[Any] = []
+    job = Job("full", cluster_jobs.full_here_dies_there, (tmp_path,))
+    waiting = threading.Thread(target=lambda: found.extend(results(pool, job)), daemon=True)
+    waiting.start()
+    waiting.join(PATIENCE)
+    assert found == ["done"]
+    assert (tmp_path / "died").exists()
 
 
 def test_a_fault_of_all_workers_is_one_line_with_their_name(pool: WorkerPool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from clsplat.cluster.job import Abandoned, JobContext
@@ -49,6 +50,15 @@ def full_on_one(context: JobContext, folder: Path) -> str:
         if first.read_text("utf-8") != str(os.getpid()):
             return "done"
     raise OutputError("disk full: free some space")
+
+
+def full_here_dies_there(context: JobContext, folder: Path) -> str:
+    """Fail on the first worker as `full_on_one`, and end the process of the other one once."""
+    done = full_on_one(context, folder)
+    with suppress(FileExistsError):
+        (folder / "died").touch(exist_ok=False)
+        os._exit(9)
+    return done
 
 
 def full_everywhere(context: JobContext) -> None:
