@@ -106,6 +106,8 @@ class ClsplatRenderEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         for item in objects:
             placement(item)  # before the camera, which may be a child of a faulty object
         scene = depsgraph.scene
+        if scene.render.use_multiview:
+            raise InputError("stereoscopy is not rendered: turn it off, or render one camera after the other")
         camera = self.camera_override or scene.camera
         if camera is None:
             raise InputError("the scene has no camera: add one, or make one active")

@@ -30,6 +30,8 @@ def register() -> None:
         name="Splats",
         description="PLY file of the splats that are rendered at the place of this object",
         subtype="FILE_PATH",
+        # Blender 5 warns about paths relative to the .blend file without this option; earlier ones do not know it.
+        **({"options": {"PATH_SUPPORTS_BLEND_RELATIVE"}} if bpy.app.version >= (5, 0, 0) else {}),
     )
     bpy.types.Scene.clsplat_background = bpy.props.FloatVectorProperty(
         name="Background",

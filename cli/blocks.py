@@ -74,6 +74,7 @@ def run_blocks(
 ) -> None:
     """Train in blocks with a live display, and print the result."""
     from clsplat.blocks.train import train_in_blocks
+    from clsplat.training.decisions import decide
     from clsplat.training.run import evaluate_test_views
 
     try:
@@ -107,7 +108,7 @@ def run_blocks(
     ]
     click.echo(table(head, rows))
     click.echo(f"{result.path}: {len(result.splats)} splats, {result.path.stat().st_size / 1e6:.2f} MB")
-    report_test_views(evaluate_test_views(result.splats, scene, config))
+    report_test_views(evaluate_test_views(result.splats, scene, decide(scene, config).config))
 
 
 def report_interruption(ctx: click.Context, model_path: Path) -> NoReturn:

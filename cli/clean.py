@@ -16,6 +16,7 @@ from .options import (
     background_options,
     changed_photos_option,
     device_option,
+    is_given,
     iteration_option,
     overwrite_option,
     quiet_option,
@@ -83,7 +84,17 @@ SECTIONS = {
 @overwrite_option()
 @device_option
 @quiet_option
-def clean_model(model: Path, output: Path | None, dry_run: bool, no_photos: bool, quiet: bool, **values: Any) -> None:
+@click.pass_context
+def clean_model(
+    ctx: click.Context,
+    /,
+    model: Path,
+    output: Path | None,
+    dry_run: bool,
+    no_photos: bool,
+    quiet: bool,
+    **values: Any,
+) -> None:
     """Remove floaters from MODEL, a folder or any file of splats.
 
     Oversized, isolated and invisible splats go too. The training photos judge every rule: their PSNR falls by no more
@@ -98,6 +109,8 @@ def clean_model(model: Path, output: Path | None, dry_run: bool, no_photos: bool
     background = background_of(values.pop("background"), values.pop("white_background"))
     if no_photos and scene.path is not None:
         raise click.UsageError("give -s or --no-photos, not both")
+    if no_photos and any(is_given(ctx, name) for name in ("tolerance", "min_views")):
+        raise click.UsageError("--tolerance and --min-views are for rules that need photos: remove --no-photos")
     with activity_line(quiet):
         result = clean(
             model, output, scene=scene, background=background, use_photos=False if no_photos else None, **values

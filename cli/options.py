@@ -14,6 +14,7 @@ import click
 from clsplat.scenes.options import ALPHA_USES
 from clsplat.splats.color import WHITE, Color
 from clsplat.training.config import OPTIONS, SECTIONS, TrainConfig
+from clsplat.training.no_effect import no_effect
 from clsplat.training.options.density import STRATEGIES
 from clsplat.training.options.option import Option, option_table
 
@@ -151,9 +152,8 @@ def overwrite_option(existing: str = "the file that is there") -> Callable[[F], 
     return click.option("--overwrite", is_flag=True, help=f"Replace {existing}.")
 
 
-def background_options(function: F, **extra: Any) -> F:
+def background_options(function: F, help_text: str = "Colour behind the splats, each part 0 to 1.", **extra: Any) -> F:
     """Add `--background R,G,B` and `-w`; read them with `background_of`. `extra`: more arguments of `click.option`."""
-    help_text = "Colour behind the splats, each part 0 to 1."
     white = click.option(
         "-w", "--white-background", is_flag=True, help="White behind the splats: --background 1,1,1.", **extra
     )
@@ -174,7 +174,7 @@ def photo_options(function: F) -> F:
         "--resolution",
         type=int,
         metavar="N",
-        help="Size of the photos. 1, 2, 4 or 8 divide it; a number from 16 on is the width in pixels; -1 keeps it up "
+        help="Size of the photos. 1, 2, 4 or 8 divide it; a number from 32 on is the width in pixels; -1 keeps it up "
         "to a width of 1600 pixels.",
     )(function)
     return click.option("-i", "--images", metavar="NAME", help="Folder of photos inside the scene, such as images_4.")(
@@ -237,7 +237,7 @@ def config_options(*without: str) -> Callable[[F], F]:
         for section, definitions in reversed(SECTIONS.items()):
             for definition in reversed(definitions):
                 if definition.name == "background":
-                    function = background_options(function, cls=SectionOption, section=section)
+                    function = background_options(function, definition.help, cls=SectionOption, section=section)
                 elif definition.name not in without:
                     function = _flag_of(definition, section)(function)
         return function
@@ -246,12 +246,12 @@ def config_options(*without: str) -> Callable[[F], F]:
 
 
 def warn_without_effect(configs: Sequence[TrainConfig], names: Iterable[str]) -> None:
-    """Warn about flags that have no effect in any of the runs, because only the other strategy has them."""
-    strategies = " or ".join(dict.fromkeys(config.strategy for config in configs))
+    """Warn about flags that have no effect in any of the runs."""
     for name in names:
-        if all(config.without_effect([name]) for config in configs):
-            flag = "--" + name.replace("_", "-")
-            warnings.warn(f"{flag} has no effect with strategy {strategies}", stacklevel=2)
+        reasons = [no_effect(config, name) for config in configs]
+        if all(reasons):
+            why = " or ".join(dict.fromkeys(filter(None, reasons)))
+            warnings.warn(f"--{name.replace('_', '-')} has no effect {why}", stacklevel=2)
 
 
 def config_values(ctx: click.Context, values: dict[str, Any]) -> dict[str, Any]:

@@ -122,6 +122,12 @@ def render(
     request = path_request(values | {"save_path": save_path})
     if values["output"] is None and values["video"] is None:
         raise click.UsageError("give -o DIR for images, --video FILE, or both")
+    if (
+        values["depth_range"] is not None
+        and not values["depth_colours"]
+        and (values["video"] is None or not values["depth"])
+    ):
+        raise click.UsageError("--depth-range is for colours: give --depth-colours")
     source = one_model(model, model_path)
     depth = values["depth"] or values["depth_colours"]
     output = RenderOutput(

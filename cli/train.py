@@ -208,6 +208,8 @@ def train(
         raise click.UsageError("--quality is for new runs: to train longer, give --resume and --iterations")
     if stay is not None and not view:
         raise click.UsageError("--stay and --no-stay need --view")
+    if not view and any(is_given(ctx, name) for name in ("port", "host", "names", "token")):
+        raise click.UsageError("--port, --host, --allow-host and --token need --view")
     path = scene or source_path
     if path is None and not (resume and model_path):
         raise click.UsageError("give the scene's folder")
@@ -252,7 +254,8 @@ def train(
         path = scene_of_photos(path, model_path, overwrite, quiet, recorded)
     with activity_line(quiet):
         loaded = load_recorded_scene(path, reading, config.background)
-    warn_without_effect([decide(loaded, config).config], flags)
+    decided = decide(loaded, config).config
+    warn_without_effect([decided], flags)
     check_photos(loaded, photos, model_path, allow=allow_changed_photos, all_views=True)
     if blocks is not None:
         run_blocks(ctx, loaded, config, blocks, model_path, resume, overwrite, quiet, cluster)
@@ -263,14 +266,16 @@ def train(
         run_search(ctx, loaded, config, search, model_path, resume, overwrite, quiet, cluster)
         return
     serving = ServerOptions(host, port, names, token)
-    with _viewer(loaded, config, model_path, serving, quiet) if view else nullcontext() as live:
+    with _viewer(loaded, decided, model_path, serving, quiet) if view else nullcontext() as live:
         model = run_training(loaded, config, model_path, resume, overwrite, quiet, live)
         if not model.finished:
             report_interruption(ctx, model)
         if not quiet:
             from clsplat.training.run import evaluate_test_views
 
-            report(model, model.evaluations.get(model.iteration) or evaluate_test_views(model.splats, loaded, config))
+            report(
+                model, model.evaluations.get(model.iteration) or evaluate_test_views(model.splats, loaded, model.config)
+            )
         if live is not None and (sys.stderr.isatty() and not quiet if stay is None else stay):
             _stay(live, model, quiet)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,7 @@ def train_block(
     """
     inside, context = Splats.load(job.folder / INSIDE), Splats.load(job.folder / CONTEXT)
     exposures = exposures_of_start(str(job.folder / START)) if job.config.appearance.exposure else {}
+    scene = replace(scene, background=job.config.background)  # the run may have chosen another one
     prepared = with_block_targets(scene, inside, context, Renderer(device), job.uncovered, exposures)
     return train_in_folder(job.config.replace(device=device), prepared, folder, context, progress, visit)
 

@@ -175,6 +175,8 @@ def write_report(
             drawn = []
             if chart_style.available():
                 drawn = draw(rows, folder / CHARTS / name)
+                if not drawn:
+                    text.append(f"No chart: no other system reaches the PSNR of {first}.")
             else:
                 text.append(f"No chart: {chart_style.MISSING}.")
             names = [f"{CHARTS}/{path.name}" for path in (*files, *drawn)]

@@ -18,6 +18,11 @@ def name_key(path: str | os.PathLike[str]) -> str:
     return text.casefold() if IGNORES_CASE else text
 
 
+def printable(name: str) -> str:
+    """Return a name for programs that take UTF-8 only. Bytes that are none become escapes, as `\\udcff`."""
+    return name.encode("utf-8", "backslashreplace").decode()
+
+
 def can_be_file(text: str) -> bool:
     """Return whether a file can have this path, with a suffix added."""
     path = PurePosixPath(text.replace("\\", "/"))

@@ -99,18 +99,23 @@ def read_image(
     raise InputError(f"{path}: float pixels are not supported; convert it to 8-bit PNG or JPEG")
 
 
-def decode_pixels(data: bytes, name: str) -> ImageU8:
+def decode_pixels(data: bytes, name: str, most: int) -> ImageU8:
     """Return the pixels (H, W, 4) of an image in memory.
+
+    most : largest number of its pixels. A few bytes can be a huge image.
 
     Raises
     ------
-    InputError : the data are not an image. The message names it `name`.
+    InputError : the data are not an image, or one that is too large. The message names it `name`.
     """
     try:
         with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
-            return np.array(image.convert("RGBA"), dtype=np.uint8)
+            width, height = image.size
+            if width * height <= most:
+                return np.array(image.convert("RGBA"), dtype=np.uint8)
     except Exception:  # decoders of damaged files raise nearly anything
         raise InputError(f"{name}: cannot be read as an image; export it again") from None
+    raise InputError(f"{name}: is {width}x{height} px, far more than its splats need; export it again")
 
 
 def encode_pixels(pixels: ImageU8) -> bytes:

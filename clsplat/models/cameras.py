@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..files.existing import refuse_existing
 from ..files.json_file import read_json
 from ..scenes.colmap import Points
-from ..scenes.export import relative_files, write_colmap, write_transforms
+from ..scenes.export import points_file, relative_files, write_colmap, write_transforms
 from ..scenes.posed_images import warn_of_left_out
 from ..scenes.scene import read_posed_images
 from ..scenes.scene_files import PHOTOGRAMMETRY_ENDINGS
@@ -81,6 +81,8 @@ def export_cameras(
         _write_3dgs(output, photos)
         return ExportedCameras(len(photos), 0)
     if form == "transforms":
+        if len(points):
+            refuse_existing([points_file(output)], overwrite)
         write_transforms(output, photos, relative_files(photo_files, output.parent), points)
     else:
         write_colmap(output, photos, points, form == "colmap-text")

@@ -81,6 +81,9 @@ def model_levels(
     refuse_existing(files, overwrite)
     loaded = model_at(model, iteration)
     found = DetailLevels(loaded.splats, levels)
+    if output is not None and overwrite:
+        for file in Path(output).glob("level_*.ply"):  # of more levels than there are now
+            file.unlink()
     files = files[: len(found) - 1]
     for number, file in enumerate(files, 1):
         found.whole(number).save(file)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..device.memory import Pool, to_device, to_host
 from ..device.opencl import Buffer
 from ..device.schedule import TILE
+from ..splats.near_plane import NEAR_PLANE
 from .build import MARGIN_X, MARGIN_Y, KernelBuild
 from .splat_buffers import SplatBuffers
 
@@ -150,6 +151,7 @@ class ProjectedSplats:
     camera : the camera block (cl/camera/pinhole.clh).
     records : (n, R) screen records. depth_key : (n,) uint32, sorts splats by depth.
     tile_rect : (n, 4) int32, first x, first y, end x and end y of the tiles that the splat covers.
+    near_plane : depth below which splats are not drawn [world units].
     """
 
     n: int
@@ -158,6 +160,7 @@ class ProjectedSplats:
     records: Buffer
     depth_key: Buffer
     tile_rect: Buffer
+    near_plane: float = NEAR_PLANE
 
 
 @dataclass(frozen=True)

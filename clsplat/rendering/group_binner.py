@@ -43,7 +43,7 @@ class GroupBinner:
 
     def __init__(self, pool: Pool, kernels: KernelBuild) -> None:
         self.sorter, self.kernels = Sorter(pool), kernels
-        self.group, self.smallest_key = self.sorter.group, int(np.float32(kernels.near_plane).view(np.uint32))
+        self.group = self.sorter.group
         self.program = group_binning_program(pool.device, kernels, self.group)
         self._by_depth, self._by_tile = SortMemory(pool), SortMemory(pool)
         self._blocks, self._n_isects = pool.buffer(np.uint32), pool.buffer(np.uint64)
@@ -59,7 +59,7 @@ class GroupBinner:
         self._splats = splats
         self._by_depth.reserve(splats.capacity)
         self._rank_starts, self._order = self.sorter.sort(
-            splats.depth_key, splats.n, DEPTH_BITS, self._by_depth, self.smallest_key
+            splats.depth_key, splats.n, DEPTH_BITS, self._by_depth, int(np.float32(splats.near_plane).view(np.uint32))
         )
 
     def begin(self, tiles_x: int, tiles_y: int) -> None:

@@ -77,6 +77,7 @@ class Pipeline:
         background: Color = BLACK,
         sh_degree: int | None = None,
         hide: Callable[[ProjectedSplats], None] | None = None,
+        near_plane: float | None = None,
     ) -> Frame:
         """Render an image. The previous frame of this pipeline is overwritten.
 
@@ -84,6 +85,7 @@ class Pipeline:
         ----------
         sh_degree : highest band of spherical harmonics in use; None for all.
         hide : called with the projected splats before they are sorted; it may set some to CULLED_KEY and no tiles.
+        near_plane : depth below which splats are not drawn [world units]; None for that of the kernels.
 
         Raises
         ------
@@ -95,7 +97,8 @@ class Pipeline:
         layout = ImageLayout(camera.width, camera.height)
         self._images.reserve(layout)  # an image that does not fit is refused before its tiles are counted
         degree = self.kernels.sh_degree if sh_degree is None else min(sh_degree, self.kernels.sh_degree)
-        projected = self._project(splats, camera, layout, degree)
+        near_plane = self.kernels.near_plane if near_plane is None else near_plane
+        projected = self._project(splats, camera, layout, degree, near_plane)
         if hide is not None and projected.n:
             hide(projected)
         frame = Frame(layout, degree, splats, projected, self._images, self._bands(projected, layout))
@@ -198,10 +201,12 @@ class Pipeline:
             height=layout.height,
         )
 
-    def _project(self, splats: SplatBuffers, camera: Camera, layout: ImageLayout, degree: int) -> ProjectedSplats:
+    def _project(
+        self, splats: SplatBuffers, camera: Camera, layout: ImageLayout, degree: int, near_plane: float
+    ) -> ProjectedSplats:
         """Project the splats into the image."""
         n, capacity = splats.n, splats.capacity
-        block = camera_block(camera, self.kernels.near_plane).astype(self.kernels.dtype)
+        block = camera_block(camera, near_plane).astype(self.kernels.dtype)
         projected = ProjectedSplats(
             n,
             capacity,
@@ -209,6 +214,7 @@ class Pipeline:
             records=self._records.reserve(capacity),
             depth_key=self._depth_key.reserve(capacity),
             tile_rect=self._tile_rect.reserve(capacity),
+            near_plane=near_plane,
         )
         if not n:
             return projected

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -62,7 +63,9 @@ class RendersSplats(Protocol):
 
 
 class Renderer:
-    """Renders splats of any shape on one device.
+    """Renders splats of any shape on one device. Several threads may use it, one after the other.
+
+    `count_splats` and `backward` are about the last render, of whichever thread.
 
     Parameters
     ----------
@@ -102,6 +105,7 @@ class Renderer:
         pool, dtype = Pool(self.device), np.dtype(precision)
         self._v_color, self._v_alpha = DeviceImage(pool, dtype, 3), DeviceImage(pool, dtype, 1)
         self._last: tuple[Pipeline, Frame] | None = None
+        self._lock = threading.Lock()  # pyopencl ends the process if two threads set arguments of one kernel
 
     def render(
         self, splats: Splats, camera: Camera, background: ArrayLike = BLACK, sh_degree: int | None = None
@@ -121,12 +125,19 @@ class Renderer:
         rgb = np.asarray(background, np.float64)
         if rgb.shape != (3,) or not np.all(np.isfinite(rgb)):
             raise InputError(f"background {background!r}: expected three finite numbers R, G, B")
-        self._last = None  # releases the splats of the last frame: memory may be short
-        pipeline = self._pipeline(splats)
-        buffers = self._upload(splats, pipeline)
-        frame = pipeline.forward(buffers, camera, (float(rgb[0]), float(rgb[1]), float(rgb[2])), sh_degree)
-        self._last = (pipeline, frame)
-        return read_frame(frame)
+        with self._lock:
+            self._last = None  # releases the splats of the last frame: memory may be short
+            pipeline = self._pipeline(splats)
+            buffers = self._upload(splats, pipeline)
+            frame = pipeline.forward(
+                buffers,
+                camera,
+                (float(rgb[0]), float(rgb[1]), float(rgb[2])),
+                sh_degree,
+                near_plane=splats.near_plane,
+            )
+            self._last = (pipeline, frame)
+            return read_frame(frame)
 
     def count_splats(self) -> NDArray[np.float32]:
         """Return how many splats each pixel of the last render needs, (H, W) (`overdraw.splats_per_pixel`).
@@ -135,9 +146,10 @@ class Renderer:
         ------
         InputError : nothing is rendered yet.
         """
-        if self._last is None:
-            raise InputError("count_splats: render an image first")
-        return splats_per_pixel(*self._last)
+        with self._lock:
+            if self._last is None:
+                raise InputError("count_splats: render an image first")
+            return splats_per_pixel(*self._last)
 
     def backward(
         self, v_color: ArrayLike, v_alpha: ArrayLike | None = None, names: Sequence[str] | None = None
@@ -158,21 +170,24 @@ class Renderer:
         ------
         InputError : nothing is rendered yet, the arrays have another size than the image, or a field is unknown.
         """
-        if self._last is None:
-            raise InputError("backward: render an image first")
-        pipeline, frame = self._last
-        unknown = [name for name in names or () if name not in frame.splats.schema.names]
-        if unknown:
-            raise InputError(f"names: {unknown[0]!r} is no field; choose from {', '.join(frame.splats.schema.names)}")
-        size = (frame.layout.height, frame.layout.width)
-        color = self._v_color.write(frame.layout, _checked("v_color", v_color, (*size, 3)))
-        alpha = self._v_alpha.write(
-            frame.layout, np.zeros(size) if v_alpha is None else _checked("v_alpha", v_alpha, size)
-        )
-        splats = frame.splats
-        grads = ParameterBuffers(self.device, splats.schema, splats.capacity, splats.dtype)
-        pipeline.backward(frame, color, grads, alpha)
-        return grads.download(splats.n, names)
+        with self._lock:
+            if self._last is None:
+                raise InputError("backward: render an image first")
+            pipeline, frame = self._last
+            unknown = [name for name in names or () if name not in frame.splats.schema.names]
+            if unknown:
+                raise InputError(
+                    f"names: {unknown[0]!r} is no field; choose from {', '.join(frame.splats.schema.names)}"
+                )
+            size = (frame.layout.height, frame.layout.width)
+            color = self._v_color.write(frame.layout, _checked("v_color", v_color, (*size, 3)))
+            alpha = self._v_alpha.write(
+                frame.layout, np.zeros(size) if v_alpha is None else _checked("v_alpha", v_alpha, size)
+            )
+            splats = frame.splats
+            grads = ParameterBuffers(self.device, splats.schema, splats.capacity, splats.dtype)
+            pipeline.backward(frame, color, grads, alpha)
+            return grads.download(splats.n, names)
 
     def _pipeline(self, splats: Splats) -> Pipeline:
         real = PRECISIONS[self.precision]
@@ -188,7 +203,6 @@ class Renderer:
             alpha_max=alpha_max,
             t_min=t_min,
             antialiased=splats.antialiased,
-            near_plane=splats.near_plane,
             low_pass=splats.low_pass,
         ).for_rendering()
         if kernels not in self._pipelines:

@@ -23,7 +23,7 @@ from .colmap_binary import ModelView, write_binary_model
 from .point_cloud import write_point_cloud
 from .undistort import Lens, RegisteredImage, make_lens
 
-POINTS_FILE = "sparse_pc.ply"  # nerfstudio's file name
+TRANSFORMS, POINTS_FILE = "transforms.json", "sparse_pc.ply"  # nerfstudio's file names
 # Keys of transforms.json for the parameters of each COLMAP model; "f" stands for both focal lengths.
 _KEYS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -36,6 +36,11 @@ _KEYS = {
 }
 _FISHEYE = "OPENCV_FISHEYE"
 _DENOMINATOR = ("k4", "k5", "k6")  # parameters of FULL_OPENCV that readers of transforms.json do not support
+
+
+def points_file(transforms: Path) -> Path:
+    """Return the file of the points beside a file of cameras: nerfstudio's for transforms.json, else one of its own."""
+    return transforms.parent / POINTS_FILE if transforms.name == TRANSFORMS else transforms.with_suffix(".ply")
 
 
 def write_transforms(path: Path, photos: Sequence[RegisteredImage], files: Sequence[str], points: Points) -> None:
@@ -59,8 +64,9 @@ def write_transforms(path: Path, photos: Sequence[RegisteredImage], files: Seque
         frames.append({"file_path": file} | _lens_keys(photo) | {"transform_matrix": pose.tolist()})
     head: dict[str, Any] = {}
     if len(points):
-        write_point_cloud(path.parent / POINTS_FILE, points)
-        head["ply_file_path"] = POINTS_FILE
+        stored = points_file(path)
+        write_point_cloud(stored, points)
+        head["ply_file_path"] = stored.name
     # Values that all frames share are written once, above the frames.
     shared = {
         key: value

@@ -5,12 +5,16 @@ from __future__ import annotations
 import filecmp
 import warnings
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from ..cameras.camera import Camera
+from ..cameras.seen import sampled, seen
 from ..errors import InputError
 from .colmap import Points
+from .extent import together
 from .origin import FAR
 from .posed_images import PosedImages
 
@@ -19,6 +23,7 @@ _MAX_POSITION = 1e12  # training in float32 breaks between this and 1e15
 _TOO_FAR = 1e6  # sizes of the scene from the origin: steps of float32 are a twentieth of the scene there
 _DIGITS = 9  # poses that agree to these decimals count as equal
 _LEAST_FOCAL = 1e-3  # of the side of an image: an angle of view of 179.9 degrees
+_SEEN_SHARE = 0.01  # of the points that some image must show
 _SHRUNK, _GROWN = 0.21, 1.99  # COLMAP's undistortion scales a side by 0.2 to 2; such sides are at the limits
 
 
@@ -52,6 +57,37 @@ def without_far_points(root: Path, points: Points) -> Points:
         stacklevel=4,
     )
     return Points(points.xyz[near], points.rgb[near], points.track_length[near])
+
+
+def without_unseen_points(root: Path, points: Points, cameras: Sequence[Camera]) -> Points:
+    """Return the points, or none and a warning if hardly any of them is in an image.
+
+    Such points are not of these poses. Splats that start there would have to be removed again.
+    """
+    sample = sampled(points.xyz)
+    shown = np.zeros(len(sample), np.bool_)
+    for camera in cameras:
+        shown |= seen(camera, sample).inside
+    if not len(sample) or shown.mean() >= _SEEN_SHARE:
+        return points
+    warnings.warn(
+        f"{root}: its photos show {shown.mean():.1%} of its {len(points)} points, so the points do not fit the poses; "
+        "they are left out",
+        stacklevel=3,
+    )
+    return Points(points.xyz[:0], points.rgb[:0], points.track_length[:0])
+
+
+def warn_of_lone_cameras(root: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:
+    """Warn about cameras that are far from all others. names : of their photos."""
+    near = {id(camera) for camera in together(cameras)}
+    lone = [name for name, camera in zip(names, cameras, strict=True) if id(camera) not in near]
+    if lone:
+        warnings.warn(
+            f"{root}: {len(lone)} of {len(names)} photos have a camera far from all others, for example {lone[0]!r}: "
+            "check its pose",
+            stacklevel=3,
+        )
 
 
 def _check_positions(root: Path, posed: PosedImages, size: float) -> None:

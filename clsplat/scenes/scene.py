@@ -12,8 +12,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..cameras.camera import Camera
 from ..errors import InputError
 from ..files.digest import file_digest
@@ -25,17 +23,22 @@ from ..splats.color import BLACK, Color
 from .colmap import Points
 from .colmap_folder import colmap_folder
 from .described import read_described
+from .extent import extent_of
 from .options import ALPHA_USES, ORIGIN, TEST_EVERY
 from .origin import near_origin, size_of
 from .photo_size import check_memory, check_resolution
-from .pose_checks import check_lenses, check_poses, without_far_points
+from .pose_checks import (
+    check_lenses,
+    check_poses,
+    warn_of_lone_cameras,
+    without_far_points,
+    without_unseen_points,
+)
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
 from .read_view import PhotoReader, read_views
 from .scene_files import SCENE_ENDINGS, described_by
 from .view import View
 from .wrong_folder import describe_file, scene_hint
-
-_EXTENT_MARGIN = 1.1  # extent over the largest distance of a camera from the cameras' mean, as in 3DGS
 
 __all__ = ["Points", "Scene", "View", "load_scene"]
 
@@ -106,13 +109,8 @@ class Scene:
 
     @cached_property
     def extent(self) -> float:
-        """Size of the scene: 1.1 times the training cameras' largest distance from their mean [world units].
-
-        It scales the learning rate of positions, as in 3DGS. It is 1 if all cameras are at one position.
-        """
-        centres = np.array([view.camera.position for view in self.train])
-        reach = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-        return _EXTENT_MARGIN * reach if reach > 0 else 1.0
+        """Size of the scene [world units], by which learning rates of positions are scaled (extent.py)."""
+        return extent_of([view.camera for view in self.train], self.points.xyz)
 
 
 def load_scene(
@@ -140,7 +138,7 @@ def load_scene(
     images : folder of the photos inside the scene, by default "images", or the folder that the file names. If its
         photos are reduced (images_4), the cameras are scaled.
     resolution : 3DGS's -r. The values 1, 2, 4 and 8 divide the size; -1 keeps the size but reduces images wider than
-        1600 px to that width; another number, at least 16, is the width [px].
+        1600 px to that width; another number, at least 32, is the width [px].
     test_every : every n-th name of the sorted names, from the first on, is a test view. Names of photos that are left
         out count, so a missing photo moves no other photo between training and test views. If the scene's files hold
         views out (transforms_test.json, nerfstudio's lists), those are the test views instead.
@@ -162,7 +160,8 @@ def load_scene(
     -----
     UserWarning : the model registers fewer than 80 % of the photos in the folder. Photos that are missing, unreadable
         or hidden by their masks are left out. Rotations, poses or lenses look wrong (`check_poses`). The scene is
-        moved, and `origin` is None. `test_every` has no effect.
+        moved, and `origin` is None. `test_every` has no effect. A camera is far from all others. The photos show none
+        of the points, which are left out then. Test photos are among the training photos.
 
     Raises
     ------
@@ -207,12 +206,18 @@ def load_scene(
             f"{root}: no training view is left: all {len(views)} photos that can be used are test views; "
             "add photos, or turn eval off"
         )
+    points = posed.points
+    if only is None:
+        cameras = [view.camera for view in views]
+        points = without_unseen_points(root, points, cameras)
+        warn_of_lone_cameras(root, names, cameras)
+        _warn_of_copies(root, dict(zip(names, digests, strict=True)), test_names)
     folder = real_path(root)
     return Scene(
         (folder.parent if root.is_file() else folder).name,
         root,
         views,
-        posed.points,
+        points,
         test_names,
         background,
         _reading(
@@ -230,6 +235,19 @@ def load_scene(
         [file for name in names for file in _files_of(name, posed, mask_of)],
         origin=posed.origin,
     )
+
+
+def _warn_of_copies(root: Path, digests: Mapping[str, str], test_names: Collection[str]) -> None:
+    """Warn if training photos are copies of test photos: the metrics would be those of training. digests : by name."""
+    trained = {digest: name for name, digest in digests.items() if name not in test_names}
+    copies = [(name, trained[digests[name]]) for name in digests if name in test_names and digests[name] in trained]
+    if copies:
+        name, copy = copies[0]
+        warnings.warn(
+            f"{root}: {len(copies)} of {len(test_names)} test photos are training photos, too, for example {name!r} "
+            f"and {copy!r}: remove the copies, or their metrics are too good",
+            stacklevel=3,
+        )
 
 
 def _files_of(name: str, posed: PosedImages, mask_of: Mapping[str, Path]) -> list[Path]:

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..errors import named_place
+from ..errors import InputError, named_place
 from .axes import Signs, flipped
 from .fields import Array, DoubleArray
 from .shapes import GAUSSIAN, GENERALISED_EXPONENTIAL, SKEW_NORMAL, shape_named
@@ -21,16 +21,20 @@ from .stored import StoredSplats
 # The kernels of interchange files, and the field that each has besides those of a Gaussian.
 EXTRA_FIELDS = {GAUSSIAN.name: "", SKEW_NORMAL.name: "skew", GENERALISED_EXPONENTIAL.name: "beta"}
 SCALE, OPACITY = "scale", "opacity"
+_LARGEST_LOG_SCALE = float(np.log(np.finfo(np.float32).max))
 _ACTIVATED = ("log_scale", "opacity_logit")
 
 
 def activated(splats: StoredSplats, signs: Signs) -> dict[str, Array]:
     """Return mean, quat, scale, opacity, sh and the field of the shape, with other signs of the axes.
 
-    Computed values are float64, the others have the type of the splats.
+    Computed values are float64, the others have the type of the splats. InputError : float32 does not hold a scale.
 
     splats : of a shape in EXTRA_FIELDS.
     """
+    largest = float(splats.arrays["log_scale"].max(initial=-np.inf))
+    if largest > _LARGEST_LOG_SCALE:
+        raise InputError(f"a splat has the scale e^{largest:.4g}, which float32 does not hold: remove it first")
     values = flipped(splats.arrays, signs)
     raw = {name: splats.arrays[name].astype(np.float64) for name in _ACTIVATED}
     quat = values["quat"].astype(np.float64)

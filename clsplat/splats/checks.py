@@ -13,6 +13,7 @@ from .fields import MAX_SH_DEGREE, Array, Field, Schema, public_shape, sh_coeffi
 
 # The squared norm of a quaternion or direction must neither vanish nor overflow in float32 (1.2e-38 to 3.4e38).
 QUAT_NORM_MIN, QUAT_NORM_MAX = 1e-15, 1e15
+_MOVED = 0.1  # sizes of a splat that rounding may move it by
 LIMIT_SLACK = 1e-5  # relative; a vector at its limit may round up in float32
 
 
@@ -65,6 +66,26 @@ def first_fault(field: Field, values: Array) -> Fault | None:
         return None
     index = int(bad[0])
     return Fault(index, (), f"norm is {norms[index]:.6g}, must be {rule}")
+
+
+def far_away(arrays: Mapping[str, Array]) -> str | None:
+    """Return a text on splats that float32 moves by more than a tenth of their size, in most of a model; else None.
+
+    Kernels and files compute in float32. Only positions in double precision can be so far from the origin.
+    """
+    mean = arrays["mean"]
+    if mean.dtype == np.float32 or not len(mean):
+        return None
+    with np.errstate(over="ignore"):
+        moved = float(np.median(np.abs(mean - mean.astype(np.float32)).max(axis=1)))
+        size = float(np.exp(np.median(arrays["log_scale"].max(axis=1))))
+    if moved <= _MOVED * size:
+        return None
+    place = ", ".join(f"{value:.6g}" for value in np.median(mean, axis=0))
+    return (
+        f"its splats are around ({place}), where float32 moves them by {moved:.2g}, and half of them are smaller than "
+        f"{size:.2g}: subtract a point near them from all positions first"
+    )
 
 
 def unusable(schema: Schema, arrays: Mapping[str, Array]) -> NDArray[np.bool_]:

@@ -113,7 +113,12 @@ class TrainConfig:
         metavar="DEPTH",
         by_scene=True,
     )
-    background: Color = option(BLACK, help="Colour behind the splats, each part 0 to 1.", metavar="R,G,B")  # noqa: RUF009
+    background: Color = option(  # noqa: RUF009
+        BLACK,
+        help="Colour behind the splats, each part 0 to 1: black, or the colour in which all photos end.",
+        metavar="R,G,B",
+        by_scene=True,
+    )
     random_background: bool = option(
         False,
         help="Train with a random background colour in each iteration, also behind transparent photos, until "

@@ -4,6 +4,7 @@
   further steps. A run that names its shape or an option of the skew keeps its shape.
 - Transparent photos are trained over random backgrounds for most of the run. Over one colour, a splat of that colour
   costs nothing wherever it is, and other views see it before the object.
+- If the photos show an object in front of one colour, that colour is behind the splats (plain_background.py).
 - A run that starts at random places, or at few points of the scene, has splats that no photo needs. Transparent photos
   get the strategy that relocates them (`mcmc`). With `adc` a penalty on opacity lets them fade until they are pruned.
 - Beside the points of a scene, some splats start at random places too: a plain wall has no points, and would else get
@@ -35,6 +36,7 @@ from typing import TYPE_CHECKING, Any
 from ..cameras.seen import mean_share_seen, sampled
 from ..device.device import open_device
 from ..device.specs import count_devices, first_device
+from ..splats.color import BLACK
 from ..splats.low_pass import LOW_PASS, PIXEL
 from ..splats.shapes import PLAIN_SHAPE
 from ..splats.splats import Splats
@@ -45,6 +47,7 @@ from .near_plane import FARTHEST, choose_near_plane
 from .options.density import Adc, Mcmc
 from .options.groups import OptimConfig
 from .options.option import option_table
+from .plain_background import plain_background
 from .silhouettes import TRANSPARENT_SHARE, transparent_share
 
 if TYPE_CHECKING:
@@ -67,7 +70,7 @@ UNSEEN_SPLATS = 50_000  # fewer splats outside of a photo save less time than th
 SHORT_RUN = 2500  # photos in all iterations: in longer runs the skew gains as much as further iterations do, or more
 SKEW_OPTIONS = {"shape", "normalisation", "skew_lr", "skew_map", "alternation"}  # who names one wants a skew
 SCREEN_FILTER = ("antialiased", "low_pass")
-BY_TRANSPARENCY = {"random_points", "random_background", "strategy"}  # decided by transparent photos
+BY_TRANSPARENCY = {"random_points", "random_background", "strategy", "background"}  # decided by transparent photos
 FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
 _RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
 
@@ -122,6 +125,11 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
         if name not in config.named_options:
             chosen[name] = value
             reasons.append(reason)
+    named = config.named_options
+    if not share and "background" not in named and (color := plain_background(scene.train)) not in (None, BLACK):
+        assert color is not None
+        chosen["background"] = color
+        reasons.append(f"a background of {','.join(f'{part:.2g}' for part in color)}, because all photos end in it")
     if transparent and "random_background" not in config.named_options:
         chosen["random_background"] = True
         part = "" if config.random_background_until == 1 else f" for {config.random_background_until:.0%} of the run"

@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 
 BUDGET, BLOCKS = "budget.json", "blocks.json"
 STAGES = {BUDGET: "budget", BLOCKS: "blocks"}  # files of trainings of several stages, and the folders of their runs
+# Files of `eval`: of test views, and of other sets of views.
+_RESULTS = tuple(
+    f"{stem}{views}{ending}"
+    for stem, ending in (("results", ".json"), ("per_view", ".json"), ("report", ".html"))
+    for views in ("", "_train", "_validation", "_all")
+)
 _ITERATION = re.compile(r"iteration_(\d+)")
 
 
@@ -125,7 +131,7 @@ class ModelFolder:
             self.config_path,
             self.cameras_path,
             self.exposures_path,
-            *(self.path / name for name in ("results.json", "per_view.json", "report.html", *STAGES)),
+            *(self.path / name for name in (*_RESULTS, *STAGES)),
         ):
             path.unlink(missing_ok=True)
         for folder in STAGES.values():

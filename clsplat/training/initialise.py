@@ -123,7 +123,7 @@ def initial_splats(
 def check_init(init: str) -> None:
     """Raise InputError if the option `init` is unknown, or names a file that does not exist. The file is not read."""
     if names_model(init) and not Path(init).exists():
-        raise InputError(f"init {init}: no such file; check its name")
+        raise InputError(f"{init}: cannot be read (no such file); check its name")
     if not names_model(init) and init not in FROM_POINTS:
         raise InputError(f"init {init!r}: choose sfm, random, or the path of a file of splats")
 

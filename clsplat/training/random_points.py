@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..cameras.orbits import where_axes_meet
 from ..cameras.seen import seen
+from ..scenes.extent import together
 from ..splats.fields import DoubleArray
 from .silhouettes import TRANSPARENT_SHARE, Silhouettes, transparent_share
 
@@ -30,6 +31,8 @@ _DEEPEST = 3.0  # largest depth of these points, in median distances of the came
 _FARTHEST = 9.0  # largest distance from the centre, in median distances of the cameras
 _AHEAD = 3.0  # distance of the centre in front of parallel cameras, in scene extents
 _SPREAD_SHARE = 0.5  # of the points: if fewer are found in the whole contracted space, the hull is that of an object
+_SMALLEST_BALL = 1e-4  # of the median distance of the cameras, in which the region that most cameras see is looked for
+_BALL_MARGIN = 1.5  # on the distance of the points that were found there
 _DRAWS = 16  # number of draws of `count` points; points that cameras see are kept
 _HULL_DRAWS = 64  # the same in the box around the visual hull: thin objects fill little of it
 _TESTED_CAMERAS = 32  # cameras that the points are tested against
@@ -66,8 +69,9 @@ class _Sight:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self.cameras = [view.camera for view in scene.train[:: -(-len(scene.train) // _TESTED_CAMERAS)]]
-        centres = np.array([view.camera.position for view in scene.train])
+        cameras = together([view.camera for view in scene.train])
+        self.cameras = cameras[:: -(-len(cameras) // _TESTED_CAMERAS)]
+        centres = np.array([camera.position for camera in cameras])
         self.middle = _middle(self.cameras, scene.extent)
         unit = float(np.median(np.linalg.norm(centres - self.middle, axis=1)))
         self.unit = unit if unit > 0 else 1.0
@@ -133,7 +137,12 @@ def _in_sight(sight: _Sight, count: int, rng: np.random.Generator) -> DoubleArra
         unseen = drawn[n_seeing < sight.min_cameras]
         if len(outer) >= count - half:
             break
-    reach = float(sight.distances(central).max(initial=0.0))
+    reach, ball = float(sight.distances(central).max(initial=0.0)), sight.unit
+    while reach == 0.0 and ball > _SMALLEST_BALL * sight.unit:  # long lenses show a small part of the space
+        ball *= 0.5
+        drawn = sight.middle + ball * _in_ball(count, rng)
+        central = drawn[sight.cameras_seeing(drawn) >= min_central]
+        reach = _BALL_MARGIN * float(sight.distances(central).max(initial=0.0))
     for _ in range(_DRAWS if reach > 0 else 0):  # the central region is often a small part of the visible space
         if len(central) >= half:
             break

@@ -63,7 +63,7 @@ class Replica:
         check_step(device, kernels, config.sghmc.position_optimizer)
         channels = target_channels(scene.train, config.random_background)
         self.targets = Targets(device, kernels, scene.train, target_budget(device), channels)
-        self.exposure = ExposureLoss(self.loss, self.targets, config, scene.background)
+        self.exposure = ExposureLoss(self.loss, self.targets, config, config.background)
         self.dropout = SplatDropout(config, self.splats)
         self.smoothness = DepthSmoothness(config, kernels, self.splats, scene.train, max_isects)
 

@@ -46,10 +46,6 @@ class ComparedSource:
     def sh_degree(self) -> int:
         return max(source.sh_degree for source in self._both)
 
-    def show(self, splats: Splats) -> None:
-        """Show another first model from the next frame on; any thread may call this."""
-        self._both[0].show(splats)
-
     def view(self, camera: Camera, settings: Settings) -> ViewPicture:
         """Return the view of a camera with the divider at the share `settings.divider` of its width."""
         if settings.mode == "depth":  # one range of depths for both
@@ -65,9 +61,11 @@ class ComparedSource:
         pictures = self._parts(camera, settings, lambda source, part: source.picture(part, settings))
         return ViewPicture(self._divided(np.concatenate(pictures, axis=1), camera, settings))
 
-    def surface(self, origin: DoubleArray, direction: DoubleArray) -> DoubleArray | None:
-        """Return where a ray meets the first model, as `ModelSource.surface`."""
-        return self._both[0].surface(origin, direction)
+    def surface(
+        self, origin: DoubleArray, direction: DoubleArray, settings: Settings, across: float = 0.0
+    ) -> DoubleArray | None:
+        """Return where a ray meets the model on its side of the divider, as `ModelSource.surface`."""
+        return self._both[across >= settings.divider].surface(origin, direction, settings)
 
     def _parts(self, camera: Camera, settings: Settings, render: Callable[[ModelSource, Camera], T]) -> list[T]:
         """Return what both models show on their sides; a side without pixels is left out."""

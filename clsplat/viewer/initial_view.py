@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..cameras.cameras_json import NamedCamera
+from ..files.file_names import printable
 from ..splats.fields import Array
 
 Vector = NDArray[np.float64]
@@ -52,7 +53,7 @@ class SceneCameras:
     def by_label(self) -> dict[str, Camera]:
         """All cameras by unique labels, training cameras first."""
         return {
-            f"{kind} {number}: {item.name}": item.camera
+            f"{kind} {number}: {printable(item.name)}": item.camera
             for kind, items in (("train", self.train), ("test", self.test))
             for number, item in enumerate(items)
         }

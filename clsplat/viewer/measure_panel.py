@@ -11,6 +11,7 @@ import numpy as np
 import viser
 
 from ..splats.fields import DoubleArray
+from .settings import Settings
 from .source import Source
 
 _COLOUR = (90, 220, 120)
@@ -24,11 +25,17 @@ class MeasurePanel:
 
     Parameters
     ----------
-    source : returns what is shown. say : shows a text.
+    source : returns what is shown. settings : returns how it is shown. say : shows a text.
     """
 
-    def __init__(self, client: viser.ClientHandle, source: Callable[[], Source], say: Callable[[str], None]) -> None:
-        self._client, self._source, self._say = client, source, say
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        source: Callable[[], Source],
+        settings: Callable[[], Settings],
+        say: Callable[[str], None],
+    ) -> None:
+        self._client, self._source, self._settings, self._say = client, source, settings, say
         self._lock = threading.Lock()  # messages of a browser come in several threads
         self._points: list[DoubleArray] = []
         self._drawn: list[Any] = []
@@ -59,7 +66,8 @@ class MeasurePanel:
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         eye = np.asarray(event.ray_origin, np.float64)
-        point = self._source().surface(eye, np.asarray(event.ray_direction, np.float64))
+        ahead = np.asarray(event.ray_direction, np.float64)
+        point = self._source().surface(eye, ahead, self._settings(), event.screen_pos[0])
         if point is None:
             self._say("there is nothing to measure: click a point of the model")
             return

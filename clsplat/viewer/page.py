@@ -25,7 +25,7 @@ from .legend import legend
 from .measure_panel import MeasurePanel
 from .page_download import PageDownload
 from .path_panel import PathPanel
-from .settings import DEFAULT_SIZE, MAX_SIZE, MIN_SIZE
+from .settings import DEFAULT_SIZE, MAX_SIZE, MIN_SIZE, Settings
 from .status_line import StatusLine, plain
 from .viewer import Viewer, ViewerImage
 
@@ -93,7 +93,7 @@ class Page:
             self._crop = CropPanel(
                 client, lambda: viewer.source.splats, up, self._choose_box, self._try, self.set_status, folder
             )
-            self._measure = MeasurePanel(client, lambda: viewer.source, self.set_status)
+            self._measure = MeasurePanel(client, lambda: viewer.source, self._settings, self.set_status)
             with client.gui.add_folder("Help", expand_by_default=False):
                 client.gui.add_markdown(HELP)
             viewer.join(client.client_id, self.send)
@@ -130,19 +130,24 @@ class Page:
         self._status.say(text)
 
     def model_changed(self) -> None:
-        """Adapt the slider of splats to the new model. A message about the previous model need not stay."""
+        """Adapt the sliders to the new model. A message about the previous model need not stay."""
         self._status.expire()
         n = self.viewer.source.n_splats
         everything = self._cap.value >= self._cap.max
         self._cap.max, self._cap.step, self._cap.visible = max(n, 1), _step(n), self.viewer.source.partial
         if everything or self._cap.value > n:
             self._cap.value = max(n, 1)
+        degree = max(self.viewer.source.sh_degree, 1)
+        all_bands = self._degree.value >= self._degree.max
+        self._degree.max, self._degree.visible = degree, self.viewer.source.sh_degree > 0
+        if all_bands or self._degree.value > degree:
+            self._degree.value = degree
         self._crop.model_changed()
         self._measure.model_changed()
 
     def _add_settings(self) -> None:
         gui, viewer, source = self.client.gui, self.viewer, self.viewer.source
-        chosen = viewer.settings_of(self.client.client_id)
+        chosen = self._settings()
         with gui.add_folder("View"):
             labels = {label: mode for mode, label in _MODES.items() if mode in source.modes}
             mode = gui.add_dropdown("Show", tuple(labels), hint="The property of the splats that is shown")
@@ -168,11 +173,16 @@ class Page:
                 "Field of view", *_FOVS, _FOV_STEP, 60.0, hint="Vertical angle of the camera in degrees"
             )
             self._fov.on_update(lambda _: self._set_fov(self._fov.value))
-            if source.sh_degree:
-                degree = gui.add_slider(
-                    "SH degree", 0, source.sh_degree, 1, source.sh_degree, hint="Bands of view-dependent colour"
-                )
-                degree.on_update(lambda _: self._choose("sh_degree", degree.value))
+            self._degree: Any = gui.add_slider(
+                "SH degree",
+                0,
+                max(source.sh_degree, 1),
+                1,
+                max(source.sh_degree, 1),
+                hint="Bands of view-dependent colour",
+                visible=source.sh_degree > 0,
+            )
+            self._degree.on_update(lambda _: self._choose("sh_degree", self._degree.value))
             n = max(source.n_splats, 1)
             self._cap: Any = gui.add_slider(
                 "Splats",
@@ -196,7 +206,7 @@ class Page:
                 lambda: viewer.source.splats,
                 self.known,
                 self._name,
-                lambda: viewer.settings_of(self.client.client_id).background,
+                lambda: self._settings().background,
                 self.set_status,
             )
             if self._reload is not None:
@@ -232,12 +242,15 @@ class Page:
     def _here(self) -> Camera | None:
         return camera_of(_pose(self.client.camera), MAX_SIZE)
 
+    def _settings(self) -> Settings:
+        return self.viewer.settings_of(self.client.client_id)
+
     def _choose_box(self, box: CropBox | None) -> None:
         self.viewer.choose(self.client.client_id, "crop", box)
 
     def _show_legend(self, frame: ViewerImage) -> None:
         """Show the colour bar of a frame."""
-        bar = "" if frame.message else legend(self.viewer.settings_of(self.client.client_id).mode, frame.near_far)
+        bar = "" if frame.message else legend(self._settings().mode, frame.near_far)
         if bar != self._legend.content:
             self._legend.content, self._legend.visible = bar, bool(bar)
 
@@ -259,8 +272,9 @@ class Page:
         self.client.send_file_download(name, encode_render(frame.picture), save_immediately=True)
 
     def _choose(self, name: str, value: Any) -> None:
-        if name == "cap" and isinstance(value, (int, float)) and value >= self._cap.max:
-            value = None
+        slider = {"cap": self._cap, "sh_degree": self._degree}.get(name)
+        if slider is not None and isinstance(value, (int, float)) and value >= slider.max:
+            value = None  # all of them, also of a later model that has more
         self.viewer.choose(self.client.client_id, name, value)
 
     def _do_reload(self) -> None:

@@ -49,17 +49,19 @@ class PageDownload:
         file = f"{self._name}.html"
         self._say(f"{file}: is being made")
         try:
-            text = self._text(splats)
+            text, kind = self._text(splats)
         except ClsplatError as error:
             self._say(str(error))
             return
         self._client.send_file_download(file, text.encode(), save_immediately=True)
-        self._say(f"{file}: {len(splats)} splats, {len(text) / 1e6:.1f} MB")
+        self._say(f"{file}: {len(splats)} {kind}, {len(text) / 1e6:.1f} MB")
 
-    def _text(self, splats: Splats) -> str:
+    def _text(self, splats: Splats) -> tuple[str, str]:
+        """Return the page, and a word for the splats that it draws."""
+        kind = "splats"
         try:
             drawn = as_drawn(splats)
         except ClsplatError:
-            drawn = nearest_gaussians(splats)
+            drawn, kind = nearest_gaussians(splats), "Gaussians, which are near the splats but not equal to them"
         cameras = (*self._cameras.train, *self._cameras.test)
-        return page_text(drawn, PageContent(self._name, cameras, background=self._background()))
+        return page_text(drawn, PageContent(self._name, cameras, background=self._background())), kind

@@ -14,6 +14,7 @@ import numpy as np
 from ..cameras.camera import Camera
 from ..cameras.cameras_json import named_cameras
 from ..errors import ClsplatError, InputError
+from ..files.file_names import printable
 from ..files.real_path import real_path
 from ..models.model import LoadedModel, SceneChoice, in_both_forms
 from ..splats.color import Color
@@ -68,11 +69,13 @@ class ViewingSession:
 
         known, options = known or known_cameras(model), options or ServerOptions()
         cameras = [item.camera for item in (*known.train, *known.test)]
-        self.source: ModelSource | ComparedSource = ModelSource(model.splats, device, detail=detail)
+        source = ModelSource(model.splats, device, detail=detail)
+        self.source: ModelSource | ComparedSource = source
+        self.watched = [(ModelWatcher(_finder(model.path, iteration)), source)]
         if against is not None:
-            names = real_path(model.path).stem, real_path(against.path).stem
-            self.source = ComparedSource(self.source, ModelSource(against.splats, device, detail=detail), names)
-        self.watch = ModelWatcher(_finder(model.path, iteration))
+            other = ModelSource(against.splats, device, detail=detail)
+            self.watched.append((ModelWatcher(_finder(against.path, None)), other))
+            self.source = ComparedSource(source, other, (_name(model), _name(against)))
         settings = Settings(background=model.background if background is None else background)
         self.viewer = Viewer(self.source, settings)
         # This picture builds the kernels before a client waits for them, and raises the device's errors here.
@@ -85,7 +88,7 @@ class ViewingSession:
             port=options.port,
             names=options.names,
             token=options.token,
-            name=real_path(model.path).stem,
+            name=_name(model),
             reload=self.reload,
             folder=options.paths,
         )
@@ -100,27 +103,32 @@ class ViewingSession:
             self.poll()
 
     def poll(self) -> None:
-        """Show the file's new model. If it cannot be read, report why and keep the old model."""
-        try:
-            with self._lock:
-                splats = self.watch.poll()
-        except ClsplatError as error:
-            self.server.set_status(_kept(error))
-            return
-        if splats is not None:
-            self.source.show(splats)
-            self.server.model_changed()
+        """Show new models of the files. If one cannot be read, report why and keep the old model."""
+        for watch, source in self.watched:
+            try:
+                with self._lock:
+                    splats = watch.poll()
+            except ClsplatError as error:
+                self.server.set_status(_kept(error))
+                continue
+            if splats is not None:
+                source.show(splats)
+                self.server.model_changed()
 
     def reload(self) -> str:
-        """Read the file at once, and return a message about the result."""
-        try:
-            with self._lock:
-                splats = self.watch.reload()
-        except ClsplatError as error:
-            return _kept(error)
-        self.source.show(splats)
+        """Read the files at once, and return a message about the result."""
+        told = []
+        for watch, source in self.watched:
+            try:
+                with self._lock:
+                    splats = watch.reload()
+            except ClsplatError as error:
+                told.append(_kept(error))
+                continue
+            source.show(splats)
+            told.append(f"{watch.path.name}: read again, {len(splats)} splats")
         self.server.model_changed()
-        return f"{self.watch.path.name}: read again, {len(splats)} splats"
+        return "; ".join(told)
 
     def close(self) -> None:
         """Close the connections and release the device."""
@@ -149,6 +157,11 @@ def require_viser() -> None:
         importlib.import_module("viser")
     except ImportError:
         raise InputError("the viewer needs viser: pip install clsplat[view]") from None
+
+
+def _name(model: LoadedModel) -> str:
+    """Return the name of a model for the browser."""
+    return printable(real_path(model.path).stem)
 
 
 def _finder(path: Path, iteration: int | None) -> Callable[[], Path]:

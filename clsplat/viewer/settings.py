@@ -48,8 +48,8 @@ class Settings:
             "mode": lambda mode: mode if mode in modes else _unusable(),
             "background": _rgb,
             "size": lambda size: _whole(size, MIN_SIZE, MAX_SIZE),
-            "sh_degree": lambda degree: _whole(degree, 0, 3),
-            "cap": lambda cap: _whole(cap, 0, 1 << 31),
+            "sh_degree": lambda degree: None if degree is None else _whole(degree, 0, 3),
+            "cap": lambda cap: None if cap is None else _whole(cap, 0, 1 << 31),
             "divider": _share,
             "crop": lambda box: box if box is None or isinstance(box, CropBox) else _unusable(),
         }

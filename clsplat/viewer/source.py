@@ -69,8 +69,13 @@ class Source(Protocol):
     def view(self, camera: Camera, settings: Settings) -> ViewPicture:
         """Return the view of a camera, in the size of its image."""
 
-    def surface(self, origin: DoubleArray, direction: DoubleArray) -> DoubleArray | None:
-        """Return the point (3,) where a ray meets the model; None if it meets nothing, or during a run."""
+    def surface(
+        self, origin: DoubleArray, direction: DoubleArray, settings: Settings, across: float = 0.0
+    ) -> DoubleArray | None:
+        """Return the point (3,) where a ray meets what is shown; None if it meets nothing, or during a run.
+
+        across : where the ray crosses the picture, as a share of its width.
+        """
 
 
 class ModelSource:
@@ -129,12 +134,14 @@ class ModelSource:
             splats = self._shown.seen(camera, settings)
             return self.renderer.render(splats, camera, settings.background, settings.sh_degree)
 
-    def surface(self, origin: DoubleArray, direction: DoubleArray) -> DoubleArray | None:
-        """Return the point (3,) where a ray meets the model, by the mean depth of a tiny image; None beside it."""
+    def surface(
+        self, origin: DoubleArray, direction: DoubleArray, settings: Settings, across: float = 0.0
+    ) -> DoubleArray | None:
+        """Return the point (3,) where a ray meets what is shown, by the mean depth of a tiny image; None beside it."""
         camera = _camera_along(origin, direction)
         if camera is None:
             return None
-        image = self.rendered(camera, Settings())
+        image = self.rendered(camera, settings)
         depth = image.median_depth
         return None if depth is None else camera.position + depth * camera.rotation[2]
 

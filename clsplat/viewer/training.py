@@ -77,7 +77,9 @@ class TrainingSource:
         counts = splats_per_pixel(pipeline, frame) if settings.mode == "splats" else None
         return ViewPicture(picture_of(image, settings.mode, settings.background, counts=counts))
 
-    def surface(self, origin: DoubleArray, direction: DoubleArray) -> DoubleArray | None:
+    def surface(
+        self, origin: DoubleArray, direction: DoubleArray, settings: Settings, across: float = 0.0
+    ) -> DoubleArray | None:
         """Return None: only the trainer's thread may render."""
         return None
 

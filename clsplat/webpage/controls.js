@@ -71,12 +71,15 @@ class Controls {
   }
 
   key(event, down) {
+    const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    if (!down) {  // wherever it is released, and with which other key
+      this.keys.delete(name);
+      return;
+    }
     if (event.target !== this.canvas && event.target !== document.body) return;
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (!"wasdqe".includes(name) && !name.startsWith("Arrow")) return;
-    if (down) this.keys.add(name);
-    else this.keys.delete(name);
+    this.keys.add(name);
     event.preventDefault();
     this.onChange();
   }

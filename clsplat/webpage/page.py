@@ -16,6 +16,7 @@ from ..cameras.orbits import ellipse
 from ..cameras.path import CameraPath
 from ..errors import InputError
 from ..files.atomic import atomic_writer
+from ..files.file_names import printable
 from ..files.html_page import escape, package_text
 from ..splats.color import BLACK, Color
 from ..splats.convert import as_one_of
@@ -101,7 +102,7 @@ def page_text(splats: Splats, content: PageContent, precision: str = PRECISIONS[
     settings_text = json.dumps(settings).replace("<", "\\u003c")
     script = "\n".join(_text(name) for name in _SCRIPTS)
     words = {
-        "TITLE": escape(content.title),
+        "TITLE": escape(printable(content.title)),
         "STYLE": _text("web.css"),
         "SETTINGS": settings_text,
         "PAYLOAD": base64.b64encode(payload).decode(),

@@ -109,8 +109,8 @@ def test_bad_splits(scene: Path, tmp_path: Path) -> None:
         (["--test-list", tmp_path / "none"], "none"),
         (["--test-every", "1"], "test_every"),
         (["-r", "0"], "resolution"),
-        (["-r", "3"], "resolution 3: use 1, 2, 4, 8, a width of at least 16 pixels, or -1"),
-        (["-r", "15"], "resolution 15"),
+        (["-r", "3"], "resolution 3: use 1, 2, 4, 8, a width of at least 32 pixels, or -1"),
+        (["-r", "31"], "resolution 31"),
     ):
         assert word in error_of("train", scene, "-m", scene / "m", *args)
 
@@ -268,7 +268,10 @@ def test_a_run_whose_scene_has_moved(copied: Path, scene: Path, tmp_path: Path) 
     assert resume(copied, scene=scene, iterations=ITERATIONS + 1).finished
 
 
-@pytest.mark.parametrize(("args", "words"), [(["--device", "abacus"], "abacus"), (["--init", "a.ply"], "no such file")])
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [(["--device", "abacus"], "abacus"), (["--init", "a.ply"], "a.ply: cannot be read (no such file)")],
+)
 def test_device_and_start_are_checked_before_poses_are_searched(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], words: str
 ) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import ITERATIONS, TEST_NAMES, WIDTH, clsplat, error_of, run
+from cli_runner import ITERATIONS, TEST_NAMES, clsplat, error_of, run
 from PIL import Image
 
 from clsplat.evaluation.metrics import protocol_named
@@ -92,12 +92,12 @@ def test_eval_of_a_moved_scene(model: Path, scene: Path, tmp_path: Path) -> None
 def test_models_of_different_views_are_not_compared_in_silence(model: Path, scene: Path, tmp_path: Path) -> None:
     small, names = tmp_path / "small", tmp_path / "names.txt"
     names.write_text("view_003.png\n")
-    clsplat("train", scene, "-m", small, "-r", WIDTH // 2, "--eval", "--iterations", "2", "--cap-max", "50", "-q")
+    clsplat("train", scene, "-m", small, "-r", 2, "--eval", "--iterations", "2", "--cap-max", "50", "-q")
     said = f"{small} and {model} are measured on different views or sizes"
     both = ("eval", "-m", model, small, "--no-report")
     assert f"warning: {said}: do not compare their numbers" in run(*both).stderr
     assert f"{said}: compare models of one scene" in error_of("eval", model, small, "--report", tmp_path / "r.html")
-    assert "warning" not in run(*both, "-r", WIDTH // 2).stderr
+    assert "warning" not in run(*both, "-r", 2).stderr
     clsplat("train", scene, "-m", small, "--overwrite", "--test-list", names, *("--iterations", "2"), "-q")
     assert f"warning: {said}" in run(*both).stderr
 

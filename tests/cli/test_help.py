@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import subprocess
+import sys
 
 import click
 import pytest
@@ -164,6 +167,20 @@ def test_help_all_lists_every_option_once(name: str) -> None:
         flag = option.opts[-1]
         assert len([line for line in listed if re.search(rf"(?<![\w-]){flag}(?![\w-])", line)]) == 1, flag
     assert f"\n{OTHER}:" not in whole
+
+
+@pytest.mark.parametrize(("words", "wanted"), [("clsplat tr", "train"), ("clsplat ", "view")])
+def test_names_of_commands_are_completed(words: str, wanted: str) -> None:
+    environment = os.environ | {"COMP_WORDS": words, "COMP_CWORD": "1", "_CLSPLAT_COMPLETE": "bash_complete"}
+    done = subprocess.run(
+        [sys.executable, "-c", "from clsplat_cli.main import main; main(prog_name='clsplat')"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert f"plain,{wanted}" in done.stdout.splitlines()
+    assert done.stderr == ""
 
 
 def test_the_program_alone_prints_its_help() -> None:

@@ -277,6 +277,15 @@ def test_report_without_matplotlib(tmp_path: Path, undrawn: None) -> None:
         write_report(tmp_path, [])
 
 
+def test_a_reference_that_nothing_reaches_has_a_page(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    best = [record | {"psnr": record["psnr"] + 50.0 * (record["system"] == "gaussian")} for record in sweep_records()]
+    paths = write_report(tmp_path, best, reference="gaussian")
+    assert "No chart: no other system reaches the PSNR of gaussian." in (tmp_path / "report.html").read_text()
+    assert {path.stem for path in paths} >= {"size", "equal", "report"}
+    assert not (tmp_path / "charts" / "equal.svg").exists()
+
+
 def test_equal_runs_of_two_folders_count_once(tmp_path: Path, undrawn: None) -> None:
     again = [record | {"psnr": 1.0} for record in sweep_records()]
     write_report(tmp_path, [*sweep_records(), *again])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
@@ -368,6 +369,48 @@ def test_one_renderer_serves_changing_scenes_and_sizes(make_renderer: MakeRender
     cases = [cloud("gaussian"), *thin_cases(SKEWED).values(), cloud(SKEWED), *thin_cases("gaussian").values()]
     for case in (*cases, *reversed(cases)):
         case.check_image(case.render(renderer), IMAGE_FLOAT32)
+
+
+def test_models_with_other_near_planes_share_the_kernels(device: Device) -> None:
+    """A model that is scaled in each frame of an animation has another near plane each time."""
+    renderer, camera = Renderer(device), random_camera(1, 64, 48)
+    splats = Splats("gaussian", for_shape(random_splats(1, 30, 1, np.float32), "gaussian"))
+    near = [renderer.render(splats.with_near_plane(plane), camera).alpha for plane in (0.01, 3.0, 100.0, 0.01)]
+    assert near[0].any()
+    assert not np.array_equal(near[0], near[1])
+    assert not near[2].any()
+    assert np.array_equal(near[0], near[3])
+    assert len(renderer._pipelines) == 1
+
+
+def test_threads_may_share_a_renderer(device: Device) -> None:
+    renderer = Renderer(device)
+    splats = Splats("gaussian", for_shape(random_splats(2, 200, 1, np.float32), "gaussian"))
+    cameras = [random_camera(seed, 96, 64) for seed in range(4)]
+    expected = [renderer.render(splats, camera).color for camera in cameras]
+
+    def renders(number: int) -> bool:
+        return all(np.array_equal(renderer.render(splats, cameras[number]).color, expected[number]) for _ in range(15))
+
+    with ThreadPoolExecutor(len(cameras)) as pool:
+        assert all(pool.map(renders, range(len(cameras))))
+
+
+@pytest.mark.parametrize("shape", ["generalised-exponential", "ges-modulation"])
+def test_a_faint_splat_does_not_change_its_neighbours(device: Device, shape: str) -> None:
+    """A vector of splats is projected at once. PoCL's pow of 0 in one lane would be wrong in others."""
+    if not device.has_fp64:
+        pytest.skip("no double precision")
+    splats = for_shape(random_splats(11, 32, 1), shape)
+    splats["opacity_logit"][:] = 2.0
+    splats["opacity_logit"][[4, 13, 22]] = -9.0  # below 1/255
+    splats["beta"][:] = np.random.default_rng(0).uniform(0.5, 4.0, 32)
+    camera = random_camera(11, 96, 64)
+    images = {
+        precision: Renderer(device, precision).render(Splats(shape, splats), camera).color
+        for precision in ("float32", "float64")
+    }
+    np.testing.assert_allclose(images["float32"], images["float64"], atol=1e-4)
 
 
 def test_gradients_without_alpha_are_those_of_zero_alpha_weights(make_renderer: MakeRenderer, device: Device) -> None:

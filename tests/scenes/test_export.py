@@ -137,6 +137,22 @@ def test_cameras_and_splat_centres_of_a_model(tmp_path: Path, model_folder: Path
     assert "3 cameras" in clsplat("cameras", tmp_path / "path.json", tmp_path / "t" / "transforms.json")
 
 
+def test_points_of_other_cameras_stay(garden: Path, tmp_path: Path, model_folder: Path) -> None:
+    """Two files of cameras in one folder have points of their own, and no points are replaced without being asked."""
+    folder = tmp_path / "nerf"
+    shutil.copytree(garden / "images", folder / "images")
+    clsplat("cameras", garden, folder / "transforms.json")
+    points = load_scene(folder).points.xyz
+    clsplat("cameras", model_folder, folder / "again.json")
+    np.testing.assert_array_equal(load_scene(folder / "transforms.json").points.xyz, points)
+    assert json.loads((folder / "again.json").read_text())["ply_file_path"] == "again.ply"
+    (folder / "third.ply").write_text("precious")
+    assert "third.ply: exists already" in error_of("cameras", model_folder, folder / "third.json")
+    assert not (folder / "third.json").exists()
+    assert (folder / "third.ply").read_text() == "precious"
+    clsplat("cameras", model_folder, folder / "third.json", "--overwrite")
+
+
 def test_missing_cameras_and_unsupported_lenses_are_refused(garden: Path, tmp_path: Path, model_folder: Path) -> None:
     ply = sorted(model_folder.glob("point_cloud/*/point_cloud.ply"))[0]
     assert "has no cameras" in error_of("cameras", ply, tmp_path / "out.json")

@@ -165,6 +165,31 @@ def test_lenses_beyond_undistortion_are_named(tmp_path: Path, k1: float, size: s
     assert f"40x30 px become {size} px" in run("info", tmp_path).stderr
 
 
+def test_points_that_no_photo_shows_are_left_out(garden: Path) -> None:
+    """They are of other poses. Splats that start there would have to be removed first."""
+    write_model(garden, moved(), shift=-500.0)
+    with pytest.warns(UserWarning, match=r"its photos show 0\.0% of its 12 points, so the points do not fit the poses"):
+        assert len(load_scene(garden).points) == 0
+    write_model(garden, moved())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(load_scene(garden).points) == 12
+
+
+def test_a_camera_far_from_all_others_is_named(garden: Path) -> None:
+    poses = moved()
+    poses[3][:3, 3] += 40.0
+    write_model(garden, poses)
+    with pytest.warns(UserWarning, match=r"1 of 9 photos have a camera far from all others, for example 'shot_3\.png'"):
+        load_scene(garden)
+
+
+def test_copies_of_test_photos_among_the_training_photos_are_named(garden: Path) -> None:
+    (garden / "images" / "shot_1.png").write_bytes((garden / "images" / "shot_0.png").read_bytes())
+    with pytest.warns(UserWarning, match=r"1 of 2 test photos are training photos, too, for example 'shot_0\.png'"):
+        load_scene(garden)
+
+
 def test_points_far_away_are_read(garden: Path) -> None:
     """Sparse models have such outliers. They are no reason to refuse a scene."""
     xyz, rgb = cloud()

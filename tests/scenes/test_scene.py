@@ -168,7 +168,7 @@ def test_extent_is_that_of_the_training_cameras(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("resolution", "size"),
-    [(-1, (40, 30)), (1, (40, 30)), (2, (20, 15)), (4, (10, 8)), (8, (5, 4)), (13, (13, 9)), (30, (30, 22))],
+    [(-1, (40, 30)), (1, (40, 30)), (2, (20, 15)), (4, (10, 8)), (8, (5, 4)), (33, (33, 24)), (39, (39, 29))],
 )
 def test_resolution(folder: Path, resolution: int, size: tuple[int, int]) -> None:
     view = load_scene(folder, resolution=resolution).views[2]

@@ -17,3 +17,12 @@ def test_iterations_rise_whatever_the_order_of_the_folders(tmp_path: Path) -> No
     (tmp_path / "point_cloud" / "iteration_8").mkdir()  # without a file
     (tmp_path / "point_cloud" / "iteration_x").mkdir()
     assert ModelFolder(tmp_path).iterations() == sorted(ITERATIONS)
+
+
+def test_a_new_run_removes_the_results_of_the_old_one_and_nothing_else(tmp_path: Path) -> None:
+    ours = ["results.json", "per_view_train.json", "report_all.html", "results_validation.json", "checkpoint.npz"]
+    theirs = ["results_final.txt", "report_draft.html", "notes.json"]
+    for name in ours + theirs:
+        (tmp_path / name).touch()
+    ModelFolder(tmp_path).clear()
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(theirs)

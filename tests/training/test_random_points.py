@@ -92,3 +92,22 @@ def test_light_reaches_the_middle_of_the_largest_random_start() -> None:
         alpha = density.init_opacity * np.exp(-0.5 * (distance / scale) ** 2)
         depths.append(-np.log1p(-alpha[before]).sum())
     assert np.exp(-np.mean(depths)) > 1e-4
+
+
+@pytest.mark.parametrize("far", [10.0, 40.0, 1000.0])
+def test_long_lenses_show_a_small_part_of_the_space(far: float) -> None:
+    """The region that all cameras see is a tiny part of the ball between them."""
+    cameras = looking(far * ring(), np.zeros(3), 0.7 / far)
+    xyz = random_points(scene(cameras), 1000, np.random.default_rng(0))
+    assert np.mean(lookers(cameras, xyz) >= 9) >= 0.5
+    central = xyz[lookers(cameras, xyz) >= 9]
+    assert np.abs(central).max() < 4
+
+
+def test_a_wrong_pose_moves_no_points() -> None:
+    cameras = looking(ring(24), np.zeros(3))
+    away = np.eye(4)
+    away[:3, 3] = (3000.0, 0.0, 500.0)
+    wrong = [*cameras, Camera(32, 32, 40, 40, 16, 16, away)]
+    xyz = random_points(scene(wrong), 1000, np.random.default_rng(0))
+    assert np.mean(lookers(cameras, xyz) >= 18) >= 0.45

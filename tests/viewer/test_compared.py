@@ -10,6 +10,7 @@ from clsplat.cameras.camera import Camera
 from clsplat.rendering.colormaps import MODES
 from clsplat.splats.splats import Splats
 from clsplat.viewer.compared import ComparedSource
+from clsplat.viewer.crop import CropBox
 from clsplat.viewer.settings import Settings
 from clsplat.viewer.source import ModelSource
 
@@ -67,10 +68,10 @@ def test_what_a_client_does_is_done_with_the_first(
     assert compared.sides == ("a", "b")
     other = model(9).select(np.arange(10))
     before = compared.splats
-    compared.show(other)
+    both[0].show(other)
     assert both[0].splats is other
     assert compared.n_splats == 60
-    compared.show(before)
+    both[0].show(before)
 
 
 @pytest.fixture(scope="module")
@@ -99,16 +100,29 @@ def test_a_ray_meets_the_surface(wall: ModelSource, origin: tuple[float, float, 
     for _ in range(10):
         x, y = rng.uniform(-1.5, 1.5, 2)
         wanted = np.array([x, y, 4 + 0.5 * x])
-        found = wall.surface(np.array(origin), 3.0 * (wanted - origin))
+        found = wall.surface(np.array(origin), 3.0 * (wanted - origin), Settings())
         assert found is not None
         np.testing.assert_allclose(found, wanted, atol=0.06)  # the size of a splat
 
 
 def test_a_ray_beside_the_surface_meets_nothing(wall: ModelSource) -> None:
-    assert wall.surface(np.zeros(3), np.array([0.0, 0.0, -1.0])) is None
-    assert wall.surface(np.zeros(3), np.array([1.0, 0.0, 0.0])) is None
-    assert wall.surface(np.zeros(3), np.zeros(3)) is None
-    assert wall.surface(np.array([np.nan, 0.0, 0.0]), np.ones(3)) is None
+    assert wall.surface(np.zeros(3), np.array([0.0, 0.0, -1.0]), Settings()) is None
+    assert wall.surface(np.zeros(3), np.array([1.0, 0.0, 0.0]), Settings()) is None
+    assert wall.surface(np.zeros(3), np.zeros(3), Settings()) is None
+    assert wall.surface(np.array([np.nan, 0.0, 0.0]), np.ones(3), Settings()) is None
+
+
+def test_a_ray_meets_only_what_is_shown(wall: ModelSource) -> None:
+    """The wall at depth 4 may be cut away or not be drawn. In a comparison, the side counts on which a user clicks."""
+    ahead, behind = np.array([0.0, 0.0, 1.0]), CropBox((0.0, 0.0, 9.0), (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    assert wall.surface(np.zeros(3), ahead, Settings(crop=behind)) is None
+    assert wall.surface(np.zeros(3), ahead, Settings(cap=0)) is None
+    moved = wall.splats.to_numpy() | {"mean": wall.splats.mean + np.float32([0.0, 0.0, 3.0])}
+    compared = ComparedSource(wall, ModelSource(wall.splats.with_arrays(moved)), ("near", "far"))
+    for across, depth in ((0.1, 4.0), (0.29, 4.0), (0.31, 7.0), (0.9, 7.0)):
+        found = compared.surface(np.zeros(3), ahead, Settings(divider=0.3), across)
+        assert found is not None
+        assert found[2] == pytest.approx(depth, abs=0.06)
 
 
 def test_the_camera_of_a_side_has_its_columns(compared: ComparedSource, both: tuple[ModelSource, ModelSource]) -> None:

@@ -205,6 +205,11 @@ def test_usable_values_are_taken(name: str, value: object, expected: object) -> 
     assert getattr(Settings().changed(name, value, MODES), name) == expected
 
 
+def test_none_is_all_splats_and_all_bands() -> None:
+    assert Settings(cap=3).changed("cap", None, MODES).cap is None
+    assert Settings(sh_degree=1).changed("sh_degree", None, MODES).sh_degree is None
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -219,7 +224,7 @@ def test_usable_values_are_taken(name: str, value: object, expected: object) -> 
         ("size", math.nan),
         ("size", "640"),
         ("size", math.inf),
-        ("sh_degree", None),
+        ("sh_degree", {}),
         ("cap", {}),
         ("divider", "0.5"),
         ("divider", math.nan),

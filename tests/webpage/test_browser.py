@@ -215,6 +215,26 @@ def test_keys_fly_and_look(page: Page) -> None:
     assert turned[2] @ axes[0] > 0.05
 
 
+@pytest.mark.parametrize("between", ["Control", "h", "focus", "tour"])
+def test_a_key_that_is_released_elsewhere_is_released(page: Page, between: str) -> None:
+    page.locator("#view").focus()
+    page.keyboard.down("w")
+    assert page.evaluate("page.controls.keys.size") == 1
+    if between == "focus":
+        page.locator("select").first.focus()
+    elif between == "tour":
+        page.locator("#tour").click()
+    else:
+        page.keyboard.down(between)
+    page.keyboard.up("w")
+    assert page.evaluate("page.controls.keys.size") == 0
+    if between in ("Control", "h"):
+        page.keyboard.up(between)
+    page.keyboard.press("Escape")
+    if page.locator("#tour").get_attribute("aria-pressed") == "true":
+        page.locator("#tour").click()
+
+
 def test_one_finger_turns_and_two_come_closer(page: Page) -> None:
     touch = """([fingers, moves]) => { const view = page.canvas;
         view.setPointerCapture = () => {};

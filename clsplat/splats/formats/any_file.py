@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from ...errors import InputError, OutputError
 from ..activated import EXTRA_FIELDS
-from ..shapes import GAUSSIAN, SKEW_NORMAL
+from ..checks import check_arrays, far_away, sh_degree_for
+from ..fields import Array
+from ..shapes import GAUSSIAN, SKEW_NORMAL, shape_named
 from ..stored import StoredSplats
 from .dot_splat import read_splat, write_splat
 from .glb import is_glb
@@ -80,7 +85,10 @@ def read_splats(path: str | os.PathLike[str]) -> StoredSplats:
             f"{path}: {suffix} files are not read: convert it with `splat-transform {path.name} {path.stem}.ply` "
             "(npm install @playcanvas/splat-transform)"
         )
-    return read_streamed_sog(path) if path.name == LOD_META else _reader(path, suffix, _start(path))(path)
+    found = read_streamed_sog(path) if path.name == LOD_META else _reader(path, suffix, _start(path))(path)
+    if (text := far_away(found.arrays)) is not None:
+        warnings.warn(f"{path}: {text}", stacklevel=2)
+    return found
 
 
 def _reader(path: Path, suffix: str, start: bytes) -> Callable[[Path], StoredSplats]:
@@ -111,8 +119,14 @@ def write_splats(
     Raises
     ------
     OutputError : the file cannot be written, or is a page, which needs cameras as well.
-    InputError : the format does not support the shape of the splats.
+    InputError : the format does not support the shape of the splats, or float32 does not hold their values.
     """
+    if any(values.dtype != np.float32 for values in splats.arrays.values()):
+        with np.errstate(over="ignore"):  # the check finds and names values that overflow
+            single: dict[str, Array] = {name: values.astype(np.float32) for name, values in splats.arrays.items()}
+        check_arrays(shape_named(splats.shape).schema(sh_degree_for(single)), single)
+    if (text := far_away(splats.arrays)) is not None:
+        raise InputError(f"{path}: not written: {text}")
     suffix = format_of(Path(path))
     if suffix == PAGE_ENDING:
         raise OutputError(f"{path}: pages are written by `clsplat convert` and clsplat.convert_model: use one of these")

@@ -44,7 +44,8 @@ EXTRA = "clsplat"
 SKEW_ZERO = 127  # byte of a component of the skew that is zero
 _MAX_FILE = 1 << 28  # bytes of one file in the archive
 _TAG = 252  # alpha of a rotation whose largest component is w
-_PALETTE_ROW = 64
+_PALETTE_ROW, _MOST_ENTRIES = 64, 1 << 16
+_SMALL_IMAGE = 1 << 16  # an image may always have this number of pixels
 _LEVELS = 256  # length of a codebook
 
 
@@ -53,8 +54,10 @@ def is_sog(start: bytes) -> bool:
     return start.startswith(b"PK\3\4")
 
 
-def read_sog(path: Path) -> StoredSplats:
+def read_sog(path: Path, with_unusable: bool = False) -> StoredSplats:
     """Read a .sog archive, or the meta.json of a folder.
+
+    with_unusable : whether to keep unusable splats, for a caller that counts them.
 
     Raises
     ------
@@ -62,14 +65,16 @@ def read_sog(path: Path) -> StoredSplats:
     """
     try:
         if path.name == META:
-            return _Reader(path, lambda name: (path.parent / Path(name).name).read_bytes()).splats()
-        with zipfile.ZipFile(path) as archive:
-            return _Reader(path, lambda name: _member(path, archive, name)).splats()
+            found = _Reader(path, lambda name: (path.parent / Path(name).name).read_bytes()).splats()
+        else:
+            with zipfile.ZipFile(path) as archive:
+                found = _Reader(path, lambda name: _member(path, archive, name)).splats()
     except OSError as error:
         name = error.filename or path
         raise InputError(f"{name}: cannot be read ({error.strerror or error}); check name and rights") from None
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, lzma.LZMAError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, UnicodeDecodeError, lzma.LZMAError) as error:
         raise InputError(f"{path}: is not a sound .sog file ({error}); export it again") from None
+    return found if with_unusable else joined_parts(path, [found])
 
 
 class _Reader:
@@ -92,7 +97,7 @@ class _Reader:
         self.count = self._whole("count", "count", 1 << 32)
 
     def splats(self) -> StoredSplats:
-        """Return the splats, without unusable ones."""
+        """Return the splats, with unusable ones."""
         low, high = (self._pixels("means", i) for i in (0, 1))
         lower, upper = self._reals("means", "mins", 3), self._reals("means", "maxs", 3)
         share = (low[:, :3] + 256.0 * high[:, :3]) / 65535.0
@@ -113,8 +118,7 @@ class _Reader:
             shape, arrays["skew"] = SKEW_NORMAL.name, self._skew()
         antialiased = self._value("antialias", default=False) is True
         near_plane, low_pass = self._number("nearPlane", NEAR_PLANES), self._number("lowPass", LOW_PASSES)
-        found = StoredSplats(shape, self._normalisation(), antialiased, arrays, near_plane, low_pass)
-        return joined_parts(self.path, [found])
+        return StoredSplats(shape, self._normalisation(), antialiased, arrays, near_plane, low_pass)
 
     def _skew(self) -> NDArray[np.float64]:
         """Return skews (N, 3)."""
@@ -149,9 +153,9 @@ class _Reader:
         if "shN" not in self.meta:
             return np.empty((self.count, 0, 3))
         bands = self._whole("shN", "bands", MAX_SH_DEGREE)
-        entries, width = self._whole("shN", "count", 1 << 16), sh_coefficients(bands) - 1
-        palette = self._image("shN", 0)[..., :3]
+        entries, width = self._whole("shN", "count", _MOST_ENTRIES), sh_coefficients(bands) - 1
         rows = -(-entries // _PALETTE_ROW)
+        palette = self._image("shN", 0, most=_MOST_ENTRIES * max(width, 1))[..., :3]
         if palette.shape[1] != _PALETTE_ROW * width or palette.shape[0] < rows:
             raise InputError(f"{self.path}: its palette is too small for {entries} entries of {bands} bands")
         stored = self._pixels("shN", 1).astype(np.int64)
@@ -166,15 +170,18 @@ class _Reader:
         flat = self._image(group, place, *inner).reshape(-1, 4)
         if len(flat) < self.count:
             raise InputError(f"{self.path}: image {place} of {group} has {len(flat)} pixels for {self.count} splats")
-        return flat[: self.count]
+        return flat[: self.count].copy()  # the image may be much larger
 
-    def _image(self, group: str, place: int, *inner: str) -> NDArray[np.uint8]:
+    def _image(self, group: str, place: int, *inner: str, most: int | None = None) -> NDArray[np.uint8]:
+        """Return an image, (H, W, 4). most : largest number of its pixels, by default what the splats may need."""
         from ...files.images import decode_pixels  # lazy: a slow import
 
         names = self._value(group, *inner, "files")
         if not isinstance(names, list) or len(names) <= place or not isinstance(names[place], str):
             raise InputError(f"{self.path}: {group}.files in {META} has no file {place}; export it again")
-        return decode_pixels(self.read(names[place]), f"{self.path}: {names[place][:80]!r}")
+        return decode_pixels(
+            self.read(names[place]), f"{self.path}: {names[place][:80]!r}", most or 4 * self.count + _SMALL_IMAGE
+        )
 
     def _reals(self, group: str, name: str, length: int) -> NDArray[np.float64]:
         """Return a list of numbers; values that are not finite are found with the splats that they spoil."""

@@ -199,7 +199,7 @@ def _read_chunk(path: Path, name: str) -> StoredSplats:
     parts = Path(name).parts
     if len(parts) != 2 or parts[0] in ("..", "/") or parts[1] != META:
         raise InputError(f"{path}: file name {name[:80]!r} is not a folder with {META}; export it again")
-    return read_sog(path.parent / name)
+    return read_sog(path.parent / name, with_unusable=True)  # the tree counts all splats
 
 
 def _part(splats: StoredSplats, rows: slice) -> StoredSplats:

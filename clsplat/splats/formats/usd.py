@@ -26,6 +26,7 @@ import numpy as np
 
 from ...errors import InputError, OutputError
 from ...files.atomic import atomic_path
+from ...files.file_names import printable
 from ...files.host_memory import limit_address_space
 from ..activated import EXTRA_FIELDS, OPACITY, SCALE, activated, placed, raw_arrays
 from ..axes import RUB
@@ -71,6 +72,8 @@ def write_usd(path: str | os.PathLike[str], splats: StoredSplats) -> None:
     _check_library(path)
     from pxr import Sdf, Tf, Usd, UsdUtils
 
+    if printable(os.fspath(path)) != os.fspath(path):
+        raise OutputError(f"{printable(os.fspath(path))}: usd-core takes names in UTF-8 only: choose another name")
     try:
         with atomic_path(path) as temporary:
             packed = temporary.suffix.lower() == USD_ENDINGS[-1]

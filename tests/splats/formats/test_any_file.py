@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ import packed_ply
 import pytest
 from reference.scenes import random_splats
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, OutputError
 from clsplat.splats.splats import Splats
 
 
@@ -58,3 +60,80 @@ def test_what_is_no_file_of_splats_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "none.splat", tmp_path / "none.spz"):
         with pytest.raises(InputError, match="cannot be read"):
             Splats.load(path)
+
+
+WRITTEN_ENDINGS = [".ply", ".splat", ".spz", ".sog", ".glb", ".usdc"]
+
+
+def in_double(splats: Splats, **changed: np.ndarray) -> Splats:
+    """Return the splats in double precision with other values of some fields."""
+    arrays = {name: values.astype(np.float64) for name, values in splats.to_numpy().items()}
+    return splats.with_arrays(arrays | changed)
+
+
+def double_ply(path: Path, splats: Splats) -> None:
+    """Write Gaussians as a PLY file in double precision, as programs for maps do."""
+    splats.save(path)
+    head, _, _ = path.read_bytes().partition(b"end_header\n")
+    columns = [line.split()[2].decode() for line in head.splitlines() if line.startswith(b"property")]
+    single = np.frombuffer(path.read_bytes()[len(head) + 11 :], "<f4").reshape(len(splats), len(columns))
+    rows = single.astype("<f8")
+    rows[:, [columns.index(name) for name in ("x", "y", "z")]] = splats.mean
+    path.write_bytes(head.replace(b"float", b"double") + b"end_header\n" + rows.tobytes())
+
+
+@pytest.mark.parametrize("ending", WRITTEN_ENDINGS)
+def test_coordinates_of_a_map_are_not_rounded_in_silence(tmp_path: Path, ending: str) -> None:
+    if ending == ".usdc":
+        pytest.importorskip("pxr")
+    near = in_double(some())
+    far = near.with_arrays(near.to_numpy() | {"mean": near.mean + np.array([500_000.0, 4_500_000.0, 100.0])})
+    with pytest.raises(InputError, match=r"not written: its splats are around \(500000, 4\.5e\+06, \d"):
+        far.save(tmp_path / f"a{ending}")
+    assert not (tmp_path / f"a{ending}").exists()
+    near.save(tmp_path / f"a{ending}")
+
+
+def test_coordinates_of_a_map_are_warned_of(tmp_path: Path) -> None:
+    near = some()
+    double_ply(tmp_path / "near.ply", near)
+    assert Splats.load(tmp_path / "near.ply").mean.dtype == np.float64
+    rows = (tmp_path / "near.ply").read_bytes()
+    head, _, body = rows.partition(b"end_header\n")
+    values = np.frombuffer(body, "<f8").reshape(len(near), -1).copy()
+    values[:, :3] += (500_000.0, 4_500_000.0, 100.0)
+    (tmp_path / "far.ply").write_bytes(head + b"end_header\n" + values.tobytes())
+    with pytest.warns(UserWarning, match=r"far\.ply: its splats are around .*subtract a point near them"):
+        assert len(Splats.load(tmp_path / "far.ply")) == len(near)
+
+
+@pytest.mark.parametrize("ending", WRITTEN_ENDINGS)
+def test_values_that_float32_does_not_hold_are_not_written(tmp_path: Path, ending: str) -> None:
+    if ending == ".usdc":
+        pytest.importorskip("pxr")
+    splats = some()
+    mean = splats.mean.astype(np.float64)
+    mean[3, 1] = 1e300
+    with pytest.raises(InputError, match=r"splats: mean\[3, 1\]: value is inf, must be finite"):
+        in_double(splats, mean=mean).save(tmp_path / f"a{ending}")
+    assert not (tmp_path / f"a{ending}").exists()
+
+
+@pytest.mark.parametrize("ending", [".glb", ".usdc"])
+def test_a_scale_that_float32_does_not_hold_is_not_written(tmp_path: Path, ending: str) -> None:
+    if ending == ".usdc":
+        pytest.importorskip("pxr")
+    splats = some()
+    log_scale = splats.log_scale.copy()
+    log_scale[2, 0] = 90.0
+    with pytest.raises(InputError, match=r"a splat has the scale e\^90, which float32 does not hold"):
+        splats.with_arrays(splats.to_numpy() | {"log_scale": log_scale}).save(tmp_path / f"a{ending}")
+    assert not (tmp_path / f"a{ending}").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_a_usd_file_needs_a_name_in_utf_8(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    with pytest.raises(OutputError, match=r"bad.*: usd-core takes names in UTF-8 only") as caught:
+        some().save(os.fsdecode(os.fsencode(tmp_path) + b"/bad\xff.usdc"))
+    assert str(caught.value).isprintable()

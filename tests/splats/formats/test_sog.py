@@ -124,6 +124,11 @@ def test_damaged_archives_and_folders_are_named(file: Path, tmp_path: Path) -> N
         with pytest.raises(InputError, match=r"is not a sound .sog file"):
             Splats.load(file)
     with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("ä.webp", b"")
+    file.write_bytes(file.read_bytes().replace("ä".encode(), b"\xff\xff"))
+    with pytest.raises(InputError, match=r"is not a sound .sog file"):
+        Splats.load(file)
+    with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("meta.json", "[1")
     with pytest.raises(InputError, match=r"meta.json is not JSON"):
         Splats.load(file)
@@ -131,6 +136,17 @@ def test_damaged_archives_and_folders_are_named(file: Path, tmp_path: Path) -> N
     (tmp_path / "quats.webp").unlink()
     with pytest.raises(InputError, match=r"quats.webp: cannot be read \(No such file"):
         Splats.load(tmp_path / "meta.json")
+
+
+def test_an_image_that_is_far_too_large_is_not_decoded(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    meta, images = sog_files.some(12, 0)
+    images["quats.webp"] = np.zeros((400, 400, 4), np.uint8)
+    sog_files.write(file, meta, images)
+    with pytest.raises(InputError, match=r"'quats.webp': is 400x400 px, far more than its splats need"):
+        Splats.load(file)
+    images["quats.webp"] = np.full((200, 200, 4), 252, np.uint8)
+    sog_files.write(file, meta, images)
+    assert len(Splats.load(file)) == 12, "writers may add rows"
 
 
 def test_files_of_a_folder_lie_in_it(tmp_path: Path) -> None:

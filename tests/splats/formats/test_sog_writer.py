@@ -230,7 +230,9 @@ def test_colours_of_transparent_splats_are_kept(tmp_path: Path) -> None:
 def test_images_come_back_exactly() -> None:
     image = np.random.default_rng(0).integers(0, 256, (7, 12, 4), dtype=np.uint8)
     image[2:5, :, 3] = 0
-    np.testing.assert_array_equal(decode_pixels(encode_pixels(image), "image"), image)
+    np.testing.assert_array_equal(decode_pixels(encode_pixels(image), "image", 84), image)
+    with pytest.raises(InputError, match=r"^image: is 12x7 px, far more than its splats need"):
+        decode_pixels(encode_pixels(image), "image", 83)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
@@ -284,7 +286,7 @@ def test_other_shapes_and_too_many_splats_are_refused(tmp_path: Path, monkeypatc
 
 def test_the_largest_image_fits_webp() -> None:
     image = np.zeros((1, sog_writer._MAX_SIDE, 4), np.uint8)
-    assert decode_pixels(encode_pixels(image), "image").shape == image.shape
+    assert decode_pixels(encode_pixels(image), "image", image.size).shape == image.shape
     width = 4 * math.ceil(math.sqrt(sog_writer._MAX_SIDE**2) / 4)
     assert width == sog_writer._MAX_SIDE <= 16383
 

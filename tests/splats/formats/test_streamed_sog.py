@@ -13,6 +13,7 @@ import pytest
 from model_arrays import random_model
 
 from clsplat.errors import InputError, OutputError
+from clsplat.files.images import decode_pixels, encode_pixels
 from clsplat.splats.formats import streamed_sog
 from clsplat.splats.formats.sog import read_sog
 from clsplat.splats.formats.streamed_sog import LOD_META, write_streamed_sog
@@ -118,6 +119,19 @@ def test_equal_models_give_equal_files_and_old_chunks_go(path: Path) -> None:
     left = {file.relative_to(path.parent).parts[0] for file in path.parent.rglob("*.webp")}
     assert left == {name for name in {n.parts[0] for n in first} if name.startswith("0_")}
     assert (path.parent / "mine" / "note.txt").exists()
+
+
+def test_an_unusable_splat_is_left_out_alone(path: Path) -> None:
+    """The tree counts the splats of a chunk with those that cannot be used."""
+    write_streamed_sog(path, model(), 1)
+    meta = json.loads(path.read_text())
+    chunk = path.parent / meta["filenames"][0]
+    name = json.loads(chunk.read_text())["quats"]["files"][0]
+    tags = decode_pixels((chunk.parent / name).read_bytes(), name, 1 << 20)
+    tags[0, 3, 3] = 7
+    (chunk.parent / name).write_bytes(encode_pixels(tags))
+    with pytest.warns(UserWarning, match=r"left out 1 of \d+ splats \(quat of splat \d+: norm is 0"):
+        assert len(Splats.load(path)) == N - 1
 
 
 def test_an_environment_is_read(path: Path) -> None:

@@ -1,0 +1,82 @@
+"""The size of a scene as training needs it: learning rates of positions and limits of sizes are in proportion to it.
+
+3DGS takes 1.1 times the largest distance of a camera from the mean of all. That is near the width of what the cameras
+see if they go around an object. It is far from it if the cameras stand in one place (a tripod), look ahead from nearly
+one place, drive along a street, or photograph from afar, and if the pose of one photo is wrong. So cameras that are
+far from all others do not count, and what the cameras see limits the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..cameras.camera import Camera
+from ..cameras.orbits import where_axes_meet
+from ..cameras.seen import sampled, seen
+from ..splats.fields import DoubleArray
+
+_MARGIN = 1.1  # of 3DGS
+_USUAL_SHARE = 0.95  # of the cameras; their largest distance from the middle is usual
+_FAR = 3.0  # a camera does not count if it is more than so many times the usual distance away
+# Limits of the extent in half diagonals of the images at the depth of the points. Cameras around an object have 1 to 3.
+_SMALLEST, _LARGEST = 0.3, 4.0
+_MAX_CAMERAS = 100  # that are looked through
+_MIN_POINTS = 20  # in an image, so that their median depth is that of the scene
+
+
+def extent_of(cameras: Sequence[Camera], xyz: DoubleArray) -> float:
+    """Return the size of a scene [world units]. It is 1 if all cameras are at one position and see no points.
+
+    Parameters
+    ----------
+    cameras : training cameras, at least one. xyz : (P, 3) points of the scene; P may be 0.
+    """
+    cameras = together(cameras)
+    extent = _reach(np.array([camera.position for camera in cameras]))
+    cameras = cameras[:: -(-len(cameras) // _MAX_CAMERAS)]
+    if (width := _width_at_points(cameras, sampled(xyz))) is not None:
+        extent = min(max(extent, _SMALLEST * width), _LARGEST * width)
+    elif (width := _width_at_middle(cameras)) is not None:
+        extent = min(extent, _LARGEST * width)
+    return extent if extent > 0 else 1.0
+
+
+def together(cameras: Sequence[Camera]) -> list[Camera]:
+    """Return the cameras without those that are far from all others: their poses are wrong."""
+    centres = np.array([camera.position for camera in cameras])
+    away = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    usual = float(np.quantile(away, _USUAL_SHARE, method="lower"))
+    return [camera for camera, far in zip(cameras, away, strict=True) if usual == 0 or far <= _FAR * usual]
+
+
+def _reach(centres: DoubleArray) -> float:
+    """Return 3DGS's extent of the centres (N, 3)."""
+    return _MARGIN * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+
+
+def _width_at_points(cameras: Sequence[Camera], xyz: DoubleArray) -> float | None:
+    """Return half the diagonal of an image at the depth of its points, by medians; None if images have too few."""
+    widths: list[float] = []
+    for camera in cameras:
+        found = seen(camera, xyz)
+        if np.count_nonzero(found.inside) >= _MIN_POINTS:
+            widths.append(_half_diagonal(camera) * float(np.median(found.depth[found.inside])))
+    return float(np.median(widths)) if widths else None
+
+
+def _width_at_middle(cameras: Sequence[Camera]) -> float | None:
+    """Return half the diagonal of an image at the point where all cameras look; None if there is no such point."""
+    middle = where_axes_meet(cameras)
+    if middle is None:
+        return None
+    found = [seen(camera, middle[None]) for camera in cameras]
+    if not all(one.inside[0] for one in found):
+        return None
+    return float(np.median([_half_diagonal(camera) * one.depth[0] for camera, one in zip(cameras, found, strict=True)]))
+
+
+def _half_diagonal(camera: Camera) -> float:
+    """Return half the diagonal of an image at a depth of 1."""
+    return 0.5 * float(np.hypot(camera.width / camera.fx, camera.height / camera.fy))

@@ -1,0 +1,91 @@
+"""The size of a scene is that of 3DGS for cameras around an object, and follows what the cameras see for others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clsplat.cameras.camera import Camera
+from clsplat.cameras.orbits import look_at
+from clsplat.scenes.extent import extent_of
+from clsplat.splats.fields import DoubleArray
+
+UP = np.array([0.0, 0.0, 1.0])
+NOTHING = np.zeros((0, 3))
+
+
+def camera(position: DoubleArray, target: DoubleArray, focal: float = 100.0) -> Camera:
+    return Camera(160, 120, focal, focal, 80.0, 60.0, look_at(position, target, UP)[:3])
+
+
+def ring(radius: float, focal: float = 100.0, n: int = 24) -> list[Camera]:
+    """Return cameras on a circle that look at its centre."""
+    angles = np.arange(n) * 2 * np.pi / n
+    places = radius * np.stack([np.cos(angles), np.sin(angles), np.full(n, 0.2)], axis=1)
+    return [camera(place, np.zeros(3), focal) for place in places]
+
+
+def cloud(size: float = 1.0, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> DoubleArray:
+    return np.random.default_rng(0).uniform(-size, size, (500, 3)) + centre
+
+
+def published(cameras: list[Camera]) -> float:
+    """Return the extent of 3DGS."""
+    centres = np.array([one.position for one in cameras])
+    return float(1.1 * np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+
+
+@pytest.mark.parametrize("xyz", [cloud(), cloud(3.0), NOTHING], ids=["object", "room", "no points"])
+def test_cameras_around_an_object_have_the_published_extent(xyz: DoubleArray) -> None:
+    assert extent_of(ring(4.0), xyz) == published(ring(4.0))
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
+@pytest.mark.parametrize("xyz", [cloud(), NOTHING], ids=["points", "no points"])
+def test_it_is_in_proportion_to_the_units(unit: float, xyz: DoubleArray) -> None:
+    wrong = [*ring(4.0), camera(np.array([300.0, 0.0, 0.0]), np.zeros(3))]
+    moved = [*ring(unit * 4.0), camera(np.array([unit * 300.0, 0.0, 0.0]), np.zeros(3))]
+    assert extent_of(moved, unit * xyz) == pytest.approx(unit * extent_of(wrong, xyz), rel=1e-9)
+
+
+@pytest.mark.parametrize("xyz", [cloud(), NOTHING], ids=["points", "no points"])
+def test_a_wrong_pose_does_not_count(xyz: DoubleArray) -> None:
+    right = ring(4.0)
+    for far in (20.0, 300.0, 1e6):
+        wrong = [*right, camera(np.array([far, 0.0, 0.0]), np.zeros(3))]
+        assert extent_of(wrong, xyz) == pytest.approx(published(right), rel=0.15)
+        assert published(wrong) > 4 * published(right)
+
+
+@pytest.mark.parametrize("xyz", [cloud(), NOTHING], ids=["points", "no points"])
+def test_photos_from_afar_show_a_small_scene(xyz: DoubleArray) -> None:
+    """Cameras forty times as far away, with lenses as much longer, take nearly the same photos."""
+    near, far = extent_of(ring(4.0, 250.0), xyz), extent_of(ring(160.0, 10_000.0), xyz)
+    assert published(ring(160.0, 10_000.0)) == pytest.approx(40 * near, rel=1e-6)
+    assert near < far < 1.6 * near
+
+
+def test_cameras_in_one_place_see_a_large_scene() -> None:
+    """A tripod: points around it are 8 units away."""
+    angles = np.arange(20) * 2 * np.pi / 20
+    away = np.stack([np.cos(angles), np.sin(angles), np.zeros(20)], axis=1)
+    cameras = [camera(0.01 * ahead, 8 * ahead) for ahead in away]
+    directions = np.random.default_rng(1).standard_normal((2000, 3))
+    xyz = 8 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    assert published(cameras) < 0.02
+    assert 1.5 < extent_of(cameras, xyz) < 4.0
+    assert extent_of(cameras, NOTHING) == pytest.approx(published(cameras)), "nothing tells how far the scene is"
+
+
+def test_cameras_that_look_ahead_and_all_cameras_in_one_place() -> None:
+    row = [camera(np.array([0.02 * x, 0.0, 0.0]), np.array([0.02 * x, 9.0, 0.0])) for x in range(10)]
+    assert extent_of(row, cloud(2.0, (0.0, 9.0, 0.0))) == pytest.approx(0.3 * 9.0, rel=0.1)
+    assert extent_of(row, NOTHING) == published(row)
+    assert extent_of(row[:1], NOTHING) == 1.0
+    assert extent_of(row[:1] * 3, cloud(1.0, (0.0, -5.0, 0.0))) == 1.0, "they see no points"
+
+
+def test_few_points_in_an_image_do_not_count() -> None:
+    assert extent_of(ring(4.0), cloud()[:19]) == published(ring(4.0))
+    far = ring(160.0, 4000.0)
+    assert extent_of(far[:1] * 2 + far, cloud()[:3]) < published(far), "the cameras look at one point"

@@ -1,0 +1,71 @@
+"""Options that a run ignores are named, with the reason."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cli_runner import error_of, run
+
+from clsplat.training.config import OPTIONS, TrainConfig
+from clsplat.training.no_effect import _FIELD_OF, _NEEDS, no_effect
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "why"),
+    [
+        ({"shape": "gaussian"}, "skew_lr", "with shape gaussian"),
+        ({"shape": "gaussian"}, "normalisation", "with shape gaussian"),
+        ({"shape": "skew-normal"}, "beta_lr", "with shape skew-normal"),
+        ({"shape": "half-gaussian"}, "skew_map", "with shape half-gaussian"),
+        ({"shape": "student-t"}, "normal_lr", "with shape student-t"),
+        ({}, "sghmc_friction", "with position optimizer adam"),
+        ({}, "exposure_rate", "without --exposure"),
+        ({}, "random_background_until", "without --random-background"),
+        ({"strategy": "adc"}, "growth", "with strategy adc"),
+        ({"iterations": 100, "save_iterations": (200, 300)}, "save_iterations", "beyond the run's 100 iterations"),
+    ],
+)
+def test_reasons(options: dict[str, Any], name: str, why: str) -> None:
+    assert no_effect(TrainConfig(**options), name) == why
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"shape": "skew-normal"}, "skew_lr"),
+        ({"shape": "bisected-skew"}, "bisect_reg"),
+        ({"shape": "generalised-exponential"}, "beta_lr"),
+        ({"shape": "student-t"}, "nu_lr"),
+        ({"shape": "half-gaussian"}, "normal_lr"),
+        ({"position_optimizer": "sghmc"}, "sghmc_friction"),
+        ({"exposure": True}, "exposure_rate"),
+        ({"random_background": True}, "random_background_until"),
+        ({"strategy": "adc"}, "opacity_reset"),
+        ({"iterations": 100, "save_iterations": (50, 300)}, "save_iterations"),
+        ({}, "save_iterations"),
+    ],
+)
+def test_options_with_an_effect(options: dict[str, Any], name: str) -> None:
+    assert no_effect(TrainConfig(**options), name) is None
+
+
+def test_all_names_are_options() -> None:
+    assert {*_FIELD_OF, *_NEEDS, *_NEEDS.values()} <= set(OPTIONS)
+
+
+def test_the_command_warns(scene: Any, capture_folder: Path, tmp_path: Path) -> None:
+    flags = ("--iterations", 2, "--cap-max", 50, "-q", "--shape", "gaussian", "--skew-lr", 0.1, "--nu-lr", 0.1)
+    shown = run("train", capture_folder, "-m", tmp_path / "m", *flags).stderr.splitlines()
+    assert "warning: --skew-lr has no effect with shape gaussian" in shown
+    assert "warning: --nu-lr has no effect with shape gaussian" in shown
+
+
+def test_flags_that_need_another_flag(model_folder: Path, capture_folder: Path, tmp_path: Path) -> None:
+    assert "need --view" in error_of("train", capture_folder, "-m", tmp_path / "m", "--port", 9, code=2)
+    clean = ("clean", model_folder, "--dry-run", "--no-photos")
+    assert "remove --no-photos" in error_of(*clean, "--min-views", 5, code=2)
+    assert "remove --no-photos" in error_of(*clean, "--tolerance", 0.2, code=2)
+    render = ("render", model_folder, "-o", tmp_path / "r", "--depth-range", "1,2")
+    assert "give --depth-colours" in error_of(*render, code=2)
