@@ -174,7 +174,7 @@ def photo_options(function: F) -> F:
         "--resolution",
         type=int,
         metavar="N",
-        help="Size of the photos. 1, 2, 4 or 8 divide it; a number from 32 on is the width in pixels; -1 keeps it up "
+        help="Size of the photos. 1, 2, 4 or 8 divide it; a number from 24 on is the width in pixels; -1 keeps it up "
         "to a width of 1600 pixels.",
     )(function)
     return click.option("-i", "--images", metavar="NAME", help="Folder of photos inside the scene, such as images_4.")(

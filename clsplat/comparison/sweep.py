@@ -173,10 +173,10 @@ def write_report(
             files = write_rows(folder / CHARTS, name, rows)
             title, *text = _TEXT[name]
             drawn = []
-            if chart_style.available():
+            if name == "equal" and all(row["ratio"] is None for row in rows):
+                text.append(f"No chart: no other system reaches the PSNR of {first}.")
+            elif chart_style.available():
                 drawn = draw(rows, folder / CHARTS / name)
-                if not drawn:
-                    text.append(f"No chart: no other system reaches the PSNR of {first}.")
             else:
                 text.append(f"No chart: {chart_style.MISSING}.")
             names = [f"{CHARTS}/{path.name}" for path in (*files, *drawn)]

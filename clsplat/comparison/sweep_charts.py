@@ -130,16 +130,13 @@ def size_chart(rows: Sequence[ChartRow], out: str | Path) -> list[Path]:
 def equal_chart(rows: Sequence[ChartRow], reference: str, out: str | Path) -> list[Path]:
     """Draw the splats needed for the PSNR of the reference, as a share of the reference's; a column for each scene.
 
-    A hollow point is a bound: the smallest model is better already. A PSNR that was not reached has no point. Without
-    any point, nothing is drawn.
+    A hollow point is a bound: the smallest model is better already. A PSNR that was not reached has no point.
 
     Parameters
     ----------
     rows : of `sweep_rows.equal_rows`. out : path without a suffix. Raises as `time_chart`.
     """
     rows = [row for row in rows if row["ratio"] is not None]
-    if not rows:
-        return []
     scenes, styles = _scenes(rows, out), looks({row["system"]: row["shape"] for row in rows})
     with drawing(out, WIDTH, 3.1 + 0.2 * legend_rows(len(styles))) as figure:
         (panels,) = figure.subplots(1, len(scenes), squeeze=False, sharey=True)

@@ -19,7 +19,7 @@ def name_key(path: str | os.PathLike[str]) -> str:
 
 
 def printable(name: str) -> str:
-    """Return a name for programs that take UTF-8 only. Bytes that are none become escapes, as `\\udcff`."""
+    """Return a name for programs that take UTF-8 only. Other bytes become escapes, as `\\udcff`."""
     return name.encode("utf-8", "backslashreplace").decode()
 
 

@@ -99,10 +99,10 @@ def read_image(
     raise InputError(f"{path}: float pixels are not supported; convert it to 8-bit PNG or JPEG")
 
 
-def decode_pixels(data: bytes, name: str, most: int) -> ImageU8:
+def decode_pixels(data: bytes, name: str, max_pixels: int) -> ImageU8:
     """Return the pixels (H, W, 4) of an image in memory.
 
-    most : largest number of its pixels. A few bytes can be a huge image.
+    max_pixels : largest number of its pixels. A few bytes can be a huge image.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def decode_pixels(data: bytes, name: str, most: int) -> ImageU8:
     try:
         with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
             width, height = image.size
-            if width * height <= most:
+            if width * height <= max_pixels:
                 return np.array(image.convert("RGBA"), dtype=np.uint8)
     except Exception:  # decoders of damaged files raise nearly anything
         raise InputError(f"{name}: cannot be read as an image; export it again") from None

@@ -112,7 +112,7 @@ def evaluate_models(
 ) -> list[ModelEvaluation]:
     """Measure several models like `evaluate`, and return their measurements.
 
-    A model is also measured if its result files cannot be written; see `ModelEvaluation.write_error`. A warning tells
+    A model is also measured if its result files cannot be written; see `ModelEvaluation.write_error`. A warning says
     that models were measured on different views. With `comparison`, that is an InputError.
 
     Parameters

@@ -1,9 +1,9 @@
 """The size of a scene as training needs it: learning rates of positions and limits of sizes are in proportion to it.
 
-3DGS takes 1.1 times the largest distance of a camera from the mean of all. That is near the width of what the cameras
-see if they go around an object. It is far from it if the cameras stand in one place (a tripod), look ahead from nearly
-one place, drive along a street, or photograph from afar, and if the pose of one photo is wrong. So cameras that are
-far from all others do not count, and what the cameras see limits the result.
+3DGS takes 1.1 times the largest distance of a camera from the mean of all. If the cameras go around an object, this is
+about as wide as what they see. On a tripod it is far too small, and so it is for cameras that look ahead from nearly
+one place. For photos from afar, and with one wrong pose, it is far too large. So cameras that are far from all others
+do not count, and what the cameras see limits the result.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from ..splats.fields import DoubleArray
 
 _MARGIN = 1.1  # of 3DGS
 _USUAL_SHARE = 0.95  # of the cameras; their largest distance from the middle is usual
-_FAR = 3.0  # a camera does not count if it is more than so many times the usual distance away
+_FAR = 3.0  # usual distances, beyond which a camera does not count
+
 # Limits of the extent in half diagonals of the images at the depth of the points. Cameras around an object have 1 to 3.
 _SMALLEST, _LARGEST = 0.3, 4.0
 _MAX_CAMERAS = 100  # that are looked through

@@ -9,7 +9,7 @@ from ..files.host_memory import available_bytes
 
 MAX_SIDE = 1 << 20  # largest side of an image that a file may name [px]
 MAX_WIDTH = 1600  # with resolution -1, wider images are reduced to this width [px], as in 3DGS
-MIN_WIDTH = 32  # smallest resolution that is a width [px]; a smaller one is a divisor that 3DGS does not have
+MIN_WIDTH = 24  # smallest resolution that is a width [px]; a smaller one is a divisor that 3DGS does not have
 _DIVISORS = (1, 2, 4, 8)
 _CHANNELS = 3
 _DECODING = 2  # copies of a photo at its stored size while it is read: decoded, and as an array

@@ -138,7 +138,7 @@ def load_scene(
     images : folder of the photos inside the scene, by default "images", or the folder that the file names. If its
         photos are reduced (images_4), the cameras are scaled.
     resolution : 3DGS's -r. The values 1, 2, 4 and 8 divide the size; -1 keeps the size but reduces images wider than
-        1600 px to that width; another number, at least 32, is the width [px].
+        1600 px to that width; another number, at least 24, is the width [px].
     test_every : every n-th name of the sorted names, from the first on, is a test view. Names of photos that are left
         out count, so a missing photo moves no other photo between training and test views. If the scene's files hold
         views out (transforms_test.json, nerfstudio's lists), those are the test views instead.

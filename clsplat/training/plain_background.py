@@ -27,8 +27,8 @@ def plain_background(views: Sequence[View]) -> Color | None:
 
     Parameters
     ----------
-    views : training views. At most 32 of them are read, evenly spread. There is no such colour if one of them has
-        transparent or masked pixels, which say themselves what is background.
+    views : training views. At most 32 of them are read, evenly spread. If one of them has transparent or masked
+        pixels, these are the background, and the result is None.
     """
     found: list[DoubleArray] = []
     for view in views[:: -(-len(views) // _VIEWS)]:

@@ -117,18 +117,18 @@ class ViewingSession:
 
     def reload(self) -> str:
         """Read the files at once, and return a message about the result."""
-        told = []
+        messages = []
         for watch, source in self.watched:
             try:
                 with self._lock:
                     splats = watch.reload()
             except ClsplatError as error:
-                told.append(_kept(error))
+                messages.append(_kept(error))
                 continue
             source.show(splats)
-            told.append(f"{watch.path.name}: read again, {len(splats)} splats")
+            messages.append(f"{watch.path.name}: read again, {len(splats)} splats")
         self.server.model_changed()
-        return "; ".join(told)
+        return "; ".join(messages)
 
     def close(self) -> None:
         """Close the connections and release the device."""

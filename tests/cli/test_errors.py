@@ -109,8 +109,8 @@ def test_bad_splits(scene: Path, tmp_path: Path) -> None:
         (["--test-list", tmp_path / "none"], "none"),
         (["--test-every", "1"], "test_every"),
         (["-r", "0"], "resolution"),
-        (["-r", "3"], "resolution 3: use 1, 2, 4, 8, a width of at least 32 pixels, or -1"),
-        (["-r", "31"], "resolution 31"),
+        (["-r", "3"], "resolution 3: use 1, 2, 4, 8, a width of at least 24 pixels, or -1"),
+        (["-r", "23"], "resolution 23"),
     ):
         assert word in error_of("train", scene, "-m", scene / "m", *args)
 

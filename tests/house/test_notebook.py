@@ -111,7 +111,7 @@ def test_resume_a_search(scene: Path, tmp_path: Path) -> None:
     package.train_budget(package.load_scene(scene), small_config(), output=tmp_path / "search")
     with pytest.raises(package.InputError, match="the search is finished: nothing to resume"):
         package.resume(tmp_path / "search")
-    with pytest.raises(package.InputError, match="no checkpoint to resume from"):
+    with pytest.raises(package.InputError, match="no such folder: there is nothing to resume"):
         package.resume(tmp_path / "none")
 
 

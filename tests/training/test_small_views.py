@@ -14,13 +14,13 @@ ROUNDS = ("--iterations", 5, "--cap-max", 200, "--sh-degree", 0)
 def test_test_views_below_the_window_are_refused(capture_folder: Path, tmp_path: Path, command: str) -> None:
     """The photos have 48x36 px."""
     extra = ("--eval",) if command == "train" else ("--systems", "default")
-    message = error_of(command, capture_folder, "-o", tmp_path / "out", "-r", 13, *extra, *ROUNDS[:2])
+    message = error_of(command, capture_folder, "-o", tmp_path / "out", "-r", 4, *extra, *ROUNDS[:2])
     assert (
-        "test view 'view_000.png' has 13x9 px; SSIM needs at least 11x11: use larger photos, or no test views"
+        "test view 'view_000.png' has 12x9 px; SSIM needs at least 11x11: use larger photos, or no test views"
         in message
     )
     assert not list((tmp_path / "out").rglob("*.ply"))
 
 
 def test_small_training_views_are_allowed(capture_folder: Path, tmp_path: Path) -> None:
-    clsplat("train", capture_folder, "-m", tmp_path / "m", "-r", 13, *ROUNDS)
+    clsplat("train", capture_folder, "-m", tmp_path / "m", "-r", 4, *ROUNDS)

@@ -155,7 +155,7 @@ class _Reader:
         bands = self._whole("shN", "bands", MAX_SH_DEGREE)
         entries, width = self._whole("shN", "count", _MOST_ENTRIES), sh_coefficients(bands) - 1
         rows = -(-entries // _PALETTE_ROW)
-        palette = self._image("shN", 0, most=_MOST_ENTRIES * max(width, 1))[..., :3]
+        palette = self._image("shN", 0, max_pixels=_MOST_ENTRIES * max(width, 1))[..., :3]
         if palette.shape[1] != _PALETTE_ROW * width or palette.shape[0] < rows:
             raise InputError(f"{self.path}: its palette is too small for {entries} entries of {bands} bands")
         stored = self._pixels("shN", 1).astype(np.int64)
@@ -172,15 +172,15 @@ class _Reader:
             raise InputError(f"{self.path}: image {place} of {group} has {len(flat)} pixels for {self.count} splats")
         return flat[: self.count].copy()  # the image may be much larger
 
-    def _image(self, group: str, place: int, *inner: str, most: int | None = None) -> NDArray[np.uint8]:
-        """Return an image, (H, W, 4). most : largest number of its pixels, by default what the splats may need."""
+    def _image(self, group: str, place: int, *inner: str, max_pixels: int | None = None) -> NDArray[np.uint8]:
+        """Return an image, (H, W, 4). max_pixels : its largest size, by default what the splats may need."""
         from ...files.images import decode_pixels  # lazy: a slow import
 
         names = self._value(group, *inner, "files")
         if not isinstance(names, list) or len(names) <= place or not isinstance(names[place], str):
             raise InputError(f"{self.path}: {group}.files in {META} has no file {place}; export it again")
         return decode_pixels(
-            self.read(names[place]), f"{self.path}: {names[place][:80]!r}", most or 4 * self.count + _SMALL_IMAGE
+            self.read(names[place]), f"{self.path}: {names[place][:80]!r}", max_pixels or 4 * self.count + _SMALL_IMAGE
         )
 
     def _reals(self, group: str, name: str, length: int) -> NDArray[np.float64]:

@@ -1,0 +1,210 @@
+"""Captures unlike those that defaults are chosen on: what the default makes of them, and what it made before.
+
+    python benchmarks/captures.py                       # all captures with three seeds: half an hour on two cores
+    python benchmarks/captures.py --captures tripod --seeds 0
+    python benchmarks/captures.py --page                # write the table of STABILITY.md
+
+The cameras are in the world of `clsplat demo`, except for "white", which is lego over white without its transparency.
+The rules are those of 3DGS ("published": the extent by the farthest camera, a black background, and all points of the
+scene) and those of today. Runs are measured on held-out training views.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from common import RESULTS, ROOT, Runs, environment, groups, parser, real_scene, spread, table, write_between
+
+from clsplat.cameras.camera import Camera
+from clsplat.evaluation.evaluate import evaluate
+from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.colmap import Points
+from clsplat.scenes.demo.capture import cast, photograph, pixels, upright_camera, visible
+from clsplat.scenes.demo.world import World
+from clsplat.scenes.pose_checks import without_unseen_points
+from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.split import hold_out
+from clsplat.splats.color import BLACK, WHITE
+from clsplat.training import random_points
+from clsplat.training.config import TrainConfig
+from clsplat.training.run import train
+
+KEY = ("capture", "rules", "seed", "iterations", "cap")
+RULES = ("published", "now")
+PAGE = ROOT / "benchmarks" / "STABILITY.md"
+MARKS = ("<!-- table of captures.py -->", "<!-- end of the table of captures.py -->")
+WIDTH, HEIGHT = 240, 180
+MIDDLE = np.array([0.0, 0.0, 0.5])
+N_POINTS = 4000
+
+
+def around(far: float = 1.0, n: int = 40) -> list[Camera]:
+    """Return cameras on a ring that look at the middle. far : factor of their distance and of their focal length."""
+    angles = 2 * np.pi * np.arange(n) / n
+    places = MIDDLE + far * np.stack([3.6 * np.cos(angles), 3.6 * np.sin(angles), 0.7 + 0.25 * np.sin(3 * angles)], 1)
+    return [upright_camera(WIDTH, HEIGHT, 0.9 * far * WIDTH, place, MIDDLE) for place in places]
+
+
+def ahead(columns: int, rows: int, step: float) -> list[Camera]:
+    """Return a grid of cameras that look ahead from nearly one place."""
+    grid = [(i - (columns - 1) / 2, j - (rows - 1) / 2) for j in range(rows) for i in range(columns)]
+    return [
+        upright_camera(
+            WIDTH, HEIGHT, 0.9 * WIDTH, np.array([-3.5, step * x, 1 + step * y]), np.array([6, step * x / 2, 0.6])
+        )
+        for x, y in grid
+    ]
+
+
+def tripod(n: int = 48) -> list[Camera]:
+    """Return cameras within two centimetres that look everywhere."""
+    angles = 2 * np.pi * np.arange(n) / n
+    places = np.stack([0.01 * np.cos(7 * angles) + 2.2, 0.01 * np.sin(5 * angles), np.full(n, 1.2)], axis=1)
+    ways = np.stack([np.cos(angles), np.sin(angles), 0.1 * np.sin(5 * angles) - 0.1], axis=1)
+    return [
+        upright_camera(WIDTH, HEIGHT, 0.7 * WIDTH, place, place + way) for place, way in zip(places, ways, strict=True)
+    ]
+
+
+def in_world(cameras: list[Camera]) -> Scene:
+    """Return photos of the demo's world with points that at least three of them show."""
+    world, rng = World(0), np.random.default_rng(0)
+    hits = []
+    for camera in cameras:
+        grid = pixels(camera)
+        hits.append(cast(world, camera, grid[rng.integers(len(grid), size=N_POINTS // len(cameras) + 1)] + 0.5))
+    xyz, normal, color = (
+        np.concatenate([getattr(hit, name) for hit in hits]) for name in ("position", "normal", "color")
+    )
+    tracks = np.sum([visible(world, camera, xyz, normal) for camera in cameras], axis=0)
+    kept = tracks >= 3
+    points = Points(
+        xyz[kept].astype(np.float64), np.rint(255 * color[kept]).astype(np.uint8), tracks[kept].astype(np.int64)
+    )
+    views = [
+        View(f"{index:03}.png", camera, np.rint(255 * np.clip(photograph(world, camera), 0, 1)).astype(np.uint8))
+        for index, camera in enumerate(cameras)
+    ]
+    return Scene("world", ROOT, views, points)
+
+
+def with_wrong_pose(scene: Scene, factor: float = 30.0) -> Scene:
+    """Return the scene with one camera far away."""
+    wrong = scene.views[9]
+    pose = wrong.camera.cam_from_world.copy()
+    pose[:3, 3] *= factor
+    return replace(
+        scene,
+        views=[*scene.views[:9], replace(wrong, camera=replace(wrong.camera, cam_from_world=pose)), *scene.views[10:]],
+    )
+
+
+def on_white(photos: int) -> Scene:
+    """Return some photos of lego over white, as files without transparency have them."""
+    scene = real_scene("lego", 200, background=WHITE)
+    views = [View(view.name, view.camera, view.loaded().image) for view in scene.train]
+    return replace(scene, views=views[:: len(views) // photos][:photos], test_names=frozenset())
+
+
+def without_points(scene: Scene) -> Scene:
+    """Return the scene without its points."""
+    return replace(scene, points=Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64)))
+
+
+def with_points_behind(scene: Scene) -> Scene:
+    """Return the scene with its points behind all cameras."""
+    return replace(scene, points=replace(scene.points, xyz=scene.points.xyz * (-1, 1, 1) - (20, 0, 0)))
+
+
+CAPTURES: dict[str, Callable[[], Scene]] = {
+    "around": lambda: in_world(around()),
+    "one wrong pose": lambda: with_wrong_pose(in_world(around())),
+    "from 10 times as far": lambda: in_world(around(10.0)),
+    "from 40 times as far": lambda: in_world(around(40.0)),
+    "from 40 times as far, no points": lambda: without_points(in_world(around(40.0))),
+    "ahead, 9 photos": lambda: in_world(ahead(3, 3, 0.35)),
+    "ahead, 20 photos": lambda: in_world(ahead(5, 4, 0.35)),
+    "ahead, 30 near photos": lambda: in_world(ahead(6, 5, 0.08)),
+    "tripod": lambda: in_world(tripod()),
+    "points behind the cameras": lambda: with_points_behind(in_world(ahead(5, 4, 0.35))),
+    "white, 9 photos": lambda: on_white(9),
+    "white, 25 photos": lambda: on_white(25),
+}
+
+
+def published(scene: Scene) -> float:
+    """Return the extent of 3DGS."""
+    centres = np.array([view.camera.position for view in scene.train])
+    return 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+
+
+def measure(scene: Scene, rules: str, config: TrainConfig) -> dict[str, Any]:
+    """Return the result of one run."""
+    scene, renderer = hold_out(scene), Renderer(config.device)
+    if rules == "now":
+        points = without_unseen_points(scene.path, scene.points, scene.cameras)
+        model = train(replace(scene, points=points), config)
+    else:
+        scene.__dict__["extent"] = published(scene)  # where the cached property keeps its value
+        with patch.object(random_points, "together", list), patch.object(random_points, "_SMALLEST_BALL", 1.0):
+            model = train(scene, config.replace(background=BLACK))
+    found = evaluate(renderer, model.splats, scene.test, model.config.background)
+    trained = evaluate(renderer, model.splats, scene.train, model.config.background)
+    return {
+        "psnr": round(found.psnr, 3),
+        "ssim": round(found.ssim, 4),
+        "train_psnr": round(trained.psnr, 3),
+        "splats": len(model.splats),
+        "seconds": round(model.seconds, 1),
+    } | environment(renderer.device, renderer.schedule)
+
+
+def page(rows: list[dict[str, Any]]) -> str:
+    """Return a Markdown table: a row for each capture, a column for the rules."""
+    lines = []
+    for (capture,), runs in groups(rows, "capture").items():
+        cells = []
+        for rules in RULES:
+            same = [row for row in runs if row["rules"] == rules]
+            psnr, ssim = [row["psnr"] for row in same], [row["ssim"] for row in same]
+            cells.append(f"{statistics.fmean(psnr):.2f}{spread(psnr)}, {statistics.fmean(ssim):.3f}" if same else "")
+        lines.append((capture, *cells))
+    return table(("capture", *RULES), lines, right=RULES)
+
+
+def main() -> None:
+    flags = parser(__doc__, RESULTS / "captures.jsonl", page=PAGE)
+    flags.add_argument("--captures", nargs="+", default=list(CAPTURES), choices=list(CAPTURES))
+    flags.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    flags.add_argument("--iterations", type=int, default=1000)
+    flags.add_argument("--cap", type=int, default=6000)
+    args = flags.parse_args()
+    if args.smoke:
+        args.captures, args.seeds, args.iterations, args.cap = ["ahead, 9 photos"], [0], 4, 100
+    runs = Runs(args.out, KEY)
+    for capture in [] if args.table or args.page else args.captures:
+        scene: Scene | None = None
+        for seed in args.seeds:
+            for rules in RULES:
+                row = {"capture": capture, "rules": rules, "seed": seed, "iterations": args.iterations, "cap": args.cap}
+                if row in runs:
+                    continue
+                scene = scene or CAPTURES[capture]()
+                options = {"iterations": args.iterations, "cap_max": args.cap, "seed": seed, "device": args.device}
+                found = measure(scene, rules, TrainConfig(**options))
+                runs.add(row | found)
+                print(f"{capture}, {rules}, seed {seed}: {found['psnr']:.2f} dB", file=sys.stderr, flush=True)
+    text = page(runs.rows)
+    if args.page:
+        write_between(PAGE, *MARKS, text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
