@@ -273,9 +273,8 @@ def train(
         if not quiet:
             from clsplat.training.run import evaluate_test_views
 
-            report(
-                model, model.evaluations.get(model.iteration) or evaluate_test_views(model.splats, loaded, model.config)
-            )
+            known = model.evaluations.get(model.iteration)
+            report(model, known or evaluate_test_views(model.splats, loaded, model.config))
         if live is not None and (sys.stderr.isatty() and not quiet if stay is None else stay):
             _stay(live, model, quiet)
 
