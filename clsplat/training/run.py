@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from ..scenes.scene import Scene
 from ..splats.splats import Splats
 from .config import TrainConfig
 from .decisions import as_decided, decide
+from .exposure_hint import exposure_hint
 from .extension import fitting_checkpoint
 from .folder import ModelFolder
 from .initialise import check_init
@@ -71,6 +73,8 @@ def train(
         folder.prepare()
     if checkpoint is None:
         config = decide(scene, config).tell(progress)
+        if progress is not None and (hint := exposure_hint(scene, config)) is not None:
+            progress(Progress(0, config.iterations, math.nan, math.nan, 0, 0.0, 0.0, hint))
     with folder_lock(None if folder is None else folder.path):
         trainer = Trainer(scene, config, checkpoint, progress, context=context)
         if folder is not None:

@@ -1,0 +1,49 @@
+"""A hint for photos whose exposures differ much: one model cannot show them all, unless it learns their exposures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..cameras.seen import sampled, seen
+from ..scenes.colmap import Points
+
+if TYPE_CHECKING:
+    from ..scenes.scene import Scene
+    from ..scenes.view import View
+    from .config import TrainConfig
+
+LARGE_SPREAD = 0.8  # stops; captures with one exposure have 0.1 to 0.5
+_VIEWS = 32  # largest number of photos that are looked at
+_GAMMA = 2.2  # of photos: stops are factors of light, not of pixels
+_DARK, _BRIGHT = 8, 247  # pixels outside have lost their brightness
+_FEWEST_POINTS, _FEWEST_PHOTOS = 20, 4  # points in a photo, and photos with as many
+
+
+def exposure_hint(scene: Scene, config: TrainConfig) -> str | None:
+    """Return a sentence if the exposures of the training photos differ much, and the run does not learn them."""
+    if config.appearance.exposure:
+        return None
+    spread = exposure_spread(scene.train, scene.points)
+    if spread is None or spread < LARGE_SPREAD:
+        return None
+    return f"the photos differ in exposure (by {spread:.1f} stops from their mean): try --exposure"
+
+
+def exposure_spread(views: Sequence[View], points: Points) -> float | None:
+    """Return the standard deviation of the photos' exposures [stops]; None if too few photos show enough points.
+
+    A photo's exposure is the median factor between its pixels at the points and the points' own colours.
+    """
+    xyz, own = sampled(points.xyz), sampled(points.rgb.astype(np.float64)).mean(axis=1)
+    stops = []
+    for view in views[:: -(-len(views) // _VIEWS)]:
+        found = seen(view.camera, xyz)
+        column, row = found.pixel[found.inside].astype(np.int64).T
+        shown, known = np.asarray(view.loaded().image)[row, column].astype(np.float64).mean(axis=1), own[found.inside]
+        sound = (np.minimum(shown, known) > _DARK) & (np.maximum(shown, known) < _BRIGHT)
+        if np.count_nonzero(sound) >= _FEWEST_POINTS:
+            stops.append(_GAMMA * float(np.median(np.log2(shown[sound] / known[sound]))))
+    return float(np.std(stops)) if len(stops) >= _FEWEST_PHOTOS else None

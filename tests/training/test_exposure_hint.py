@@ -1,0 +1,63 @@
+"""Photos whose exposures differ much get a hint; others do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.scenes.colmap import Points
+from clsplat.scenes.scene import Scene, View
+from clsplat.training.config import TrainConfig
+from clsplat.training.exposure_hint import exposure_hint, exposure_spread
+from clsplat.training.log import Progress
+from clsplat.training.run import train
+
+CONFIG = TrainConfig(iterations=3, cap_max=50, sh_degree=0)
+
+
+def exposed(scene: Scene, stops: float) -> Scene:
+    """Return the scene with photos of alternating exposure, `stops` above and below."""
+    views = []
+    for number, view in enumerate(scene.views):
+        light = (np.asarray(view.image) / 255.0) ** 2.2 * 2.0 ** (stops * (-1) ** number)
+        image = np.rint(255 * np.clip(light, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+        views.append(View(view.name, view.camera, image))
+    return replace(scene, views=views)
+
+
+def test_photos_of_one_exposure(scene: Scene) -> None:
+    spread = exposure_spread(scene.train, scene.points)
+    assert spread is not None
+    assert spread < 0.2
+    assert exposure_hint(scene, CONFIG) is None
+
+
+@pytest.mark.parametrize("stops", [0.3, 1.0, 1.5])
+def test_the_spread_is_in_stops(scene: Scene, stops: float) -> None:
+    """Bright pixels that are clipped do not count, so that dark photos say more."""
+    spread = exposure_spread(exposed(scene, stops).train, scene.points)
+    assert spread == pytest.approx(stops, rel=0.25, abs=0.05)
+
+
+def test_a_run_says_it_once_and_not_with_the_option(scene: Scene) -> None:
+    messages: list[str] = []
+    uneven = exposed(scene, 1.5)
+
+    def hear(progress: Progress) -> None:
+        messages.append(progress.message)
+
+    train(uneven, CONFIG, hear)
+    said = [message for message in messages if "the photos differ in exposure (by 1." in message]
+    assert len(said) == 1
+    assert said[0].endswith("stops from their mean): try --exposure")
+    assert exposure_hint(uneven, CONFIG.replace(exposure=True)) is None
+
+
+def test_few_points_say_nothing(scene: Scene) -> None:
+    few = Points(scene.points.xyz[:5], scene.points.rgb[:5], scene.points.track_length[:5])
+    nothing = Points(scene.points.xyz[:0], scene.points.rgb[:0], scene.points.track_length[:0])
+    assert exposure_spread(exposed(scene, 1.5).train, few) is None
+    assert exposure_spread(exposed(scene, 1.5).train, nothing) is None
+    assert exposure_spread(exposed(scene, 1.5).train[:3], scene.points) is None
