@@ -25,6 +25,7 @@ from ..rendering.renderer import Rendered, Renderer
 from ..rendering.views import RenderOutput, ViewProgress, files_of
 from ..scenes.scene import View
 from ..splats.color import Color
+from ..splats.formats.any_file import stored_bytes
 from ..splats.stats import complexity
 from .evaluation_report import write_model_report
 from .measurements import ModelEvaluation, ViewRecorder
@@ -213,7 +214,7 @@ class Evaluator:
             "PSNR": measured.psnr,
             **{metric: statistics.fmean(values.values()) for metric, values in recorder.per_view.items()},
             "render_ms": measured.render_ms,
-            "bytes": model.ply.stat().st_size,
+            "bytes": stored_bytes(model.ply),
             **complexity(model.splats).to_json(),
             "shape": model.splats.shape,
             "normalisation": model.splats.normalisation,

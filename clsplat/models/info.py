@@ -12,7 +12,7 @@ from ..scenes.info import SceneInfo, is_scene, scene_info
 from ..scenes.reconstruct.photo_files import is_photographs
 from ..scenes.scene_files import OTHER_KINDS
 from ..scenes.wrong_folder import scene_hint
-from ..splats.formats.any_file import READ_NAMES
+from ..splats.formats.any_file import READ_NAMES, stored_bytes
 from ..splats.stats import Complexity, complexity
 from ..training.folder import ModelFolder
 from .model import LoadedModel, load_model
@@ -40,7 +40,7 @@ class ModelInfo:
             "antialiased": splats.antialiased,
             "low_pass": splats.low_pass,
             "origin": list(self.model.origin),
-            "bytes": self.model.ply.stat().st_size,
+            "bytes": stored_bytes(self.model.ply),
             **self.complexity.to_json(),
         }
 

@@ -42,7 +42,10 @@ def exposure_spread(views: Sequence[View], points: Points) -> float | None:
     for view in views[:: -(-len(views) // _VIEWS)]:
         found = seen(view.camera, xyz)
         column, row = found.pixel[found.inside].astype(np.int64).T
-        shown, known = np.asarray(view.loaded().image)[row, column].astype(np.float64).mean(axis=1), colors[found.inside]
+        shown, known = (
+            np.asarray(view.loaded().image)[row, column].astype(np.float64).mean(axis=1),
+            colors[found.inside],
+        )
         sound = (np.minimum(shown, known) > _DARK) & (np.maximum(shown, known) < _BRIGHT)
         if np.count_nonzero(sound) >= _FEWEST_POINTS:
             stops.append(_GAMMA * float(np.median(np.log2(shown[sound] / known[sound]))))

@@ -155,6 +155,15 @@ def write_splats(
         )
 
 
+def stored_bytes(path: Path) -> int:
+    """Return the bytes of a file of splats, with those of the images that a meta.json or lod-meta.json names."""
+    if path.name not in READ_NAMES:
+        return path.stat().st_size
+    parts = path.parent.glob("*") if path.name == META else path.parent.rglob("*")
+    kinds = (".webp", ".json")
+    return sum(part.stat().st_size for part in parts if part.suffix in kinds and part.is_file())
+
+
 def format_of(path: Path) -> str:
     """Return the key of a file in WRITTEN: its ending in lower case, or its whole name."""
     return LOD_META if path.name == LOD_META else path.suffix.lower()

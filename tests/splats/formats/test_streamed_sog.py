@@ -15,6 +15,7 @@ from model_arrays import random_model
 from clsplat.errors import InputError, OutputError
 from clsplat.files.images import decode_pixels, encode_pixels
 from clsplat.splats.formats import streamed_sog
+from clsplat.splats.formats.any_file import stored_bytes
 from clsplat.splats.formats.sog import read_sog
 from clsplat.splats.formats.streamed_sog import LOD_META, write_streamed_sog
 from clsplat.splats.quaternions import rotations
@@ -132,6 +133,16 @@ def test_an_unusable_splat_is_left_out_alone(path: Path) -> None:
     (chunk.parent / name).write_bytes(encode_pixels(tags))
     with pytest.warns(UserWarning, match=r"left out 1 of \d+ splats \(quat of splat \d+: norm is 0"):
         assert len(Splats.load(path)) == N - 1
+
+
+def test_its_bytes_are_those_of_all_its_files(path: Path) -> None:
+    write_streamed_sog(path, model(), 2)
+    (path.parent / "notes.txt").write_text("not of the scene")
+    files = [file for file in path.parent.rglob("*") if file.suffix in (".json", ".webp")]
+    assert len(files) > 10
+    assert stored_bytes(path) == sum(file.stat().st_size for file in files)
+    chunk = next(path.parent.glob("0_*")) / "meta.json"
+    assert path.stat().st_size < stored_bytes(chunk) < stored_bytes(path)
 
 
 def test_an_environment_is_read(path: Path) -> None:
