@@ -144,7 +144,8 @@ def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str], dict[int, set[i
                     raise
                 with without_observations(whole, suffix) as (bare, named):
                     reconstruction = pycolmap.Reconstruction(str(bare))
-                tracks = {number: images & set(reconstruction.images) for number, images in named.items()}
+                known = set(reconstruction.images)
+                tracks = {number: images & known for number, images in named.items()}
                 warnings.warn(
                     f"{folder}: its points or frames name images or observations that the model lacks; they are left "
                     "out",
