@@ -165,6 +165,51 @@ def test_view_shows_a_file_that_changes_and_ends_with_ctrl_c(viewing: tuple[Comm
     assert len(command.said.splitlines()) == 1, command.said
 
 
+def test_both_models_of_a_comparison_are_read_again(tmp_path: Path, model_folder: Path) -> None:
+    pytest.importorskip("viser")
+    from clsplat.viewer.options import ServerOptions
+    from clsplat.viewer.session import ViewingSession
+
+    files = [tmp_path / "one.ply", tmp_path / "other.ply"]
+    splats = load_model(model_folder).splats
+    for file in files:
+        splats.save(file)
+    session = ViewingSession(load_model(files[0]), options=ServerOptions(port=0), against=load_model(files[1]))
+    try:
+        shown = [source for _, source in session.watched]
+        for number, file in enumerate(files):
+            splats.select(np.arange(10 + number)).save(file)
+            session.poll()  # a file is read once it has stayed the same
+            session.poll()
+            assert len(shown[number].splats) == 10 + number
+        splats.select(np.arange(7)).save(files[1])
+        assert session.reload() == "one.ply: read again, 10 splats; other.ply: read again, 7 splats"
+        files[1].unlink()
+        assert "other.ply: does not exist any more; the previous model stays" in session.reload()
+        assert len(shown[1].splats) == 7
+    finally:
+        session.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_that_are_not_utf_8_are_shown_as_escapes(tmp_path: Path, model_folder: Path) -> None:
+    """viser's messages are UTF-8. The browser would get no panel."""
+    pytest.importorskip("viser")
+    from clsplat.viewer.initial_view import SceneCameras
+    from clsplat.viewer.options import ServerOptions
+    from clsplat.viewer.session import ViewingSession
+
+    file = Path(os.fsdecode(os.fsencode(tmp_path) + b"/bad\xff.ply"))
+    load_model(model_folder).splats.save(file)
+    camera = NamedCamera("a\udcff", Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4)))
+    session = ViewingSession(load_model(file), SceneCameras((camera,)), options=ServerOptions(port=0))
+    try:
+        assert session.server._name == r"bad\udcff"
+        assert list(SceneCameras((camera,)).by_label) == [r"train 0: a\udcff"]
+    finally:
+        session.close()
+
+
 @pytest.mark.slow
 def test_train_view_shows_the_run(tmp_path: Path, capture_folder: Path) -> None:
     pytest.importorskip("viser", reason="viser is not installed (pip install clsplat[view])")
