@@ -29,7 +29,7 @@ def exposure_hint(scene: Scene, config: TrainConfig) -> str | None:
     spread = exposure_spread(scene.train, scene.points)
     if spread is None or spread < LARGE_SPREAD:
         return None
-    return f"the photos differ in exposure (by {spread:.1f} stops from their mean): try --exposure"
+    return f"the photos differ in exposure (by {spread:.1f} stops from their mean): the option exposure learns them"
 
 
 def exposure_spread(views: Sequence[View], points: Points) -> float | None:

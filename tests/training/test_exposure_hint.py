@@ -51,7 +51,7 @@ def test_a_run_says_it_once_and_not_with_the_option(scene: Scene) -> None:
     train(uneven, CONFIG, hear)
     said = [message for message in messages if "the photos differ in exposure (by 1." in message]
     assert len(said) == 1
-    assert said[0].endswith("stops from their mean): try --exposure")
+    assert said[0].endswith("stops from their mean): the option exposure learns them")
     assert exposure_hint(uneven, CONFIG.replace(exposure=True)) is None
 
 
