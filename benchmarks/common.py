@@ -21,6 +21,7 @@ from clsplat.comparison.runs import Run
 from clsplat.comparison.table import Record, markdown_table
 from clsplat.device.device import Device
 from clsplat.errors import ClsplatError
+from clsplat.rendering.tuning import schedule_for
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.scenes.split import hold_out
 from clsplat.splats.color import BLACK, WHITE, Color
@@ -131,13 +132,16 @@ def commit() -> str:
 
 
 def environment(device: Device, schedule: object) -> dict[str, Any]:
-    """Return device, driver, schedule, commit and cores: where a result was measured."""
+    """Return device, driver, schedule, commit and cores: where a result was measured.
+
+    schedule : that of the kernels; None for the one that runs on the device take.
+    """
     info = device.info
     return {
         "device": info.name,
         "platform": info.platform,
         "driver": info.driver,
-        "schedule": str(schedule),
+        "schedule": str(schedule or schedule_for(device)),
         "commit": commit(),
         "cores": os.cpu_count(),
         "machine": platform.machine(),

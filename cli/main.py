@@ -89,9 +89,8 @@ class Commands(click.Group):
             formatter.write_dl(EXIT_CODES)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        if (
-            not args and not ctx.resilient_parsing
-        ):  # click 8.2 and later would make an error of the help, and `main` would print it as one line
+        # click 8.2 and later would make an error of the help, and `main` would print it as one line.
+        if not args and not ctx.resilient_parsing:
             click.echo(ctx.get_help(), err=True)
             ctx.exit(2)
         return super().parse_args(ctx, args)

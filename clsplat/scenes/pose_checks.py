@@ -64,12 +64,14 @@ def without_unseen_points(root: Path, points: Points, cameras: Sequence[Camera])
 
     Such points are not of these poses. Splats that start there would have to be removed again.
     """
+    if not len(points):
+        return points
     sample = sampled(points.xyz)
     shown = np.zeros(len(sample), np.bool_)
     for camera in cameras:
         shown |= seen(camera, sample).inside
-    if not len(sample) or shown.mean() >= _SEEN_SHARE:
-        return points
+        if shown.mean() >= _SEEN_SHARE:  # mostly after the first camera
+            return points
     warnings.warn(
         f"{root}: its photos show {shown.mean():.1%} of its {len(points)} points, so the points do not fit the poses; "
         "they are left out",

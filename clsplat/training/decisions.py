@@ -27,7 +27,6 @@ docs/decisions.md has the measurements.
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -94,7 +93,7 @@ class Decision:
     def tell(self, progress: Callable[[Progress], None] | None) -> TrainConfig:
         """Send the reasons as one message, and return the options."""
         if progress is not None and self.reasons:
-            progress(Progress(0, self.config.iterations, math.nan, math.nan, 0, 0.0, 0.0, str(self)))
+            progress(Progress.note(str(self), self.config.iterations))
         return self.config
 
 
@@ -125,9 +124,8 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
         if name not in config.named_options:
             chosen[name] = value
             reasons.append(reason)
-    named = config.named_options
-    if not share and "background" not in named and (color := plain_background(scene.train)) not in (None, BLACK):
-        assert color is not None
+    color = None if share or "background" in config.named_options else plain_background(scene.train)
+    if color is not None and color != BLACK:
         chosen["background"] = color
         reasons.append(f"a background of {','.join(f'{part:.2g}' for part in color)}, because all photos end in it")
     if transparent and "random_background" not in config.named_options:

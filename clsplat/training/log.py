@@ -39,6 +39,11 @@ class Progress:
     forecast: float | None = None
     phase: str = ""
 
+    @classmethod
+    def note(cls, message: str, iterations: int) -> Progress:
+        """Return a message before the first iteration. iterations : of the run."""
+        return cls(0, iterations, math.nan, math.nan, 0, 0.0, 0.0, message)
+
     @property
     def seconds_left(self) -> float:
         """Time that the rest of the run takes [s]; infinite if it is not known."""

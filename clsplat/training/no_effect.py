@@ -27,7 +27,7 @@ def no_effect(config: TrainConfig, name: str) -> str | None:
 
     config : complete options of the run (`decide`).
     """
-    shape = shape_named(config.shape)
+    shape, values = shape_named(config.shape), config.to_json()
     if config.without_effect([name]):
         return f"with strategy {config.strategy}"
     field = _FIELD_OF.get(name)
@@ -35,13 +35,11 @@ def no_effect(config: TrainConfig, name: str) -> str | None:
         return f"with shape {config.shape}"
     if name == "normalisation" and not shape.normalised:
         return f"with shape {config.shape}"
-    if name.startswith("sghmc_") and config.sghmc.position_optimizer == "adam":
+    if name.startswith("sghmc_") and values["position_optimizer"] == "adam":
         return "with position optimizer adam"
     switch = _NEEDS.get(name)
-    if switch is not None and not getattr(config, switch, getattr(config.appearance, switch, False)):
+    if switch is not None and not values[switch]:
         return f"without --{switch.replace('_', '-')}"
-    if name in ("save_iterations", "test_iterations"):
-        chosen = getattr(config.output, name)
-        if chosen and min(chosen) > config.iterations:
-            return f"beyond the run's {config.iterations} iterations"
+    if name in ("save_iterations", "test_iterations") and min(values[name], default=0) > config.iterations:
+        return f"beyond the run's {config.iterations} iterations"
     return None

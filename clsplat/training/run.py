@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -74,7 +73,7 @@ def train(
     if checkpoint is None:
         config = decide(scene, config).tell(progress)
         if progress is not None and (hint := exposure_hint(scene, config)) is not None:
-            progress(Progress(0, config.iterations, math.nan, math.nan, 0, 0.0, 0.0, hint))
+            progress(Progress.note(hint, config.iterations))
     with folder_lock(None if folder is None else folder.path):
         trainer = Trainer(scene, config, checkpoint, progress, context=context)
         if folder is not None:

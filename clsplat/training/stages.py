@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
@@ -123,7 +122,7 @@ class StepReports:
         self._step = step
         if self._report is not None:
             text = f"step {step} of {self._steps}, {message}"
-            self._report(Progress(0, self._iterations, math.nan, math.nan, 0, 0.0, 0.0, text))
+            self._report(Progress.note(text, self._iterations))
 
     def _with_step(self, report: Progress) -> None:
         if self._report is not None:

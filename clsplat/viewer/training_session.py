@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable
 from types import TracebackType
@@ -107,5 +106,5 @@ class TrainingSession:
 
     def _say_pause(self, paused: bool, message: str) -> None:
         iterations = self._config.iterations
-        self._report(Progress(0, iterations, math.nan, math.nan, 0, 0.0, 0.0, message))
+        self._report(Progress.note(message, iterations))
         self._server.show_paused(paused)
