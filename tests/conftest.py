@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from cli_runner import HEIGHT, MODEL_RUN, N_VIEWS, WIDTH, clsplat
 from device_schedules import schedule_on, suits
+from hypothesis import settings
 
 from clsplat.device.device import Device, list_devices, open_device
 from clsplat.device.program import OPTIONS_VARIABLE
@@ -31,6 +32,10 @@ collect_ignore = [
 ]
 if sys.platform != "win32":
     collect_ignore.clear()
+
+# The same examples in each run, so that a change fails by what it changes. "--hypothesis-profile=default" draws others.
+settings.register_profile("same", derandomize=True, database=None)
+settings.load_profile("same")
 
 MakeRenderer = Callable[..., Renderer]
 

@@ -123,8 +123,6 @@ def try_all_kinds(commands: tuple[str, ...], model: Path, examples: int) -> None
     @settings(
         max_examples=examples,
         deadline=None,
-        database=None,
-        derandomize=True,
         suppress_health_check=list(HealthCheck),
     )
     @given(command=st.sampled_from(commands), place=places, value=st.just(MISSING) | VALUES)

@@ -6,6 +6,7 @@ The lines come from click's lists of parameters (tests/support/hostile_flags.py)
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -89,7 +90,7 @@ def hostile_lines(command: str, places: Places, data: st.DataObject, most: int) 
 
 
 @pytest.mark.parametrize("command", WITH_OPTIONS)
-@settings(max_examples=6, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None)
+@settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_hostile_lines(command: str, places: Places, data: st.DataObject) -> None:
     hostile_lines(command, places, data, 3)
@@ -122,3 +123,7 @@ def test_a_fault_is_found(places: Places, monkeypatch: pytest.MonkeyPatch) -> No
     assert "control characters" in end_with(lambda: say("error: \x07"))
     assert "exit code 3" in end_with(lambda: exit(3))
     assert end_with(lambda: say("error: plain")) == ""
+    monkeypatch.setattr(hostile_flags, "SECONDS", 0.1)
+    monkeypatch.setattr(hostile_flags, "WAIT", 1)
+    assert "0.1 s of the processor" in end_with(lambda: sum(1 for _ in count()))
+    assert "longer than 1 s" in end_with(lambda: time.sleep(30))
