@@ -4,9 +4,11 @@
     python benchmarks/captures.py --captures tripod --seeds 0
     python benchmarks/captures.py --page                # write the table of STABILITY.md
 
-The cameras are in the world of `clsplat demo`, except for "white", which is lego over white without its transparency.
-The rules are those of 3DGS ("published": the extent by the farthest camera, a black background, and all points of the
-scene) and those of today. Runs are measured on held-out training views.
+The cameras are in the world of `clsplat demo`, except for objects over one colour, which are photos without their
+transparency: "white" is lego, others name their scene. Some are of blender_scenes.py: put these scenes beside those of
+CLSPLAT_DATA. "published" are the rules of 3DGS: the extent by the farthest camera, a black background, and all points
+of the scene. "not cut out" are those of today, but objects are not cut out. Runs are measured on held-out training
+views.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from common import RESULTS, ROOT, Runs, environment, groups, parser, real_scene,
 
 from clsplat.cameras.camera import Camera
 from clsplat.evaluation.evaluate import evaluate
+from clsplat.files.images import ImageU8, decode_pixels, encode_jpeg
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.colmap import Points
 from clsplat.scenes.demo.capture import cast, photograph, pixels, upright_camera, visible
@@ -30,13 +33,13 @@ from clsplat.scenes.demo.world import World
 from clsplat.scenes.pose_checks import without_unseen_points
 from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.split import hold_out
-from clsplat.splats.color import BLACK, WHITE
+from clsplat.splats.color import BLACK, WHITE, Color
 from clsplat.training import random_points
 from clsplat.training.config import TrainConfig
 from clsplat.training.run import train
 
 KEY = ("capture", "rules", "seed", "iterations", "cap")
-RULES = ("published", "now")
+RULES = ("published", "not cut out", "now")
 PAGE = ROOT / "benchmarks" / "STABILITY.md"
 MARKS = ("<!-- table of captures.py -->", "<!-- end of the table of captures.py -->")
 WIDTH, HEIGHT = 240, 180
@@ -105,11 +108,21 @@ def with_wrong_pose(scene: Scene, factor: float = 30.0) -> Scene:
     )
 
 
-def on_white(photos: int) -> Scene:
-    """Return some photos of lego over white, as files without transparency have them."""
-    scene = real_scene("lego", 200, background=WHITE)
-    views = [View(view.name, view.camera, view.loaded().image) for view in scene.train]
-    return replace(scene, views=views[:: len(views) // photos][:photos], test_names=frozenset())
+def over(color: Color, photos: int, name: str = "lego", resolution: int = 200, quality: int | None = None) -> Scene:
+    """Return some photos of an object over one colour, as files without transparency have them.
+
+    Parameters
+    ----------
+    name, resolution : as of `real_scene`. quality : of the JPEG files that the photos went through; None for PNG.
+    """
+    scene = real_scene(name, resolution, background=color)
+    views = [View(view.name, view.camera, stored(view.loaded().image, quality)) for view in scene.train]
+    return replace(scene, views=views[:: len(views) // photos][:photos], test_names=frozenset(), background=BLACK)
+
+
+def stored(image: ImageU8, quality: int | None) -> ImageU8:
+    """Return an image as it comes out of a JPEG file; the same image for a quality of None."""
+    return image if quality is None else decode_pixels(encode_jpeg(image, quality), "photo", image.size)
 
 
 def without_points(scene: Scene) -> Scene:
@@ -133,9 +146,19 @@ CAPTURES: dict[str, Callable[[], Scene]] = {
     "ahead, 30 near photos": lambda: in_world(ahead(6, 5, 0.08)),
     "tripod": lambda: in_world(tripod()),
     "points behind the cameras": lambda: with_points_behind(in_world(ahead(5, 4, 0.35))),
-    "white, 9 photos": lambda: on_white(9),
-    "white, 25 photos": lambda: on_white(25),
+    "white, 9 photos": lambda: over(WHITE, 9),
+    "white, 25 photos": lambda: over(WHITE, 25),
 }
+OBJECTS: dict[str, Callable[[], Scene]] = {
+    "lego_full over black, 25 photos": lambda: over(BLACK, 25, "lego_full", 2),
+    "plant over white, 25 photos": lambda: over(WHITE, 25, "plant", -1),
+    "plant over black, 90 photos": lambda: over(BLACK, 90, "plant", -1),
+    "plant over white, 90 JPEG photos": lambda: over(WHITE, 90, "plant", -1, quality=90),
+    "wires over white, 25 photos": lambda: over(WHITE, 25, "wires", -1),
+    "metals over white, 90 photos": lambda: over(WHITE, 90, "metals", -1),
+    "metals over black, 25 photos": lambda: over(BLACK, 25, "metals", -1),
+}
+CUT_OUT = ("white, 9 photos", "white, 25 photos", *OBJECTS)  # captures of an object, which is cut out now
 
 
 def published(scene: Scene) -> float:
@@ -147,13 +170,14 @@ def published(scene: Scene) -> float:
 def measure(scene: Scene, rules: str, config: TrainConfig) -> dict[str, Any]:
     """Return the result of one run."""
     scene, renderer = hold_out(scene), Renderer(config.device)
-    if rules == "now":
+    if rules != "published":
         points = without_unseen_points(scene.path, scene.points, scene.cameras)
+        config = config if rules == "now" else config.replace(cut_background=False)
         model = train(replace(scene, points=points), config)
     else:
         scene.__dict__["extent"] = published(scene)  # where the cached property keeps its value
         with patch.object(random_points, "together", list), patch.object(random_points, "_SMALLEST_BALL", 1.0):
-            model = train(scene, config.replace(background=BLACK))
+            model = train(scene, config.replace(background=BLACK, cut_background=False))
     found = evaluate(renderer, model.splats, scene.test, model.config.background)
     trained = evaluate(renderer, model.splats, scene.train, model.config.background)
     return {
@@ -180,7 +204,8 @@ def page(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     flags = parser(__doc__, RESULTS / "captures.jsonl", page=PAGE)
-    flags.add_argument("--captures", nargs="+", default=list(CAPTURES), choices=list(CAPTURES))
+    known = CAPTURES | OBJECTS
+    flags.add_argument("--captures", nargs="+", default=list(known), choices=list(known))
     flags.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     flags.add_argument("--iterations", type=int, default=1000)
     flags.add_argument("--cap", type=int, default=6000)
@@ -193,9 +218,9 @@ def main() -> None:
         for seed in args.seeds:
             for rules in RULES:
                 row = {"capture": capture, "rules": rules, "seed": seed, "iterations": args.iterations, "cap": args.cap}
-                if row in runs:
+                if row in runs or (rules == "not cut out" and capture not in CUT_OUT):
                     continue
-                scene = scene or CAPTURES[capture]()
+                scene = scene or known[capture]()
                 options = {"iterations": args.iterations, "cap_max": args.cap, "seed": seed, "device": args.device}
                 found = measure(scene, rules, TrainConfig(**options))
                 runs.add(row | found)

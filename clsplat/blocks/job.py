@@ -16,6 +16,7 @@ from ..splats.splats import Splats
 from ..training.config import TrainConfig
 from ..training.exposure_file import exposures_of_start
 from ..training.log import Progress
+from ..training.photos import with_photos
 from ..training.trainer import Visit
 from .targets import with_block_targets
 
@@ -56,7 +57,9 @@ def train_block(
     inside, context = Splats.load(job.folder / INSIDE), Splats.load(job.folder / CONTEXT)
     exposures = exposures_of_start(str(job.folder / START)) if job.config.appearance.exposure else {}
     scene = replace(scene, background=job.config.background)  # the run may have chosen another one
-    prepared = with_block_targets(scene, inside, context, Renderer(device), job.uncovered, exposures)
+    prepared = with_block_targets(
+        with_photos(scene, job.config), inside, context, Renderer(device), job.uncovered, exposures
+    )
     return train_in_folder(job.config.replace(device=device), prepared, folder, context, progress, visit)
 
 

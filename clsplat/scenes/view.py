@@ -126,6 +126,23 @@ class StoredView(View):
         """Return the view with its pixels in memory. Raise InputError if the photo cannot be used."""
         return self._kept or self._read()
 
+    def changed(self, change: Callable[[View], View], working_bytes: int = 0) -> StoredView:
+        """Return a view that applies `change` to the pixels whenever they are decoded.
+
+        Parameters
+        ----------
+        change : returns another view of the same size. A mask that it adds needs `may_hide_pixels`.
+        working_bytes : memory that it needs beside its result.
+        """
+        return StoredView(
+            self.name,
+            self.camera,
+            lambda: change(self._read()),
+            max(self.decoding_bytes, working_bytes),
+            None if self._kept is None else change(self._kept),
+            self.may_hide_pixels,
+        )
+
     def keep(self) -> None:
         """Decode the photo, and keep the pixels until `release`. Raise InputError if the photo cannot be used."""
         object.__setattr__(self, "_kept", self.loaded())

@@ -119,6 +119,12 @@ class TrainConfig:
         metavar="R,G,B",
         by_scene=True,
     )
+    cut_background: bool = option(
+        False,
+        help="Count the background of photos as transparent: pixels of the colour --background that are connected to a "
+        "side of the photo, and those in holes. On if all photos show an object before one colour.",
+        by_scene=True,
+    )
     random_background: bool = option(
         False,
         help="Train with a random background colour in each iteration, also behind transparent photos, until "

@@ -4,7 +4,8 @@
   further steps. A run that names its shape or an option of the skew keeps its shape.
 - Transparent photos are trained over random backgrounds for most of the run. Over one colour, a splat of that colour
   costs nothing wherever it is, and other views see it before the object.
-- If the photos show an object in front of one colour, that colour is behind the splats (plain_background.py).
+- If the photos show an object in front of one colour, that colour is behind the splats (plain_background.py). It is cut
+  out of the photos (scenes/cut_out.py).
 - A run that starts at random places, or at few points of the scene, has splats that no photo needs. Transparent photos
   get the strategy that relocates them (`mcmc`). With `adc` a penalty on opacity lets them fade until they are pruned.
 - Beside the points of a scene, some splats start at random places too: a plain wall has no points, and would else get
@@ -35,6 +36,7 @@ from typing import TYPE_CHECKING, Any
 from ..cameras.seen import mean_share_seen, sampled
 from ..device.device import open_device
 from ..device.specs import count_devices, first_device
+from ..scenes.cut_out import SPREAD, share_cut_out
 from ..splats.color import BLACK
 from ..splats.low_pass import LOW_PASS, PIXEL
 from ..splats.shapes import PLAIN_SHAPE
@@ -69,7 +71,10 @@ UNSEEN_SPLATS = 50_000  # fewer splats outside of a photo save less time than th
 SHORT_RUN = 2500  # photos in all iterations: in longer runs the skew gains as much as further iterations do, or more
 SKEW_OPTIONS = {"shape", "normalisation", "skew_lr", "skew_map", "alternation"}  # who names one wants a skew
 SCREEN_FILTER = ("antialiased", "low_pass")
-BY_TRANSPARENCY = {"random_points", "random_background", "strategy", "background"}  # decided by transparent photos
+# Decided by transparent photos, and by those that an object does not fill.
+BY_TRANSPARENCY = {"random_points", "random_background", "strategy", "background", "cut_background"}
+CUT_VIEWS = 32  # largest number of photos that are cut out to see how much remains
+CUT_SHARE = 0.2  # of the photos: a smaller background is the frame of a photo that shows more than an object
 FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
 _RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
 
@@ -105,10 +110,7 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
     scene : its training views and points are looked at, never its test views.
     config : options of the run. All options of a stored run count as named (`TrainConfig.named_options`).
     """
-    chosen: dict[str, Any] = {}
-    reasons = []
-    # Photos that are not in memory are decoded for it, which takes longer than all other decisions.
-    share = transparent_share(scene.train) if BY_TRANSPARENCY - config.named_options.keys() else 0.0
+    chosen, reasons, share = for_background(scene, config)
     transparent = share >= TRANSPARENT_SHARE
     why = random_start(scene, config)
     share_random = config.start.random_points if config.start.init == "sfm" else 0.0
@@ -124,10 +126,6 @@ def decide(scene: Scene, config: TrainConfig) -> Decision:
         if name not in config.named_options:
             chosen[name] = value
             reasons.append(reason)
-    color = None if share or "background" in config.named_options else plain_background(scene.train)
-    if color is not None and color != BLACK:
-        chosen["background"] = color
-        reasons.append(f"a background of {','.join(f'{part:.2g}' for part in color)}, because all photos end in it")
     if transparent and "random_background" not in config.named_options:
         chosen["random_background"] = True
         part = "" if config.random_background_until == 1 else f" for {config.random_background_until:.0%} of the run"
@@ -222,6 +220,35 @@ def for_few_photos(n_photos: int, is_short: bool) -> list[tuple[str, Any, str]]:
         ("depth_smoothness", SMOOTHNESS, "a penalty on steps of the depth"),
         ("occluder_check", True, "no splats that would cover the view between the photos"),
     ]
+
+
+def for_background(scene: Scene, config: TrainConfig) -> tuple[dict[str, Any], list[str], float]:
+    """Return options for what is behind an object in the photos, their reasons, and the share of transparent pixels.
+
+    Photos that are not in memory are decoded for it, which takes longer than all other decisions.
+    """
+    chosen: dict[str, Any] = {}
+    reasons: list[str] = []
+    named = config.named_options
+    if not BY_TRANSPARENCY - named.keys():
+        return chosen, reasons, 0.0
+    if share := transparent_share(scene.train):
+        return chosen, reasons, share
+    color = None if {"background", "cut_background"} <= named.keys() else plain_background(scene.train)
+    if color is not None and color != BLACK and "background" not in named:
+        chosen["background"] = color
+        reasons.append(f"a background of {','.join(f'{part:.2g}' for part in color)}, because all photos end in it")
+    background = chosen.get("background", config.background)
+    plain = color is not None and max(abs(a - b) for a, b in zip(color, background, strict=True)) <= SPREAD / 255
+    if not named.get("cut_background", plain):
+        return chosen, reasons, 0.0
+    share = share_cut_out(scene.train[:: -(-len(scene.train) // CUT_VIEWS)], background)
+    if "cut_background" not in named:
+        if share < CUT_SHARE:
+            return chosen, reasons, 0.0
+        chosen["cut_background"] = True
+        reasons.append(f"the background is cut out of the photos, because {share:.0%} of their pixels have its colour")
+    return chosen, reasons, share
 
 
 def share_beside(scene: Scene, config: TrainConfig, transparent: bool) -> float:

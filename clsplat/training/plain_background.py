@@ -1,7 +1,8 @@
 """A colour that surrounds an object in all photos: studio photos, and renders that are stored without transparency.
 
 With that colour behind the splats, no splat has to show it. Behind another colour, splats would stand in front of the
-cameras for it, and other views see them before the object.
+cameras for it, and other views see them before the object. Photos whose background is cut out (scenes/cut_out.py) have
+all that transparent photos have: a start inside the silhouettes, and random backgrounds.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..scenes.cut_out import SPREAD
 from ..splats.color import Color
 from ..splats.fields import DoubleArray
 
@@ -18,7 +20,6 @@ if TYPE_CHECKING:
     from ..scenes.view import View
 
 _VIEWS = 32  # largest number of photos that are looked at
-_SPREAD = 4  # largest difference of a pixel from the colour, of 255: photos have noise
 _SHARE = 0.9  # of the pixels at the sides of a photo, and of the photos, that have the colour
 
 
@@ -41,7 +42,7 @@ def plain_background(views: Sequence[View]) -> Color | None:
     if not len(plain):
         return None
     color = np.median(plain, axis=0)
-    if np.count_nonzero(np.abs(plain - color).max(axis=1) <= _SPREAD) < _SHARE * len(colors):
+    if np.count_nonzero(np.abs(plain - color).max(axis=1) <= SPREAD) < _SHARE * len(colors):
         return None
     red, green, blue = (float(part) for part in color / 255.0)
     return red, green, blue
@@ -51,5 +52,5 @@ def _side_color(image: np.ndarray) -> DoubleArray:
     """Return the colour of the outermost pixels of an image (H, W, 3), 0 to 255; NaN if they have several."""
     sides = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).astype(np.float64)
     color = np.median(sides, axis=0)
-    alike = np.abs(sides - color).max(axis=1) <= _SPREAD
+    alike = np.abs(sides - color).max(axis=1) <= SPREAD
     return np.asarray(color if alike.mean() >= _SHARE else np.full(3, np.nan))

@@ -39,6 +39,7 @@ _RATES = {
     "depth_smoothness": 0.0,
     "occluder_check": False,
     "visible_adam": False,
+    "cut_background": False,
     "random_background": False,
     "antialiased": False,
     "turnover": 0.0,

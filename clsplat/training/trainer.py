@@ -20,7 +20,6 @@ from ..files.host_memory import peak_bytes
 from ..rendering.frame import Frame
 from ..rendering.renderer import Renderer
 from ..rendering.tuning import schedule_for
-from ..scenes.read_view import keep_photos
 from ..scenes.scene import Scene, View
 from ..scenes.split import with_validation
 from ..splats.fields import Array
@@ -44,6 +43,7 @@ from .memory_estimate import run_memory
 from .model import Model
 from .occluders import OccluderCheck
 from .optim.optimizer import make_optimizer
+from .photos import with_photos
 from .programs import kernel_build
 from .rate_limits import check_rates
 from .replica import Replica
@@ -95,7 +95,7 @@ class Trainer:
             scene.path,
         )
         check_rates(config)
-        keep_photos(scene.train)
+        scene = with_photos(scene, config)
         self.scene, self.config, self.progress = scene, config, progress
         self.device, *others = [device] if device is not None else open_devices(config.device)
         check_batch(config, 1 + len(others))

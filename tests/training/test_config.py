@@ -59,6 +59,7 @@ DEFAULTS = {
     "low_pass": None,
     "near_plane": None,
     "background": (0.0, 0.0, 0.0),
+    "cut_background": False,
     "random_background": False,
     "random_background_until": 0.8,
     "seed": 0,
