@@ -13,6 +13,7 @@ views.
 
 from __future__ import annotations
 
+import io
 import statistics
 import sys
 from collections.abc import Callable
@@ -22,10 +23,11 @@ from unittest.mock import patch
 
 import numpy as np
 from common import RESULTS, ROOT, Runs, environment, groups, parser, real_scene, spread, table, write_between
+from PIL import Image
 
 from clsplat.cameras.camera import Camera
 from clsplat.evaluation.evaluate import evaluate
-from clsplat.files.images import ImageU8, decode_pixels, encode_jpeg
+from clsplat.files.images import ImageU8
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.colmap import Points
 from clsplat.scenes.demo.capture import cast, photograph, pixels, upright_camera, visible
@@ -122,7 +124,11 @@ def over(color: Color, photos: int, name: str = "lego", resolution: int = 200, q
 
 def stored(image: ImageU8, quality: int | None) -> ImageU8:
     """Return an image as it comes out of a JPEG file; the same image for a quality of None."""
-    return image if quality is None else decode_pixels(encode_jpeg(image, quality), "photo", image.size)
+    if quality is None:
+        return image
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "JPEG", quality=quality)
+    return np.array(Image.open(file))
 
 
 def without_points(scene: Scene) -> Scene:

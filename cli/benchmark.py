@@ -11,7 +11,7 @@ from clsplat.benchmark.sets import SETS
 from clsplat.comparison.methods import DEFAULT, parse_methods
 
 from .compare import distinct_numbers, report_run
-from .comparison_options import check_device, cluster_option, grid_options
+from .comparison_options import check_devices_of_runs, cluster_option, grid_options
 from .options import (
     PATH,
     TrainingCommand,
@@ -114,7 +114,7 @@ def benchmark(
     from clsplat.benchmark.run import run_benchmark
     from clsplat.benchmark.sets import benchmark_set
 
-    check_device(values.get("device"), cluster)
+    check_devices_of_runs(values.get("device"), cluster)
     methods = parse_methods(systems)
     common = config_values(ctx, values)
     if iterations is not None:

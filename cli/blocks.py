@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -14,7 +15,7 @@ from clsplat.files.stop_signals import exit_code
 from clsplat.training.config import TrainConfig
 
 from .options import F
-from .progress import TrainingDisplay, report_test_views, table
+from .progress import TrainingDisplay, report_test_views, resume_command, table
 
 if TYPE_CHECKING:
     from clsplat.blocks.partition import Partition
@@ -46,7 +47,7 @@ def blocks_options(function: F) -> F:
     return function
 
 
-def given_blocks(values: dict[str, Any]) -> Callable[[TrainConfig], BlocksOptions] | None:
+def given_blocks(values: dict[str, Any], resume: bool = False) -> Callable[[TrainConfig], BlocksOptions] | None:
     """Remove the options of blocks from `values`.
 
     Returns
@@ -55,6 +56,8 @@ def given_blocks(values: dict[str, Any]) -> Callable[[TrainConfig], BlocksOption
     """
     blocks, polish = values.pop("blocks"), values.pop("polish")
     if blocks is None:
+        if polish is not None and resume:
+            raise click.UsageError("--polish stays as it was when a training goes on: remove it")
         if polish is not None:
             raise click.UsageError("--polish is for trainings in blocks: give --blocks too")
         return None
@@ -73,6 +76,7 @@ def run_blocks(
     cluster: str | None,
 ) -> None:
     """Train in blocks with a live display, and print the result."""
+    warn_of_single_model(config)
     from clsplat.blocks.train import train_in_blocks
     from clsplat.training.decisions import decide
     from clsplat.training.run import evaluate_test_views
@@ -90,7 +94,7 @@ def run_blocks(
                 cluster=cluster,
             )
     except KeyboardInterrupt:
-        report_interruption(ctx, model_path)
+        report_interruption(ctx, model_path, cluster)
     if quiet:
         return
     head = ("block", "photos", "splats", "around it", "seconds", "MB of device", "MB in all")
@@ -111,9 +115,16 @@ def run_blocks(
     report_test_views(evaluate_test_views(result.splats, scene, decide(scene, config).config))
 
 
-def report_interruption(ctx: click.Context, model_path: Path) -> NoReturn:
+def warn_of_single_model(config: TrainConfig) -> None:
+    """Warn about options that write or measure models before the last one, which a training in blocks does not have."""
+    for name in ("save_iterations", "test_iterations"):
+        if config.named_options.get(name):
+            warnings.warn(f"--{name.replace('_', '-')} has no effect with --blocks", stacklevel=2)
+
+
+def report_interruption(ctx: click.Context, model_path: Path, cluster: str | None = None) -> NoReturn:
     """Print how to continue after Ctrl-C or another signal, and exit."""
-    click.echo(f"interrupted, finished steps are kept; to continue: clsplat train --resume -m {model_path}", err=True)
+    click.echo(f"interrupted, finished steps are kept; to continue: {resume_command(model_path, cluster)}", err=True)
     ctx.exit(exit_code())
 
 

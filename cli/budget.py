@@ -93,7 +93,7 @@ def run_search(
                 cluster=cluster,
             )
     except KeyboardInterrupt:
-        report_interruption(ctx, model_path)
+        report_interruption(ctx, model_path, cluster)
     charts = draw_search(result.report, model_path)
     if quiet:
         return

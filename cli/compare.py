@@ -15,7 +15,7 @@ from clsplat.splats.color import BLACK
 from clsplat.training.presets import PRESETS
 from clsplat.training.stored_run import load_recorded_scene
 
-from .comparison_options import check_device, cluster_option, comparison_sections, grid_options
+from .comparison_options import check_devices_of_runs, cluster_option, comparison_sections, grid_options
 from .options import (
     PATH,
     TrainingCommand,
@@ -105,7 +105,7 @@ def compare_systems(
     from clsplat.comparison.compare import compare
     from clsplat.comparison.table import HEAD, cells, notes, summarise
 
-    check_device(values.get("device"), cluster)
+    check_devices_of_runs(values.get("device"), cluster)
     methods = parse_methods(systems)
     common, loaded = options_and_scenes(ctx, scenes, methods, values)
     with TrainingDisplay(quiet) as display:

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
+from clsplat.device.specs import count_devices
 from clsplat.training.config import TrainConfig
 
 from .options import PATH, Numbers
@@ -24,6 +25,13 @@ def check_device(device: str | None, cluster: str | None) -> None:
     """Refuse `--device` beside workers of other programs, which have devices of their own."""
     if device is not None and cluster is not None and not cluster.startswith("local"):
         raise click.UsageError("--device has no effect here: each worker has its own (clsplat worker --device)")
+
+
+def check_devices_of_runs(device: str | None, cluster: str | None) -> None:
+    """Refuse several devices, as each run of a comparison has one; and `--device` as `check_device` does."""
+    check_device(device, cluster)
+    if count_devices(device) > 1:
+        raise click.UsageError("--device: each run has one device: name one, or give --cluster local:N")
 
 
 def comparison_sections(*others: str) -> dict[str, tuple[str, ...]]:

@@ -11,7 +11,7 @@ from clsplat.comparison.methods import parse_methods
 from clsplat.splats.shapes import DEFAULT_SHAPE, SHAPES
 
 from .compare import distinct_numbers, options_and_scenes, report_run
-from .comparison_options import check_device, cluster_option, comparison_sections, grid_options
+from .comparison_options import check_devices_of_runs, cluster_option, comparison_sections, grid_options
 from .options import (
     PATH,
     TrainingCommand,
@@ -125,7 +125,7 @@ def draw_frontier(
         records = read_runs(output)
         write_report(output, [*records, *more], reference=methods[0].label)
     else:
-        check_device(values.get("device"), cluster)
+        check_devices_of_runs(values.get("device"), cluster)
         common, loaded = options_and_scenes(ctx, scenes, methods, values)
         with TrainingDisplay(quiet) as display:
             records = sweep(

@@ -74,3 +74,5 @@ def lod(
     click.echo(table(("distance", "splats", "of all", "ms", "ms, whole", "PSNR [dB]"), lines))
     for file in found.files:
         click.echo(str(file))
+    if output is not None and not found.files:
+        click.echo("no files: these splats have a single level")

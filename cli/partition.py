@@ -12,7 +12,7 @@ from clsplat.scenes.options import READING_OPTIONS
 from clsplat.training.config import TrainConfig
 from clsplat.training.stored_run import load_recorded_scene
 
-from .blocks import blocks_options, given_blocks, partition_table, report_interruption
+from .blocks import blocks_options, given_blocks, partition_table, report_interruption, warn_of_single_model
 from .options import (
     PATH,
     TrainingCommand,
@@ -25,7 +25,7 @@ from .options import (
     quiet_option,
     split_options,
 )
-from .progress import TrainingDisplay
+from .progress import TrainingDisplay, resume_command
 
 
 @click.command(
@@ -79,6 +79,7 @@ def partition(
         raise InputError("name the blocks: --blocks 2x2")
     config = TrainConfig(**config_values(ctx, values))
     options = blocks(config)
+    warn_of_single_model(config)
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
     loaded = load_recorded_scene(scene, reading, config.background)
     try:
@@ -88,6 +89,4 @@ def partition(
         report_interruption(ctx, model_path)
     if not quiet:
         click.echo(partition_table(found))
-        click.echo(
-            f"{model_path / PICTURE}: the blocks from above; to train them: clsplat train --resume -m {model_path}"
-        )
+        click.echo(f"{model_path / PICTURE}: the blocks from above; to train them: {resume_command(model_path)}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -14,7 +16,12 @@ from clsplat.training.progress import TrainingDisplay
 if TYPE_CHECKING:
     from clsplat.evaluation.evaluate import Evaluation
 
-__all__ = ["TrainingDisplay", "ViewCount", "activity_line", "duration", "report_test_views", "table"]
+__all__ = ["TrainingDisplay", "ViewCount", "activity_line", "duration", "report_test_views", "resume_command", "table"]
+
+
+def resume_command(model: Path, cluster: str | None = None) -> str:
+    """Return the command that continues a training, quoted for a shell."""
+    return shlex.join(["clsplat", "train", "--resume", "-m", str(model), *(["--cluster", cluster] if cluster else [])])
 
 
 class ViewCount:

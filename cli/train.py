@@ -40,7 +40,7 @@ from .options import (
     split_options,
     warn_without_effect,
 )
-from .progress import TrainingDisplay, activity_line, duration, report_test_views
+from .progress import TrainingDisplay, activity_line, duration, report_test_views, resume_command
 from .reconstruct import scene_of_photos
 from .view import addresses, server_options
 
@@ -213,7 +213,7 @@ def train(
     path = scene or source_path
     if path is None and not (resume and model_path):
         raise click.UsageError("give the scene's folder")
-    search, blocks_for = search_options(values), given_blocks(values)
+    search, blocks_for = search_options(values), given_blocks(values, resume)
     if blocks_for is not None and (view or search is not None):
         raise click.UsageError("--blocks is for one model of a large scene: remove --view and --budget")
     if count_devices(values.get("device")) > 1 and (blocks_for is not None or search is not None):
@@ -333,7 +333,8 @@ def _viewer(
 
 def report_interruption(ctx: click.Context, model: Model) -> NoReturn:
     """Print how to continue after Ctrl-C or another signal, and exit."""
-    command = f"clsplat train --resume -m {model.path}"
+    assert model.path is not None
+    command = resume_command(model.path)
     click.echo(f"stopped at iteration {model.iteration}, checkpoint saved; to continue: {command}", err=True)
     ctx.exit(exit_code())
 

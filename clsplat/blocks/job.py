@@ -56,10 +56,8 @@ def train_block(
     """
     inside, context = Splats.load(job.folder / INSIDE), Splats.load(job.folder / CONTEXT)
     exposures = exposures_of_start(str(job.folder / START)) if job.config.appearance.exposure else {}
-    scene = replace(scene, background=job.config.background)  # the run may have chosen another one
-    prepared = with_block_targets(
-        with_photos(scene, job.config), inside, context, Renderer(device), job.uncovered, exposures
-    )
+    scene = with_photos(replace(scene, background=job.config.background), job.config)  # as the run decided
+    prepared = with_block_targets(scene, inside, context, Renderer(device), job.uncovered, exposures)
     return train_in_folder(job.config.replace(device=device), prepared, folder, context, progress, visit)
 
 

@@ -25,6 +25,7 @@ from ..cluster.job import Job
 from ..cluster.pool import WorkerPool, check_cluster
 from ..cluster.training import marked, train_in_folder
 from ..compression.prune_and_refine import Part, fine_tuning
+from ..device.specs import count_devices
 from ..errors import InputError, OutputError, Remedy
 from ..files.lock import folder_lock
 from ..files.real_path import real_path
@@ -42,6 +43,7 @@ from ..training.initialise import FROM_POINTS
 from ..training.log import Progress
 from ..training.options.density import Adc
 from ..training.stages import StepReports
+from ..training.stored_run import DAMAGE
 from .job import CONTEXT, INSIDE, RUN, START, BlockJob, train_block, train_block_on_worker
 from .partition import Partition, make_partition, surroundings
 from .picture import write_picture
@@ -131,7 +133,7 @@ def _begin(
     """Return the state of a training, new or resumed, and a function that makes its stages."""
     config = config or TrainConfig()
     folder, state = ModelFolder(output), BlocksState(Path(output))
-    check_options(config)
+    check_options(config, options)
     if resume:
         state.load()
         config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
@@ -153,8 +155,12 @@ def _begin(
     return state, lambda cluster: _Stages(scene, config, options, progress, state, folder, cluster)
 
 
-def check_options(config: TrainConfig) -> None:
+def check_options(config: TrainConfig, options: BlocksOptions) -> None:
     """Raise InputError for options that a training in blocks cannot have."""
+    if count_devices(config.device) > 1:
+        raise InputError(f"device {config.device}: blocks share runs, not photos, among devices: name one device")
+    if config.cap_max < options.count:
+        raise InputError(f"cap_max {config.cap_max}: less than a splat for each of {options.count} blocks: raise it")
     if config.validation.validate:
         raise InputError("validate: each block has other photos: leave --validate out")
     if config.start.init not in FROM_POINTS:
@@ -192,11 +198,17 @@ class _Stages:
             self.train_coarse()
         if "partition" not in self.state.values:
             self.divide()
-        return Partition.from_json(self.state.values["partition"])
+        try:
+            return Partition.from_json(self.state.values["partition"])
+        except DAMAGE as error:
+            raise InputError(f"{self.state.path}: damaged ({error!r}): start again with --overwrite") from None
 
     def coarse(self) -> Splats:
         """Return the coarse model."""
-        return Splats.load(self.state.run_folder("coarse").latest_ply()[0])
+        folder = self.state.run_folder("coarse")
+        if not folder.iterations():
+            raise InputError(f"{folder.path}: the coarse model is gone: start again with --overwrite")
+        return Splats.load(folder.latest_ply()[0])
 
     def train_coarse(self) -> None:
         """Make the coarse model."""
@@ -221,7 +233,7 @@ class _Stages:
         """
         coarse = self.coarse()
         blocks = [block for block in partition.blocks if block.views]
-        cap = self.config.cap_max // self.options.count
+        cap = self.config.cap_max // max(len(blocks), 1)
         self.steps.tell(3, f"{len(blocks)} blocks with at most {cap} splats, {self.config.iterations} iterations each")
         cell = partition.cells.of(coarse.mean)
         around = surroundings(self.scene, coarse, Renderer(self.config.device), partition)

@@ -30,8 +30,10 @@ def check_cluster(address: str | None, device: str | None) -> None:
     """Raise what `WorkerPool` raises, before a long stage that needs no workers yet. None stands for no cluster."""
     if address is None:
         return
-    if ClusterAddress.parse(address).is_local:
-        distributed()  # its workers start later
+    place = ClusterAddress.parse(address)
+    if place.is_local:
+        distributed()
+        plan_workers([device], place.workers, local=True)  # they start later
         return
     with WorkerPool(address, device):
         pass
@@ -262,7 +264,8 @@ class _Round:
 
     def _gone(self) -> ClusterError:
         return ClusterError(
-            f"{self.place}: the scheduler is gone: finished runs are kept, so start it and give the same command again"
+            f"{self.place}: the scheduler is gone: finished runs are kept, so start it and give the same command again "
+            "(clsplat train needs --resume for that)"
         )
 
     def _on_event(self, event: tuple[float, Any]) -> None:

@@ -46,7 +46,7 @@ class DetailLevels:
     """
 
     def __init__(self, splats: Splats, levels: int = LEVELS) -> None:
-        if not 1 <= levels <= MAX_LEVELS:
+        if levels not in range(1, MAX_LEVELS + 1):
             raise InputError(f"{levels} levels of detail: choose 1 to {MAX_LEVELS}")
         self.splats = splats
         gaussians = splats if splats.shape == GAUSSIAN.name else nearest_gaussians(splats)
@@ -83,7 +83,13 @@ class DetailLevels:
         Parameters
         ----------
         pixels : largest distance of merged centres in the image [px]; 0 draws the model itself.
+
+        Raises
+        ------
+        InputError : `pixels` is negative or not a number.
         """
+        if not pixels >= 0:
+            raise InputError(f"detail {pixels}: give a number of pixels, at least 0")
         outside = np.maximum(np.maximum(self._low - camera.position, camera.position - self._high), 0.0)
         depth = np.maximum(np.linalg.norm(outside, axis=1), 1e-12)
         fits = self.distances * max(camera.fx, camera.fy) <= pixels * depth
@@ -121,7 +127,9 @@ class DetailLevels:
         return self._last[1]
 
     def whole(self, level: int) -> Splats:
-        """Return the whole model at one level."""
+        """Return the whole model at one level, 0 to the last. Raise InputError for another number."""
+        if level not in range(len(self)):
+            raise InputError(f"level {level}: the model has the levels 0 to {len(self) - 1}")
         return self.at(np.full(self.counts.shape[1], level))
 
     def seen(self, camera: Camera, pixels: float) -> Splats:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..cameras.make_path import PathRequest
+from ..errors import InputError, OutputError
 from ..files.existing import refuse_existing
 from ..rendering.renderer import Renderer
 from .detail import LEVELS, DetailLevels
@@ -77,14 +79,27 @@ def model_levels(
     InputError : the model does not exist, or the number of levels is out of range.
     OutputError : a file exists or cannot be written.
     """
-    files = [] if output is None else [Path(output) / f"level_{number}.ply" for number in range(1, levels)]
-    refuse_existing(files, overwrite)
     loaded = model_at(model, iteration)
+    if not len(loaded.splats):
+        raise InputError(f"{loaded.ply}: has no splats to merge: choose another model")
     found = DetailLevels(loaded.splats, levels)
-    if output is not None and overwrite:
-        for file in Path(output).glob("level_*.ply"):  # of more levels than there are now
-            file.unlink()
-    files = files[: len(found) - 1]
+    if output is None:
+        return ModelLevels(loaded, found, ())
+    existing = {number: file for file in Path(output).glob("level_*.ply") if (number := _number(file))}
+    for file in existing.values():
+        if file.samefile(loaded.ply):
+            raise OutputError(f"{file}: is the model itself: choose another folder")
+    files = [Path(output) / f"level_{number}.ply" for number in range(1, len(found))]
+    refuse_existing(dict.fromkeys([*files, *existing.values()]), overwrite)
     for number, file in enumerate(files, 1):
         found.whole(number).save(file)
+    for number, file in existing.items():
+        if number >= len(found):  # of more levels than there are now
+            file.unlink()
     return ModelLevels(loaded, found, tuple(files))
+
+
+def _number(file: Path) -> int:
+    """Return the number in the name of a level's file; 0 for another file."""
+    found = re.fullmatch(r"level_([1-9]\d*)\.ply", file.name)
+    return int(found[1]) if found else 0

@@ -21,7 +21,9 @@ from .view import StoredView, View
 
 FloatImage = NDArray[np.float32]
 
-SPREAD = 4  # largest difference of a pixel from the colour, of 255: photos have noise
+SPREAD = 4  # largest difference of a pixel from the colour, of 255
+_NOISY_SPREAD = 12  # the same in a photo with noise, such as the traces of JPEG beside outlines
+_NOISY = 0.9  # pixels that nearly have the colour in a photo with noise, for each pixel of the outline; without, some
 _REACH = 2  # px from a mixed pixel, or from a hole, to pixels that may be the pure object
 _CONTRAST = 50.0  # smallest distance of the object from the colour, 0 to 441, by which a mixture is resolved
 _RING_SHARE = 0.9  # of the pixels around a hole that are the object for sure
@@ -60,20 +62,28 @@ def cut_out(view: View, color: Color) -> View:
     """
     if view.alpha is not None or view.mask is not None:
         return view
-    pixel = np.rint(255.0 * np.asarray(color)).astype(np.int16)
-    low, high = (np.clip(pixel + step, 0, 255).astype(np.uint8) for step in (-SPREAD, SPREAD))
-    image = np.asarray(view.image)
-    difference = image.astype(np.float32) - pixel.astype(np.float32)
+    difference = np.asarray(view.image).astype(np.float32) - np.rint(255.0 * np.asarray(color)).astype(np.float32)
     contrast = np.einsum("ijk,ijk->ij", difference, difference)
-    empty = _background(np.all((image >= low) & (image <= high), axis=2), contrast)
+    empty = _background(_alike(np.abs(difference).max(axis=2)), contrast)
     alpha = np.where(empty, np.uint8(0), np.uint8(255))
     _set_mixed(alpha, empty, difference, contrast)
     return View(view.name, view.camera, view.image, None, alpha)
 
 
+def _alike(difference: FloatImage) -> Mask:
+    """Return which pixels have the colour but for noise. difference : (H, W), the largest one of a pixel's channels."""
+    from scipy.ndimage import binary_dilation  # lazy: a slow import
+
+    alike: Mask = difference <= SPREAD
+    outline = binary_dilation(alike, _CORNERS) & ~alike
+    if np.count_nonzero(alike & (difference > 0)) > _NOISY * np.count_nonzero(outline):
+        alike = difference <= _NOISY_SPREAD
+    return alike
+
+
 def _background(alike: Mask, contrast: FloatImage) -> Mask:
     """Return which of the pixels with the background's colour are background, (H, W)."""
-    from scipy.ndimage import binary_dilation, label, maximum_filter  # lazy: a slow import
+    from scipy.ndimage import binary_dilation, label, maximum_filter
 
     regions, n_regions = label(alike)
     wider = maximum_filter(regions, 2 * _REACH + 1)

@@ -19,6 +19,7 @@ from .posed_images import PosedImages
 
 # Largest distance from the origin in units of the scene's size. Beyond it, training in float32 loses image quality.
 FAR = 1e4
+_ROUNDING = 1e-14  # of the distance from the origin: places closer than this are one place
 _LOST = 1e10  # beyond this distance, float64 has lost the scene, too
 
 
@@ -91,8 +92,10 @@ def size_of(posed: PosedImages) -> float:
 def _spread(xyz: NDArray[np.float64]) -> float:
     if not len(xyz):
         return 0.0
+    middle = np.median(xyz, axis=0)
     with np.errstate(over="ignore"):  # outliers may be at any distance
-        return float(np.median(np.abs(xyz - np.median(xyz, axis=0)).max(axis=1)))
+        spread = float(np.median(np.abs(xyz - middle).max(axis=1)))
+    return 0.0 if spread <= _ROUNDING * np.abs(middle).max() else spread
 
 
 def _ratio(centre: NDArray[np.float64], size: float) -> float:

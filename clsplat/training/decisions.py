@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Any
 from ..cameras.seen import mean_share_seen, sampled
 from ..device.device import open_device
 from ..device.specs import count_devices, first_device
-from ..scenes.cut_out import SPREAD, share_cut_out
+from ..scenes.cut_out import share_cut_out
 from ..splats.color import BLACK
 from ..splats.low_pass import LOW_PASS, PIXEL
 from ..splats.shapes import PLAIN_SHAPE
@@ -239,8 +239,7 @@ def for_background(scene: Scene, config: TrainConfig) -> tuple[dict[str, Any], l
         chosen["background"] = color
         reasons.append(f"a background of {','.join(f'{part:.2g}' for part in color)}, because all photos end in it")
     background = chosen.get("background", config.background)
-    plain = color is not None and max(abs(a - b) for a, b in zip(color, background, strict=True)) <= SPREAD / 255
-    if not named.get("cut_background", plain):
+    if not named.get("cut_background", color is not None):
         return chosen, reasons, 0.0
     share = share_cut_out(scene.train[:: -(-len(scene.train) // CUT_VIEWS)], background)
     if "cut_background" not in named:

@@ -54,13 +54,19 @@ class StagesState:
 
     def check(self, config: TrainConfig, options: Any) -> None:
         """Raise InputError unless the training was started with these options."""
-        stored = TrainConfig.from_json(self.values["config"]).to_json() | self.values["options"]
-        for key, value in (config.to_json() | asdict(options)).items():
+        before = self.described(self.OPTIONS(**self.values["options"]))
+        stored = TrainConfig.from_json(self.values["config"]).to_json() | before
+        for key, value in (config.to_json() | self.described(options)).items():
             if key not in FREE_OPTIONS and stored.get(key) != value:
                 raise InputError(
                     f"{self.path}: --resume with {key}={value}, but the {self.NAME} was started with "
                     f"{key}={stored.get(key)}: use the same options, or --overwrite to start again"
                 )
+
+    @staticmethod
+    def described(options: Any) -> dict[str, Any]:
+        """Return the options as messages call them."""
+        return asdict(options)
 
     def put(self, stage: str, value: Any) -> None:
         """Store the result of a finished stage."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -264,7 +265,7 @@ def test_what_cannot_be_resumed_or_replaced(finished: BlocksModel, scene: Scene,
     with pytest.raises(InputError, match="blocks\\.json"):
         train_in_blocks(scene, TWO, CONFIG, output=tmp_path / "new", resume=True)
     partition_scene(scene, TWO, CONFIG, output=tmp_path)
-    with pytest.raises(InputError, match="--resume with columns=3, but the training was started with columns=2"):
+    with pytest.raises(InputError, match="--resume with blocks=3x1, but the training was started with blocks=2x1"):
         train_in_blocks(scene, BlocksOptions(3, 1, 8), CONFIG, output=tmp_path, resume=True)
     (tmp_path / "blocks.json").write_text('{"config": {}, "options": {}, "scene": {}}')
     with pytest.raises(InputError, match=r"blocks\.json: damaged"):
@@ -323,3 +324,65 @@ def test_a_missing_cluster_is_said_at_once(
 def test_options_that_blocks_cannot_have(scene: Scene, tmp_path: Path, options: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=f"^{next(iter(options))}.*leave --"):
         train_in_blocks(scene, TWO, TrainConfig(**options), output=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ((2, 2, 1.5), "polish of blocks: 1.5"),
+        ((2, 2, -3), "polish of blocks: -3"),
+        ((2, -1), "rows of blocks: -1"),
+        ((2.0, 2), "columns of blocks: 2.0"),
+        ((0, 2), "columns of blocks: 0"),
+        ((1000, 1), "columns of blocks: 1000; give a whole number, 1 to 64"),
+        ((1, 1), "at least two"),
+    ],
+)
+def test_blocks_that_cannot_be(values: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        BlocksOptions(*values)
+
+
+def test_options_that_blocks_cannot_have_are_refused_before_the_first_stage(scene: Scene, tmp_path: Path) -> None:
+    for config, message in (
+        (CONFIG.replace(device="cpu/2"), "device cpu/2: blocks share runs, not photos"),
+        (CONFIG.replace(cap_max=1), "less than a splat for each of 2 blocks"),
+    ):
+        with pytest.raises(InputError, match=message):
+            partition_scene(scene, TWO, config, output=tmp_path / "model")
+    assert not (tmp_path / "model").exists()
+    with pytest.raises(InputError, match="start fewer"):
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path / "model", cluster="local:999")
+    assert not (tmp_path / "model").exists()
+
+
+def test_blocks_that_no_photo_shows_leave_their_share_of_the_cap_to_the_others(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    partition_scene(scene, TWO, CONFIG, output=tmp_path)
+    file = tmp_path / "blocks.json"
+    values = json.loads(file.read_text())
+    values["partition"]["blocks"][1]["views"] = []
+    file.write_text(json.dumps(values))
+    train_in_blocks(scene, TWO, CONFIG, lambda at: told.append(at.message or ""), output=tmp_path, resume=True)
+    assert any("1 blocks with at most 120 splats" in text for text in told)
+
+
+def test_damaged_stages_are_one_line(scene: Scene, tmp_path: Path) -> None:
+    partition_scene(scene, TWO, CONFIG, output=tmp_path)
+    file = tmp_path / "blocks.json"
+    good = file.read_text()
+    for damage in ("views", "rows"):
+        values = json.loads(good)
+        if damage == "views":
+            del values["partition"]["blocks"][0]["views"]
+        else:
+            values["partition"]["cells"]["rows"] = [1.0, 2.0, 3.0]
+        file.write_text(json.dumps(values))
+        with pytest.raises(InputError, match=r"blocks\.json: damaged .*--overwrite"):
+            train_in_blocks(scene, TWO, CONFIG, output=tmp_path, resume=True)
+    file.write_text(good)
+    shutil.rmtree(tmp_path / "blocks" / "coarse" / "point_cloud")
+    with pytest.raises(InputError, match="the coarse model is gone: start again with --overwrite"):
+        train_in_blocks(scene, TWO, CONFIG, output=tmp_path, resume=True)

@@ -39,3 +39,20 @@ def test_mistakes_are_one_line(scene: Path, tmp_path: Path) -> None:
     assert "remove --view and --budget" in error_of(*arguments, "--blocks", "2x2", "--budget", "auto", code=2)
     assert "name the blocks" in error_of("partition", scene, "-m", tmp_path / "m")
     assert not (tmp_path / "m").exists()
+
+
+def test_what_has_no_effect_and_what_cannot_change(scene: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "Mäp dir"
+    said = run("partition", scene, "-m", folder, "--blocks", "2x1", "--save-iterations", "6,12", *TINY)
+    assert "--save-iterations has no effect with --blocks" in said.stderr
+    assert f"clsplat train --resume -m '{folder}'" in said.stdout
+    assert "--polish stays as it was" in error_of("train", "--resume", "-m", folder, "--polish", "5", code=2)
+
+
+def test_several_devices(scene: Path, tmp_path: Path) -> None:
+    words = ("partition", scene, "-m", tmp_path / "m", "--blocks", "2x1", "--device", "cpu/2", *TINY)
+    assert "name one device" in error_of(*words)
+    for command in ("compare", "frontier"):
+        words = (command, scene, "-o", tmp_path / command, "--device", "0:0,1:0", "--iterations", "2")
+        assert "each run has one device" in error_of(*words, code=2)
+        assert not (tmp_path / command).exists()

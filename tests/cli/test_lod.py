@@ -34,6 +34,34 @@ def test_a_file_alone_is_seen_from_around(model_folder: Path, tmp_path: Path) ->
     assert run("lod", file, "-q").stdout == ""
 
 
+def test_other_files_and_the_model_itself_stay(model_folder: Path, tmp_path: Path) -> None:
+    (ply,) = model_folder.glob("point_cloud/iteration_40/*.ply")
+    names = ("level_0.ply", "level_backup.ply", "level_1.ply", "level_9.ply")
+    for name in names:
+        (tmp_path / name).write_bytes(ply.read_bytes())
+    message = error_of("lod", tmp_path / "level_1.ply", "-o", tmp_path, "--overwrite")
+    assert "level_1.ply: is the model itself: choose another folder" in message
+    assert all((tmp_path / name).read_bytes() == ply.read_bytes() for name in names)
+    run("lod", tmp_path / "level_0.ply", "-o", tmp_path, "--levels", "3", "--overwrite")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "level_0.ply",
+        "level_1.ply",
+        "level_2.ply",
+        "level_backup.ply",
+    ]
+    assert all((tmp_path / name).read_bytes() == ply.read_bytes() for name in names[:2])
+
+
+def test_models_of_no_splat_and_of_one(model_folder: Path, tmp_path: Path) -> None:
+    (ply,) = model_folder.glob("point_cloud/iteration_40/*.ply")
+    splats = Splats.load(ply)
+    splats.select(np.arange(0)).save(tmp_path / "none.ply")
+    splats.select(np.arange(1)).save(tmp_path / "one.ply")
+    assert "none.ply: has no splats to merge" in error_of("lod", tmp_path / "none.ply")
+    said = run("lod", tmp_path / "one.ply", "-o", tmp_path / "levels").stdout.splitlines()
+    assert said[-1] == "no files: these splats have a single level"
+
+
 def test_images_with_levels_of_detail(model_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(detail, "_LEAF", 8)  # else the cameras are inside the only part
     for name, flags in (("all", ()), ("none", ("--detail", "0")), ("coarse", ("--detail", "50"))):

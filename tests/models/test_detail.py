@@ -165,3 +165,16 @@ def test_measures() -> None:
 def test_numbers_of_levels(count: int) -> None:
     with pytest.raises(InputError, match=f"{count} levels of detail: choose 1 to {MAX_LEVELS}"):
         DetailLevels(wall(), levels=count)
+
+
+def test_levels_that_cannot_be() -> None:
+    splats = wall()
+    levels = DetailLevels(splats, 3)
+    for level in (-1, 99, 0.5):
+        with pytest.raises(InputError, match="the model has the levels 0 to"):
+            levels.whole(level)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="levels of detail: choose 1 to 12"):
+        DetailLevels(splats, 2.5)  # type: ignore[arg-type]
+    for pixels in (-1.0, float("nan")):
+        with pytest.raises(InputError, match="give a number of pixels, at least 0"):
+            levels.seen(before_wall(3.0), pixels)

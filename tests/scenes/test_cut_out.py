@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from typing import cast
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from clsplat.cameras.camera import Camera
-from clsplat.scenes.cut_out import cut_out, with_cut_outs
+from clsplat.scenes.cut_out import SPREAD, cut_out, with_cut_outs
 from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.view import StoredView
 from clsplat.splats.fields import DoubleArray
@@ -63,6 +65,26 @@ def test_noise_of_the_background_is_cut_out() -> None:
     alpha, rng = disc((48.0, 48.0), 25.0), np.random.default_rng(0)
     pixels = over((0.8, 0.8, 0.8), alpha, texture()) + rng.integers(-3, 4, (SIDE, SIDE, 3))
     assert np.all(opacity(view_of(pixels), (0.8, 0.8, 0.8))[alpha == 0] == 0)
+
+
+@pytest.mark.parametrize("quality", [75, 90])
+def test_traces_of_jpeg_are_cut_out(quality: int) -> None:
+    alpha = disc((50.3, 44.8), 30.0) * (1 - disc((55.0, 48.0), 9.5))
+    image = np.asarray(view_of(over(WHITE, alpha, texture())).image)
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "JPEG", quality=quality)
+    photo = np.array(Image.open(file))
+    assert np.count_nonzero(np.abs(photo.astype(int) - 255).max(axis=2)[alpha == 0] > SPREAD) > 100, "traces"
+    found = opacity(replace(view_of(texture()), image=photo), WHITE)
+    assert np.mean(found[alpha == 0] == 0) > 0.97
+    assert np.abs(found - alpha).mean() < 0.02
+
+
+def test_a_pale_object_without_noise_stays() -> None:
+    """Its colours are within the noise of JPEG files, but this photo does not have any."""
+    alpha = disc((48.0, 48.0), 30.0)
+    pale = np.full((SIDE, SIDE, 3), 247.0)
+    assert np.all(opacity(view_of(over(WHITE, alpha, pale)), WHITE)[alpha == 1] == 1)
 
 
 def test_a_highlight_that_fades_stays() -> None:

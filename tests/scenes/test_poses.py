@@ -7,16 +7,21 @@ import re
 import struct
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from cli_runner import clsplat, error_of, run
+from scipy.spatial.transform import Rotation
 from small_scene import as_text, cloud, model_views, moved, photo_of, write_garden, write_model
 
 from clsplat.errors import InputError
 from clsplat.files.images import write_png
 from clsplat.scenes.colmap import read_model
 from clsplat.scenes.colmap_binary import write_binary_model
+from clsplat.scenes.origin import camera_centres, size_of
+from clsplat.scenes.posed_images import PosedImages
 from clsplat.scenes.scene import load_scene
 
 
@@ -128,6 +133,16 @@ def test_a_camera_far_from_the_scene_is_named(garden: Path) -> None:
     write_model(garden, poses)
     with pytest.warns(UserWarning, match=r"times the size of the scene .*; its image loses sharpness in float32"):
         load_scene(garden)
+
+
+def test_cameras_in_one_place_away_from_the_origin() -> None:
+    """Their centres differ by rounding, which is not the size of a scene."""
+    turns = [Rotation.from_euler("zyx", [0.7 * index, 0.3 * index, 0.1]).as_matrix() for index in range(9)]
+    poses = [np.vstack([np.c_[turn, -turn @ (3.6, 0.1, 0.7)], [0, 0, 0, 1]]) for turn in turns]
+    photos = [SimpleNamespace(cam_from_world=pose) for pose in poses]
+    posed = cast(PosedImages, SimpleNamespace(points=SimpleNamespace(xyz=np.zeros((0, 3))), photos=photos))
+    assert np.ptp(camera_centres(posed), axis=0).max() > 0
+    assert size_of(posed) == 1
 
 
 def test_cameras_far_from_their_points_are_named(garden: Path) -> None:
