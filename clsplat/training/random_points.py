@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 SEEN_BY = 2  # smallest number of cameras that see a point: one camera alone does not determine its place
 CENTRAL_SHARE = 0.75  # half of the points are in the region that this share of the cameras sees, if it exists
 HULL_SHARE = 0.25  # share of the cameras that see a point of the visual hull: cones that few cameras see are empty
+OBJECT_SHARE = 0.5  # the same around an object: below it, only cones reach out of the photos
 _FEWEST = 0.01  # of the points: if fewer are found in the visual hull, the silhouettes contradict each other
 _BOX_POINTS = 4096  # points of the hull that are enough to know its box
 _BOX_MARGIN = 0.1  # of the box's sides, for what these points do not reach
@@ -97,16 +98,16 @@ def _in_hull(sight: _Sight, silhouettes: Silhouettes, count: int, rng: np.random
     landscape without its sky, gets points of the contracted space. The hull of few photos reaches farther, too, behind
     the object, but fills little of that space. Such an object gets points in the box around the near part of the hull.
     """
-    min_cameras = max(sight.min_cameras, HULL_SHARE * len(sight.cameras))
 
-    def kept(drawn: DoubleArray) -> DoubleArray:
-        drawn = drawn[silhouettes.admit(drawn)]  # first, because it soon leaves few points
-        return drawn[sight.cameras_seeing(drawn) >= min_cameras]
+    def seen_by(share: float, drawn: DoubleArray) -> DoubleArray:
+        return drawn[sight.cameras_seeing(drawn) >= max(sight.min_cameras, share * len(sight.cameras))]
 
-    def gather(draw: Callable[[], DoubleArray], enough: int, draws: int) -> DoubleArray:
+    def gather(draw: Callable[[], DoubleArray], enough: int, draws: int, share: float = HULL_SHARE) -> DoubleArray:
         points = np.zeros((0, 3))
         for _ in range(draws):
-            points = np.concatenate([points, kept(draw())])
+            drawn = draw()
+            drawn = drawn[silhouettes.admit(drawn)]  # first, because it soon leaves few points
+            points = np.concatenate([points, seen_by(share, drawn)])
             if len(points) >= enough:
                 break
         return points[:enough]
@@ -119,9 +120,14 @@ def _in_hull(sight: _Sight, silhouettes: Silhouettes, count: int, rng: np.random
         spread = gather(lambda: sight.draw(count, rng), count, _DRAWS)
         if len(spread) >= _SPREAD_SHARE * count or 2 * len(near) < len(found):
             return spread
+    central = seen_by(OBJECT_SHARE, near)
+    if len(central) >= _FEWEST * len(near):
+        near, share = central, OBJECT_SHARE
+    else:
+        share = HULL_SHARE
     low, high = near.min(axis=0), near.max(axis=0)
     margin = _BOX_MARGIN * (high - low)
-    return gather(lambda: rng.uniform(low - margin, high + margin, (count, 3)), count, _HULL_DRAWS)
+    return gather(lambda: rng.uniform(low - margin, high + margin, (count, 3)), count, _HULL_DRAWS, share)
 
 
 def _in_sight(sight: _Sight, count: int, rng: np.random.Generator) -> DoubleArray:
