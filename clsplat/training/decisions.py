@@ -59,6 +59,7 @@ FEW_POINTS = 0.05  # fewer points than this share of the cap are few
 PENALTY = 0.005  # weight of the mean opacity in a run with splats that start at random and adc
 RANDOM_SHARE = 0.05  # share of the cap that starts at random places beside the scene's points
 RANDOM_SHARE_OF_FEW = 0.1  # the same, if the scene has fewer points than this share
+RANDOM_SHARE_OF_VERY_FEW = 0.5  # the same, if it has so few that the start counts as random (FEW_POINTS)
 FEW_VIEWS = 12  # with more training views, a short run loses more by dropout than it gains
 FEW_FOR_LONG_RUN = 18  # the same for a longer run, which fits each photo more closely
 VERY_FEW_VIEWS = 6  # with more training views, random points beside the scene's gain more than they cost
@@ -259,6 +260,8 @@ def share_beside(scene: Scene, config: TrainConfig, transparent: bool) -> float:
     n_points = len(scene.points.xyz)
     if config.start.init != "sfm" or n_points < MIN_POINTS or len(scene.train) <= VERY_FEW_VIEWS:
         return 0.0
+    if n_points < FEW_POINTS * config.cap_max:
+        return RANDOM_SHARE_OF_VERY_FEW
     if n_points < RANDOM_SHARE_OF_FEW * config.cap_max:
         return RANDOM_SHARE_OF_FEW
     return 0.0 if transparent else RANDOM_SHARE

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..scenes.view import View
     from .config import TrainConfig
 
-LARGE_SPREAD = 0.8  # stops; captures with one exposure have 0.1 to 0.5
+LARGE_SPREAD = 0.6  # stops; captures with one exposure have 0.1 to 0.5
 _VIEWS = 32  # largest number of photos that are looked at
 _GAMMA = 2.2  # of photos: stops are factors of light, not of pixels
 _DARK, _BRIGHT = 8, 247  # pixels outside have lost their brightness
@@ -35,18 +35,16 @@ def exposure_hint(scene: Scene, config: TrainConfig) -> str | None:
 def exposure_spread(views: Sequence[View], points: Points) -> float | None:
     """Return the standard deviation of the photos' exposures [stops]; None if too few photos show enough points.
 
-    A photo's exposure is the median factor between its pixels at the points and the points' own colours.
+    A photo's exposure is the median factor between its pixels at the points and the points' own colours, in each
+    channel. The result is that of the channel that differs most: casts of colour are exposures, too.
     """
-    xyz, colors = sampled(points.xyz), sampled(points.rgb.astype(np.float64)).mean(axis=1)
+    xyz, colors = sampled(points.xyz), sampled(points.rgb.astype(np.float64))
     stops = []
     for view in views[:: -(-len(views) // _VIEWS)]:
         found = seen(view.camera, xyz)
         column, row = found.pixel[found.inside].astype(np.int64).T
-        shown, known = (
-            np.asarray(view.loaded().image)[row, column].astype(np.float64).mean(axis=1),
-            colors[found.inside],
-        )
-        sound = (np.minimum(shown, known) > _DARK) & (np.maximum(shown, known) < _BRIGHT)
+        shown, known = np.asarray(view.loaded().image)[row, column].astype(np.float64), colors[found.inside]
+        sound = ((np.minimum(shown, known) > _DARK) & (np.maximum(shown, known) < _BRIGHT)).all(axis=1)
         if np.count_nonzero(sound) >= _FEWEST_POINTS:
-            stops.append(_GAMMA * float(np.median(np.log2(shown[sound] / known[sound]))))
-    return float(np.std(stops)) if len(stops) >= _FEWEST_PHOTOS else None
+            stops.append(_GAMMA * np.median(np.log2(shown[sound] / known[sound]), axis=0))
+    return float(np.std(stops, axis=0).max()) if len(stops) >= _FEWEST_PHOTOS else None

@@ -18,6 +18,7 @@ from ..splats.near_plane import NEAR_PLANE
 from ..splats.shapes import DEFAULT_SHAPE, shape_named
 from ..splats.splats import Splats
 from .near_plane import check_near_plane
+from .point_colors import with_colors
 from .random_points import random_points
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ FROM_POINTS = ("sfm", "random")  # starts that are not the path of a file
 RANDOM_POINTS = 100_000  # 3DGS
 _MOST_CELLS = 4096  # of the grid of `best_observed`, per unit of length; contracted space has 4 units
 _KEY = 4 * _MOST_CELLS + 1  # more than the number of cells in a direction
+DENSE = 10  # points for each splat of the cap: clouds of scanners and of multi-view stereo
 MIN_POINTS = 4  # the first scale needs a point and its three neighbours
 
 
@@ -137,18 +139,19 @@ def _points(
     scene: Scene, init: str, cap: int, rng: np.random.Generator, random_share: float | None
 ) -> tuple[Array, NDArray[np.uint8], str]:
     """Return the positions and colours of the first points, and the message."""
-    points = scene.points
+    points = with_colors(scene.points, scene.train)
     n_points = len(points.xyz)
     apart = distinct(points.xyz)
     if init == "sfm" and len(apart) >= MIN_POINTS:
         xyz, rgb, tracks = points.xyz[apart], points.rgb[apart], points.track_length[apart]
         n_random = min(round((random_share or 0.0) * cap), cap - 1)
+        colored = "" if points is scene.points else ", with colours of the photos"
         if len(apart) <= cap - n_random:
-            message = f"{len(apart)} splats from the scene's points"
+            message = f"{len(apart)} splats from the scene's points{colored}"
         else:
             keep = best_observed(xyz, tracks, cap - n_random, scene)
             which = "spread among" if all_equal(tracks) else "the best observed of"
-            message = f"{cap - n_random} splats from the scene's points: {which} {len(apart)}"
+            message = f"{cap - n_random} splats from the scene's points: {which} {len(apart)}{colored}"
             xyz, rgb = xyz[keep], rgb[keep]
         if not n_random:
             return xyz, rgb, message
@@ -191,8 +194,8 @@ def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene
     Half of them are the points with the longest tracks in the cells of a grid. The others have the longest of the
     remaining tracks. By track length alone, all points could come from a textured surface, and none from the
     background. If all tracks are equal, as in files of points without tracks, all come from the grid: the order of
-    a file may be that of a scanner. Space is contracted around the cameras (Barron et al. 2022, Mip-NeRF 360, eq. 10),
-    so that far points share larger cells.
+    a file may be that of a scanner. So do those of a dense cloud, whose longest tracks are all in one place. Space is
+    contracted around the cameras (Barron et al. 2022, Mip-NeRF 360, eq. 10), so that far points share larger cells.
     """
     centres = np.array([view.camera.position for view in scene.train])
     from_centre = (xyz - centres.mean(axis=0)) / scene.extent
@@ -200,7 +203,8 @@ def best_observed(xyz: Array, track_length: NDArray[np.integer], cap: int, scene
     contracted = np.where(norm > 1, from_centre / norm * (2 - 1 / norm), from_centre)
     # The sort is stable: equal tracks stay in the order of their indices.
     order = np.argsort(-track_length.astype(np.int64), kind="stable")
-    n_spread = cap if all_equal(track_length) else max(cap // 2, 1)
+    is_dense = len(xyz) > DENSE * cap
+    n_spread = cap if all_equal(track_length) or is_dense else max(cap // 2, 1)
     low, high = 1.0, float(_MOST_CELLS)  # cells per unit of length
     first = order[:0]
     for _ in range(24):

@@ -18,6 +18,7 @@ from .decisions import as_decided, decide
 from .exposure_hint import exposure_hint
 from .extension import fitting_checkpoint
 from .folder import ModelFolder
+from .frame_hint import frame_hint
 from .initialise import check_init
 from .log import Progress
 from .model import Model
@@ -72,8 +73,9 @@ def train(
         folder.prepare()
     if checkpoint is None:
         config = decide(scene, config).tell(progress)
-        if progress is not None and (hint := exposure_hint(scene, config)) is not None:
-            progress(Progress.note(hint, config.iterations))
+        if progress is not None:
+            for hint in filter(None, (exposure_hint(scene, config), frame_hint(scene))):
+                progress(Progress.note(hint, config.iterations))
     with folder_lock(None if folder is None else folder.path):
         trainer = Trainer(scene, config, checkpoint, progress, context=context)
         if folder is not None:

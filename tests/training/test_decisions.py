@@ -25,11 +25,13 @@ from clsplat.training.config import TrainConfig
 from clsplat.training.decisions import (
     DROPOUT,
     FEW_FOR_LONG_RUN,
+    FEW_POINTS,
     FEW_VIEWS,
     FEWEST_ITERATIONS,
     PENALTY,
     RANDOM_SHARE,
     RANDOM_SHARE_OF_FEW,
+    RANDOM_SHARE_OF_VERY_FEW,
     RANDOM_START_RATES,
     SHORT_RUN,
     SMALL_DROPOUT,
@@ -95,8 +97,16 @@ def test_good_points_and_opaque_photos_need_no_decision(scene: Scene) -> None:
 
 
 def test_some_points_are_random_beside_good_ones(scene: Scene) -> None:
-    """A twentieth of the cap, or a tenth if the scene has fewer points. A penalty on opacity removes needless ones."""
-    for cap, share in ((len(scene.points), RANDOM_SHARE), (int(len(scene.points) / RANDOM_SHARE_OF_FEW) + 9, 0.1)):
+    """A twentieth of the cap, a tenth if the scene has fewer points, half of it if it has very few.
+
+    A penalty on opacity removes needless ones.
+    """
+    n_points = len(scene.points)
+    for cap, share in (
+        (n_points, RANDOM_SHARE),
+        (int(n_points / RANDOM_SHARE_OF_FEW) + 9, 0.1),
+        (int(n_points / FEW_POINTS) - 9, 0.1),
+    ):
         config = options_of(cap_max=cap)
         decision = decide(scene, config)
         assert decision.config == config.replace(random_points=share, opacity_reg=PENALTY)
@@ -179,7 +189,7 @@ def test_test_and_validation_views_do_not_count(scene: Scene) -> None:
 def test_random_starts_and_few_points(scene: Scene, options: dict[str, Any]) -> None:
     """Transparent photos get the strategy that relocates, other photos a penalty on opacity."""
     start = scene if options else without_points(scene)
-    beside = {"random_points": RANDOM_SHARE_OF_FEW} if "cap_max" in options else {}
+    beside = {"random_points": RANDOM_SHARE_OF_VERY_FEW} if "cap_max" in options else {}
     config = options_of(opacity_lr=0.07, **options)
     assert decide(start, config).config == config.replace(opacity_reg=PENALTY, **beside)
     seen = transparent(start, 0.5)

@@ -41,6 +41,17 @@ def test_the_spread_is_in_stops(scene: Scene, stops: float) -> None:
     assert spread == pytest.approx(stops, rel=0.25, abs=0.05)
 
 
+def test_a_cast_of_colour_is_an_exposure(scene: Scene) -> None:
+    """Half of the photos have less blue, so that their brightness hardly differs."""
+    views = []
+    for number, view in enumerate(scene.views):
+        image = np.asarray(view.image).astype(np.float64)
+        image[..., 2] *= 0.6 ** (number % 2)
+        views.append(View(view.name, view.camera, np.rint(image).astype(np.uint8)))
+    spread = exposure_spread(replace(scene, views=views).train, scene.points)
+    assert spread == pytest.approx(2.2 * -np.log2(0.6) / 2, rel=0.2)
+
+
 def test_a_run_says_it_once_and_not_with_the_option(scene: Scene) -> None:
     messages: list[str] = []
     uneven = exposed(scene, 1.5)

@@ -92,6 +92,18 @@ def test_points_without_tracks_are_spread_over_the_scene() -> None:
     assert np.bincount(np.searchsorted(edges, splats.mean[:, 0]), minlength=4).min() >= 15
 
 
+@pytest.mark.parametrize(("cap", "is_dense"), [(39, True), (41, False)])
+def test_dense_clouds_are_spread_over_the_scene(cap: int, is_dense: bool) -> None:
+    """Their longest tracks are all in one place, so they say little about the other places."""
+    source = scene(400)
+    source.points.xyz[:200] *= 0.01
+    source.points.track_length[:] = np.where(np.arange(400) < 200, 9, 2)
+    splats, _ = initial_splats(source, cap=cap)
+    near = np.abs(splats.mean).max(axis=1) <= np.abs(source.points.xyz[:200]).max()
+    assert (near.mean() < 0.3) == is_dense
+    assert (near.mean() >= 0.5) != is_dense
+
+
 @pytest.mark.parametrize(("init", "n_points"), [("random", 50), ("sfm", 0), ("sfm", 3)])
 def test_scenes_without_points_start_at_random(init: str, n_points: int) -> None:
     splats, message = initial_splats(scene(n_points), cap=3000, init=init)

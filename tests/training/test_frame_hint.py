@@ -1,0 +1,83 @@
+"""Pixels that never change get a hint if the scene goes on there; backgrounds of objects and usual photos do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clsplat.scenes.colmap import Points
+from clsplat.scenes.scene import Scene, View
+from clsplat.training.config import TrainConfig
+from clsplat.training.frame_hint import frame_hint, still_pixels
+from clsplat.training.log import Progress
+from clsplat.training.run import train
+
+
+def barred(scene: Scene, rows: int = 4, color: int = 0, transparent: bool = False) -> Scene:
+    """Return the scene with bars above and below in all photos."""
+    views = []
+    for view in scene.views:
+        image = np.asarray(view.image).copy()
+        alpha = np.full(image.shape[:2], 255, np.uint8)
+        for part in (slice(None, rows), slice(-rows, None)):
+            image[part], alpha[part] = color, 0
+        views.append(View(view.name, view.camera, image, None, alpha if transparent else None))
+    return replace(scene, views=views)
+
+
+@pytest.mark.parametrize("color", [0, 90])
+def test_bars(scene: Scene, color: int) -> None:
+    hint = frame_hint(barred(scene, color=color))
+    assert hint is not None
+    assert "22% of the pixels are the same in all photos, but points of the scene lie there" in hint
+    assert hint.endswith("leave them out with masks, or crop the photos")
+
+
+def test_transparent_rims(scene: Scene) -> None:
+    hint = frame_hint(barred(scene, transparent=True))
+    assert hint is not None
+    assert "22% of the pixels are transparent in all photos" in hint
+    assert hint.endswith("the option alpha=mask leaves them out")
+
+
+def test_what_gets_no_hint(scene: Scene) -> None:
+    assert frame_hint(scene) is None, "usual photos"
+    assert frame_hint(barred(scene, rows=14)) is None, "most of the photo: a background"
+    nothing = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
+    assert frame_hint(replace(barred(scene), points=nothing)) is None
+    bars, middle = barred(scene), scene.points.xyz.copy()
+    middle[:] = np.median(middle, axis=0) + 0.01 * (middle - np.median(middle, axis=0))
+    assert frame_hint(replace(bars, points=replace(scene.points, xyz=middle))) is None, "no point lies in the bars"
+    assert frame_hint(replace(bars, views=bars.train[:4], test_names=frozenset())) is None, "few photos agree by chance"
+    masked = []
+    for view in bars.views:
+        mask = np.ones(view.image.shape[:2], np.bool_)
+        mask[:4], mask[-4:] = False, False
+        masked.append(replace(view, mask=mask))
+    assert frame_hint(replace(bars, views=masked)) is None, "they are left out already"
+
+
+def test_still_pixels_are_those_that_vary_by_noise_only(scene: Scene) -> None:
+    rng = np.random.default_rng(0)
+    views = []
+    for view in barred(scene, color=100).train:
+        noisy = np.asarray(view.image).astype(int)
+        noisy[:4] += rng.integers(-2, 3, noisy[:4].shape)
+        views.append(View(view.name, view.camera, np.clip(noisy, 0, 255).astype(np.uint8)))
+    still, is_empty = still_pixels(views)
+    assert not is_empty
+    assert still[:4].all()
+    assert still[-4:].all()
+    assert still[4:-4].mean() < 0.05
+
+
+def test_a_run_says_it_once(scene: Scene) -> None:
+    said: list[str] = []
+
+    def hear(progress: Progress) -> None:
+        said.append(progress.message)
+
+    train(barred(scene), TrainConfig(iterations=3, cap_max=50, sh_degree=0), hear)
+    assert sum("are the same in all photos" in message for message in said) == 1
