@@ -49,9 +49,9 @@ def frame_hint(scene: Scene) -> str | None:
         within += int(np.count_nonzero(still[row, column]))
     if within < _FEWEST_POINTS or not _LEAST <= within / inside <= _MOST:
         return None
-    said = "transparent" if is_empty else "the same"
+    kind = "transparent" if is_empty else "the same"
     remedy = "the option alpha=mask leaves them out" if is_empty else "leave them out with masks, or crop the photos"
-    return f"{still.mean():.0%} of the pixels are {said} in all photos, but points of the scene lie there: {remedy}"
+    return f"{still.mean():.0%} of the pixels are {kind} in all photos, but points of the scene lie there: {remedy}"
 
 
 def still_pixels(photos: Sequence[View]) -> tuple[Mask, bool]:
