@@ -136,7 +136,7 @@ class LoadedModel:
             eval=test_names is None,
             background=self.background if background is None else background,
             masks=choice.masks or record.get("masks"),
-            alpha=choice.alpha or record.get("alpha", ALPHA_USES[0]),
+            alpha=choice.alpha or record.get("alpha") or ALPHA_USES[0],
             read_photos=False,
             origin=origin,
         )

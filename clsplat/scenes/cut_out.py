@@ -10,14 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..files.masks import Mask
 from ..splats.color import Color
-from .scene import Scene
 from .view import StoredView, View
+
+if TYPE_CHECKING:
+    from .scene import Scene
 
 FloatImage = NDArray[np.float32]
 

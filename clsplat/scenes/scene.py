@@ -37,10 +37,13 @@ from .pose_checks import (
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
 from .read_view import PhotoReader, read_views
 from .scene_files import SCENE_ENDINGS, described_by
+from .still_pixels import VIEWS, pixels_before_scene
 from .view import View
 from .wrong_folder import describe_file, scene_hint
 
 __all__ = ["Points", "Scene", "View", "load_scene"]
+
+_OPAQUE_FILES = (".jpg", ".jpeg")  # endings of files without transparency
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +125,7 @@ def load_scene(
     eval: bool = True,
     background: Color = BLACK,
     masks: str | None = None,
-    alpha: str = ALPHA_USES[0],
+    alpha: str | None = None,
     read_photos: bool = True,
     only: Collection[str] | None = None,
     origin: Sequence[float] | None = None,
@@ -148,7 +151,8 @@ def load_scene(
     masks : folder of masks inside the scene (see files/masks.py), or "none" for no masks. By default "masks" if it
         exists, and the masks named in transforms.json.
     alpha : use of a photo's transparency. "background" composites the photo over the background; "mask" masks out
-        pixels that are less than half opaque.
+        pixels that are less than half opaque. By default it is "background", but "mask" if the same pixels are
+        transparent in all photos and points lie there: rims that undistortion leaves without data.
     read_photos : whether to decode the training photos now and keep them. Photos of test views, or all of them, are
         decoded at each use instead (`View.loaded`).
     only : names of the photos to read, for a part of a large scene. The files of the others are not opened, except for
@@ -169,7 +173,7 @@ def load_scene(
         Fewer than a quarter of the photos can be used, no training view is left, or memory is too small.
     """
     root = Path(path)
-    if alpha not in ALPHA_USES:
+    if alpha is not None and alpha not in ALPHA_USES:
         raise InputError(f"alpha {alpha!r}: choose one of {', '.join(ALPHA_USES)}")
     check_resolution(resolution)
     posed = read_posed_images(root, images, origin)
@@ -177,6 +181,8 @@ def load_scene(
     test_names = select_test_names(posed, test_every, test_list) if eval else frozenset()
     mask_of = find_masks(root, posed, masks)
     photos = [photo for photo in posed.photos if only is None or photo.name in only]
+    if alpha is None:
+        alpha = _use_of_alpha(root, posed, resolution, background)
     decoded = [read_photos and photo.name not in test_names for photo in photos]
     sizes = [posed.sizes[photo.name] for photo, now in zip(photos, decoded, strict=True) if now]
     check_memory(root, sizes, resolution)
@@ -237,6 +243,34 @@ def load_scene(
     )
 
 
+def _use_of_alpha(root: Path, posed: PosedImages, resolution: int, background: Color) -> str:
+    """Return what the transparency of the photos means, one of ALPHA_USES, and warn if it means that data is missing.
+
+    The photos of all views are looked at, so that a part of a scene is read as the whole.
+    """
+    some = [photo for photo in posed.photos if posed.files[photo.name].suffix.lower() not in _OPAQUE_FILES]
+    if not some or not len(posed.points):
+        return ALPHA_USES[0]
+    views = []
+    for photo in some[:: -(-len(some) // VIEWS)]:
+        file, size = posed.files[photo.name], posed.sizes[photo.name]
+        view = PhotoReader(photo, file, size, resolution, background, None, False).read()
+        if isinstance(view, View):
+            if view.alpha is None:
+                return ALPHA_USES[0]
+            views.append(view)
+    found = pixels_before_scene(views, posed.points.xyz)
+    if found is None:
+        return ALPHA_USES[0]
+    warnings.warn(
+        f"{root}: {found.share:.0%} of the pixels are transparent in all photos, but points of the scene lie there: "
+        'they are left out as pixels without data (alpha "mask"); with alpha "background" they are the background of '
+        "an object",
+        stacklevel=3,
+    )
+    return ALPHA_USES[1]
+
+
 def _warn_of_copies(root: Path, digests: Mapping[str, str], test_names: Collection[str]) -> None:
     """Warn if training photos are copies of test photos: the metrics would be those of training. digests : by name."""
     trained = {digest: name for name, digest in digests.items() if name not in test_names}
@@ -256,10 +290,10 @@ def _files_of(name: str, posed: PosedImages, mask_of: Mapping[str, Path]) -> lis
 
 
 def _reading(*, eval: bool, **arguments: Any) -> dict[str, Any]:
-    """Return a record of `load_scene`'s arguments: None for default values, and always a value of `eval`."""
+    """Return a record of `load_scene`'s arguments: None for default values, and always values of `eval` and `alpha`."""
     parameters = inspect.signature(load_scene).parameters
     record = {name: None if value == parameters[name].default else value for name, value in arguments.items()}
-    return record | {"eval": bool(eval)}
+    return record | {"eval": bool(eval), "alpha": arguments["alpha"]}
 
 
 def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, Path]:

@@ -1,75 +1,22 @@
-"""A hint for pixels that are the same in all photos, although the scene goes on there.
-
-Bars of a video, rims that undistortion leaves without data, watermarks and the bonnet of a car are such pixels. A run
-learns them as a part of the scene, right in front of each camera. Nothing behind an object is such a place: no points
-of the scene are there.
-"""
+"""A hint for pixels that are the same in all photos, which a run learns as a part of the scene."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from ..cameras.seen import sampled, seen
-from ..files.masks import Mask
-from ..scenes.cut_out import SPREAD
+from ..scenes.still_pixels import pixels_before_scene
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
-    from ..scenes.view import View
-
-_VIEWS = 32  # largest number of photos that are looked at
-_FEWEST_VIEWS = 6  # fewer photos may agree by chance
-_FEWEST_POINTS = 50  # points in all photos together, in the pixels that do not change
-_LEAST, _MOST = 0.01, 0.3  # of a photo, and of the points in it: less is harmless, more is the background of an object
-_EMPTY = 8  # largest alpha of a pixel without data
 
 
 def frame_hint(scene: Scene) -> str | None:
     """Return a sentence if the photos have pixels that never change, although points of the scene lie there."""
-    sizes = Counter((view.camera.width, view.camera.height) for view in scene.train)
-    if not len(scene.points) or not sizes:
+    found = pixels_before_scene(scene.train, scene.points.xyz)
+    if found is None:
         return None
-    size, count = sizes.most_common(1)[0]
-    views = [view for view in scene.train if (view.camera.width, view.camera.height) == size]
-    if count < _FEWEST_VIEWS:
-        return None
-    still, is_empty = still_pixels([view.loaded() for view in views[:: -(-count // _VIEWS)]])
-    if not _LEAST <= still.mean() <= _MOST:
-        return None
-    xyz = sampled(scene.points.xyz)
-    inside, within = 0, 0
-    for view in views:
-        found = seen(view.camera, xyz)
-        column, row = found.pixel[found.inside].astype(np.int64).T
-        inside += len(row)
-        within += int(np.count_nonzero(still[row, column]))
-    if within < _FEWEST_POINTS or not _LEAST <= within / inside <= _MOST:
-        return None
-    kind = "transparent" if is_empty else "the same"
-    remedy = "the option alpha=mask leaves them out" if is_empty else "leave them out with masks, or crop the photos"
-    return f"{still.mean():.0%} of the pixels are {kind} in all photos, but points of the scene lie there: {remedy}"
-
-
-def still_pixels(photos: Sequence[View]) -> tuple[Mask, bool]:
-    """Return the pixels that are transparent in all photos, or else of one colour, (H, W), and whether it is the first.
-
-    Parameters
-    ----------
-    photos : views of one size, in memory. Pixels that a mask hides in any of them do not count.
-    """
-    counted: Mask = np.ones(photos[0].image.shape[:2], np.bool_)
-    for photo in photos:
-        if photo.mask is not None:
-            counted &= photo.mask
-    alphas = [photo.alpha for photo in photos if photo.alpha is not None]
-    if len(alphas) == len(photos):
-        return counted & (np.max(alphas, axis=0) <= _EMPTY), True
-    low, high = photos[0].image.copy(), photos[0].image.copy()
-    for photo in photos[1:]:
-        np.minimum(low, photo.image, out=low)
-        np.maximum(high, photo.image, out=high)
-    return counted & ((high - low).max(axis=2) <= SPREAD), False
+    kind = "transparent" if found.is_empty else "the same"
+    remedy = (
+        "the option alpha=mask leaves them out" if found.is_empty else "leave them out with masks, or crop the photos"
+    )
+    return f"{found.share:.0%} of the pixels are {kind} in all photos, but points of the scene lie there: {remedy}"

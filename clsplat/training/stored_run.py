@@ -53,6 +53,7 @@ class StoredRun:
             raise InputError("scene.path is missing")
         scene["path"] = str(folder / scene["path"])
         scene.setdefault("photos", {})
+        scene.setdefault("alpha", ALPHA_USES[0])  # runs of earlier versions
         return cls(read_options(values["config"]), scene)
 
     @property

@@ -1,0 +1,83 @@
+"""Pixels that are the same in all photos, although the scene goes on there.
+
+Bars of a video, rims that undistortion leaves without data, watermarks and the bonnet of a car are such pixels. A run
+learns them as a part of the scene, right in front of each camera. Nothing behind an object is such a place: no points
+of the scene are there.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..cameras.seen import sampled, seen
+from ..files.masks import Mask
+from ..splats.fields import DoubleArray
+from .cut_out import SPREAD
+from .view import View
+
+VIEWS = 32  # largest number of photos that are looked at
+_FEWEST_VIEWS = 6  # fewer photos may agree by chance
+_FEWEST_POINTS = 50  # points in all photos together, in the pixels that do not change
+_LEAST, _MOST = 0.01, 0.3  # of a photo, and of the points in it: less is harmless, more is the background of an object
+_EMPTY = 8  # largest alpha of a pixel without data
+
+
+class StillPixels(NamedTuple):
+    """Pixels that never change: their share of a photo, 0 to 1, and whether they are transparent."""
+
+    share: float
+    is_empty: bool
+
+
+def pixels_before_scene(views: Sequence[View], xyz: DoubleArray) -> StillPixels | None:
+    """Return the pixels that never change where points of the scene lie; None if there are hardly any, or too many.
+
+    Parameters
+    ----------
+    views : those of the commonest size are looked at, at most 32 of them. xyz : points of the scene (P, 3).
+    """
+    sizes = Counter((view.camera.width, view.camera.height) for view in views)
+    if not len(xyz) or not sizes:
+        return None
+    size, count = sizes.most_common(1)[0]
+    alike = [view for view in views if (view.camera.width, view.camera.height) == size]
+    if count < _FEWEST_VIEWS:
+        return None
+    still, is_empty = still_pixels([view.loaded() for view in alike[:: -(-count // VIEWS)]])
+    if not _LEAST <= still.mean() <= _MOST:
+        return None
+    some = sampled(xyz)
+    inside, within = 0, 0
+    for view in alike:
+        found = seen(view.camera, some)
+        column, row = found.pixel[found.inside].astype(np.int64).T
+        inside += len(row)
+        within += int(np.count_nonzero(still[row, column]))
+    if within < _FEWEST_POINTS or not _LEAST <= within / inside <= _MOST:
+        return None
+    return StillPixels(float(still.mean()), is_empty)
+
+
+def still_pixels(photos: Sequence[View]) -> tuple[Mask, bool]:
+    """Return the pixels that are transparent in all photos, or else of one colour, (H, W), and whether it is the first.
+
+    Parameters
+    ----------
+    photos : views of one size, in memory. Pixels that a mask hides in any of them do not count.
+    """
+    counted: Mask = np.ones(photos[0].image.shape[:2], np.bool_)
+    for photo in photos:
+        if photo.mask is not None:
+            counted &= photo.mask
+    alphas = [photo.alpha for photo in photos if photo.alpha is not None]
+    if len(alphas) == len(photos):
+        return counted & (np.max(alphas, axis=0) <= _EMPTY), True
+    low, high = photos[0].image.copy(), photos[0].image.copy()
+    for photo in photos[1:]:
+        np.minimum(low, photo.image, out=low)
+        np.maximum(high, photo.image, out=high)
+    return counted & ((high - low).max(axis=2) <= SPREAD), False
