@@ -1,4 +1,4 @@
-"""Pixels that never change: found where the scene goes on, and left out by themselves if they are transparent."""
+"""Pixels that never change: found where the scene goes on, and left out automatically if they are transparent."""
 
 from __future__ import annotations
 
