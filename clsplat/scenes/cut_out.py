@@ -9,8 +9,6 @@ matting with a known background (Smith and Blinn, Blue Screen Matting, 1996).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +16,6 @@ from numpy.typing import NDArray
 from ..files.masks import Mask
 from ..splats.color import Color
 from .view import StoredView, View
-
-if TYPE_CHECKING:
-    from .scene import Scene
 
 FloatImage = NDArray[np.float32]
 
@@ -35,20 +30,14 @@ _WORKING_BYTES = 48  # of a pixel, while a photo is cut out
 _CORNERS = np.ones((3, 3), np.bool_)  # neighbours of a pixel, also those at its corners
 
 
-def with_cut_outs(scene: Scene, color: Color) -> Scene:
-    """Return the scene with `cut_out` for its training views. Photos that are not in memory follow when decoded."""
-    trained = {view.name for view in scene.train}
-    views = [_lazily_cut_out(view, color) if view.name in trained else view for view in scene.views]
-    return replace(scene, views=views)
-
-
 def share_cut_out(views: Sequence[View], color: Color) -> float:
     """Return the share of the pixels of photos, 0 to 1, that `cut_out` makes transparent. Each photo counts alike."""
     shares = [np.mean(view.alpha == 0) for photo in views if (view := cut_out(photo.loaded(), color)).alpha is not None]
     return float(np.mean(shares)) if shares else 0.0
 
 
-def _lazily_cut_out(view: View, color: Color) -> View:
+def cut_out_when_read(view: View, color: Color) -> View:
+    """Return the view with `cut_out`. A photo that is not in memory is cut out when it is decoded."""
     if isinstance(view, StoredView):
         nbytes = _WORKING_BYTES * view.camera.width * view.camera.height
         return view.changed(lambda photo: cut_out(photo, color), nbytes)

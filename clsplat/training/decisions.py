@@ -36,7 +36,6 @@ from typing import TYPE_CHECKING, Any
 from ..cameras.seen import mean_share_seen, sampled
 from ..device.device import open_device
 from ..device.specs import count_devices, first_device
-from ..scenes.cut_out import share_cut_out
 from ..splats.color import BLACK
 from ..splats.low_pass import LOW_PASS, PIXEL
 from ..splats.shapes import PLAIN_SHAPE
@@ -242,6 +241,8 @@ def for_background(scene: Scene, config: TrainConfig) -> tuple[dict[str, Any], l
     background = chosen.get("background", config.background)
     if not named.get("cut_background", color is not None):
         return chosen, reasons, 0.0
+    from ..scenes.cut_out import share_cut_out  # lazy: it loads an image library, which would slow down --help
+
     share = share_cut_out(scene.train[:: -(-len(scene.train) // CUT_VIEWS)], background)
     if "cut_background" not in named:
         if share < CUT_SHARE:

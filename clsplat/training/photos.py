@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from ..scenes.cut_out import with_cut_outs
+from dataclasses import replace
+
+from ..scenes.cut_out import cut_out_when_read
 from ..scenes.read_view import keep_photos
 from ..scenes.scene import Scene
+from ..splats.color import Color
 from .config import TrainConfig
 
 
@@ -19,3 +22,10 @@ def with_photos(scene: Scene, config: TrainConfig) -> Scene:
         scene = with_cut_outs(scene, config.background)
     keep_photos(scene.train)
     return scene
+
+
+def with_cut_outs(scene: Scene, color: Color) -> Scene:
+    """Return the scene with training views that are cut out from a background of this colour, each part 0 to 1."""
+    trained = {view.name for view in scene.train}
+    views = [cut_out_when_read(view, color) if view.name in trained else view for view in scene.views]
+    return replace(scene, views=views)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..scenes.cut_out import SPREAD
 from ..splats.color import Color
 from ..splats.fields import DoubleArray
 
@@ -31,12 +30,14 @@ def plain_background(views: Sequence[View]) -> Color | None:
     views : training views. At most 32 of them are read, evenly spread. If one of them has transparent or masked
         pixels, these are the background, and the result is None.
     """
+    from ..scenes.cut_out import SPREAD  # lazy: it loads an image library
+
     found: list[DoubleArray] = []
     for view in views[:: -(-len(views) // _VIEWS)]:
         photo = view.loaded()
         if photo.alpha is not None or photo.mask is not None:
             return None
-        found.append(_side_color(np.asarray(photo.image)))
+        found.append(_side_color(np.asarray(photo.image), SPREAD))
     colors = np.array(found).reshape(-1, 3)
     plain = colors[np.isfinite(colors).all(axis=1)]
     if not len(plain):
@@ -48,9 +49,12 @@ def plain_background(views: Sequence[View]) -> Color | None:
     return red, green, blue
 
 
-def _side_color(image: np.ndarray) -> DoubleArray:
-    """Return the colour of the outermost pixels of an image (H, W, 3), 0 to 255; NaN if they have several."""
+def _side_color(image: np.ndarray, spread: int) -> DoubleArray:
+    """Return the colour of the outermost pixels of an image (H, W, 3), 0 to 255; NaN if they have several.
+
+    spread : largest difference of a pixel that has the colour.
+    """
     sides = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).astype(np.float64)
     color = np.median(sides, axis=0)
-    alike = np.abs(sides - color).max(axis=1) <= SPREAD
+    alike = np.abs(sides - color).max(axis=1) <= spread
     return np.asarray(color if alike.mean() >= _SHARE else np.full(3, np.nan))

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..cameras.seen import seen
-from ..scenes.colmap import Points
 
 if TYPE_CHECKING:
+    from ..scenes.colmap import Points
     from ..scenes.view import View
 
 _VIEWS = 32  # largest number of photos that are looked at

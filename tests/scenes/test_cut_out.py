@@ -11,10 +11,11 @@ import pytest
 from PIL import Image
 
 from clsplat.cameras.camera import Camera
-from clsplat.scenes.cut_out import SPREAD, cut_out, with_cut_outs
+from clsplat.scenes.cut_out import SPREAD, cut_out
 from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.view import StoredView
 from clsplat.splats.fields import DoubleArray
+from clsplat.training.photos import with_cut_outs
 
 SIDE = 96
 WHITE, BLACK, GREEN = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.8, 0.2)
