@@ -38,7 +38,7 @@ from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left
 from .read_view import PhotoReader, read_views
 from .scene_files import SCENE_ENDINGS, described_by
 from .still_pixels import VIEWS, pixels_before_scene
-from .view import View
+from .view import StoredView, View
 from .wrong_folder import describe_file, scene_hint
 
 __all__ = ["Points", "Scene", "View", "load_scene"]
@@ -251,15 +251,15 @@ def _use_of_alpha(root: Path, posed: PosedImages, resolution: int, background: C
     some = [photo for photo in posed.photos if posed.files[photo.name].suffix.lower() not in _OPAQUE_FILES]
     if not some or not len(posed.points):
         return ALPHA_USES[0]
-    views = []
+    views: list[View] = []
     for photo in some[:: -(-len(some) // VIEWS)]:
         file, size = posed.files[photo.name], posed.sizes[photo.name]
-        view = PhotoReader(photo, file, size, resolution, background, None, False).read()
-        if isinstance(view, View):
-            if view.alpha is None:
-                return ALPHA_USES[0]
-            views.append(view)
-    found = pixels_before_scene(views, posed.points.xyz)
+        reader = PhotoReader(photo, file, size, resolution, background, None, False)
+        views.append(StoredView(photo.name, reader.camera(), reader.view))
+    try:
+        found = None if views[0].alpha is None else pixels_before_scene(views, posed.points.xyz)
+    except InputError:  # of a photo that cannot be used: it is reported when all are read
+        found = None
     if found is None:
         return ALPHA_USES[0]
     warnings.warn(
