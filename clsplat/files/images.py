@@ -88,10 +88,10 @@ def read_image(
                 pixels = np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)
                 return pixels if opaque_size is None else resize_area(pixels, *opaque_size)
             if image.mode != "F":
-                has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
-                mode = "RGBA" if has_alpha else "RGB"
+                transparent = _is_transparent(image)
+                mode = "RGBA" if transparent else "RGB"
                 pillow = image if image.mode == mode else image.convert(mode)
-                if opaque_size is not None and not has_alpha:
+                if opaque_size is not None and not transparent:
                     pillow = _resized(pillow, *opaque_size)
                 return np.array(pillow, dtype=np.uint8)
         except Exception as error:  # decoders of damaged files raise nearly anything
@@ -142,6 +142,16 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """
     with _open(path) as image:
         return image.size
+
+
+def has_alpha(path: str | os.PathLike[str]) -> bool:
+    """Return whether an image has transparency, read from the file's header alone. Raises as `image_size`."""
+    with _open(path) as image:
+        return _is_transparent(image)
+
+
+def _is_transparent(image: Image.Image) -> bool:
+    return image.mode in _ALPHA_MODES or "transparency" in image.info
 
 
 def read_photo_header(path: str | os.PathLike[str]) -> PhotoHeader:

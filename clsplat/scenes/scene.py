@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 from ..cameras.camera import Camera
 from ..errors import InputError
 from ..files.digest import file_digest
-from ..files.images import ImageU8
+from ..files.images import ImageU8, has_alpha
 from ..files.masks import MASK_FOLDER, NO_MASKS, mask_files
 from ..files.real_path import real_path
 from ..files.whole_file import read_whole
@@ -38,12 +39,10 @@ from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left
 from .read_view import PhotoReader, read_views
 from .scene_files import SCENE_ENDINGS, described_by
 from .still_pixels import VIEWS, pixels_before_scene
-from .view import View
+from .view import StoredView, View
 from .wrong_folder import describe_file, scene_hint
 
 __all__ = ["Points", "Scene", "View", "load_scene"]
-
-_OPAQUE_FILES = (".jpg", ".jpeg")  # endings of files without transparency
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,18 +247,17 @@ def _use_of_alpha(root: Path, posed: PosedImages, resolution: int, background: C
 
     The photos of all views are looked at, so that a part of a scene is read as the whole.
     """
-    some = [photo for photo in posed.photos if posed.files[photo.name].suffix.lower() not in _OPAQUE_FILES]
-    if not some or not len(posed.points):
-        return ALPHA_USES[0]
-    views = []
-    for photo in some[:: -(-len(some) // VIEWS)]:
-        file, size = posed.files[photo.name], posed.sizes[photo.name]
-        view = PhotoReader(photo, file, size, resolution, background, None, False).read()
-        if isinstance(view, View):
-            if view.alpha is None:
-                return ALPHA_USES[0]
-            views.append(view)
-    found = pixels_before_scene(views, posed.points.xyz)
+    some = posed.photos[:: -(-len(posed.photos) // VIEWS)]
+    readers = [
+        PhotoReader(photo, posed.files[photo.name], posed.sizes[photo.name], resolution, background, None, False)
+        for photo in some
+    ]
+    found = None
+    # A photo that cannot be used is reported when all are read.
+    with suppress(InputError):
+        if len(posed.points) and all(has_alpha(reader.file) for reader in readers):
+            views = [StoredView(reader.photo.name, reader.camera(), reader.view) for reader in readers]
+            found = pixels_before_scene(views, posed.points.xyz)
     if found is None:
         return ALPHA_USES[0]
     warnings.warn(

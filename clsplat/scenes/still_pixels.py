@@ -47,7 +47,7 @@ def pixels_before_scene(views: Sequence[View], xyz: DoubleArray) -> StillPixels 
     alike = [view for view in views if (view.camera.width, view.camera.height) == size]
     if count < _FEWEST_VIEWS:
         return None
-    still, is_empty = still_pixels([view.loaded() for view in alike[:: -(-count // VIEWS)]])
+    still, is_empty = still_pixels(alike[:: -(-count // VIEWS)])
     if not _LEAST <= still.mean() <= _MOST:
         return None
     some = sampled(xyz)
@@ -62,22 +62,24 @@ def pixels_before_scene(views: Sequence[View], xyz: DoubleArray) -> StillPixels 
     return StillPixels(float(still.mean()), is_empty)
 
 
-def still_pixels(photos: Sequence[View]) -> tuple[Mask, bool]:
+def still_pixels(views: Sequence[View]) -> tuple[Mask, bool]:
     """Return the pixels that are transparent in all photos, or else of one colour, (H, W), and whether it is the first.
 
     Parameters
     ----------
-    photos : views of one size, in memory. Pixels that a mask hides in any of them do not count.
+    views : of one size. Their photos are decoded one after the other. Pixels that a mask hides in any of them do not
+        count.
     """
-    counted: Mask = np.ones(photos[0].image.shape[:2], np.bool_)
-    for photo in photos:
+    first = views[0].loaded()
+    low, high = first.image.copy(), first.image.copy()
+    counted: Mask = np.ones(low.shape[:2], np.bool_)
+    empty: Mask | None = counted.copy()  # None as soon as a photo is opaque
+    for view in views:
+        photo = view.loaded()
         if photo.mask is not None:
             counted &= photo.mask
-    alphas = [photo.alpha for photo in photos if photo.alpha is not None]
-    if len(alphas) == len(photos):
-        return counted & (np.max(alphas, axis=0) <= _EMPTY), True
-    low, high = photos[0].image.copy(), photos[0].image.copy()
-    for photo in photos[1:]:
+        empty = None if empty is None or photo.alpha is None else empty & (photo.alpha <= _EMPTY)
         np.minimum(low, photo.image, out=low)
         np.maximum(high, photo.image, out=high)
-    return counted & ((high - low).max(axis=2) <= SPREAD), False
+    still: Mask = (high - low).max(axis=2) <= SPREAD
+    return (counted & still, False) if empty is None else (counted & empty, True)
