@@ -180,11 +180,11 @@ def load_scene(
     test_names = select_test_names(posed, test_every, test_list) if eval else frozenset()
     mask_of = find_masks(root, posed, masks)
     photos = [photo for photo in posed.photos if only is None or photo.name in only]
-    if alpha is None:
-        alpha = _use_of_alpha(root, posed, resolution, background)
     decoded = [read_photos and photo.name not in test_names for photo in photos]
     sizes = [posed.sizes[photo.name] for photo, now in zip(photos, decoded, strict=True) if now]
     check_memory(root, sizes, resolution)
+    if alpha is None:
+        alpha = _use_of_alpha(root, posed, resolution, background)
     readers = [
         PhotoReader(
             photo,
