@@ -82,15 +82,17 @@ def model_levels(
     loaded = model_at(model, iteration)
     if not len(loaded.splats):
         raise InputError(f"{loaded.ply}: has no splats to merge: choose another model")
-    found = DetailLevels(loaded.splats, levels)
-    if output is None:
-        return ModelLevels(loaded, found, ())
-    existing = {number: file for file in Path(output).glob("level_*.ply") if (number := _number(file))}
+    folder = None if output is None else Path(output)
+    listed = [] if folder is None else folder.glob("level_*.ply")
+    existing = {number: file for file in listed if (number := _number(file))}
     for file in existing.values():
-        if file.samefile(loaded.ply):
+        if file.exists() and file.samefile(loaded.ply):
             raise OutputError(f"{file}: is the model itself: choose another folder")
-    files = [Path(output) / f"level_{number}.ply" for number in range(1, len(found))]
-    refuse_existing(dict.fromkeys([*files, *existing.values()]), overwrite)
+    refuse_existing(existing.values(), overwrite)
+    found = DetailLevels(loaded.splats, levels)
+    if folder is None:
+        return ModelLevels(loaded, found, ())
+    files = [folder / f"level_{number}.ply" for number in range(1, len(found))]
     for number, file in enumerate(files, 1):
         found.whole(number).save(file)
     for number, file in existing.items():
