@@ -351,6 +351,10 @@ def test_options_that_blocks_cannot_have_are_refused_before_the_first_stage(scen
         with pytest.raises(InputError, match=message):
             partition_scene(scene, TWO, config, output=tmp_path / "model")
     assert not (tmp_path / "model").exists()
+
+
+def test_too_many_workers_are_refused_before_the_first_stage(scene: Scene, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
     with pytest.raises(InputError, match="start fewer"):
         train_in_blocks(scene, TWO, CONFIG, output=tmp_path / "model", cluster="local:999")
     assert not (tmp_path / "model").exists()
