@@ -78,7 +78,6 @@ def run_blocks(
     """Train in blocks with a live display, and print the result."""
     warn_of_single_model(config)
     from clsplat.blocks.train import train_in_blocks
-    from clsplat.training.decisions import decide
     from clsplat.training.run import evaluate_test_views
 
     try:
@@ -112,7 +111,8 @@ def run_blocks(
     ]
     click.echo(table(head, rows))
     click.echo(f"{result.path}: {len(result.splats)} splats, {result.path.stat().st_size / 1e6:.2f} MB")
-    report_test_views(evaluate_test_views(result.splats, scene, decide(scene, config).config))
+    decided = TrainConfig.from_json(result.report["config"]).replace(device=config.device)
+    report_test_views(evaluate_test_views(result.splats, scene, decided))
 
 
 def warn_of_single_model(config: TrainConfig) -> None:

@@ -77,7 +77,6 @@ def run_search(
     """Run the search with a live display, and print its result."""
     from clsplat.comparison.search_chart import draw_search
     from clsplat.compression.search import train_budget
-    from clsplat.training.decisions import decide
     from clsplat.training.run import evaluate_test_views
 
     try:
@@ -101,7 +100,8 @@ def run_search(
         click.echo(line)
     if charts:
         click.echo(f"chart of the rounds: {', '.join(str(file) for file in charts)}")
-    report_test_views(evaluate_test_views(result.splats, scene, decide(scene, config).config))
+    decided = TrainConfig.from_json(result.report["config"]).replace(device=config.device)
+    report_test_views(evaluate_test_views(result.splats, scene, decided))
 
 
 def result_lines(result: Budgeted) -> list[str]:

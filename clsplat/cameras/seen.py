@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Camera
 
-_SAMPLED_POINTS = 2000
+_SAMPLED_POINTS, _SAMPLED_VIEWS = 2000, 32
+
+T = TypeVar("T")
 
 
 class Seen(NamedTuple):
@@ -27,6 +29,12 @@ class Seen(NamedTuple):
     pixel: NDArray[np.float64]
     inside: NDArray[np.bool_]
 
+    @property
+    def rows_and_columns(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of the pixels in which the points are, of those inside: the index into an image."""
+        column, row = self.pixel[self.inside].astype(np.int64).T
+        return row, column
+
 
 def seen(camera: Camera, xyz: NDArray[np.float64]) -> Seen:
     """Return where points (P, 3) in the world are in the image of a camera. Nothing hides them."""
@@ -41,6 +49,11 @@ def seen(camera: Camera, xyz: NDArray[np.float64]) -> Seen:
 def sampled(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return at most 2000 of the points (P, 3), evenly spread in their order: enough for what holds for all of them."""
     return xyz[:: -(-len(xyz) // _SAMPLED_POINTS) or 1]
+
+
+def sampled_views(views: Sequence[T]) -> Sequence[T]:
+    """Return at most 32 of the views or photos, evenly spread in their order: enough for what holds for all of them."""
+    return views[:: -(-len(views) // _SAMPLED_VIEWS) or 1]
 
 
 def mean_share_seen(cameras: Sequence[Camera], xyz: NDArray[np.float64]) -> float:

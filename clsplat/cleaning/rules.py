@@ -146,10 +146,9 @@ def is_outside(splats: Splats, views: Sequence[View]) -> Mask | None:
         if view.alpha is None:
             continue
         camera, widened, found = view.camera, view.alpha, True
-        _, pixel, inside = seen(camera, mean)
+        found_at = seen(camera, mean)
         size = 2 * max(round(_MARGIN * max(camera.width, camera.height)), 1) + 1
         for axis in (0, 1):
             widened = maximum_filter1d(widened, size, axis=axis, mode="constant")
-        column, row = pixel[inside].astype(np.int64).T
-        outside[inside] += widened[row, column] == 0
+        outside[found_at.inside] += widened[found_at.rows_and_columns] == 0
     return outside >= min(_OUTSIDE_VIEWS, len(views)) if found else None

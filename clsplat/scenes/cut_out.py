@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files.masks import Mask
-from ..splats.color import Color
+from ..splats.color import SPREAD, Color
 from .view import StoredView, View
 
 FloatImage = NDArray[np.float32]
 
-SPREAD = 4  # largest difference of a pixel from the colour, of 255
-_NOISY_SPREAD = 12  # the same in a photo with noise, such as the traces of JPEG beside outlines
+_NOISY_SPREAD = 12  # SPREAD in a photo with noise, such as the traces of JPEG beside outlines
 _NOISY = 0.9  # pixels that nearly have the colour in a photo with noise, for each pixel of the outline; without, some
 _REACH = 2  # px from a mixed pixel, or from a hole, to pixels that may be the pure object
 _CONTRAST = 50.0  # smallest distance of the object from the colour, 0 to 441, by which a mixture is resolved

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..cameras.camera import Camera
+from ..cameras.seen import sampled_views
 from ..errors import InputError
 from ..files.digest import file_digest
 from ..files.images import ImageU8, has_alpha
@@ -38,7 +39,7 @@ from .pose_checks import (
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
 from .read_view import PhotoReader, read_views
 from .scene_files import SCENE_ENDINGS, described_by
-from .still_pixels import VIEWS, pixels_before_scene
+from .still_pixels import pixels_before_scene
 from .view import StoredView, View
 from .wrong_folder import describe_file, scene_hint
 
@@ -247,7 +248,7 @@ def _use_of_alpha(root: Path, posed: PosedImages, resolution: int, background: C
 
     The photos of all views are looked at, so that a part of a scene is read as the whole.
     """
-    some = posed.photos[:: -(-len(posed.photos) // VIEWS)]
+    some = sampled_views(posed.photos)
     readers = [
         PhotoReader(photo, posed.files[photo.name], posed.sizes[photo.name], resolution, background, None, False)
         for photo in some

@@ -13,13 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..cameras.seen import sampled, seen
+from ..cameras.seen import sampled, sampled_views, seen
 from ..files.masks import Mask
+from ..splats.color import SPREAD
 from ..splats.fields import DoubleArray
-from .cut_out import SPREAD
 from .view import View
 
-VIEWS = 32  # largest number of photos that are looked at
 _FEWEST_VIEWS = 6  # fewer photos may agree by chance
 _FEWEST_POINTS = 50  # points in all photos together, in the pixels that do not change
 _LEAST, _MOST = 0.01, 0.3  # of a photo, and of the points in it: less is harmless, more is the background of an object
@@ -47,16 +46,15 @@ def pixels_before_scene(views: Sequence[View], xyz: DoubleArray) -> StillPixels 
     alike = [view for view in views if (view.camera.width, view.camera.height) == size]
     if count < _FEWEST_VIEWS:
         return None
-    still, is_empty = still_pixels(alike[:: -(-count // VIEWS)])
+    still, is_empty = still_pixels(sampled_views(alike))
     if not _LEAST <= still.mean() <= _MOST:
         return None
     some = sampled(xyz)
     inside, within = 0, 0
     for view in alike:
         found = seen(view.camera, some)
-        column, row = found.pixel[found.inside].astype(np.int64).T
-        inside += len(row)
-        within += int(np.count_nonzero(still[row, column]))
+        inside += int(np.count_nonzero(found.inside))
+        within += int(np.count_nonzero(still[found.rows_and_columns]))
     if within < _FEWEST_POINTS or not _LEAST <= within / inside <= _MOST:
         return None
     return StillPixels(float(still.mean()), is_empty)

@@ -33,7 +33,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from ..cameras.seen import mean_share_seen, sampled
+from ..cameras.seen import mean_share_seen, sampled, sampled_views
 from ..device.device import open_device
 from ..device.specs import count_devices, first_device
 from ..splats.color import BLACK
@@ -73,7 +73,6 @@ SKEW_OPTIONS = {"shape", "normalisation", "skew_lr", "skew_map", "alternation"} 
 SCREEN_FILTER = ("antialiased", "low_pass")
 # Decided by transparent photos, and by those that an object does not fill.
 BY_TRANSPARENCY = {"random_points", "random_background", "strategy", "background", "cut_background"}
-CUT_VIEWS = 32  # largest number of photos that are cut out to see how much remains
 CUT_SHARE = 0.2  # of the photos: a smaller background is the frame of a photo that shows more than an object
 FEWEST_ITERATIONS = 100  # shorter runs have rates that must not be raised
 _RATES = tuple(name for name in option_table(OptimConfig) if name.endswith("_lr") or name.startswith("position_lr"))
@@ -243,7 +242,7 @@ def for_background(scene: Scene, config: TrainConfig) -> tuple[dict[str, Any], l
         return chosen, reasons, 0.0
     from ..scenes.cut_out import share_cut_out  # lazy: it loads an image library, which would slow down --help
 
-    share = share_cut_out(scene.train[:: -(-len(scene.train) // CUT_VIEWS)], background)
+    share = share_cut_out(sampled_views(scene.train), background)
     if "cut_background" not in named:
         if share < CUT_SHARE:
             return chosen, reasons, 0.0

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..cameras.seen import sampled, seen
+from ..cameras.seen import sampled, sampled_views, seen
 from ..scenes.colmap import Points
 
 if TYPE_CHECKING:
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from .config import TrainConfig
 
 LARGE_SPREAD = 0.6  # stops; captures with one exposure have 0.1 to 0.5
-_VIEWS = 32  # largest number of photos that are looked at
 _GAMMA = 2.2  # of photos: stops are factors of light, not of pixels
 _DARK, _BRIGHT = 8, 247  # pixels outside have lost their brightness
 _FEWEST_POINTS, _FEWEST_PHOTOS = 20, 4  # points in a photo, and photos with as many
@@ -40,10 +39,10 @@ def exposure_spread(views: Sequence[View], points: Points) -> float | None:
     """
     xyz, colors = sampled(points.xyz), sampled(points.rgb.astype(np.float64))
     stops = []
-    for view in views[:: -(-len(views) // _VIEWS)]:
+    for view in sampled_views(views):
         found = seen(view.camera, xyz)
-        column, row = found.pixel[found.inside].astype(np.int64).T
-        shown, known = np.asarray(view.loaded().image)[row, column].astype(np.float64), colors[found.inside]
+        shown = np.asarray(view.loaded().image)[found.rows_and_columns].astype(np.float64)
+        known = colors[found.inside]
         sound = ((np.minimum(shown, known) > _DARK) & (np.maximum(shown, known) < _BRIGHT)).all(axis=1)
         if np.count_nonzero(sound) >= _FEWEST_POINTS:
             stops.append(_GAMMA * np.median(np.log2(shown[sound] / known[sound]), axis=0))

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..splats.color import Color
+from ..cameras.seen import sampled_views
+from ..splats.color import SPREAD, Color
 from ..splats.fields import DoubleArray
 
 if TYPE_CHECKING:
     from ..scenes.view import View
 
-_VIEWS = 32  # largest number of photos that are looked at
 _SHARE = 0.9  # of the pixels at the sides of a photo, and of the photos, that have the colour
 
 
@@ -30,14 +30,12 @@ def plain_background(views: Sequence[View]) -> Color | None:
     views : training views. At most 32 of them are read, evenly spread. If one of them has transparent or masked
         pixels, these are the background, and the result is None.
     """
-    from ..scenes.cut_out import SPREAD  # lazy: it loads an image library
-
     found: list[DoubleArray] = []
-    for view in views[:: -(-len(views) // _VIEWS)]:
+    for view in sampled_views(views):
         photo = view.loaded()
         if photo.alpha is not None or photo.mask is not None:
             return None
-        found.append(_side_color(np.asarray(photo.image), SPREAD))
+        found.append(_side_color(np.asarray(photo.image)))
     colors = np.array(found).reshape(-1, 3)
     plain = colors[np.isfinite(colors).all(axis=1)]
     if not len(plain):
@@ -49,12 +47,9 @@ def plain_background(views: Sequence[View]) -> Color | None:
     return red, green, blue
 
 
-def _side_color(image: np.ndarray, spread: int) -> DoubleArray:
-    """Return the colour of the outermost pixels of an image (H, W, 3), 0 to 255; NaN if they have several.
-
-    spread : largest difference of a pixel that has the colour.
-    """
+def _side_color(image: np.ndarray) -> DoubleArray:
+    """Return the colour of the outermost pixels of an image (H, W, 3), 0 to 255; NaN if they have several."""
     sides = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).astype(np.float64)
     color = np.median(sides, axis=0)
-    alike = np.abs(sides - color).max(axis=1) <= spread
+    alike = np.abs(sides - color).max(axis=1) <= SPREAD
     return np.asarray(color if alike.mean() >= _SHARE else np.full(3, np.nan))

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..cameras.seen import seen
+from ..cameras.seen import sampled_views, seen
+from .silhouettes import OPAQUE
 
 if TYPE_CHECKING:
     from ..scenes.colmap import Points
     from ..scenes.view import View
 
-_VIEWS = 32  # largest number of photos that are looked at
-_OPAQUE = 250  # smallest alpha of a pixel that has the colour of the object alone
 _AT_A_TIME = 65_536  # points, which keeps the pixels of all photos small
 
 
@@ -28,18 +27,18 @@ def with_colors(points: Points, views: Sequence[View]) -> Points:
     if len(points.rgb) < 2 or (points.rgb != points.rgb[0]).any():
         return points
     rgb = points.rgb.copy()
-    photos = [view.loaded() for view in views[:: -(-len(views) // _VIEWS)]]
+    photos = [view.loaded() for view in sampled_views(views)]
     for first in range(0, len(points.rgb), _AT_A_TIME):
         part = slice(first, first + _AT_A_TIME)
         pixels = np.full((len(photos), *rgb[part].shape), np.nan, np.float32)
         for number, photo in enumerate(photos):
             found = seen(photo.camera, points.xyz[part])
-            column, row = found.pixel[found.inside].astype(np.int64).T
-            color = np.asarray(photo.image)[row, column].astype(np.float32)
+            at = found.rows_and_columns
+            color = np.asarray(photo.image)[at].astype(np.float32)
             if photo.mask is not None:
-                color[~photo.mask[row, column]] = np.nan
+                color[~photo.mask[at]] = np.nan
             if photo.alpha is not None:
-                color[photo.alpha[row, column] < _OPAQUE] = np.nan
+                color[photo.alpha[at] < OPAQUE] = np.nan
             pixels[number, found.inside] = color
         shown = ~np.isnan(pixels[:, :, 0]).all(axis=0)
         rgb[part][shown] = np.rint(np.nanmedian(pixels[:, shown], axis=0))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 TRANSPARENT_SHARE = 0.01  # photos with a smaller share of transparent pixels count as opaque
 _STEP = 8  # pixels between two that are looked at
-_OPAQUE = 250  # smallest alpha of a pixel that counts as opaque: photos are resampled and rounded
+OPAQUE = 250  # smallest alpha of a pixel that counts as opaque: photos are resampled and rounded
 _SIDE = 256  # px: the longer side of a silhouette is reduced to at most this
 _VIEWS = 128  # largest number of silhouettes
 _COLORED_BY = 32  # largest number of photos whose colours are averaged
@@ -32,7 +32,7 @@ def transparent_share(views: Sequence[View]) -> float:
     """Return the share of transparent pixels in photos, 0 to 1, from every 8th row and column."""
     samples = [alpha[::_STEP, ::_STEP] for view in views if (alpha := view.alpha) is not None]
     total = sum(-(-view.camera.width // _STEP) * -(-view.camera.height // _STEP) for view in views)
-    return float(sum((sample < _OPAQUE).sum() for sample in samples)) / total if total else 0.0
+    return float(sum((sample < OPAQUE).sum() for sample in samples)) / total if total else 0.0
 
 
 class Silhouettes:

@@ -11,9 +11,10 @@ import pytest
 from PIL import Image
 
 from clsplat.cameras.camera import Camera
-from clsplat.scenes.cut_out import SPREAD, cut_out
+from clsplat.scenes.cut_out import cut_out
 from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.view import StoredView
+from clsplat.splats.color import SPREAD
 from clsplat.splats.fields import DoubleArray
 from clsplat.training.photos import with_cut_outs
 
