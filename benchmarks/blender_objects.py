@@ -1,77 +1,12 @@
-"""What stands in the scenes of blender_scenes.py: objects and a room, made of Blender's primitives."""
+"""Objects of blender_scenes.py that stand alone, before nothing."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
-import bpy
 import numpy as np
+from blender_shapes import add, add_mesh, add_wire, material, textured
 from mathutils import Matrix
-
-
-def material(name: str, color: tuple[float, float, float], roughness: float = 0.6, metallic: float = 0.0) -> Any:
-    """Return a principled material."""
-    made = bpy.data.materials.new(name)
-    made.use_nodes = True
-    principled = made.node_tree.nodes["Principled BSDF"]
-    principled.inputs["Base Color"].default_value = (*color, 1.0)
-    principled.inputs["Roughness"].default_value = roughness
-    principled.inputs["Metallic"].default_value = metallic
-    return made
-
-
-def textured(name: str, kind: str, scale: float, dark: tuple[float, ...], light: tuple[float, ...]) -> Any:
-    """Return a material with a procedural texture, from `dark` to `light`, in coordinates of the object."""
-    made = material(name, (0.5, 0.5, 0.5))
-    nodes, links = made.node_tree.nodes, made.node_tree.links
-    place, texture, ramp = (nodes.new(t) for t in ("ShaderNodeTexCoord", f"ShaderNodeTex{kind}", "ShaderNodeValToRGB"))
-    texture.inputs["Scale"].default_value = scale
-    links.new(place.outputs["Object"], texture.inputs["Vector"])
-    value = "Fac" if "Fac" in texture.outputs else 0 if "Distance" not in texture.outputs else "Distance"
-    links.new(texture.outputs[value], ramp.inputs["Fac"])
-    ramp.color_ramp.elements[0].color, ramp.color_ramp.elements[1].color = (*dark, 1.0), (*light, 1.0)
-    ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.35, 0.65
-    links.new(ramp.outputs["Color"], nodes["Principled BSDF"].inputs["Base Color"])
-    return made
-
-
-def add(
-    primitive: str, made_of: Any, location: Any = (0, 0, 0), scale: Any = (1, 1, 1), smooth: bool = True, **k: Any
-) -> Any:
-    """Add a primitive mesh and return its object."""
-    getattr(bpy.ops.mesh, f"primitive_{primitive}_add")(location=location, **k)
-    result = bpy.context.object
-    result.scale = scale
-    result.data.materials.append(made_of)
-    if smooth:
-        bpy.ops.object.shade_smooth()
-    return result
-
-
-def add_mesh(name: str, vertices: Any, faces: Any, made_of: Any) -> Any:
-    """Add a mesh of vertices [n, 3] and faces, and return its object."""
-    mesh = bpy.data.meshes.new(name)
-    mesh.from_pydata([tuple(map(float, v)) for v in vertices], [], [tuple(map(int, f)) for f in faces])
-    result = bpy.data.objects.new(name, mesh)
-    mesh.materials.append(made_of)
-    bpy.context.collection.objects.link(result)
-    return result
-
-
-def add_wire(name: str, path: Any, radius: float, made_of: Any) -> Any:
-    """Add a tube around a path [n, 3], and return its object."""
-    curve = bpy.data.curves.new(name, "CURVE")
-    curve.dimensions, curve.bevel_depth = "3D", radius
-    line = curve.splines.new("POLY")
-    line.points.add(len(path) - 1)
-    for point, place in zip(line.points, path, strict=True):
-        point.co = (*map(float, place), 1.0)
-    result = bpy.data.objects.new(name, curve)
-    curve.materials.append(made_of)
-    bpy.context.collection.objects.link(result)
-    return result
 
 
 def plant(rng: np.random.Generator) -> None:
@@ -177,72 +112,33 @@ def wires(rng: np.random.Generator) -> None:
         )
 
 
-def room(rng: np.random.Generator) -> None:
-    """A furnished room with plain and patterned walls, two lamps, and shiny things."""
-    walls = [
-        textured("wall", "Brick", 3.0, (0.35, 0.12, 0.08), (0.6, 0.55, 0.5)),
-        material("plain", (0.75, 0.72, 0.65)),
-        textured("paper", "Voronoi", 4.0, (0.2, 0.3, 0.5), (0.8, 0.8, 0.7)),
-        material("white", (0.85, 0.85, 0.85)),
-    ]
-    sides = (
-        ((0, 3, 1.5), (math.pi / 2, 0, 0)),
-        ((3, 0, 1.5), (math.pi / 2, 0, math.pi / 2)),
-        ((0, -3, 1.5), (math.pi / 2, 0, 0)),
-        ((-3, 0, 1.5), (math.pi / 2, 0, math.pi / 2)),
-    )
-    for made_of, (place, turn) in zip(walls, sides, strict=True):
-        add("plane", made_of, place, (3, 1.5, 1), smooth=False).rotation_euler = turn
-    add(
-        "plane", textured("floor", "Wave", 1.5, (0.2, 0.1, 0.05), (0.5, 0.32, 0.18)), (0, 0, 0), (3, 3, 1), smooth=False
-    )
-    add("plane", material("ceiling", (0.9, 0.9, 0.9)), (0, 0, 3), (3, 3, 1), smooth=False)
-    wood = textured("wood", "Noise", 8.0, (0.3, 0.15, 0.06), (0.55, 0.35, 0.18))
-    add("cube", wood, (0, 0, 0.75), (0.8, 0.5, 0.03), smooth=False)
-    for x in (-0.7, 0.7):
-        for y in (-0.4, 0.4):
-            add("cylinder", wood, (x, y, 0.37), radius=0.04, depth=0.74)
-    add("monkey", material("red", (0.7, 0.05, 0.05), 0.2), (0.2, 0.1, 1.0), (0.22, 0.22, 0.22))
-    add("uv_sphere", material("mirror", (0.9, 0.9, 0.9), 0.02, metallic=1.0), (-0.4, 0.1, 0.95), (0.17, 0.17, 0.17))
-    add(
-        "torus",
-        textured("ring", "Checker", 12.0, (0.9, 0.6, 0.0), (0.05, 0.05, 0.3)),
-        (-0.1, -0.3, 0.84),
-        major_radius=0.14,
-        minor_radius=0.05,
-    )
-    shelf = [material(f"book{i}", tuple(rng.uniform(0.05, 0.8, 3)), 0.5) for i in range(12)]
-    for z in (0.5, 1.0, 1.5, 2.0):
-        add("cube", wood, (-2.8, 0, z), (0.18, 1.2, 0.015), smooth=False)
-        for y in np.arange(-1.1, 1.1, 0.09):
-            tall = rng.uniform(0.12, 0.2)
-            add(
-                "cube",
-                shelf[rng.integers(12)],
-                (-2.8, y, z + 0.015 + tall),
-                (0.13, rng.uniform(0.02, 0.04), tall),
-                smooth=False,
-            )
-    for _ in range(14):
-        x, y = rng.uniform(-2.5, 2.5, 2)
-        if max(abs(x), abs(y)) > 1.6:
-            size = rng.uniform(0.1, 0.35)
-            kind = textured(
-                "box",
-                ("Voronoi", "Checker", "Noise")[rng.integers(3)],
-                rng.uniform(4, 12),
-                tuple(rng.uniform(0, 0.4, 3)),
-                tuple(rng.uniform(0.4, 1, 3)),
-            )
-            add("cube", kind, (x, y, size), (size, size, size), smooth=False).rotation_euler = (0, 0, rng.uniform(0, 3))
-    for x, y in ((1.2, 0.5), (-1.0, -1.2)):
-        bpy.ops.object.light_add(type="AREA", location=(x, y, 2.9))
-        bpy.context.object.data.energy, bpy.context.object.data.size = 60, 1.0
-
-
-SCENES: dict[str, Callable[[np.random.Generator], None]] = {
-    "plant": plant,
-    "metals": metals,
-    "wires": wires,
-    "room": room,
-}
+def dishes(rng: np.random.Generator) -> None:
+    """A laid table: smooth plates, fruit, forks, and glasses of water that show what stands behind them."""
+    cloth = textured("cloth", "Checker", 9.0, (0.55, 0.08, 0.07), (0.8, 0.78, 0.74))
+    add("cylinder", cloth, (0, 0, -0.55), radius=1.25, depth=0.06, vertices=96)
+    china = material("china", (0.85, 0.84, 0.8), 0.08)
+    steel = material("steel", (0.6, 0.6, 0.62), 0.15, metallic=1.0)
+    glass = material("glass", (1.0, 1.0, 1.0), 0.0)
+    glass.node_tree.nodes["Principled BSDF"].inputs["Transmission Weight"].default_value = 1.0
+    for k in range(4):
+        angle = math.pi / 2 * k + 0.3
+        x, y = 0.8 * math.cos(angle), 0.8 * math.sin(angle)
+        add("cone", china, (x, y, -0.48), vertices=64, radius1=0.2, radius2=0.33, depth=0.07)
+        add("torus", china, (x, y, -0.45), major_radius=0.33, minor_radius=0.015)
+        turned = angle + 0.55
+        fx, fy = 0.85 * math.cos(turned), 0.85 * math.sin(turned)
+        handle = [(0.6 * fx, 0.6 * fy, -0.5), (0.9 * fx, 0.9 * fy, -0.48), (1.15 * fx, 1.15 * fy, -0.5)]
+        add_wire("handle", handle, 0.018, steel)
+        for side in (-0.04, 0.0, 0.04):
+            tine = [(0.6 * fx, 0.6 * fy, -0.5), (0.42 * fx - side * fy, 0.42 * fy + side * fx, -0.5)]
+            add_wire("tine", tine, 0.009, steel)
+        gx, gy = 0.5 * math.cos(angle - 0.5), 0.5 * math.sin(angle - 0.5)
+        add("cylinder", glass, (gx, gy, -0.3), radius=0.1, depth=0.44, vertices=64)
+    add("uv_sphere", china, (0, 0, -0.42), (0.36, 0.36, 0.14), segments=64, ring_count=32)
+    for k in range(14):
+        color = np.array([(0.7, 0.1, 0.05), (0.75, 0.5, 0.05), (0.25, 0.5, 0.08)][k % 3]) * rng.uniform(0.7, 1.1)
+        skin = textured(f"skin{k}", "Noise", rng.uniform(10, 30), tuple(0.5 * color), tuple(color))
+        ring, angle = (0.0, 0.0) if k == 0 else ((0.24, 2 * math.pi * k / 9) if k < 10 else (0.13, 1.57 * k))
+        place = ring * math.cos(angle), ring * math.sin(angle), -0.2 + (0.16 if ring < 0.2 else 0.0)
+        size = rng.uniform(0.1, 0.13)
+        add("uv_sphere", skin, place, (size, size, size * rng.uniform(0.85, 1.1)))

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import bpy
 import numpy as np
-from blender_objects import SCENES
+from blender_objects import dishes, metals, plant, wires
+from blender_places import garden, lane, room
 from mathutils import Matrix, Vector
 
 FIELD_OF_VIEW = 0.6911112  # of NeRF-synthetic, horizontal [radians]
 DISTANCE = 4.031  # of its cameras from the origin [world units]
-ROOM_FIELD_OF_VIEW = 1.1  # [radians]
+PLACE_FIELD_OF_VIEW = 1.1  # inside a place [radians]
 SAMPLES = 16  # paths of a pixel, before the denoiser
-POINTS = 12000  # of `room`
+POINTS = 12000  # of a place
 NOISE = 0.003  # standard deviation of its points around the surfaces [world units]
+FAR_NOISE = 0.002  # the same along the ray, outdoors, at one world unit: it grows with the square of the depth
 
 
 def look_at(eye: Any, target: Any) -> Matrix:
@@ -39,10 +43,16 @@ def sphere_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple
     return poses(around, height), poses(*spiral)
 
 
+def every_few(poses: list[Matrix], n_test: int) -> tuple[list[Matrix], list[Matrix]]:
+    """Return training poses, and test poses between them, of cameras along a path."""
+    every = max(2, round(len(poses) / max(n_test, 1)))
+    test = [pose for i, pose in enumerate(poses) if i % every == every - 1]
+    return [pose for i, pose in enumerate(poses) if i % every != every - 1], test
+
+
 def room_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[list[Matrix], list[Matrix]]:
     """Return poses on two rings inside the room; every test view lies between training views."""
     n = n_train + n_test
-    every = max(2, round(n / max(n_test, 1)))
     poses = []
     for i in range(n):
         angle = 4 * math.pi * i / n
@@ -50,20 +60,61 @@ def room_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[l
         away = i % 3 == 2
         target = (-0.9 * eye[0], -0.9 * eye[1], 1.4) if away else (rng.normal(0, 0.3), rng.normal(0, 0.3), 0.8)
         poses.append(look_at(eye, target))
-    test = [pose for i, pose in enumerate(poses) if i % every == every - 1]
-    return [pose for i, pose in enumerate(poses) if i % every != every - 1], test
+    return every_few(poses, n_test)
 
 
-def prepare(size: int, field_of_view: float, indoors: bool) -> Any:
+def garden_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[list[Matrix], list[Matrix]]:
+    """Return poses on three rings around the table."""
+    n, poses = n_train + n_test, []
+    for i in range(n):
+        angle, ring = 6 * math.pi * i / n, 3 * i // n
+        radius, height = (2.6, 3.4, 2.2)[ring] + rng.normal(0, 0.1), (1.1, 1.6, 2.1)[ring] + rng.normal(0, 0.06)
+        eye = (radius * math.cos(angle), radius * math.sin(angle), height)
+        poses.append(look_at(eye, (*rng.normal(0, 0.15, 2), 0.85)))
+    return every_few(poses, n_test)
+
+
+def lane_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[list[Matrix], list[Matrix]]:
+    """Return the poses of a walk along the lane; the view turns a little to both sides."""
+    n, poses = n_train + n_test, []
+    for i in range(n):
+        eye = (-24 + 48 * i / n, 0.4 * math.sin(i / 5) + rng.normal(0, 0.05), 1.6 + rng.normal(0, 0.04))
+        turn = 0.5 * math.sin(i / 4)
+        poses.append(look_at(eye, (eye[0] + math.cos(turn), eye[1] + math.sin(turn), eye[2] - 0.05)))
+    return every_few(poses, n_test)
+
+
+@dataclass(frozen=True)
+class Sort:
+    """How a scene is photographed. around : photos have no transparent pixels. outdoors : the noise of points grows."""
+
+    build: Callable[[np.random.Generator], None]
+    cameras: Callable[[np.random.Generator, int, int], tuple[list[Matrix], list[Matrix]]] = sphere_cameras
+    around: bool = False
+    outdoors: bool = False
+
+
+SCENES = {
+    "plant": Sort(plant),
+    "metals": Sort(metals),
+    "wires": Sort(wires),
+    "dishes": Sort(dishes),
+    "room": Sort(room, room_cameras, around=True),
+    "garden": Sort(garden, garden_cameras, around=True, outdoors=True),
+    "lane": Sort(lane, lane_cameras, around=True, outdoors=True),
+}
+
+
+def prepare(size: int, field_of_view: float, around: bool) -> Any:
     """Set Cycles up, and return the camera's object."""
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
     scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.seed = SAMPLES, True, 0
     scene.cycles.max_bounces, scene.render.use_persistent_data = 6, True
     scene.render.resolution_x = scene.render.resolution_y = size
-    scene.render.film_transparent = not indoors
+    scene.render.film_transparent = not around
     scene.view_settings.view_transform = "Standard"
-    scene.render.image_settings.color_mode = "RGB" if indoors else "RGBA"
+    scene.render.image_settings.color_mode = "RGB" if around else "RGBA"
     world = bpy.data.worlds.new("sky")
     scene.world, world.use_nodes = world, True
     sky = world.node_tree.nodes.new("ShaderNodeTexSky")
@@ -76,9 +127,9 @@ def prepare(size: int, field_of_view: float, indoors: bool) -> Any:
     return scene.camera
 
 
-def surface_points(cameras: list[Matrix], field_of_view: float, rng: np.random.Generator) -> Any:
+def surface_points(cameras: list[Matrix], field_of_view: float, outdoors: bool, rng: np.random.Generator) -> Any:
     """Return points [n, 3] that rays through random pixels of the cameras hit, with noise, in textured parts or not."""
-    depsgraph, reach, found = bpy.context.evaluated_depsgraph_get(), math.tan(field_of_view / 2), []
+    depsgraph, reach, found, noise = bpy.context.evaluated_depsgraph_get(), math.tan(field_of_view / 2), [], []
     for pose in cameras:
         for x, y in rng.uniform(-reach, reach, (POINTS // len(cameras), 2)):
             direction = pose.to_3x3() @ Vector((x, y, -1)).normalized()
@@ -86,7 +137,9 @@ def surface_points(cameras: list[Matrix], field_of_view: float, rng: np.random.G
             plain = hit and of.data.materials[0].name in ("plain", "white", "ceiling", "mirror")
             if hit and not (plain and rng.uniform() < 0.97):
                 found.append(place)
-    return np.array(found) + rng.normal(0, NOISE, (len(found), 3))
+                depth = (place - pose.translation).length
+                noise.append(FAR_NOISE * depth**2 * rng.normal() * direction if outdoors else (0, 0, 0))
+    return np.array(found) + np.array(noise) + rng.normal(0, NOISE, (len(found), 3))
 
 
 def colors_of(points: Any, folder: Path, frames: list[dict[str, Any]], size: int, field_of_view: float) -> Any:
@@ -118,13 +171,11 @@ def write_ply(path: Path, points: Any, colors: Any) -> None:
 def render(folder: Path, name: str, size: int, n_train: int, n_test: int) -> None:
     """Build a scene and render what is missing of its photos."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    rng, indoors = np.random.default_rng(sum(map(ord, name))), name == "room"
-    SCENES[name](rng)
-    angle = ROOM_FIELD_OF_VIEW if indoors else FIELD_OF_VIEW
-    camera = prepare(size, angle, indoors)
-    poses = dict(
-        zip(("train", "test"), (room_cameras if indoors else sphere_cameras)(rng, n_train, n_test), strict=True)
-    )
+    rng, sort = np.random.default_rng(sum(map(ord, name))), SCENES[name]
+    sort.build(rng)
+    angle = PLACE_FIELD_OF_VIEW if sort.around else FIELD_OF_VIEW
+    camera = prepare(size, angle, sort.around)
+    poses = dict(zip(("train", "test"), sort.cameras(rng, n_train, n_test), strict=True))
     folder.mkdir(parents=True, exist_ok=True)
     bpy.context.view_layer.update()
     for split, cameras in poses.items():
@@ -137,8 +188,8 @@ def render(folder: Path, name: str, size: int, n_train: int, n_test: int) -> Non
                 bpy.context.scene.render.filepath = str(folder / file)
                 bpy.ops.render.render(write_still=True)
         head: dict[str, Any] = {"camera_angle_x": angle}
-        if indoors and split == "train":
-            points = surface_points(cameras, angle, rng)
+        if sort.around and split == "train":
+            points = surface_points(cameras, angle, sort.outdoors, rng)
             write_ply(folder / "points3d.ply", points, colors_of(points, folder, frames, size, angle))
         (folder / f"transforms_{split}.json").write_text(
             json.dumps(head | {"frames": frames}, indent=1), encoding="utf-8"

@@ -11,7 +11,7 @@ from ..cameras.cameras_json import NamedCamera, read_cameras
 from ..errors import InputError, Remedy
 from ..files.image_names import bare_name
 from ..files.json_file import describe, to_real
-from ..scenes.options import ALPHA_USES, ORIGIN, TEST_EVERY
+from ..scenes.options import BEFORE, ORIGIN, TEST_EVERY
 from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from ..training.folder import ModelFolder
@@ -136,9 +136,10 @@ class LoadedModel:
             eval=test_names is None,
             background=self.background if background is None else background,
             masks=choice.masks or record.get("masks"),
-            alpha=choice.alpha or record.get("alpha") or ALPHA_USES[0],
+            alpha=choice.alpha or record.get("alpha") or BEFORE["alpha"],
             read_photos=False,
             origin=origin,
+            bars=record.get("bars") or BEFORE["bars"],
         )
         as_recorded = all(getattr(choice, name) in (None, record.get(name)) for name in ("images", "masks"))
         if check and as_recorded:

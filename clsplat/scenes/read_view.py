@@ -18,10 +18,12 @@ from ..files.host_memory import give_back_free_memory
 from ..files.images import ImageU8, is_whole, read_image, resize_area
 from ..files.masks import read_mask, resize_mask
 from ..splats.color import Color
+from .bars import NO_BARS, Bars
 from .photo_size import target_size
 from .undistort import RegisteredImage, is_pinhole
 from .view import StoredView, View
 
+_SOFT_ROWS = 1  # beside a bar, which may have a part of both
 _OPAQUE = 128  # smallest alpha of a pixel that counts, if transparency is a mask
 _ROWS = 64  # rows that are composited at a time, which keeps the real numbers small
 # Bytes of a pixel at its stored size while a photo is decoded: Pillow's image and an array of it. Undistortion holds
@@ -40,6 +42,7 @@ class PhotoReader:
     file : its file. size : its (width, height) as stored [px].
     mask_file : file of its mask, if it has one.
     alpha_hides : whether transparency is a mask.
+    bars : bars of the photo, which are masked out.
     """
 
     photo: RegisteredImage
@@ -49,6 +52,7 @@ class PhotoReader:
     background: Color
     mask_file: Path | None
     alpha_hides: bool
+    bars: Bars = NO_BARS
 
     @property
     def decoding_bytes(self) -> int:
@@ -59,7 +63,7 @@ class PhotoReader:
     @property
     def may_hide_pixels(self) -> bool:
         """Whether a mask may hide some of the pixels, or all."""
-        return self.mask_file is not None or self.alpha_hides
+        return self.mask_file is not None or self.alpha_hides or any(self.bars)
 
     def camera(self) -> Camera:
         """Return the camera of the view without decoding the photo; raises as `RegisteredImage.fit`."""
@@ -81,6 +85,8 @@ class PhotoReader:
             return str(error)
         width, height = self.size
         masks = [] if self.mask_file is None else [read_mask(self.mask_file)]
+        if any(self.bars):
+            masks.append(self.bars.uncovered(width, height, _SOFT_ROWS))
         alpha = None
         if stored.shape[2] == 4:
             alpha = stored[:, :, 3].copy()  # a slice would keep the whole photo in memory

@@ -7,21 +7,20 @@ import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from ..cameras.camera import Camera
-from ..cameras.seen import sampled_views
 from ..errors import InputError
 from ..files.digest import file_digest
-from ..files.images import ImageU8, has_alpha
+from ..files.images import ImageU8
 from ..files.masks import MASK_FOLDER, NO_MASKS, mask_files
 from ..files.real_path import real_path
 from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
+from .bars import NO_BARS, Bars, commonest_size
 from .colmap import Points
 from .colmap_folder import colmap_folder
 from .described import read_described
@@ -39,8 +38,8 @@ from .pose_checks import (
 from .posed_images import PosedImages, check_left_out, read_colmap, warn_of_left_out
 from .read_view import PhotoReader, read_views
 from .scene_files import SCENE_ENDINGS, described_by
-from .still_pixels import pixels_before_scene
-from .view import StoredView, View
+from .view import View
+from .without_data import bars_of, use_of_alpha
 from .wrong_folder import describe_file, scene_hint
 
 __all__ = ["Points", "Scene", "View", "load_scene"]
@@ -129,6 +128,7 @@ def load_scene(
     read_photos: bool = True,
     only: Collection[str] | None = None,
     origin: Sequence[float] | None = None,
+    bars: Sequence[float] | None = None,
 ) -> Scene:
     """Read a scene: a folder with photos and their cameras.
 
@@ -149,7 +149,7 @@ def load_scene(
     eval : whether to hold out test views; if False, all views are training views.
     background : colour 0..1 under transparent pixels.
     masks : folder of masks inside the scene (see files/masks.py), or "none" for no masks. By default "masks" if it
-        exists, and the masks named in transforms.json.
+        exists, and the masks named in transforms.json. "none" keeps bars, too.
     alpha : use of a photo's transparency. "background" composites the photo over the background; "mask" masks out
         pixels that are less than half opaque. By default it is "background", but "mask" if the same pixels are
         transparent in all photos and points lie there: rims that undistortion leaves without data.
@@ -159,6 +159,9 @@ def load_scene(
         their sizes. Test views are chosen among all photos.
     origin : the point of the files' coordinates that becomes the origin, (3,). By default, a scene that is too far from
         the origin for float32 gets a round point inside it, and other scenes are not moved.
+    bars : parts of the height and width, 0 to 1, at the top, right, bottom and left that are masked out, (4,). They are
+        those of photos of the commonest size. By default, bars of one colour that all photos have are masked out if
+        points lie there.
 
     Warns
     -----
@@ -185,7 +188,9 @@ def load_scene(
     sizes = [posed.sizes[photo.name] for photo, now in zip(photos, decoded, strict=True) if now]
     check_memory(root, sizes, resolution)
     if alpha is None:
-        alpha = _use_of_alpha(root, posed, resolution, background)
+        alpha = use_of_alpha(root, posed, resolution, background)
+    bars = NO_BARS if masks == NO_MASKS else bars_of(root, posed, mask_of) if bars is None else Bars(*bars)
+    barred_size = commonest_size(posed.sizes)
     readers = [
         PhotoReader(
             photo,
@@ -195,6 +200,7 @@ def load_scene(
             background,
             mask_of.get(photo.name),
             alpha == "mask",
+            bars if posed.sizes[photo.name] == barred_size else NO_BARS,
         )
         for photo in photos
     ]
@@ -235,39 +241,13 @@ def load_scene(
             test_list=None if test_list is None else str(real_path(test_list)),
             eval=eval,
             origin=list(posed.origin) if any(posed.origin) else None,
+            bars=list(bars),
         ),
         left_out,
         dict(zip(names, digests, strict=True)),
         [file for name in names for file in _files_of(name, posed, mask_of)],
         origin=posed.origin,
     )
-
-
-def _use_of_alpha(root: Path, posed: PosedImages, resolution: int, background: Color) -> str:
-    """Return what the transparency of the photos means, one of ALPHA_USES, and warn if it means that data is missing.
-
-    The photos of all views are looked at, so that a part of a scene is read as the whole.
-    """
-    some = sampled_views(posed.photos)
-    readers = [
-        PhotoReader(photo, posed.files[photo.name], posed.sizes[photo.name], resolution, background, None, False)
-        for photo in some
-    ]
-    found = None
-    # A photo that cannot be used is reported when all are read.
-    with suppress(InputError):
-        if len(posed.points) and all(has_alpha(reader.file) for reader in readers):
-            views = [StoredView(reader.photo.name, reader.camera(), reader.view) for reader in readers]
-            found = pixels_before_scene(views, posed.points.xyz)
-    if found is None:
-        return ALPHA_USES[0]
-    warnings.warn(
-        f"{root}: {found.share:.0%} of the pixels are transparent in all photos, but points of the scene lie there: "
-        'they are left out as pixels without data (alpha "mask"); with alpha "background" they are the background of '
-        "an object",
-        stacklevel=3,
-    )
-    return ALPHA_USES[1]
 
 
 def _warn_of_copies(root: Path, digests: Mapping[str, str], test_names: Collection[str]) -> None:
@@ -289,7 +269,7 @@ def _files_of(name: str, posed: PosedImages, mask_of: Mapping[str, Path]) -> lis
 
 
 def _reading(*, eval: bool, **arguments: Any) -> dict[str, Any]:
-    """Return a record of `load_scene`'s arguments: None for default values, and always values of `eval` and `alpha`."""
+    """Return a record of `load_scene`'s arguments: None for default values; `eval`, `alpha` and `bars` have values."""
     parameters = inspect.signature(load_scene).parameters
     record = {name: None if value == parameters[name].default else value for name, value in arguments.items()}
     return record | {"eval": bool(eval), "alpha": arguments["alpha"]}

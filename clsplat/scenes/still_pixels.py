@@ -1,25 +1,26 @@
 """Pixels that are the same in all photos, although the scene goes on there.
 
 Bars of a video, rims that undistortion leaves without data, watermarks and the bonnet of a car are such pixels. A run
-learns them as a part of the scene, right in front of each camera. Nothing behind an object is such a place: no points
-of the scene are there.
+would learn them as a part of the scene, right in front of each camera. Nothing behind an object is such a place: no
+points of the scene are there.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from ..cameras.camera import Camera
 from ..cameras.seen import sampled, sampled_views, seen
 from ..files.masks import Mask
 from ..splats.color import SPREAD
 from ..splats.fields import DoubleArray
 from .view import View
 
-_FEWEST_VIEWS = 6  # fewer photos may agree by chance
+FEWEST_VIEWS = 6  # fewer photos may agree by chance
 _FEWEST_POINTS = 50  # points in all photos together, in the pixels that do not change
 _LEAST, _MOST = 0.01, 0.3  # of a photo, and of the points in it: less is harmless, more is the background of an object
 _EMPTY = 8  # largest alpha of a pixel without data
@@ -44,20 +45,30 @@ def pixels_before_scene(views: Sequence[View], xyz: DoubleArray) -> StillPixels 
         return None
     size, count = sizes.most_common(1)[0]
     alike = [view for view in views if (view.camera.width, view.camera.height) == size]
-    if count < _FEWEST_VIEWS:
+    if count < FEWEST_VIEWS:
         return None
     still, is_empty = still_pixels(sampled_views(alike))
-    if not _LEAST <= still.mean() <= _MOST:
-        return None
-    some = sampled(xyz)
-    inside, within = 0, 0
-    for view in alike:
-        found = seen(view.camera, some)
-        inside += int(np.count_nonzero(found.inside))
-        within += int(np.count_nonzero(still[found.rows_and_columns]))
-    if within < _FEWEST_POINTS or not _LEAST <= within / inside <= _MOST:
+    if not hide_points(((view.camera, still) for view in alike), xyz):
         return None
     return StillPixels(float(still.mean()), is_empty)
+
+
+def hide_points(parts: Iterable[tuple[Camera, Mask]], xyz: DoubleArray) -> bool:
+    """Return whether points of the scene lie in parts of photos, which are neither tiny nor most of the photos.
+
+    Parameters
+    ----------
+    parts : camera of each photo, and the part of it, (H, W) bool. xyz : points of the scene (P, 3).
+    """
+    some, shares = sampled(xyz), []
+    inside, within = 0, 0
+    for camera, part in parts:
+        found = seen(camera, some)
+        shares.append(part.mean())
+        inside += int(np.count_nonzero(found.inside))
+        within += int(np.count_nonzero(part[found.rows_and_columns]))
+    is_small = _LEAST <= np.mean(shares) <= _MOST
+    return bool(is_small and within >= _FEWEST_POINTS and _LEAST <= within / inside <= _MOST)
 
 
 def still_pixels(views: Sequence[View]) -> tuple[Mask, bool]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InputError
 from ..files.json_file import MAX_NUMBER, describe, read_object, to_real
 from ..files.real_path import real_path
-from ..scenes.options import ALPHA_USES, READING_OPTIONS
+from ..scenes.options import ALPHA_USES, BEFORE, READING_OPTIONS
 from ..splats.color import BLACK, Color
 from .config import FREE_OPTIONS, TrainConfig, read_options
 from .folder import ModelFolder
@@ -53,7 +53,8 @@ class StoredRun:
             raise InputError("scene.path is missing")
         scene["path"] = str(folder / scene["path"])
         scene.setdefault("photos", {})
-        scene.setdefault("alpha", ALPHA_USES[0])  # runs of earlier versions
+        for key, value in BEFORE.items():
+            scene.setdefault(key, value)
         return cls(read_options(values["config"]), scene)
 
     @property
@@ -101,6 +102,12 @@ def _is_place(value: object) -> bool:
     return all((number := to_real(each)) is not None and abs(number) < MAX_NUMBER for each in value)
 
 
+def _is_four_parts(value: object) -> bool:
+    if not isinstance(value, list) or len(value) != 4:
+        return False
+    return all((number := to_real(each)) is not None and 0 <= number <= 1 for each in value)
+
+
 def _is_count(value: object) -> bool:
     return type(value) is int and 1 <= value <= _LARGEST
 
@@ -122,6 +129,7 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "test_every": (f"a whole number from 1 to {_LARGEST}", _is_count),
     "eval": ("true or false", lambda value: isinstance(value, bool)),
     "origin": ("three numbers", _is_place),
+    "bars": ("four parts from 0 to 1", _is_four_parts),
     "photos": ("the digest of each photo by name", lambda value: isinstance(value, dict)),
     "test_names": ("a list of names", _is_list_of_names),
     "validation_names": ("a list of names", _is_list_of_names),
