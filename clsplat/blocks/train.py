@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -180,7 +180,7 @@ class _Stages:
         folder: ModelFolder,
         cluster: str | None,
     ) -> None:
-        self.scene, self.options, self.cluster = scene, options, cluster
+        self.whole, self.options, self.cluster = scene, options, cluster
         self.config = config.replace(save_iterations=(), test_iterations=())
         self.state, self.folder = state, folder
         self.steps = StepReports(progress, STEPS, config.iterations)
@@ -215,6 +215,15 @@ class _Stages:
         config = self.config.replace(cap_max=max(math.ceil(COARSE_CAP * self.config.cap_max), 1))
         self.steps.tell(1, f"a coarse model of {config.iterations} iterations with at most {config.cap_max} splats")
         self.state.put("coarse", self.train_whole("coarse", config))
+
+    @property
+    def scene(self) -> Scene:
+        """The scene without the photos that the coarse run has left out because they disagree with all others."""
+        coarse = self.state.values.get("coarse")
+        gone = coarse.get("left_out") if isinstance(coarse, dict) else None
+        if not isinstance(gone, list):
+            return self.whole
+        return replace(self.whole, views=[view for view in self.whole.views if view.name not in gone])
 
     def divide(self) -> None:
         """Divide the scene, and draw the cells."""
@@ -274,8 +283,8 @@ class _Stages:
             copy_exposures(self.state.run_folder(before), exposures_beside(file))
             self.train_whole(name, fine_tuning(run, whole, part, file))
             whole, before = Splats.load(self.state.run_folder(name).latest_ply()[0]), name
-        self.folder.write_run(self.state.values["config"], self.scene)
-        self.folder.write_views([*self.scene.test, *self.scene.train])
+        self.folder.write_run(self.state.values["config"], self.whole)
+        self.folder.write_views([*self.whole.test, *self.whole.train])
         copy_exposures(self.state.run_folder(before), self.folder.exposures_path)
         path = self.folder.ply_path(self.config.iterations + iterations)
         whole.save(path)
@@ -330,5 +339,6 @@ def block_config(config: TrainConfig, start: Path, cap: int) -> TrainConfig:
         "bisect_reg": 0.0,
         "position_optimizer": "adam",
         "optimizer": "fused",
+        "outlier_check": False,  # of the coarse run
     }
     return TrainConfig(**config.to_json() | changed)

@@ -61,7 +61,7 @@ def train_in_folder(
     Returns
     -------
     What the run took: "splats" (without the context), "context" (their number), "seconds", "peak_bytes" of this process
-    and "device_bytes".
+    and "device_bytes"; "left_out" names the photos that it left out.
 
     Raises
     ------
@@ -87,6 +87,7 @@ def train_in_folder(
         "seconds": round(model.seconds, 2),
         "peak_bytes": model.peak_bytes,
         "device_bytes": model.device_bytes,
+        "left_out": list(model.left_out),
     }
 
 

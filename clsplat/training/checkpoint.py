@@ -19,7 +19,7 @@ from ..files.atomic import atomic_writer
 from ..splats.fields import MAX_SH_DEGREE, Array
 
 VERSION = 4
-READABLE = (2, 3, VERSION)  # version 2 has no `reached`, and both have no `average`
+READABLE = (2, 3, VERSION)  # version 2 has no `reached`, and both have no `average`; `left_out` is optional
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class Checkpoint:
     signals : (3, N) densification statistics (SplatStatistics).
     reached : limits of the schedules, if the run was made longer.
     average : state of the `ParameterAverage` by key, empty before the last part of the run.
+    left_out : indices of training views that the rest of the run leaves out.
     """
 
     iteration: int
@@ -69,6 +70,7 @@ class Checkpoint:
     signals: Array
     reached: Reached | None = None
     average: dict[str, NDArray[Any]] = field(default_factory=dict)
+    left_out: list[int] = field(default_factory=list)
 
     def save(self, path: Path) -> None:
         """Write the checkpoint to a file. If that fails, raise OutputError and keep the old file."""
@@ -82,6 +84,7 @@ class Checkpoint:
             "schedule": self.schedule,
             "n_first": self.n_first,
             "reached": self.reached and asdict(self.reached),
+            "left_out": self.left_out,
         }
         arrays = {f"splats.{k}": v for k, v in self.splats.items()}
         arrays |= {f"optimizer.{k}": v for k, v in self.optimizer.items()}
@@ -123,6 +126,7 @@ class Checkpoint:
                 arrays["signals"],
                 Reached(**meta["reached"]) if meta.get("reached") else None,
                 part("average."),
+                meta.get("left_out", []),
             )
             checkpoint._check()
         except _DAMAGE as error:
@@ -144,8 +148,9 @@ class Checkpoint:
             degree, downscale = self.reached.sh_degree, self.reached.downscale
             if not (type(degree) is type(downscale) is int and 0 <= degree <= MAX_SH_DEGREE and downscale >= 1):
                 raise ValueError("its reached is not a degree and a downscale")
-        if not all(type(place) is int and place >= 0 for place in self.queue):
-            raise ValueError("its queue is not a list of views")
+        for name, places in (("queue", self.queue), ("left_out", self.left_out)):
+            if not all(type(place) is int and place >= 0 for place in places):
+                raise ValueError(f"its {name} is not a list of views")
         np.random.default_rng().bit_generator.state = self.rng
         n = len(self.splats["mean"])
         for group in (self.splats, self.optimizer, self.average, {"signals": self.signals}):
@@ -166,6 +171,7 @@ _KINDS = {
     "config": dict,
     "rng": dict,
     "queue": list,
+    "left_out": list,
     "seconds": int | float,
     "schedule": str,
     "n_first": int,

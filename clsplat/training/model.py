@@ -24,6 +24,7 @@ class Model:
     evaluation_seconds : training time before each evaluation.
     path : the model folder, or None.
     best_iteration : iteration that was best on the validation views; 0 without the option `validate`.
+    left_out : names of training views that the run left out because they disagree with all others.
     """
 
     splats: Splats
@@ -36,6 +37,7 @@ class Model:
     evaluation_seconds: dict[int, float] = field(default_factory=dict)
     path: Path | None = None
     best_iteration: int = 0
+    left_out: tuple[str, ...] = ()
 
     @property
     def finished(self) -> bool:

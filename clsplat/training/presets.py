@@ -38,6 +38,7 @@ _RATES = {
     "dropout": 0.0,
     "depth_smoothness": 0.0,
     "occluder_check": False,
+    "outlier_check": False,
     "visible_adam": False,
     "cut_background": False,
     "random_background": False,

@@ -43,6 +43,7 @@ from .memory_estimate import run_memory
 from .model import Model
 from .occluders import OccluderCheck
 from .optim.optimizer import make_optimizer
+from .outliers import OutlierCheck
 from .photos import with_photos
 from .programs import kernel_build
 from .rate_limits import check_rates
@@ -121,19 +122,19 @@ class Trainer:
             self.rng,
             checkpoint.queue if checkpoint else [],
             self.reached.downscale if self.reached else None,
+            checkpoint.left_out if checkpoint else (),
         )
         self.schedule = RunSchedule.create(config, self.n_first)
         self.average = ParameterAverage(config, self.schedule.densify_last)
         if checkpoint is not None and checkpoint.config["iterations"] == config.iterations:
             self.average.load_state(checkpoint.average)
-        statistics = self.pipeline.statistics
         self.density = DensityControl(
             config,
             self.kernels,
             self.schedule,
             self.splats,
             self.optimizer,
-            statistics,
+            self.pipeline.statistics,
             self.rng,
             scene.extent,
             self.frozen,
@@ -143,6 +144,7 @@ class Trainer:
         self.noise = ExplorationNoise(config, self.kernels, self.splats, scene.extent)
         self.renderer = Renderer(self.device, schedule=self.kernels.schedule)
         self.occluders = OccluderCheck(config, scene.train, self.renderer, self.density, self.average.begin)
+        self.outliers = OutlierCheck(config, scene.train, self.renderer, self.views)
         self.validation = RunValidation(
             self.renderer, scene.validation, config.background, config.iterations, config.output.save_iterations
         )
@@ -202,6 +204,9 @@ class Trainer:
                 start = time.perf_counter()
                 self.step()
                 it = self.iteration
+                if self.outliers.is_due(it) and (names := self.outliers.left_out):
+                    log.write({"iteration": it, "left_out": names})
+                    self._send(self.outliers.message)
                 if self.progress is not None:
                     self.clock.end(it)
                     self.running.observe(self.losses)
@@ -250,6 +255,7 @@ class Trainer:
             self.evaluation_seconds,
             None if folder is None else folder.path,
             self.validation.best.iteration,
+            tuple(self.outliers.left_out),
         )
 
     def _measure_test_views(self, log: RunLog) -> None:
@@ -308,6 +314,8 @@ class Trainer:
             self.density.densify(it)
         if self.occluders.is_due(it):
             self.occluders.remove(self.snapshot())
+        if self.outliers.is_due(it):
+            self.outliers.look(self.snapshot())
         self.noise.add(it, mean_lr)
         if self.average.is_due(it):
             self.average.add(self.optimizer.read())
@@ -361,6 +369,7 @@ class Trainer:
             self.pipeline.statistics.read(self.splats.n),
             self.reached,
             self.average.state(),
+            sorted(self.views.left_out),
         )
 
     def evaluate(self, views: list[View]) -> Evaluation:
@@ -380,18 +389,9 @@ class Trainer:
         if self.progress is not None:
             loss, psnr = self.running.means()
             speed = (self.iteration - since) / (time.perf_counter() - started)
-            self.progress(
-                Progress(
-                    self.iteration,
-                    self.config.iterations,
-                    loss,
-                    psnr,
-                    self.splats.n,
-                    self.seconds,
-                    speed,
-                    forecast=self.clock.forecast.seconds_left(),
-                )
-            )
+            counts = self.splats.n, self.seconds, speed
+            left = self.clock.forecast.seconds_left()
+            self.progress(Progress(self.iteration, self.config.iterations, loss, psnr, *counts, forecast=left))
 
     def _send(self, message: str) -> None:
         if self.progress is not None:

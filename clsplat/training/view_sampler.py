@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Collection
 
 import numpy as np
 
@@ -19,6 +20,7 @@ class ViewSampler:
     coarse_to_fine : whether the first images are smaller.
     queue : rest of the permutation of a resumed run.
     largest_downscale : limit of the downscales, of a run that was made longer.
+    left_out : indices of views that are not sampled.
 
     Attributes
     ----------
@@ -34,8 +36,9 @@ class ViewSampler:
         rng: np.random.Generator,
         queue: list[int],
         largest_downscale: int | None = None,
+        left_out: Collection[int] = (),
     ) -> None:
-        self.views, self.rng, self.queue = views, rng, list(queue)
+        self.views, self.rng, self.queue, self.left_out = views, rng, list(queue), frozenset(left_out)
         side = min(min(view.camera.width, view.camera.height) for view in views)
         self.pixels = statistics.median(view.camera.width * view.camera.height for view in views)
         stages = resolution_schedule(iterations, image_side=side) if coarse_to_fine else [(0, 1)]
@@ -43,9 +46,12 @@ class ViewSampler:
 
     def next(self, iteration: int, n_splats: int) -> tuple[int, int]:
         """Return the index of the view of an iteration (from 1), and the downscale of its image for `n_splats`."""
-        if not self.queue:
-            self.queue = self.rng.permutation(len(self.views)).tolist()
-        return self.queue.pop(), self.downscale(iteration, n_splats)
+        while True:
+            if not self.queue:
+                self.queue = self.rng.permutation(len(self.views)).tolist()
+            view = self.queue.pop()
+            if view not in self.left_out:
+                return view, self.downscale(iteration, n_splats)
 
     def downscale(self, iteration: int, n_splats: int) -> int:
         """Return the downscale of the image of an iteration (from 1)."""

@@ -42,8 +42,9 @@ def test_an_object(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_room(tmp_path: Path) -> None:
-    scene = rendered(tmp_path, "room")
+@pytest.mark.parametrize("name", ["room", "garden", "lane"])
+def test_a_place(tmp_path: Path, name: str) -> None:
+    scene = rendered(tmp_path, name)
     assert scene.points is not None
     assert len(scene.points) > 100
     errors = []

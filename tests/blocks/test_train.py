@@ -390,3 +390,19 @@ def test_damaged_stages_are_one_line(scene: Scene, tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "blocks" / "coarse" / "point_cloud")
     with pytest.raises(InputError, match="the coarse model is gone: start again with --overwrite"):
         train_in_blocks(scene, TWO, CONFIG, output=tmp_path, resume=True)
+
+
+def test_photos_that_the_coarse_run_leaves_out_are_in_no_later_stage(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = scene.train[2].name
+    monkeypatch.setattr("clsplat.training.outliers.FEWEST_VIEWS", 1)
+    monkeypatch.setattr("clsplat.training.outliers.outliers", lambda measured: frozenset({2}))
+    found = train_in_blocks(scene, TWO, CONFIG, output=tmp_path)
+    assert found.report["coarse"]["left_out"] == [gone]
+    blocks = found.report["partition"]["blocks"]
+    assert all(gone not in block["views"] for block in blocks)
+    assert len(set().union(*(block["views"] for block in blocks))) > 3
+    assert all(not row["left_out"] for row in found.report["blocks"]), "blocks do not look"
+    recorded = json.loads((tmp_path / "config.json").read_text())["scene"]["photos"]
+    assert gone in recorded, "the record has all photos of the scene"

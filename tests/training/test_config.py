@@ -75,6 +75,7 @@ DEFAULTS = {
     "dropout": 0.0,
     "depth_smoothness": 0.0,
     "occluder_check": False,
+    "outlier_check": True,
     "position_lr_init": 1.6e-4,
     "position_lr_final": 1.6e-6,
     "opacity_lr": 0.05,

@@ -111,6 +111,11 @@ class ViewsConfig(OptionGroup):
         "the run.",
         by_scene=True,
     )
+    outlier_check: bool = option(
+        True,
+        help="Leave out photos whose renders do not resemble them at all, as with wrong poses, after 0.1, 0.2 and "
+        "0.5 of the run.",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
