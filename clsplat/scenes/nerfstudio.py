@@ -40,6 +40,8 @@ _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RA
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _LAST_ROW = 1e-6  # largest error of the last row of a pose
 _HELD_OUT = "test_frames"  # of ScanNet++, beside the list `frames`
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # of nerfstudio's `distortion_params`, in its order
+_NO_PINHOLE = ("latlong", "equirectangular", "orthographic", "ftheta_p0")  # lenses of instant-ngp
 _LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists of photos
 _COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0")  # where nerfstudio and COLMAP put a COLMAP model
 _SUFFIXES = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
@@ -182,7 +184,7 @@ class _Frame:
         if fx is None or fy is None:
             raise InputError(f"{self.place}: has neither fl_x nor camera_angle_x; add the focal length")
         core = [fx, fy, self.number("cx", width / 2), self.number("cy", height / 2)]
-        k1, k2, k3, k4, p1, p2 = (self.number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+        k1, k2, k3, k4, p1, p2 = self.distortion()
         model = str(self.value("camera_model") or "OPENCV").upper()
         if model in _FISHEYE or self.value("is_fisheye"):
             return make_lens("OPENCV_FISHEYE", width, height, [*core, k1, k2, k3, k4])
@@ -191,13 +193,37 @@ class _Frame:
                 f"{self.place}: camera_model {model!r} has no pinhole image; make perspective views "
                 f"first, or use one of {', '.join((*_PERSPECTIVE[:2], _FISHEYE[0]))}"
             )
-        if k4:
-            raise InputError(f"{self.place}: k4 of a perspective lens is not supported; undistort the photos first")
+        for key, value in (("k4", k4), *((key, self.number(key, 0.0)) for key in ("k5", "k6"))):
+            if value:
+                raise InputError(
+                    f"{self.place}: {key} of a perspective lens is not supported; undistort the photos first"
+                )
+        for key in _NO_PINHOLE:
+            if self.value(key):
+                raise InputError(f"{self.place}: {key} has no pinhole image; make perspective views first")
         return brown_lens(width, height, core, (k1, k2, k3), (p1, p2))
 
+    def distortion(self) -> list[float]:
+        """Return k1, k2, k3, k4, p1 and p2, from nerfstudio's list of them or from keys of their own."""
+        listed = self.value("distortion_params")
+        if listed is None:
+            return [self.number(key, 0.0) for key in _DISTORTION]
+        known = [to_real(value) for value in listed] if isinstance(listed, list) else []
+        sound = [value for value in known if value is not None and abs(value) < MAX_NUMBER]
+        if not len(known) == len(sound) == len(_DISTORTION):
+            raise InputError(
+                f"{self.place}: distortion_params is {str(listed)[:40]!r}; it must be the numbers "
+                f"{', '.join(_DISTORTION)}"
+            )
+        return sound
+
     def focal(self, key: str, angle: str, size: int, default: float | None = None) -> float | None:
-        """Return the focal length [px] at `key`, or from the angle of view at `angle`, or the default."""
-        if self.value(key) is not None:
+        """Return the focal length [px] at `key`, or from the angle of view at `angle`, or the default.
+
+        An angle of the frame itself counts more than a focal length of all frames.
+        """
+        own_angle = key not in self.values and self.values.get(angle) is not None
+        if self.value(key) is not None and not own_angle:
             return self.positive(key)
         if self.value(angle) is None:
             return default

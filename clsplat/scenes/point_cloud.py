@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,8 @@ GREY = 128  # colour of points in files without colours
 
 
 def read_point_cloud(path: str | os.PathLike[str]) -> Points:
-    """Read points from the properties x, y, z and red, green, blue (0 to 255). Points without colours are grey.
+    """Read points from the properties x, y, z and red, green, blue (0 to 255; reals may end at 1, 16-bit numbers at
+    65535). Points without colours are grey.
 
     Returns
     -------
@@ -47,8 +49,18 @@ def read_point_cloud(path: str | os.PathLike[str]) -> Points:
         raise InputError(f"{path}: point {bad[0]} has a position that is not finite; export the points again")
     rgb = np.full((len(xyz), 3), GREY, np.uint8)
     if all(name in columns for name in ("red", "green", "blue")):
-        rgb = np.stack([np.clip(columns[name], 0, 255).astype(np.uint8) for name in ("red", "green", "blue")], axis=1)
+        rgb = _bytes(np.stack([columns[name] for name in ("red", "green", "blue")], axis=1))
     return Points(xyz, rgb, np.ones(len(xyz), np.int64))
+
+
+def _bytes(colors: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return colours as 0 to 255. Files have them as bytes, as 16-bit numbers, or as reals up to 1 or 255."""
+    values = np.nan_to_num(colors.astype(np.float64), nan=GREY, posinf=255.0, neginf=0.0)
+    if colors.dtype.kind == "f" and values.max(initial=0.0) <= 1.0:
+        values = 255.0 * values
+    elif colors.dtype.itemsize == 2 and colors.dtype.kind == "u" and values.max(initial=0.0) > 255.0:
+        values = values / 257.0
+    return np.rint(np.clip(values, 0.0, 255.0)).astype(np.uint8)
 
 
 def write_point_cloud(path: str | os.PathLike[str], points: Points) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..cameras.seen import sampled, sampled_views, seen
 from ..scenes.colmap import Points
+from ..splats.color import SPREAD
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
@@ -37,6 +38,8 @@ def exposure_spread(views: Sequence[View], points: Points) -> float | None:
     A photo's exposure is the median factor between its pixels at the points and the points' own colours, in each
     channel. The result is that of the channel that differs most: casts of colour are exposures, too.
     """
+    if len(points) and np.ptp(points.rgb.astype(int), axis=0).max() <= SPREAD:
+        return None  # points without colours say nothing about the photos
     xyz, colors = sampled(points.xyz), sampled(points.rgb.astype(np.float64))
     stops = []
     for view in sampled_views(views):

@@ -96,6 +96,9 @@ def test_angles_of_view_of_both_axes(folder: Path, in_frames: bool) -> None:
     camera = load_scene(write(folder, values)).views[0].camera
     assert camera.fx == pytest.approx(WIDTH / 2 / np.tan(0.5), rel=1e-12)
     assert camera.fy == pytest.approx(HEIGHT / 2 / np.tan(0.25), rel=1e-12)
+    of_a_frame = size | {"fl_x": FX, "fl_y": FY, "frames": [frame | angles for frame in frames()]}
+    camera = load_scene(write(folder, of_a_frame)).views[0].camera
+    assert (camera.fx, camera.fy) == pytest.approx((WIDTH / 2 / np.tan(0.5), HEIGHT / 2 / np.tan(0.25)), rel=1e-12)
     mixed = size | {"fl_x": FX, "camera_angle_y": 0.5, "frames": frames()}
     camera = load_scene(write(folder, mixed)).views[0].camera
     assert (camera.fx, camera.fy) == (FX, pytest.approx(HEIGHT / 2 / np.tan(0.25), rel=1e-12))
@@ -120,6 +123,8 @@ def test_photos_are_undistorted(folder: Path) -> None:
     image, camera = RegisteredImage("a", np.eye(4), lens).fit(photo_of(0))
     assert scene.views[0].camera.fx == pytest.approx(camera.fx)
     np.testing.assert_array_equal(scene.views[0].image, image)
+    listed = {"distortion_params": [0.1, 0, 0, 0, 0, 0.01], "k1": 0.9, "frames": frames()}
+    np.testing.assert_array_equal(load_scene(write(folder, LENS | listed)).views[0].image, image)
     fisheye = load_scene(write(folder, LENS | {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "frames": frames()}))
     assert fisheye.views[0].image.shape != (HEIGHT, WIDTH, 3) or (fisheye.views[0].image != photo_of(0)).any()
 
@@ -265,6 +270,30 @@ def test_points_of_a_ply(folder: Path) -> None:
     np.testing.assert_array_equal(points.rgb, rgb)
 
 
+@pytest.mark.parametrize(("kind", "factor"), [("float", 1 / 255), ("float", 1), ("ushort", 257), ("ushort", 1)])
+def test_colours_of_points_have_any_type(folder: Path, kind: str, factor: float) -> None:
+    """Reals end at 1 or 255, and 16-bit numbers at 65535 or 255."""
+    xyz, rgb = cloud()
+    kinds = [("float", name) for name in "xyz"] + [(kind, name) for name in ("red", "green", "blue")]
+    header = "\n".join(
+        [
+            "ply",
+            "format ascii 1.0",
+            f"element vertex {len(xyz)}",
+            *(f"property {each} {name}" for each, name in kinds),
+            "end_header\n",
+        ]
+    )
+    number = float if kind == "float" else round
+    rows = [
+        " ".join(map(str, (*map(float, at), *(number(factor * int(part)) for part in color))))
+        for at, color in zip(xyz, rgb, strict=True)
+    ]
+    (folder / "cloud.ply").write_text(header + "\n".join(rows) + "\n")
+    points = load_scene(write(folder, LENS | {"ply_file_path": "cloud.ply", "frames": frames()})).points
+    np.testing.assert_array_equal(points.rgb, rgb)
+
+
 def test_points_of_the_model_behind_the_poses_are_transformed(folder: Path, tmp_path: Path) -> None:
     shutil.move(write_garden(tmp_path / "other") / "sparse", folder / "colmap" / "sparse")
     moved = [[0, 1, 0, 1], [-1, 0, 0, 2], [0, 0, 1, 3]]
@@ -304,6 +333,14 @@ def in_frame(**values: Any) -> Callable[[Values], Values]:
         (changed(fl_x=None, fl_y=None, camera_angle_x=4.0), "camera_angle_x is 4; an angle of view is below pi"),
         (changed(w=0), "w x h is 0 x 30"),
         (changed(k4=0.1), "k4 of a perspective lens"),
+        (changed(k6=-0.1), "k6 of a perspective lens"),
+        (changed(distortion_params=[0, 0, 0, 0.1, 0, 0]), "k4 of a perspective lens"),
+        (changed(distortion_params=[0.1, 0.2]), "distortion_params is .* the numbers k1, k2, k3, k4, p1, p2"),
+        (changed(distortion_params=[0.1, 0, 0, 0, 0, "a"]), "distortion_params is"),
+        (changed(distortion_params=0.1), "distortion_params is '0.1'"),
+        (changed(latlong=True), "frame 0: latlong has no pinhole image; make perspective views first"),
+        (in_frame(equirectangular=True), "frame 1: equirectangular has no pinhole image"),
+        (changed(ftheta_p0=0.2), "ftheta_p0 has no pinhole image"),
         (changed(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR' has no pinhole image"),
         (changed(ply_file_path="gone.ply"), r"gone\.ply: cannot be read"),
         (changed(ply_file_path="images"), "images: cannot be read"),

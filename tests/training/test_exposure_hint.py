@@ -72,3 +72,10 @@ def test_few_points_say_nothing(scene: Scene) -> None:
     assert exposure_spread(exposed(scene, 1.5).train, few) is None
     assert exposure_spread(exposed(scene, 1.5).train, nothing) is None
     assert exposure_spread(exposed(scene, 1.5).train[:3], scene.points) is None
+
+
+def test_points_of_one_colour_say_nothing(scene: Scene) -> None:
+    """Clouds without colours are grey."""
+    grey = replace(scene.points, rgb=np.full_like(scene.points.rgb, 128))
+    assert exposure_spread(scene.train, grey) is None
+    assert exposure_spread(scene.train, scene.points) is not None
