@@ -1,5 +1,11 @@
 // controls.js: moves the camera by mouse, touch and keys. The camera turns around a target, or flies.
 
+// Whether an element uses keys itself: a list, the choice of a colour, or the help. Buttons do not use letters and arrows.
+function needsKeys(target) {
+  return Boolean(target.closest?.("select, input, dialog"));
+}
+
+
 const FLY = 0.8;     // distances to the target in a second
 const LOOK = 0.9;    // radians in a second
 const STEEP = 0.99;  // largest cosine between the view and the up direction: the camera never turns over
@@ -76,7 +82,7 @@ class Controls {
       this.keys.delete(name);
       return;
     }
-    if (event.target !== this.canvas && event.target !== document.body) return;
+    if (needsKeys(event.target)) return;
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (!"wasdqe".includes(name) && !name.startsWith("Arrow")) return;
     this.keys.add(name);

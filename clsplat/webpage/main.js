@@ -54,7 +54,13 @@ class Page {
   buttons(head) {
     const list = find("cameras");
     this.cameras.forEach((camera, i) => list.add(new Option(camera.name || `view ${i + 1}`, i)));
-    list.onchange = () => this.jump(Number(list.value));
+    let byPointer = false;
+    list.onpointerdown = () => { byPointer = true; };
+    list.onkeydown = () => { byPointer = false; };
+    list.onchange = () => {
+      this.jump(Number(list.value));
+      if (byPointer) this.canvas.focus();  // so that keys move the camera. Who walks through the list by keys stays there
+    };
     find("previous").onclick = () => this.jump(this.index - 1);
     find("next").onclick = () => this.jump(this.index + 1);
     find("reset").onclick = () => this.jump(0);
@@ -79,7 +85,7 @@ class Page {
   }
 
   key(event) {
-    if (event.target !== this.canvas && event.target !== document.body) return;
+    if (needsKeys(event.target)) return;
     const buttons = { ",": "previous", ".": "next", t: "tour", r: "reset", f: "fullscreen", h: "help-button" };
     const button = buttons[event.key];
     if (button && !event.ctrlKey && !event.metaKey && !event.altKey) find(button).click();

@@ -215,6 +215,39 @@ def test_keys_fly_and_look(page: Page) -> None:
     assert turned[2] @ axes[0] > 0.05
 
 
+@pytest.mark.parametrize("button", ["#next", "#reset", "#tour"])
+def test_keys_work_after_a_click_on_a_button(page: Page, button: str) -> None:
+    page.locator(button).click()
+    page.keyboard.down("w")
+    assert page.evaluate("page.controls.keys.size") == 1
+    page.keyboard.up("w")
+    index = page.evaluate("page.index")
+    page.keyboard.press(".")
+    assert page.evaluate("page.index") != index
+    page.keyboard.press("r")
+
+
+def test_keys_work_after_a_choice_in_the_list_by_pointer(page: Page) -> None:
+    """Who walks through the list by keys stays there."""
+    cameras = page.locator("#cameras")
+    cameras.focus()
+    page.keyboard.press("ArrowDown")
+    assert page.evaluate("page.index") == 1
+    assert page.evaluate("document.activeElement.id") == "cameras"
+    page.keyboard.down("d")
+    assert page.evaluate("page.controls.keys.size") == 0, "letters choose in the list"
+    page.keyboard.up("d")
+    page.evaluate("""() => {
+        const list = document.getElementById("cameras");
+        list.dispatchEvent(new PointerEvent("pointerdown"));
+        list.value = 2;
+        list.dispatchEvent(new Event("change"));
+    }""")
+    assert page.evaluate("page.index") == 2
+    assert page.evaluate("document.activeElement.id") == "view"
+    page.keyboard.press("r")
+
+
 @pytest.mark.parametrize("between", ["Control", "h", "focus", "tour"])
 def test_a_key_that_is_released_elsewhere_is_released(page: Page, between: str) -> None:
     page.locator("#view").focus()
