@@ -64,7 +64,7 @@ SECTIONS = {
     "--output",
     type=PATH,
     metavar="PATH",
-    help="A .ply, .splat or .spz file to write, or the folder of a new model.",
+    help="A file to write (.ply, .splat, .spz, .sog, .glb or USD), or the folder of a new model.",
 )
 @click.option("--dry-run", is_flag=True, help="Print what would be removed, and write nothing.")
 @click.option(

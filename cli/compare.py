@@ -73,7 +73,7 @@ SYSTEMS = (DEFAULT, *PRESETS)
 )
 @photo_options
 @hiding_options
-@split_options
+@split_options()
 @click.option("--save-models", is_flag=True, help="Keep the splats of each run, in DIR/models.")
 @cluster_option
 @quiet_option

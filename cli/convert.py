@@ -126,9 +126,12 @@ def convert_model(
     Without --approximate, nothing is written if a splat cannot be converted exactly. With --shape gaussian, a .ply has
     only 3DGS's columns.
     """
+    from clsplat.cameras.cameras_json import read_cameras
     from clsplat.models.convert import PageOptions, conversion_cost, level_costs
     from clsplat.models.convert import convert_model as convert
 
+    if cameras is not None:
+        read_cameras(cameras)  # a wrong file stops the command before it writes
     page = None
     if output.suffix.lower() == PAGE_ENDING or precision or camera_path or title:
         page = PageOptions(precision or PRECISIONS[0], cameras, camera_path, title)

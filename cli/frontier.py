@@ -80,7 +80,7 @@ SYSTEMS = (next(iter(SHAPES)), DEFAULT_SHAPE)
 @click.option("--charts-only", is_flag=True, help="Draw the existing runs, without training.")
 @photo_options
 @hiding_options
-@split_options
+@split_options()
 @cluster_option
 @quiet_option
 @config_options(

@@ -7,18 +7,21 @@ import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from clsplat.scenes.options import ALPHA_USES
 from clsplat.splats.color import WHITE, Color
 from clsplat.training.config import OPTIONS, SECTIONS, TrainConfig
-from clsplat.training.no_effect import no_effect
+from clsplat.training.no_effect import no_effect, no_effect_in
 from clsplat.training.options.density import STRATEGIES
 from clsplat.training.options.option import Option, option_table
 
 from .command import SectionedCommand, SectionOption
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -213,21 +216,25 @@ def hiding_options(function: F) -> F:
     )(function)
 
 
-def split_options(function: F) -> F:
-    """Add `--test-every` and `--test-list`: which views are held out."""
-    function = click.option(
-        "--test-list",
-        type=PATH,
-        metavar="FILE",
-        help="Names of the test views, one per line; implies --eval.",
-    )(function)
-    return click.option(
-        "--test-every",
-        type=int,
-        metavar="N",
-        help="Every Nth of the sorted views is a test view; implies --eval. No effect if the scene's files name test "
-        "views.  [default: 8]",
-    )(function)
+def split_options(implied: str = "") -> Callable[[F], F]:
+    """Add `--test-every` and `--test-list`: which views are held out. implied : what else they do, for their help."""
+
+    def decorate(function: F) -> F:
+        function = click.option(
+            "--test-list",
+            type=PATH,
+            metavar="FILE",
+            help=f"Names of the test views, one per line{implied}.",
+        )(function)
+        return click.option(
+            "--test-every",
+            type=int,
+            metavar="N",
+            help=f"Every Nth of the sorted views is a test view{implied}. No effect if the scene's files name test "
+            "views.  [default: 8]",
+        )(function)
+
+    return decorate
 
 
 def config_options(*without: str) -> Callable[[F], F]:
@@ -245,10 +252,11 @@ def config_options(*without: str) -> Callable[[F], F]:
     return decorate
 
 
-def warn_without_effect(configs: Sequence[TrainConfig], names: Iterable[str]) -> None:
-    """Warn about flags that have no effect in any of the runs."""
+def warn_without_effect(configs: Sequence[TrainConfig], names: Iterable[str], scene: Scene | None = None) -> None:
+    """Warn about flags that have no effect in any of the runs. scene : that of all runs, if it is one."""
     for name in names:
-        reasons = [no_effect(config, name) for config in configs]
+        why_in_scene = None if scene is None else no_effect_in(scene, name)
+        reasons = [no_effect(config, name) or why_in_scene for config in configs]
         if all(reasons):
             why = " or ".join(dict.fromkeys(filter(None, reasons)))
             warnings.warn(f"--{name.replace('_', '-')} has no effect {why}", stacklevel=2)

@@ -57,7 +57,7 @@ from .progress import TrainingDisplay, resume_command
 @photo_options
 @hiding_options
 @click.option("--eval", is_flag=True, help="Hold test views out of training.")
-@split_options
+@split_options("; implies --eval")
 @overwrite_option("the model that is there")
 @quiet_option
 @config_options()

@@ -20,7 +20,13 @@ from clsplat.training.decisions import decide
 from clsplat.training.folder import ModelFolder
 from clsplat.training.presets import PRESETS, with_preset
 from clsplat.training.quality import NORMAL, QUALITIES, quality
-from clsplat.training.stored_run import check_reading, existing_scene, load_recorded_scene, read_options_file
+from clsplat.training.stored_run import (
+    check_reading,
+    existing_scene,
+    load_recorded_scene,
+    read_options_file,
+    read_views_of_file,
+)
 from clsplat.viewer.options import ServerOptions
 
 from .blocks import blocks_options, given_blocks, run_blocks
@@ -129,7 +135,7 @@ def _qualities() -> str:
     help=f"How long to train, and with how many splats: {_qualities()}. Flags replace them.  [default: {NORMAL}]",
 )
 @click.option("--eval", is_flag=True, help="Hold test views out of training, and measure them at the end.")
-@split_options
+@split_options("; implies --eval")
 @click.option("--resume", is_flag=True, help="Continue from the model's checkpoint, with the options of its run.")
 @changed_photos_option
 @overwrite_option("the model that is there, and start again")
@@ -229,7 +235,8 @@ def train(
     options |= ({} if quality_name is None else quality(quality_name, batch)) | flags
     if preset is not None:
         options = with_preset(preset, options)
-    reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
+    reading = {} if config_file is None or resume else read_views_of_file(config_file)
+    reading |= {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
     model_path = model_path or _default_folder(path)
     recorded, photos, blocks = None, {}, None
     if resume:
@@ -255,7 +262,7 @@ def train(
     with activity_line(quiet):
         loaded = load_recorded_scene(path, reading, config.background)
     decided = decide(loaded, config).config
-    warn_without_effect([decided], flags)
+    warn_without_effect([decided], flags, loaded)
     check_photos(loaded, photos, model_path, allow=allow_changed_photos, all_views=True)
     if blocks is not None:
         run_blocks(ctx, loaded, config, blocks, model_path, resume, overwrite, quiet, cluster)

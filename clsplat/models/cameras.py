@@ -63,7 +63,8 @@ def export_cameras(
 
     Raises
     ------
-    InputError : the source has no cameras, or the format does not support a lens.
+    InputError : the source has no cameras, or the format does not support a lens. `iteration` names one of a scene, or
+        `images` a folder of a model.
     OutputError : a file exists or cannot be written.
     """
     source, output = Path(source), Path(output)
@@ -72,7 +73,12 @@ def export_cameras(
     suffix = ".txt" if form == "colmap-text" else ".bin"
     files = [output / f"{name}{suffix}" for name in _COLMAP_FILES] if form.startswith("colmap") else [output]
     refuse_existing(files, overwrite)
-    if _is_scene(source):
+    is_scene = _is_scene(source)
+    if is_scene and iteration is not None:
+        raise InputError(f"{source}: is a scene, which has no iterations; name a model, or leave out the iteration")
+    if images is not None and not is_scene:
+        raise InputError(f"{source}: is not a scene with photos; name a scene, or leave out the folder of photos")
+    if is_scene:
         photos, photo_files, points = _of_scene(source, images)
     else:
         photos, points = _of_model(source, iteration)

@@ -13,10 +13,11 @@ import numpy as np
 
 from ..cameras.cameras_json import NamedCamera
 from ..cameras.path import DEFAULT_FPS
+from ..errors import InputError
 from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from .colormaps import depth_range
-from .outputs import ImageWriter, VideoFiles, extra_video, image_file, output_stems
+from .outputs import EXTRAS, ImageWriter, VideoFiles, extra_video, image_file, output_stems
 from .renderer import RendersSplats
 
 _QUARTILES = (0.25, 0.75)  # quantiles over the frames of the near and of the far end
@@ -48,6 +49,11 @@ class RenderOutput:
     depth_colours: bool = False
     depth_range: tuple[float, float] | None = None
     fps: float | None = None
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.extras if name not in EXTRAS]
+        if unknown:
+            raise InputError(f"extras {unknown[0]!r}: choose from {', '.join(EXTRAS)}")
 
 
 @dataclass(frozen=True)

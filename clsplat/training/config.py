@@ -71,7 +71,10 @@ class TrainConfig:
         by_scene=True,
     )
     iterations: int = option(
-        7000, help="Number of training steps. Each one learns from a single photo.", at_least=1, aliases=["--steps"]
+        7000,
+        help="Number of training steps. Each one learns from --batch photos, usually one.",
+        at_least=1,
+        aliases=["--steps"],
     )
     cap_max: int = option(
         100_000,

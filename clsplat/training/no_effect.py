@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ..splats.shapes import shape_named
 from .config import TrainConfig
+
+if TYPE_CHECKING:
+    from ..scenes.scene import Scene
 
 # Options by the field of the splats that they are about.
 _BY_FIELD = {
@@ -37,9 +42,20 @@ def no_effect(config: TrainConfig, name: str) -> str | None:
         return f"with shape {config.shape}"
     if name.startswith("sghmc_") and values["position_optimizer"] == "adam":
         return "with position optimizer adam"
+    if name.startswith("alternation_") and values["alternation"] == "off":
+        return "with alternation off"
+    if name == "dense_size" and values["split"] != "published":
+        return f"with split {values['split']}"
     switch = _NEEDS.get(name)
     if switch is not None and not values[switch]:
         return f"without --{switch.replace('_', '-')}"
-    if name in ("save_iterations", "test_iterations") and min(values[name], default=0) > config.iterations:
-        return f"beyond the run's {config.iterations} iterations"
+    if name in ("save_iterations", "test_iterations"):
+        beyond = [number for number in values[name] if number > config.iterations]
+        if beyond and len(beyond) == len(values[name]):
+            return f"beyond the run's {config.iterations} iterations"
     return None
+
+
+def no_effect_in(scene: Scene, name: str) -> str | None:
+    """Return why a named option has no effect with this scene; None if it has one."""
+    return "without test views" if name == "test_iterations" and not scene.test else None

@@ -19,12 +19,14 @@ from ..splats.splats import Splats
 from .config import TrainConfig
 from .view_sampler import ViewSampler
 
-CHECKS = (0.1, 0.2, 0.5)  # parts of the run. With small images in the first half, photos are still in memory then
+CHECKS = (0.1, 0.2, 0.3)  # parts of the run. Later, hard photos stand out, because all others fit so well
 LONGEST = 200  # longest side of the images [px]
 FEWEST_VIEWS = 10  # of fewer photos, each may be the only one of its place
 MOST = 0.25  # part of the photos that may be outliers; if it is more, nothing says which photos are right
 UNLIKE = 6.0  # times the usual lack of correlation, and at least
-LEAST_UNLIKE = 0.1
+LEAST_UNLIKE = 0.15
+UNUSUAL = 4.5  # times the usual deviation from it, as a factor. In outdoor scenes, photos differ much
+_TINY = 1e-6  # lack of correlation of a perfect render
 _NAMED = 3  # views that the message names
 ERROR = 4.0  # times the usual squared error. A photo of a plain wall may lack correlation, but has a small error
 
@@ -96,5 +98,7 @@ def outliers(measured: Sequence[Likeness]) -> frozenset[int]:
     """Return the indices of outliers; none if there are too many of them."""
     unlike, error = np.array(measured).T
     usual = float(np.median(unlike)), float(np.median(error))
-    found = (unlike > max(UNLIKE * usual[0], LEAST_UNLIKE)) & (error > ERROR * usual[1])
+    factor = np.log(np.maximum(unlike, _TINY) / max(usual[0], _TINY))
+    spread = float(np.median(np.abs(factor)))
+    found = (unlike > max(UNLIKE * usual[0], LEAST_UNLIKE)) & (error > ERROR * usual[1]) & (factor > UNUSUAL * spread)
     return frozenset(np.flatnonzero(found).tolist()) if found.mean() <= MOST else frozenset()

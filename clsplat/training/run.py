@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 from ..device.several import open_devices
 from ..device.specs import first_device
-from ..errors import OutputError
+from ..errors import InputError, OutputError
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..files.lock import folder_lock
 from ..rendering.renderer import Renderer
@@ -61,6 +62,8 @@ def train(
     DeviceError : the device has too little memory.
     TrainingError : the loss is not finite; the last checkpoint is kept.
     """
+    if isinstance(scene, str | os.PathLike):
+        raise InputError(f"{scene}: train takes a scene, not its path: clsplat.load_scene reads it")
     config = config or TrainConfig()
     folder = None if output is None else ModelFolder(output)
     checkpoint = None

@@ -214,6 +214,25 @@ def read_options_file(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise InputError(f"{path}: {error}") from None
 
 
+def read_views_of_file(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return how the run of a config.json read its views: "eval", "resolution" and "test_every", as far as recorded.
+
+    Masks and folders of photos belong to its scene. A file of options records nothing.
+
+    Raises
+    ------
+    InputError : the file cannot be read, or holds another value.
+    """
+    record = read_object(path).get("scene")
+    if record is None:
+        return {}
+    try:
+        known = checked_record(record)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return {key: known[key] for key in ("eval", "resolution", "test_every") if key in known}
+
+
 def load_recorded_scene(path: str | os.PathLike[str], record: Mapping[str, Any], background: Color = BLACK) -> Scene:
     """Return a scene, loaded with the recorded arguments of `load_scene`.
 

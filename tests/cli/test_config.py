@@ -102,3 +102,22 @@ def test_a_flag_of_the_other_strategy_warns(scene: Path, tmp_path: Path) -> None
     result = run("train", scene, "-m", tmp_path / "b", "--strategy", "mcmc", "--growth", "1.2", *short)
     assert (result.exit_code, result.stderr) == (0, "")
     assert config_of(tmp_path / "b")["growth"] == 1.2
+
+
+def test_views_of_a_former_run_are_read_alike(scene: Path, tmp_path: Path) -> None:
+    """Its test views stay test views, at its size, unless the command says otherwise."""
+    former, again, other = (tmp_path / name for name in ("former", "again", "other"))
+    short = ("--iterations", 3, "--cap-max", 50, "-q")
+    clsplat("train", scene, "-m", former, "--test-every", 3, "-r", 2, *short)
+    clsplat("train", scene, "-m", again, "--config", former / "config.json", "--seed", 1, "-q")
+    records = [json.loads((model / "config.json").read_text())["scene"] for model in (former, again)]
+    assert records[0] == records[1]
+    assert (records[1]["eval"], records[1]["resolution"], records[1]["test_every"]) == (True, 2, 3)
+    clsplat("train", scene, "-m", other, "--config", former / "config.json", "--test-every", 4, "-r", 1, "-q")
+    record = json.loads((other / "config.json").read_text())["scene"]
+    assert (record["eval"], record["resolution"], record["test_every"]) == (True, 1, 4)
+    values = json.loads((former / "config.json").read_text())
+    values["scene"]["resolution"] = "large"
+    (former / "config.json").write_text(json.dumps(values))
+    message = error_of("train", scene, "-m", tmp_path / "m", "--config", former / "config.json")
+    assert f"{former / 'config.json'}: scene.resolution is" in message

@@ -267,3 +267,9 @@ def test_negative_opacity_has_no_equal_in_a_shape_without(tmp_path: Path) -> Non
     message = error_of("convert", source, tmp_path / "out.ply", "--shape", "gaussian")
     assert "opacity" in message
     assert not (tmp_path / "out.ply").exists()
+
+
+def test_wrong_cameras_stop_the_command_before_it_writes(model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.ply"
+    assert "nothere.json" in error_of("convert", model, out, "--cameras", tmp_path / "nothere.json")
+    assert not out.exists()

@@ -10,7 +10,7 @@ import sys
 
 import click
 import pytest
-from cli_runner import clsplat, error_of, run
+from cli_runner import clsplat, error_of, flags_of, run
 from clsplat_cli.command import OTHER, DocumentedCommand, SectionedCommand
 from clsplat_cli.help_layout import TerminalFormatter, wrapped, write_examples
 from clsplat_cli.main import COMMANDS, EXAMPLES, main
@@ -197,3 +197,9 @@ def test_the_nearest_command_is_named(wrong: str, right: str) -> None:
 
 def test_no_command_is_near() -> None:
     assert error_of("xyz", code=2) == "error: no command 'xyz' (see: clsplat --help)"
+
+
+@pytest.mark.parametrize("command", ["compare", "frontier", "train", "partition"])
+def test_help_names_only_flags_of_the_command(command: str) -> None:
+    shown = run(command, "--help-all").output
+    assert ("implies --eval" in " ".join(shown.split())) == ("--eval" in flags_of(command))

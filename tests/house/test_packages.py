@@ -240,3 +240,9 @@ def test_commands_only_parse_call_and_print() -> None:
         if names_used(tree) & (WRITERS | {"open"}):
             writing.add(path.name)
     assert writing == set(COMMANDS_THAT_WRITE)
+
+
+def test_the_package_lists_its_names() -> None:
+    import clsplat
+
+    assert set(clsplat.__all__) <= set(dir(clsplat))

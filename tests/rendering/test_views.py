@@ -10,7 +10,9 @@ import pytest
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
+from clsplat.errors import InputError
 from clsplat.rendering import views
+from clsplat.rendering.views import RenderOutput
 
 
 def test_the_range_of_a_path_is_between_quartiles_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,3 +23,8 @@ def test_the_range_of_a_path_is_between_quartiles_of_its_frames(monkeypatch: pyt
     splats: Any = None
     cameras = [NamedCamera(str(i), Camera(40, 30, 30.0, 30.0, 20.0, 15.0, np.eye(4))) for i in range(5)]
     assert views.depths_seen(renderer, splats, cameras) == pytest.approx((1.0, 9.0))
+
+
+def test_extras_that_do_not_exist_are_named() -> None:
+    with pytest.raises(InputError, match="extras 'normals': choose from alpha, depth"):
+        RenderOutput("out", extras=("alpha", "normals"))

@@ -245,3 +245,9 @@ def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> Non
 def test_options_of_the_other_strategy_are_checked() -> None:
     with pytest.raises(InputError, match="relocation_limit 5"):
         TrainConfig(strategy="adc", relocation_limit=5.0)
+
+
+@pytest.mark.parametrize(("name", "value"), [("iterations", "200"), ("opacity_lr", [0.1]), ("cap_max", {})])
+def test_values_of_another_type_are_named(name: str, value: object) -> None:
+    with pytest.raises(InputError, match=f"{name} is .*; expected"):
+        TrainConfig(**{name: value})

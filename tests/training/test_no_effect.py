@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from cli_runner import error_of, run
 
+from clsplat.scenes.scene import Scene
 from clsplat.training.config import OPTIONS, TrainConfig
-from clsplat.training.no_effect import _FIELD_OF, _NEEDS, no_effect
+from clsplat.training.no_effect import _FIELD_OF, _NEEDS, no_effect, no_effect_in
 
 
 @pytest.mark.parametrize(
@@ -24,6 +26,9 @@ from clsplat.training.no_effect import _FIELD_OF, _NEEDS, no_effect
         ({}, "exposure_rate", "without --exposure"),
         ({}, "random_background_until", "without --random-background"),
         ({"strategy": "adc"}, "growth", "with strategy adc"),
+        ({"shape": "skew-normal"}, "alternation_cycle", "with alternation off"),
+        ({"shape": "skew-normal"}, "alternation_split", "with alternation off"),
+        ({"split": "long-axis"}, "dense_size", "with split long-axis"),
         ({"iterations": 100, "save_iterations": (200, 300)}, "save_iterations", "beyond the run's 100 iterations"),
     ],
 )
@@ -43,6 +48,8 @@ def test_reasons(options: dict[str, Any], name: str, why: str) -> None:
         ({"exposure": True}, "exposure_rate"),
         ({"random_background": True}, "random_background_until"),
         ({"strategy": "adc"}, "opacity_reset"),
+        ({"shape": "skew-normal", "alternation": "cyclic"}, "alternation_cycle"),
+        ({"split": "published"}, "dense_size"),
         ({"iterations": 100, "save_iterations": (50, 300)}, "save_iterations"),
         ({}, "save_iterations"),
     ],
@@ -69,3 +76,14 @@ def test_flags_that_need_another_flag(model_folder: Path, capture_folder: Path, 
     assert "remove --no-photos" in error_of(*clean, "--tolerance", 0.2, code=2)
     render = ("render", model_folder, "-o", tmp_path / "r", "--depth-range", "1,2")
     assert "give --depth-colours" in error_of(*render, code=2)
+
+
+def test_measurements_without_test_views_are_named(scene: Scene, capture_folder: Path, tmp_path: Path) -> None:
+    assert no_effect_in(scene, "test_iterations") is None
+    assert no_effect_in(replace(scene, test_names=frozenset()), "test_iterations") == "without test views"
+    assert no_effect_in(replace(scene, test_names=frozenset()), "save_iterations") is None
+    flags = ("--iterations", 4, "--cap-max", 50, "-q", "--test-iterations", 2)
+    said = run("train", capture_folder, "-m", tmp_path / "m", *flags).stderr
+    assert "--test-iterations has no effect without test views" in said
+    said = run("train", capture_folder, "-m", tmp_path / "n", "--eval", *flags).stderr
+    assert "no effect" not in said

@@ -76,6 +76,9 @@ def test_which_views_are_outliers() -> None:
     assert not outliers([*usual, Likeness(0.2, 0.003)]), "a plain wall: its error is small"
     assert not outliers([*usual, Likeness(0.12, 0.01)]), "four times what is usual: a hard photo"
     assert not outliers([Likeness(0.001 * (1 + index / 18), 1e-5) for index in range(18)] + [Likeness(0.05, 0.01)])
+    wide = [Likeness(0.02 * 1.12 ** (index - 9), 1e-3) for index in range(18)]
+    assert not outliers([*wide, Likeness(0.16, 0.01)]), "eight times what is usual, where photos differ much"
+    assert outliers([*wide, Likeness(1.2, 0.01)]) == {18}
     many = [Likeness(0.5, 0.1)] * 6
     assert outliers([*usual, *many]) == {18, 19, 20, 21, 22, 23}
     assert not outliers([*usual, *many, many[0]]), "too many to say which are right"
@@ -134,7 +137,7 @@ def test_a_resumed_run_leaves_out_the_same(misplaced: Scene, tmp_path: Path) -> 
         np.testing.assert_array_equal(values, rest.splats.arrays[name])
     lines = [json.loads(line) for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
     named = [line for line in lines if "left_out" in line]
-    assert named[-1] == {"iteration": 500, "left_out": names_of(misplaced)}
+    assert named[-1] == {"iteration": 300, "left_out": names_of(misplaced)}
 
 
 def test_when_it_looks(scene: Scene) -> None:
@@ -143,8 +146,8 @@ def test_when_it_looks(scene: Scene) -> None:
         trainer = Trainer(some, TrainConfig(**(OPTIONS | options)))
         return [it for it in range(1, 1001) if trainer.outliers.is_due(it)]
 
-    assert due({}) == [100, 200, 500]
+    assert due({}) == [100, 200, 300]
     assert due({"outlier_check": False}) == []
     assert due(preset("3dgs") | OPTIONS) == [], "published systems learn from all photos"
-    assert due({}, FEWEST_VIEWS) == [100, 200, 500]
+    assert due({}, FEWEST_VIEWS) == [100, 200, 300]
     assert due({}, FEWEST_VIEWS - 1) == []

@@ -260,3 +260,8 @@ def test_splats_that_are_not_finite_are_mended_or_left_out(
     )
     with pytest.raises(TrainingError, match="no splat is finite"):
         trainer.snapshot()
+
+
+def test_the_path_of_a_scene_is_not_a_scene(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"train takes a scene, not its path: clsplat\.load_scene reads it"):
+        train(str(tmp_path))  # type: ignore[arg-type]

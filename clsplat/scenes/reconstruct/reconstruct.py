@@ -111,6 +111,8 @@ def reconstruct(
             )
         else:
             photo_files = find_photos(source)
+            if options.frames != ReconstructOptions().frames:
+                warnings.warn(f"{source}: frames {options.frames} has no effect: these are photos", stacklevel=2)
         source_digest = fingerprint(source)
         photo_files = with_faces(source, photo_files, options.panoramas, work / "faces", report)
         ready = _stage_all(photo_files, source, work, report)

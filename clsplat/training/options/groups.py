@@ -114,7 +114,7 @@ class ViewsConfig(OptionGroup):
     outlier_check: bool = option(
         True,
         help="Leave out photos whose renders do not resemble them at all, as with wrong poses, after 0.1, 0.2 and "
-        "0.5 of the run.",
+        "0.3 of the run.",
     )
 
 

@@ -93,7 +93,13 @@ class Option:
             raise InputError(f"{self.name} {value!r}: choose one of {', '.join(self.choices)}")
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError(f"{self.name} {value}: must be finite{f' and {self.range}' if self.range else ''}")
-        if self.range is not None and value is not None and not self.range.allows(value):
+        if self.range is None or value is None:
+            return
+        try:
+            is_allowed = self.range.allows(value)
+        except TypeError:
+            raise InputError(f"{self.name} is {describe(value)}; expected {_expected(self.type)}") from None
+        if not is_allowed:
             raise InputError(f"{self.name} {value}: must be {self.range}")
 
     def from_json(self, value: Any) -> Any:
