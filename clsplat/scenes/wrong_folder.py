@@ -12,6 +12,7 @@ from ..files.image_names import IMAGE_SUFFIXES
 from ..files.real_path import real_path
 from ..splats.formats.any_file import READ_ENDINGS
 from .colmap import find_model, read_model
+from .colmap_folder import PHOTOS
 from .described import read_described
 from .photo_listing import is_posed
 from .scene_files import OTHER_KINDS, described_by
@@ -35,8 +36,17 @@ def describe_scenes(path: Path, scenes: Sequence[str]) -> str:
     """Return a text that asks for one of the scenes below a folder."""
     some = ", ".join(scenes[:_MAX_NAMED]) + (", ..." if len(scenes) > _MAX_NAMED else "")
     if len(scenes) == 1:
-        return f"the subfolder {some} is a scene: give {path / scenes[0]}"
+        return f"the subfolder {some} is a scene: give {path / scenes[0]}{_photos_above(path, scenes[0])}"
     return f"the subfolders {some} are scenes: give one of them, such as {path / scenes[0]}"
+
+
+def _photos_above(path: Path, scene: str) -> str:
+    """Return words on the photos of a COLMAP model in a subfolder, if they lie beside that folder: its `images`."""
+    sub = path / scene
+    if described_by(sub) or (sub / PHOTOS).is_dir() or not (path / PHOTOS).is_dir():
+        return ""
+    up = "/".join([".."] * len(Path(scene).parts))
+    return f", and its folder of photos: {up}/{PHOTOS}"
 
 
 def describe_file(file: Path) -> str:

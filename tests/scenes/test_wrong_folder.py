@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import error_of
+from cli_runner import error_of, run
 from small_scene import NAMES, write_garden
 
 from clsplat.files.images import write_png
@@ -49,6 +49,17 @@ def test_the_folder_above_scenes(data: Path, tmp_path: Path, command: str) -> No
     assert "the subfolders garden, more/other are scenes: give one of them, such as " in message
     shutil.rmtree(data / "more")
     assert "the subfolder garden is a scene: give " in refusal(command, data, tmp_path / "out")
+
+
+@pytest.mark.parametrize("below", ["colmap", "work/distorted"])
+def test_a_model_in_a_subfolder_beside_its_photos(data: Path, tmp_path: Path, below: str) -> None:
+    garden = data / "garden"
+    (garden / below).mkdir(parents=True)
+    (garden / "sparse").rename(garden / below / "sparse")
+    photos = "../" * len(Path(below).parts) + "images"
+    message = refusal("info", garden, tmp_path / "out")
+    assert message.endswith(f"is a scene: give {garden / below}, and its folder of photos: {photos}")
+    assert run("info", garden / below, "-i", photos).exit_code == 0
 
 
 @pytest.mark.parametrize("command", COMMANDS)
