@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cli_runner import SHORT, clsplat, run
+from recorded_scenes import go_on_without_record, scene_and_warnings
 
 from clsplat.errors import InputError
 from clsplat.files.images import read_image, write_photo, write_png
@@ -39,13 +39,6 @@ def barred(capture_folder: Path, tmp_path: Path) -> Path:
     return with_bars(capture_folder, tmp_path / "barred")
 
 
-def loaded(folder: Path, **arguments: object) -> tuple[Scene, str]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        scene = load_scene(folder, **arguments)  # type: ignore[arg-type]
-    return scene, " ".join(str(one.message) for one in caught)
-
-
 def has_bars(scene: Scene, rows: int = LEFT_OUT) -> bool:
     """Return whether the pixels above and below are left out in all photos, and no others are."""
     masks = [view.mask for view in (*scene.train, *scene.test)]
@@ -61,7 +54,7 @@ def has_bars(scene: Scene, rows: int = LEFT_OUT) -> bool:
 
 @pytest.mark.parametrize("color", [0, 90, 255])
 def test_bars_are_left_out(capture_folder: Path, tmp_path: Path, color: int) -> None:
-    scene, said = loaded(with_bars(capture_folder, tmp_path / "barred", color))
+    scene, said = scene_and_warnings(with_bars(capture_folder, tmp_path / "barred", color))
     assert MESSAGE in said
     assert has_bars(scene)
     assert scene.reading["bars"] == pytest.approx([ROWS / 36, 0, ROWS / 36, 0])
@@ -73,7 +66,7 @@ def test_bars_at_the_left_and_right(capture_folder: Path, tmp_path: Path) -> Non
         pixels = read_image(file)[..., :3].copy()
         pixels[:, :5], pixels[:, -3:] = 16, 16
         write_png(file, pixels)
-    scene, said = loaded(folder)
+    scene, said = scene_and_warnings(folder)
     assert "bars at the right and left of all photos" in said
     mask = scene.train[0].mask
     assert mask is not None
@@ -84,13 +77,13 @@ def test_bars_at_the_left_and_right(capture_folder: Path, tmp_path: Path) -> Non
 
 def test_what_keeps_bars(barred: Path, capture_folder: Path, tmp_path: Path) -> None:
     for arguments in ({"masks": "none"}, {"bars": NO_BARS}):
-        scene, said = loaded(barred, **arguments)
+        scene, said = scene_and_warnings(barred, **arguments)
         assert MESSAGE not in said
         assert not has_bars(scene)
         assert scene.reading["bars"] == list(NO_BARS)
     one_without = with_bars(capture_folder, tmp_path / "one", but=3)
-    assert not has_bars(loaded(one_without)[0]), "a photo has none: the scene is dark there"
-    usual, said = loaded(capture_folder)
+    assert not has_bars(scene_and_warnings(one_without)[0]), "a photo has none: the scene is dark there"
+    usual, said = scene_and_warnings(capture_folder)
     assert usual.reading["bars"] == list(NO_BARS)
     assert "bars" not in said
 
@@ -111,7 +104,7 @@ def test_masks_that_hide_the_bars_are_enough(barred: Path) -> None:
         mask = np.full((36, read_image(file).shape[1], 3), 255, np.uint8)
         mask[:ROWS], mask[-ROWS:] = 0, 0
         write_png(barred / "masks" / f"{file.name}.png", mask)
-    scene, said = loaded(barred)
+    scene, said = scene_and_warnings(barred)
     assert MESSAGE not in said
     assert has_bars(scene, ROWS)
     assert scene.reading["bars"] == list(NO_BARS)
@@ -119,7 +112,7 @@ def test_masks_that_hide_the_bars_are_enough(barred: Path) -> None:
         mask = np.full((36, read_image(file).shape[1], 3), 255, np.uint8)
         mask[10:14] = 0
         write_png(file, mask)
-    scene, said = loaded(barred)
+    scene, said = scene_and_warnings(barred)
     assert MESSAGE in said, "these masks hide other pixels"
     assert scene.train[0].mask is not None
     assert not scene.train[0].mask[[*range(LEFT_OUT), *range(10, 14)]].any()
@@ -127,10 +120,10 @@ def test_masks_that_hide_the_bars_are_enough(barred: Path) -> None:
 
 def test_a_part_of_a_scene_and_smaller_photos_are_read_as_the_whole(barred: Path) -> None:
     names = load_scene(barred, bars=NO_BARS).names
-    part, _ = loaded(barred, only=[names[3]])
+    part, _ = scene_and_warnings(barred, only=[names[3]])
     assert len(part.views) == 1
     assert has_bars(part)
-    small, _ = loaded(barred, resolution=2)
+    small, _ = scene_and_warnings(barred, resolution=2)
     mask = small.train[0].mask
     assert mask is not None
     assert not mask[[0, 1, -2, -1]].any()
@@ -142,7 +135,7 @@ def test_photos_of_another_size_are_not_touched(barred: Path) -> None:
     file = sorted((barred / "images").iterdir())[1]
     pixels = read_image(file)
     write_png(file, np.repeat(np.repeat(pixels, 2, axis=0), 2, axis=1))
-    scene, said = loaded(barred)
+    scene, said = scene_and_warnings(barred)
     assert MESSAGE in said
     assert scene.reading["bars"] == bars
     assert {view.name for view in scene.views if view.mask is None} == {file.name}
@@ -198,7 +191,7 @@ def test_few_photos_have_no_bars(barred: Path) -> None:
     names = load_scene(barred, bars=NO_BARS).names
     for name in names[5:]:
         (barred / "images" / name).unlink()
-    scene, said = loaded(barred)
+    scene, said = scene_and_warnings(barred)
     assert len(scene.views) == 5
     assert MESSAGE not in said
 
@@ -222,13 +215,7 @@ def test_a_run_records_bars_and_goes_on_with_them(barred: Path, tmp_path: Path) 
     assert said.exit_code == 0, said.output
     assert MESSAGE not in said.stderr, "they are recorded"
     with_them = json.loads((model / "results.json").read_text())
-    # Runs of earlier versions recorded no bars, and went on with them.
-    values["scene"]["bars"] = None
-    file.write_text(json.dumps(values))
-    for command in (("eval", model), ("train", "--resume", "-m", model, "--iterations", "60")):
-        said = run(*command)
-        assert said.exit_code == 0, said.output
-        assert MESSAGE not in said.stderr
+    go_on_without_record(model, "bars", MESSAGE)  # as runs of earlier versions
     assert json.loads((model / "results.json").read_text()) != with_them
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 from cli_runner import SHORT, clsplat, error_of, run
+from recorded_scenes import go_on_without_record, scene_and_warnings
 
 from clsplat.files.images import read_image, write_png
 from clsplat.scenes.scene import Scene, View, load_scene
@@ -32,15 +32,8 @@ def rims(capture_folder: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def loaded(folder: Path, **arguments: object) -> tuple[Scene, str]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        scene = load_scene(folder, **arguments)  # type: ignore[arg-type]
-    return scene, " ".join(str(one.message) for one in caught)
-
-
 def test_rims_without_data_are_left_out(rims: Path) -> None:
-    scene, said = loaded(rims)
+    scene, said = scene_and_warnings(rims)
     assert MESSAGE in said
     assert scene.reading["alpha"] == "mask"
     for view in (*scene.train, *scene.test):
@@ -49,14 +42,14 @@ def test_rims_without_data_are_left_out(rims: Path) -> None:
         assert view.mask[ROWS:-ROWS].all()
         assert view.alpha is None
     for alpha in ("mask", "background"):
-        scene, said = loaded(rims, alpha=alpha)
+        scene, said = scene_and_warnings(rims, alpha=alpha)
         assert scene.reading["alpha"] == alpha
         assert MESSAGE not in said
         assert (scene.train[0].mask is None) == (alpha == "background")
 
 
 def test_a_part_of_a_scene_is_read_as_the_whole(rims: Path) -> None:
-    scene, _ = loaded(rims, only=[load_scene(rims, alpha="mask").names[3]])
+    scene, _ = scene_and_warnings(rims, only=[load_scene(rims, alpha="mask").names[3]])
     assert len(scene.views) == 1
     assert scene.reading["alpha"] == "mask"
 
@@ -69,7 +62,7 @@ def test_photos_of_an_object_stay_transparent(rims: Path) -> None:
         pixels[: 4 + number, :, 3] = 0
         pixels[:, : 14 - number, 3] = 0
         write_png(file, np.roll(pixels, 12 * number, axis=1))
-    scene, said = loaded(rims)
+    scene, said = scene_and_warnings(rims)
     assert scene.reading["alpha"] == "background"
     assert "transparent in all photos" not in said
 
@@ -90,14 +83,7 @@ def test_runs_of_earlier_versions_go_on_as_they_began(rims: Path, tmp_path: Path
     """They recorded nothing for the default, which was the background."""
     model = tmp_path / "m"
     clsplat("train", rims, "-m", model, "--eval", "--alpha", "background", "-q", *SHORT)
-    file = model / "config.json"
-    values = json.loads(file.read_text())
-    values["scene"]["alpha"] = None
-    file.write_text(json.dumps(values))
-    for command in (("eval", model), ("train", "--resume", "-m", model, "--iterations", "60")):
-        said = run(*command)
-        assert said.exit_code == 0, said.output
-        assert MESSAGE not in said.stderr
+    go_on_without_record(model, "alpha", MESSAGE)
 
 
 def test_still_pixels_are_those_that_vary_by_noise_only(scene: Scene) -> None:
