@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from ..files.images import ImageU8, read_image
 from ..files.masks import Mask
 from ..splats.color import SPREAD
@@ -45,6 +46,13 @@ class Bars(NamedTuple):
 
 
 NO_BARS = Bars(0.0, 0.0, 0.0, 0.0)
+
+
+def checked_bars(bars: Sequence[float]) -> Bars:
+    """Return the bars; raise InputError unless they are four parts from 0 to 1."""
+    if len(bars) != len(NO_BARS) or not all(0 <= share <= 1 for share in bars):
+        raise InputError(f"bars {tuple(bars)}: give four parts from 0 to 1: {', '.join(Bars._fields)}")
+    return Bars(*bars)
 
 
 def commonest_size(sizes: Mapping[str, tuple[int, int]]) -> tuple[int, int] | None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -179,8 +179,10 @@ class _Frame:
         width, height = int(self.number("w", size[0])), int(self.number("h", size[1]))
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
             raise InputError(f"{self.place}: w x h is {width} x {height}; both must be 1 to {MAX_SIDE}")
-        fx = self.focal("fl_x", "camera_angle_x", width)
-        fy = self.focal("fl_y", "camera_angle_y", height, fx)
+        # An angle of the frame itself counts more than focal lengths of all frames.
+        known = self.values if "camera_angle_x" in self.values else self.document.values | self.values
+        fx = self.focal(known, "fl_x", "camera_angle_x", width)
+        fy = self.focal(known, "fl_y", "camera_angle_y", height, fx)
         if fx is None or fy is None:
             raise InputError(f"{self.place}: has neither fl_x nor camera_angle_x; add the focal length")
         core = [fx, fy, self.number("cx", width / 2), self.number("cy", height / 2)]
@@ -217,15 +219,16 @@ class _Frame:
             )
         return sound
 
-    def focal(self, key: str, angle: str, size: int, default: float | None = None) -> float | None:
+    def focal(
+        self, known: Mapping[str, Any], key: str, angle: str, size: int, default: float | None = None
+    ) -> float | None:
         """Return the focal length [px] at `key`, or from the angle of view at `angle`, or the default.
 
-        An angle of the frame itself counts more than a focal length of all frames.
+        known : the values that may have them.
         """
-        own_angle = key not in self.values and self.values.get(angle) is not None
-        if self.value(key) is not None and not own_angle:
+        if known.get(key) is not None:
             return self.positive(key)
-        if self.value(angle) is None:
+        if known.get(angle) is None:
             return default
         field_of_view = self.positive(angle)
         if field_of_view >= math.pi:

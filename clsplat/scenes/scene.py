@@ -20,7 +20,7 @@ from ..files.masks import MASK_FOLDER, NO_MASKS, mask_files
 from ..files.real_path import real_path
 from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
-from .bars import NO_BARS, Bars, commonest_size
+from .bars import NO_BARS, checked_bars, commonest_size
 from .colmap import Points
 from .colmap_folder import colmap_folder
 from .described import read_described
@@ -189,7 +189,9 @@ def load_scene(
     check_memory(root, sizes, resolution)
     if alpha is None:
         alpha = use_of_alpha(root, posed, resolution, background)
-    bars = NO_BARS if masks == NO_MASKS else bars_of(root, posed, mask_of) if bars is None else Bars(*bars)
+    if masks == NO_MASKS:
+        bars = NO_BARS
+    bars = bars_of(root, posed, mask_of) if bars is None else checked_bars(bars)
     barred_size = commonest_size(posed.sizes)
     readers = [
         PhotoReader(

@@ -203,6 +203,12 @@ def test_the_pixels_that_bars_leave() -> None:
     assert kept.sum() == 2 * 9
 
 
+@pytest.mark.parametrize("bars", [(0.1, 0.1), (0.0, 0.0, 0.0, 1.5), (0.0, -0.1, 0.0, 0.0)])
+def test_bars_that_cannot_be_are_named(barred: Path, bars: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match=r"bars .* give four parts from 0 to 1: top, right, bottom, left"):
+        load_scene(barred, bars=bars)
+
+
 def test_a_run_records_bars_and_goes_on_with_them(barred: Path, tmp_path: Path) -> None:
     model = tmp_path / "m"
     said = run("train", barred, "-m", model, "--eval", *SHORT)

@@ -99,6 +99,9 @@ def test_angles_of_view_of_both_axes(folder: Path, in_frames: bool) -> None:
     of_a_frame = size | {"fl_x": FX, "fl_y": FY, "frames": [frame | angles for frame in frames()]}
     camera = load_scene(write(folder, of_a_frame)).views[0].camera
     assert (camera.fx, camera.fy) == pytest.approx((WIDTH / 2 / np.tan(0.5), HEIGHT / 2 / np.tan(0.25)), rel=1e-12)
+    one_angle = size | {"fl_x": FX, "fl_y": FY, "frames": [frame | {"camera_angle_x": 1.0} for frame in frames()]}
+    camera = load_scene(write(folder, one_angle)).views[0].camera
+    assert camera.fx == camera.fy == pytest.approx(WIDTH / 2 / np.tan(0.5), rel=1e-12), "pixels are square"
     mixed = size | {"fl_x": FX, "camera_angle_y": 0.5, "frames": frames()}
     camera = load_scene(write(folder, mixed)).views[0].camera
     assert (camera.fx, camera.fy) == (FX, pytest.approx(HEIGHT / 2 / np.tan(0.25), rel=1e-12))

@@ -22,9 +22,9 @@ def scene_and_warnings(folder: Path, **arguments: object) -> tuple[Scene, str]:
 def go_on_without_record(model: Path, key: str, message: str) -> None:
     """Measure a model and train it on as one whose run recorded nothing for `key`. Reading must not warn of it."""
     file = model / "config.json"
-    values = json.loads(file.read_text())
+    values = json.loads(file.read_text(encoding="utf-8"))
     values["scene"][key] = None
-    file.write_text(json.dumps(values))
+    file.write_text(json.dumps(values), encoding="utf-8")
     for command in (("eval", model), ("train", "--resume", "-m", model, "--iterations", "60")):
         said = run(*command)
         assert said.exit_code == 0, said.output
