@@ -3,7 +3,8 @@
 3DGS takes 1.1 times the largest distance of a camera from the mean of all. If the cameras go around an object, this is
 about as wide as what they see. On a tripod it is far too small, and so it is for cameras that look ahead from nearly
 one place. For photos from afar, and with one wrong pose, it is far too large. So cameras that are far from all others
-do not count, and what the cameras see limits the result.
+do not count, and what the cameras see limits the result. On a walk it grows with the way, although each camera sees
+what is near it: there the nearest points limit the result.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ _FAR = 3.0  # usual distances, beyond which a camera does not count
 
 # Limits of the extent in half diagonals of the images at the depth of the points. Cameras around an object have 1 to 3.
 _SMALLEST, _LARGEST = 0.3, 4.0
+# A walk is a path that is not wider than a tenth of its length. Its limit is in half diagonals at the nearest points.
+_WALK_WIDTH, _FEWEST_OF_WALK, _LARGEST_OF_WALK = 0.1, 8, 2.0
+_MIDDLE, _NEAREST = 0.5, 0.1  # parts of the points in an image that are nearer than the depth
 _MAX_CAMERAS = 100  # that are looked through
 _MIN_POINTS = 20  # in an image, so that their median depth is that of the scene
 
@@ -35,10 +39,13 @@ def extent_of(cameras: Sequence[Camera], xyz: DoubleArray) -> float:
     cameras : training cameras, at least one. xyz : (P, 3) points of the scene; P may be 0.
     """
     cameras = together(cameras)
-    extent = _reach(np.array([camera.position for camera in cameras]))
+    centres, some = np.array([camera.position for camera in cameras]), sampled(xyz)
+    extent = _reach(centres)
     cameras = cameras[:: -(-len(cameras) // _MAX_CAMERAS)]
-    if (width := _width_at_points(cameras, sampled(xyz))) is not None:
+    if (width := _width_at_points(cameras, some, _MIDDLE)) is not None:
         extent = min(max(extent, _SMALLEST * width), _LARGEST * width)
+        if _is_walk(centres) and (width := _width_at_points(cameras, some, _NEAREST)) is not None:
+            extent = min(extent, _LARGEST_OF_WALK * width)
     elif (width := _width_at_middle(cameras)) is not None:
         extent = min(extent, _LARGEST * width)
     return extent if extent > 0 else 1.0
@@ -57,13 +64,24 @@ def _reach(centres: DoubleArray) -> float:
     return _MARGIN * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
 
-def _width_at_points(cameras: Sequence[Camera], xyz: DoubleArray) -> float | None:
-    """Return half the diagonal of an image at the depth of its points, by medians; None if images have too few."""
+def _is_walk(centres: DoubleArray) -> bool:
+    """Return whether the centres (N, 3) are nearly on a line."""
+    if len(centres) < _FEWEST_OF_WALK:
+        return False
+    length, width, _ = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
+    return bool(width < _WALK_WIDTH * length)
+
+
+def _width_at_points(cameras: Sequence[Camera], xyz: DoubleArray, nearer: float) -> float | None:
+    """Return half the diagonal of an image at the depth of its points, a median of images; None if they have too few.
+
+    nearer : part of the points in an image that are nearer than this depth.
+    """
     widths: list[float] = []
     for camera in cameras:
         found = seen(camera, xyz)
         if np.count_nonzero(found.inside) >= _MIN_POINTS:
-            widths.append(_half_diagonal(camera) * float(np.median(found.depth[found.inside])))
+            widths.append(_half_diagonal(camera) * float(np.quantile(found.depth[found.inside], nearer)))
     return float(np.median(widths)) if widths else None
 
 

@@ -89,3 +89,49 @@ def test_few_points_in_an_image_do_not_count() -> None:
     assert extent_of(ring(4.0), cloud()[:19]) == published(ring(4.0))
     far = ring(160.0, 4000.0)
     assert extent_of(far[:1] * 2 + far, cloud()[:3]) < published(far), "the cameras look at one point"
+
+
+def walk(length: float, ahead: bool, n: int = 24) -> list[Camera]:
+    """Return cameras on a straight way, which look along it or to its side."""
+    places = [np.array([along, 0.02 * np.sin(along), 0.0]) for along in np.linspace(0.0, length, n)]
+    look = np.array([1.0, 0.1, 0.0]) if ahead else np.array([0.0, 1.0, 0.0])
+    return [camera(place, place + look) for place in places]
+
+
+def corridor(length: float) -> DoubleArray:
+    """Return points on two walls beside the way."""
+    rng = np.random.default_rng(1)
+    along, side, up = rng.uniform(0, length + 10, 1500), rng.choice([-2.0, 2.0], 1500), rng.uniform(-1, 1, 1500)
+    return np.stack([along, side, up], axis=1)
+
+
+def half_diagonals(cameras: list[Camera], xyz: DoubleArray, nearer: float) -> float:
+    """Return the median half diagonal of images at a depth of their points, in plain NumPy."""
+    found = []
+    for one in cameras:
+        x, y, depth = (xyz @ one.rotation.T + one.translation).T
+        front = depth > 0
+        u, v = 100 * x[front] / depth[front] + 80, 100 * y[front] / depth[front] + 60
+        inside = (u >= 0) & (u < 160) & (v >= 0) & (v < 120)
+        if inside.sum() >= 20:
+            found.append(np.quantile(depth[front][inside], nearer))
+    return float(np.median(found))  # half a diagonal is 1 at a depth of 1: 200 px and a focal length of 100
+
+
+@pytest.mark.parametrize("length", [60.0, 240.0])
+def test_the_extent_of_a_walk_follows_what_is_near(length: float) -> None:
+    cameras, xyz = walk(length, ahead=True), corridor(length)
+    assert extent_of(cameras, xyz) == pytest.approx(2 * half_diagonals(cameras, xyz, 0.1), rel=1e-6)
+    assert extent_of(cameras, xyz) < 0.5 * published(cameras)
+    assert extent_of(cameras, NOTHING) == published(cameras), "nothing says what is near"
+
+
+def test_what_is_not_a_walk() -> None:
+    few, xyz = walk(60.0, ahead=True, n=7), corridor(60.0)
+    usual = min(published(few), 4 * half_diagonals(few, xyz, 0.5))
+    assert extent_of(few, xyz) == pytest.approx(usual), "few cameras are always nearly on a line"
+    slider = walk(4.0, ahead=False)
+    assert extent_of(slider, corridor(4.0)) == published(slider), "what it sees is as wide as the way"
+    places = [np.array([2.5 * index, 9.0 * np.sin(index), 0.0]) for index in range(24)]
+    wide = [camera(place, np.array([place[0] + 5.0, 0.0, 0.0])) for place in places]
+    assert extent_of(wide, xyz) == pytest.approx(min(published(wide), 4 * half_diagonals(wide, xyz, 0.5)))
