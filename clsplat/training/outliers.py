@@ -19,7 +19,10 @@ from ..splats.splats import Splats
 from .config import TrainConfig
 from .view_sampler import ViewSampler
 
-CHECKS = (0.1, 0.2, 0.3)  # parts of the run. Later, hard photos stand out, because all others fit so well
+# Parts of the run, the most useful one first. Later, hard photos stand out, because all others fit so well.
+CHECKS = (0.2, 0.3, 0.1)
+MOST_WORK = 0.06  # part of the run's work that checks may take
+COST = 1 / 3  # of a small render and its comparison, in iterations
 LONGEST = 200  # longest side of the images [px]
 FEWEST_VIEWS = 10  # of fewer photos, each may be the only one of its place
 MOST = 0.25  # part of the photos that may be outliers; if it is more, nothing says which photos are right
@@ -50,7 +53,8 @@ class OutlierCheck:
         self.views, self.renderer, self.sampler = views, renderer, sampler
         self.background, self.iterations = config.background, config.iterations
         is_on = config.views.outlier_check and len(views) >= FEWEST_VIEWS
-        self.due = {round(part * config.iterations) for part in CHECKS} if is_on else set()
+        affordable = int(MOST_WORK * config.iterations / (COST * len(views))) if is_on else 0
+        self.due = {round(part * config.iterations) for part in CHECKS[:affordable]}
 
     def is_due(self, iteration: int) -> bool:
         """Whether a check follows this iteration."""

@@ -151,4 +151,6 @@ def test_when_it_looks(scene: Scene) -> None:
     assert due({"outlier_check": False}) == []
     assert due(preset("3dgs") | OPTIONS) == [], "published systems learn from all photos"
     assert due({}, FEWEST_VIEWS) == [100, 200, 300]
+    for iterations, expected in ((400, [80, 120]), (250, [50]), (150, [])):
+        assert due({"iterations": iterations}) == expected, "a check of 35 photos takes the time of 12 iterations"
     assert due({}, FEWEST_VIEWS - 1) == []
