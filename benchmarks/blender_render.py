@@ -85,7 +85,7 @@ def lane_cameras(rng: np.random.Generator, n_train: int, n_test: int) -> tuple[l
 
 
 @dataclass(frozen=True)
-class Sort:
+class SceneKind:
     """How a scene is photographed. around : photos have no transparent pixels. outdoors : the noise of points grows."""
 
     build: Callable[[np.random.Generator], None]
@@ -95,13 +95,13 @@ class Sort:
 
 
 SCENES = {
-    "plant": Sort(plant),
-    "metals": Sort(metals),
-    "wires": Sort(wires),
-    "dishes": Sort(dishes),
-    "room": Sort(room, room_cameras, around=True),
-    "garden": Sort(garden, garden_cameras, around=True, outdoors=True),
-    "lane": Sort(lane, lane_cameras, around=True, outdoors=True),
+    "plant": SceneKind(plant),
+    "metals": SceneKind(metals),
+    "wires": SceneKind(wires),
+    "dishes": SceneKind(dishes),
+    "room": SceneKind(room, room_cameras, around=True),
+    "garden": SceneKind(garden, garden_cameras, around=True, outdoors=True),
+    "lane": SceneKind(lane, lane_cameras, around=True, outdoors=True),
 }
 
 
@@ -171,11 +171,11 @@ def write_ply(path: Path, points: Any, colors: Any) -> None:
 def render(folder: Path, name: str, size: int, n_train: int, n_test: int) -> None:
     """Build a scene and render what is missing of its photos."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    rng, sort = np.random.default_rng(sum(map(ord, name))), SCENES[name]
-    sort.build(rng)
-    angle = PLACE_FIELD_OF_VIEW if sort.around else FIELD_OF_VIEW
-    camera = prepare(size, angle, sort.around)
-    poses = dict(zip(("train", "test"), sort.cameras(rng, n_train, n_test), strict=True))
+    rng, kind = np.random.default_rng(sum(map(ord, name))), SCENES[name]
+    kind.build(rng)
+    angle = PLACE_FIELD_OF_VIEW if kind.around else FIELD_OF_VIEW
+    camera = prepare(size, angle, kind.around)
+    poses = dict(zip(("train", "test"), kind.cameras(rng, n_train, n_test), strict=True))
     folder.mkdir(parents=True, exist_ok=True)
     bpy.context.view_layer.update()
     for split, cameras in poses.items():
@@ -188,8 +188,8 @@ def render(folder: Path, name: str, size: int, n_train: int, n_test: int) -> Non
                 bpy.context.scene.render.filepath = str(folder / file)
                 bpy.ops.render.render(write_still=True)
         head: dict[str, Any] = {"camera_angle_x": angle}
-        if sort.around and split == "train":
-            points = surface_points(cameras, angle, sort.outdoors, rng)
+        if kind.around and split == "train":
+            points = surface_points(cameras, angle, kind.outdoors, rng)
             write_ply(folder / "points3d.ply", points, colors_of(points, folder, frames, size, angle))
         (folder / f"transforms_{split}.json").write_text(
             json.dumps(head | {"frames": frames}, indent=1), encoding="utf-8"

@@ -48,27 +48,28 @@ def pixels_before_scene(views: Sequence[View], xyz: DoubleArray) -> StillPixels 
     if count < FEWEST_VIEWS:
         return None
     still, is_empty = still_pixels(sampled_views(alike))
-    if not hide_points(((view.camera, still) for view in alike), xyz):
+    if not hide_points(float(still.mean()), ((view.camera, still) for view in alike), xyz):
         return None
     return StillPixels(float(still.mean()), is_empty)
 
 
-def hide_points(parts: Iterable[tuple[Camera, Mask]], xyz: DoubleArray) -> bool:
+def hide_points(share: float, parts: Iterable[tuple[Camera, Mask]], xyz: DoubleArray) -> bool:
     """Return whether points of the scene lie in parts of photos, which are neither tiny nor most of the photos.
 
     Parameters
     ----------
+    share : of the pixels of a photo in its part, 0 to 1. Parts of another size than is possible are not looked at.
     parts : camera of each photo, and the part of it, (H, W) bool. xyz : points of the scene (P, 3).
     """
-    some, shares = sampled(xyz), []
+    if not _LEAST <= share <= _MOST:
+        return False
+    some = sampled(xyz)
     inside, within = 0, 0
     for camera, part in parts:
         found = seen(camera, some)
-        shares.append(part.mean())
         inside += int(np.count_nonzero(found.inside))
         within += int(np.count_nonzero(part[found.rows_and_columns]))
-    is_small = _LEAST <= np.mean(shares) <= _MOST
-    return bool(is_small and within >= _FEWEST_POINTS and _LEAST <= within / inside <= _MOST)
+    return within >= _FEWEST_POINTS and _LEAST <= within / inside <= _MOST
 
 
 def still_pixels(views: Sequence[View]) -> tuple[Mask, bool]:

@@ -78,7 +78,8 @@ def bars_of(root: Path, posed: PosedImages, mask_of: Mapping[str, Path]) -> Bars
             part = ~photo.fit_mask(~covered, *size)
             return part & photo.fit_mask(read_mask(mask_of[photo.name]), *size) if photo.name in mask_of else part
 
-        if hide_points(((photo.fitted_camera(*size), hidden(photo)) for photo in some), posed.points.xyz):
+        parts = ((photo.fitted_camera(*size), hidden(photo)) for photo in some)
+        if hide_points(float(covered.mean()), parts, posed.points.xyz):
             sides = " and ".join(side for side, share in zip(bars._fields, bars, strict=True) if share)
             warnings.warn(
                 f"{root}: {covered.mean():.0%} of the pixels are bars at the {sides} of all photos, and points of the "

@@ -51,7 +51,7 @@ class OutlierCheck:
 
     def __init__(self, config: TrainConfig, views: Sequence[View], renderer: Renderer, sampler: ViewSampler) -> None:
         self.views, self.renderer, self.sampler = views, renderer, sampler
-        self.background, self.iterations = config.background, config.iterations
+        self.background, self.is_new = config.background, False
         is_on = config.views.outlier_check and len(views) >= FEWEST_VIEWS
         affordable = int(MOST_WORK * config.iterations / (COST * len(views))) if is_on else 0
         self.due = {round(part * config.iterations) for part in CHECKS[:affordable]}
@@ -63,7 +63,8 @@ class OutlierCheck:
     def look(self, splats: Splats) -> None:
         """Leave the outliers out of the rest of the run."""
         measured = [likeness(self.renderer, splats, view, self.background) for view in self.views]
-        self.sampler.left_out = outliers(measured)
+        found = outliers(measured)
+        self.is_new, self.sampler.left_out = found != self.sampler.left_out, found
 
     @property
     def left_out(self) -> list[str]:
@@ -72,8 +73,10 @@ class OutlierCheck:
 
     @property
     def message(self) -> str:
-        """A sentence that names the views that are left out."""
+        """A sentence that names the views that are left out; empty if the last check changed nothing."""
         names = self.left_out
+        if not self.is_new:
+            return ""
         some = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
         return (
             f"{len(names)} of {len(self.views)} photos disagree with all others, as with wrong poses: {some}; the run "

@@ -97,15 +97,17 @@ def _is_list_of_names(value: object) -> bool:
 
 
 def _is_place(value: object) -> bool:
-    if not isinstance(value, list) or len(value) != 3:
-        return False
-    return all((number := to_real(each)) is not None and abs(number) < MAX_NUMBER for each in value)
+    return _are_numbers(value, 3, lambda number: abs(number) < MAX_NUMBER)
 
 
-def _is_four_parts(value: object) -> bool:
-    if not isinstance(value, list) or len(value) != 4:
+def _are_parts(value: object) -> bool:
+    return _are_numbers(value, 4, lambda number: 0 <= number <= 1)
+
+
+def _are_numbers(value: object, count: int, is_sound: Callable[[float], bool]) -> bool:
+    if not isinstance(value, list) or len(value) != count:
         return False
-    return all((number := to_real(each)) is not None and 0 <= number <= 1 for each in value)
+    return all((number := to_real(each)) is not None and is_sound(number) for each in value)
 
 
 def _is_count(value: object) -> bool:
@@ -129,7 +131,7 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "test_every": (f"a whole number from 1 to {_LARGEST}", _is_count),
     "eval": ("true or false", lambda value: isinstance(value, bool)),
     "origin": ("three numbers", _is_place),
-    "bars": ("four parts from 0 to 1", _is_four_parts),
+    "bars": ("four parts from 0 to 1", _are_parts),
     "photos": ("the digest of each photo by name", lambda value: isinstance(value, dict)),
     "test_names": ("a list of names", _is_list_of_names),
     "validation_names": ("a list of names", _is_list_of_names),

@@ -394,7 +394,7 @@ class Trainer:
             self.progress(Progress(self.iteration, self.config.iterations, loss, psnr, *counts, forecast=left))
 
     def _send(self, message: str) -> None:
-        if self.progress is not None:
+        if message and self.progress is not None:
             self.progress(
                 Progress(self.iteration, self.config.iterations, math.nan, math.nan, 0, self.seconds, 0, message)
             )

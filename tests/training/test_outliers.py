@@ -92,7 +92,7 @@ def test_a_run_goes_on_without_photos_of_wrong_poses(misplaced: Scene) -> None:
     trainer.run()
     assert trainer.outliers.left_out == names_of(misplaced)
     messages = [progress.message for progress in said if "disagree" in progress.message]
-    assert messages
+    assert len(messages) == len(set(messages)) > 0, "each choice is said once"
     n = len(misplaced.train)
     assert messages[-1] == (
         f"2 of {n} photos disagree with all others, as with wrong poses: {', '.join(names_of(misplaced))}; the run "
