@@ -76,7 +76,7 @@ def run_blocks(
     cluster: str | None,
 ) -> None:
     """Train in blocks with a live display, and print the result."""
-    warn_of_single_model(config)
+    warn_of_single_model(config, "--blocks")
     from clsplat.blocks.train import train_in_blocks
     from clsplat.training.run import evaluate_test_views
 
@@ -115,11 +115,11 @@ def run_blocks(
     report_test_views(evaluate_test_views(result.splats, scene, decided))
 
 
-def warn_of_single_model(config: TrainConfig) -> None:
-    """Warn about options that write or measure models before the last one, which a training in blocks does not have."""
+def warn_of_single_model(config: TrainConfig, flag: str) -> None:
+    """Warn about options that write or measure models before the last one. Trainings with `flag` ignore them."""
     for name in ("save_iterations", "test_iterations"):
         if config.named_options.get(name):
-            warnings.warn(f"--{name.replace('_', '-')} has no effect with --blocks", stacklevel=2)
+            warnings.warn(f"--{name.replace('_', '-')} has no effect with {flag}", stacklevel=2)
 
 
 def report_interruption(ctx: click.Context, model_path: Path, cluster: str | None = None) -> NoReturn:

@@ -10,7 +10,7 @@ import click
 from clsplat.compression.rules import TOLERANCE, BudgetOptions
 from clsplat.training.config import TrainConfig
 
-from .blocks import report_interruption
+from .blocks import report_interruption, warn_of_single_model
 from .options import Decibels, F
 from .progress import TrainingDisplay, report_test_views
 
@@ -75,6 +75,7 @@ def run_search(
     cluster: str | None = None,
 ) -> None:
     """Run the search with a live display, and print its result."""
+    warn_of_single_model(config, "--budget")
     from clsplat.comparison.search_chart import draw_search
     from clsplat.compression.search import train_budget
     from clsplat.training.run import evaluate_test_views

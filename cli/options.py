@@ -14,7 +14,7 @@ import click
 from clsplat.scenes.options import ALPHA_USES
 from clsplat.splats.color import WHITE, Color
 from clsplat.training.config import OPTIONS, SECTIONS, TrainConfig
-from clsplat.training.no_effect import no_effect, no_effect_in
+from clsplat.training.no_effect import no_effect
 from clsplat.training.options.density import STRATEGIES
 from clsplat.training.options.option import Option, option_table
 
@@ -255,8 +255,7 @@ def config_options(*without: str) -> Callable[[F], F]:
 def warn_without_effect(configs: Sequence[TrainConfig], names: Iterable[str], scene: Scene | None = None) -> None:
     """Warn about flags that have no effect in any of the runs. scene : that of all runs, if it is one."""
     for name in names:
-        why_in_scene = None if scene is None else no_effect_in(scene, name)
-        reasons = [no_effect(config, name) or why_in_scene for config in configs]
+        reasons = [no_effect(config, name, scene) for config in configs]
         if all(reasons):
             why = " or ".join(dict.fromkeys(filter(None, reasons)))
             warnings.warn(f"--{name.replace('_', '-')} has no effect {why}", stacklevel=2)

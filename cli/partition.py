@@ -79,7 +79,7 @@ def partition(
         raise InputError("name the blocks: --blocks 2x2")
     config = TrainConfig(**config_values(ctx, values))
     options = blocks(config)
-    warn_of_single_model(config)
+    warn_of_single_model(config, "--blocks")
     reading = {key: values[key] for key in READING_OPTIONS if is_given(ctx, key)}
     loaded = load_recorded_scene(scene, reading, config.background)
     try:

@@ -119,9 +119,13 @@ def render(
     size = values["size"]
     if values["path"] is not None and view_set is not None:
         raise click.UsageError("give --path or --set, not both")
+    if values["fps"] is not None and values["path"] is None and values["video"] is None:
+        raise click.UsageError("--fps is for videos and paths: give --video FILE or --path")
     request = path_request(values | {"save_path": save_path})
     if values["output"] is None and values["video"] is None:
         raise click.UsageError("give -o DIR for images, --video FILE, or both")
+    if values["format"] == "npy" and values["output"] is None:
+        raise click.UsageError("--format npy is for images: give -o DIR")
     if (
         values["depth_range"] is not None
         and not values["depth_colours"]

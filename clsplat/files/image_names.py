@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 
 READS_HEIC = find_spec("pillow_heif") is not None  # the extra `heic`
+JPEG_SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif")
 HEIC_SUFFIXES = (".heic", ".heif")  # of iPhones
 IMAGE_SUFFIXES = frozenset(
-    (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *(HEIC_SUFFIXES if READS_HEIC else ()))
+    (
+        *(".png", *JPEG_SUFFIXES, ".tif", ".tiff", ".bmp", ".webp", ".avif", ".jp2"),
+        *(HEIC_SUFFIXES if READS_HEIC else ()),
+    )
 )
-JPEG_SUFFIXES = (".jpg", ".jpeg")
 HEIC_REMEDY = "pip install 'clsplat[heic]'"
 # Programs that convert formats of photos that are not supported to JPEG.
 CONVERTERS = {

@@ -13,6 +13,7 @@ from .images import read_image
 
 Mask = NDArray[np.bool_]
 
+BESIDE = ".mask.png"  # end of the name of a mask beside its photo
 MASK_FOLDER = "masks"  # default folder of masks inside a scene
 NO_MASKS = "none"  # the user's word for using no masks, in place of a folder's name
 _THRESHOLD = 127.5  # smallest mean of the channels of a pixel that counts
@@ -29,6 +30,22 @@ def mask_files(folder: Path, photos: Mapping[str, Path]) -> dict[str, Path]:
     photos : file of each photo by name.
     """
     found = {name: _mask_of(folder, name, file) for name, file in photos.items()}
+    return {name: mask for name, mask in found.items() if mask is not None}
+
+
+def masks_beside(photos: Mapping[str, Path]) -> dict[str, Path]:
+    """Return the masks beside photos, as RealityScan writes them, by the names of the photos.
+
+    The mask of `a.jpg` is `a.jpg.mask.png` or `a.mask.png`.
+
+    Parameters
+    ----------
+    photos : file of each photo by name.
+    """
+    found = {}
+    for name, file in photos.items():
+        masks = (file.with_name(f"{start}{BESIDE}") for start in (file.name, file.stem))
+        found[name] = next((mask for mask in masks if mask.is_file()), None)
     return {name: mask for name, mask in found.items() if mask is not None}
 
 

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from ..errors import InputError, reason_of
 from ..splats.quaternions import rotations
 from .colmap_binary import check_binary_model, count_registered
-from .colmap_copies import complete_model, image_lines, without_observations
+from .colmap_copies import complete_model, without_observations
 from .colmap_folder import colmap_folder, model_suffix
+from .colmap_text import names_with_spaces
 from .scene_files import OTHER_KINDS
 from .undistort import RegisteredImage, colmap_library
 
-_WORDS_BEFORE_NAME = 9  # words before the name in a line of images.txt
 _LACKING = "does not exist"  # in pycolmap's message on a frame of an image that the model lacks
 _UNIT = 1e-6  # largest error of the norm of a quaternion that pycolmap turns into a rotation as it is
 
@@ -151,25 +151,12 @@ def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str], dict[int, set[i
                     "out",
                     stacklevel=5,
                 )
-            yield reconstruction, _names_with_spaces(whole / "images.txt") if suffix == ".txt" else {}, tracks
+            yield reconstruction, names_with_spaces(whole / "images.txt") if suffix == ".txt" else {}, tracks
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
         raise InputError(
             f"{folder}: COLMAP cannot read the model ({reason_of(error)}); the files are "
             "damaged or do not belong together: copy or rebuild them"
         ) from None
-
-
-def _names_with_spaces(images: Path) -> dict[int, str]:
-    """Return the names with spaces in images.txt, by image id.
-
-    COLMAP ends a name at the first space, but other programs write whole names.
-    """
-    names = {}
-    for line in image_lines(images, errors="replace"):
-        words = line.split(maxsplit=_WORDS_BEFORE_NAME)
-        if len(words) > _WORDS_BEFORE_NAME and words[0].isdecimal() and len(words[-1].split()) > 1:
-            names[int(words[0])] = words[-1]
-    return names
 
 
 def read_registered(reconstruction: Any, names: Mapping[int, str] | None = None) -> list[RegisteredImage]:

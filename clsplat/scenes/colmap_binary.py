@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.atomic import atomic_writer
+from .colmap_text import read_image_lines
 from .photo_size import MAX_SIDE
 
 # Number of parameters of each camera model, by COLMAP's model id (https://colmap.github.io/cameras.html), from
@@ -190,15 +191,14 @@ def binary_without_observations(images: Path, points: Path) -> tuple[bytes, byte
 def count_registered(folder: Path) -> int:
     """Return the number of registered images of the model in a folder.
 
-    The number is the count in images.bin, or follows from the lines of images.txt.
+    The number is the count in images.bin, or the number of images in images.txt.
     """
     binary = folder / "images.bin"
     if binary.is_file():
         with binary.open("rb") as file:
             head = file.read(_COUNT.size)
         return int(_COUNT.unpack(head)[0]) if len(head) == _COUNT.size else 0
-    with (folder / "images.txt").open(encoding="utf-8", errors="replace") as lines:
-        return (sum(1 for line in lines if not line.startswith("#")) + 1) // 2
+    return sum(1 for _ in read_image_lines(folder / "images.txt", "replace"))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,8 +3,8 @@
 3DGS takes 1.1 times the largest distance of a camera from the mean of all. If the cameras go around an object, this is
 about as wide as what they see. On a tripod it is far too small, and so it is for cameras that look ahead from nearly
 one place. For photos from afar, and with one wrong pose, it is far too large. So cameras that are far from all others
-do not count, and what the cameras see limits the result. On a walk it grows with the way, although each camera sees
-what is near it: there the nearest points limit the result.
+do not count, and what the cameras see limits the result. On a walk it grows with the way, and in a survey with the
+area, although each camera sees what is near it: there the nearest points limit the result.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _FAR = 3.0  # usual distances, beyond which a camera does not count
 
 # Limits of the extent in half diagonals of the images at the depth of the points. Cameras around an object have 1 to 3.
 _SMALLEST, _LARGEST = 0.3, 4.0
-# A walk is a path that is not wider than a tenth of its length. Its limit is in half diagonals at the nearest points.
-_WALK_WIDTH, _FEWEST_OF_WALK, _LARGEST_OF_WALK = 0.1, 8, 2.0
+_LARGEST_OF_WALK = 1.4  # half diagonals at the depth of the nearest points
 _MIDDLE, _NEAREST = 0.5, 0.1  # parts of the points in an image that are nearer than the depth
+_AROUND = 0.75  # of the cameras that see the place where all look, so that they are around it
 _MAX_CAMERAS = 100  # that are looked through
 _MIN_POINTS = 20  # in an image, so that their median depth is that of the scene
 
@@ -39,15 +39,16 @@ def extent_of(cameras: Sequence[Camera], xyz: DoubleArray) -> float:
     cameras : training cameras, at least one. xyz : (P, 3) points of the scene; P may be 0.
     """
     cameras = together(cameras)
-    centres, some = np.array([camera.position for camera in cameras]), sampled(xyz)
-    extent = _reach(centres)
+    extent, some = _reach(np.array([camera.position for camera in cameras])), sampled(xyz)
     cameras = cameras[:: -(-len(cameras) // _MAX_CAMERAS)]
+    middle = _depths_of_middle(cameras)
     if (width := _width_at_points(cameras, some, _MIDDLE)) is not None:
         extent = min(max(extent, _SMALLEST * width), _LARGEST * width)
-        if _is_walk(centres) and (width := _width_at_points(cameras, some, _NEAREST)) is not None:
+        if np.isfinite(middle).mean() < _AROUND and (width := _width_at_points(cameras, some, _NEAREST)) is not None:
             extent = min(extent, _LARGEST_OF_WALK * width)
-    elif (width := _width_at_middle(cameras)) is not None:
-        extent = min(extent, _LARGEST * width)
+    elif np.isfinite(middle).all():
+        widths = [_half_diagonal(camera) * depth for camera, depth in zip(cameras, middle, strict=True)]
+        extent = min(extent, _LARGEST * float(np.median(widths)))
     return extent if extent > 0 else 1.0
 
 
@@ -64,14 +65,6 @@ def _reach(centres: DoubleArray) -> float:
     return _MARGIN * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
 
-def _is_walk(centres: DoubleArray) -> bool:
-    """Return whether the centres (N, 3) are nearly on a line."""
-    if len(centres) < _FEWEST_OF_WALK:
-        return False
-    length, width, _ = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
-    return bool(width < _WALK_WIDTH * length)
-
-
 def _width_at_points(cameras: Sequence[Camera], xyz: DoubleArray, nearer: float) -> float | None:
     """Return half the diagonal of an image at the depth of its points, a median of images; None if they have too few.
 
@@ -85,15 +78,13 @@ def _width_at_points(cameras: Sequence[Camera], xyz: DoubleArray, nearer: float)
     return float(np.median(widths)) if widths else None
 
 
-def _width_at_middle(cameras: Sequence[Camera]) -> float | None:
-    """Return half the diagonal of an image at the point where all cameras look; None if there is no such point."""
+def _depths_of_middle(cameras: Sequence[Camera]) -> DoubleArray:
+    """Return the depth of the place where all cameras look, in each of them, (N,); infinity outside its image."""
     middle = where_axes_meet(cameras)
     if middle is None:
-        return None
+        return np.full(len(cameras), np.inf)
     found = [seen(camera, middle[None]) for camera in cameras]
-    if not all(one.inside[0] for one in found):
-        return None
-    return float(np.median([_half_diagonal(camera) * one.depth[0] for camera, one in zip(cameras, found, strict=True)]))
+    return np.array([one.depth[0] if one.inside[0] else np.inf for one in found])
 
 
 def _half_diagonal(camera: Camera) -> float:

@@ -27,10 +27,12 @@ from ..cameras.path import cam_from_world_of
 from ..cameras.rotations import NearestRotation, NotARotation, nearest_rotation, warn_of_corrections
 from ..errors import InputError, Remedy
 from ..files.file_names import can_be_file
-from ..files.image_names import IMAGE_SUFFIXES
+from ..files.image_names import CONVERTERS, IMAGE_SUFFIXES
 from ..files.json_file import MAX_NUMBER, read_json, to_real
 from ..files.masks import is_same_file
 from .colmap import Points, read_model
+from .colmap_folder import PHOTOS
+from .photo_names import is_absolute, last_parts
 from .photo_size import MAX_SIDE
 from .point_cloud import join_points, read_point_cloud
 from .posed_images import PosedImages, read_sizes
@@ -93,6 +95,17 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
         {name: frame.mask_file for name, frame in kept.items() if frame.values.get("mask_path") is not None},
         left_out,
     )
+
+
+def _with_suffix(file: Path) -> Path | None:
+    """Return a photo's file, which may lack its suffix; None if it lacks one and no photo has the name.
+
+    A name with the suffix of an image, or of photos that are not supported, lacks none.
+    """
+    if file.suffix.lower() in (*IMAGE_SUFFIXES, *CONVERTERS) or file.is_file():
+        return file
+    candidates = (file.with_name(file.name + suffix) for suffix in _SUFFIXES)
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _held_out(documents: list[_Document], frames: dict[str, _Frame]) -> frozenset[str] | None:
@@ -289,14 +302,21 @@ class _Document:
         """Return the photo's file; Blender sets omit the suffix. Raises InputError if no file can have the name."""
         if not can_be_file(file_path):
             raise InputError(f"{self.path}: {ascii(file_path)[:60]} is not the name of a photo; name a file beside it")
-        relative = Path(file_path.replace("\\", "/"))
-        if images is not None and not relative.is_absolute():
-            relative = Path(images, *relative.parts[1:] if len(relative.parts) > 1 else relative.parts)
-        file = self.path.parent / relative
-        if file.suffix.lower() in IMAGE_SUFFIXES:
-            return file
-        candidates = [file.with_name(file.name + suffix) for suffix in _SUFFIXES]
-        return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
+        if is_absolute(file_path):
+            places = self._places(file_path, images)
+        else:
+            parts = Path(file_path.replace("\\", "/")).parts
+            places = [self.path.parent.joinpath(*parts if images is None else (images, *(parts[1:] or parts)))]
+        files = [_with_suffix(place) for place in places]
+        found = next((file for file in files if file is not None and file.is_file()), None)
+        return found or files[0] or places[0].with_name(places[0].name + _SUFFIXES[0])
+
+    def _places(self, file_path: str, images: str | None) -> list[Path]:
+        """Return where the photo of an absolute path may be, which may be one of another computer."""
+        home, parts = self.path.parent, last_parts(file_path)
+        if images is not None:
+            return [home / images / part for part in reversed(parts)]
+        return [Path(file_path), *(folder / part for folder in (home, home / PHOTOS) for part in parts)]
 
     def name_of(self, file: Path) -> str:
         """Return a photo's name: its path below the scene's folder with `/` between folders, or else its file name."""

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError
+from ..files.image_names import bare_name
 from ..files.images import is_render
 from ..files.json_file import read_json
-from ..files.masks import MASK_FOLDER
+from ..files.masks import BESIDE, MASK_FOLDER
 from .colmap_folder import colmap_folder, model_suffix
 from .reconstruct.options import RECORD
 from .scene_files import find_scene_files
@@ -39,6 +40,7 @@ class Listing:
 
 def list_images(home: Path, suffixes: Collection[str]) -> Listing:
     """Return the files below a folder that have one of the suffixes. Hidden files and folders and masks are ignored.
+    Masks are in the folder `masks`, or beside their photos (`masks_beside`).
 
     Scenes, models and comparisons that clsplat wrote are left out, and so are other scenes. They are known by their
     contents, not by their names. Renders are left out beside photos; a folder with nothing else is taken as it is.
@@ -65,6 +67,8 @@ def list_images(home: Path, suffixes: Collection[str]) -> Listing:
             for name in files
             if not name.startswith(".") and Path(name).suffix.lower() in suffixes
         ]
+    known = {part for name in names for part in (name, bare_name(name))}
+    names = [name for name in names if not (name.lower().endswith(BESIDE) and name[: -len(BESIDE)] in known)]
     photos = [name for name in names if not (name.lower().endswith(".png") and is_render(home / name))]
     renders = len(names) - len(photos)
     if photos and renders:

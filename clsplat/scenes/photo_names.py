@@ -14,8 +14,8 @@ def place_photos(folder: Path, stored: Sequence[str]) -> dict[str, tuple[str, Pa
     """Return a name and a file for each stored name.
 
     A name below the folder stays as it is. Other names become paths below the common folder of all such photos, because
-    masks and renders have the names of their photos. An absolute path that does not exist is looked for in the folder
-    by its last parts: models are often copied from another computer.
+    masks and renders have the names of their photos. A path that does not exist is looked for in the folder in other
+    ways (`_file_of`): models are often copied from another computer.
 
     Parameters
     ----------
@@ -54,12 +54,29 @@ def place_photos(folder: Path, stored: Sequence[str]) -> dict[str, tuple[str, Pa
     return {name: (inside[name], files[name]) for name in stored}
 
 
-def _file_of(folder: Path, name: str) -> Path:
-    """Return the file of a stored name. A foreign absolute path is found by its last parts."""
-    file = folder / name
-    absolute = PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()
-    if not absolute or file.is_file():
-        return file
+def is_absolute(name: str) -> bool:
+    """Return whether a stored name is an absolute path, of this or of another system."""
+    return PurePosixPath(name).is_absolute() or PureWindowsPath(name).is_absolute()
+
+
+def last_parts(name: str) -> list[str]:
+    """Return what may remain of an absolute path in another folder: all folders and the name, and so on to the name."""
     parts = PureWindowsPath(name).parts[1:]  # takes both kinds of slashes
-    tails = [folder.joinpath(*parts[start:]) for start in range(len(parts))]
-    return next((tail for tail in tails if tail.is_file()), file)
+    return ["/".join(parts[start:]) for start in range(len(parts)) if ".." not in parts[start:]]
+
+
+def _file_of(folder: Path, name: str) -> Path:
+    """Return the file of a stored name.
+
+    A foreign absolute path is found by its last parts. A relative one may have Windows' slashes, and may begin with the
+    name of the folder.
+    """
+    file = folder / name
+    if file.is_file():
+        return file
+    if is_absolute(name):
+        others = last_parts(name)
+    else:
+        slashed = name.replace("\\", "/")
+        others = [slashed, slashed.removeprefix(f"{folder.name}/")]
+    return next((folder / other for other in others if (folder / other).is_file()), file)

@@ -17,11 +17,12 @@ from ..splats.formats.ply_header import read_header
 from .colmap import Points
 
 GREY = 128  # colour of points in files without colours
+_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 
 
 def read_point_cloud(path: str | os.PathLike[str]) -> Points:
     """Read points from the properties x, y, z and red, green, blue (0 to 255; reals may end at 1, 16-bit numbers at
-    65535). Points without colours are grey.
+    65535). The colours may have other usual names. Points without colours are grey.
 
     Returns
     -------
@@ -48,8 +49,9 @@ def read_point_cloud(path: str | os.PathLike[str]) -> Points:
     if bad.size:
         raise InputError(f"{path}: point {bad[0]} has a position that is not finite; export the points again")
     rgb = np.full((len(xyz), 3), GREY, np.uint8)
-    if all(name in columns for name in ("red", "green", "blue")):
-        rgb = _bytes(np.stack([columns[name] for name in ("red", "green", "blue")], axis=1))
+    named = next((names for names in _COLORS if all(name in columns for name in names)), None)
+    if named is not None:
+        rgb = _bytes(np.stack([columns[name] for name in named], axis=1))
     return Points(xyz, rgb, np.ones(len(xyz), np.int64))
 
 

@@ -40,6 +40,7 @@ class PosedImages:
     masks : by photo name, functions that look up the mask which the scene's files name. They raise InputError.
     left_out : reason why a photo with a pose cannot be used, by name.
     origin : the point of the file's coordinates that is the origin of the poses and points (origin.py).
+    unused : names of those left out that the file itself does not use, such as disabled cameras.
     """
 
     photos: list[RegisteredImage]
@@ -50,6 +51,7 @@ class PosedImages:
     masks: Mapping[str, Callable[[], Path]] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     origin: tuple[float, float, float] = ORIGIN
+    unused: frozenset[str] = frozenset()
 
     @property
     def names(self) -> list[str]:
@@ -77,11 +79,12 @@ def check_left_out(root: Path, posed: PosedImages, left_out: Mapping[str, str]) 
     """Raise InputError if fewer than a quarter of a scene's photos can be used.
 
     A quarter of the training photos is enough if the scene's files name the test views. BlenderNeRF writes poses of
-    test views without photos.
+    test views without photos. Photos that the scene's file does not use do not count.
     """
+    left_out = {name: reason for name, reason in left_out.items() if name not in posed.unused}
     if not left_out:
         return
-    listed = set(posed.listed)
+    listed = set(posed.listed) - posed.unused
     for names in (listed, listed - (posed.test_names or set())):
         if len(names - set(left_out)) >= max(1, MIN_USABLE * len(names)):
             return

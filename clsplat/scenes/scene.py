@@ -16,7 +16,7 @@ from ..cameras.camera import Camera
 from ..errors import InputError
 from ..files.digest import file_digest
 from ..files.images import ImageU8
-from ..files.masks import MASK_FOLDER, NO_MASKS, mask_files
+from ..files.masks import MASK_FOLDER, NO_MASKS, mask_files, masks_beside
 from ..files.real_path import real_path
 from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
@@ -149,7 +149,7 @@ def load_scene(
     eval : whether to hold out test views; if False, all views are training views.
     background : colour 0..1 under transparent pixels.
     masks : folder of masks inside the scene (see files/masks.py), or "none" for no masks. By default "masks" if it
-        exists, and the masks named in transforms.json. "none" keeps bars, too.
+        exists, the masks named in transforms.json, and masks beside photos. "none" keeps bars, too.
     alpha : use of a photo's transparency. "background" composites the photo over the background; "mask" masks out
         pixels that are less than half opaque. By default it is "background", but "mask" if the same pixels are
         transparent in all photos and points lie there: rims that undistortion leaves without data.
@@ -167,8 +167,8 @@ def load_scene(
     -----
     UserWarning : the model registers fewer than 80 % of the photos in the folder. Photos that are missing, unreadable
         or hidden by their masks are left out. Rotations, poses or lenses look wrong (`check_poses`). The scene is
-        moved, and `origin` is None. `test_every` has no effect. A camera is far from all others. The photos show none
-        of the points, which are left out then. Test photos are among the training photos.
+        moved, and `origin` is None. `test_every` has no effect. No test view can be used. A camera is far from all
+        others. The photos show none of the points, which are left out then. Test photos are among the training photos.
 
     Raises
     ------
@@ -219,6 +219,12 @@ def load_scene(
         raise InputError(
             f"{root}: no training view is left: all {len(views)} photos that can be used are test views; "
             "add photos, or turn eval off"
+        )
+    if only is None and test_names.isdisjoint(names) and test_names:
+        warnings.warn(
+            f"{root}: none of its {len(test_names)} test views can be used, so nothing will be measured; change "
+            "test_every, or name test views",
+            stacklevel=2,
         )
     points = posed.points
     if only is None:
@@ -282,7 +288,7 @@ def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, 
 
     Parameters
     ----------
-    folder : folder of masks inside the scene, NO_MASKS, or None for the default folder.
+    folder : folder of masks inside the scene, NO_MASKS, or None for the default folder and masks beside the photos.
 
     Raises
     ------
@@ -293,11 +299,12 @@ def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, 
     path = (root.parent if root.is_file() else root) / (folder or MASK_FOLDER)
     if folder is not None and not path.is_dir():
         raise InputError(f"{path}: no such folder of masks; name another, or {NO_MASKS!r} for no masks")
-    masks = mask_files(path, {name: posed.files[name] for name in posed.names})
+    files = {name: posed.files[name] for name in posed.names}
+    masks = mask_files(path, files)
     if folder is not None and posed.names and not masks:
         raise InputError(f"{path}: no mask of any photo in it; a mask of {posed.names[0]!r} is {posed.names[0]}.png")
     named = {name: find() for name, find in posed.masks.items() if name not in masks}
-    return named | masks
+    return (masks_beside(files) if folder is None else {}) | named | masks
 
 
 def read_posed_images(root: Path, images: str | None, origin: Sequence[float] | None = None) -> PosedImages:

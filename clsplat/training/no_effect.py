@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ..splats.shapes import shape_named
 from .config import TrainConfig
+from .initialise import names_model
 
 if TYPE_CHECKING:
     from ..scenes.scene import Scene
@@ -19,6 +21,8 @@ _BY_FIELD = {
     "opacity_minus_logit": ("bisect_reg",),
 }
 _FIELD_OF = {name: field for field, names in _BY_FIELD.items() for name in names}
+# Options of splats that are made of points.
+_OF_POINTS = ("init_scale", "init_opacity", "random_points")
 # Options by the switch that they need.
 _NEEDS = {
     "exposure_rate": "exposure",
@@ -27,10 +31,10 @@ _NEEDS = {
 }
 
 
-def no_effect(config: TrainConfig, name: str) -> str | None:
+def no_effect(config: TrainConfig, name: str, scene: Scene | None = None) -> str | None:
     """Return why a named option has no effect in a run, such as "with shape gaussian"; None if it has one.
 
-    config : complete options of the run (`decide`).
+    config : complete options of the run (`decide`). scene : that of the run, if it is known.
     """
     shape, values = shape_named(config.shape), config.to_json()
     if config.without_effect([name]):
@@ -40,22 +44,30 @@ def no_effect(config: TrainConfig, name: str) -> str | None:
         return f"with shape {config.shape}"
     if name == "normalisation" and not shape.normalised:
         return f"with shape {config.shape}"
+    if name in _OF_POINTS and names_model(config.start.init):
+        return f"with splats of a file ({config.start.init})"
     if name.startswith("sghmc_") and values["position_optimizer"] == "adam":
         return "with position optimizer adam"
     if name.startswith("alternation_") and values["alternation"] == "off":
         return "with alternation off"
     if name == "dense_size" and values["split"] != "published":
         return f"with split {values['split']}"
+    if name == "average_last" and values[name] > 0 and values["densify_until"] == 1:
+        return "with densification until the end"
     switch = _NEEDS.get(name)
     if switch is not None and not values[switch]:
         return f"without --{switch.replace('_', '-')}"
+    if name == "test_iterations" and scene is not None and not scene.test:
+        return "without test views"
     if name in ("save_iterations", "test_iterations"):
-        beyond = [number for number in values[name] if number > config.iterations]
-        if beyond and len(beyond) == len(values[name]):
-            return f"beyond the run's {config.iterations} iterations"
+        return _beyond(values[name], config.iterations)
     return None
 
 
-def no_effect_in(scene: Scene, name: str) -> str | None:
-    """Return why a named option has no effect with this scene; None if it has one."""
-    return "without test views" if name == "test_iterations" and not scene.test else None
+def _beyond(numbers: Sequence[int], last: int) -> str | None:
+    """Return why some of the numbers of iterations have no effect; None if all are within the run."""
+    late = [number for number in numbers if number > last]
+    if not late:
+        return None
+    which = "" if len(late) == len(numbers) else f"for {', '.join(map(str, late))}, "
+    return f"{which}beyond the run's {last} iterations"

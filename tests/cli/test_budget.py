@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import clsplat, error_of
+from cli_runner import clsplat, error_of, run
 
 from clsplat.splats.convert import convert
 from clsplat.splats.splats import Splats
@@ -31,9 +31,12 @@ SEARCH = (
 
 @pytest.fixture(scope="module")
 def found(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Folder of a model from a search, and the command's output."""
+    """Folder of a model from a search, and the command's output, with its warnings."""
     folder = tmp_path_factory.mktemp("search") / "model"
-    return folder, clsplat("train", scene, "-m", folder, "--budget", "auto", "--budget-tolerance", "1dB", *SEARCH)
+    search = ("--budget", "auto", "--budget-tolerance", "1dB", "--save-iterations", "5", *SEARCH)
+    result = run("train", scene, "-m", folder, *search)
+    assert result.exit_code == 0, result.output
+    return folder, result.output
 
 
 def test_info_counts(model: Path, tmp_path: Path) -> None:
@@ -120,6 +123,7 @@ def test_prune_refuses(model: Path, tmp_path: Path) -> None:
 
 def test_a_search_writes_a_smaller_model(found: tuple[Path, str]) -> None:
     folder, output = found
+    assert "warning: --save-iterations has no effect with --budget" in output
     report = json.loads((folder / "budget.json").read_text())
     assert report["options"]["tolerance"] == 1
     last = ModelFolder(folder).latest_ply()[0]
@@ -144,8 +148,6 @@ def test_a_finished_search_is_not_resumed_or_replaced(found: tuple[Path, str], s
 def test_an_interrupted_search_prints_how_to_continue(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from cli_runner import run
-
     import clsplat.compression.search as budget
 
     def stop(*args: object, **kinds: object) -> None:

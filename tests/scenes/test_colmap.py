@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import struct
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -135,6 +136,56 @@ def test_frames_of_images_that_are_gone(folder: Path) -> None:
     assert (model / "frames.txt").is_file()
     with pytest.warns(UserWarning, match="its points or frames"):
         assert len(load_scene(folder).views) == len(lines) // 2 - 1
+
+
+@pytest.mark.parametrize("n_short", [1, 2, 100], ids=["one", "two", "all"])
+@pytest.mark.parametrize("points", [True, False], ids=["points", "no points"])
+def test_images_without_a_line_of_observations(folder: Path, n_short: int, points: bool) -> None:
+    """Other programs leave the second line of an image out if it would be empty; COLMAP would skip the next image."""
+    wanted, model = load_scene(folder), folder / "sparse" / "0"
+    as_text(model, model)
+    for file in [*model.glob("*.bin"), *model.glob("frames.*"), *model.glob("rigs.*")]:
+        file.unlink()
+    lines = [line for line in (model / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    short = [
+        line for number in range(0, len(lines), 2) for line in lines[number : number + 1 + (number >= 2 * n_short)]
+    ]
+    (model / "images.txt").write_text("# all images\n" + "\n".join(short))
+    if not points:
+        (model / "points3D.txt").unlink()
+    with pytest.warns(UserWarning, match="its points or frames") if points else nullcontext():
+        scene = load_scene(folder)
+    assert scene.names == wanted.names
+    for view, expected in zip(scene.views, wanted.views, strict=True):
+        np.testing.assert_allclose(view.camera.cam_from_world, expected.camera.cam_from_world, atol=1e-9)
+    assert len(scene.points) == (len(wanted.points) if points else 0)
+
+
+def test_names_of_three_words_without_a_line_of_observations(folder: Path) -> None:
+    """Such a line has as many words as four observations."""
+    wanted, model = load_scene(folder), folder / "sparse" / "0"
+    as_text(model, model)
+    for file in [*model.glob("*.bin"), *model.glob("frames.*"), *model.glob("rigs.*"), model / "points3D.txt"]:
+        file.unlink()
+    lines = [line for line in (model / "images.txt").read_text().splitlines() if not line.startswith("#")][::2]
+    for name in wanted.names:
+        (folder / "images" / name).rename(folder / "images" / f"my garden {name}")
+    renamed = [line.replace(line.split()[-1], f"my garden {line.split()[-1]}") for line in lines]
+    (model / "images.txt").write_text("\n".join(renamed))
+    assert load_scene(folder).names == [f"my garden {name}" for name in wanted.names]
+
+
+def test_the_last_pose_may_end_without_a_line_end(folder: Path, recwarn: pytest.WarningsRecorder) -> None:
+    model = folder / "sparse" / "0"
+    as_text(model, model)
+    for file in model.glob("*.bin"):
+        file.unlink()
+    lines = [line for line in (model / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    poses = "\n".join(line for pose in lines[::2] for line in (pose, ""))
+    (model / "images.txt").write_text(poses.rstrip("\n"))
+    (model / "points3D.txt").write_text("")
+    assert len(load_scene(folder).views) == len(lines) // 2
+    assert not [warning for warning in recwarn if "points or frames" in str(warning.message)]
 
 
 def test_text_with_a_byte_order_mark(folder: Path) -> None:

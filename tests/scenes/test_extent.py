@@ -118,20 +118,47 @@ def half_diagonals(cameras: list[Camera], xyz: DoubleArray, nearer: float) -> fl
     return float(np.median(found))  # half a diagonal is 1 at a depth of 1: 200 px and a focal length of 100
 
 
-@pytest.mark.parametrize("length", [60.0, 240.0])
-def test_the_extent_of_a_walk_follows_what_is_near(length: float) -> None:
-    cameras, xyz = walk(length, ahead=True), corridor(length)
-    assert extent_of(cameras, xyz) == pytest.approx(2 * half_diagonals(cameras, xyz, 0.1), rel=1e-6)
+def assert_follows_what_is_near(cameras: list[Camera], xyz: DoubleArray) -> None:
+    """A walk has 1.4 half diagonals at the depth that a tenth of the points are nearer than."""
+    assert extent_of(cameras, xyz) == pytest.approx(1.4 * half_diagonals(cameras, xyz, 0.1), rel=1e-6)
     assert extent_of(cameras, xyz) < 0.5 * published(cameras)
+
+
+@pytest.mark.parametrize("n", [6, 24])
+@pytest.mark.parametrize("length", [60.0, 240.0])
+def test_the_extent_of_a_walk_follows_what_is_near(length: float, n: int) -> None:
+    cameras, xyz = walk(length, ahead=True, n=n), corridor(length)
+    assert_follows_what_is_near(cameras, xyz)
     assert extent_of(cameras, NOTHING) == published(cameras), "nothing says what is near"
 
 
+@pytest.mark.parametrize("turn", [0.5 * np.pi, 2 * np.pi], ids=["a corner", "around a block"])
+def test_a_walk_may_turn(turn: float) -> None:
+    """Cameras on a circle that look along it see walls on both sides, but not its centre."""
+    angles = np.linspace(0.0, turn, 24, endpoint=False)
+    places = 40.0 * np.stack([np.cos(angles), np.sin(angles), np.zeros(24)], axis=1)
+    ahead = np.stack([-np.sin(angles), np.cos(angles), np.zeros(24)], axis=1)
+    cameras = [camera(place, place + step) for place, step in zip(places, ahead, strict=True)]
+    rng = np.random.default_rng(1)
+    along, radius = rng.uniform(0.0, turn + 0.2, 1900), rng.choice([38.0, 42.0], 1900)
+    walls = np.stack([radius * np.cos(along), radius * np.sin(along), rng.uniform(-1, 1, 1900)], axis=1)
+    assert_follows_what_is_near(cameras, walls)
+
+
+def test_a_survey_from_above_is_a_walk() -> None:
+    places = np.array([[x, y, 10.0] for x in np.linspace(-60, 60, 10) for y in np.linspace(-60, 60, 10)])
+    cameras = [camera(place, place - (0.0, 0.01, 10.0)) for place in places]
+    ground = np.random.default_rng(1).uniform((-70, -70, -0.5), (70, 70, 0.5), (2000, 3))
+    assert_follows_what_is_near(cameras, ground)
+
+
 def test_what_is_not_a_walk() -> None:
-    few, xyz = walk(60.0, ahead=True, n=7), corridor(60.0)
-    usual = min(published(few), 4 * half_diagonals(few, xyz, 0.5))
-    assert extent_of(few, xyz) == pytest.approx(usual), "few cameras are always nearly on a line"
     slider = walk(4.0, ahead=False)
     assert extent_of(slider, corridor(4.0)) == published(slider), "what it sees is as wide as the way"
     places = [np.array([2.5 * index, 9.0 * np.sin(index), 0.0]) for index in range(24)]
-    wide = [camera(place, np.array([place[0] + 5.0, 0.0, 0.0])) for place in places]
-    assert extent_of(wide, xyz) == pytest.approx(min(published(wide), 4 * half_diagonals(wide, xyz, 0.5)))
+    inwards = [camera(place, np.array([30.0, 20.0, 0.0])) for place in places]
+    xyz = cloud(4.0, (30.0, 20.0, 0.0))
+    assert 1.4 * half_diagonals(inwards, xyz, 0.1) < published(inwards)
+    assert extent_of(inwards, xyz) == published(inwards), "all look at one place"
+    some = inwards[:18] + [camera(place, place - (0.0, 1.0, 0.0)) for place in places[18:]]
+    assert extent_of(some, xyz) == published(some), "three quarters of them do"

@@ -14,6 +14,7 @@ from small_scene import HEIGHT, N_VIEWS, NAMES, WIDTH, photo_of, write_garden
 from clsplat.errors import InputError
 from clsplat.files.images import read_image, write_png
 from clsplat.files.masks import mask_files, read_mask, resize_mask
+from clsplat.scenes.reconstruct.photo_files import find_photos
 from clsplat.scenes.scene import load_scene
 from clsplat.training.config import TrainConfig
 from clsplat.training.trainer import Trainer
@@ -47,6 +48,30 @@ def test_masks_are_found_by_the_names_of_their_photos(folder: Path, form: str) -
         else:
             assert view.mask is None
     assert all(view.mask is None for view in load_scene(folder, masks="none").views)
+
+
+@pytest.mark.parametrize("form", ["{name}.mask.png", "{stem}.mask.png"])
+def test_masks_beside_photos(folder: Path, form: str) -> None:
+    """RealityScan writes them there."""
+    masks = {name: folder / "images" / form.format(name=name, stem=Path(name).stem) for name in NAMES[3:5]}
+    for mask in masks.values():
+        write_mask(mask, left_half())
+    photos = [photo.name for photo in find_photos(folder / "images")]
+    assert photos == NAMES, "masks are no photos"
+    assert [photo.mask for photo in find_photos(folder / "images")] == [masks.get(name) for name in NAMES]
+    scene = load_scene(folder)
+    assert scene.names == NAMES
+    assert [view.name for view in scene.views if view.mask is not None] == NAMES[3:5]
+    write_mask(folder / "masks" / f"{NAMES[3]}.png", ~left_half())
+    found = {view.name: view.mask for view in load_scene(folder).views}
+    np.testing.assert_array_equal(found[NAMES[3]], ~left_half(), "those in the folder come first")
+    np.testing.assert_array_equal(found[NAMES[4]], left_half())
+    assert all(view.mask is None for view in load_scene(folder, masks="none").views)
+
+
+def test_a_photo_whose_name_ends_like_a_mask(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.mask.png", photo_of(0))
+    assert [photo.name for photo in find_photos(tmp_path)] == ["a.mask.png"]
 
 
 @pytest.mark.parametrize(

@@ -149,6 +149,32 @@ def test_cameras_that_cannot_be_used_are_left_out_with_a_reason(tmp_path: Path) 
         assert "camera 'DJI_000" in reason
 
 
+def test_cameras_that_the_file_does_not_use_do_not_count_as_missing(tmp_path: Path) -> None:
+    labels = [
+        replace(made.Label(Path(name).stem), enabled=str(int(index == 2))) for index, name in enumerate(made.NAMES)
+    ]
+    folder = write(tmp_path, made.metashape_xml(labels=labels))
+    with pytest.warns(UserWarning, match=f"{len(made.NAMES) - 1} of {len(made.NAMES)} photos are left out"):
+        assert load_scene(folder, eval=False).names == [made.NAMES[2]]
+    (folder / "images" / made.NAMES[2]).unlink()
+    with pytest.raises(InputError, match=r"none of its \d+ photos can be used"):
+        load_scene(folder, eval=False)
+    write(tmp_path, made.metashape_xml(labels=[replace(label, enabled="0") for label in labels]))
+    with pytest.raises(InputError, match="is disabled, and no other camera can be used; align the photos"):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_of_several_chunks_the_one_with_most_poses_is_read(tmp_path: Path, first: bool) -> None:
+    text = made.metashape_xml()
+    start, end = text.index("<chunk"), text.index("</chunk>") + len("</chunk>")
+    few = '<chunk label="few"><sensors/><cameras><camera id="0" label="x"/></cameras></chunk>'
+    joined = [few, text[start:end]][:: 1 if first else -1]
+    folder = write(tmp_path, text[:start] + "".join(joined) + text[end:])
+    with pytest.warns(UserWarning, match="has 2 chunks, and only the one with the most poses is read"):
+        assert read_posed_images(folder, None).names == made.NAMES
+
+
 def test_points_are_optional_and_must_be_one_file(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "cameras.ply").rename(tmp_path / "dense.ply")

@@ -297,6 +297,17 @@ def test_colours_of_points_have_any_type(folder: Path, kind: str, factor: float)
     np.testing.assert_array_equal(points.rgb, rgb)
 
 
+@pytest.mark.parametrize("names", [("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")])
+def test_colours_of_points_may_have_other_names(folder: Path, names: tuple[str, ...]) -> None:
+    xyz, rgb = cloud()
+    properties = [*(f"property float {name}" for name in "xyz"), *(f"property uchar {name}" for name in names)]
+    header = "\n".join(["ply", "format ascii 1.0", f"element vertex {len(xyz)}", *properties, "end_header\n"])
+    rows = [" ".join(map(str, (*map(float, at), *map(int, color)))) for at, color in zip(xyz, rgb, strict=True)]
+    (folder / "cloud.ply").write_text(header + "\n".join(rows) + "\n")
+    points = load_scene(write(folder, LENS | {"ply_file_path": "cloud.ply", "frames": frames()})).points
+    np.testing.assert_array_equal(points.rgb, rgb)
+
+
 def test_points_of_the_model_behind_the_poses_are_transformed(folder: Path, tmp_path: Path) -> None:
     shutil.move(write_garden(tmp_path / "other") / "sparse", folder / "colmap" / "sparse")
     moved = [[0, 1, 0, 1], [-1, 0, 0, 2], [0, 0, 1, 3]]
@@ -469,3 +480,36 @@ def test_names_do_not_lead_out_of_the_folder(tmp_path: Path) -> None:
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
     (scene / "transforms.json").write_text(json.dumps({"fl_x": 5, "frames": frames}))
     assert load_scene(scene, eval=False).names == ["a.png", "b.png"]
+
+
+@pytest.mark.parametrize("suffix", [".jfif", ".avif", ".JPE", ".gif"])
+def test_photos_with_rare_suffixes(folder: Path, suffix: str) -> None:
+    values = LENS | {"frames": frames()}
+    for frame in values["frames"]:
+        file = folder / frame["file_path"]
+        file.rename(file.with_suffix(suffix))
+        frame["file_path"] = str(Path(frame["file_path"]).with_suffix(suffix))
+    write(folder, values)
+    assert load_scene(folder).names == [frame["file_path"] for frame in values["frames"]]
+
+
+def test_a_photo_of_an_unknown_format_is_looked_for_under_its_name(folder: Path) -> None:
+    values = LENS | {"frames": frames()}
+    values["frames"][2]["file_path"] = "images/IMG.CR2"
+    write(folder, values)
+    with pytest.warns(UserWarning, match=r"images/IMG\.CR2: no such image file"):
+        load_scene(folder)
+
+
+def test_no_usable_test_view_is_named(folder: Path, recwarn: pytest.WarningsRecorder) -> None:
+    values = LENS | {"frames": frames()}
+    for name in NAMES[::8]:
+        (folder / "images" / name).unlink()
+    write(folder, values)
+    text = "none of its 2 test views can be used"
+    with pytest.warns(UserWarning, match=text):
+        assert load_scene(folder).test == []
+    recwarn.clear()
+    load_scene(folder, eval=False)
+    load_scene(folder, test_every=3)
+    assert not [warning for warning in recwarn if text in str(warning.message)]

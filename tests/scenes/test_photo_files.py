@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_runner import error_of
 from PIL import Image
 
 from clsplat.errors import InputError
@@ -92,20 +93,23 @@ def test_scene_names_stay_unique(tmp_path: Path) -> None:
 def test_folders_without_photos(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         find_photos(tmp_path / "absent")
-    with pytest.raises(InputError, match=r"no photos in this folder or below; looked for \.bmp"):
+    with pytest.raises(InputError, match=r"no photos in this folder or below; looked for \.avif, \.bmp"):
         find_photos(tmp_path)
+    assert not is_photographs(tmp_path)
     for name in ("b.cr2", "b.NEF"):
         (tmp_path / name).write_bytes(b"raw")
     text = "2 files .cr2, .nef: convert them to JPEG, for example with darktable-cli"
     with pytest.raises(InputError, match=f"no photos in this folder or below; {text}"):
         find_photos(tmp_path)
     assert unsupported_photos(tmp_path) == text
+    assert is_photographs(tmp_path)
+    assert text in error_of("train", tmp_path, "-m", tmp_path / "m")
+    assert text in error_of("reconstruct", tmp_path, "-o", tmp_path / "s")
     if READS_HEIC:
         return
     (tmp_path / "IMG_1.HEIC").write_bytes(b"heic")
     text = "3 files .cr2, .heic, .nef: convert them to JPEG, for example with darktable-cli or heif-convert"
     assert unsupported_photos(tmp_path) == f"{text}; or pip install 'clsplat[heic]'"
-    assert not is_photographs(tmp_path)
 
 
 def test_names_that_a_model_cannot_store(tmp_path: Path) -> None:

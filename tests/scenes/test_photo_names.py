@@ -111,6 +111,36 @@ def test_models_of_another_computer(tmp_path: Path) -> None:
     assert placed[stored[3]] == ("c.png", Path("/nowhere/c.png"))
 
 
+def test_names_with_the_slashes_of_windows_and_with_the_folder_of_the_photos(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    for index, name in enumerate(("day/a.png", "b.png", "images/c.png")):
+        write_png(folder / name, photo_of(index))
+    stored = [r"day\a.png", "images/b.png", "images/c.png", "other/b.png"]
+    placed = place_photos(folder, stored)
+    assert placed[stored[0]] == ("day/a.png", folder / "day" / "a.png")
+    assert placed[stored[1]] == ("b.png", folder / "b.png")
+    assert placed[stored[2]] == ("images/c.png", folder / "images" / "c.png"), "a file with the stored name comes first"
+    assert not placed[stored[3]][1].exists(), "other folders are not left out"
+
+
+@pytest.mark.parametrize("form", ["/home/her/data/images/{}", r"C:\data\images\{}", "/home/her/{}"])
+def test_transforms_of_another_computer(garden: Path, form: str) -> None:
+    shutil.rmtree(garden / "sparse")
+    frames = [
+        {"file_path": form.format(name.removesuffix(".png")), "transform_matrix": np.eye(4).tolist()} for name in NAMES
+    ]
+    for index, frame in enumerate(frames):
+        frame["fl_x"] = 30.0 + index
+    (garden / "transforms.json").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "frames": frames}))
+    scene = load_scene(garden)
+    assert scene.names == [f"images/{name}" for name in NAMES]
+    assert [view.camera.fx for view in scene.views] == [30.0 + index for index in range(len(NAMES))]
+    shutil.copytree(garden / "images", garden / "images_b")
+    assert load_scene(garden, "images_b").names == [f"images_b/{name}" for name in NAMES]
+    with pytest.raises(InputError, match=rf"images_c/{NAMES[0]}: no such image file"):
+        load_scene(garden, "images_c")
+
+
 def test_names_stay_unique(tmp_path: Path) -> None:
     placed = place_photos(tmp_path, ["/x/1/a.jpg", "/x/2/a.jpg", "b.jpg", "sub/../c.jpg"])
     assert [name for name, _ in placed.values()] == ["1/a.jpg", "2/a.jpg", "b.jpg", "c.jpg"]

@@ -100,6 +100,10 @@ def test_relative_paths_stay_relative(data: Path, monkeypatch: pytest.MonkeyPatc
     [
         ("a.jpg", "is one photo; give the folder of the photos"),
         ("points.ply", "is a model or a point cloud, not a scene; give the scene's folder"),
+        (
+            "cameras.csv",
+            "is a table, which says too little about lenses; export the cameras of RealityScan as a COLMAP",
+        ),
         ("notes.txt", "is not a scene; give a folder with photos, a video, a transforms.json, an OPF project"),
     ],
 )
@@ -107,4 +111,6 @@ def test_files_that_are_not_scenes(tmp_path: Path, name: str, remedy: str) -> No
     (tmp_path / name).write_bytes(b"something")
     for command in ("train", "compare"):
         assert f"{name}: {remedy}" in refusal(command, tmp_path / name, tmp_path / "out")
+    if name != "points.ply":
+        assert f"{name}: {remedy}" in error_of("info", tmp_path / name)
     assert f"{name}: is a file; give a folder" in refusal("reconstruct", tmp_path / name, tmp_path / "out")

@@ -11,7 +11,7 @@ from cli_runner import error_of, run
 
 from clsplat.scenes.scene import Scene
 from clsplat.training.config import OPTIONS, TrainConfig
-from clsplat.training.no_effect import _FIELD_OF, _NEEDS, no_effect, no_effect_in
+from clsplat.training.no_effect import _FIELD_OF, _NEEDS, _OF_POINTS, no_effect
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,13 @@ from clsplat.training.no_effect import _FIELD_OF, _NEEDS, no_effect, no_effect_i
         ({"shape": "skew-normal"}, "alternation_cycle", "with alternation off"),
         ({"shape": "skew-normal"}, "alternation_split", "with alternation off"),
         ({"split": "long-axis"}, "dense_size", "with split long-axis"),
+        ({"average_last": 0.1, "densify_until": 1.0}, "average_last", "with densification until the end"),
         ({"iterations": 100, "save_iterations": (200, 300)}, "save_iterations", "beyond the run's 100 iterations"),
+        (
+            {"iterations": 100, "test_iterations": (50, 200, 300)},
+            "test_iterations",
+            "for 200, 300, beyond the run's 100 iterations",
+        ),
     ],
 )
 def test_reasons(options: dict[str, Any], name: str, why: str) -> None:
@@ -50,7 +56,11 @@ def test_reasons(options: dict[str, Any], name: str, why: str) -> None:
         ({"strategy": "adc"}, "opacity_reset"),
         ({"shape": "skew-normal", "alternation": "cyclic"}, "alternation_cycle"),
         ({"split": "published"}, "dense_size"),
-        ({"iterations": 100, "save_iterations": (50, 300)}, "save_iterations"),
+        ({"iterations": 100, "save_iterations": (50, 100)}, "save_iterations"),
+        ({"average_last": 0.1, "densify_until": 0.99}, "average_last"),
+        ({"average_last": 0.0, "densify_until": 1.0}, "average_last"),
+        ({"init": "random"}, "init_scale"),
+        ({}, "random_points"),
         ({}, "save_iterations"),
     ],
 )
@@ -58,8 +68,14 @@ def test_options_with_an_effect(options: dict[str, Any], name: str) -> None:
     assert no_effect(TrainConfig(**options), name) is None
 
 
+@pytest.mark.parametrize("name", _OF_POINTS)
+def test_options_of_points_have_no_effect_on_splats_of_a_file(tmp_path: Path, name: str) -> None:
+    (tmp_path / "a.ply").touch()
+    assert no_effect(TrainConfig(init=str(tmp_path / "a.ply")), name) == f"with splats of a file ({tmp_path / 'a.ply'})"
+
+
 def test_all_names_are_options() -> None:
-    assert {*_FIELD_OF, *_NEEDS, *_NEEDS.values()} <= set(OPTIONS)
+    assert {*_FIELD_OF, *_NEEDS, *_NEEDS.values(), *_OF_POINTS} <= set(OPTIONS)
 
 
 def test_the_command_warns(scene: Any, capture_folder: Path, tmp_path: Path) -> None:
@@ -76,12 +92,16 @@ def test_flags_that_need_another_flag(model_folder: Path, capture_folder: Path, 
     assert "remove --no-photos" in error_of(*clean, "--tolerance", 0.2, code=2)
     render = ("render", model_folder, "-o", tmp_path / "r", "--depth-range", "1,2")
     assert "give --depth-colours" in error_of(*render, code=2)
+    assert "give --video FILE or --path" in error_of(*render[:-2], "--fps", 10, code=2)
+    video = ("render", model_folder, "--video", tmp_path / "v.mp4", "--format", "npy")
+    assert "give -o DIR" in error_of(*video, code=2)
 
 
 def test_measurements_without_test_views_are_named(scene: Scene, capture_folder: Path, tmp_path: Path) -> None:
-    assert no_effect_in(scene, "test_iterations") is None
-    assert no_effect_in(replace(scene, test_names=frozenset()), "test_iterations") == "without test views"
-    assert no_effect_in(replace(scene, test_names=frozenset()), "save_iterations") is None
+    without = replace(scene, test_names=frozenset())
+    assert no_effect(TrainConfig(), "test_iterations", scene) is None
+    assert no_effect(TrainConfig(), "test_iterations", without) == "without test views"
+    assert no_effect(TrainConfig(), "save_iterations", without) is None
     flags = ("--iterations", 4, "--cap-max", 50, "-q", "--test-iterations", 2)
     said = run("train", capture_folder, "-m", tmp_path / "m", *flags).stderr
     assert "--test-iterations has no effect without test views" in said

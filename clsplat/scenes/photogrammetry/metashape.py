@@ -44,7 +44,7 @@ def read_metashape(path: Path, images: str | None = None) -> PosedImages:
     """Read the photos with poses of an XML file of Metashape, and the points in a PLY file beside it.
 
     Photos that are disabled, that have no pose, or that belong to another component are left out. A slave of a rig has
-    a pose if its master has one.
+    a pose if its master has one. If there are several chunks, that with the most poses is read.
 
     Parameters
     ----------
@@ -53,16 +53,14 @@ def read_metashape(path: Path, images: str | None = None) -> PosedImages:
 
     Warns
     -----
-    UserWarning : rotations were corrected, or the points of a georeferenced chunk are left out.
+    UserWarning : rotations were corrected, or chunks, or the points of a georeferenced chunk, are left out.
 
     Raises
     ------
-    InputError : the file is damaged, a number is missing or bad, a slave's master is unknown, or a lens has no
-        counterpart. The message names file, camera and element.
+    InputError : the file is damaged, a number is missing or bad, a slave's master is unknown, a lens has no
+        counterpart, or no camera can be used. The message names file, camera and element.
     """
-    chunk = read_xml(path, _EXPECTED).find("chunk")
-    if chunk is None:
-        raise InputError(f"{path}: has no <chunk>; choose {_EXPECTED}")
+    chunk = _chunk(path)
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
     cameras = _cameras(path, chunk, sensors)
     placed = find_named_photos(path, list(cameras), images)
@@ -70,6 +68,9 @@ def read_metashape(path: Path, images: str | None = None) -> PosedImages:
     files = dict(placed.values())
     active = _active_component(chunk, cameras.values())
     reasons = {name: reason for name, camera in named.items() if (reason := camera.unused(active)) is not None}
+    if len(reasons) == len(named):
+        first = next(iter(reasons.values()))
+        raise InputError(f"{first}, and no other camera can be used; align the photos, and export the cameras again")
     sizes, left_out = read_sizes({name: file for name, file in files.items() if name not in reasons})
     left_out |= reasons
     lenses = _lenses(path, sensors, {named[name].sensor for name in sizes})
@@ -85,7 +86,24 @@ def read_metashape(path: Path, images: str | None = None) -> PosedImages:
         RegisteredImage(name, local.camera_pose(rotation.matrix, position), lenses[named[name].sensor])
         for name, (rotation, position) in poses.items()
     ]
-    return PosedImages(photos, files, sizes, _points(path, world.is_geocentric), left_out=left_out)
+    return PosedImages(
+        photos, files, sizes, _points(path, world.is_geocentric), left_out=left_out, unused=frozenset(reasons)
+    )
+
+
+def _chunk(path: Path) -> ET.Element:
+    """Return the chunk with the most poses."""
+    chunks = read_xml(path, _EXPECTED).findall("chunk")
+    if not chunks:
+        raise InputError(f"{path}: has no <chunk>; choose {_EXPECTED}")
+    chosen = max(chunks, key=lambda chunk: len(chunk.findall("cameras//camera/transform")))
+    if len(chunks) > 1:
+        warnings.warn(
+            f"{path}: has {len(chunks)} chunks, and only the one with the most poses is read "
+            f"({chosen.get('label', 'without a label')}): export each chunk to a separate file",
+            stacklevel=4,
+        )
+    return chosen
 
 
 @dataclass(frozen=True, eq=False)

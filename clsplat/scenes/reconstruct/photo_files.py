@@ -24,7 +24,7 @@ from ...files.images import (
     write_photo,
     write_png,
 )
-from ...files.masks import MASK_FOLDER, Mask, mask_files, read_mask, resize_mask
+from ...files.masks import MASK_FOLDER, Mask, mask_files, masks_beside, read_mask, resize_mask
 from ...files.real_path import real_path
 from ..colmap_folder import colmap_folder
 from ..photo_listing import Listing, list_images
@@ -88,13 +88,14 @@ def is_photographs(path: Path) -> bool:
     if not path.is_dir():
         return is_video(path)
     posed = colmap_folder(path) is not None or any(path.glob("transforms*.json")) or bool(find_scene_files(path))
-    return not posed and bool(list_images(_photo_folder(path), IMAGE_SUFFIXES).names)
+    return not posed and bool(list_images(_photo_folder(path), {*IMAGE_SUFFIXES, *CONVERTERS}).names)
 
 
 def find_photos(path: Path) -> list[PhotoFile]:
     """Return the photos in a folder and its subfolders, sorted by name, with their masks.
 
-    If a folder of _PHOTO_FOLDERS inside it has photos, only those are returned. Masks are in the folder `masks`.
+    If a folder of _PHOTO_FOLDERS inside it has photos, only those are returned. Masks are in the folder `masks`, or
+    beside the photos.
     Hidden files and folders are ignored. Scenes, models and renders below the folder are left out (`left_out_below`).
 
     Raises
@@ -120,8 +121,8 @@ def find_photos(path: Path) -> list[PhotoFile]:
     for name in names:
         if not name.isprintable():  # a model's files cannot store line ends and names that are not UTF-8
             raise InputError(f"{home}: the name {name!a} cannot be written into a model; rename the photo")
-    folder = path / MASK_FOLDER
-    masks = mask_files(folder, {name: home / name for name in names}) if folder.is_dir() else {}
+    folder, files = path / MASK_FOLDER, {name: home / name for name in names}
+    masks = masks_beside(files) | (mask_files(folder, files) if folder.is_dir() else {})
     return [
         PhotoFile(scene_name, home / name, masks.get(name))
         for name, scene_name in zip(names, _scene_names(names), strict=True)
