@@ -79,7 +79,7 @@ def _summary(result: PrunedModel) -> list[str]:
 
     pruned, output = result.pruned, result.output
     old, new = complexity(result.source.splats), complexity(pruned.splats)
-    old_bytes, new_bytes = result.source.ply.stat().st_size, output.stat().st_size
+    old_bytes, new_bytes = result.source_bytes, output.stat().st_size
     lines = [f"{output}: {new_bytes / 1e6:.2f} MB, {new_bytes / old_bytes:.0%} of {old_bytes / 1e6:.2f} MB"]
     kinds = [("splats", "splats", new.splats, old.splats)]
     kinds += [(name, f"splats with {name}", new.fields[name], count) for name, count in old.fields.items()]

@@ -124,6 +124,8 @@ def render(
     request = path_request(values | {"save_path": save_path})
     if values["output"] is None and values["video"] is None:
         raise click.UsageError("give -o DIR for images, --video FILE, or both")
+    if values["format"] == "npy" and values["depth_colours"] and values["video"] is None:
+        raise click.UsageError("--depth-colours are for --format png and videos")
     if values["format"] == "npy" and values["output"] is None:
         raise click.UsageError("--format npy is for images: give -o DIR")
     if (

@@ -5,6 +5,7 @@ Files that clsplat names itself, in a folder that it made, are written again wit
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -14,7 +15,8 @@ from .real_path import real_path
 
 
 def refuse_existing(paths: Iterable[str | Path], overwrite: bool = False, inputs: Iterable[str | Path] = ()) -> None:
-    """Raise OutputError for the first path that exists and may not be replaced, or that comes twice.
+    """Raise OutputError for the first path that exists and may not be replaced, that comes twice, or whose place takes
+    no files. So the work for a file begins only if it can be written.
 
     Parameters
     ----------
@@ -22,7 +24,7 @@ def refuse_existing(paths: Iterable[str | Path], overwrite: bool = False, inputs
     overwrite : whether files may be replaced. Folders and devices such as /dev/null never are.
     inputs : files that are read, such as the photos of the scene. They are never replaced either.
     """
-    kept, written = {name_key(real_path(path)) for path in inputs}, set()
+    kept, written, places = {name_key(real_path(path)) for path in inputs}, set(), set()
     for path in map(Path, paths):
         place = name_key(real_path(path))
         if place in kept:
@@ -34,3 +36,18 @@ def refuse_existing(paths: Iterable[str | Path], overwrite: bool = False, inputs
             raise OutputError(f"{path}: is not a file: choose another name")
         if path.exists() and not overwrite:
             raise OutputError(f"{path}: exists already: use --overwrite or another name")
+        if path.parent not in places:
+            _check_place(path)
+            places.add(path.parent)
+
+
+def _check_place(path: Path) -> None:
+    """Raise OutputError if the folder of a path, or the first one above it that exists, takes no files."""
+    folder = next((parent for parent in path.absolute().parents if parent.exists()), None)
+    if folder is None or not folder.is_dir():
+        return  # writing says what is in the way
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +12,7 @@ from .. import activity
 from ..cleaning.clean import Cleaned, clean, clean_without_views
 from ..errors import InputError, OutputError, Remedy
 from ..evaluation.evaluate import Evaluation, evaluate
+from ..files.atomic import move
 from ..files.existing import refuse_existing
 from ..files.real_path import real_path
 from ..rendering.renderer import Renderer
@@ -18,6 +21,7 @@ from ..splats.color import Color
 from ..splats.formats.any_file import check_ending
 from ..splats.formats.page_payload import PAGE_ENDING
 from ..splats.splats import Splats
+from ..training.exposure_file import copy_exposures
 from ..training.folder import ModelFolder
 from .model import LoadedModel, SceneChoice, model_at
 
@@ -143,13 +147,33 @@ def _write(splats: Splats, model: LoadedModel, output: Path) -> None:
         return
     assert model.folder is not None
     assert model.iteration is not None
+    is_new = not output.exists()
     folder = ModelFolder(output)
     folder.prepare()
-    folder.clear()
-    stored = model.folder.read_config()
+    try:
+        # The new model is complete before the old one goes. It lies in the folder, so that its files only change place.
+        with tempfile.TemporaryDirectory(prefix=".", dir=output) as temporary:
+            _write_folder(splats, model, model.folder, model.iteration, ModelFolder(temporary))
+            folder.clear()
+            for file in [path for path in Path(temporary).rglob("*") if path.is_file()]:
+                target = output / file.relative_to(temporary)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                move(file, target)
+    except (OutputError, OSError) as error:
+        if is_new:
+            shutil.rmtree(output, ignore_errors=True)
+        cause = error.__cause__ if isinstance(error, OutputError) else error
+        reason = getattr(cause, "strerror", None) or cause or error
+        raise OutputError(f"{output}: cannot be written ({reason}); free some space, or choose another place") from None
+
+
+def _write_folder(splats: Splats, model: LoadedModel, source: ModelFolder, iteration: int, folder: ModelFolder) -> None:
+    """Write the splats into a folder, with what the folder of the model has for later commands."""
+    stored = source.read_config()
     if "path" in model.scene_record:  # the record may be relative to the old folder
         stored["scene"] = {**stored["scene"], "path": real_path(model.scene_record["path"]).as_posix()}
     folder.write_config(stored)
     if cameras := model.read_cameras():
         folder.write_cameras(cameras)
-    folder.save(splats, model.iteration)
+    copy_exposures(source, folder.exposures_path)
+    folder.save(splats, iteration)

@@ -113,8 +113,9 @@ def evaluate_models(
 ) -> list[ModelEvaluation]:
     """Measure several models like `evaluate`, and return their measurements.
 
-    A model is also measured if its result files cannot be written; see `ModelEvaluation.write_error`. A warning says
-    that models were measured on different views. With `comparison`, that is an InputError.
+    A model is also measured if its result files cannot be written; see `ModelEvaluation.write_error`. If the caller
+    named other places, with `comparison` or `numbers`, that is only a warning. A warning says that models were measured
+    on different views. With `comparison`, that is an InputError.
 
     Parameters
     ----------
@@ -135,12 +136,20 @@ def evaluate_models(
             if comparison is not None:
                 raise InputError(f"{differ}: compare models of one scene, or measure them without a common report")
             warnings.warn(f"{differ}: do not compare their numbers", stacklevel=2)
-    if numbers is not None:
-        entries = zip(paths, measured, strict=True)
-        write_json(numbers, {str(path): {"results": one.result, "per_view": one.per_view} for path, one in entries})
-    if comparison is not None:
-        write_model_report(comparison, measured[-1].scene.name, measured, _labels(paths))
-    return measured
+    try:
+        if numbers is not None:
+            entries = zip(paths, measured, strict=True)
+            write_json(numbers, {str(path): {"results": one.result, "per_view": one.per_view} for path, one in entries})
+        if comparison is not None:
+            write_model_report(comparison, measured[-1].scene.name, measured, _labels(paths))
+    except OutputError as error:
+        return [*measured[:-1], replace(measured[-1], write_error=error)]
+    if numbers is None and comparison is None:
+        return measured
+    for one in measured:
+        if one.write_error is not None:
+            warnings.warn(str(one.write_error), stacklevel=2)
+    return [replace(one, write_error=None) for one in measured]
 
 
 class Evaluator:
@@ -220,6 +229,7 @@ class Evaluator:
             "normalisation": model.splats.normalisation,
             "set": options.view_set,
             "views": len(views),
+            "sizes": sorted({(view.camera.width, view.camera.height) for view in views}),
             "background": list(background),
             "device": str(self.renderer.device.info),
             "protocol": options.protocol.describe() | recorder.describe(),
@@ -237,17 +247,13 @@ class Evaluator:
         try:
             for stem, entry in (("results", result), ("per_view", per_view)):
                 _add_entry(model.folder.path / f"{stem}{ending}.json", key, entry)
+            if not self.write_reports:
+                return evaluation
+            file, name = model.folder.path / f"{Path(REPORT).stem}{ending}.html", options.scene_name or scene.name
+            report = write_model_report(file, name, [evaluation], [real_path(model.path).name])
         except OutputError as error:
             return replace(evaluation, write_error=error)
-        if not self.write_reports:
-            return evaluation
-        file = model.folder.path / f"{Path(REPORT).stem}{ending}.html"
-        return replace(
-            evaluation,
-            report=write_model_report(
-                file, options.scene_name or scene.name, [evaluation], [real_path(model.path).name]
-            ),
-        )
+        return replace(evaluation, report=report)
 
 
 def _on_equal_views(one: ModelEvaluation, other: ModelEvaluation) -> bool:

@@ -14,7 +14,7 @@ from ..errors import InputError, OutputError
 from ..files.existing import refuse_existing
 from ..rendering.renderer import Renderer
 from ..scenes.split import hold_out
-from ..splats.formats.any_file import PLY_ENDING
+from ..splats.formats.any_file import PLY_ENDING, stored_bytes
 from ..training.log import Progress
 from .model import LoadedModel, SceneChoice, model_at
 
@@ -29,11 +29,13 @@ class PrunedModel:
     ----------
     source : the model before. output : the file that was written.
     pruned : the smaller model, and its loss of quality.
+    source_bytes : size of the model before, which may have been the same file.
     """
 
     source: LoadedModel
     output: Path
     pruned: Pruned
+    source_bytes: int
 
 
 def prune_model(
@@ -81,8 +83,9 @@ def prune_model(
     if not len(loaded.splats):
         raise InputError(f"{loaded.path}: has no splats")
     pruned = _pruned(loaded, scene, tolerance, iterations, device, progress)
+    source_bytes = stored_bytes(loaded.ply)
     pruned.splats.save(output, compact=compact)
-    return PrunedModel(loaded, output, pruned)
+    return PrunedModel(loaded, output, pruned, source_bytes)
 
 
 def _pruned(

@@ -12,8 +12,9 @@ from ..cameras.cameras_json import NamedCamera, named_cameras, read_cameras, wri
 from ..cameras.interpolate import resized_by_height
 from ..cameras.make_path import PathRequest, make_path, name_frames
 from ..cameras.path import DEFAULT_FPS, CameraPath, write_path
-from ..errors import InputError
+from ..errors import InputError, OutputError
 from ..files.existing import refuse_existing
+from ..files.real_path import real_path
 from ..files.video import VideoWriter
 from ..rendering.renderer import Renderer, RendersSplats
 from ..rendering.views import RenderOutput, ViewProgress, files_of, render_to_files
@@ -102,6 +103,9 @@ def render_views(
     views, path = choose_views(loaded, choice)
     fps = output.fps or (path.fps if path is not None else DEFAULT_FPS)
     path_cameras = None if path is None or output.folder is None else Path(output.folder) / "cameras.json"
+    kept = None if loaded.folder is None else loaded.folder.cameras_path
+    if path_cameras is not None and kept is not None and real_path(path_cameras) == real_path(kept):
+        raise OutputError(f"{output.folder}: is the model itself, whose cameras.json is kept: name another folder")
     named = [Path(file) for file in (save_path, path_cameras) if file is not None]
     refuse_existing([*files_of(output, [view.name for view in views]), *named], overwrite)
     if path is not None and save_path is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from clsplat.models.model import SceneChoice, load_model
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import Scene
 from clsplat.splats.splats import Splats
+from clsplat.training.folder import ModelFolder
 
 
 @pytest.fixture(scope="module")
@@ -154,6 +156,7 @@ def test_a_new_folder_is_a_model_and_the_old_one_is_kept(model_folder: Path, tmp
     again = load_model(tmp_path / "new")
     assert len(again.splats) == len(result.cleaned.splats)
     assert again.iteration == load_model(model_folder).iteration
+    assert not list((tmp_path / "new").glob(".*"))
     assert [view.name for view in again.load_scene().test] == [
         v.name for v in load_model(model_folder).load_scene().test
     ]
@@ -166,6 +169,14 @@ def test_a_new_folder_is_a_model_and_the_old_one_is_kept(model_folder: Path, tmp
         clean_model(load_model(model_folder).ply, tmp_path / "other")
     with pytest.raises(OutputError, match="choose one of these endings"):
         clean_model(model_folder, tmp_path / "a.txt")
+
+
+def test_exposures_stay_with_the_model(model_folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(model_folder, tmp_path / "old")
+    ModelFolder(tmp_path / "old").write_exposures({"a.png": [[1.0, 0.0, 0.0, 0.5]] * 3})
+    clean_model(tmp_path / "old", tmp_path / "new", use_photos=False)
+    old, new = (ModelFolder(tmp_path / name).exposures_path.read_bytes() for name in ("old", "new"))
+    assert old == new
 
 
 def test_a_file_is_judged_by_the_scene_that_is_named(model_folder: Path, capture_folder: Path, tmp_path: Path) -> None:

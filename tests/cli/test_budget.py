@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,7 @@ def test_eval_writes_the_complexity(copied_model: Path) -> None:
     assert entry["sh_coefficients"] == [3 * entry["splats"], 9 * entry["splats"]]
 
 
-def test_prune_removes_unnecessary_splats(model: Path, tmp_path: Path) -> None:
+def test_prune_removes_unnecessary_splats(model: Path, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
     output = clsplat("prune", model, "-o", out, "--tolerance", "0.5dB")
     ply = ModelFolder(model).latest_ply()[0]
@@ -70,6 +71,9 @@ def test_prune_removes_unnecessary_splats(model: Path, tmp_path: Path) -> None:
     assert len(small) <= len(whole)
     assert out.stat().st_size < 0.8 * ply.stat().st_size
     assert f"splats: {len(small)} of {len(whole)}, " in output
+    shutil.copy(ply, tmp_path / "own.ply")
+    own = clsplat("prune", tmp_path / "own.ply", "-s", scene, "-o", tmp_path / "own.ply", "--overwrite")
+    assert f"% of {ply.stat().st_size / 1e6:.2f} MB" in own
     assert "validation views: PSNR " in output
     clsplat(
         "prune",

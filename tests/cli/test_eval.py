@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_runner import ITERATIONS, TEST_NAMES, clsplat, error_of, run
+from cli_runner import HEIGHT, ITERATIONS, TEST_NAMES, WIDTH, clsplat, error_of, run
 from PIL import Image
 
 from clsplat.evaluation.metrics import protocol_named
@@ -35,6 +35,7 @@ def test_eval_writes_3dgs_files_with_the_protocol(copied_model: Path, scene: Pat
     assert entry["bytes"] == ply(copied_model).stat().st_size
     splats = Splats.load(ply(copied_model))
     assert (entry["splats"], entry["shape"], entry["views"]) == (len(splats), "skew-normal", 2)
+    assert entry["sizes"] == [[WIDTH, HEIGHT]]
     assert entry["parameters"] == len(splats) * (3 + 4 + 3 + 1 + 3 * 4 + 3)
     assert entry["render_ms"] > 0
     per_view = json.loads((copied_model / "per_view.json").read_text())[f"ours_{ITERATIONS}"]

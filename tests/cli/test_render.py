@@ -25,6 +25,7 @@ from clsplat.rendering.colormaps import depth_picture
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
 from clsplat.splats.splats import Splats
+from clsplat.training.folder import ModelFolder
 
 
 def files(folder: Path) -> set[str]:
@@ -113,6 +114,14 @@ def test_durations_that_no_path_can_have(model: Path, tmp_path: Path, flag: str,
     error = error_of(*args, flag, value, code=1 if in_range or value == "nan" else 2)
     assert flag[2:] in error or "more than 100000 frames" in error
     assert not (tmp_path / "r").exists()
+
+
+def test_a_path_does_not_replace_the_cameras_of_the_model(copied_model: Path) -> None:
+    before = ModelFolder(copied_model).cameras_path.read_bytes()
+    command = ("render", copied_model, "--path", "orbit", "--frames", 2, "-o", copied_model, "--overwrite")
+    assert "is the model itself, whose cameras.json is kept: name another folder" in error_of(*command)
+    assert ModelFolder(copied_model).cameras_path.read_bytes() == before
+    clsplat("render", copied_model, "-o", copied_model, "-q")
 
 
 @pytest.mark.parametrize("kind", ["ellipse", "spiral"])

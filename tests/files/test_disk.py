@@ -88,6 +88,8 @@ def test_places_that_take_no_files(capture_folder: Path, model_folder: Path, tmp
         ["cameras", model_folder, place / "sparse" / "0"],
         ["render", model_folder, "-o", place / "r"],
         ["prune", model_folder, "-o", place / "p.ply"],
+        ["clean", model_folder, "-o", place / "c.ply"],
+        ["clean", model_folder, "-o", place / "cleaned"],
         ["compare", capture_folder, "-o", place / "c"],
         ["frontier", capture_folder, "-o", place / "f"],
         ["benchmark", "tanks", tanks, "-o", place / "b"],
@@ -135,6 +137,57 @@ def test_two_comparisons_in_one_folder(capture_folder: Path, tmp_path: Path) -> 
         for command in ("compare", "frontier"):
             assert "another run writes into it" in refused(command, capture_folder, "-o", tmp_path / "c")
         holder.kill()
+
+
+def filled(disk: Path, spare: int) -> None:
+    """Fill a disk but for some bytes."""
+    with (disk / "rest").open("wb", buffering=0) as rest, suppress(OSError):
+        while rest.write(bytes(4096)):
+            pass
+    with (disk / "rest").open("r+b") as rest:
+        rest.truncate(max((disk / "rest").stat().st_size - spare, 0))
+
+
+@pytest.mark.parametrize("spare", [0, 16384], ids=["full", "room for the options"])
+def test_clean_keeps_the_old_model_on_a_full_disk(model_folder: Path, tmp_path: Path, spare: int) -> None:
+    with mounted(tmp_path / "disk", "-t", "tmpfs", "-o", "size=4m", "tmpfs") as disk:
+        shutil.copytree(model_folder, disk / "old")
+        filled(disk, spare)
+        before = {path: path.read_bytes() for path in (disk / "old").rglob("*") if path.is_file()}
+        command = ("clean", model_folder, "--no-photos", "-q", "-o")
+        assert f"{disk / 'old'}: cannot be written (No space left" in error_of(*command, disk / "old", "--overwrite")
+        assert f"{disk / 'new'}: cannot be written (No space left" in error_of(*command, disk / "new")
+        assert {path: path.read_bytes() for path in (disk / "old").rglob("*") if path.is_file()} == before
+        assert sorted(path.name for path in disk.iterdir()) == ["old", "rest"]
+        (disk / "rest").unlink()
+        clsplat(*command, disk / "old", "--overwrite")
+        clsplat(*command, disk / "new")
+        assert not list(disk.glob("*/.*"))
+        assert "splats" in clsplat("info", disk / "old", disk / "new")
+
+
+def test_metrics_in_other_places_are_enough(model_folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(model_folder, tmp_path / "model")
+    with read_only(tmp_path / "model") as folder:
+        for flag, file in (("--json", tmp_path / "n.json"), ("--report", tmp_path / "r.html")):
+            result = run("eval", folder, flag, file)
+            assert result.exit_code == 0, result.output
+            assert "PSNR" in result.stdout
+            assert f"warning: {folder / 'results.json'}: cannot be written" in result.stderr
+            assert file.is_file()
+        result = run("eval", folder, "--json", folder / "n.json")
+        assert "n.json: cannot be written (Read-only file system)" in result.stderr
+        assert result.stdout == "", "it is refused before the work"
+
+
+def test_a_report_for_which_there_is_no_room(model_folder: Path, tmp_path: Path) -> None:
+    with mounted(tmp_path / "disk", "-t", "tmpfs", "-o", "size=4m", "tmpfs") as disk:
+        shutil.copytree(model_folder, disk / "model")
+        filled(disk, 12288)
+        result = run("eval", disk / "model")
+    assert result.exit_code == 1
+    assert "PSNR" in result.stdout
+    assert "report.html: cannot be written (No space left" in result.stderr.splitlines()[-1]
 
 
 def test_metrics_are_said_where_they_cannot_be_written(model_folder: Path, tmp_path: Path) -> None:

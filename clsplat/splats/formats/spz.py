@@ -51,6 +51,7 @@ from .spz_streams import (
 VERSIONS = (GZIP_VERSION, ZSTD_VERSION)  # that are written, the default first
 
 _MAX_FIXED = (1 << 23) - 1  # the largest fixed-point position
+_SCALES = (-10.0 - 0.5 / 16, 255.5 / 16 - 10.0)  # logarithms of the scales that a byte holds
 _FRACTION_BITS = 20  # the most that are used; positions then reach 8 units
 _FINE, _COARSE = 2, 4  # quantisation steps of SH band 1 and of the others
 _RDF = 6  # the coordinate system of a PLY
@@ -65,6 +66,10 @@ def write_spz(path: str | os.PathLike[str], splats: StoredSplats, version: int =
     InputError : the shape is not Gaussian, the version is not 3 or 4, or a position is beyond 8 million units; or
         version 4 needs Zstandard, which is not installed.
     OutputError : the file cannot be written.
+
+    Warns
+    -----
+    UserWarning : the sizes of some splats are clipped.
     """
     check_gaussian(path, splats.shape, ".spz")
     if version not in VERSIONS:
@@ -76,6 +81,7 @@ def write_spz(path: str | os.PathLike[str], splats: StoredSplats, version: int =
             f"{path}: a splat lies {farthest:.3g} units away, .spz files reach {_MAX_FIXED}: remove it, or write a .ply"
         )
     bits = min(_FRACTION_BITS, math.floor(math.log2(_MAX_FIXED / max(farthest, 1e-30))))
+    _warn_of_sizes(path, arrays["log_scale"])
     degree = sh_degree_of(arrays["sh"].shape[1])
     header = SpzHeader(version, len(arrays["mean"]), degree, bits, ANTIALIASED * splats.antialiased)
     parts: list[NDArray[Any]] = [
@@ -90,6 +96,18 @@ def write_spz(path: str | os.PathLike[str], splats: StoredSplats, version: int =
         data = write_container(header, [part.tobytes() for part in parts])
     with atomic_writer(path) as stream:
         stream.write(data)
+
+
+def _warn_of_sizes(path: str | os.PathLike[str], log_scale: NDArray[np.floating]) -> None:
+    """Warn of splats whose size the file cannot hold: a scale is too large, or all three are too small."""
+    clipped = (log_scale > _SCALES[1]).any(axis=1) | (log_scale < _SCALES[0]).all(axis=1)
+    if clipped.any():
+        low, high = np.exp(_SCALES)
+        warnings.warn(
+            f"{path}: {clipped.mean():.1%} of the splats are smaller or larger than .spz holds ({low:.2g} to "
+            f"{high:.3g} units): their sizes are clipped; write a .ply or a .sog",
+            stacklevel=3,
+        )
 
 
 def read_spz(path: str | os.PathLike[str]) -> StoredSplats:

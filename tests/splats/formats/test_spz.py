@@ -220,6 +220,7 @@ def test_version_4_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.Monk
     assert [path.name for path in tmp_path.iterdir()] == ["a.spz"]
 
 
+@pytest.mark.filterwarnings("ignore:.*their sizes are clipped")
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [3e38, -3e38])
 @pytest.mark.parametrize("name", ["log_scale", "sh", "opacity_logit"])
@@ -229,6 +230,27 @@ def test_huge_values_become_the_nearest_bytes(tmp_path: Path, name: str, value: 
     gaussians(**{name: np.sign(value) * 100}).save(tmp_path / "b.spz")
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
     gaussians(**{name: value}).save(tmp_path / "a.splat")
+
+
+@pytest.mark.parametrize(
+    ("scales", "clipped"),
+    [
+        ((6.0, 0.0, 0.0), True),  # too large along one axis
+        ((-10.1, -12.0, -11.0), True),  # too small along all
+        ((5.9, 0.0, 0.0), False),
+        ((-14.0, -14.0, 0.0), False),  # a needle
+    ],
+)
+def test_sizes_that_spz_does_not_hold_are_named(
+    tmp_path: Path, scales: tuple[float, ...], clipped: bool, recwarn: pytest.WarningsRecorder
+) -> None:
+    arrays = dict(gaussians(n=10).arrays)
+    arrays["log_scale"] = np.zeros((10, 3), np.float32)
+    arrays["log_scale"][3] = scales
+    Splats("gaussian", arrays).save(tmp_path / "a.spz")
+    said = [str(warning.message) for warning in recwarn]
+    expected = f"{tmp_path / 'a.spz'}: 10.0% of the splats are smaller or larger than .spz holds (4.4e-05 to 391 units)"
+    assert [text.startswith(expected) for text in said] == [True] * clipped
 
 
 def test_every_component_can_be_the_largest(tmp_path: Path) -> None:
