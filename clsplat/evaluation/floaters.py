@@ -56,8 +56,8 @@ class FloaterMeasures:
         if self.psnr_gap is not None:
             gap = f", {abs(self.psnr_gap):.2f} dB {'above' if self.psnr_gap >= 0 else 'below'} the test views"
         return (
-            f"training views (at most {_PSNR_VIEWS}) {self.train_psnr:.2f} dB{gap}; {self.few_views_share:.1%} of the splats are seen by fewer "
-            f"than {FEW_VIEWS} training views; {self.near_camera_share:.2%} of the weight is near cameras"
+            f"training views (at most {_PSNR_VIEWS}) {self.train_psnr:.2f} dB{gap}; {self.few_views_share:.1%} of the "
+            f"splats are seen by fewer than {FEW_VIEWS} training views; {self.near_camera_share:.2%} of the weight is near cameras"
         )
 
 
