@@ -185,5 +185,6 @@ def _summary(output: RenderOutput, rendered: ModelRenders) -> list[str]:
         lines.append(f"{output.folder}: {count} images, the first {size}, {time}")
     if output.video is not None:
         files = ", ".join([str(output.video), *(extra_video(output.video, extra).name for extra in output.extras)])
+        size = f"{camera.width + camera.width % 2}x{camera.height + camera.height % 2} px"  # as H.264 needs it
         lines.append(f"{files}: {count} frames of {size}, {count / fps:.4g} s at {fps:g} a second, {time}")
     return lines

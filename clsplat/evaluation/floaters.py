@@ -57,7 +57,8 @@ class FloaterMeasures:
             gap = f", {abs(self.psnr_gap):.2f} dB {'above' if self.psnr_gap >= 0 else 'below'} the test views"
         return (
             f"training views (at most {_PSNR_VIEWS}) {self.train_psnr:.2f} dB{gap}; {self.few_views_share:.1%} of the "
-            f"splats are seen by fewer than {FEW_VIEWS} training views; {self.near_camera_share:.2%} of the weight is near cameras"
+            f"splats are seen by fewer than {FEW_VIEWS} training views; {self.near_camera_share:.2%} of the weight is "
+            "near cameras"
         )
 
 

@@ -231,7 +231,11 @@ class ModelWatcher:
         ------
         InputError : the new file is unusable; raised once for each state of the file.
         """
-        path = self._find()
+        try:
+            path = self._find()
+        except InputError:
+            self._read = self._seen = ()  # if it comes back as it was, it is read again, and the error is over
+            raise
         stamp = _stamp(path)
         # A file is read once it has stayed the same between two polls.
         settled, self._seen = stamp == self._seen, stamp

@@ -206,7 +206,7 @@ def test_render_videos_of_colour_depth_and_alpha(model: Path, tmp_path: Path) ->
         "--depth",
         "--alpha",
     )
-    assert "4 frames of 49x35 px, 0.4 s at 10 a second" in out
+    assert "4 frames of 50x36 px, 0.4 s at 10 a second" in out, "the size of the video"
     assert files(tmp_path / "v") == {"turn.mp4", "turn_depth.mp4", "turn_alpha.mp4"}
     for name in ("turn", "turn_depth", "turn_alpha"):
         with imageio.get_reader(tmp_path / "v" / f"{name}.mp4") as reader:

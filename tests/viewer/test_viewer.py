@@ -475,6 +475,26 @@ def test_a_broken_file_is_said_once_and_mended_by_the_next(tmp_path: Path) -> No
     assert len(watch.reload()) == 12
 
 
+def test_a_file_that_comes_back_as_it_was_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "model.ply"
+    model(10).save(path)
+    there = [True]
+
+    def find() -> Path:
+        if not there[0]:
+            raise InputError("no point cloud yet")
+        return path
+
+    watch = ModelWatcher(find)
+    there[0] = False
+    with pytest.raises(InputError, match="no point cloud yet"):
+        watch.poll()
+    there[0] = True
+    watch.poll()
+    assert watch.poll() is not None, "so that the viewer does not show the error for ever"
+    assert watch.poll() is None
+
+
 def test_a_later_file_takes_over(tmp_path: Path) -> None:
     for n in (10, 20):
         model(n).save(tmp_path / f"{n}.ply")

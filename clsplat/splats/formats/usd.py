@@ -89,7 +89,7 @@ def write_usd(path: str | os.PathLike[str], splats: StoredSplats) -> None:
                 if packed:
                     layer.unlink(missing_ok=True)
     except Tf.ErrorException as error:
-        raise OutputError(f"{path}: cannot be written ({_reason(error)}); check place and rights") from None
+        raise OutputError(f"{path}: cannot be written ({_reason(error)}); check place, rights and free space") from None
 
 
 def _define(stage: Any, splats: StoredSplats) -> None:
