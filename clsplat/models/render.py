@@ -14,6 +14,7 @@ from ..cameras.make_path import PathRequest, make_path, name_frames
 from ..cameras.path import DEFAULT_FPS, CameraPath, write_path
 from ..errors import InputError, OutputError
 from ..files.existing import refuse_existing
+from ..files.host_memory import available_bytes
 from ..files.real_path import real_path
 from ..files.video import VideoWriter
 from ..rendering.renderer import Renderer, RendersSplats
@@ -23,6 +24,7 @@ from .detail import DetailLevels, DetailRenderer
 from .model import LoadedModel, SceneChoice, in_both_forms, model_at
 
 VIEW_SETS = ("test", "train", "validation", "all")
+_BYTES = 60  # of a pixel: colour, alpha and depth as float32 on the device and the host, and what is written
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,8 @@ def render_views(
 
     Raises
     ------
-    InputError : the model or the views do not exist, or two views have the same file.
+    InputError : the model or the views do not exist, two views have the same file, or an image is too large for the
+        free memory.
     OutputError : a file exists or cannot be written.
     """
     choice = choice or ViewChoice()
@@ -101,6 +104,7 @@ def render_views(
         VideoWriter(Path(output.video), DEFAULT_FPS)  # raises now if the ending is wrong, not after the work
     loaded = model_at(model, iteration)
     views, path = choose_views(loaded, choice)
+    _check_memory(views)
     fps = output.fps or (path.fps if path is not None else DEFAULT_FPS)
     path_cameras = None if path is None or output.folder is None else Path(output.folder) / "cameras.json"
     kept = None if loaded.folder is None else loaded.folder.cameras_path
@@ -150,6 +154,17 @@ def choose_views(model: LoadedModel, choice: ViewChoice) -> tuple[list[NamedCame
     if choice.size is not None:
         views = [NamedCamera(view.name, resized_by_height(view.camera, *choice.size)) for view in views]
     return views, None
+
+
+def _check_memory(views: Sequence[NamedCamera]) -> None:
+    """Raise InputError if the largest image cannot fit into the free memory of the machine."""
+    width, height = max(((view.camera.width, view.camera.height) for view in views), key=lambda size: size[0] * size[1])
+    needed, free = _BYTES * width * height, available_bytes()
+    if needed > free:
+        raise InputError(
+            f"an image of {width}x{height} px needs at least {needed / 1e6:.0f} MB of memory, {free / 1e6:.0f} MB are "
+            "free: choose a smaller size"
+        )
 
 
 class _HeldOut(NamedTuple):

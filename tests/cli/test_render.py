@@ -124,6 +124,13 @@ def test_a_path_does_not_replace_the_cameras_of_the_model(copied_model: Path) ->
     clsplat("render", copied_model, "-o", copied_model, "-q")
 
 
+def test_an_image_that_no_memory_holds_is_refused(model: Path, tmp_path: Path) -> None:
+    message = error_of("render", model, "-o", tmp_path / "r", "--size", "99999x99999")
+    assert "an image of 99999x99999 px needs at least 599988 MB of memory" in message
+    assert message.endswith("MB are free: choose a smaller size")
+    assert not (tmp_path / "r").exists()
+
+
 @pytest.mark.parametrize("kind", ["ellipse", "spiral"])
 def test_render_other_paths(model: Path, tmp_path: Path, kind: str) -> None:
     clsplat("render", model, "--path", kind, "--seconds", "0.1", "-o", tmp_path / "r", "--size", "40x30")
