@@ -4,11 +4,11 @@
     python benchmarks/captures.py --captures tripod --seeds 0
     python benchmarks/captures.py --page                # write the table of STABILITY.md
 
-The cameras are in the world of `clsplat demo`, except for objects over one colour, which are photos without their
-transparency: "white" is lego, others name their scene. Some are of blender_scenes.py: put these scenes beside those of
-CLSPLAT_DATA. "published" are the rules of 3DGS: the extent by the farthest camera, a black background, and all points
-of the scene. "not cut out" are those of today, but objects are not cut out. Runs are measured on held-out training
-views.
+The cameras are in the worlds of `clsplat demo` (capture_worlds.py), except for objects over one colour, which are
+photos without their transparency: "white" is lego, others name their scene. Some are of blender_scenes.py: put these
+scenes beside those of CLSPLAT_DATA. "published" are the rules of 3DGS: the extent by the farthest camera, a black
+background, and all points of the scene. "not cut out" are those of today, but objects are not cut out. Runs are
+measured on held-out training views.
 """
 
 from __future__ import annotations
@@ -22,16 +22,14 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from capture_worlds import ahead, around, around_a_block, from_above, in_street, in_world, street_ahead, tripod
 from common import RESULTS, ROOT, Runs, environment, groups, parser, real_scene, spread, table, write_between
 from PIL import Image
 
-from clsplat.cameras.camera import Camera
 from clsplat.evaluation.evaluate import evaluate
 from clsplat.files.images import ImageU8
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.colmap import Points
-from clsplat.scenes.demo.capture import cast, photograph, pixels, upright_camera, visible
-from clsplat.scenes.demo.world import World
 from clsplat.scenes.pose_checks import without_unseen_points
 from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.split import hold_out
@@ -44,59 +42,6 @@ KEY = ("capture", "rules", "seed", "iterations", "cap")
 RULES = ("published", "not cut out", "now")
 PAGE = ROOT / "benchmarks" / "STABILITY.md"
 MARKS = ("<!-- table of captures.py -->", "<!-- end of the table of captures.py -->")
-WIDTH, HEIGHT = 240, 180
-MIDDLE = np.array([0.0, 0.0, 0.5])
-N_POINTS = 4000
-
-
-def around(far: float = 1.0, n: int = 40) -> list[Camera]:
-    """Return cameras on a ring that look at the middle. far : factor of their distance and of their focal length."""
-    angles = 2 * np.pi * np.arange(n) / n
-    places = MIDDLE + far * np.stack([3.6 * np.cos(angles), 3.6 * np.sin(angles), 0.7 + 0.25 * np.sin(3 * angles)], 1)
-    return [upright_camera(WIDTH, HEIGHT, 0.9 * far * WIDTH, place, MIDDLE) for place in places]
-
-
-def ahead(columns: int, rows: int, step: float) -> list[Camera]:
-    """Return a grid of cameras that look ahead from nearly one place."""
-    grid = [(i - (columns - 1) / 2, j - (rows - 1) / 2) for j in range(rows) for i in range(columns)]
-    return [
-        upright_camera(
-            WIDTH, HEIGHT, 0.9 * WIDTH, np.array([-3.5, step * x, 1 + step * y]), np.array([6, step * x / 2, 0.6])
-        )
-        for x, y in grid
-    ]
-
-
-def tripod(n: int = 48) -> list[Camera]:
-    """Return cameras within two centimetres that look everywhere."""
-    angles = 2 * np.pi * np.arange(n) / n
-    places = np.stack([0.01 * np.cos(7 * angles) + 2.2, 0.01 * np.sin(5 * angles), np.full(n, 1.2)], axis=1)
-    ways = np.stack([np.cos(angles), np.sin(angles), 0.1 * np.sin(5 * angles) - 0.1], axis=1)
-    return [
-        upright_camera(WIDTH, HEIGHT, 0.7 * WIDTH, place, place + way) for place, way in zip(places, ways, strict=True)
-    ]
-
-
-def in_world(cameras: list[Camera]) -> Scene:
-    """Return photos of the demo's world with points that at least three of them show."""
-    world, rng = World(0), np.random.default_rng(0)
-    hits = []
-    for camera in cameras:
-        grid = pixels(camera)
-        hits.append(cast(world, camera, grid[rng.integers(len(grid), size=N_POINTS // len(cameras) + 1)] + 0.5))
-    xyz, normal, color = (
-        np.concatenate([getattr(hit, name) for hit in hits]) for name in ("position", "normal", "color")
-    )
-    tracks = np.sum([visible(world, camera, xyz, normal) for camera in cameras], axis=0)
-    kept = tracks >= 3
-    points = Points(
-        xyz[kept].astype(np.float64), np.rint(255 * color[kept]).astype(np.uint8), tracks[kept].astype(np.int64)
-    )
-    views = [
-        View(f"{index:03}.png", camera, np.rint(255 * np.clip(photograph(world, camera), 0, 1)).astype(np.uint8))
-        for index, camera in enumerate(cameras)
-    ]
-    return Scene("world", ROOT, views, points)
 
 
 def with_wrong_pose(scene: Scene, factor: float = 30.0) -> Scene:
@@ -151,6 +96,10 @@ CAPTURES: dict[str, Callable[[], Scene]] = {
     "ahead, 20 photos": lambda: in_world(ahead(5, 4, 0.35)),
     "ahead, 30 near photos": lambda: in_world(ahead(6, 5, 0.08)),
     "tripod": lambda: in_world(tripod()),
+    "a street, ahead": lambda: in_street(street_ahead()),
+    "a street from above": lambda: in_street(from_above(), lots=14),
+    "around a corner": lambda: in_street(around_a_block(0.5), block=True),
+    "around a block": lambda: in_street(around_a_block(1.0), block=True),
     "points behind the cameras": lambda: with_points_behind(in_world(ahead(5, 4, 0.35))),
     "white, 9 photos": lambda: over(WHITE, 9),
     "white, 25 photos": lambda: over(WHITE, 25),

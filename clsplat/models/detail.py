@@ -21,7 +21,7 @@ from ..splats.shapes import GAUSSIAN
 from ..splats.splats import Splats
 
 LEVELS, MAX_LEVELS = 8, 12  # by default, and at most
-_LEAF = 4096  # largest number of splats of a leaf at the first level
+_LEAF = 512  # largest number of splats of a leaf at the first level
 _MARGIN = 4.0  # pixels around the image: a splat outside of it is widened by the low-pass filter
 
 Choice = NDArray[np.int64]
