@@ -77,9 +77,11 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
     listed = {name: frame for name, frame in sorted(photos.items()) if name in used}
     photo_files = {name: frame.file for name, frame in listed.items()}
     sizes, left_out = read_sizes(photo_files)
+    bad = {name: frame for name, frame in listed.items() if frame.values.get("is_bad") is True}  # of ScanNet++
     for name in [name for name in sizes if listed[name].is_lost]:
         left_out[name] = f"{listed[name].place}: its transform_matrix is not finite"
-        del sizes[name]
+    left_out |= {name: f"{frame.place}: is marked as bad (is_bad)" for name, frame in bad.items()}
+    sizes = {name: size for name, size in sizes.items() if name not in left_out}
     kept = {name: listed[name] for name in sizes}
     for document in documents:
         of_file = (frame for frame in kept.values() if frame.document is document)
@@ -94,6 +96,7 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
         _held_out(documents, listed),
         {name: frame.mask_file for name, frame in kept.items() if frame.values.get("mask_path") is not None},
         left_out,
+        unused=frozenset(bad),
     )
 
 

@@ -501,6 +501,15 @@ def test_a_photo_of_an_unknown_format_is_looked_for_under_its_name(folder: Path)
         load_scene(folder)
 
 
+def test_bad_frames_of_scannet_are_left_out(folder: Path) -> None:
+    values = LENS | {"frames": frames()}
+    for index, frame in enumerate(values["frames"]):
+        frame["is_bad"] = index != 5
+    write(folder, values)
+    with pytest.warns(UserWarning, match=r"frame 0: is marked as bad \(is_bad\)"):
+        assert load_scene(folder, eval=False).names == [values["frames"][5]["file_path"]]
+
+
 def test_no_usable_test_view_is_named(folder: Path, recwarn: pytest.WarningsRecorder) -> None:
     values = LENS | {"frames": frames()}
     for name in NAMES[::8]:
