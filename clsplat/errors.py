@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+
+_NAMED = re.compile(r"([a-z]+(?:_[a-z]+)*) [^/]+?: ")  # at the start of a message
 
 
 class Remedy:
@@ -43,9 +46,15 @@ class ClsplatError(Exception):
         return _sentence(self.message, [remedy.text for remedy in self.remedies])
 
     def for_command(self, options: Collection[str]) -> str:
-        """Return the message with the remedies of a command, which has these options."""
+        """Return the message with the remedies of a command, which has these options.
+
+        A message that begins with the name and value of an option, such as "cap_max 0: ...", begins with its flag.
+        """
         texts = (remedy.for_command(options) for remedy in self.remedies)
-        return _sentence(self.message, [text for text in texts if text is not None])
+        named = _NAMED.match(self.message)
+        flag = f"--{named[1].replace('_', '-')}" if named else ""
+        message = flag + self.message[len(named[1]) :] if named and flag in options else self.message
+        return _sentence(message, [text for text in texts if text is not None])
 
 
 class InputError(ClsplatError):

@@ -10,7 +10,7 @@
 // count.cl has this loop and nothing else. Here the loop is arranged for speed, with the same sums in the same order:
 // - A group of GROUP work-items has one tile of TILE x TILE pixels. Each work-item has VECS blocks of LANES pixels of it:
 //   GROUP * VECS * LANES = TILE * TILE. On CPUs one work-item keeps the accumulators of a tile in its first cache. On GPUs
-//   a work-item keeps one pixel in registers.
+//   a work-item keeps one to eight pixels in registers.
 // - Isects come in batches of BATCH (batch.clh). The loop ends when no pixel of the tile is live.
 // - An isect visits only the blocks that the splat can reach (blocks.clh).
 // - On CPUs a pass computes alpha in all these blocks, and a second one blends. A CPU holds fewer operations in flight than

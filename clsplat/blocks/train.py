@@ -245,16 +245,20 @@ class _Stages:
         cap = self.config.cap_max // max(len(blocks), 1)
         self.steps.tell(3, f"{len(blocks)} blocks with at most {cap} splats, {self.config.iterations} iterations each")
         cell = partition.cells.of(coarse.mean)
-        around = surroundings(self.scene, coarse, Renderer(self.config.device), partition)
+        folders = {block.number: real_path(self.state.folder) / f"block_{block.number}" for block in blocks}
+        # A training that goes on keeps the parts of its blocks, because another device may choose other surroundings.
+        made = all((folder / CONTEXT).is_file() for folder in folders.values())
+        around = [] if made else surroundings(self.scene, coarse, Renderer(self.config.device), partition)
         source, jobs = SceneSource.of(self.scene), []
         for block in blocks:
-            folder = real_path(self.state.folder) / f"block_{block.number}"
-            folder.mkdir(parents=True, exist_ok=True)
+            folder = folders[block.number]
             inside = coarse.select(np.flatnonzero(cell == block.number))
-            inside.save(folder / INSIDE)
-            with_points(inside, self.scene, partition.cells, block.number, cap, self.config).save(folder / START)
-            copy_exposures(self.state.run_folder("coarse"), exposures_beside(folder / START))
-            coarse.select(around[block.number]).save(folder / CONTEXT)
+            if not (folder / CONTEXT).is_file():
+                folder.mkdir(parents=True, exist_ok=True)
+                inside.save(folder / INSIDE)
+                with_points(inside, self.scene, partition.cells, block.number, cap, self.config).save(folder / START)
+                copy_exposures(self.state.run_folder("coarse"), exposures_beside(folder / START))
+                coarse.select(around[block.number]).save(folder / CONTEXT)  # the last one: the others are complete
             config = block_config(self.config, folder / START, max(cap, len(inside)))
             config = config.replace(exposure_rate=0.0)  # exposures are common to all blocks
             jobs.append(BlockJob(source.of_views(block.views), config, folder, 1.0 / len(blocks)))
@@ -276,8 +280,11 @@ class _Stages:
             self.steps.tell(4, f"{len(whole)} splats together, {iterations} iterations")
         before = "coarse"
         run = block_config(self.config, self.folder.path, self.config.cap_max)  # its last rates are those of the polish
-        for number, rate in enumerate(POLISH_RATES if iterations else ()):
-            name, part = f"polish_{number}", Part(iterations / len(POLISH_RATES) / run.iterations, rate)
+        for number, rate in enumerate(POLISH_RATES):
+            first, last = (iterations * (number + each) // len(POLISH_RATES) for each in (0, 1))
+            if first == last:
+                continue
+            name, part = f"polish_{number}", Part((last - first) / run.iterations, rate)
             file = real_path(self.state.folder) / f"{name}.ply"
             whole.save(file)
             copy_exposures(self.state.run_folder(before), exposures_beside(file))

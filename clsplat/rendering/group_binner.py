@@ -1,4 +1,4 @@
-"""The binner for devices with many work-items: a work-item for each splat, and two sorts."""
+"""The binner for devices with many work-items: a work-item for each splat and for each isect, and two sorts."""
 
 from __future__ import annotations
 

@@ -120,6 +120,7 @@ class ImageWriter:
             elif self.near_far is not None:
                 write_png(path, depth_picture(image, self.near_far, self.background), render=True)
             else:
+                plane = np.maximum(plane, 0.0)  # opacities below zero may lead to depths below zero
                 farthest = float(plane.max()) or 1.0
                 write_grey16(path, np.rint(plane * (_FULL_SCALE / farthest)).astype(np.uint16))
                 self.depth_scales[path.name] = farthest

@@ -43,9 +43,10 @@ def extent_of(cameras: Sequence[Camera], xyz: DoubleArray) -> float:
     cameras = cameras[:: -(-len(cameras) // _MAX_CAMERAS)]
     middle = _depths_of_middle(cameras)
     if (width := _width_at_points(cameras, some, _MIDDLE)) is not None:
-        extent = min(max(extent, _SMALLEST * width), _LARGEST * width)
-        if np.isfinite(middle).mean() < _AROUND and (width := _width_at_points(cameras, some, _NEAREST)) is not None:
-            extent = min(extent, _LARGEST_OF_WALK * width)
+        largest = _LARGEST * width
+        if np.isfinite(middle).mean() < _AROUND and (near := _width_at_points(cameras, some, _NEAREST)) is not None:
+            largest = min(largest, _LARGEST_OF_WALK * near)
+        extent = max(min(extent, largest), _SMALLEST * width)
     elif np.isfinite(middle).all():
         widths = [_half_diagonal(camera) * depth for camera, depth in zip(cameras, middle, strict=True)]
         extent = min(extent, _LARGEST * float(np.median(widths)))

@@ -14,7 +14,7 @@ import numpy as np
 from ..splats.fields import Array
 from .config import TrainConfig
 
-SAMPLES = 20  # number of iterations whose parameters are averaged, at equal distances
+SAMPLES = 20  # smallest number of iterations whose parameters are averaged, at equal distances, in long windows
 
 
 class ParameterAverage:

@@ -9,7 +9,7 @@ with the root of the number of photos (Zhao et al. 2024, "On Scaling Up 3D Gauss
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Lock
 
@@ -98,7 +98,8 @@ class Batch:
                 frame, one = self._learn_one(main, photo, sh_degree, iteration)
                 learned.append(one)
                 self._add(slot, main.grads.geom, main.grads.sh)
-        finally:  # the threads may not outlive the iteration, also if this device fails
+        finally:  # the threads may not outlive the iteration, also if a device fails
+            wait(waiting)
             others = [one for future in waiting for one in future.result()]
         for slot, one in enumerate(others, share):
             self._add_rows(slot, one.rows)

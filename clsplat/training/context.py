@@ -17,6 +17,7 @@ from ..rendering.splat_buffers import CompactGradients, SplatBuffers
 from ..splats.fields import Array, Group
 from ..splats.low_pass import LOW_PASS
 from ..splats.splats import Splats
+from .checkpoint import Checkpoint
 from .columns import Columns
 from .config import TrainConfig
 from .density.edit import DensifyEdit, Indices
@@ -25,10 +26,17 @@ from .options.density import Adc
 from .programs import columns_program
 
 
-def check_context(context: Splats | None, config: TrainConfig) -> None:
-    """Raise InputError if a run with these options cannot leave the splats of `context` as they are."""
+def check_context(context: Splats | None, config: TrainConfig, checkpoint: Checkpoint | None = None) -> None:
+    """Raise InputError if a run with these options cannot leave the splats of `context` as they are.
+
+    checkpoint : that the run goes on from; its last splats are those of the same context.
+    """
     if context is None:
         return
+    if checkpoint is not None:
+        stored = checkpoint.splats["mean"]
+        if not np.array_equal(stored[len(stored) - len(context) :], context.mean):
+            raise InputError("the context is not that of the checkpoint: resume with the same one, or start a new run")
     if config.strategy != Adc.strategy or config.optim.optimizer != "fused" or config.optim.visible_adam:
         raise InputError("a context needs the strategy adc and steps of all splats on the device")
     if config.sghmc.position_optimizer != "adam" or config.density.noise_lr:

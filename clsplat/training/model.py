@@ -20,7 +20,7 @@ class Model:
     seconds : training time, without evaluations.
     peak_bytes : peak of the host memory. On a CPU device it includes the device memory.
     device_bytes : memory of the pools of buffers.
-    evaluations : metrics of the test views by iteration, for the config's `test_iterations`.
+    evaluations : metrics of the test views by iteration, for the config's `test_iterations` since the last resume.
     evaluation_seconds : training time before each evaluation.
     path : the model folder, or None.
     best_iteration : iteration that was best on the validation views; 0 without the option `validate`.

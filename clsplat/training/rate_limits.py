@@ -10,6 +10,7 @@ import math
 
 from ..errors import InputError
 from .config import OPTIONS, TrainConfig
+from .optim.rules import SH_REST_POWER
 
 # By option: the field with the `rate_factor` that applies, and the largest step per iteration.
 LIMITS = {
@@ -36,7 +37,7 @@ def check_rates(config: TrainConfig) -> None:
         rate, default = getattr(config.optim, name), OPTIONS[name].default or 0.0
         if rate is None:
             continue
-        length = config.rate_factor(field)
+        length = config.length_factor(SH_REST_POWER) if name == "feature_rest_lr" else config.rate_factor(field)
         highest = max(limit / length, default)
         if rate > highest:
             raise _too_high(config, name, rate, rate * length, limit, highest)

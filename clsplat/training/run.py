@@ -44,7 +44,7 @@ def train(
     Parameters
     ----------
     config : options of the run. Those that it does not name are decided by the scene (`training/decisions.py`).
-    progress : called about every 50 iterations.
+    progress : called about every 50 iterations, at least twice a second, and with messages.
     output : model folder. Without it, no file is written and Ctrl-C raises KeyboardInterrupt.
     resume : continue from the folder's checkpoint. The config must be the same, except for options without an effect
         on the result, such as `device`, and for more `iterations`.

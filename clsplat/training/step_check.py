@@ -26,7 +26,8 @@ def check_step(device: Device, kernels: KernelBuild, position_optimizer: str) ->
 
     Parameters
     ----------
-    kernels : build of the run, whose program of the optimizer is checked.
+    kernels : build of the run. Its program of the optimizer is checked as it is without half moments, steps of visible
+        splats only, and batches.
     position_optimizer : as in the options of the run.
 
     Raises

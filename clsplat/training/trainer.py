@@ -85,7 +85,7 @@ class Trainer:
         device: Device | None = None,
         context: Splats | None = None,
     ) -> None:
-        check_context(context, config)
+        check_context(context, config, checkpoint)
         self.context = context
         if config.validation.validate and not scene.validation_names:
             scene = with_validation(scene)

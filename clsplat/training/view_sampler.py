@@ -7,6 +7,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from ..errors import InputError
 from ..scenes.scene import View
 from .schedules import downscale_for, resolution_schedule
 
@@ -38,6 +39,8 @@ class ViewSampler:
         largest_downscale: int | None = None,
         left_out: Collection[int] = (),
     ) -> None:
+        if any(not 0 <= view < len(views) for view in (*queue, *left_out)) or len(set(left_out)) >= len(views):
+            raise InputError(f"the checkpoint is of a scene with other photos than these {len(views)}: start a new run")
         self.views, self.rng, self.queue, self.left_out = views, rng, list(queue), frozenset(left_out)
         side = min(min(view.camera.width, view.camera.height) for view in views)
         self.pixels = statistics.median(view.camera.width * view.camera.height for view in views)

@@ -206,6 +206,44 @@ def test_an_interrupted_training_goes_on(
     assert found.path.read_bytes() == finished.path.read_bytes()
 
 
+def test_the_parts_of_a_block_stay_when_a_training_goes_on(
+    finished: BlocksModel, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another device may see other splats around a block, but the checkpoint has those of the first one."""
+
+    def killed(*arguments: Any) -> Any:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("clsplat.blocks.job.train_in_folder", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train_in_blocks(scene, TWO, CONFIG, output=tmp_path)
+    parts = {file: file.read_bytes() for file in tmp_path.glob("blocks/block_*/*.ply")}
+    assert len(parts) == 6
+    monkeypatch.setattr(module, "surroundings", killed)
+    found = resume(tmp_path)
+    assert isinstance(found, BlocksModel)
+    assert {file: file.read_bytes() for file in tmp_path.glob("blocks/block_*/*.ply")} in ({}, parts)
+    assert found.path.read_bytes() == finished.path.read_bytes()
+
+
+@pytest.mark.parametrize("polish", [1, 3])
+def test_an_odd_polish_has_its_iterations(
+    finished: BlocksModel, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, polish: int
+) -> None:
+    runs = []
+    original = module.train_in_folder
+
+    def counted(config: TrainConfig, *arguments: Any, **named: Any) -> Any:
+        runs.append(config.iterations)
+        return original(config, *arguments, **named)
+
+    monkeypatch.setattr(module, "train_in_folder", counted)
+    train_in_blocks(scene, BlocksOptions(2, 1, polish), CONFIG, output=tmp_path / "new")
+    assert sum(runs[1:]) == polish, "after the coarse run"
+    assert all(runs)
+
+
 def test_new_points_do_not_change_what_a_block_learns(
     finished: BlocksModel, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

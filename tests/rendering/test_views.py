@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from clsplat.cameras.camera import Camera
 from clsplat.cameras.cameras_json import NamedCamera
 from clsplat.errors import InputError
 from clsplat.rendering import views
+from clsplat.rendering.outputs import ImageWriter
+from clsplat.rendering.renderer import Rendered
 from clsplat.rendering.views import RenderOutput
 
 
@@ -28,3 +32,12 @@ def test_the_range_of_a_path_is_between_quartiles_of_its_frames(monkeypatch: pyt
 def test_extras_that_do_not_exist_are_named() -> None:
     with pytest.raises(InputError, match="extras 'normals': choose from alpha, depth"):
         RenderOutput("out", extras=("alpha", "normals"))
+
+
+def test_depths_below_zero_are_black(tmp_path: Path) -> None:
+    """Splats whose opacity has a sign can make them."""
+    depth = np.array([[4.0, -1.0], [2.0, 0.0]], np.float32)
+    for stem, plane in (("some", depth), ("all", -np.abs(depth) - 1)):
+        ImageWriter(tmp_path, extras=("depth",)).write(stem, Rendered(np.zeros((2, 2, 3)), np.ones((2, 2)), plane))
+    assert np.asarray(Image.open(tmp_path / "some_depth.png")).tolist() == [[65535, 0], [32768, 0]]
+    assert not np.asarray(Image.open(tmp_path / "all_depth.png")).any()

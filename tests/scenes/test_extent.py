@@ -160,5 +160,11 @@ def test_what_is_not_a_walk() -> None:
     xyz = cloud(4.0, (30.0, 20.0, 0.0))
     assert 1.4 * half_diagonals(inwards, xyz, 0.1) < published(inwards)
     assert extent_of(inwards, xyz) == published(inwards), "all look at one place"
+    row = [camera(np.array([0.3 * x, 0.0, 0.0]), np.array([0.3 * x, 9.0, 0.0])) for x in range(10)]
+    xyz_of_row = np.concatenate([cloud(2.0, (1.0, 9.0, 0.0)), cloud() * (2.5, 0.1, 0.5) + (1.5, 1.0, 0.0)])
+    assert 1.4 * half_diagonals(row, xyz_of_row, 0.1) < 0.3 * half_diagonals(row, xyz_of_row, 0.5)
+    assert extent_of(row, xyz_of_row) == pytest.approx(0.3 * half_diagonals(row, xyz_of_row, 0.5)), (
+        "the lower limit holds"
+    )
     some = inwards[:18] + [camera(place, place - (0.0, 1.0, 0.0)) for place in places[18:]]
     assert extent_of(some, xyz) == published(some), "three quarters of them do"

@@ -62,6 +62,19 @@ def test_the_context_stays_as_it_is(scene: Scene, parts: tuple[Path, Splats]) ->
     assert not np.isin(start.mean, splats.mean[:n]).all(), "they move"
 
 
+def test_a_run_goes_on_with_its_own_context_only(
+    scene: Scene, parts: tuple[Path, Splats], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file, context = parts
+    config = options(file, iterations=20)
+    train(scene, config, output=tmp_path, context=context)
+    longer = config.replace(iterations=30)
+    for other in (context.select(np.arange(len(context) - 1)), context.select(np.arange(len(context))[::-1])):
+        with pytest.raises(InputError, match="the context is not that of the checkpoint"):
+            train(scene, longer, output=tmp_path, resume=True, context=other)
+    assert len(train(scene, longer, output=tmp_path, resume=True, context=context).splats) > len(context)
+
+
 def test_the_context_is_shown(scene: Scene, parts: tuple[Path, Splats]) -> None:
     file, context = parts
     with_context, without = (Trainer(scene, options(file), context=given) for given in (context, None))

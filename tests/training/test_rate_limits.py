@@ -29,6 +29,14 @@ def test_a_hundred_times_the_rate_is_refused_and_a_usable_one_named(name: str) -
     check_rates(TrainConfig(iterations=200, **{name: usable}))
 
 
+@pytest.mark.parametrize("iterations", [100, 1000, 7000])
+def test_the_rate_of_the_bands_is_checked_as_the_run_has_it(iterations: int) -> None:
+    highest = 0.08 / max(1.0, 30_000 / iterations) ** 0.25
+    check_rates(TrainConfig(iterations=iterations, feature_rest_lr=0.99 * highest))
+    with pytest.raises(InputError, match="feature_rest_lr"):
+        check_rates(TrainConfig(iterations=iterations, feature_rest_lr=1.01 * highest))
+
+
 @pytest.mark.parametrize("iterations", [FEWEST_ITERATIONS, 200, 1000, 30_000])
 def test_the_factor_of_a_random_start_passes(iterations: int) -> None:
     check_rates(TrainConfig(iterations=iterations, lr_factor=RANDOM_START_RATES))

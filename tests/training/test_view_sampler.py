@@ -9,6 +9,7 @@ import pytest
 from cli_runner import HEIGHT, N_VIEWS, WIDTH
 
 from clsplat.cameras.camera import Camera
+from clsplat.errors import InputError
 from clsplat.scenes.scene import View, load_scene
 from clsplat.training.view_sampler import ViewSampler
 
@@ -37,3 +38,10 @@ def test_size_goes_with_iteration_and_splats(views: list[View]) -> None:
     assert [sampler.next(iteration, 21_600)[1] for iteration in (1, 200, 201, 500, 501)] == [4, 4, 2, 2, 1]
     assert [sampler.next(iteration, 100)[1] for iteration in (1, 260, 261, 650, 651)] == [4, 4, 2, 2, 1]
     assert ViewSampler(large, 1000, False, np.random.default_rng(0), []).next(1, 1)[1] == 1
+
+
+@pytest.mark.parametrize(("queue", "left_out"), [([3], []), ([-1], []), ([], [3]), ([], [0, 1, 2])])
+def test_places_of_other_photos_are_refused(views: list[View], queue: list[int], left_out: list[int]) -> None:
+    """They come from a checkpoint. Without a photo that may be trained, the search for one would not end."""
+    with pytest.raises(InputError, match="is of a scene with other photos than these 3: start a new run"):
+        ViewSampler(views[:3], 100, False, np.random.default_rng(0), queue, None, left_out)

@@ -1,4 +1,4 @@
-"""Penalties on opacities and scales in NumPy; the kernel is in cl/train/optim.cl."""
+"""Penalties on opacities and scales in NumPy; the kernel is in cl/train/steps.clh."""
 
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ class DensityConfig(OptionGroup):
     title: ClassVar[str] = "Densification"
     strategy: ClassVar[str]
 
-    densify_from: float = option(0.05, help="Start of densification, as a fraction of the run.")
-    densify_until: float = option(help="End of densification, as a fraction of the run.")
+    densify_from: float = option(0.05, help="Start of densification, as a fraction of the run.", at_least=0, at_most=1)
+    densify_until: float = option(help="End of densification, as a fraction of the run.", at_least=0, at_most=1)
     densify_interval: int = option(
         100, help="Iterations between two densification steps; of a larger batch, photos.", at_least=1
     )
@@ -101,7 +101,10 @@ class Mcmc(DensityConfig):
     scale_reg: float = 0.001
     noise_lr: float = 5e5
     growth: float = option(
-        1.05, help="Growth factor of the number of splats per densification step; larger if the cap is far away."
+        1.05,
+        help="Growth factor of the number of splats per densification step; larger if the cap is far away.",
+        at_least=1,
+        at_most=100,
     )
     relocation: str = option(
         "length",
