@@ -35,6 +35,7 @@ from .noise import PUBLISHED_EXTENT as SSS_EXTENT
 from .noise import covariance_times, noise_gate
 
 STREAM = 1  # argument `stream` of noise.normal3
+_SMALLEST_EXTENT = 1e-6  # for cameras in one place, whose extent is 0
 
 
 class Coefficients(NamedTuple):
@@ -73,7 +74,7 @@ class Sghmc:
         """
         length = math.sqrt(rate)
         burning = iteration <= self.burn_in
-        extent = self.extent
+        extent = max(self.extent, _SMALLEST_EXTENT)
         unit = length / math.sqrt(extent)
         friction = (self.burn_in_friction if burning else self.friction) * math.sqrt(SSS_EXTENT)
         # x moves by length * noise. In the burn-in, the factor Sigma grows as E^2 as well.
