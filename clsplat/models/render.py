@@ -12,7 +12,7 @@ from ..cameras.cameras_json import NamedCamera, named_cameras, read_cameras, wri
 from ..cameras.interpolate import resized_by_height
 from ..cameras.make_path import PathRequest, make_path, name_frames
 from ..cameras.path import DEFAULT_FPS, CameraPath, write_path
-from ..errors import InputError, OutputError
+from ..errors import SMALLER_IMAGES, InputError, OutputError
 from ..files.existing import refuse_existing
 from ..files.host_memory import available_bytes
 from ..files.real_path import real_path
@@ -163,7 +163,8 @@ def _check_memory(views: Sequence[NamedCamera]) -> None:
     if needed > free:
         raise InputError(
             f"an image of {width}x{height} px needs at least {needed / 1e6:.0f} MB of memory, {free / 1e6:.0f} MB are "
-            "free: choose a smaller size"
+            "free",
+            SMALLER_IMAGES,
         )
 
 

@@ -127,7 +127,7 @@ def test_a_path_does_not_replace_the_cameras_of_the_model(copied_model: Path) ->
 def test_an_image_that_no_memory_holds_is_refused(model: Path, tmp_path: Path) -> None:
     message = error_of("render", model, "-o", tmp_path / "r", "--size", "99999x99999")
     assert "an image of 99999x99999 px needs at least 599988 MB of memory" in message
-    assert message.endswith("MB are free: choose a smaller size")
+    assert message.endswith("MB are free: use smaller images (-r 2, 4, 8 or --size WxH)")
     assert not (tmp_path / "r").exists()
 
 

@@ -24,7 +24,7 @@ from clsplat.training.trainer import Trainer
 from clsplat.training.view_sampler import ViewSampler
 
 OPTIONS: dict[str, Any] = {"iterations": 1000, "cap_max": 1500, "densify_interval": 20, "sh_degree": 0}
-WRONG = (3, 11)  # training views with wrong poses
+WRONG = (3, 11, 19, 27)  # training views with wrong poses
 
 
 def turned(camera: Camera, degrees: float) -> Camera:
@@ -42,7 +42,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 @pytest.fixture
 def misplaced(scene: Scene) -> Scene:
-    """The small capture with wrong poses of two training views."""
+    """The small capture with wrong poses of four training views."""
     names = {scene.train[index].name for index in WRONG}
     views = [replace(view, camera=turned(view.camera, 180.0)) if view.name in names else view for view in scene.views]
     return replace(scene, views=views)
@@ -95,14 +95,16 @@ def test_a_run_goes_on_without_photos_of_wrong_poses(misplaced: Scene) -> None:
     assert len(messages) == len(set(messages)) > 0, "each choice is said once"
     n = len(misplaced.train)
     assert messages[-1] == (
-        f"2 of {n} photos disagree with all others, as with wrong poses: {', '.join(names_of(misplaced))}; the run "
-        "goes on without them (outlier_check=False keeps them)"
+        f"{len(WRONG)} of {n} photos disagree with all others, as with wrong poses: {', '.join(names_of(misplaced)[:3])}, "
+        "...; the run goes on without them (outlier_check=False keeps them)"
     )
     kept = Trainer(misplaced, config.replace(outlier_check=False))
     kept.run()
     assert not kept.outliers.left_out
     test = misplaced.test
-    assert trainer.evaluate(test).psnr > kept.evaluate(test).psnr + 0.3
+    assert trainer.evaluate(test).psnr > kept.evaluate(test).psnr + 0.2, (
+        "0.3 to 0.5 dB, by the rounding of the schedule"
+    )
 
 
 def test_a_usual_capture_is_not_changed(scene: Scene) -> None:
