@@ -93,10 +93,10 @@ def test_a_run_goes_on_without_photos_of_wrong_poses(misplaced: Scene) -> None:
     assert trainer.outliers.left_out == names_of(misplaced)
     messages = [progress.message for progress in said if "disagree" in progress.message]
     assert len(messages) == len(set(messages)) > 0, "each choice is said once"
-    n = len(misplaced.train)
+    n, first = len(misplaced.train), ", ".join(names_of(misplaced)[:3])
     assert messages[-1] == (
-        f"{len(WRONG)} of {n} photos disagree with all others, as with wrong poses: {', '.join(names_of(misplaced)[:3])}, "
-        "...; the run goes on without them (outlier_check=False keeps them)"
+        f"{len(WRONG)} of {n} photos disagree with all others, as with wrong poses: {first}, ...; the run goes on "
+        "without them (outlier_check=False keeps them)"
     )
     kept = Trainer(misplaced, config.replace(outlier_check=False))
     kept.run()
