@@ -21,7 +21,8 @@ def main() -> None:
     try:
         stop_signals.install()
         code = _run(command)
-    except KeyboardInterrupt:  # a second signal, during the message about the first
+        _end_at_signals()
+    except KeyboardInterrupt:  # a second signal, during the message about the first, or one after the end of the work
         code = stop_signals.exit_code()
     _end_at_signals()
     if stop_signals.is_waiting():
