@@ -121,7 +121,7 @@ def perform(pickled: bytes, topic: str, number: int, version: str) -> Outcome:
     """
     name = str(distributed().get_worker().name)
     if version != __version__:
-        text = f"worker {name} has clsplat {__version__}, not {version}: install the same version on both machines"
+        text = f"it has clsplat {__version__}, not {version}: install the same version on both machines"
         return Outcome(error=InputError(text), elsewhere=True, worker=name)
     job: Job = pickle.loads(pickled)
     context = JobContext(topic, number, os.environ.get(DEVICE_VARIABLE) or None)

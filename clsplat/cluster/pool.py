@@ -19,10 +19,11 @@ from ..errors import ClsplatError, ClusterError
 from .address import ClusterAddress
 from .dask import distributed, scheduler_address
 from .job import RESOURCE, Job, Outcome, perform
-from .workers import CONNECT_SECONDS, POLL, local_cluster, no_scheduler, plan_workers
+from .workers import CONNECT_SECONDS, POLL, check_scheduler, local_cluster, no_scheduler, plan_workers
 
 MOST_DEATHS = 5  # times that Dask may give up a job because its workers died; Dask itself tries four workers each time
 SAVING_SECONDS = 60.0  # that jobs get to save their work after Ctrl-C
+GONE_SECONDS = 30.0  # after which a worker that went is not expected to start anew
 SHOWN = 4  # running jobs in a line
 
 
@@ -68,6 +69,7 @@ class WorkerPool:
                 place: Any = opened.enter_context(local_cluster(plans))
             else:
                 place = scheduler_address(self.place)
+                check_scheduler(str(place))
             try:
                 self._client = opened.enter_context(
                     package.Client(place, timeout=CONNECT_SECONDS, set_as_default=False, direct_to_workers=False)
@@ -145,6 +147,9 @@ class _Round:
         self.deaths = [0] * len(jobs)
         self.failed_at: list[set[str]] = [set() for _ in jobs]
         self.pinned: dict[Any, set[str]] = {}  # addresses of the only workers that may do a job
+        self.gone: dict[Any, float] = {}  # when the last one of them was missed [s]
+        self.refusals: dict[int, ClusterError] = {}  # why a worker could not do a job
+        self.given_up: list[int] = []
         self.begun: set[int] = set()
         self.announced: set[int] = set()
         self.at: dict[int, str] = {}  # workers of jobs that have begun
@@ -161,6 +166,10 @@ class _Round:
         while self.futures:
             self._report()
             self._unpin()
+            for number in self.given_up:
+                self.done += 1
+                yield number, self.refusals[number]
+            self.given_up.clear()
             self.changed.wait(POLL)
             self.changed.clear()
             self._announce()
@@ -213,16 +222,27 @@ class _Round:
         future.add_done_callback(lambda _: self.changed.set())
 
     def _unpin(self) -> None:
-        """Send jobs again whose workers are all gone. A worker that starts anew has another address."""
+        """Send jobs again whose workers are all gone, or give them up if all other workers have failed at them.
+
+        A worker that starts anew has another address.
+        """
         self.pinned = {future: places for future, places in self.pinned.items() if future in self.futures}
         workers = _workers(self.client) if self.pinned else {}
         for future, places in list(self.pinned.items()):
             number = self.futures[future]
             others = [at for at, name in workers.items() if name not in self.failed_at[number]]
-            if others and not places & workers.keys():
-                del self.pinned[future], self.futures[future]
-                self.client.cancel([future], asynchronous=False)
+            if not workers or places & workers.keys():
+                self.gone.pop(future, None)
+                continue
+            now = time.monotonic()
+            if not others and now - self.gone.setdefault(future, now) < GONE_SECONDS:
+                continue
+            del self.pinned[future], self.futures[future]
+            self.client.cancel([future], asynchronous=False)
+            if others:
                 self._submit(number, others)
+            else:
+                self.given_up.append(number)
 
     def _collect(self, future: Any, number: int) -> Outcome | None:
         """Return the outcome of a future that is done; None if its job was sent again."""
@@ -235,6 +255,7 @@ class _Round:
             return self._failed(error, number)
         if outcome.error is not None and outcome.elsewhere:
             self.failed_at[number].add(outcome.worker)
+            self.refusals[number] = ClusterError(f"worker {outcome.worker}: {outcome.error}")
             others = [at for at, name in _workers(self.client).items() if name not in self.failed_at[number]]
             if others:
                 self._submit(number, others)
@@ -289,8 +310,8 @@ class _Round:
 
     def _report(self) -> None:
         """Tell a display how far the jobs are."""
-        running = sorted(self.shares.items())
-        texts = [f"{self.jobs[number].name} {share:.0%}" for number, share in running[:SHOWN]]
+        running = self._running()
+        texts = [f"{self.jobs[number].name} {self.shares.get(number, 0.0):.0%}" for number in running[:SHOWN]]
         if len(running) > SHOWN:
             texts.append(f"{len(running) - SHOWN} more")
         if not running and not _workers(self.client):

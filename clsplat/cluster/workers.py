@@ -7,6 +7,7 @@ import os
 import platform
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -191,9 +192,25 @@ async def _answers(address: str) -> bool:
     try:
         async with package.core.rpc(address) as scheduler:
             await asyncio.wait_for(scheduler.identity(), CONNECT_SECONDS)
-    except (OSError, TimeoutError, ValueError, asyncio.CancelledError):
+    except (Exception, asyncio.CancelledError):  # the bytes of another service may lead to any error
         return False
     return True
+
+
+async def _answers_in_time(address: str) -> bool:
+    """Return whether a scheduler answers soon. Another service at the address may take a message and never answer."""
+    try:
+        return await asyncio.wait_for(_answers(address), CONNECT_SECONDS)
+    except TimeoutError:
+        return False
+
+
+def check_scheduler(address: str) -> None:
+    """Raise ClusterError if no scheduler answers at an address."""
+    with ThreadPoolExecutor(1) as thread:  # the caller may be in an event loop, as in a notebook
+        answers = thread.submit(lambda: asyncio.run(_answers_in_time(address))).result()
+    if not answers:
+        raise no_scheduler(address)
 
 
 def serve(address: str, plans: Sequence[WorkerPlan], on_ready: Callable[[WorkerPlan], None] | None = None) -> None:
@@ -215,11 +232,7 @@ def serve(address: str, plans: Sequence[WorkerPlan], on_ready: Callable[[WorkerP
             on_ready(plan)
 
     async def run() -> None:
-        try:
-            answers = await asyncio.wait_for(_answers(address), CONNECT_SECONDS)
-        except TimeoutError:
-            answers = False
-        if not answers:
+        if not await _answers_in_time(address):
             raise no_scheduler(address)
         await asyncio.gather(*(_keep(address, plan, partial(ready, plan)) for plan in plans))
 

@@ -177,7 +177,7 @@ def test_faults_stand_in_the_report_area(blender: tuple[Path, dict[str, Any]]) -
         "missing": "gone.ply",
         "no PLY": "cameras.json",
         "import": "cameras.json",
-        "cameras": "no JSON",
+        "cameras": "is not JSON",
         "export": "no camera",
     }.items():
         assert word in told[name], f"{name}: {told[name]}"

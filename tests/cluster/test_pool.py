@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cluster_jobs
@@ -18,7 +21,8 @@ import pytest
 
 from clsplat.activity import listening
 from clsplat.cluster import pool as module
-from clsplat.cluster.job import Job
+from clsplat.cluster import workers
+from clsplat.cluster.job import RESOURCE, Job
 from clsplat.cluster.pool import WorkerPool
 from clsplat.errors import ClusterError, InputError
 
@@ -182,10 +186,96 @@ def test_a_worker_without_the_module_of_a_job_is_one_line(pool: WorkerPool, monk
     assert "square: a worker cannot load it (No module named 'no_such_module'): install clsplat" in str(error)
 
 
-def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "CONNECT_SECONDS", 1.0)
-    with pytest.raises(ClusterError, match=r"tcp://127\.0\.0\.1:9: no scheduler answers"), WorkerPool("127.0.0.1:9"):
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("address", ["127.0.0.1:9", "tcp://127.0.0.1"])
+def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
+    monkeypatch.setattr(workers, "CONNECT_SECONDS", 1.0)
+    with pytest.raises(ClusterError, match=r"tcp://127\.0\.0\.1.*: no scheduler answers"), WorkerPool(address):
         pass
+
+
+@pytest.mark.parametrize("answers", [True, False], ids=["web server", "silent"])
+def test_another_service_at_the_address_is_one_line(monkeypatch: pytest.MonkeyPatch, answers: bool) -> None:
+    monkeypatch.setattr(workers, "CONNECT_SECONDS", 2.0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        if answers:
+            threading.Thread(target=greet, args=(server,), daemon=True).start()
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        started = time.monotonic()
+        with pytest.raises(ClusterError, match=f"tcp://{address}: no scheduler answers"), WorkerPool(address):
+            pass
+        assert time.monotonic() - started < PATIENCE
+
+
+def greet(server: socket.socket) -> None:
+    """Answer each connection as a web server does that does not know the request."""
+    with suppress(OSError):
+        while True:
+            connection, _ = server.accept()
+            with connection:
+                connection.recv(100)
+                connection.sendall(b"HTTP/1.0 400 Bad request\r\n\r\n")
+
+
+def test_a_job_that_only_a_lost_worker_could_do_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its worker may start anew for some time. Without any worker, the job waits for new ones."""
+    known: dict[str, Any] = {
+        "tcp://1": {"name": "good", "resources": {RESOURCE: 1}},
+        "tcp://2": {"name": "bad", "resources": {RESOURCE: 1}},
+    }
+    sent: list[Any] = []
+
+    class Client:
+        status = "running"
+
+        def scheduler_info(self, n_workers: int) -> dict[str, Any]:
+            return {"workers": known}
+
+        def submit(self, *arguments: Any, **named: Any) -> Any:
+            sent.append(named["workers"])
+            return Future()
+
+        def cancel(self, futures: Any, asynchronous: bool) -> None:
+            pass
+
+    jobs = [Job("square", cluster_jobs.squared, (1,))]
+    round_ = module._Round(Client(), "address", jobs, None)
+    round_.failed_at[0].add("bad")
+    round_.refusals[0] = ClusterError("worker bad: no such scene")
+    round_._submit(0, ["tcp://1"])
+    round_._unpin()
+    good = known.pop("tcp://1")
+    bad = known.pop("tcp://2")
+    monkeypatch.setattr(module, "GONE_SECONDS", 0.0)
+    round_._unpin()
+    assert not round_.given_up, "no worker is left: new ones may come"
+    known["tcp://2"] = bad
+    monkeypatch.setattr(module, "GONE_SECONDS", 60.0)
+    round_._unpin()
+    assert not round_.given_up, "it may start anew"
+    known["tcp://3"] = good
+    round_._unpin()
+    assert sent == [["tcp://1"], ["tcp://3"]], "it did"
+    del known["tcp://3"]
+    monkeypatch.setattr(module, "GONE_SECONDS", 0.0)
+    round_._unpin()
+    assert (round_.given_up, round_.futures, round_.pinned) == ([0], {}, {})
+
+
+def test_runs_of_lost_workers_do_not_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    known: dict[str, Any] = {"tcp://1": {"name": "one", "resources": {RESOURCE: 1}}}
+    client = SimpleNamespace(status="running", scheduler_info=lambda n_workers: {"workers": known})
+    round_ = module._Round(client, "address", [Job("square", cluster_jobs.squared, (1,))], None)
+    said: list[str] = []
+    monkeypatch.setattr(module.activity, "report", said.append)
+    round_._on_event((0.0, {"job": 0, "kind": "begins", "value": "one"}))
+    round_._report()
+    known.clear()
+    round_._report()
+    assert said == [
+        "0 of 1 runs done; square 0%",
+        "0 of 1 runs done; waiting for workers: clsplat worker address",
+    ]
 
 
 def test_a_scheduler_that_ends_is_one_line(tmp_path: Path) -> None:
