@@ -84,8 +84,8 @@ def around_a_block(turn: float, n: int = 72) -> list[Camera]:
 
 def _on_lane(way: float) -> np.ndarray:
     """Return a place on the lane, (3,). way : sides of the square that are behind, from 0 on."""
-    side, along = int(way) % 4, (2 * (way - int(way)) - 1) * (BLOCK + LANE / 2)
     far = BLOCK + LANE / 2
+    side, along = int(way) % 4, (2 * (way - int(way)) - 1) * far
     x, y = [(-far, along), (along, far), (far, -along), (-along, -far)][side]
     return np.array([x, y, EYES + 0.1 * np.sin(9 * way)])
 

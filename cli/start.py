@@ -24,7 +24,7 @@ def main() -> None:
         _end_at_signals()
     except KeyboardInterrupt:  # a second signal, during the message about the first, or one after the end of the work
         code = stop_signals.exit_code()
-    _end_at_signals()
+        _end_at_signals()
     if stop_signals.is_waiting():
         code = stop_signals.exit_code()
     if not _flushed() and stop_signals.received():

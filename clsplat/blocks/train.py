@@ -247,13 +247,13 @@ class _Stages:
         cell = partition.cells.of(coarse.mean)
         folders = {block.number: real_path(self.state.folder) / f"block_{block.number}" for block in blocks}
         # A training that goes on keeps the parts of its blocks, because another device may choose other surroundings.
-        made = all((folder / CONTEXT).is_file() for folder in folders.values())
-        around = [] if made else surroundings(self.scene, coarse, Renderer(self.config.device), partition)
+        new = {number for number, folder in folders.items() if not (folder / CONTEXT).is_file()}
+        around = surroundings(self.scene, coarse, Renderer(self.config.device), partition) if new else []
         source, jobs = SceneSource.of(self.scene), []
         for block in blocks:
             folder = folders[block.number]
             inside = coarse.select(np.flatnonzero(cell == block.number))
-            if not (folder / CONTEXT).is_file():
+            if block.number in new:
                 folder.mkdir(parents=True, exist_ok=True)
                 inside.save(folder / INSIDE)
                 with_points(inside, self.scene, partition.cells, block.number, cap, self.config).save(folder / START)

@@ -253,16 +253,17 @@ class _Round:
             return None
         except Exception as error:  # also of a job that had ended: it is done again if its worker dies before this
             return self._failed(error, number)
-        if outcome.error is not None and outcome.elsewhere:
+        if outcome.error is None:
+            return outcome
+        named = ClusterError(f"worker {outcome.worker}: {outcome.error}")
+        if outcome.elsewhere:
             self.failed_at[number].add(outcome.worker)
-            self.refusals[number] = ClusterError(f"worker {outcome.worker}: {outcome.error}")
+            self.refusals[number] = named
             others = [at for at, name in _workers(self.client).items() if name not in self.failed_at[number]]
             if others:
                 self._submit(number, others)
                 return None
-        if outcome.error is not None and len(self.failed_at[number]) and outcome.worker:
-            return Outcome(error=ClusterError(f"worker {outcome.worker}: {outcome.error}"))
-        return outcome
+        return Outcome(error=named) if self.failed_at[number] and outcome.worker else outcome
 
     def _failed(self, error: Exception, number: int) -> Outcome | None:
         """Return the outcome of a job that Dask could not have done; None if the job was sent again."""

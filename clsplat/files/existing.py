@@ -41,13 +41,18 @@ def refuse_existing(paths: Iterable[str | Path], overwrite: bool = False, inputs
             places.add(path.parent)
 
 
+def probe(folder: Path) -> None:
+    """Raise OSError if a folder takes no files."""
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+
+
 def _check_place(path: Path) -> None:
     """Raise OutputError if the folder of a path, or the first one above it that exists, takes no files."""
     folder = next((parent for parent in path.absolute().parents if parent.exists()), None)
     if folder is None or not folder.is_dir():
         return  # writing says what is in the way
     try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
+        probe(folder)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from None

@@ -51,7 +51,7 @@ def masks_beside(photos: Mapping[str, Path]) -> dict[str, Path]:
 
 def _mask_of(folder: Path, name: str, file: Path) -> Path | None:
     photo = PurePosixPath(name)
-    candidates = (f"{name}.png", str(photo.with_suffix(".png")), str(photo.with_suffix(".mask.png")), name)
+    candidates = (f"{name}.png", str(photo.with_suffix(".png")), str(photo.with_suffix(BESIDE)), name)
     masks = (folder / candidate for candidate in candidates)
     return next((mask for mask in masks if os.path.isfile(mask) and not is_same_file(mask, file)), None)
 

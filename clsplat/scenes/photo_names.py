@@ -60,8 +60,9 @@ def is_absolute(name: str) -> bool:
 
 
 def last_parts(name: str) -> list[str]:
-    """Return what may remain of an absolute path in another folder: all folders and the name, and so on to the name."""
-    parts = PureWindowsPath(name).parts[1:]  # takes both kinds of slashes
+    """Return what may remain of a path in another folder: all its folders and the name, and so on to the name alone."""
+    # Parts of Windows' paths take both kinds of slashes. Those that end like this are drives and roots.
+    parts = [part for part in PureWindowsPath(name).parts if not part.endswith(("/", "\\", ":"))]
     return ["/".join(parts[start:]) for start in range(len(parts)) if ".." not in parts[start:]]
 
 

@@ -220,14 +220,14 @@ def load_scene(
             f"{root}: no training view is left: all {len(views)} photos that can be used are test views; "
             "add photos, or turn eval off"
         )
-    if only is None and test_names.isdisjoint(names) and test_names:
-        warnings.warn(
-            f"{root}: none of its {len(test_names)} test views can be used, so nothing will be measured; change "
-            "test_every, or name test views",
-            stacklevel=2,
-        )
     points = posed.points
     if only is None:
+        if test_names and test_names.isdisjoint(names):
+            warnings.warn(
+                f"{root}: none of its {len(test_names)} test views can be used, so nothing will be measured; change "
+                "test_every, or name test views",
+                stacklevel=2,
+            )
         cameras = [view.camera for view in views]
         points = without_unseen_points(root, points, cameras)
         warn_of_lone_cameras(root, names, cameras)

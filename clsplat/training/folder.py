@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..cameras.cameras_json import NamedCamera, named_cameras, write_cameras
 from ..errors import InputError, OutputError
+from ..files.existing import probe
 from ..files.json_file import read_object, write_json
 from ..files.real_path import real_path
 from ..splats.splats import Splats
@@ -116,9 +117,7 @@ class ModelFolder:
         """Make the folder; raise OutputError if it cannot be written."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            probe = self.path / ".clsplat-write-test"
-            probe.write_bytes(b"")
-            probe.unlink()
+            probe(self.path)
         except OSError as error:
             reason = error.strerror or error
             raise OutputError(f"{self.path}: cannot be written ({reason}): choose another folder") from None

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePosixPath
 
 from ...errors import InputError
 from ...files.file_names import can_be_file
 from ...files.image_names import IMAGE_SUFFIXES
 from ..photo_listing import list_images
-from ..photo_names import place_photos
+from ..photo_names import last_parts, place_photos
 from ..posed_images import photo_folder
 from ..reduced_photos import with_reduced_photos
 
@@ -87,8 +87,7 @@ def _found(folder: Path, name: str, anywhere: bool) -> str | None:
     ----------
     anywhere : whether the whole name counts, which can lead out of the folder.
     """
-    parts = [part for part in PureWindowsPath(name).parts if not part.endswith(("/", "\\", ":"))]
-    tails = ["/".join(parts[start:]) for start in range(len(parts)) if ".." not in parts[start:]]
+    tails = last_parts(name)
     for stem in [_slashed(name), *tails] if anywhere else tails:
         for suffix in _suffixes(stem):
             if (folder / (stem + suffix)).is_file():
