@@ -121,6 +121,15 @@ def test_photos_in_subfolders_are_found_by_their_labels(tmp_path: Path) -> None:
         assert f"100MEDIA/{made.NAMES[0]}" not in load_scene(folder).names
 
 
+def test_photos_of_one_name_are_told_apart_by_the_folders_of_their_labels(tmp_path: Path) -> None:
+    labels = [made.Label(f"/home/someone/{index}MEDIA/photo.png") for index in range(made.N_CAMERAS)]
+    folder = write(tmp_path, made.metashape_xml(labels=labels))
+    for index, name in enumerate(made.NAMES):
+        (folder / "images" / f"{index}MEDIA").mkdir()
+        (folder / "images" / name).rename(folder / "images" / f"{index}MEDIA" / "photo.png")
+    assert read_posed_images(folder, None).names == [f"{index}MEDIA/photo.png" for index in range(made.N_CAMERAS)]
+
+
 def test_suffixes_of_photos_may_be_large(tmp_path: Path) -> None:
     names = read_posed_images(write(tmp_path, suffix=".PNG"), None).names
     assert names == [name.replace(".png", ".PNG") for name in made.NAMES]
