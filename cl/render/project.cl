@@ -160,8 +160,8 @@ kernel void project_splats(
 
 // moments [SHAPE_V + 3, capacity]: sums over pixels; the last three rows are the gradient of the colour.
 // Overwrites grad_geom and grad_sh, which have the rows of geom and sh, with zeros for splats that are not seen; of grad_sh
-// only the bands in use. If `compact`, grad_sh is [6, capacity]: the gradient of the colour and the unit direction; the
-// gradient of sh is the product of the colour's and the basis in that direction.
+// only the bands in use. If `compact`, grad_sh is [COMPACT_ROWS, capacity]: the gradient of the colour and the unit direction.
+// The gradient of sh is the product of the colour's and the basis in that direction.
 // Adds three numbers for densification to signals [3, capacity] for each seen splat. The first is the norm of the gradient of
 // mean_px in units of half the image (3DGS's normalised device coordinates). The second is the absolute gradient along the
 // viewing ray [1/world unit] (3DSGS's depth gradient). The third is 1.
@@ -192,7 +192,7 @@ kernel void project_splats_vjp(
     const vmask seen = lanes_load(flag) > zero;
     if (!lanes_any(seen)) {  // the result is zeros
         for (int row = 0; row < GEOM_ROWS; ++row) lanes_store(zero, grad_geom + first + row * capacity);
-        const int rows = compact ? 6 : 3 * (sh_degree + 1) * (sh_degree + 1);
+        const int rows = compact ? COMPACT_ROWS : 3 * (sh_degree + 1) * (sh_degree + 1);
         for (int row = 0; row < rows; ++row) lanes_store(zero, grad_sh + first + row * capacity);
         return;
     }

@@ -38,6 +38,11 @@ class Schedule:
     def __str__(self) -> str:
         return f"{self.group}x{self.vecs}x{self.lanes}"
 
+    @property
+    def block(self) -> tuple[int, int]:
+        """Width and height of the block of pixels in a vector [px]: BLOCK_W and BLOCK_H of cl/math/lanes.clh."""
+        return (1, 1) if self.lanes == 1 else (4, self.lanes // 4)
+
     @classmethod
     def parse(cls, text: str) -> Schedule:
         """Return the schedule for a name of `SCHEDULES` or a text "GROUPxVECSxLANES".

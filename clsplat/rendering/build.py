@@ -16,6 +16,7 @@ from ..splats.low_pass import LOW_PASS
 from ..splats.near_plane import NEAR_PLANE
 from ..splats.shapes import NORMALISATIONS, SKEW_MAX, SLANT_MAX, Shape, shape_named
 from .camera_block import CAMERA_MEMBERS
+from .splat_buffers import COMPACT_ROWS
 
 MARGIN_X, MARGIN_Y = 16, 8  # zero margin of every image plane: the SSIM window reaches 5 pixels out
 BATCH, GROUP_BATCH = 64, 32  # isects of a tile that are looked at together; a group has little local memory
@@ -160,6 +161,7 @@ class KernelBuild:
                 "SHAPE_V": shape.moments,
                 "CAMERA_MEMBERS": ", ".join(CAMERA_MEMBERS),
                 "CULLED_KEY": f"{CULLED_KEY:#x}u",
+                "COMPACT_ROWS": COMPACT_ROWS,
                 "TILE": TILE,
                 "BATCH": self.batch,
                 "SUM_ROWS": SUM_ROWS,

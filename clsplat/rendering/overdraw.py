@@ -19,11 +19,10 @@ def count_pairs(pipeline: Pipeline, frame: Frame) -> int:
 def splats_per_pixel(pipeline: Pipeline, frame: Frame) -> NDArray[np.float32]:
     """Return the useful splats of each pixel (H, W), as the mean over its block of pixels.
 
-    A block is what the schedule computes at once: 4 x 4 pixels with 16 lanes, 4 x 2 with 8, and one pixel with 1 lane.
+    A block is what the schedule computes at once (`Schedule.block`).
     """
-    layout, lanes = frame.layout, pipeline.kernels.lanes
-    wide = 1 if lanes == 1 else 4  # BLOCK_W and BLOCK_H of cl/math/lanes.clh
-    high = lanes // wide
+    layout = frame.layout
+    wide, high = pipeline.kernels.schedule.block
     blocks_x, blocks_y = TILE // wide, TILE // high
     by_tile = _block_counts(pipeline, frame).reshape(layout.tiles_y, layout.tiles_x, blocks_y, blocks_x)
     blocks = by_tile.transpose(0, 2, 1, 3).reshape(layout.tiles_y * blocks_y, layout.tiles_x * blocks_x)

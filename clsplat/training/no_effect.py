@@ -54,6 +54,8 @@ def no_effect(config: TrainConfig, name: str, scene: Scene | None = None) -> str
         return f"with split {values['split']}"
     if name == "average_last" and values[name] > 0 and values["densify_until"] == 1:
         return "with densification until the end"
+    if name == "densify_from" and values[name] >= values["densify_until"]:
+        return f"with densification until {values['densify_until']:g} of the run"
     switch = _NEEDS.get(name)
     if switch is not None and not values[switch]:
         return f"without --{switch.replace('_', '-')}"

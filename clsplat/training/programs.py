@@ -8,6 +8,7 @@ from ..device.device import Device
 from ..device.program import Define, Program, build
 from ..device.schedule import Schedule
 from ..rendering.build import CULLED_KEY, MARGIN_X, MARGIN_Y, KernelBuild, layout_defines
+from ..rendering.splat_buffers import COMPACT_ROWS
 from ..splats.fields import Group, sh_coefficients
 from ..splats.harmonics import SH_C0
 from ..splats.low_pass import LOW_PASS
@@ -16,7 +17,7 @@ from ..splats.optical_depth import MAX_COORDINATE
 from ..splats.shapes import shape_named
 from .config import TrainConfig
 from .optim import adam, noise
-from .optim.skew_map import SKEW_MAPS
+from .optim.skew_map import R_CEILING, R_FLOOR, SKEW_MAPS
 
 EXPOSURE_VECS = 8  # vectors of a work-item of cl/train/exposure.cl
 EXPOSURE_GROUP = 64
@@ -155,7 +156,12 @@ def _optim_defines(kernels: KernelBuild, half_moments: bool) -> dict[str, Define
         "COEFFICIENTS": coefficients_of_item(kernels),
         "HALF_MOMENTS": int(half_moments),
         "FULL_MOMENTS": int(not half_moments),
+        "COMPACT_ROWS": COMPACT_ROWS,
         "SKEW_MAP": SKEW_MAPS.index(kernels.skew_map),
+        "SKEW_FLOOR": R_FLOOR,
+        "SKEW_CEILING": R_CEILING,
+        "GATE_SHARPNESS": noise.GATE_SHARPNESS,
+        "GATE_OFFSET": noise.GATE_OFFSET,
         "ADAM_BETA1": adam.BETA1,
         "ADAM_BETA2": adam.BETA2,
         "ADAM_EPS": adam.EPS,

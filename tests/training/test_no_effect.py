@@ -30,6 +30,8 @@ from clsplat.training.no_effect import _FIELD_OF, _NEEDS, _OF_POINTS, no_effect
         ({"shape": "skew-normal"}, "alternation_split", "with alternation off"),
         ({"split": "long-axis"}, "dense_size", "with split long-axis"),
         ({"average_last": 0.1, "densify_until": 1.0}, "average_last", "with densification until the end"),
+        ({"densify_from": 0.9}, "densify_from", "with densification until 0.5 of the run"),
+        ({"densify_from": 0.3, "densify_until": 0.3}, "densify_from", "with densification until 0.3 of the run"),
         ({"iterations": 100, "save_iterations": (200, 300)}, "save_iterations", "beyond the run's 100 iterations"),
         (
             {"iterations": 100, "test_iterations": (50, 200, 300)},
@@ -58,6 +60,7 @@ def test_reasons(options: dict[str, Any], name: str, why: str) -> None:
         ({"split": "published"}, "dense_size"),
         ({"iterations": 100, "save_iterations": (50, 100)}, "save_iterations"),
         ({"average_last": 0.1, "densify_until": 0.99}, "average_last"),
+        ({"densify_from": 0.4}, "densify_from"),
         ({"average_last": 0.0, "densify_until": 1.0}, "average_last"),
         ({"init": "random"}, "init_scale"),
         ({}, "random_points"),

@@ -34,7 +34,7 @@ from ...splats.shapes import SKEW_MAX, SLANT_MAX
 # Maps by form of the skew (Shape.skew_form). The first map is the default.
 MAPS = {"centred": ("cube-root",), "direct": ("polar", "coupled")}
 SKEW_MAPS = tuple(name for names in MAPS.values() for name in names)
-R_FLOOR = 1e-6  # skew_map.clh has the same constant
+R_FLOOR = 1e-6
 R_CEILING = 20.0  # bound of r that keeps cosh(r)^2 in the range of float32; tanh is 1 there
 TANH_CEILING = 1.0 - 1e-4  # largest tanh of the inverse map, so that the slope of the map is not zero
 
