@@ -1,1 +1,1 @@
-"""OpenCL C sources of clsplat, read as package data by clsplat.program."""
+"""OpenCL C sources of clsplat, read as package data by clsplat.device.program."""

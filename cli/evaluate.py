@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from clsplat.evaluation.metrics import DEFAULT_PROTOCOL, PROTOCOLS, MetricProtocol, protocol_named
-from clsplat.files.real_path import real_path
 
 from .command import SectionedCommand
 from .models import scene_choice
@@ -141,8 +140,6 @@ def evaluate_models(
         raise click.UsageError("give at least one model folder or file of splats")
     if report is not None and no_report:
         raise click.UsageError("give --report or --no-report, not both")
-    if save_renders is not None and len({real_path(path).name for path in paths}) < len(paths):
-        raise click.UsageError("--save-renders: models in folders of the same name; measure them one by one")
     options = evaluation.EvaluationOptions(
         values["view_set"] or "test",
         replace(protocol_named(values["compat"]), corrected=values["color_correct"]),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from clsplat.scenes.options import ALPHA_USES
+from clsplat.scenes.options import ALPHA_USES, VIEW_SETS
 from clsplat.splats.color import WHITE, Color
 from clsplat.training.config import OPTIONS, SECTIONS, TrainConfig
 from clsplat.training.no_effect import no_effect
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-SETS = ("test", "train", "validation", "all")
 
 
 class AnyPath(click.Path):
@@ -146,7 +144,7 @@ iteration_option = click.option(
     help="Point cloud to use, by iteration.  [default: the last]",
 )
 set_option = click.option(
-    "--set", "--views", "view_set", type=click.Choice(SETS), help="Views of the scene to use.  [default: test]"
+    "--set", "--views", "view_set", type=click.Choice(VIEW_SETS), help="Views of the scene to use.  [default: test]"
 )
 
 

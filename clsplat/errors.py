@@ -77,6 +77,12 @@ class ClusterError(ClsplatError):
     """The scheduler of a cluster or its workers cannot be used."""
 
 
+def check_choice(name: str, value: str, choices: Collection[str]) -> None:
+    """Raise InputError unless an option has one of its values. name : of the option, or of the parameter."""
+    if value not in choices:
+        raise InputError(f"{name} {value!r}: choose one of {', '.join(choices)}")
+
+
 FEWER_SPLATS = Remedy("use fewer splats", "--cap-max", "--splats")
 SMALLER_IMAGES = Remedy("use smaller images", "-r 2, 4, 8", "--size WxH", "--width N", "--max-size PX")
 OTHER_DEVICE = Remedy("choose another device", "--device")

@@ -158,7 +158,7 @@ kernel void project_splats(
     }
 }
 
-// moments [SHAPE_V + 3, capacity]: sums over pixels; the last three rows are the gradient of the colour.
+// moments [V_RECORD, capacity]: sums over pixels; the last three rows are the gradient of the colour.
 // Overwrites grad_geom and grad_sh, which have the rows of geom and sh, with zeros for splats that are not seen; of grad_sh
 // only the bands in use. If `compact`, grad_sh is [COMPACT_ROWS, capacity]: the gradient of the colour and the unit direction.
 // The gradient of sh is the product of the colour's and the basis in that direction.
@@ -202,8 +202,8 @@ kernel void project_splats_vjp(
     }
     const splat_terms s = splat_project(geom + first, capacity, cam);
 
-    vreal v[SHAPE_V + 3];
-    for (int j = 0; j < SHAPE_V + 3; ++j) v[j] = lanes_if(seen, lanes_load(moments + first + j * capacity), zero);
+    vreal v[V_RECORD];
+    for (int j = 0; j < V_RECORD; ++j) v[j] = lanes_if(seen, lanes_load(moments + first + j * capacity), zero);
 
     shape_grads g;
     shape_project_vjp(s.shown, s.b0, s.b1, s.cov2d, v, &g);

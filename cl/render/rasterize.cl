@@ -20,10 +20,9 @@
 // Images are planar with a margin: plane c has pixel (x, y) at c * plane + (y + MARGIN_Y) * stride + x + MARGIN_X. Pixels of
 // a tile beyond width or height are written as 0.
 
-#define V_RECORD (SHAPE_V + 3)  // an isect's gradient record: the shape's moments, then the gradient of the colour
-
-// Groups of work-items do not ask for it: the test of each block costs more than the formula saves.
-#ifndef SHAPE_PLAIN  // the shape has no cheaper formula for some splats
+// A shape without a cheaper formula for some splats. Groups of work-items never use the cheaper formula: the test of each
+// block costs more than it saves.
+#ifndef SHAPE_PLAIN
 #define shape_is_plain(p) false
 #define shape_alpha_plain(dx, dy, p) ((vreal)0)
 #define shape_alpha_plain_vjp(dx, dy, alpha, v_alpha, v)

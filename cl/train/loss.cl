@@ -3,7 +3,7 @@
 // Smooth L1 of an error e is e^2 / (2 beta) below beta, and |e| - beta / 2 from there on. Kernels get beta and
 // steepness = 1 / beta, or 0 and a huge number, which makes it L1.
 //
-// SSIM: 11 x 11 Gaussian window, sigma 1.5, C1 = 0.01^2, C2 = 0.03^2, zero padding, mean over pixels and channels
+// SSIM: 11 x 11 Gaussian window (constants: clsplat/evaluation/metrics.py), zero padding, mean over pixels and channels
 // (Wang et al. 2004, with the constants of 3DGS). The formulas use the sum s = x + y and the difference d = x - y of
 // the rendered image x and the truth y. m is the mean over the window and h half the variance, (E[s^2] - m_s^2) / 2:
 //   2 m_x m_y = (m_s^2 - m_d^2) / 2    m_x^2 + m_y^2 = (m_s^2 + m_d^2) / 2
@@ -14,9 +14,6 @@
 // 1). The work-item blurs each row, keeps the last 11 rows in a ring, and blurs the columns of the ring. So no blurred
 // map is stored. Global size: (at least the strips, segments, 3 channels). Images are planar with a zero margin
 // (rasterize.cl); the truth has bytes.
-
-#define SSIM_C1 R(0.0001)
-#define SSIM_C2 R(0.0009)
 
 #define REACH 5
 #define TAPS 11

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,7 @@ from ..cluster.pool import WorkerPool, check_cluster
 from ..cluster.training import marked, train_in_folder
 from ..compression.prune_and_refine import Part, fine_tuning
 from ..device.specs import count_devices
-from ..errors import InputError, OutputError, Remedy
-from ..files.lock import folder_lock
+from ..errors import InputError
 from ..files.real_path import real_path
 from ..rendering.renderer import Renderer
 from ..scenes.in_memory import with_small_photos_in_memory
@@ -100,9 +100,8 @@ def train_in_blocks(
     KeyboardInterrupt : Ctrl-C; `resume` goes on from there.
     """
     check_cluster(cluster, None if config is None else config.device)
-    state, stages = _begin(scene, options, config, progress, output, resume, overwrite)
-    with folder_lock(state.path.parent):
-        return stages(cluster).run()
+    with _opened(scene, options, config, progress, output, resume, overwrite, cluster) as stages:
+        return stages.run()
 
 
 def partition_scene(
@@ -116,12 +115,12 @@ def partition_scene(
     overwrite: bool = False,
 ) -> Partition:
     """Do the first two stages of `train_in_blocks`, which goes on from there with `resume`."""
-    state, stages = _begin(scene, options, config, progress, output, resume, overwrite)
-    with folder_lock(state.path.parent):
-        return stages(None).divided()
+    with _opened(scene, options, config, progress, output, resume, overwrite) as stages:
+        return stages.divided()
 
 
-def _begin(
+@contextmanager
+def _opened(
     scene: Scene,
     options: BlocksOptions,
     config: TrainConfig | None,
@@ -129,30 +128,23 @@ def _begin(
     output: str | Path,
     resume: bool,
     overwrite: bool,
-) -> tuple[BlocksState, Callable[[str | None], _Stages]]:
-    """Return the state of a training, new or resumed, and a function that makes its stages."""
+    cluster: str | None = None,
+) -> Iterator[_Stages]:
+    """Yield the stages of a training, new or resumed. The model folder is locked until the block ends."""
     config = config or TrainConfig()
     folder, state = ModelFolder(output), BlocksState(Path(output))
     check_options(config, options)
-    if resume:
-        state.load()
-        config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
-        state.check(config, options)
-    elif folder.is_used and not overwrite:
-        raise OutputError(
-            f"{folder.path}: already holds a model",
-            Remedy("replace it", "--overwrite"),
-            Remedy("continue it", "--resume"),
-            Remedy("choose another folder"),
-        )
-    folder.prepare()
-    scene = with_small_photos_in_memory(scene)
-    if not resume:
-        config = decide(scene, config).tell(progress)
-        with folder_lock(folder.path):
+    with folder.for_run(resume=resume, overwrite=overwrite):
+        if resume:
+            state.load()
+            config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
+            state.check(config, options)
+        scene = with_small_photos_in_memory(scene)
+        if not resume:
+            config = decide(scene, config).tell(progress)
             folder.clear()
             state.begin(config, options, scene_record(scene, folder.path))
-    return state, lambda cluster: _Stages(scene, config, options, progress, state, folder, cluster)
+        yield _Stages(scene, config, options, progress, state, folder, cluster)
 
 
 def check_options(config: TrainConfig, options: BlocksOptions) -> None:

@@ -21,7 +21,7 @@ from .table import Record, scene_title, summarise
 ChartRow = dict[str, Any]
 
 COSTS = ("render_ms", "bytes", "splats")  # the horizontal axes
-AUTO = "auto"  # first word of the system of a run that chose its group number of splats
+AUTO = "auto"  # first word of the system of a run that chose its number of splats
 MIN_SEEDS = 3  # for a spread
 
 

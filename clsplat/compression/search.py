@@ -25,8 +25,6 @@ from typing import Any
 from ..cluster.job import Job
 from ..cluster.pool import WorkerPool, check_cluster
 from ..cluster.training import TrainJob, marked, train_in_place, unmark
-from ..errors import OutputError
-from ..files.lock import folder_lock
 from ..rendering.renderer import Renderer
 from ..scenes.in_memory import with_small_photos_in_memory
 from ..scenes.scene import Scene
@@ -106,17 +104,13 @@ def train_budget(
     check_cluster(cluster, config.device)
     state = BudgetState(Path(output))
     folder = ModelFolder(output)
-    if resume:
-        state.load()
-        config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
-        state.check(config, options)
-    elif folder.is_used and not overwrite:
-        raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
-    folder.prepare()
-    if not resume:
-        config = decide(scene, config).tell(progress)
-    with folder_lock(folder.path):
-        if not resume:
+    with folder.for_run(resume=resume, overwrite=overwrite):
+        if resume:
+            state.load()
+            config = as_decided(config, TrainConfig.from_json(state.values["config"]).to_json())
+            state.check(config, options)
+        else:
+            config = decide(scene, config).tell(progress)
             folder.clear()
             state.begin(config, options, scene_record(scene, folder.path))
         return _Search(scene, config, options, progress, state, folder, cluster).run()

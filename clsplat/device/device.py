@@ -34,10 +34,11 @@ BROKEN_POCL = (
     "PoCL 3.0-rc2 (the wheel behind pyopencl[pocl]) cannot build kernels on recent CPUs: "
     "`apt install pocl-opencl-icd` or `pip install clsplat[cpu]`"
 )
-_CLANG_PLATFORMS = ("Portable Computing Language", "Intel(R) OpenCL")  # they compile CPU kernels by clang alone
-_SCALAR_PLATFORMS = ("rusticl", "Clover")  # of Mesa: their compilers take vectors apart
+POCL, RUSTICL = "Portable Computing Language", "rusticl"  # names of platforms: PoCL, and Mesa's newer driver
+_CLANG_PLATFORMS = (POCL, "Intel(R) OpenCL")  # they compile CPU kernels by clang alone
+_SCALAR_PLATFORMS = (RUSTICL, "Clover")  # of Mesa: their compilers take vectors apart
 _NATIVE_PLATFORMS = (  # their GPUs have instructions for 2^x and 1/x with errors of about 2e-7
-    *("NVIDIA CUDA", "AMD Accelerated Parallel Processing", "rusticl", "Portable Computing Language"),
+    *("NVIDIA CUDA", "AMD Accelerated Parallel Processing", RUSTICL, POCL),
     *("Intel(R) OpenCL Graphics", "Intel(R) OpenCL HD Graphics"),
 )
 LESS_MEMORY = (FEWER_SPLATS, SMALLER_IMAGES, OTHER_DEVICE)
@@ -69,7 +70,7 @@ class DeviceInfo:
     @property
     def fault(self) -> str | None:
         """A reason why this device is known not to work, with the remedy; None if there is no such reason."""
-        if self.platform == "Portable Computing Language" and "3.0-rc2" in self.platform_version:
+        if self.platform == POCL and "3.0-rc2" in self.platform_version:
             return BROKEN_POCL
         version = re.match(r"OpenCL (\d+)\.(\d+)", self.version)
         if version and tuple(map(int, version.groups())) < _VERSION:
@@ -298,7 +299,7 @@ def _rank(info: DeviceInfo) -> tuple[int, int, int]:
     kind = {"GPU": 0, "CPU": 1}.get(info.type, 2)
     if info.platform == "Oclgrind" or "llvmpipe" in info.name:
         return 3, 0, 0  # a checker and a software renderer: correct but slow
-    order = 0 if info.platform == "Portable Computing Language" else 1
+    order = 0 if info.platform == POCL else 1
     return kind, order if kind else 0, -info.compute_units if kind == 0 else 0
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from ..errors import DeviceError
 from .device import Device
 from .opencl import Buffer, Event
 
@@ -40,7 +41,13 @@ class GrowingBuffer:
             if self._buffer is not None:
                 size = min(int(_GROWTH * needed), max(self.device.info.max_alloc_bytes, needed))
             self._buffer, self.nbytes = None, 0  # released first: memory may be short
-            self._buffer = self.device.alloc(size)
+            try:
+                self._buffer = self.device.alloc(size)
+            except DeviceError:
+                if size == needed:
+                    raise
+                size = needed
+                self._buffer = self.device.alloc(size)
             self.nbytes = size
         return self._buffer
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from .. import activity
 from ..errors import OTHER_DEVICE, DeviceError, Remedy
-from .device import BROKEN_POCL, LESS_MEMORY, Device, DeviceInfo
+from .device import BROKEN_POCL, LESS_MEMORY, RUSTICL, Device, DeviceInfo
 from .kernel_args import Parameter, Signatures, parse_signatures
 from .kernel_args import Real as Real  # of this module's interface
 from .memory import to_device, to_host
@@ -42,7 +42,7 @@ OPTIONS_VARIABLE = "CLSPLAT_BUILD_OPTIONS"  # further options from the environme
 SMOKE_TOLERANCE = 1e-5  # relative; OpenCL allows an error of 16 ulp in erfc, 6e-8 each
 
 # Mesa 22.3 says 32 for every kernel of its software device, which runs larger groups.
-_WITHOUT_LIMITS = frozenset({"rusticl"})
+_WITHOUT_LIMITS = frozenset({RUSTICL})
 GROUP_ITEMS = 64  # of kernels with one work-item per splat or isect
 
 

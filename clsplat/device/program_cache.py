@@ -17,10 +17,10 @@ from pathlib import Path
 from ..errors import OutputError
 from ..files.atomic import atomic_writer
 from .caches import user_cache
-from .device import DeviceInfo
+from .device import POCL, DeviceInfo
 
 # Platforms whose drivers cache programs. PoCL also caches each kernel by its group size.
-SELF_CACHING = ("Portable Computing Language", "NVIDIA CUDA")
+SELF_CACHING = (POCL, "NVIDIA CUDA")
 MAX_BYTES = 256 << 20  # of all files; the files unused for longest are removed first
 
 _DIGEST = hashlib.sha256().digest_size

@@ -9,7 +9,7 @@ from .device import DeviceInfo
 
 TILE = 16  # side of a tile [px]
 _LANES = (1, 8, 16)  # widths that cl/math/lanes.clh implements
-_GROUP_STEP = 32  # sums are taken over parts of 16 items, and PoCL 3.1 miscompiles groups of 16
+SUM_PART = 32  # work-items of a part of a sum (cl/render/group.clh); a group has a whole number of parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +32,8 @@ class Schedule:
             raise DeviceError(f"schedule {self}: GROUPxVECSxLANES must multiply to {TILE * TILE}")
         if self.lanes not in _LANES:
             raise DeviceError(f"schedule {self}: LANES must be 1, 8 or 16")
-        if self.group > 1 and self.group % _GROUP_STEP:
-            raise DeviceError(f"schedule {self}: GROUP must be 1 or a multiple of {_GROUP_STEP}")
+        if self.group > 1 and self.group % SUM_PART:
+            raise DeviceError(f"schedule {self}: GROUP must be 1 or a multiple of {SUM_PART}")
 
     def __str__(self) -> str:
         return f"{self.group}x{self.vecs}x{self.lanes}"

@@ -372,7 +372,9 @@ def _unreadable(path: str | os.PathLike[str], error: Exception) -> InputError:
             return InputError(
                 f"{path}: is a HEIC image: {HEIC_REMEDY}, or convert it to JPEG with {CONVERTERS['.heic']}"
             )
-    return InputError(f"{path}: cannot be read as an image ({reason}); replace or remove the file")
+    converter = CONVERTERS.get(Path(path).suffix.lower())
+    remedy = f"convert it to PNG or JPEG with {converter}" if converter else "replace or remove the file"
+    return InputError(f"{path}: cannot be read as an image ({reason}); {remedy}")
 
 
 def _is_heic(file: Path) -> bool:

@@ -11,11 +11,12 @@ import numpy as np
 
 from ..cameras.cameras_json import NamedCamera, named_cameras, read_cameras, write_cameras
 from ..cameras.path import read_path
-from ..errors import InputError
+from ..errors import InputError, check_choice
 from ..files.existing import refuse_existing
 from ..files.json_file import read_json
 from ..scenes.colmap import Points
 from ..scenes.export import points_file, relative_files, write_colmap, write_transforms
+from ..scenes.options import CAMERA_FORMATS
 from ..scenes.posed_images import warn_of_left_out
 from ..scenes.scene import read_posed_images
 from ..scenes.scene_files import PHOTOGRAMMETRY_ENDINGS
@@ -70,6 +71,7 @@ def export_cameras(
     source, output = Path(source), Path(output)
     if form is None:
         form = "cameras" if output.name == "cameras.json" else "transforms" if output.suffix == ".json" else "colmap"
+    check_choice("form", form, CAMERA_FORMATS)
     suffix = ".txt" if form == "colmap-text" else ".bin"
     files = [output / f"{name}{suffix}" for name in _COLMAP_FILES] if form.startswith("colmap") else [output]
     refuse_existing(files, overwrite)

@@ -14,6 +14,7 @@ from ..errors import InputError, OutputError, Remedy
 from ..evaluation.evaluate import Evaluation, evaluate
 from ..files.atomic import move
 from ..files.existing import refuse_existing
+from ..files.lock import folder_lock
 from ..files.real_path import real_path
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
@@ -145,16 +146,21 @@ def _write(splats: Splats, model: LoadedModel, output: Path) -> None:
     if output.suffix:
         splats.save(output)
         return
+    is_new = not output.exists()
+    ModelFolder(output).prepare()
+    with folder_lock(output):
+        _replace_model(splats, model, output, is_new)
+
+
+def _replace_model(splats: Splats, model: LoadedModel, output: Path, is_new: bool) -> None:
+    """Write the model's folder, or raise OutputError and leave the old model in it. A new folder goes then."""
     assert model.folder is not None
     assert model.iteration is not None
-    is_new = not output.exists()
-    folder = ModelFolder(output)
-    folder.prepare()
     try:
         # The new model is complete before the old one goes. It lies in the folder, so that its files only change place.
         with tempfile.TemporaryDirectory(prefix=".", dir=output) as temporary:
             _write_folder(splats, model, model.folder, model.iteration, ModelFolder(temporary))
-            folder.clear()
+            ModelFolder(output).clear()
             for file in [path for path in Path(temporary).rglob("*") if path.is_file()]:
                 target = output / file.relative_to(temporary)
                 target.parent.mkdir(parents=True, exist_ok=True)

@@ -171,9 +171,9 @@ def convert_model(
     if suffix == PAGE_ENDING:
         _write_page(output, source, converted, page or PageOptions())
     elif suffix == LOD_META:
-        coarser = _write_levels(output, converted, levels or LEVELS)
+        coarser = _write_levels(output, converted, LEVELS if levels is None else levels)
     else:
-        converted.save(output, spz_version=spz_version or SPZ_VERSIONS[0])
+        converted.save(output, spz_version=SPZ_VERSIONS[0] if spz_version is None else spz_version)
     return ConvertedModel(source, output, converted, is_nearest, tuple(coarser))
 
 
@@ -213,11 +213,14 @@ def _costs(
     if not named or not written:
         return []
     renderer = Renderer(device)
-    before = [renderer.render(source.splats, entry.camera, source.background).color for entry in named]
     found = []
     for splats in written:
-        after = (renderer.render(splats, entry.camera, source.background).color for entry in named)
-        values = [min(psnr(a, b), MAX_PSNR) for a, b in zip(before, after, strict=True)]
+        values = []
+        for entry in named:  # one image of each at a time: those of all cameras may be larger than memory
+            before, after = (
+                renderer.render(one, entry.camera, source.background).color for one in (source.splats, splats)
+            )
+            values.append(min(psnr(before, after), MAX_PSNR))
         found.append(ConversionCost(sum(values) / len(values), min(values), len(values)))
     return found
 

@@ -11,7 +11,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError, OutputError
+from ..errors import InputError, OutputError, check_choice
 from ..evaluation.evaluate import evaluate as evaluate_views
 from ..evaluation.floaters import measure_floaters
 from ..evaluation.metrics import DEFAULT_PROTOCOL, MetricProtocol
@@ -23,6 +23,7 @@ from ..files.real_path import real_path
 from ..rendering.outputs import ImageWriter, output_stems
 from ..rendering.renderer import Rendered, Renderer
 from ..rendering.views import RenderOutput, ViewProgress, files_of
+from ..scenes.options import VIEW_SETS
 from ..scenes.scene import View
 from ..splats.color import Color
 from ..splats.formats.any_file import stored_bytes
@@ -59,6 +60,9 @@ class EvaluationOptions:
     scene: SceneChoice = field(default_factory=SceneChoice)
     report: bool = True
     scene_name: str | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("view_set", self.view_set, VIEW_SETS)
 
 
 def evaluate(
@@ -124,12 +128,15 @@ def evaluate_models(
     numbers : JSON file for the numbers of all models, by path: the entries of results.json and per_view.json.
     overwrite : replace existing files of `comparison`, `numbers` and `renders`.
     """
+    names = [real_path(path).name for path in paths]
+    if renders is not None and len(set(names)) < len(names):
+        raise InputError("the images of models in folders of one name would mix: measure these models one by one")
     refuse_existing([path for path in (comparison, numbers) if path is not None], overwrite)
     write = options.report and comparison is None
     evaluator = Evaluator(options, Renderer(device), write_reports=write, overwrite=overwrite)
     measured = []
-    for path in paths:
-        folder = renders / real_path(path).name if renders is not None and len(paths) > 1 else renders
+    for path, name in zip(paths, names, strict=True):
+        folder = renders / name if renders is not None and len(paths) > 1 else renders
         measured.append(evaluator(load_model(path, iteration), folder, progress))
         if not _on_equal_views(measured[0], measured[-1]):
             differ = f"{path} and {paths[0]} are measured on different views or sizes"
@@ -141,7 +148,9 @@ def evaluate_models(
             entries = zip(paths, measured, strict=True)
             write_json(numbers, {str(path): {"results": one.result, "per_view": one.per_view} for path, one in entries})
         if comparison is not None:
-            write_model_report(comparison, measured[-1].scene.name, measured, _labels(paths))
+            # Whole paths if two folders have one name.
+            labels = names if len(set(names)) == len(names) else [str(path) for path in paths]
+            write_model_report(comparison, measured[-1].scene.name, measured, labels)
     except OutputError as error:
         return [*measured[:-1], replace(measured[-1], write_error=error)]
     if numbers is None and comparison is None:
@@ -261,12 +270,6 @@ def _on_equal_views(one: ModelEvaluation, other: ModelEvaluation) -> bool:
     sizes, others = one.view_sizes, other.view_sizes
     named = match_names(list(sizes), list(others))
     return named is not None and all(sizes[named[name]] == size for name, size in others.items())
-
-
-def _labels(paths: Sequence[Path]) -> list[str]:
-    """Return the names of the folders, or whole paths if two folders have the same name."""
-    names = [real_path(path).name for path in paths]
-    return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
 
 def _add_entry(path: Path, key: str, entry: dict[str, Any]) -> None:

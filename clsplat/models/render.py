@@ -12,18 +12,18 @@ from ..cameras.cameras_json import NamedCamera, named_cameras, read_cameras, wri
 from ..cameras.interpolate import resized_by_height
 from ..cameras.make_path import PathRequest, make_path, name_frames
 from ..cameras.path import DEFAULT_FPS, CameraPath, write_path
-from ..errors import SMALLER_IMAGES, InputError, OutputError
+from ..errors import SMALLER_IMAGES, InputError, OutputError, check_choice
 from ..files.existing import refuse_existing
 from ..files.host_memory import available_bytes
 from ..files.real_path import real_path
 from ..files.video import VideoWriter
-from ..rendering.renderer import Renderer, RendersSplats
+from ..rendering.renderer import Renderer
 from ..rendering.views import RenderOutput, ViewProgress, files_of, render_to_files
+from ..scenes.options import VIEW_SETS
 from ..splats.color import Color
 from .detail import DetailLevels, DetailRenderer
 from .model import LoadedModel, SceneChoice, in_both_forms, model_at
 
-VIEW_SETS = ("test", "train", "validation", "all")
 _BYTES = 60  # of a pixel: colour, alpha and depth as float32 on the device and the host, and what is written
 
 
@@ -45,6 +45,10 @@ class ViewChoice:
     view_set: str | None = None
     path: PathRequest | None = None
     size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.view_set is not None:
+            check_choice("view_set", self.view_set, VIEW_SETS)
 
 
 @dataclass(frozen=True)
@@ -114,11 +118,9 @@ def render_views(
     refuse_existing([*files_of(output, [view.name for view in views]), *named], overwrite)
     if path is not None and save_path is not None:
         write_path(save_path, path)
-    renderer: RendersSplats = Renderer(device)
-    if detail:
-        renderer = DetailRenderer(Renderer(device), DetailLevels(loaded.splats), detail)
+    renderer = Renderer(device)
     rendered = render_to_files(
-        renderer,
+        DetailRenderer(renderer, DetailLevels(loaded.splats), detail) if detail else renderer,
         loaded.splats,
         views,
         replace(output, fps=fps),
@@ -137,7 +139,8 @@ def choose_views(model: LoadedModel, choice: ViewChoice) -> tuple[list[NamedCame
     ------
     InputError : there are no such views, or the scene or a file cannot be read.
     """
-    held_out, source, view_set = _HeldOut(model.test_names, model.validation_names), model.path, choice.view_set
+    held_out = _HeldOut(model.test_names or frozenset(), model.validation_names)
+    source, view_set = model.path, choice.view_set
     if choice.cameras is not None:
         views, source, view_set = read_cameras(choice.cameras), Path(choice.cameras), view_set or "all"
     elif choice.scene:
@@ -169,9 +172,9 @@ def _check_memory(views: Sequence[NamedCamera]) -> None:
 
 
 class _HeldOut(NamedTuple):
-    """Names of the views that a run did not train on. test : None if they are not known."""
+    """Names of the views that a run did not train on, as far as they are known."""
 
-    test: frozenset[str] | None
+    test: frozenset[str]
     validation: frozenset[str]
 
 
@@ -181,7 +184,7 @@ def _select(views: Sequence[NamedCamera], held_out: _HeldOut, view_set: str | No
         raise InputError(
             f"{source}: no cameras to render: give --cameras cameras.json, a scene with -s, or --path orbit"
         )
-    test_names, validation_names = in_both_forms(held_out.test or frozenset()), in_both_forms(held_out.validation)
+    test_names, validation_names = in_both_forms(held_out.test), in_both_forms(held_out.validation)
     test = [view for view in views if view.name in test_names]
     if view_set in (None, "all"):
         return test if test and view_set is None else list(views)
@@ -195,5 +198,9 @@ def _select(views: Sequence[NamedCamera], held_out: _HeldOut, view_set: str | No
         return validation
     if not test:
         raise InputError(f"{source}: no test views are known: use --set all, or train with clsplat train --eval")
-    others = test_names | validation_names
-    return test if view_set == "test" else [view for view in views if view.name not in others]
+    if view_set == "test":
+        return test
+    train = [view for view in views if view.name not in test_names | validation_names]
+    if not train:
+        raise InputError(f"{source}: no training views are known: choose others with --set")
+    return train

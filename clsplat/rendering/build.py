@@ -10,7 +10,7 @@ import numpy as np
 
 from ..device.device import Device
 from ..device.program import GROUP_ITEMS, Define, Program, Real, build
-from ..device.schedule import TILE, Schedule
+from ..device.schedule import SUM_PART, TILE, Schedule
 from ..splats.fields import Group, Schema
 from ..splats.low_pass import LOW_PASS
 from ..splats.near_plane import NEAR_PLANE
@@ -165,6 +165,7 @@ class KernelBuild:
                 "TILE": TILE,
                 "BATCH": self.batch,
                 "SUM_ROWS": SUM_ROWS,
+                "SUM_PART": SUM_PART,
                 "MARGIN_X": MARGIN_X,
                 "MARGIN_Y": MARGIN_Y,
                 "GROUP": self.schedule.group,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..cameras.camera import Camera
-from ..errors import InputError
+from ..errors import InputError, check_choice
 from ..splats.color import BLACK
 from ..splats.fields import Array
 from ..splats.harmonics import SH_C0
@@ -69,8 +69,7 @@ def picture(
     ------
     InputError : unknown mode, or wrong `near_far`.
     """
-    if mode not in MODES:
-        raise InputError(f"picture {mode!r}: choose one of {', '.join(MODES)}")
+    check_choice("picture", mode, MODES)
     image = renderer.render(splats, camera, BLACK if mode == "skew" else background, sh_degree)
     return picture_of(image, mode, background, near_far, renderer.count_splats() if mode == "splats" else None)
 

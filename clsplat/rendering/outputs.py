@@ -87,7 +87,7 @@ class ImageWriter:
 
     Attributes
     ----------
-    depth_scales : by the name of a grey depth PNG, its full scale [world units].
+    depth_scales : by the path of a grey depth PNG within the folder, its full scale [world units].
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class ImageWriter:
                 plane = np.maximum(plane, 0.0)  # opacities below zero may lead to depths below zero
                 farthest = float(plane.max()) or 1.0
                 write_grey16(path, np.rint(plane * (_FULL_SCALE / farthest)).astype(np.uint16))
-                self.depth_scales[path.name] = farthest
+                self.depth_scales[path.relative_to(self.folder).as_posix()] = farthest
 
 
 class VideoFiles:

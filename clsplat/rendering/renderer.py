@@ -26,6 +26,7 @@ from .pipeline import Pipeline
 from .splat_buffers import ParameterBuffers, SplatBuffers
 from .tuning import schedule_for
 
+_BUILDS = 4  # builds whose buffers are kept: a page or a comparison has a few shapes at most
 _SOLID = 0.5  # alpha from which a pixel belongs to a surface
 PRECISIONS: dict[str, Real] = {"float32": "float", "float64": "double"}
 
@@ -205,9 +206,13 @@ class Renderer:
             antialiased=splats.antialiased,
             low_pass=splats.low_pass,
         ).for_rendering()
-        if kernels not in self._pipelines:
-            self._pipelines[kernels] = Pipeline(self.device, kernels)
-        return self._pipelines[kernels]
+        found = self._pipelines.pop(kernels, None)
+        if found is None:
+            while len(self._pipelines) >= _BUILDS:
+                self._pipelines.pop(next(iter(self._pipelines)))
+            found = Pipeline(self.device, kernels)
+        self._pipelines[kernels] = found  # the last one is the one used last
+        return found
 
     def _upload(self, splats: Splats, pipeline: Pipeline) -> SplatBuffers:
         """Return the splats on the device. Splats are immutable, so one object is copied once."""

@@ -168,8 +168,12 @@ def _key(device: Device) -> str:
 def _digest() -> str:
     """A digest of everything that the self-test depends on: all kernels, and the stored numbers."""
     folders = (folder for folder in importlib.resources.files("clsplat_cl").iterdir() if folder.is_dir())
-    kernels = (file for folder in folders for file in folder.iterdir() if file.name.endswith((".cl", ".clh")))
-    texts = {file.name: file.read_bytes() for file in kernels} | {NUMBERS.name: NUMBERS.read_bytes()}
+    texts = {NUMBERS.name: NUMBERS.read_bytes()} | {
+        f"{folder.name}/{file.name}": file.read_bytes()
+        for folder in folders
+        for file in folder.iterdir()
+        if file.name.endswith((".cl", ".clh"))
+    }
     return hashlib.sha256(b"\0".join(texts[name] for name in sorted(texts))).hexdigest()[:12]
 
 
@@ -182,7 +186,14 @@ def _read_cache() -> dict[str, str]:
         values = json.loads(_cache_path().read_text(encoding="utf-8"))
     except (OSError, ValueError, RuntimeError):
         return {}
-    return {k: v for k, v in values.items() if isinstance(v, str)} if isinstance(values, dict) else {}
+    return {k: v for k, v in values.items() if _is_schedule(v)} if isinstance(values, dict) else {}
+
+
+def _is_schedule(value: object) -> bool:
+    try:
+        return isinstance(value, str) and bool(Schedule.parse(value))
+    except DeviceError:
+        return False
 
 
 def _write_cache(key: str, schedule: str) -> None:

@@ -13,11 +13,11 @@ import numpy as np
 
 from ..cameras.cameras_json import NamedCamera
 from ..cameras.path import DEFAULT_FPS
-from ..errors import InputError
+from ..errors import check_choice
 from ..splats.color import BLACK, Color
 from ..splats.splats import Splats
 from .colormaps import depth_range
-from .outputs import EXTRAS, ImageWriter, VideoFiles, extra_video, image_file, output_stems
+from .outputs import EXTRAS, FORMATS, ImageWriter, VideoFiles, extra_video, image_file, output_stems
 from .renderer import RendersSplats
 
 _QUARTILES = (0.25, 0.75)  # quantiles over the frames of the near and of the far end
@@ -51,9 +51,9 @@ class RenderOutput:
     fps: float | None = None
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.extras if name not in EXTRAS]
-        if unknown:
-            raise InputError(f"extras {unknown[0]!r}: choose from {', '.join(EXTRAS)}")
+        check_choice("format", self.format, FORMATS)
+        for extra in self.extras:
+            check_choice("extras", extra, EXTRAS)
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class RenderedViews:
     Attributes
     ----------
     render_ms : median wall time of a render after the first [ms].
-    depth_scales : by the name of a grey depth PNG, the depth of its brightest value, 65535 [world units].
+    depth_scales : by the path of a grey depth PNG within the folder, the depth of its brightest value, 65535 [world
+        units].
     """
 
     render_ms: float

@@ -17,7 +17,8 @@ from ..errors import InputError, reason_of
 from ..splats.quaternions import rotations
 from .colmap_binary import check_binary_model, count_registered
 from .colmap_copies import complete_model, without_observations
-from .colmap_folder import colmap_folder, model_suffix
+from .colmap_faults import image_fault, text_fault
+from .colmap_folder import colmap_folder, model_suffix, models_in
 from .colmap_text import names_with_spaces
 from .scene_files import OTHER_KINDS
 from .undistort import RegisteredImage, colmap_library
@@ -65,7 +66,7 @@ def find_model(scene: Path) -> Path:
     """
     if not scene.is_dir():
         raise InputError(f"{scene}: no such folder; give a folder with images/ and sparse/, or {OTHER_KINDS}")
-    sparse = colmap_folder(scene)
+    sparse = colmap_folder(scene) or (scene if model_suffix(scene) else None)
     if sparse is None:
         raise InputError(
             f"{scene}: no folder 'sparse'; a scene needs a COLMAP model in sparse/0 (clsplat reconstruct makes one of "
@@ -73,8 +74,7 @@ def find_model(scene: Path) -> Path:
         )
     if sparse == scene:
         return scene
-    candidates = [sparse, *sorted(folder for folder in sparse.iterdir() if folder.is_dir())]
-    models = [folder for folder in candidates if model_suffix(folder)]
+    models = models_in(sparse)
     if not models:
         raise InputError(
             f"{sparse}: no COLMAP model (cameras and images, .bin or .txt) in this folder or below; "
@@ -132,6 +132,8 @@ def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str], dict[int, set[i
         raise InputError(f"{folder}: cameras or images file is missing (.bin or .txt)")
     if suffix == ".bin":
         check_binary_model(folder)
+    elif (fault := image_fault(folder / f"images{suffix}")) is not None:
+        raise InputError(fault)
     pycolmap = colmap_library()
     tracks: dict[int, set[int]] = {}
     try:
@@ -153,6 +155,8 @@ def _opened(folder: Path) -> Iterator[tuple[Any, dict[int, str], dict[int, set[i
                 )
             yield reconstruction, names_with_spaces(whole / "images.txt") if suffix == ".txt" else {}, tracks
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError) as error:
+        if suffix == ".txt" and (fault := text_fault(folder)) is not None:
+            raise InputError(fault) from None
         raise InputError(
             f"{folder}: COLMAP cannot read the model ({reason_of(error)}); the files are "
             "damaged or do not belong together: copy or rebuild them"

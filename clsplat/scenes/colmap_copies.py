@@ -17,15 +17,18 @@ from .colmap_text import text_without_observations, with_observation_lines
 def complete_model(folder: Path, suffix: str) -> Iterator[Path]:
     """Yield a model's folder, or a copy that pycolmap reads.
 
-    pycolmap refuses a model without points3D, and text that begins with a byte order mark. It reads every
-    second image of an images.txt with one line for each image. The copy has an empty file of points, no mark, and two
-    lines for each image. Pipes are left out, because opening one would wait for ever.
+    pycolmap refuses a model without points3D, frames without rigs, and text that begins with a byte order mark. It
+    reads every second image of an images.txt with one line for each image. The copy has an empty file of points, no
+    such frames (images have poses of their own), no mark, and two lines for each image. Pipes are left out, because
+    opening one would wait for ever.
     """
-    files = [file for file in folder.glob(f"*{suffix}") if file.is_file()]
+    files = found = [file for file in folder.glob(f"*{suffix}") if file.is_file()]
+    if not (folder / f"rigs{suffix}").is_file():
+        files = [file for file in found if file.stem != "frames"]
     images, points = (folder / f"{stem}{suffix}" for stem in FILES[1:])
     marked = suffix == ".txt" and any(map(_is_marked, files))
     lines = with_observation_lines(images) if suffix == ".txt" else None
-    if points in files and not marked and lines is None:
+    if points in files and files == found and not marked and lines is None:
         yield folder
         return
     with tempfile.TemporaryDirectory() as temporary:

@@ -1,4 +1,4 @@
-"""Where a scene has its COLMAP model: in `sparse`, or beside its photos, where RealityScan writes it."""
+"""Where a scene has its COLMAP model: in `sparse`, beside its photos (RealityScan), or in a folder of another name."""
 
 from __future__ import annotations
 
@@ -8,17 +8,33 @@ from ..files.image_names import IMAGE_SUFFIXES
 
 FILES = ("cameras", "images", "points3D")
 PHOTOS = "images"  # folder of a scene's photos
+_OTHER_FOLDERS = ("colmap/sparse", "colmap_sparse", "colmap_text")  # of nerfstudio and of instant-ngp
 
 
 def colmap_folder(scene: Path) -> Path | None:
     """Return the folder in which a scene has its COLMAP model or models; None without one.
 
-    This is `sparse`. Without it, it is the scene's own folder, if that holds a model and photos.
+    This is `sparse`. Without it, it is the scene's own folder or one of _OTHER_FOLDERS, if that holds a model, and the
+    scene's folder holds photos.
     """
     sparse = scene / "sparse"
     if sparse.is_dir():
         return sparse
-    return scene if model_suffix(scene) and _has_photos(scene) else None
+    if model_suffix(scene):
+        return scene if _has_photos(scene) else None
+    found = next((scene / name for name in _OTHER_FOLDERS if models_in(scene / name)), None)
+    return found if found is not None and _has_photos(scene) else None
+
+
+def models_in(folder: Path) -> list[Path]:
+    """Return the folders with a model, of a folder and its subfolders."""
+    if not folder.is_dir():
+        return []
+    try:
+        places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
+    except OSError:
+        return []
+    return [place for place in places if model_suffix(place)]
 
 
 def model_suffix(folder: Path) -> str:

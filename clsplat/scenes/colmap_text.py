@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-_WORDS_BEFORE_NAME = 9  # words before the name in a line of images.txt
-_POINT_WORDS = 8  # words before the track in a line of points3D.txt
+POSE_WORDS = 10  # words of a line of images.txt with a pose; the last one is the name
+POINT_WORDS = 8  # words before the track in a line of points3D.txt
 _LONGEST_POSE = 5000  # characters; longer lines are observations
 
 
@@ -56,8 +56,8 @@ def names_with_spaces(images: Path) -> dict[int, str]:
     """
     names = {}
     for image in read_image_lines(images, "replace"):
-        words = image.pose.split(maxsplit=_WORDS_BEFORE_NAME)
-        if len(words) > _WORDS_BEFORE_NAME and words[0].isdecimal() and len(words[-1].split()) > 1:
+        words = image.pose.split(maxsplit=POSE_WORDS - 1)
+        if len(words) == POSE_WORDS and words[0].isdecimal() and len(words[-1].split()) > 1:
             names[int(words[0])] = words[-1]
     return names
 
@@ -69,8 +69,8 @@ def text_without_observations(images: Path, points: Path) -> tuple[bytes, bytes,
         for line in lines:
             words = line.split()
             if words and not words[0].startswith("#"):
-                bare.append(" ".join(words[:_POINT_WORDS]))
-                tracks[int(words[0])] = [int(word) for word in words[_POINT_WORDS::2]]
+                bare.append(" ".join(words[:POINT_WORDS]))
+                tracks[int(words[0])] = [int(word) for word in words[POINT_WORDS::2]]
     named = "".join(f"{image.pose}\n\n" for image in read_image_lines(images, "surrogateescape"))
     return named.encode("utf-8", "surrogateescape"), "\n".join(bare).encode(), tracks
 
@@ -80,10 +80,11 @@ def _is_observations(line: str) -> bool:
     if len(line) > _LONGEST_POSE:
         return True
     words = line.split()
-    return len(words) % 3 == 0 and all(map(_is_number, words))
+    return len(words) % 3 == 0 and all(map(is_number, words))
 
 
-def _is_number(word: str) -> bool:
+def is_number(word: str) -> bool:
+    """Return whether a word of a text model is a number."""
     try:
         float(word)
     except ValueError:

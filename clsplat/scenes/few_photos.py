@@ -26,11 +26,10 @@ def few_photos(scene: Scene, count: int) -> Scene:
     ------
     InputError : the scene has fewer training views, or the count is not positive.
     """
-    if not 1 <= count <= len(scene.train):
-        raise InputError(
-            f"{scene.path}: {count} photos, but it has {len(scene.train)} training views: choose 1 to that"
-        )
-    steps = np.linspace(0, len(scene.train) - 1, count).round().astype(int)
+    n = len(scene.train)
+    if not 1 <= count <= n:
+        raise InputError(f"{scene.path}: {count} photos, but it has {n} training views: choose 1 to {n}")
+    steps = np.linspace(0, n - 1, count).round().astype(int)
     chosen = {scene.train[step].name for step in steps}
     views = [view for view in scene.views if view.name in chosen | scene.test_names]
     return replace(scene, views=views, points=_points(scene, chosen), validation_names=frozenset())

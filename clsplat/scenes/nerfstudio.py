@@ -3,7 +3,8 @@
 A frame has a `file_path` and a `transform_matrix`, camera-to-world with OpenGL's axes (x right, y up, z backwards).
 Lens keys are in the frame, or beside the list of frames for all of them: `w`, `h`, `fl_x`, `fl_y`, `cx`, `cy` [px],
 `k1` ... `k4`, `p1`, `p2`, `camera_model` and `is_fisheye`. The angles of view `camera_angle_x` and `camera_angle_y`
-[rad] can replace focal lengths.
+[rad], or `x_fov` and `y_fov` [degrees], can replace focal lengths. So can a matrix, `intrinsic_matrix` or `K`. Poses of
+NeuS2, with `from_na`, have OpenCV's axes (y down, z forwards).
 
 The world is that of the poses, which include nerfstudio's `applied_transform` and `applied_scale`. Points are moved by
 these two only if they come from the COLMAP model behind the poses.
@@ -11,10 +12,9 @@ these two only if they come from the COLMAP model behind the poses.
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -33,17 +33,15 @@ from ..files.masks import is_same_file
 from .colmap import Points, read_model
 from .colmap_folder import PHOTOS
 from .photo_names import is_absolute, last_parts
-from .photo_size import MAX_SIDE
 from .point_cloud import join_points, read_point_cloud
 from .posed_images import PosedImages, read_sizes
-from .undistort import Lens, RegisteredImage, brown_lens, make_lens
+from .reduced_photos import with_reduced_photos
+from .transforms_lens import FrameLens
+from .undistort import Lens, RegisteredImage
 
-_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
-_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _LAST_ROW = 1e-6  # largest error of the last row of a pose
 _HELD_OUT = "test_frames"  # of ScanNet++, beside the list `frames`
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # of nerfstudio's `distortion_params`, in its order
-_NO_PINHOLE = ("latlong", "equirectangular", "orthographic", "ftheta_p0")  # lenses of instant-ngp
+_OPENCV_AXES = "from_na"  # of NeuS2: poses have y down and z forwards
 _LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists of photos
 _COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0")  # where nerfstudio and COLMAP put a COLMAP model
 _SUFFIXES = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
@@ -73,9 +71,10 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
         if frame.name in photos:
             raise InputError(f"{frame.place}: {frame.name!r} has a frame already; remove one")
         photos[frame.name] = frame
+    _warn_of_motion(documents[0].path, frames)
     used = set().union(*(document.listed_frames(photos) for document in documents))
     listed = {name: frame for name, frame in sorted(photos.items()) if name in used}
-    photo_files = {name: frame.file for name, frame in listed.items()}
+    photo_files = with_reduced_photos(files[0].parent, {name: frame.file for name, frame in listed.items()})
     sizes, left_out = read_sizes(photo_files)
     bad = {name: frame for name, frame in listed.items() if frame.values.get("is_bad") is True}  # of ScanNet++
     for name in [name for name in sizes if listed[name].is_lost]:
@@ -98,6 +97,16 @@ def read_transforms(files: list[Path], images: str | None = None) -> PosedImages
         left_out,
         unused=frozenset(bad),
     )
+
+
+def _warn_of_motion(path: Path, frames: Iterable[_Frame]) -> None:
+    """Warn if the frames are of different times, as those of D-NeRF."""
+    times = {time for time in (to_real(frame.values.get("time")) for frame in frames) if time is not None}
+    if len(times) > 1:
+        warnings.warn(
+            f"{path}: its frames have different times (time); what moves will be blurred: a model does not move",
+            stacklevel=4,
+        )
 
 
 def _with_suffix(file: Path) -> Path | None:
@@ -188,87 +197,13 @@ class _Frame:
         """Return the world-to-camera matrix, (4, 4), with OpenCV's axes."""
         pose = self.matrix.copy()
         pose[:3, :3] = self.rotation.matrix
+        if self.values.get(_OPENCV_AXES, self.document.values.get(_OPENCV_AXES)):
+            pose[:3, 1:3] *= -1.0
         return cam_from_world_of(pose)
 
     def lens(self, size: tuple[int, int]) -> Lens:
         """Return the lens, with the size in the file, or else the photo's size."""
-        width, height = int(self.number("w", size[0])), int(self.number("h", size[1]))
-        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-            raise InputError(f"{self.place}: w x h is {width} x {height}; both must be 1 to {MAX_SIDE}")
-        # An angle of the frame itself counts more than focal lengths of all frames.
-        known = self.values if "camera_angle_x" in self.values else self.document.values | self.values
-        fx = self.focal(known, "fl_x", "camera_angle_x", width)
-        fy = self.focal(known, "fl_y", "camera_angle_y", height, fx)
-        if fx is None or fy is None:
-            raise InputError(f"{self.place}: has neither fl_x nor camera_angle_x; add the focal length")
-        core = [fx, fy, self.number("cx", width / 2), self.number("cy", height / 2)]
-        k1, k2, k3, k4, p1, p2 = self.distortion()
-        model = str(self.value("camera_model") or "OPENCV").upper()
-        if model in _FISHEYE or self.value("is_fisheye"):
-            return make_lens("OPENCV_FISHEYE", width, height, [*core, k1, k2, k3, k4])
-        if model not in _PERSPECTIVE:
-            raise InputError(
-                f"{self.place}: camera_model {model!r} has no pinhole image; make perspective views "
-                f"first, or use one of {', '.join((*_PERSPECTIVE[:2], _FISHEYE[0]))}"
-            )
-        for key, value in (("k4", k4), *((key, self.number(key, 0.0)) for key in ("k5", "k6"))):
-            if value:
-                raise InputError(
-                    f"{self.place}: {key} of a perspective lens is not supported; undistort the photos first"
-                )
-        for key in _NO_PINHOLE:
-            if self.value(key):
-                raise InputError(f"{self.place}: {key} has no pinhole image; make perspective views first")
-        return brown_lens(width, height, core, (k1, k2, k3), (p1, p2))
-
-    def distortion(self) -> list[float]:
-        """Return k1, k2, k3, k4, p1 and p2, from nerfstudio's list of them or from keys of their own."""
-        listed = self.value("distortion_params")
-        if listed is None:
-            return [self.number(key, 0.0) for key in _DISTORTION]
-        known = [to_real(value) for value in listed] if isinstance(listed, list) else []
-        sound = [value for value in known if value is not None and abs(value) < MAX_NUMBER]
-        if not len(known) == len(sound) == len(_DISTORTION):
-            raise InputError(
-                f"{self.place}: distortion_params is {str(listed)[:40]!r}; it must be the numbers "
-                f"{', '.join(_DISTORTION)}"
-            )
-        return sound
-
-    def focal(
-        self, known: Mapping[str, Any], key: str, angle: str, size: int, default: float | None = None
-    ) -> float | None:
-        """Return the focal length [px] at `key`, or from the angle of view at `angle`, or the default.
-
-        known : the values that may have them.
-        """
-        if known.get(key) is not None:
-            return self.positive(key)
-        if known.get(angle) is None:
-            return default
-        field_of_view = self.positive(angle)
-        if field_of_view >= math.pi:
-            raise InputError(f"{self.place}: {angle} is {field_of_view:g}; an angle of view is below pi")
-        return 0.5 * size / math.tan(0.5 * field_of_view)
-
-    def positive(self, key: str) -> float:
-        value = self.number(key, 0.0)
-        if value <= 0:
-            raise InputError(f"{self.place}: {key} is {value:g}; it must be above 0")
-        return value
-
-    def number(self, key: str, default: float) -> float:
-        value = self.value(key)
-        if value is None:
-            return default
-        real = to_real(value)
-        if real is None or not abs(real) < MAX_NUMBER:
-            raise InputError(f"{self.place}: {key} is {str(value)[:40]!r}; it must be a number")
-        return real
-
-    def value(self, key: str) -> Any:
-        """Return the frame's value of `key`, or else the value for all frames."""
-        return self.values.get(key, self.document.values.get(key))
+        return FrameLens(self.place, self.values, self.document.values).read(size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,39 +222,50 @@ class _Document:
             or not (frames or may_be_empty)
             or not isinstance(values.get(_HELD_OUT, []), list)
         ):
+            if isinstance(values, list) and values and isinstance(values[0], dict) and "position" in values[0]:
+                raise InputError(f"{path}: has the cameras of a model, without a scene; give the scene's folder")
             raise InputError(f"{path}: has no list 'frames'; give a transforms.json of NeRF, instant-ngp or nerfstudio")
         return _Document(path, values)
 
     def frames(self, images: str | None) -> Iterator[_Frame]:
         """Yield all frames, including frames without an existing photo."""
+        without = 0
         for held_out, key in ((False, "frames"), (True, _HELD_OUT)):
             for number, values in enumerate(self.values.get(key) or []):
+                if isinstance(values, dict) and "file_path" in values and values["file_path"] is None:
+                    without += 1  # other programs write poses to render so
+                    continue
                 place = f"{self.path}: {'test frame' if held_out else 'frame'} {number}"
                 path = values.get("file_path") if isinstance(values, dict) else None
                 if not isinstance(path, str) or not path:
                     raise InputError(f"{place}: has no file_path; name its photo")
                 file = self.photo_file(path, images)
                 yield _Frame(self, place, values, self.name_of(file), file, held_out)
+        if without:
+            warnings.warn(
+                f"{self.path}: {without} frames have no photo (file_path null); they are left out", stacklevel=4
+            )
 
     def photo_file(self, file_path: str, images: str | None = None) -> Path:
         """Return the photo's file; Blender sets omit the suffix. Raises InputError if no file can have the name."""
         if not can_be_file(file_path):
             raise InputError(f"{self.path}: {ascii(file_path)[:60]} is not the name of a photo; name a file beside it")
-        if is_absolute(file_path):
-            places = self._places(file_path, images)
-        else:
-            parts = Path(file_path.replace("\\", "/")).parts
-            places = [self.path.parent.joinpath(*parts if images is None else (images, *(parts[1:] or parts)))]
+        places = self._places(file_path, images)
         files = [_with_suffix(place) for place in places]
         found = next((file for file in files if file is not None and file.is_file()), None)
         return found or files[0] or places[0].with_name(places[0].name + _SUFFIXES[0])
 
     def _places(self, file_path: str, images: str | None) -> list[Path]:
-        """Return where the photo of an absolute path may be, which may be one of another computer."""
+        """Return where a photo may be. Its path may be one of another computer, or begin in another folder."""
         home, parts = self.path.parent, last_parts(file_path)
+        if is_absolute(file_path):
+            first = [] if images is not None else [Path(file_path)]
+        else:
+            relative = Path(file_path.replace("\\", "/")).parts
+            first = [home.joinpath(*relative if images is None else (images, *(relative[1:] or relative)))]
         if images is not None:
-            return [home / images / part for part in reversed(parts)]
-        return [Path(file_path), *(folder / part for folder in (home, home / PHOTOS) for part in parts)]
+            return [*first, *(home / images / part for part in reversed(parts))]
+        return [*first, *(folder / part for folder in (home, home / PHOTOS) for part in parts)]
 
     def name_of(self, file: Path) -> str:
         """Return a photo's name: its path below the scene's folder with `/` between folders, or else its file name."""
@@ -363,6 +309,10 @@ class _Document:
             if not ply.isprintable() or not can_be_file(ply):
                 raise InputError(
                     f"{self.path}: ply_file_path {ply!r} is not the name of a file; name a PLY, or remove it"
+                )
+            if not (folder / ply).is_file():
+                raise InputError(
+                    f"{self.path}: ply_file_path {ply!r} is not a file: copy the points there, or remove the key"
                 )
             return read_point_cloud(folder / ply)
         if (folder / "points3d.ply").is_file():

@@ -11,4 +11,5 @@ READING_OPTIONS = ("images", "resolution", "masks", "alpha", "test_every", "test
 BEFORE: Mapping[str, Any] = {"alpha": ALPHA_USES[0], "bars": [0.0, 0.0, 0.0, 0.0]}
 TEST_EVERY = 8  # every 8th view of the sorted names is a test view (Barron et al. 2022), as in 3DGS
 ORIGIN = (0.0, 0.0, 0.0)  # of the coordinates of a scene's files
+VIEW_SETS = ("test", "train", "validation", "all")  # sets of views that commands render or measure
 CAMERA_FORMATS = ("transforms", "colmap", "colmap-text", "cameras")  # formats that `clsplat cameras` writes

@@ -12,7 +12,7 @@ from ..files.image_names import bare_name
 from ..files.images import is_render
 from ..files.json_file import read_json
 from ..files.masks import BESIDE, MASK_FOLDER
-from .colmap_folder import colmap_folder, model_suffix
+from .colmap_folder import colmap_folder, models_in
 from .reconstruct.options import RECORD
 from .scene_files import find_scene_files
 
@@ -86,12 +86,8 @@ def is_posed(folder: Path) -> bool:
     """Return whether a folder holds poses: a COLMAP model, or files that describe cameras."""
     if find_scene_files(folder):
         return True
-    sparse = folder / "sparse"
-    try:
-        places = [sparse, *sparse.iterdir()] if sparse.is_dir() else []
-    except OSError:
-        return False
-    return colmap_folder(folder) == folder or any(model_suffix(place) for place in places)
+    found = colmap_folder(folder)
+    return found is not None and bool(models_in(found))
 
 
 def _is_made_scene(folder: Path) -> bool:

@@ -23,6 +23,7 @@ _MAX_POSITION = 1e12  # training in float32 breaks between this and 1e15
 _TOO_FAR = 1e6  # sizes of the scene from the origin: steps of float32 are a twentieth of the scene there
 _DIGITS = 9  # poses that agree to these decimals count as equal
 _LEAST_FOCAL = 1e-3  # of the side of an image: an angle of view of 179.9 degrees
+_UNEVEN = 2.0  # largest ratio of the focal lengths of a photo that goes without a warning
 _SEEN_SHARE = 0.01  # of the points that some image must show
 _SHRUNK, _GROWN = 0.21, 1.99  # COLMAP's undistortion scales a side by 0.2 to 2; such sides are at the limits
 
@@ -136,14 +137,14 @@ def check_lenses(root: Path, posed: PosedImages) -> None:
 
     Warns
     -----
-    UserWarning : a lens distorts more than undistortion can follow.
+    UserWarning : a lens distorts more than undistortion can follow, or its focal lengths are far from each other.
 
     Raises
     ------
     InputError : a focal length is below a thousandth of its side, or as `RegisteredImage.fit`.
     """
     scales: dict[tuple[object, ...], tuple[float, float]] = {}
-    strange = []
+    strange, uneven = [], []
     for photo in posed.photos:
         lens, (width, height) = photo.lens, posed.sizes[photo.name]
         key = (lens.model, lens.width, lens.height, *lens.params, width, height)
@@ -155,8 +156,17 @@ def check_lenses(root: Path, posed: PosedImages) -> None:
                     f"for an image of {camera.width}x{camera.height} px; correct its lens"
                 )
             scales[key] = camera.width / width, camera.height / height
+            if not 1 / _UNEVEN < camera.fx / camera.fy < _UNEVEN:
+                uneven.append((photo, camera))
         if min(scales[key]) <= _SHRUNK or min(scales[key]) >= _GROWN:
             strange.append((photo, width, height, scales[key]))
+    if uneven:
+        photo, camera = uneven[0]
+        warnings.warn(
+            f"{root}: the focal lengths of {photo.name!r} are {camera.fx:g} and {camera.fy:g} px; pixels are seldom so "
+            "far from square. Check its lens",
+            stacklevel=3,
+        )
     if strange:
         photo, width, height, (across, down) = strange[0]
         values = ", ".join(f"{value:g}" for value in photo.lens.params)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..cameras.camera import Camera
-from ..errors import InputError
+from ..errors import InputError, check_choice
 from ..files.digest import file_digest
 from ..files.images import ImageU8
 from ..files.masks import MASK_FOLDER, NO_MASKS, mask_files, masks_beside
@@ -22,7 +22,7 @@ from ..files.whole_file import read_whole
 from ..splats.color import BLACK, Color
 from .bars import NO_BARS, checked_bars, commonest_size
 from .colmap import Points
-from .colmap_folder import colmap_folder
+from .colmap_folder import colmap_folder, model_suffix
 from .described import read_described
 from .extent import extent_of
 from .options import ALPHA_USES, ORIGIN, TEST_EVERY
@@ -40,7 +40,7 @@ from .read_view import PhotoReader, read_views
 from .scene_files import SCENE_ENDINGS, described_by
 from .view import View
 from .without_data import bars_of, use_of_alpha
-from .wrong_folder import describe_file, scene_hint
+from .wrong_folder import describe_file, of_other_program, scene_hint
 
 __all__ = ["Points", "Scene", "View", "load_scene"]
 
@@ -176,8 +176,8 @@ def load_scene(
         Fewer than a quarter of the photos can be used, no training view is left, or memory is too small.
     """
     root = Path(path)
-    if alpha is not None and alpha not in ALPHA_USES:
-        raise InputError(f"alpha {alpha!r}: choose one of {', '.join(ALPHA_USES)}")
+    if alpha is not None:
+        check_choice("alpha", alpha, ALPHA_USES)
     check_resolution(resolution)
     posed = read_posed_images(root, images, origin)
     check_lenses(root, posed)
@@ -309,11 +309,11 @@ def find_masks(root: Path, posed: PosedImages, folder: str | None) -> dict[str, 
 
 def read_posed_images(root: Path, images: str | None, origin: Sequence[float] | None = None) -> PosedImages:
     """Read a scene's photos with poses, without decoding them; parameters and errors as `load_scene`."""
-    if root.is_file() and root.suffix.lower() not in SCENE_ENDINGS:
+    if root.is_file() and (root.suffix.lower() not in SCENE_ENDINGS or of_other_program(root)):
         raise InputError(f"{root}: {describe_file(root)}")
     if files := described_by(root):
         posed = read_described(files, images)
-    elif root.is_dir() and colmap_folder(root) is None and (hint := scene_hint(root)) is not None:
+    elif root.is_dir() and _needs_hint(root, images) and (hint := scene_hint(root)) is not None:
         raise InputError(hint)
     else:
         posed = read_colmap(root, images)
@@ -322,6 +322,11 @@ def read_posed_images(root: Path, images: str | None, origin: Sequence[float] | 
     posed = near_origin(root, posed, size, origin)
     check_poses(root, posed, size)
     return replace(posed, points=without_far_points(root, posed.points))
+
+
+def _needs_hint(root: Path, images: str | None) -> bool:
+    """Return whether a folder cannot be read as a scene. A model alone is one if its folder of photos is named."""
+    return colmap_folder(root) is None and not (images is not None and model_suffix(root))
 
 
 def select_test_names(posed: PosedImages, test_every: int, test_list: str | os.PathLike[str] | None) -> frozenset[str]:

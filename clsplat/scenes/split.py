@@ -21,8 +21,8 @@ def hold_out(scene: Scene) -> Scene:
     ------
     InputError : the scene has fewer than three training views.
     """
-    views = scene.train
-    return replace(scene, views=views, test_names=_every_few(scene), validation_names=frozenset())
+    test_names = _every_few(scene, Remedy("choose the number of splats yourself", "--cap-max"))
+    return replace(scene, views=scene.train, test_names=test_names, validation_names=frozenset())
 
 
 def with_validation(scene: Scene) -> Scene:
@@ -32,17 +32,17 @@ def with_validation(scene: Scene) -> Scene:
     ------
     InputError : the scene has fewer than three training views.
     """
-    return replace(scene, validation_names=_every_few(scene))
+    return replace(scene, validation_names=_every_few(scene, Remedy("train without validation views")))
 
 
-def _every_few(scene: Scene) -> frozenset[str]:
-    """Return the names of the training views that are held out."""
+def _every_few(scene: Scene, without: Remedy) -> frozenset[str]:
+    """Return the names of the training views that are held out. without : what to do if they are too few."""
     views = scene.train
     if len(views) < MIN_TRAIN_VIEWS:
         raise InputError(
             f"{scene.path}: has {len(views)} training views; at least {MIN_TRAIN_VIEWS} are needed to hold one out",
             Remedy("add photos"),
-            Remedy("choose the number of splats yourself", "--cap-max"),
+            without,
         )
     stride = max(2, min(STRIDE, len(views) // MIN_TRAIN_VIEWS))
     return frozenset(view.name for view in views[stride // 2 :: stride])

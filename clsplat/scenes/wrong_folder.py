@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ..errors import InputError
@@ -12,15 +12,26 @@ from ..files.image_names import IMAGE_SUFFIXES
 from ..files.real_path import real_path
 from ..splats.formats.any_file import READ_ENDINGS
 from .colmap import find_model, read_model
-from .colmap_folder import PHOTOS
+from .colmap_folder import FILES as COLMAP_FILES
+from .colmap_folder import PHOTOS, model_suffix
 from .described import read_described
 from .photo_listing import is_posed
 from .scene_files import OTHER_KINDS, described_by
 
+_PHOTO_FOLDERS = (PHOTOS, "input")  # of scenes, and of 3DGS's convert.py
 _LEVELS_UP = 3  # a model's files are two folders below the scene, and photos may be in a subfolder of `images`
 _LEVELS_DOWN = 2
 _MAX_FOLDERS = 2000  # largest number of folders to look into
 _MAX_NAMED = 5
+_TO_COLMAP = "export it as a COLMAP model"
+_OTHER_PROGRAMS = {  # by name or ending: whose reconstructions these are, and what a user can do
+    "sfm_data.json": f"OpenMVG; {_TO_COLMAP} (openMVG_main_openMVG2Colmap)",
+    "reconstruction.json": f"OpenSfM; {_TO_COLMAP} (opensfm export_colmap)",
+    "poses_bounds.npy": "LLFF; give its COLMAP model, or find the poses again with clsplat reconstruct",
+    "bundle.out": f"Bundler; {_TO_COLMAP}",
+    "*.sfm": f"AliceVision; {_TO_COLMAP}",
+    "*.nvm": f"VisualSFM; {_TO_COLMAP}",
+}
 _MODEL_SUFFIXES = (*READ_ENDINGS, ".ksplat")
 
 
@@ -41,17 +52,57 @@ def describe_scenes(path: Path, scenes: Sequence[str]) -> str:
 
 
 def _photos_above(path: Path, scene: str) -> str:
-    """Return words on the photos of a COLMAP model in a subfolder, if they lie beside that folder: its `images`."""
-    sub = path / scene
-    if described_by(sub) or (sub / PHOTOS).is_dir() or not (path / PHOTOS).is_dir():
+    """Return words on the photos of a COLMAP model in a subfolder, if they lie beside that folder."""
+    sub, photos = path / scene, _photo_folders(path)
+    if described_by(sub) or (sub / PHOTOS).is_dir() or not photos:
         return ""
     up = "/".join([".."] * len(Path(scene).parts))
-    return f", and its folder of photos: {up}/{PHOTOS}"
+    return f", and its folder of photos: {up}/{photos[0]}"
+
+
+def model_below(path: Path) -> str | None:
+    """Return a message on a COLMAP model in a subfolder of a folder of photos; None without one."""
+    for folder in _folders_below(path):
+        alone = is_posed(folder) and not described_by(folder) and not (folder / PHOTOS).is_dir()
+        if model_suffix(folder) or alone:
+            place = folder.relative_to(path)
+            photos = "/".join([".."] * len(place.parts) + _photo_folders(path)[:1])
+            return (
+                f"{path}: has a COLMAP model in {place.as_posix()}: give {folder}, and its folder of photos: {photos}"
+            )
+    return None
+
+
+def _photo_folders(path: Path) -> list[str]:
+    """Return the names of a folder's folders of photos."""
+    return [name for name in _PHOTO_FOLDERS if (path / name).is_dir()]
+
+
+def other_poses(path: Path) -> str | None:
+    """Return a message on the reconstruction of another program in a folder of photos; None without one."""
+    for folder in (path, *_folders_below(path)):
+        for file in sorted(folder.glob("*.*")):
+            if of_other_program(file):
+                return f"{file}: {describe_file(file)}"
+    return None
+
+
+def of_other_program(file: Path) -> bool:
+    """Return whether a file is the reconstruction of a program whose files are not read, by its name."""
+    return _program_of(file) is not None
+
+
+def _program_of(file: Path) -> str | None:
+    return _OTHER_PROGRAMS.get(file.name.lower()) or _OTHER_PROGRAMS.get(f"*{file.suffix.lower()}")
 
 
 def describe_file(file: Path) -> str:
     """Return what a user should give instead of a file that is not a scene."""
     kind = file.suffix.lower()
+    if file.stem in COLMAP_FILES and kind in (".bin", ".txt"):
+        return "is a file of a COLMAP model; give the folder of the scene"
+    if program := _program_of(file):
+        return f"is a reconstruction of {program}"
     if kind in IMAGE_SUFFIXES:
         return "is one photo; give the folder of the photos"
     if kind in _MODEL_SUFFIXES:
@@ -75,21 +126,22 @@ def scene_above(path: Path) -> Path | None:
 
 def scenes_below(path: Path) -> list[str]:
     """Return the scenes in the subfolders of a folder, as paths relative to it."""
-    found: list[str] = []
+    return [folder.relative_to(path).as_posix() for folder in _folders_below(path) if is_posed(folder)]
+
+
+def _folders_below(path: Path) -> Iterator[Path]:
+    """Yield the folders below a folder, some levels down, but none inside a scene."""
     looked = 0
     for folder, folders, _ in os.walk(path):
-        below = Path(folder).relative_to(path)
         kept = []
         for name in sorted(folders):
             looked += 1
             if name.startswith(".") or looked > _MAX_FOLDERS:
                 continue
-            if is_posed(Path(folder) / name):
-                found.append((below / name).as_posix())
-            else:
+            yield Path(folder) / name
+            if not is_posed(Path(folder) / name):
                 kept.append(name)
-        folders[:] = kept if len(below.parts) + 1 < _LEVELS_DOWN else []
-    return found
+        folders[:] = kept if len(Path(folder).relative_to(path).parts) + 1 < _LEVELS_DOWN else []
 
 
 def _has_photos_of(scene: Path, photos: Path, place: Path) -> bool:

@@ -1,6 +1,6 @@
 """Shape descriptors: the properties of each splat kernel in Python. The formulas are in cl/shape/*.clh.
 
-The skew has two forms (ARCHITECTURE.md). In the centred form (the "centred parameters" of Azzalini 1985), `skew` is m,
+The skew has two forms. In the centred form (the "centred parameters" of Azzalini 1985), `skew` is m,
 the vector from the location to the mean. Its unit is the splat's standard deviation, and |m| < sqrt(2 / (pi - 2)). In
 the direct form, `skew` is the slant eta, which has no unit.
 """

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..cameras.cameras_json import NamedCamera, named_cameras, write_cameras
-from ..errors import InputError, OutputError
+from ..errors import InputError, OutputError, Remedy
 from ..files.existing import probe
 from ..files.json_file import read_object, write_json
+from ..files.lock import folder_lock
 from ..files.real_path import real_path
 from ..splats.splats import Splats
 
@@ -112,6 +114,34 @@ class ModelFolder:
             raise InputError(f"{self.path}: no iteration {iteration}: it has {', '.join(map(str, found))}")
         chosen = found[-1] if iteration is None else iteration
         return self.ply_path(chosen), chosen
+
+    @contextmanager
+    def for_run(self, *, resume: bool, overwrite: bool) -> Iterator[None]:
+        """Keep the folder for one run while the block lasts. A new run must not replace a model unasked.
+
+        The folder is made if it is missing, except for `resume`: there the caller finds out that it has nothing.
+
+        Raises
+        ------
+        OutputError : the folder holds a model, another run writes into it, or it cannot be written.
+        """
+        if resume and not self.path.is_dir():
+            yield
+            return
+        self._refuse_model(resume or overwrite)
+        self.prepare()
+        with folder_lock(self.path):
+            self._refuse_model(resume or overwrite)  # another run may have ended since
+            yield
+
+    def _refuse_model(self, allowed: bool) -> None:
+        if self.is_used and not allowed:
+            raise OutputError(
+                f"{self.path}: already holds a model",
+                Remedy("replace it", "--overwrite"),
+                Remedy("continue it", "--resume"),
+                Remedy("choose another folder"),
+            )
 
     def prepare(self) -> None:
         """Make the folder; raise OutputError if it cannot be written."""

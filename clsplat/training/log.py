@@ -69,16 +69,16 @@ class RunLog:
                     continue  # a crash interrupted the writing of this line
         with atomic_writer(path) as stream:  # keeps the old file if the program crashes here
             stream.writelines(kept)
-        self._stream = self._guard(lambda: path.open("a", encoding="utf-8", newline="\n"))
 
     def write(self, values: dict[str, Any]) -> None:
+        """Append a line. The file is closed after each, so that nothing holds it if the run ends in any way."""
         if self.path is not None:
-            self._guard(lambda: self._stream.write(json.dumps(values) + "\n"))
-            self.flush()
+            self._guard(lambda: self._append(json.dumps(values) + "\n"))
 
-    def flush(self) -> None:
-        if self.path is not None:
-            self._guard(self._stream.flush)
+    def _append(self, line: str) -> None:
+        assert self.path is not None
+        with self.path.open("a", encoding="utf-8", newline="\n") as stream:
+            stream.write(line)
 
     def _guard(self, action: Callable[[], Any]) -> Any:
         try:

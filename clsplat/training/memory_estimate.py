@@ -99,7 +99,7 @@ def estimate(
     planes: float = _IMAGE_PLANES
     if config.views.depth_smoothness:  # a copy of the splats with depths as colours, its gradients, and its images
         extra += 2 * rows[Group.GEOM] + 3 + COMPACT_ROWS
-        screen, n_isects = 2 * screen, 2 * n_isects
+        screen, isect = 2 * screen, 2 * isect
         # The shorter side of an image of depths is below twice SMALLEST_SIDE, also while the photos are small.
         planes += _DEPTH_PLANES * min(2 * SMALLEST_SIDE / min(layout.width, layout.height), 1.0) ** 2
     widest = max(*rows.values(), kernels.record, kernels.v_record)  # of the buffers with a column for each splat

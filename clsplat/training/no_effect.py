@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from ..splats.shapes import shape_named
 from .config import TrainConfig
+from .density.strategy import relocation_rule
 from .initialise import names_model
 
 if TYPE_CHECKING:
@@ -44,6 +45,10 @@ def no_effect(config: TrainConfig, name: str, scene: Scene | None = None) -> str
         return f"with shape {config.shape}"
     if name == "normalisation" and not shape.normalised:
         return f"with shape {config.shape}"
+    if name == "relocation" and (rule := relocation_rule(config)) != values[name]:
+        return f"with normalisation {config.normalisation}, which needs {rule}"
+    if name in ("feature_rest_lr", "sh_interval") and config.sh_degree == 0:
+        return "with sh degree 0"
     if name in _OF_POINTS and names_model(config.start.init):
         return f"with splats of a file ({config.start.init})"
     if name.startswith("sghmc_") and values["position_optimizer"] == "adam":

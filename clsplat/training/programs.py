@@ -7,6 +7,7 @@ import numpy as np
 from ..device.device import Device
 from ..device.program import Define, Program, build
 from ..device.schedule import Schedule
+from ..evaluation.metrics import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_SIGMA
 from ..rendering.build import CULLED_KEY, MARGIN_X, MARGIN_Y, KernelBuild, layout_defines
 from ..rendering.splat_buffers import COMPACT_ROWS
 from ..splats.fields import Group, sh_coefficients
@@ -49,9 +50,10 @@ def loss_strip(kernels: KernelBuild) -> int:
 
 def loss_program(device: Device, kernels: KernelBuild) -> Program:
     """Return the program of L1, SSIM and their gradients. It depends on lanes and precision only."""
-    window = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    window = np.exp(-0.5 * (np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) / SSIM_SIGMA) ** 2)
     window /= window.sum()
-    defines: dict[str, Define] = {f"WINDOW_{i}": float(window[i]) for i in range(6)}
+    defines: dict[str, Define] = {f"WINDOW_{i}": float(window[i]) for i in range(SSIM_RADIUS + 1)}
+    defines |= {"SSIM_C1": SSIM_C1, "SSIM_C2": SSIM_C2}
     defines |= {"LANES": kernels.lanes, "STRIP": loss_strip(kernels), "MARGIN_X": MARGIN_X, "MARGIN_Y": MARGIN_Y}
     return build(device, ("math/lanes.clh", "train/loss.cl"), defines, kernels.real)
 

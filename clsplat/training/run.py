@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 from ..device.several import open_devices
 from ..device.specs import first_device
-from ..errors import InputError, OutputError
+from ..errors import InputError
 from ..evaluation.evaluate import Evaluation, evaluate
-from ..files.lock import folder_lock
 from ..rendering.renderer import Renderer
 from ..scenes.scene import Scene
 from ..splats.splats import Splats
@@ -66,20 +66,16 @@ def train(
         raise InputError(f"{scene}: train takes a scene, not its path: clsplat.load_scene reads it")
     config = config or TrainConfig()
     folder = None if output is None else ModelFolder(output)
-    checkpoint = None
-    if folder is not None:
-        if resume:
+    with nullcontext() if folder is None else folder.for_run(resume=resume, overwrite=overwrite):
+        checkpoint = None
+        if folder is not None and resume:
             checkpoint = fitting_checkpoint(folder, config)
             config = as_decided(config, TrainConfig.from_json(checkpoint.config).to_json())
-        elif folder.is_used and not overwrite:
-            raise OutputError(f"{folder.path}: already holds a model: use --overwrite, --resume or another folder")
-        folder.prepare()
-    if checkpoint is None:
-        config = decide(scene, config).tell(progress)
-        if progress is not None:
-            for hint in filter(None, (exposure_hint(scene, config), frame_hint(scene))):
-                progress(Progress.note(hint, config.iterations))
-    with folder_lock(None if folder is None else folder.path):
+        else:
+            config = decide(scene, config).tell(progress)
+            if progress is not None:
+                for hint in filter(None, (exposure_hint(scene, config), frame_hint(scene))):
+                    progress(Progress.note(hint, config.iterations))
         trainer = Trainer(scene, config, checkpoint, progress, context=context)
         if folder is not None:
             if checkpoint is None:

@@ -233,7 +233,7 @@ class Trainer:
                 if folder is not None and (it in config.output.save_iterations or ends):
                     self._save_model(folder)
                 if folder is not None and (ends or times.is_due(it)):
-                    self._save_checkpoint(folder, log)
+                    self._save_checkpoint(folder)
                     times.saved()
                 if visit is not None:
                     start = time.perf_counter()
@@ -241,7 +241,7 @@ class Trainer:
                     started += time.perf_counter() - start
             # The file is written inside the block, where a second SIGTERM or SIGHUP does not interrupt it.
             if folder is not None and self.iteration < config.iterations:
-                self._save_checkpoint(folder, log)
+                self._save_checkpoint(folder)
         if self.scene.validation and self.iteration == config.iterations:
             self._send(self.validation.summary(folder))
         return Model(
@@ -281,8 +281,7 @@ class Trainer:
             names = [view.name for view in self.scene.train]
             folder.write_exposures(exposures_json(names, self.exposure.exposures()))
 
-    def _save_checkpoint(self, folder: ModelFolder, log: RunLog) -> None:
-        log.flush()
+    def _save_checkpoint(self, folder: ModelFolder) -> None:
         self.checkpoint().save(folder.checkpoint_path)
 
     @property

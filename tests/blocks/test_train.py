@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -144,6 +146,46 @@ def test_an_unfinished_training_is_replaced_only_if_asked(scene: Scene, tmp_path
     with pytest.raises(OutputError, match="already holds a model"):
         train_budget(scene, CONFIG, output=tmp_path)
     assert (tmp_path / kind / "run").is_dir()
+
+
+@pytest.mark.parametrize("kind", ["run", "blocks", "budget"])
+def test_a_model_of_another_run_stays_that_ends_meanwhile(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """The folder is looked at under its lock, and the lock stays until the training ends."""
+    fcntl = pytest.importorskip("fcntl")
+    folder, free = tmp_path / "m", []
+
+    def other_run(*_: object) -> None:
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            free.append(True)
+        except BlockingIOError:
+            free.append(False)
+        finally:
+            os.close(opened)
+        raise KeyboardInterrupt
+
+    module = {"run": "training.run", "blocks": "blocks.train", "budget": "compression.search"}[kind]
+    monkeypatch.setattr(f"clsplat.{module}.decide", other_run)
+    start: Callable[..., object] = {
+        "run": lambda: train(scene, CONFIG, output=folder),
+        "blocks": lambda: train_in_blocks(scene, TWO, CONFIG, output=folder),
+        "budget": lambda: train_budget(scene, CONFIG, output=folder),
+    }[kind]
+    with pytest.raises(KeyboardInterrupt):
+        start()
+    assert free == [False]
+    prepare = ModelFolder.prepare
+
+    def ended(self: ModelFolder) -> None:
+        prepare(self)
+        self.write_config({})
+
+    monkeypatch.setattr(ModelFolder, "prepare", ended)
+    with pytest.raises(OutputError, match="already holds a model"):
+        start()
 
 
 def test_splats_that_move_over_a_border_stay(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,10 @@ from cli_runner import (
 from PIL import Image
 
 from clsplat.cameras.cameras_json import read_cameras
+from clsplat.errors import InputError
+from clsplat.models.cameras import export_cameras
+from clsplat.models.evaluation import EvaluationOptions
+from clsplat.models.render import ViewChoice
 from clsplat.rendering.colormaps import depth_picture
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
@@ -94,6 +98,24 @@ def test_render_sets_and_resolution(model: Path, scene: Path, tmp_path: Path) ->
     assert Image.open(tmp_path / "half" / TEST_NAMES[0]).size == (WIDTH // 2, HEIGHT // 2)
     clsplat("render", ply(model), "-s", scene, "-o", tmp_path / "ply")
     assert files(tmp_path / "ply") == set(TEST_NAMES)
+
+
+def test_sets_without_a_view_are_one_line(model: Path, tmp_path: Path) -> None:
+    cameras = json.loads((model / "cameras.json").read_text())
+    stems = {Path(name).stem for name in TEST_NAMES}
+    tests = [camera for camera in cameras if Path(camera["img_name"]).stem in stems]
+    (tmp_path / "tests.json").write_text(json.dumps(tests))
+    message = error_of("render", model, "--cameras", tmp_path / "tests.json", "--set", "train", "-o", tmp_path / "r")
+    assert message.endswith("tests.json: no training views are known: choose others with --set")
+
+
+def test_sets_and_formats_that_do_not_exist(model: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="view_set 'tests': choose one of test, train, validation, all"):
+        ViewChoice(view_set="tests")
+    with pytest.raises(InputError, match="view_set 'tests': choose one of test, train, validation, all"):
+        EvaluationOptions(view_set="tests")
+    with pytest.raises(InputError, match="form 'json': choose one of transforms, colmap, colmap-text, cameras"):
+        export_cameras(model, tmp_path / "a", "json")
 
 
 def test_render_orbit_looks_at_the_scene(model: Path, tmp_path: Path) -> None:

@@ -9,6 +9,8 @@ import pytest
 
 from clsplat.device.device import Device
 from clsplat.device.memory import Pool, UploadQueue, to_device, to_host
+from clsplat.device.opencl import Buffer
+from clsplat.errors import DeviceError
 
 
 def test_a_buffer_is_reused_until_it_is_too_small(device: Device) -> None:
@@ -29,6 +31,24 @@ def test_a_buffer_does_not_grow_beyond_the_largest_allocation(device: Device, mo
     memory = Pool(device).buffer(np.uint32)
     memory.reserve(1)
     assert memory.reserve(20).size == 4 * 25
+
+
+def test_a_buffer_takes_what_is_needed_if_there_is_no_more(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = Pool(device).buffer(np.uint32)
+    memory.reserve(1)
+    alloc, asked = device.alloc, []
+
+    def limited(size: int) -> Buffer:
+        asked.append(size)
+        if size > 100:
+            raise DeviceError("no more than 100 bytes")
+        return alloc(size)
+
+    monkeypatch.setattr(device, "alloc", limited)
+    assert memory.reserve(20).size == memory.nbytes == 80
+    assert asked == [120, 80]
+    with pytest.raises(DeviceError, match="no more than 100 bytes"):
+        memory.reserve(26)
 
 
 def test_rows_are_read_back(device: Device) -> None:

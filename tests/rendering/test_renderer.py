@@ -383,6 +383,15 @@ def test_models_with_other_near_planes_share_the_kernels(device: Device) -> None
     assert len(renderer._pipelines) == 1
 
 
+def test_a_renderer_keeps_the_buffers_of_a_few_shapes(device: Device) -> None:
+    renderer, camera = Renderer(device), random_camera(1, 64, 48)
+    arrays = random_splats(1, 30, 1, np.float32)
+    shapes = [*SHAPES, next(iter(SHAPES))]
+    images = [renderer.render(Splats(shape, for_shape(arrays, shape)), camera).color for shape in shapes]
+    assert len(renderer._pipelines) < len(SHAPES)
+    assert np.array_equal(images[0], images[-1])
+
+
 def test_threads_may_share_a_renderer(device: Device) -> None:
     renderer = Renderer(device)
     splats = Splats("gaussian", for_shape(random_splats(2, 200, 1, np.float32), "gaussian"))

@@ -59,6 +59,18 @@ def test_the_fastest_schedule_is_chosen_once(device: Device, monkeypatch: pytest
 
 
 @pytest.mark.usefixtures("nothing_chosen")
+@pytest.mark.parametrize("stored", ['"1x2x3"', '"fast"', "3", "null"])
+def test_a_damaged_choice_is_measured_again(
+    device: Device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, stored: str
+) -> None:
+    """Versions before had other schedules, and files break."""
+    (tmp_path / "schedules.json").write_text(f'{{"{tuning._key(device)}": {stored}}}')
+    names = candidates(device, monkeypatch)
+    monkeypatch.setattr(tuning, "_measure_one", lambda _, schedule: float(str(schedule) != names[0]))
+    assert str(tuning.schedule_for(device)) == names[0]
+
+
+@pytest.mark.usefixtures("nothing_chosen")
 def test_a_schedule_that_does_not_run_is_not_chosen(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     running = candidates(device, monkeypatch)[-1:]
 

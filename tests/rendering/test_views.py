@@ -30,8 +30,20 @@ def test_the_range_of_a_path_is_between_quartiles_of_its_frames(monkeypatch: pyt
 
 
 def test_extras_that_do_not_exist_are_named() -> None:
-    with pytest.raises(InputError, match="extras 'normals': choose from alpha, depth"):
+    with pytest.raises(InputError, match="extras 'normals': choose one of alpha, depth"):
         RenderOutput("out", extras=("alpha", "normals"))
+
+
+def test_formats_that_do_not_exist_are_named() -> None:
+    with pytest.raises(InputError, match="format 'jpg': choose one of png, npy"):
+        RenderOutput("out", format="jpg")
+
+
+def test_views_in_subfolders_have_a_scale_each(tmp_path: Path) -> None:
+    writer = ImageWriter(tmp_path, extras=("depth",))
+    for stem, depth in (("a/0001", 4.0), ("b/0001", 5.0)):
+        writer.write(stem, Rendered(np.zeros((2, 2, 3)), np.ones((2, 2)), np.full((2, 2), depth, np.float32)))
+    assert writer.depth_scales == {"a/0001_depth.png": 4.0, "b/0001_depth.png": 5.0}
 
 
 def test_depths_below_zero_are_black(tmp_path: Path) -> None:

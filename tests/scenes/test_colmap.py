@@ -188,6 +188,46 @@ def test_the_last_pose_may_end_without_a_line_end(folder: Path, recwarn: pytest.
     assert not [warning for warning in recwarn if "points or frames" in str(warning.message)]
 
 
+def test_frames_without_rigs(folder: Path, recwarn: pytest.WarningsRecorder) -> None:
+    """Such a file is left when only some files of a model are copied. Nothing is lost, because images have poses."""
+    wanted, model = load_scene(folder), folder / "sparse" / "0"
+    as_text(model, model)
+    for file in [*model.glob("*.bin"), *model.glob("rigs.*")]:
+        file.unlink()
+    assert (model / "frames.txt").is_file()
+    scene = load_scene(folder)
+    assert scene.names == wanted.names
+    assert not [warning for warning in recwarn if "points or frames" in str(warning.message)]
+
+
+CAMERA, IMAGE, POINT = "1 PINHOLE 40 30 50 50 20 15", "1 1 0 0 0 0 0 0 1 a.png\n", "1 0 0 0 9 9 9 0.5"
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "fault"),
+    [
+        ("cameras.txt", "1 OPENCV 40 30 50 50 20 15 0 0 0 0 0", "line 2: OPENCV has 9 parameters instead of 8 (fx, fy"),
+        ("cameras.txt", "1 PINHOLE 40 30 50 50 20", "line 2: PINHOLE has 3 parameters instead of 4 (fx, fy, cx, cy)"),
+        ("cameras.txt", "1 pinhole 40 30 50 50 20 15", "line 2: COLMAP has no camera model 'pinhole'"),
+        ("cameras.txt", "1 PINHOLE 40.0 30 50 50 20 15", "line 2 is no camera (ID MODEL WIDTH HEIGHT PARAMETERS"),
+        ("cameras.txt", "1 PINHOLE 40 30 50, 50, 20, 15", "line 2: the parameter '50,' is not a number"),
+        ("cameras.txt", "The cameras of this scene:", "line 2 is no camera (ID MODEL WIDTH HEIGHT PARAMETERS"),
+        ("images.txt", "1 1 0 0 0 0 0 0 a.png\n", "'1 1 0 0 0 0 0 0 a.png' is no image (ID QW QX QY QZ TX TY TZ"),
+        ("images.txt", "1 1 0 0 0 0 0 zero 1 a.png\n", "'1 1 0 0 0 0 0 zero 1 a.png' is no image (ID QW QX QY QZ TX"),
+        ("points3D.txt", "1 0 0 0 9 9 9", "line 2 is no point (ID X Y Z R G B ERROR TRACK"),
+        ("points3D.txt", "1 0 0 0 0.5 0.5 0.5 1", "line 2 is no point (ID X Y Z R G B ERROR TRACK"),
+    ],
+)  # fmt: skip
+def test_text_of_a_wrong_form_names_the_line(tmp_path: Path, file: str, text: str, fault: str) -> None:
+    texts = {"cameras.txt": CAMERA, "images.txt": IMAGE, "points3D.txt": POINT} | {file: text}
+    for name, content in texts.items():
+        (tmp_path / name).write_text(f"# a comment\n{content}\n")
+    with pytest.raises(InputError) as error:
+        read_model(tmp_path)
+    assert str(error.value).startswith(f"{tmp_path / file}: {fault}"), str(error.value)
+    assert str(error.value).endswith(": correct it, or write the model again")
+
+
 def test_text_with_a_byte_order_mark(folder: Path) -> None:
     """Editors of Windows write one."""
     wanted, model = load_scene(folder), folder / "sparse" / "0"

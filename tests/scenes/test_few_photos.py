@@ -48,5 +48,5 @@ def test_points_without_tracks_stay(scene: Scene, tmp_path: Path) -> None:
 @pytest.mark.parametrize("count", [0, -1, 9])
 def test_a_number_that_the_scene_does_not_have(capture_folder: Path, count: int) -> None:
     scene = load_scene(capture_folder, read_photos=False)
-    with pytest.raises(InputError, match=rf"{count} photos, but it has 8 training views: choose 1 to that"):
+    with pytest.raises(InputError, match=rf"{count} photos, but it has 8 training views: choose 1 to 8"):
         few_photos(scene, count)

@@ -321,6 +321,7 @@ def test_missing_photos_are_named_and_left_out(folder: Path) -> None:
     write(folder, LENS | {"frames": frames()})
     with pytest.warns(UserWarning, match=rf"1 of 9 photos are left out \(12 %\): .*images/{NAMES[3]}: no such"):
         assert len(load_scene(folder).views) == 8
+    (folder / "images").rename(folder / "pictures")
     with pytest.raises(InputError, match="none of its 9 photos can be used"):
         load_scene(write(folder, LENS | {"frames": frames("nowhere/")}))
 
@@ -356,8 +357,11 @@ def in_frame(**values: Any) -> Callable[[Values], Values]:
         (in_frame(equirectangular=True), "frame 1: equirectangular has no pinhole image"),
         (changed(ftheta_p0=0.2), "ftheta_p0 has no pinhole image"),
         (changed(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR' has no pinhole image"),
-        (changed(ply_file_path="gone.ply"), r"gone\.ply: cannot be read"),
-        (changed(ply_file_path="images"), "images: cannot be read"),
+        (changed(ply_file_path="gone.ply"), r"ply_file_path .gone\.ply. is not a file: copy the points there, or"),
+        (changed(ply_file_path="images"), "ply_file_path .images. is not a file"),
+        (changed(fl_x=None, fl_y=None, K=[[1, 0], [0, 1]]), "K must be 3 x 3 numbers"),
+        (changed(fl_x=None, fl_y=None, K=[[50, 3, 20], [0, 50, 15], [0, 0, 1]]), "has a skew of 3 px; undistort"),
+        (changed(sk_x=-2), "has a skew of -2 px; undistort"),
         (changed(test_filenames=[1]), "is not a list of photos"),
         (in_frame(transform_matrix=[[1, 2], [3, 4]]), "frame 1: transform_matrix must be 4 x 4"),
         (in_frame(transform_matrix=np.diag([2.0, 2, 1, 1]).tolist()), "frame 1: .* transform_matrix is not a rotation"),

@@ -103,6 +103,15 @@ def test_photos_are_found_by_the_last_parts_of_their_paths(tmp_path: Path, prefi
     assert read_posed_images(tmp_path, None).names == made.NAMES
 
 
+def test_a_camera_without_a_photo_is_left_out(tmp_path: Path) -> None:
+    """As in the example of OPF's specification."""
+    project = made.opf_project()
+    project.files[CAMERAS]["cameras"][1]["id"] = 5
+    with pytest.warns(UserWarning, match=f"1 of {made.N_CAMERAS} calibrated cameras are in no camera list"):
+        found = read_posed_images(write(tmp_path, project), None)
+    assert len(found.photos) == made.N_CAMERAS - 1
+
+
 def test_another_folder_of_photos(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "images").rename(tmp_path / "images_2")
@@ -168,7 +177,10 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
     ),
     "a missing file": (lambda f: f.pop(CAMERAS), ["cameras.json", "copy it there"]),
     "no cameras": (lambda f: f[CAMERAS].update(cameras=[]), ["no camera is calibrated"]),
-    "an unlisted camera": (camera_with(id=5), ["cameras[1]", "is in no camera list"]),
+    "unlisted cameras": (
+        lambda f: [camera.update(id=camera["id"] + 1000) for camera in f[CAMERAS]["cameras"]],
+        ["cameras[0]", "is in no camera list"],
+    ),
     "a camera twice": (
         lambda f: f[CAMERAS]["cameras"][1].update(id=f[CAMERAS]["cameras"][0]["id"]),
         ["cameras[1]", "another camera has already"],

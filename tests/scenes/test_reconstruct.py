@@ -138,6 +138,37 @@ def test_a_scene_is_not_replaced_without_overwrite(scene: Path, walk: Path, tmp_
     assert is_made_from(tmp_path, walk) is None
 
 
+@pytest.mark.parametrize("killed", [False, True])
+def test_an_old_scene_stays_until_the_new_one_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed: bool
+) -> None:
+    """A full disk, or the end of the process, comes between the two moves."""
+    scene, new = tmp_path / "scene", tmp_path / ".scene.unfinished" / "scene"
+    for folder in (scene, new):
+        folder.mkdir(parents=True)
+        (folder / "reconstruct.json").write_text(folder.parent.name)
+    moves = []
+
+    def fails(source: Path, target: Path) -> None:
+        moves.append(target)
+        if source == new:
+            raise OSError("no space")
+        if killed and source != scene:
+            raise OSError("killed before")
+        source.replace(target)
+
+    monkeypatch.setattr(module, "move", fails)
+    with pytest.raises(OSError, match="killed before" if killed else "no space"):
+        module._move_into_place(new, scene)
+    assert scene.exists() is not killed
+    monkeypatch.undo()
+    module._finish_killed(scene)
+    assert (scene / "reconstruct.json").read_text() == tmp_path.name
+    module._move_into_place(new, scene)
+    assert (scene / "reconstruct.json").read_text() == ".scene.unfinished"
+    assert [path.name for path in tmp_path.iterdir() if "old" in path.name] == []
+
+
 TINY = ("--eval", "--iterations", 10, "--cap-max", 300, "--sh-degree", 0)
 
 

@@ -1,4 +1,4 @@
-"""Reduced photos with other names than those of the model: another suffix, or numbers as in LLFF's scenes."""
+"""Photos with other names than in the model: another suffix, or, if reduced, numbers as in LLFF's scenes."""
 
 from __future__ import annotations
 
@@ -21,9 +21,17 @@ def paired(folder: Path, *names: str) -> dict[str, str]:
     return {name: file.name for name, file in found.items()}
 
 
-def test_another_suffix(tmp_path: Path) -> None:
-    folder = made(tmp_path / "images_4", "a.png", "b.JPG", "c.png", "c.jpg")
-    assert paired(folder, "a.JPG", "b.JPG", "c.bmp") == {"a.JPG": "a.png", "b.JPG": "b.JPG", "c.bmp": "c.bmp"}
+@pytest.mark.parametrize("name", ["images_4", "images", "cut out"])
+def test_another_suffix(tmp_path: Path, name: str) -> None:
+    folder = made(tmp_path / name, "a.png", "b.JPG", "c.png", "c.jpg", "d.1.png", "e.png")
+    assert paired(folder, "a.JPG", "b.JPG", "c.bmp", "d.1", "e.jpg", "e.png") == {
+        "a.JPG": "a.png",
+        "b.JPG": "b.JPG",
+        "c.bmp": "c.bmp",  # two others have its name
+        "d.1": "d.1.png",
+        "e.jpg": "e.jpg",  # the other one is another photo of the model
+        "e.png": "e.png",
+    }
 
 
 def test_numbers_in_the_order_of_the_photos(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,10 @@ import pytest
 from cli_runner import error_of, run
 from small_scene import NAMES, write_garden
 
+from clsplat.errors import InputError
 from clsplat.files.images import write_png
+from clsplat.scenes.reconstruct.model_scene import plan_scene
+from clsplat.scenes.scene import load_scene
 from clsplat.scenes.wrong_folder import scene_above, scene_hint, scenes_below
 
 
@@ -51,7 +55,7 @@ def test_the_folder_above_scenes(data: Path, tmp_path: Path, command: str) -> No
     assert "the subfolder garden is a scene: give " in refusal(command, data, tmp_path / "out")
 
 
-@pytest.mark.parametrize("below", ["colmap", "work/distorted"])
+@pytest.mark.parametrize("below", ["sfm", "work/distorted"])
 def test_a_model_in_a_subfolder_beside_its_photos(data: Path, tmp_path: Path, below: str) -> None:
     garden = data / "garden"
     (garden / below).mkdir(parents=True)
@@ -60,6 +64,73 @@ def test_a_model_in_a_subfolder_beside_its_photos(data: Path, tmp_path: Path, be
     message = refusal("info", garden, tmp_path / "out")
     assert message.endswith(f"is a scene: give {garden / below}, and its folder of photos: {photos}")
     assert run("info", garden / below, "-i", photos).exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["colmap/sparse", "colmap_sparse", "colmap_text"])
+def test_models_in_folders_of_other_names(data: Path, name: str) -> None:
+    """Those of nerfstudio and of instant-ngp."""
+    garden = data / "garden"
+    expected = load_scene(garden)
+    (garden / name).parent.mkdir(parents=True, exist_ok=True)
+    (garden / "sparse").rename(garden / name)
+    found = load_scene(garden)
+    assert found.names == expected.names
+    assert len(found.points) == len(expected.points)
+    assert run("info", garden).exit_code == 0
+
+
+@pytest.mark.parametrize("photos", ["images", "input", "."])
+@pytest.mark.parametrize("model", ["sfm", "glomap/0", "work/distorted/sparse/0"])
+def test_photos_are_not_reconstructed_beside_a_model(data: Path, tmp_path: Path, photos: str, model: str) -> None:
+    """The message names the two folders, and they are read together."""
+    garden = data / "garden"
+    for file in (garden / "images").iterdir():
+        (garden / photos).mkdir(exist_ok=True)
+        file.rename(garden / photos / file.name)
+    (garden / model).parent.mkdir(parents=True, exist_ok=True)
+    (garden / "sparse" / "0").rename(garden / model)
+    shutil.rmtree(garden / "sparse")
+    if photos != "images":
+        shutil.rmtree(garden / "images")
+    message = error_of("train", garden, "-m", tmp_path / "out")
+    found = re.search(r"give (\S+), and its folder of photos: (\S+), or find new poses with clsplat recon", message)
+    assert found, message
+    assert load_scene(found[1], images=found[2]).names == NAMES
+
+
+def test_a_model_without_photos_beside_it_has_them_named(data: Path, tmp_path: Path) -> None:
+    (data / "garden" / "sparse" / "0").rename(tmp_path / "model")
+    (data / "garden" / "images").rename(tmp_path / "pictures")
+    assert load_scene(tmp_path / "model", images="../pictures").names == NAMES
+    with pytest.raises(InputError, match="there is no such folder of photos; put the photos there, or name their"):
+        load_scene(tmp_path / "model")
+    message = error_of("info", next((tmp_path / "model").glob("cameras.*")))
+    assert message.endswith("is a file of a COLMAP model; give the folder of the scene")
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("sfm_data.json", "OpenMVG; export it as a COLMAP model (openMVG_main_openMVG2Colmap)"),
+        ("reconstruction.json", "OpenSfM; export it as a COLMAP model (opensfm export_colmap)"),
+        ("poses_bounds.npy", "LLFF; give its COLMAP model, or find the poses again with clsplat reconstruct"),
+        ("a.nvm", "VisualSFM; export it as a COLMAP model"),
+    ],
+)
+def test_reconstructions_of_other_programs(data: Path, tmp_path: Path, name: str, said: str) -> None:
+    file = data / "loose" / name
+    file.write_text("{}")
+    assert error_of("info", file).endswith(f"is a reconstruction of {said}")
+    with pytest.warns(UserWarning, match=re.escape(f"{file}: is a reconstruction of {said}")):
+        plan_scene(data / "loose", tmp_path / "out")
+
+
+def test_the_cameras_of_a_model_are_no_scene(tmp_path: Path) -> None:
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps([{"id": 0, "img_name": "a", "position": [0, 0, 0]}]))
+    assert "cameras.json: has the cameras of a model, without a scene; give the scene's folder" in error_of(
+        "info", file
+    )
 
 
 @pytest.mark.parametrize("command", COMMANDS)

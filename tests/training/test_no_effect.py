@@ -30,6 +30,13 @@ from clsplat.training.no_effect import _FIELD_OF, _NEEDS, _OF_POINTS, no_effect
         ({"shape": "skew-normal"}, "alternation_split", "with alternation off"),
         ({"split": "long-axis"}, "dense_size", "with split long-axis"),
         ({"average_last": 0.1, "densify_until": 1.0}, "average_last", "with densification until the end"),
+        ({"sh_degree": 0, "sh_interval": 10}, "sh_interval", "with sh degree 0"),
+        ({"sh_degree": 0, "feature_rest_lr": 1e-4}, "feature_rest_lr", "with sh degree 0"),
+        (
+            {"shape": "skew-normal-direct", "normalisation": "none", "strategy": "mcmc", "relocation": "length"},
+            "relocation",
+            "with normalisation none, which needs opacity-only",
+        ),
         ({"densify_from": 0.9}, "densify_from", "with densification until 0.5 of the run"),
         ({"densify_from": 0.3, "densify_until": 0.3}, "densify_from", "with densification until 0.3 of the run"),
         ({"iterations": 100, "save_iterations": (200, 300)}, "save_iterations", "beyond the run's 100 iterations"),

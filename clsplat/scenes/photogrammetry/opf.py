@@ -13,6 +13,7 @@ from __future__ import annotations
 import ntpath
 import os
 import re
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -60,9 +61,15 @@ def read_opf(path: Path, images: str | None = None) -> PosedImages:
     project = _Project.read(path)
     calibrated = project.calibration()
     uris, cameras = project.photos(), list(_cameras(calibrated))
-    for camera in cameras:
-        if camera.id not in uris:
-            raise InputError(f"{camera.place}: is in no camera list of {path}; {REMEDY}")
+    strangers = [camera for camera in cameras if camera.id not in uris]
+    if len(strangers) == len(cameras):
+        raise InputError(f"{strangers[0].place}: is in no camera list of {path}; {REMEDY}")
+    if strangers:
+        warnings.warn(
+            f"{path}: {len(strangers)} of {len(cameras)} calibrated cameras are in no camera list; they are left out",
+            stacklevel=4,
+        )
+        cameras = [camera for camera in cameras if camera.id in uris]
     found = find_named_photos(path, [uris[camera.id] for camera in cameras], images)
     placed = [(camera, *found[uris[camera.id]]) for camera in cameras]
     files = {name: file for _, name, file in placed}

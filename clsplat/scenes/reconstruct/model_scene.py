@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import InputError, OutputError
-from ..wrong_folder import scene_above
+from ..wrong_folder import model_below, other_poses, scene_above
 from .options import RECORD, ReconstructOptions
 from .photo_files import find_photos, is_video
 from .reconstruct import estimate_seconds, is_made_from
@@ -48,7 +49,7 @@ def plan_scene(
 
     Raises
     ------
-    InputError : there are no photos, their poses are in the folder above, or a resumed run had other photos.
+    InputError : there are no photos, their poses are in the folder above or below, or a resumed run had other photos.
     OutputError : the scene was made from other photos.
     """
     options = options or ReconstructOptions()
@@ -72,5 +73,9 @@ def plan_scene(
         )
     if is_video(photos):
         return PlannedScene(scene, False, options.frames)
+    if (message := model_below(photos)) is not None:
+        raise InputError(f"{message}, or find new poses with clsplat reconstruct {photos} -o SCENE")
+    if (message := other_poses(photos)) is not None:
+        warnings.warn(message, stacklevel=2)
     files = find_photos(photos)
     return PlannedScene(scene, False, len(files), estimate_seconds(files, options))

@@ -101,6 +101,7 @@ def reconstruct(
     OutputError : the scene exists or cannot be written.
     """
     source, target, options = Path(photos), Path(scene), options or ReconstructOptions()
+    _finish_killed(target.absolute())
     _refuse_used(target, overwrite)
     start = time.perf_counter()
     report: StepCallback = progress or (lambda step: None)
@@ -165,7 +166,7 @@ def reconstruct(
                 **{key: value for key, value in asdict(result).items() if key != "scene"},
             },
         )
-        _move_into_place(work / "scene", target)
+        _move_into_place(work / "scene", target.absolute())
     return result
 
 
@@ -245,12 +246,34 @@ def _unfinished(scene: Path) -> Iterator[Path]:
         raise OutputError(f"{scene}: cannot be written ({error.strerror or error}); choose another place") from None
 
 
-def _move_into_place(finished: Path, scene: Path) -> None:
-    """Move the finished scene to its folder in place of an old scene."""
+def _place_of_old(scene: Path) -> Path:
+    """Return where an old scene lies while the new one takes its place."""
+    return scene.with_name(f".{scene.name}.old")
+
+
+def _finish_killed(scene: Path) -> None:
+    """End the exchange of scenes of a killed command: with the old scene if the new one is not in its place."""
+    old = _place_of_old(scene)
+    if not old.is_dir():
+        return
     if scene.exists():
-        old = finished.with_name("old")
+        shutil.rmtree(old, ignore_errors=True)
+    else:
+        move(old, scene)
+
+
+def _move_into_place(finished: Path, scene: Path) -> None:
+    """Move the finished scene to its folder in place of an old scene, which goes last."""
+    old = _place_of_old(scene)
+    if scene.exists():
         move(scene, old)
-    move(finished, scene)
+    try:
+        move(finished, scene)
+    except BaseException:
+        if old.exists():
+            move(old, scene)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def _stage_all(photos: Sequence[PhotoFile], source: Path, work: Path, report: StepCallback) -> list[StagedPhoto]:

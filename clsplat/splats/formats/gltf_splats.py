@@ -68,7 +68,7 @@ def _attribute(shape: str) -> str:
 
 
 def write_gltf_splats(path: str | os.PathLike[str], splats: StoredSplats) -> None:
-    """Write splats of one of GLTF_SHAPES as a .glb file.
+    """Write splats of one of the shapes of `_KERNELS` as a .glb file.
 
     Raises
     ------

@@ -43,6 +43,13 @@ class StepInfo:
     extent: float
 
 
+def relocation_rule(config: TrainConfig) -> str:
+    """Return the rule of relocation (`relocation.RULES`) of a run with strategy "mcmc"."""
+    # The length factor needs a profile with peak 1. Other normalisations change the peak with the view.
+    scaled = config.normalisation == "peak" or not shape_named(config.shape).normalised
+    return str(config.to_json()["relocation"]) if scaled else "opacity-only"
+
+
 def next_edit(
     config: TrainConfig, splats: SplatTable, stats: Array, rng: np.random.Generator, info: StepInfo
 ) -> DensifyEdit:
@@ -60,8 +67,6 @@ def next_edit(
     """
     shape, density = shape_named(config.shape), config.density
     if isinstance(density, Mcmc):
-        # The length factor needs a profile with peak 1. Other normalisations change the peak with the view.
-        scaled = config.normalisation == "peak" or not shape.normalised
         return plan_relocation(
             splats,
             shape,
@@ -69,7 +74,7 @@ def next_edit(
             config.cap_max,
             growth=info.growth,
             limit=density.relocation_limit,
-            rule=density.relocation if scaled else "opacity-only",
+            rule=relocation_rule(config),
             turnover=turnover(config),
             split=density.split,
             gradient=stats[SplatStatistics.SCREEN_GRADIENT] / np.maximum(stats[SplatStatistics.TIMES_SEEN], 1.0),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from types import NoneType, UnionType
 from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 
-from ...errors import InputError
+from ...errors import InputError, check_choice
 from ...files.json_file import describe, to_real
 
 
@@ -89,8 +89,8 @@ class Option:
 
     def check(self, value: Any) -> None:
         """Raise InputError if a value is not one of the choices, not finite, or out of range."""
-        if self.choices and value not in self.choices:
-            raise InputError(f"{self.name} {value!r}: choose one of {', '.join(self.choices)}")
+        if self.choices:
+            check_choice(self.name, value, self.choices)
         if isinstance(value, float) and not math.isfinite(value):
             raise InputError(f"{self.name} {value}: must be finite{f' and {self.range}' if self.range else ''}")
         if self.range is None or value is None:
